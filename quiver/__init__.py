@@ -1,0 +1,1 @@
+"""quiver: restores blur-free video from few-bit quanta streams; trains, evaluates and compares."""

@@ -1,0 +1,1 @@
+"""Classical restorers, one file per method, one signature: restore(codes, sensor, exposure, ...)."""
