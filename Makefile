@@ -1,0 +1,38 @@
+# make demo    scenes -> few-bit frames -> restored video, as one page: out/demo/index.html
+# make test    the quick tests (about five minutes); make test-slow: the long ones
+# make lint    style and types
+
+PYTHON ?= python3
+BIN := .venv/bin
+EXTRAS := train,cluster,denoise,video,formats,dev
+# One thread per test process: two processes share two cores.
+TEST_ENV := OMP_NUM_THREADS=1 PYTHONWARNINGS=error::SyntaxWarning
+
+.PHONY: setup demo test test-slow lint clean
+
+setup: .venv/.ready
+
+.venv/.ready: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info[:2] < (3, 14) else "qsim needs Python 3.11, 3.12 or 3.13, and %s is %s; name another with PYTHON=python3.12" % (sys.executable, sys.version.split()[0]))'
+	@$(PYTHON) -m venv .venv || { echo "python -m venv failed: on Debian and Ubuntu install it with 'apt-get install python3-venv'" >&2; exit 1; }
+	@echo "Installing qsim and what it needs into .venv (one to five minutes) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS)]'
+	@sh .ci/ensure-llvm $(BIN)/python
+	@touch $@
+
+demo: setup
+	@$(BIN)/python docs/demo.py out/demo
+
+test: setup
+	$(TEST_ENV) $(BIN)/python -m pytest -m "not slow" -n 2
+
+test-slow: setup
+	$(TEST_ENV) $(BIN)/python -m pytest -m slow -n 2
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf out .venv build *.egg-info
