@@ -15,8 +15,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-GAMMA = 2.2  # the one tone curve of every picture
-
 
 @dataclass(frozen=True)
 class Panel:
@@ -34,12 +32,6 @@ class Table:
     headers: Sequence[str]
     rows: Sequence[Sequence[object]]
     best: frozenset[int] = frozenset()
-
-
-def tone(linear: NDArray[np.floating], peak: float) -> NDArray[np.uint8]:
-    """Linear light -> 8-bit grey, 255 (v / peak)^(1/2.2), clipped to 0 ... peak and rounded; NaN is shown black."""
-    scaled = np.clip(np.nan_to_num(np.asarray(linear, np.float64)) / peak, 0.0, 1.0)
-    return np.rint(255.0 * scaled ** (1 / GAMMA)).astype(np.uint8)
 
 
 def picture_uri(pixels: NDArray[np.uint8], *, quality: int | None = None) -> str:
