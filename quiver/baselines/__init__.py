@@ -1,1 +1,41 @@
-"""Classical restorers, one file per method, one signature: restore(codes, sensor, exposure, ...)."""
+"""Classical restorers, one file per method, one signature.
+
+    restore(codes [T, H, W], sensor, exposure, *, window=...) -> restored photons [T, H, W], float32
+
+Any number of frames and any size; a clip is continued by reflection at both ends. METHODS is the whole list: import the module of a
+method for its other settings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from numpy import ndarray as Array
+
+from quiver.baselines import mean, moment
+from quiver.baselines.windows import look_ahead
+
+
+@dataclass(frozen=True)
+class Method:
+    """A restorer and what a table says about it."""
+
+    name: str
+    restore: Callable[..., Array]  # restore(codes, sensor, exposure, *, window=...) -> photons
+    window: int  # frames used for one restored frame, when not told otherwise
+    description: str
+
+    @property
+    def look_ahead(self) -> int:
+        """Future frames used for one restored frame, with the default window."""
+        return look_ahead(self.window)
+
+
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (
+        Method("naive", mean.restore, 11, "mean of the codes, taken as linear in light"),
+        Method("moment", moment.restore, 11, "mean of the codes through the exact inverse response"),
+    )
+}

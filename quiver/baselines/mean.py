@@ -1,0 +1,41 @@
+"""Naive mean: the floor under every table. Averages the codes of a window and believes they are linear in light.
+
+    photons = max(0, mean(codes) - dark) * white / top
+
+Source: textbook. `white / top` is the light of one code step as the settings promise it (1/(gain * efficiency)), `dark` the codes which
+dark counts and offset add in the same linear picture. Clipping and dead time are ignored: at 3.25 photons per pixel (3 bits,
+gain 1.077) the estimate is 4 % low, at four times that light 39 %.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.qis import QIS
+from qsim.sensor import Sensor
+from qsim.spad import BinarySPAD, CountingSPAD
+from quiver.baselines.windows import check_codes, check_window, window_sums
+
+
+def dark_codes(sensor: Sensor, exposure: float) -> float:
+    """What a linear sensor would read in the dark [codes]; for a sensor model unknown here, its exact mean code without light."""
+    if isinstance(sensor, QIS):
+        return sensor.gain * sensor.dark_current * exposure + sensor.offset
+    if isinstance(sensor, BinarySPAD | CountingSPAD):
+        return sensor.dark_count_rate * exposure
+    return float(sensor.mean(np.zeros(1), exposure)[0])
+
+
+def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11) -> Array:
+    """Codes [T, H, W] -> restored photons [T, H, W], float32; `window` frames around each, reflected at the clip's ends.
+
+    Raises ValueError for codes the sensor cannot produce and for an empty window.
+    """
+    check_codes(codes, sensor)
+    check_window(window)
+    top = sensor.levels - 1
+    mean_code = np.arange(window * top + 1) / window
+    photons = np.maximum(0, mean_code - dark_codes(sensor, exposure)) * (sensor.white(exposure) / top)
+    table = photons.astype(np.float32)
+    return np.stack([table[total] for total in window_sums(codes, window, top)])

@@ -1,0 +1,29 @@
+"""Moment inverse: the mean code of a window, sent back through the sensor's exact mean response.
+
+    photons = mu^-1(min(mean(codes), top - 1/(2 window)))
+
+Source: method of moments, textbook. Knows clipping, rounding, dark counts and dead time, because mu comes from the sensor's exact
+distribution; knows nothing about space or motion. A sum of codes has few values, so the whole method is one table and a running sum.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.sensor import Sensor
+from quiver.baselines.tables import response_table
+from quiver.baselines.windows import check_codes, check_window, window_sums
+
+
+def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11) -> Array:
+    """Codes [T, H, W] -> restored photons [T, H, W], float32; `window` frames around each, reflected at the clip's ends.
+
+    Raises ValueError for codes the sensor cannot produce and for an empty window.
+    """
+    check_codes(codes, sensor)
+    check_window(window)
+    top = sensor.levels - 1
+    mean_code = np.arange(window * top + 1) / window
+    table = response_table(sensor, exposure).invert(mean_code, window).astype(np.float32)
+    return np.stack([table[total] for total in window_sums(codes, window, top)])

@@ -1,0 +1,56 @@
+"""A sensor's response as a table: photons -> mean code and variance, and back.
+
+    mean code m, averaged over n codes -> photons,  mu^-1(min(m, top - 1/(2n)))
+
+The only source is the sensor's exact distribution (`sensor.mean`, `sensor.variance`): no baseline holds a sensor model of its own.
+An all-saturated pixel has no finite estimate, so the mean code is limited to half a count below the top of the response (cap).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.sensor import Sensor
+
+POINTS = 4096  # of a table; linear interpolation then errs by less than 1e-6 of the full scale
+FLAT = 1e-7  # a response this close to its top (relative to the full scale) has ended
+
+
+@dataclass(frozen=True)
+class ResponseTable:
+    """Exact mean and variance of one code over a grid of photons, evenly spaced in sqrt(photons), rising in mean."""
+
+    photons: Array  # [G], expected photons per pixel and exposure, from 0
+    mean: Array  # [G], codes, strictly rising
+    variance: Array  # [G], codes^2
+
+    def cap(self, samples: int) -> float:
+        """The largest estimate [photons] from the mean of `samples` codes: half a count below saturation."""
+        return float(np.interp(self.mean[-1] - 0.5 / samples, self.mean, self.photons))
+
+    def invert(self, mean_code: Array, samples: int) -> Array:
+        """Photons whose mean code is this; 0 below the mean of a dark pixel, cap(samples) at saturation. Any shape."""
+        return np.interp(np.minimum(mean_code, self.mean[-1] - 0.5 / samples), self.mean, self.photons)
+
+
+def brightest(sensor: Sensor, exposure: float) -> float:
+    """Photons at which the mean code stops rising: at the top code, or before (full well, dead time)."""
+    top = sensor.levels - 1
+    photons = sensor.white(exposure) * 2.0 ** np.arange(-4, 40)
+    mean = sensor.mean(photons, exposure)
+    ended = (top - mean < FLAT * top) | (np.diff(mean, append=mean[-1]) < FLAT * top)
+    return float(photons[np.argmax(ended)])
+
+
+def response_table(sensor: Sensor, exposure: float, points: int = POINTS) -> ResponseTable:
+    """Tabulate a sensor's response from darkness to the end of its rise.
+
+    Where the response falls again (a paralyzable counter) the table holds its rising branch only.
+    """
+    photons = np.linspace(0, np.sqrt(brightest(sensor, exposure)), points) ** 2
+    mean, variance = sensor.mean(photons, exposure), sensor.variance(photons, exposure)
+    rising = np.concatenate([[True], mean[1:] > np.maximum.accumulate(mean)[:-1]])
+    return ResponseTable(photons[rising], mean[rising], variance[rising])

@@ -1,0 +1,69 @@
+"""Frames of a stream: checking them, reaching over the ends of a clip, sums over a sliding window.
+
+    codes [T, H, W] -> for every frame t the sum of the codes of `window` frames around it
+
+A window of w frames covers t - w//2 ... t + (w-1)//2: centred for odd w, one frame more of the past for even w. Frames before the
+first and after the last are reflections that do not repeat the end frame (-1 is frame 1), over and over for short clips.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.sensor import Sensor
+
+
+def check_codes(codes: Array, sensor: Sensor) -> None:
+    """Raise ValueError unless `codes` is an integer stack [T, H, W] (none of them 0) of codes this sensor can produce."""
+    if codes.ndim != 3 or codes.size == 0 or not np.issubdtype(codes.dtype, np.integer):
+        raise ValueError(f"codes: expected integers [T, H, W] with at least one frame, got {codes.dtype} {codes.shape}")
+    if codes.max() >= sensor.levels or codes.min() < 0:
+        bad = (codes < 0) | (codes >= sensor.levels)
+        where = tuple(int(i) for i in np.unravel_index(np.argmax(bad), codes.shape))
+        raise ValueError(
+            f"codes: expected 0..{sensor.levels - 1} for a {sensor.bits}-bit sensor, "
+            f"found {codes[where]} at (t, y, x) = {where}"
+        )
+
+
+def check_window(window: int) -> None:
+    """Raise ValueError unless a window holds at least one frame."""
+    if window < 1:
+        raise ValueError(f"window is a number of frames, got {window}; use 1 or more")
+
+
+def look_ahead(window: int) -> int:
+    """Future frames which a window of this many frames needs."""
+    return (window - 1) // 2
+
+
+def reflect(index: Array, length: int) -> Array:
+    """Frame numbers inside 0 ... length-1 for any integers: -1 -> 1, length -> length-2, and 0 where there is one frame."""
+    if length == 1:
+        return np.zeros_like(index)
+    folded = np.abs(index) % (2 * length - 2)
+    return np.where(folded < length, folded, 2 * length - 2 - folded)
+
+
+def window_frames(frame: int, window: int, length: int) -> Array:
+    """The `window` frame numbers around `frame`, reflected at both ends of a clip of `length` frames."""
+    return reflect(np.arange(frame - window // 2, frame + look_ahead(window) + 1), length)
+
+
+def window_sums(codes: Array, window: int, top: int) -> Iterator[Array]:
+    """Sum of the codes over the window around each frame: T unsigned arrays [H, W], 0 ... window * top.
+
+    A running sum: one frame enters, one leaves. Every yielded array is the caller's own.
+    """
+    dtype = np.uint16 if window * top < 2**16 else np.uint32
+    length = len(codes)
+    total = codes[window_frames(0, window, length)].sum(axis=0, dtype=dtype)
+    yield total
+    for frame in range(1, length):
+        leaves, enters = reflect(np.array([frame - 1 - window // 2, frame + look_ahead(window)]), length)
+        total = total + codes[enters].astype(dtype)
+        total -= codes[leaves].astype(dtype)
+        yield total
