@@ -1,0 +1,101 @@
+"""What training minimises: pixel and gradient differences at three scales, and of the pre-denoised frames.
+
+    l(a, b) = mean|a - b| + w (mean|Dx a - Dx b| + mean|Dy a - Dy b|)
+    total   = 0.85 l(O1, G) + 0.10 l(O2, G/2) + 0.05 l(O4, G/4) + 0.20 l(d, all clean frames)
+
+The published program and the paper's text differ in w, in the gradient and in how targets are made smaller; both are
+presets (spec 5.2). Any model whose output is a plain tensor gets l(O, G) alone. Always float32, also under autocast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+
+class MultiScale(Protocol):
+    """Output of the network: every frame pre-denoised, the restored ones at scale 1, 1/2, 1/4 (None = not built)."""
+
+    denoised: Tensor | None
+    scale1: Tensor
+    scale2: Tensor | None
+    scale4: Tensor | None
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Weights and operators of the loss."""
+
+    gradient_weight: float  # w
+    gradient: Literal["sobel", "difference"]  # 3 x 3 (1 2 1), not normalised, no padding | x[i+1] - x[i]
+    resize: Literal["bilinear", "bicubic"]  # of the smaller targets, no antialiasing
+    scales: tuple[float, float, float] = (0.85, 0.10, 0.05)  # of scale 1, 1/2, 1/4
+    denoised: float = 0.20
+
+    def __post_init__(self) -> None:
+        for name, value in (("gradient_weight", self.gradient_weight), ("denoised", self.denoised)):
+            if not 0 <= value < float("inf"):
+                raise ValueError(f"Loss.{name} must be a finite number >= 0, got {value!r}")
+
+
+PUBLISHED = Loss(gradient_weight=0.5, gradient="sobel", resize="bilinear")
+# "horizontal and vertical gradients": read as first differences; "bicubic" as the kernel alone
+PAPER = Loss(gradient_weight=1.0, gradient="difference", resize="bicubic")
+L1 = Loss(gradient_weight=0.0, gradient="difference", resize="bilinear")  # of plain controls
+PRESETS = {"published": PUBLISHED, "paper": PAPER, "l1": L1}
+
+
+def gradients(image: Tensor, operator: str) -> tuple[Tensor, Tensor]:
+    """Horizontal and vertical gradient of [N, 1, H, W]; the border without a full neighbourhood is cut off."""
+    if operator == "difference":
+        return image[..., :, 1:] - image[..., :, :-1], image[..., 1:, :] - image[..., :-1, :]
+    kernel = torch.tensor(
+        [[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]], dtype=image.dtype, device=image.device
+    )
+    both = functional.conv2d(image, torch.stack([kernel, kernel.T])[:, None])
+    return both[:, :1], both[:, 1:]
+
+
+def pair_loss(output: Tensor, target: Tensor, loss: Loss) -> Tensor:
+    """l(a, b) of [..., 1, H, W]; a gradient that has no pixel left (1 px frames) counts 0."""
+    a, b = output.float().flatten(0, -4), target.float().flatten(0, -4)
+    total = (a - b).abs().mean()
+    if loss.gradient_weight == 0 or (loss.gradient == "sobel" and min(a.shape[-2:]) < 3):
+        return total
+    for da in gradients(a - b, loss.gradient):  # both operators are linear: one pass over the difference is enough
+        if da.numel():
+            total = total + loss.gradient_weight * da.abs().mean()
+    return total
+
+
+def shrink(target: Tensor, size: Sequence[int], mode: str) -> Tensor:
+    """Target [B, T, 1, H, W] at a smaller size; bilinear by 4 is the mean of the central 2 x 2 of each block."""
+    flat = functional.interpolate(target.float().flatten(0, 1), size=list(size), mode=mode, align_corners=False)
+    return flat.view(*target.shape[:2], *flat.shape[1:])
+
+
+def centred(target: Tensor, frames: int, first: int) -> Tensor:
+    """The `frames` target frames that an output from frame `first` on answers for; ValueError if they do not exist."""
+    if first < 0 or first + frames > target.shape[1]:
+        raise ValueError(f"output holds frames {first}..{first + frames - 1}, the target only 0..{target.shape[1] - 1}")
+    return target[:, first : first + frames]
+
+
+def training_loss(output: Tensor | MultiScale, target: Tensor, loss: Loss, *, first: int) -> Tensor:
+    """The loss of one batch, a float32 scalar; target [B, T, 1, H, W], `first` = index of the first restored frame."""
+    with torch.autocast(target.device.type, enabled=False):
+        if isinstance(output, Tensor):
+            return pair_loss(output, centred(target, output.shape[1], first), loss)
+        goal = centred(target, output.scale1.shape[1], first)
+        total = loss.scales[0] * pair_loss(output.scale1, goal, loss)
+        for weight, smaller in zip(loss.scales[1:], (output.scale2, output.scale4), strict=True):
+            if smaller is not None and weight:
+                total = total + weight * pair_loss(smaller, shrink(goal, smaller.shape[-2:], loss.resize), loss)
+        if output.denoised is not None and loss.denoised:
+            total = total + loss.denoised * pair_loss(output.denoised, target, loss)
+        return total
