@@ -2,10 +2,10 @@
 
     Scene = Camera + lights + bodies (mesh, material, motion)
 
-Lengths are metres, angles radians, y points up. Bodies are described in their own coordinates; `motion.pose(t)` (4x4, body to
-world) places them at time t [s]. The camera looks from `origin` to `target`; its optional motion acts in the camera's own axes
-(x right, y down, z forward): a spin about y is a pan, a translation along z a dolly. Radiance belongs to one band around
-`Camera.wavelength`. Left out: polarisation, spectra, participating media, lens aberrations.
+Lengths are metres, angles radians, y points up. Bodies are described in their own coordinates; `motion.pose(t)` (4x4,
+body to world) places them at time t [s]. The camera looks from `origin` to `target`; its optional motion acts in the
+camera's own axes (x right, y down, z forward): a spin about y is a pan, a translation along z a dolly. Radiance belongs
+to one band around `Camera.wavelength`. Left out: polarisation, spectra, participating media, lens aberrations.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ class Constant:
 
 @dataclass(frozen=True, eq=False)
 class SunSky:
-    """A clear sky by the CIE standard general sky (type 12), a sun disk, and a ground of constant radiance below the horizon.
+    """A clear sky (CIE standard general sky, type 12), a sun disk, and a ground of constant radiance below the horizon.
 
     Both irradiances are those in the rendered band. Azimuth 0 is +z, pi/2 is +x.
     """
@@ -206,9 +206,9 @@ class PointLight:
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentImage:
-    """An equirectangular picture of radiance around the scene: array [H, W] or a file (.hdr, .exr), row 0 at the zenith.
+    """An equirectangular picture of radiance around the scene: array [H, W] or a file (.hdr, .exr), zenith on top.
 
-    Column 0 and the last column meet at azimuth `rotation` + pi; the middle column looks to azimuth `rotation` (0 is +z).
+    The first and last column meet at azimuth `rotation` + pi; the middle column is azimuth `rotation` (0 is +z).
     """
 
     image: np.ndarray | str
@@ -315,7 +315,7 @@ class Camera:
         return 1.0 / np.linalg.norm(self.directions(), axis=-1)
 
     def project(self, points: np.ndarray, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """World points [..., 3] -> pixel coordinates [..., 2] (x, y; the first pixel's centre is 0.5) and depth z [m]."""
+        """World points [..., 3] -> pixels [..., 2] (x, y; the first pixel's centre is 0.5) and depth z [m]."""
         pose = self.pose(t)
         local = (np.asarray(points, np.float64) - pose[:3, 3]) @ pose[:3, :3]
         with np.errstate(divide="ignore", invalid="ignore"):
