@@ -1,0 +1,65 @@
+"""Cloth in the wind: the one thing here that changes its shape.
+
+A `Flag` is a rigid motion (of its pole) that also moves the vertices of its mesh in body coordinates: travelling waves, in
+closed form, so that place and velocity are exact at any time. Left out: stretching, folds onto itself, gravity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from qsim.motion import Motion, Still
+from qsim.rotation import Array
+
+
+@dataclass(frozen=True)
+class Ripple:
+    """A wave that leaves the pole: amplitude * x / width * sin(2 pi (x / wavelength - f t) + slant y + phase)."""
+
+    amplitude: float  # m, at the free edge
+    wavelength: float  # m, along x
+    frequency: float  # Hz
+    slant: float = 0.0  # rad/m along y: crests lean
+    phase: float = 0.0  # rad
+
+    def angle(self, places: Array, t: float) -> Array:
+        """Phase [rad] at the places [V, 3] at time `t` [s]."""
+        x, y = places[:, 0], places[:, 1]
+        return 2 * np.pi * (x / self.wavelength - self.frequency * t) + self.slant * y + self.phase
+
+
+@dataclass(frozen=True, eq=False)
+class Flag(Motion):
+    """A sheet in the plane z = 0, held at x = 0, free at x = width: the ripples displace it in z."""
+
+    rest: Array  # m, vertices [V, 3] of the sheet at rest
+    ripples: tuple[Ripple, ...]
+    carrier: Motion = field(default_factory=Still)  # of the pole
+
+    @property
+    def width(self) -> float:
+        """Distance [m] from the pole to the free edge."""
+        return float(self.rest[:, 0].max())
+
+    def pose(self, t: float) -> Array:
+        return self.carrier.pose(t)
+
+    def velocity(self, t: float) -> tuple[Array, Array]:
+        return self.carrier.velocity(t)
+
+    def deform(self, t: float) -> Array:
+        """Vertices [m] in body coordinates, [V, 3]."""
+        moved = np.array(self.rest, dtype=np.float64)
+        for ripple in self.ripples:
+            moved[:, 2] += ripple.amplitude * self.rest[:, 0] / self.width * np.sin(ripple.angle(self.rest, t))
+        return moved
+
+    def deform_velocity(self, t: float) -> Array:
+        """Velocities [m/s] of the vertices in body coordinates, [V, 3]."""
+        speed = np.zeros_like(self.rest, dtype=np.float64)
+        for ripple in self.ripples:
+            rate = -2 * np.pi * ripple.frequency * np.cos(ripple.angle(self.rest, t))
+            speed[:, 2] += ripple.amplitude * self.rest[:, 0] / self.width * rate
+        return speed

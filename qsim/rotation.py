@@ -1,0 +1,111 @@
+"""Rotations and poses: the small algebra under every motion.
+
+A rotation is a 3x3 matrix or a rotation vector (axis times angle [rad]); a pose is a 4x4 matrix, body to world, column
+vectors. Right-handed: positive angles turn counter-clockwise for someone whom the axis points at.
+Formulae: Rodrigues; the exponential, logarithm and left Jacobian of SO(3) as in Sola, Deray & Atchuthan,
+"A micro Lie theory for state estimation in robotics" (2018).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+ORIGIN: Vector = (0.0, 0.0, 0.0)
+UP: Vector = (0.0, 1.0, 0.0)
+
+
+def vector(value: ArrayLike) -> Vector:
+    """Three finite floats as a tuple (what frozen records hold); `ValueError` says what came instead."""
+    v = np.asarray(value, dtype=np.float64).reshape(-1)
+    if v.shape != (3,) or not np.isfinite(v).all():
+        raise ValueError(f"expected three finite numbers (x, y, z), got {value!r}")
+    return float(v[0]), float(v[1]), float(v[2])
+
+
+def unit(axis: ArrayLike) -> Array:
+    """The direction of `axis`, length 1; `ValueError` for a zero axis."""
+    a = np.asarray(vector(axis))
+    length = float(np.linalg.norm(a))
+    if length == 0:
+        raise ValueError("an axis of rotation must not be (0, 0, 0)")
+    return a / length
+
+
+def cross_matrix(v: ArrayLike) -> Array:
+    """[v]x, so that [v]x p = v x p."""
+    x, y, z = np.asarray(v, dtype=np.float64)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def rotation_matrix(axis: ArrayLike, angle: float) -> Array:
+    """3x3 rotation by `angle` [rad] about `axis` through the origin (Rodrigues)."""
+    k = cross_matrix(unit(axis))
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
+
+
+def pose_matrix(rotation: Array | None = None, position: ArrayLike = ORIGIN) -> Array:
+    """4x4 of a 3x3 rotation (identity when None) followed by a shift [m]."""
+    pose = np.eye(4)
+    if rotation is not None:
+        pose[:3, :3] = rotation
+    pose[:3, 3] = position
+    return pose
+
+
+def rotation_between(start: ArrayLike, end: ArrayLike) -> Array:
+    """3x3, the shortest rotation that turns direction `start` into direction `end`."""
+    a, b = unit(start), unit(end)
+    axis, cosine = np.cross(a, b), float(np.clip(a @ b, -1, 1))
+    if np.linalg.norm(axis) < 1e-12:
+        if cosine > 0:
+            return np.eye(3)
+        axis = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
+    return rotation_matrix(axis, float(np.arccos(cosine)))
+
+
+def euler(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Array:
+    """3x3 rotation by `x`, then `y`, then `z` [rad] about the fixed axes."""
+    return rotation_matrix((0, 0, 1), z) @ rotation_matrix((0, 1, 0), y) @ rotation_matrix((1, 0, 0), x)
+
+
+def exponential(turn: ArrayLike) -> Array:
+    """3x3 rotation of a rotation vector [rad]; accurate down to angle 0."""
+    k = cross_matrix(turn)
+    angle = float(np.linalg.norm(turn))
+    return np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (k @ k)
+
+
+def logarithm(rotation: ArrayLike) -> Array:
+    """Rotation vector [rad] of a 3x3 rotation, its length at most pi."""
+    r = np.asarray(rotation, dtype=np.float64)
+    # The unit quaternion (w, v), from its largest component so that half turns stay accurate
+    squares = np.array([1 + np.trace(r), *(1 + 2 * np.diag(r) - np.trace(r))])
+    largest = int(np.argmax(squares))
+    skew = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    if largest == 0:
+        w, v = squares[0], skew
+    else:
+        w, v = skew[largest - 1], (r + r.T)[largest - 1].copy()
+        v[largest - 1] = squares[largest]
+    if w < 0:
+        w, v = -w, -v
+    length = float(np.linalg.norm(v))
+    return v * (2 * np.arctan2(length, w) / length) if length > 0 else np.zeros(3)
+
+
+def left_jacobian(turn: ArrayLike) -> Array:
+    """J with angular velocity = J(turn) d(turn)/dt, in the world's axes."""
+    k = cross_matrix(turn)
+    angle = float(np.linalg.norm(turn))
+    if angle < 1e-4:  # the series: sin and cos would cancel
+        return np.eye(3) + k / 2 + (k @ k) / 6
+    return np.eye(3) + (1 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * (k @ k)
+
+
+def about(rotation: Array, center: ArrayLike) -> Array:
+    """Pose of a rotation about the point `center` [m] instead of the origin."""
+    return pose_matrix(rotation, np.asarray(center) - rotation @ np.asarray(center))
