@@ -1,0 +1,98 @@
+"""Random keys: noise is a function of (seed, clip, stage, frame, row, column), never of call order.
+
+The generator is Philox4x32 with 7 rounds (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011), the
+variant that Dr.Jit offers, so that NumPy (here, the reference) and compiled kernels draw the same 32-bit words.
+
+* The 64-bit Philox key is a hash of (seed, clip, stage).
+* A pixel's word is number ``x & 3`` of the block whose counters are ``(x >> 2, y, frame, redraw)``: four neighbours in a
+  row share one block, and x, y are coordinates of the **full** frame, so a crop sees the words of the whole.
+* ``redraw`` counts further words of the same pixel: 0 decides nearly every pixel, 1 refines it to 64 bits where the
+  first cannot (tails), and pixels that need more than one number take as many as they like.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from hashlib import blake2b
+from operator import index
+
+import numpy as np
+from numpy import ndarray as Array
+
+ROUNDS = 7  # of Philox4x32; Dr.Jit's default
+_MULTIPLIERS = (np.uint64(0xD2511F53), np.uint64(0xCD9E8D57))
+_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
+_LOW, _SHIFT = np.uint64(0xFFFFFFFF), np.uint64(32)
+
+
+@dataclass(frozen=True)
+class Key:
+    """The name of a random stream; ``at`` moves along the frames of a clip."""
+
+    seed: int  # of the study; a training sample puts its epoch in here
+    clip: int  # hash_name of the clip's name, or any integer
+    frame: int = 0  # 0 ... 2^32 - 1
+    stage: int = 0  # which random step of the chain: 0 is the sensor's read-out
+
+    def __post_init__(self) -> None:
+        for name in ("seed", "clip", "frame", "stage"):
+            try:
+                object.__setattr__(self, name, index(getattr(self, name)))
+            except TypeError:
+                raise ValueError(f"Key.{name} is an integer, got {getattr(self, name)!r}") from None
+        if not 0 <= self.frame < 2**32:
+            raise ValueError(f"Key.frame counts frames from 0 to 2^32 - 1, got {self.frame}")
+
+    def at(self, frame: int) -> Key:
+        """The same stream at another frame."""
+        return replace(self, frame=frame)
+
+    @property
+    def philox_key(self) -> int:
+        """The 64-bit key of the generator: a hash of (seed, clip, stage)."""
+        text = f"{self.seed},{self.clip},{self.stage}".encode()
+        return int.from_bytes(blake2b(text, digest_size=8, person=b"qsim key").digest(), "little")
+
+
+def hash_name(name: str) -> int:
+    """A clip's name as an integer below 2^63, the same on every machine."""
+    return int.from_bytes(blake2b(name.encode(), digest_size=8, person=b"qsim name").digest(), "little") >> 1
+
+
+def philox4x32(counters: Array, key: int) -> Array:
+    """Four random words per counter: uint32 [4, ...] -> uint32 [4, ...] under a 64-bit key."""
+    c0, c1, c2, c3 = (np.asarray(c, np.uint64) for c in counters)
+    k0, k1 = key >> 32 & 0xFFFFFFFF, key & 0xFFFFFFFF
+    for _ in range(ROUNDS):
+        even, odd = _MULTIPLIERS[0] * c0, _MULTIPLIERS[1] * c2
+        c0, c2 = (odd >> _SHIFT) ^ c1 ^ np.uint64(k0), (even >> _SHIFT) ^ c3 ^ np.uint64(k1)
+        c1, c3 = odd & _LOW, even & _LOW
+        k0, k1 = (k0 + _KEY_STEPS[0]) & 0xFFFFFFFF, (k1 + _KEY_STEPS[1]) & 0xFFFFFFFF
+    return np.stack([c0, c1, c2, c3]).astype(np.uint32)
+
+
+def words(key: Key, shape: tuple[int, int], origin: tuple[int, int] = (0, 0), redraw: int = 0) -> Array:
+    """One word per pixel of the frame `key.frame`: uint32 [H, W] of the crop that starts at `origin` = (y, x)."""
+    (height, width), (y, x) = shape, origin
+    if min(y, x, redraw) < 0 or max(y + height, x + width, redraw) > 2**32:
+        raise ValueError(f"origin {origin} and redraw {redraw} are counted from 0 to 2^32 - 1 in the full frame")
+    first, last = x >> 2, (x + width + 3) >> 2
+    rows = np.arange(y, y + height, dtype=np.uint64)[:, None]
+    blocks = np.arange(first, last, dtype=np.uint64)[None, :]
+    counters = np.broadcast_arrays(blocks, rows, np.uint64(key.frame), np.uint64(redraw))
+    block = np.moveaxis(philox4x32(counters, key.philox_key), 0, -1).reshape(height, -1)
+    return block[:, x - 4 * first : x - 4 * first + width]
+
+
+def uniform(first: Array, second: Array | None = None) -> Array:
+    """Numbers in (0, 1): the middle of the cell that a word names, or that two words name (2^-64 wide).
+
+    Two words just below 1 round to 1 in float64: where that matters take `uniform_pair`.
+    """
+    low = 0.5 if second is None else (second.astype(np.float64) + 0.5) * 2.0**-32
+    return (first.astype(np.float64) + low) * 2.0**-32
+
+
+def uniform_pair(first: Array, second: Array) -> tuple[Array, Array]:
+    """(u, 1 - u) from two words, both with full relative precision, for tails on either side."""
+    return uniform(first, second), uniform(~first, ~second)
