@@ -2,8 +2,8 @@
 
     restore(codes [T, H, W], sensor, exposure, *, window=...) -> restored photons [T, H, W], float32
 
-Any number of frames and any size; a clip is continued by reflection at both ends. METHODS is the whole list: import the module of a
-method for its other settings.
+Any number of frames and any size; a clip is continued by reflection at both ends. METHODS is the whole list: import
+the module of a method for its other settings.
 """
 
 from __future__ import annotations

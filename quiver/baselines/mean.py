@@ -2,9 +2,9 @@
 
     photons = max(0, mean(codes) - dark) * white / top
 
-Source: textbook. `white / top` is the light of one code step as the settings promise it (1/(gain * efficiency)), `dark` the codes which
-dark counts and offset add in the same linear picture. Clipping and dead time are ignored: at 3.25 photons per pixel (3 bits,
-gain 1.077) the estimate is 4 % low, at four times that light 39 %.
+Source: textbook. `white / top` is the light of one code step as the settings promise it (1/(gain * efficiency)),
+`dark` the codes which dark counts and offset add in the same linear picture. Clipping and dead time are ignored: at
+3.25 photons per pixel (3 bits, gain 1.077) the estimate is 4 % low, at four times that light 39 %.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from quiver.baselines.windows import check_codes, check_window, window_sums
 
 
 def dark_codes(sensor: Sensor, exposure: float) -> float:
-    """What a linear sensor would read in the dark [codes]; for a sensor model unknown here, its exact mean code without light."""
+    """What a linear sensor would read in the dark [codes]; for other models their exact mean code without light."""
     if isinstance(sensor, QIS):
         return sensor.gain * sensor.dark_current * exposure + sensor.offset
     if isinstance(sensor, BinarySPAD | CountingSPAD):
@@ -28,7 +28,7 @@ def dark_codes(sensor: Sensor, exposure: float) -> float:
 
 
 def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11) -> Array:
-    """Codes [T, H, W] -> restored photons [T, H, W], float32; `window` frames around each, reflected at the clip's ends.
+    """Codes [T, H, W] -> restored photons [T, H, W], float32, from `window` frames around each.
 
     Raises ValueError for codes the sensor cannot produce and for an empty window.
     """

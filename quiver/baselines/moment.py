@@ -2,8 +2,9 @@
 
     photons = mu^-1(min(mean(codes), top - 1/(2 window)))
 
-Source: method of moments, textbook. Knows clipping, rounding, dark counts and dead time, because mu comes from the sensor's exact
-distribution; knows nothing about space or motion. A sum of codes has few values, so the whole method is one table and a running sum.
+Source: method of moments, textbook. Knows clipping, rounding, dark counts and dead time, because mu comes from the
+sensor's exact distribution; knows nothing about space or motion. A sum of codes has few values, so the whole method
+is one table and a running sum.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from quiver.baselines.windows import check_codes, check_window, window_sums
 
 
 def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11) -> Array:
-    """Codes [T, H, W] -> restored photons [T, H, W], float32; `window` frames around each, reflected at the clip's ends.
+    """Codes [T, H, W] -> restored photons [T, H, W], float32, from `window` frames around each.
 
     Raises ValueError for codes the sensor cannot produce and for an empty window.
     """

@@ -2,8 +2,9 @@
 
     mean code m, averaged over n codes -> photons,  mu^-1(min(m, top - 1/(2n)))
 
-The only source is the sensor's exact distribution (`sensor.mean`, `sensor.variance`): no baseline holds a sensor model of its own.
-An all-saturated pixel has no finite estimate, so the mean code is limited to half a count below the top of the response (cap).
+The only source is the sensor's exact distribution (`sensor.mean`, `sensor.variance`): no baseline holds a sensor
+model of its own. An all-saturated pixel has no finite estimate, so the mean code is limited to half a count below the
+top of the response (cap).
 """
 
 from __future__ import annotations

@@ -2,8 +2,9 @@
 
     codes [T, H, W] -> for every frame t the sum of the codes of `window` frames around it
 
-A window of w frames covers t - w//2 ... t + (w-1)//2: centred for odd w, one frame more of the past for even w. Frames before the
-first and after the last are reflections that do not repeat the end frame (-1 is frame 1), over and over for short clips.
+A window of w frames covers t - w//2 ... t + (w-1)//2: centred for odd w, one frame more of the past for even w.
+Frames before the first and after the last are reflections that do not repeat the end frame (-1 is frame 1), over and
+over for short clips.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from qsim.sensor import Sensor
 
 
 def check_codes(codes: Array, sensor: Sensor) -> None:
-    """Raise ValueError unless `codes` is an integer stack [T, H, W] (none of them 0) of codes this sensor can produce."""
+    """Raise ValueError unless `codes` is a non-empty integer stack [T, H, W] which this sensor can produce."""
     if codes.ndim != 3 or codes.size == 0 or not np.issubdtype(codes.dtype, np.integer):
         raise ValueError(f"codes: expected integers [T, H, W] with at least one frame, got {codes.dtype} {codes.shape}")
     if codes.max() >= sensor.levels or codes.min() < 0:
@@ -41,7 +42,7 @@ def look_ahead(window: int) -> int:
 
 
 def reflect(index: Array, length: int) -> Array:
-    """Frame numbers inside 0 ... length-1 for any integers: -1 -> 1, length -> length-2, and 0 where there is one frame."""
+    """Frame numbers inside 0 ... length-1 for any integers: -1 -> 1, length -> length-2; always 0 for one frame."""
     if length == 1:
         return np.zeros_like(index)
     folded = np.abs(index) % (2 * length - 2)
