@@ -1,0 +1,226 @@
+"""Which machine renders: finds CUDA or a usable LLVM, proves it in a child process, sets Mitsuba's variant.
+
+    CUDA with OptiX -> LLVM 16 or newer -> scalar (slow, always there)
+
+Dr.Jit 1.5 refuses LLVM 14 with an ImportError and with LLVM 15 the first render aborts the whole process. So no library
+is loaded here before a child process has rendered with it; the answer is kept in the user's cache folder, keyed by the
+library's path and time and the versions of Mitsuba and Dr.Jit. Nobody else sets a variant.
+
+Environment: DRJIT_LIBLLVM_PATH names an LLVM to try first, QSIM_ENGINE=cuda|llvm|scalar insists on one engine.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import glob
+import json
+import os
+import re
+import subprocess
+import sys
+import warnings
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from qsim.files import write_bytes
+
+LLVM_VERSIONS = (22, 21, 20, 19, 18, 17, 16)  # newest first; 21 is tried like the others, its probe decides
+BACKENDS = ("cuda", "llvm", "scalar")
+VARIANTS = {"cuda": "cuda_ad_mono", "llvm": "llvm_ad_mono", "scalar": "scalar_rgb"}
+PROBE_SECONDS = 180
+INSTALL_HINT = "install LLVM 16 or newer (Debian, Ubuntu: apt install libllvm19) or set DRJIT_LIBLLVM_PATH to one"
+
+# Runs in a child process: one 4x4 frame of a lit sphere whose mean must be a positive number.
+_PROBE = """
+import ctypes, os, sys
+variant, library = sys.argv[1], sys.argv[2]
+if library:
+    loaded = ctypes.CDLL(library)
+    if not hasattr(loaded, "LLVMGetVersion"):
+        sys.exit("older than LLVM 16, which Dr.Jit cannot use safely")
+    number = ctypes.c_uint()
+    loaded.LLVMGetVersion(ctypes.byref(number), None, None)
+    print("version", number.value)
+    os.environ["DRJIT_LIBLLVM_PATH"] = library
+import mitsuba as mi
+mi.set_variant(variant)
+scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "light": {"type": "constant"},
+    "ball": {"type": "sphere"}, "sensor": {"type": "perspective",
+    "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+    "film": {"type": "hdrfilm", "width": 4, "height": 4}}})
+import numpy as np
+mean = float(np.mean(np.array(mi.render(scene, spp=4))))
+print("rendered" if mean > 0 else f"rendered a mean of {mean}")
+"""
+
+
+@dataclass(frozen=True)
+class Engine:
+    """The chosen renderer and why."""
+
+    variant: str  # Mitsuba variant
+    backend: str  # "cuda" | "llvm" | "scalar"
+    llvm_path: str | None  # library that Dr.Jit loads, for "llvm"
+    reason: str  # one line
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What a child process found out about one candidate."""
+
+    backend: str
+    library: str | None
+    works: bool
+    detail: str  # version, or the last line of the failure
+
+
+def select(prefer: str | None = None) -> Engine:
+    """Choose (once per process) and activate an engine; `prefer` or QSIM_ENGINE insists on "cuda", "llvm" or "scalar".
+
+    Raises ValueError when the wanted engine does not work here, with the reason and what to install.
+    """
+    wanted = prefer or os.environ.get("QSIM_ENGINE") or None
+    if wanted not in (None, *BACKENDS):
+        raise ValueError(f"engine {wanted!r}: expected one of {', '.join(BACKENDS)}")
+    engine = _choose(wanted)
+    activate(engine)
+    return engine
+
+
+def activate(engine: Engine) -> None:
+    """Make this engine's variant the current one; cheap when it already is."""
+    if engine.llvm_path:
+        os.environ["DRJIT_LIBLLVM_PATH"] = engine.llvm_path
+    import mitsuba as mi
+
+    if mi.variant() != engine.variant:
+        mi.set_variant(engine.variant)
+
+
+def report() -> dict[str, Any]:
+    """Everything `qsim doctor` says about rendering: the choice, every probe, versions, cache file."""
+    engine = _choose(os.environ.get("QSIM_ENGINE") or None)
+    probes = [asdict(probe) for probe in _cached_probes()]
+    software = {"mitsuba": version("mitsuba"), "drjit": version("drjit")}
+    return asdict(engine) | {"probes": probes, "software": software, "cache": str(_cache_file())}
+
+
+@lru_cache
+def _choose(wanted: str | None) -> Engine:
+    failures = []
+    if wanted in (None, "cuda"):
+        probe = _probe_cuda()
+        if probe.works:
+            return Engine(VARIANTS["cuda"], "cuda", None, probe.detail)
+        failures.append(f"CUDA: {probe.detail}")
+    if wanted in (None, "llvm"):
+        for library in llvm_candidates():
+            probe = _probe(VARIANTS["llvm"], library)
+            if probe.works:
+                return Engine(VARIANTS["llvm"], "llvm", library, f"{probe.detail}, {library}")
+            failures.append(f"{library}: {probe.detail}")
+            if library == os.environ.get("DRJIT_LIBLLVM_PATH"):
+                warnings.warn(f"DRJIT_LIBLLVM_PATH={failures[-1]}; looking further", RuntimeWarning, stacklevel=3)
+        if not llvm_candidates():
+            failures.append("no libLLVM of version 16 to 22 found")
+    if wanted == "scalar":
+        return Engine(VARIANTS["scalar"], "scalar", None, "asked for")
+    why = "; ".join(failures)
+    if wanted is not None:
+        hint = INSTALL_HINT if wanted == "llvm" else "it needs an NVIDIA GPU whose driver brings OptiX"
+        raise ValueError(f"engine {wanted} does not work here ({why}); {hint}")
+    warnings.warn(f"rendering with the slow scalar engine ({why}): {INSTALL_HINT}", RuntimeWarning, stacklevel=3)
+    return Engine(VARIANTS["scalar"], "scalar", None, why)
+
+
+def llvm_candidates() -> list[str]:
+    """Paths of LLVM libraries worth a trial: DRJIT_LIBLLVM_PATH first, then the newest; each real file once."""
+    named = os.environ.get("DRJIT_LIBLLVM_PATH")
+    found = [named] if named else []
+    for number in LLVM_VERSIONS:
+        for pattern in _llvm_patterns(number):
+            found += sorted(glob.glob(pattern))
+        listed = ctypes.util.find_library(f"LLVM-{number}")
+        if listed and os.path.isabs(listed):
+            found.append(listed)
+    unique: dict[str, str] = {}
+    for path in found:
+        if os.path.isfile(path):
+            unique.setdefault(os.path.realpath(path), path)
+    return list(unique.values())
+
+
+def _llvm_patterns(number: int) -> list[str]:
+    folders = ["/usr/lib/*-linux-gnu", f"/usr/lib/llvm-{number}/lib", f"/usr/lib/llvm{number}/lib*", "/usr/lib64"]
+    folders += ["/usr/lib", "/usr/local/lib", f"{sys.prefix}/lib", os.environ.get("CONDA_PREFIX", sys.prefix) + "/lib"]
+    names = [f"libLLVM.so.{number}.*", f"libLLVM-{number}.so*", f"libLLVM.{number}*.dylib"]
+    brew = [f"{root}/opt/llvm@{number}/lib/libLLVM.dylib" for root in ("/opt/homebrew", "/usr/local")]
+    return [f"{folder}/{name}" for folder in dict.fromkeys(folders) for name in names] + brew
+
+
+def _probe_cuda() -> Probe:
+    """CUDA is tried only where a driver is present; its version is part of the cache key."""
+    driver = Path("/proc/driver/nvidia/version")
+    if not (driver.exists() or ctypes.util.find_library("cuda") or ctypes.util.find_library("nvcuda")):
+        return Probe("cuda", None, False, "no NVIDIA driver on this machine")
+    stamp = driver.read_text().splitlines()[0] if driver.exists() else "driver"
+    return _probe(VARIANTS["cuda"], None, stamp)
+
+
+def _probe(variant: str, library: str | None, stamp: str = "") -> Probe:
+    """Render once in a child process, or recall the answer of an earlier child."""
+    modified = os.stat(library).st_mtime_ns if library else 0
+    software = [version("mitsuba"), version("drjit"), sys.version.split()[0]]
+    key = json.dumps([variant, os.path.realpath(library) if library else None, modified, stamp, *software])
+    answers = _read_cache()
+    if key not in answers:
+        answers = _read_cache() | {key: asdict(_run_probe(variant, library))}
+        _write_cache(answers)
+    return Probe(**answers[key])
+
+
+def _run_probe(variant: str, library: str | None) -> Probe:
+    backend = variant.split("_")[0]
+    command = [sys.executable, "-W", "ignore", "-c", _PROBE, variant, library or ""]
+    try:
+        child = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False)
+    except subprocess.TimeoutExpired:
+        return Probe(backend, library, False, f"no frame after {PROBE_SECONDS} s")
+    numbers = re.search(r"^version (\d+)$", child.stdout, re.MULTILINE)
+    if child.returncode == 0 and child.stdout.rstrip().endswith("rendered"):
+        return Probe(backend, library, True, f"LLVM {numbers.group(1)}" if numbers else "CUDA with OptiX")
+    lines = [line.strip() for line in (child.stderr + "\n" + child.stdout).splitlines() if line.strip()]
+    last = next((line for line in lines if "ERROR" in line.upper()), lines[-1] if lines else "no message")
+    ended = f"child process died with signal {-child.returncode}: " if child.returncode < 0 else ""
+    if backend == "cuda" and any("optix" in line.lower() for line in lines):
+        last = f"OptiX is missing or too old ({last}); update the NVIDIA driver"
+    return Probe(backend, library, False, (ended + last)[:300])
+
+
+def _cache_file() -> Path:
+    root = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or str(Path.home() / ".cache")
+    return Path(root) / "qsim" / "engine.json"
+
+
+def _read_cache() -> dict[str, dict[str, Any]]:
+    try:
+        answers = json.loads(_cache_file().read_text())
+    except (OSError, ValueError):
+        return {}
+    return answers if isinstance(answers, dict) else {}
+
+
+def _write_cache(answers: dict[str, dict[str, Any]]) -> None:
+    """Best effort: a machine without a writable home probes again each time."""
+    try:
+        _cache_file().parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(_cache_file(), json.dumps(answers, indent=1).encode())
+    except OSError as error:
+        warnings.warn(f"{_cache_file()}: cannot keep the engine's choice ({error})", RuntimeWarning, stacklevel=2)
+
+
+def _cached_probes() -> list[Probe]:
+    return [Probe(**answer) for answer in _read_cache().values()]
