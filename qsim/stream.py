@@ -1,0 +1,334 @@
+"""Few-bit streams of a clip: sensing, storing, reading, replaying.
+
+    clip (radiance) --light level, optics--> photons --sensor, key--> codes --> streams/NAME.npy + streams/NAME.json
+
+NAME.npy is uint8 [T, H, ceil(W*bits/8)], each row packed alone, most significant bit first: one bit is a photon cube.
+NAME.json is written last and holds everything needed to draw any frame again: sensor, light factor, key, widths.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import __version__, codes, files, optics
+
+if TYPE_CHECKING:
+    from qsim.clip import Clip
+    from qsim.keys import Key
+    from qsim.sensor import Sensor
+
+FORMAT_VERSION = 1
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_BLOCK_PIXELS = 1 << 22  # photons held in memory at a time while sensing: 32 MiB of float64
+
+Progress = Callable[[int, int], None]  # (frames done, frames in all)
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """Codes of one clip seen by one sensor at one light level."""
+
+    path: Path  # streams/NAME.npy
+    meta: dict[str, Any]  # streams/NAME.json
+
+    @staticmethod
+    def open(json_path: Path) -> Stream:
+        """`FileNotFoundError` if there is no such stream, `ValueError` if its description is damaged."""
+        if not json_path.is_file():
+            raise FileNotFoundError(f"{json_path}: no such stream")
+        meta = files.read_json(json_path)
+        files.check_version(json_path, meta.get("format_version"), FORMAT_VERSION)
+        for key in ("shape", "bits", "width", "sensor", "ppp_factor", "exposure", "frame_rate"):
+            if key not in meta:
+                raise ValueError(f"{json_path}: key '{key}' is missing; the file is damaged, sense again with --force")
+        return Stream(json_path.with_suffix(".npy") if json_path.suffix == ".json" else json_path, meta)
+
+    def __len__(self) -> int:
+        return int(self.meta["shape"][0])
+
+    @property
+    def name(self) -> str:
+        return self.path.name.removesuffix(".npy")
+
+    @property
+    def bits(self) -> int:
+        return int(self.meta["bits"])
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(T, H, W) of the codes, before packing."""
+        frames, height, width = self.meta["shape"]
+        return frames, height, width
+
+    @property
+    def exposure(self) -> float:
+        """Seconds of one code (of one plane, where a code sums planes of its own clip frames, times their number)."""
+        return float(self.meta["exposure"])
+
+    @property
+    def photons_factor(self) -> float:
+        """photons seen by the sensor = this factor times the clip's expected photons."""
+        return float(self.meta["ppp_factor"])
+
+    @cached_property
+    def sensor(self) -> Sensor:
+        from qsim import devices
+
+        return devices.from_dict(self.meta["sensor"])
+
+    @cached_property
+    def packed(self) -> Array:
+        """The packed array [T, H, ceil(W*bits/8)] as a memory map; `ValueError` if the file does not fit its json."""
+        frames, height, width = self.shape
+        expected = (frames, height, codes.packed_width(width, self.bits))
+        if not self.path.is_file():
+            raise FileNotFoundError(f"{self.path}: no such file, though its json is there; sense again with --force")
+        try:
+            array = np.load(self.path, mmap_mode="r", allow_pickle=False)
+        except (ValueError, EOFError) as error:
+            raise ValueError(f"{self.path}: not readable as .npy ({error}); sense again with --force") from None
+        if array.shape != expected or array.dtype != np.uint8:
+            raise ValueError(
+                f"{self.path}: expected uint8 {list(expected)}, found {array.dtype} {list(array.shape)}; "
+                "sense again with --force"
+            )
+        return array
+
+    def codes(self, start: int = 0, stop: int | None = None, crop: optics.Crop | None = None) -> Array:
+        """Codes [stop - start, h, w] of frames start ... stop - 1: uint8, uint16 above 8 bits; crop = (y, x, h, w)."""
+        frames, height, width = self.shape
+        stop = frames if stop is None else stop
+        if not 0 <= start < stop <= frames:
+            raise ValueError(f"{self.path}: frames {start}..{stop} asked for, the stream has {frames}")
+        if crop is None:
+            return codes.unpack(np.asarray(self.packed[start:stop]), self.bits, width)
+        y, x, h, w = check_crop(crop, height, width, str(self.path))
+        # The packed bytes that hold the columns: from the last code that starts on a byte.
+        step = 8 // math.gcd(8, self.bits)
+        first = x // step * step
+        low, high = first * self.bits // 8, codes.packed_width(x + w, self.bits)
+        part = np.asarray(self.packed[start:stop, y : y + h, low:high])
+        return codes.unpack(part, self.bits, x + w - first)[..., x - first :]
+
+    def verify(self) -> list[str]:
+        """Problems of the stream's files in words; empty if they are what was written."""
+        if not self.path.is_file():
+            return [f"{self.path}: missing"]
+        if files.sha256(self.path) != self.meta.get("sha256"):
+            return [f"{self.path}: contents changed (checksum differs)"]
+        return []
+
+
+def check_crop(crop: optics.Crop, height: int, width: int, where: str) -> optics.Crop:
+    """The crop (y, x, h, w) if it lies inside the frame, else `ValueError`."""
+    y, x, h, w = crop
+    if y < 0 or x < 0 or h < 1 or w < 1 or y + h > height or x + w > width:
+        raise ValueError(f"{where}: crop (y, x, h, w) = {(y, x, h, w)} is not inside {height} x {width} pixels")
+    return crop
+
+
+def check_name(name: str) -> str:
+    """A stream or clip name that is also a safe file name, else `ValueError`."""
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"name {name!r}: use letters, digits, '.', '_' and '-' only, as in fan_03 or qis-3bit")
+    return name
+
+
+def write_stream(clip: Clip, name: str, codes_iter: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
+    """Store codes ([H, W] frames or [t, H, W] blocks, in order) as a stream of `clip`; the json comes last.
+
+    `meta` must hold shape (T, H, W), ppp_factor, exposure and frame_rate. `ValueError` if there are not T frames.
+    """
+    frames, height, width = meta["shape"]
+    bits = sensor.bits
+    folder = clip.path / "streams"
+    folder.mkdir(exist_ok=True)
+    json_path, path = folder / f"{check_name(name)}.json", folder / f"{name}.npy"
+    json_path.unlink(missing_ok=True)  # from here on the old stream, if any, is not accepted any more
+    done = 0
+    with files.replacing(path) as file:
+        header = {"descr": "|u1", "fortran_order": False, "shape": (frames, height, codes.packed_width(width, bits))}
+        np.lib.format.write_array_header_1_0(file, header)
+        for block in codes_iter:
+            block = block if block.ndim == 3 else block[None]
+            if block.shape[1:] != (height, width):
+                raise ValueError(f"{path}: frame {done} is {block.shape[1:]}, expected {(height, width)}")
+            file.write(codes.pack(block, bits).tobytes())
+            done += len(block)
+        if done != frames:
+            raise ValueError(f"{path}: got {done} frames, expected {frames}")
+    full = {
+        "format_version": FORMAT_VERSION,
+        "bits": bits,
+        "width": width,
+        "bit_order": "msb",
+        "orientation": "upright",
+        "code_model": sensor.code_model,
+        "sensor": sensor.to_dict(),
+        "planes_per_code": 1,
+        "sha256": files.sha256(path),
+        "software": {"qsim": __version__},
+    } | meta
+    full["shape"] = [frames, height, width]
+    files.write_json(json_path, full)
+    return Stream.open(json_path)
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """What to draw: a sensor at a light level, with a seed; independent of the clip."""
+
+    sensor: str  # a name of qsim.devices or a .toml file
+    bits: int | None = None  # None: the device's own
+    ppp: float | None = None  # photons per pixel and code over the whole clip; neither ppp nor lux: light as it is
+    lux: float | None = None  # faceplate lux at 555 nm
+    seed: int = 0
+    name: str | None = None  # of the stream; made from the rest if None
+    group: bool = False  # a code sums 2^bits - 1 binary planes, each its own clip frame
+    diffraction: bool = False  # blur by the lens's Airy pattern
+
+    @property
+    def stream_name(self) -> str:
+        """The given name, or for example `quiver-physical_3bit_3.25ppp`."""
+        if self.name is not None:
+            return check_name(self.name)
+        light = (
+            "asis" if self.ppp is self.lux is None else f"{self.ppp:g}ppp" if self.lux is None else f"{self.lux:g}lx"
+        )
+        bits = "" if self.bits is None else f"_{self.bits}bit"
+        seed = f"_seed{self.seed}" if self.seed else ""
+        return check_name(f"{Path(self.sensor).stem}{bits}_{light}{seed}")
+
+
+@dataclass(frozen=True)
+class Draw:
+    """A `Sensing` applied to one clip: everything that decides its codes."""
+
+    sensor: Sensor
+    plane: Sensor  # draws one clip frame; the same as `sensor` unless planes are summed
+    level: optics.LightLevel  # per clip frame
+    key: Key
+    planes: int  # clip frames per code
+    diffraction: bool
+
+    def frames(self, clip: Clip, start: int, stop: int) -> Array:
+        """Codes of stream frames start ... stop - 1, [stop - start, H, W]."""
+        first, last = start * self.planes, stop * self.planes
+        photons = np.stack(
+            [optics.clip_photons(clip, t, self.level.factor, diffraction=self.diffraction) for t in range(first, last)]
+        )
+        drawn = self.plane.sample(photons, clip.exposure, key=self.key.at(first))
+        if self.planes == 1:
+            return drawn
+        return drawn.reshape(-1, self.planes, *drawn.shape[1:]).sum(axis=1).astype(codes.code_dtype(self.sensor.bits))
+
+
+def prepare(clip: Clip, sensing: Sensing) -> Draw:
+    """The sensor, light factor and key for one clip; `ValueError` if they do not fit it."""
+    from qsim import devices, keys
+
+    planes = 1
+    if sensing.group:
+        if sensing.bits is None:
+            raise ValueError(f"{clip.name}: summing planes needs the bits of a code, as in --bits 3")
+        planes = 2**sensing.bits - 1
+        if len(clip) < planes:
+            raise ValueError(f"{clip.name}: {len(clip)} frames are too few for one code of {planes} planes")
+    target = None if sensing.ppp is None else sensing.ppp / planes
+    level = optics.light_level(clip, ppp=target, lux=sensing.lux)
+    sensor = devices.load(sensing.sensor, ppp=level.ppp * planes, bits=sensing.bits, exposure=clip.exposure * planes)
+    plane = sensor
+    if planes > 1:
+        if sensor.code_model != "binary_sum":
+            raise ValueError(
+                f"{sensing.sensor}: only a clocked SPAD sums planes; its code model is {sensor.code_model}"
+            )
+        plane = dataclasses.replace(sensor, bits=1)
+    key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
+    return Draw(sensor, plane, level, key, planes, sensing.diffraction)
+
+
+def describe(clip: Clip, sensing: Sensing, draw: Draw) -> dict[str, Any]:
+    """The json of the stream that `draw` makes, without what only the written file knows."""
+    frames, height, width = clip.shape
+    return {
+        "shape": [frames // draw.planes, height, width],
+        "sensor_name": sensing.sensor,
+        "ppp_target": sensing.ppp,
+        "lux_target": sensing.lux,
+        "ppp": draw.level.ppp * draw.planes,
+        "ppp_factor": draw.level.factor,
+        "mean_photons_before": draw.level.mean_before * draw.planes,
+        "equivalent_lux_555nm": draw.level.lux,
+        "radiance_unit": clip.meta["radiance_unit"],
+        "transfer": "linear",
+        "diffraction": draw.diffraction,
+        "seed": draw.key.seed,
+        "clip_key": draw.key.clip,
+        "clip": clip.name,
+        "frame_rate": clip.frame_rate / draw.planes,
+        "exposure": clip.exposure * draw.planes,
+        "planes_per_code": draw.planes,
+    }
+
+
+def sense(clip: Clip, sensing: Sensing, *, force: bool = False, progress: Progress | None = None) -> tuple[Stream, str]:
+    """Draw and store a stream; returns it and its line of light. A stream that is already there as asked is kept.
+
+    `FileExistsError` if the name is taken by another stream and `force` is not set.
+    """
+    draw = prepare(clip, sensing)
+    meta = describe(clip, sensing, draw)
+    line = draw.level.line(clip, draw.planes * electrons_per_photon(draw.sensor))
+    json_path = clip.path / "streams" / f"{sensing.stream_name}.json"
+    if json_path.is_file() and not force:
+        old = Stream.open(json_path)
+        if (
+            all(old.meta.get(key) == value for key, value in meta.items())
+            and old.meta["sensor"] == draw.sensor.to_dict()
+        ):
+            return old, line
+        raise FileExistsError(f"{json_path}: exists with other settings; name this stream with --name, or use --force")
+    stream = write_stream(clip, sensing.stream_name, _blocks(clip, draw, meta["shape"][0], progress), draw.sensor, meta)
+    return stream, line
+
+
+def replay(clip: Clip, stream: Stream, frame: int) -> tuple[Array, Array]:
+    """One frame drawn again from the stream's json alone, and the stored one: both codes [H, W]."""
+    if not 0 <= frame < len(stream):
+        raise ValueError(f"{stream.path}: frame {frame} asked for, the stream has frames 0..{len(stream) - 1}")
+    from qsim.keys import Key
+
+    meta = stream.meta
+    planes = int(meta.get("planes_per_code", 1))
+    plane = stream.sensor if planes == 1 else dataclasses.replace(stream.sensor, bits=1)
+    level = optics.LightLevel(stream.photons_factor, meta["ppp"] / planes, meta["mean_photons_before"] / planes, None)
+    key = Key(seed=meta["seed"], clip=meta["clip_key"])
+    draw = Draw(stream.sensor, plane, level, key, planes, bool(meta.get("diffraction", False)))
+    return draw.frames(clip, frame, frame + 1)[0], stream.codes(frame, frame + 1)[0]
+
+
+def electrons_per_photon(sensor: Sensor) -> float:
+    """Quantum or photon-detection efficiency of a sensor, for the line of light."""
+    described = sensor.to_dict()
+    return float(described.get("quantum_efficiency", described.get("pde", 1.0)))
+
+
+def _blocks(clip: Clip, draw: Draw, frames: int, progress: Progress | None) -> Iterator[Array]:
+    per_code = clip.shape[1] * clip.shape[2] * draw.planes
+    step = max(1, _BLOCK_PIXELS // per_code)
+    for start in range(0, frames, step):
+        stop = min(start + step, frames)
+        yield draw.frames(clip, start, stop)
+        if progress is not None:
+            progress(stop, frames)
