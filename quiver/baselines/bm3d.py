@@ -1,14 +1,16 @@
 """BM3D: removes white Gaussian noise of known deviation from one image, by filtering stacks of similar blocks together.
 
-    image -> (match, Haar x DCT, hard threshold, aggregate) = basic -> (match on basic, empirical Wiener) -> denoised
+    image -> (match, Haar x wavelet, hard threshold, aggregate) = basic -> (match on basic, Haar x DCT, Wiener) ->
+    denoised
 
-Source: Dabov, Foi, Katkovnik, Egiazarian, "Image denoising by sparse 3-D transform-domain collaborative filtering", IEEE
-TIP 16(8), 2007; written from the description. Our reading: the DCT serves in both steps (the article allows any block
-transform in the first), and above 40 grey levels of noise only the thresholds change, not the block size.
+Source: Dabov, Foi, Katkovnik, Egiazarian, "Image denoising by sparse 3-D transform-domain collaborative filtering",
+IEEE TIP 16(8), 2007; written from the description, with the parameters of its normal profile. Our reading: in the
+first step blocks are similar if their distance exceeds that of two noisy copies of one block, 2 sigma^2, by at most
+3000. That replaces the article's second set of parameters for strong noise, and needs no filter before matching.
 
-How it is fast without a loop over pixels: the DCT of the block at every position is one row of a table [positions, 64].
-Distances are matrix products of rows (a DCT keeps distances), stacks are gathered rows, and filtered rows are added up
-at their positions, so that each position is transformed back once. Memory: about 1.2 kB per pixel.
+How it is fast without a loop over pixels: the transformed block at every position is one row of a table [positions,
+64]. Distances are matrix products of rows (a DCT keeps distances), stacks are gathered rows, and filtered rows are
+added up at their positions, so that each position is transformed back once. Memory: about 1.2 kB per pixel.
 """
 
 from __future__ import annotations
@@ -31,33 +33,21 @@ FAR = 1e30  # squared distance of a position outside the image
 
 
 @dataclass(frozen=True)
-class Step:
-    """Thresholds of one of the two steps, in grey levels of 0 ... 255."""
-
-    stack: int  # similar blocks per stack, at most; a power of two
-    limit: float  # squared distance per pixel up to which blocks are similar
-    prethreshold: float  # deviations below which a coefficient is ignored when matching; 0 matches all
-
-
-@dataclass(frozen=True)
 class Profile:
-    """The two steps, and the deviations below which the first one sets a coefficient to zero."""
+    """Parameters of the two steps; distances per pixel in squared grey levels of 0 ... 255."""
 
-    first: Step
-    second: Step
-    threshold: float
-
-
-NORMAL = Profile(Step(16, 3000.0, 0.0), Step(32, 400.0, 0.0), 2.7)
-NOISY = Profile(Step(16, 5000.0, 2.0), Step(32, 3500.0, 0.0), 2.8)
-NOISY_FROM = 40.0  # grey levels of noise above which NOISY serves
+    threshold: float = 2.7  # deviations below which the first step sets a coefficient to zero
+    stack: int = 16  # similar blocks per stack of the first step, at most; a power of two
+    limit: float = 3000.0  # squared distance up to which blocks are similar, beyond the 2 sigma^2 of noise alone
+    second_stack: int = 32  # the same for the second step
+    second_limit: float = 400.0  # of blocks of the basic estimate, whose noise is gone
 
 
-def denoise(image: Array, sigma: float, *, peak: float = 1.0, profile: Profile | None = None) -> Array:
+def denoise(image: Array, sigma: float, *, peak: float = 1.0, profile: Profile = Profile()) -> Array:
     """An image [H, W] of any size with white noise of deviation `sigma` -> denoised float32 [H, W], same unit.
 
-    `peak` is the image value that stands for 255 grey levels, the unit in which the profile's limits are given; without
-    a profile the noise chooses NORMAL or NOISY. Raises ValueError for anything that is not an image or not a noise.
+    `peak` is the image value that stands for 255 grey levels, the unit in which the profile's limits are given.
+    Raises ValueError for anything that is not an image or not a noise.
     """
     if image.ndim != 2 or image.size == 0 or not np.all(np.isfinite(image)):
         raise ValueError(f"image: expected finite numbers [H, W], got {image.dtype} {image.shape}")
@@ -66,12 +56,11 @@ def denoise(image: Array, sigma: float, *, peak: float = 1.0, profile: Profile |
     if sigma == 0:
         return image.astype(np.float32)
     grey = 255.0 / peak
-    chosen = profile or (NORMAL if sigma * grey <= NOISY_FROM else NOISY)
     noisy = torch.from_numpy(_pad(image * grey).astype(np.float32))
     with torch.no_grad():
         coefficients = _transform(noisy)
-        basic = _aggregate(*_first(coefficients, noisy.shape, sigma * grey, chosen), noisy.shape)
-        final = _aggregate(*_second(coefficients, basic, sigma * grey, chosen), noisy.shape)
+        basic = _aggregate(*_first(coefficients, noisy.shape, sigma * grey, profile), noisy.shape)
+        final = _aggregate(*_second(coefficients, basic, sigma * grey, profile), noisy.shape)
     height, width = image.shape
     return (final[:height, :width] / grey).numpy()
 
@@ -87,6 +76,21 @@ def _dct() -> Tensor:
     n = np.arange(BLOCK)
     one = np.cos(np.pi * (2 * n[None, :] + 1) * n[:, None] / (2 * BLOCK)) * np.sqrt(2 / BLOCK)
     one[0] /= np.sqrt(2)
+    return torch.from_numpy(np.kron(one, one).astype(np.float32))
+
+
+def _wavelet() -> Tensor:
+    """The periodic biorthogonal 1.5 wavelet transform of a block, rows of unit length: [64 coefficients, 64 pixels]."""
+    low = np.array([3, -3, -22, 22, 128, 128, 22, -22, -3, 3]) / (128 * np.sqrt(2))
+    one, size = np.eye(BLOCK), BLOCK
+    while size > 1:
+        level = np.zeros((size, size))
+        for k in range(size // 2):
+            np.add.at(level[k], (2 * k + np.arange(-4, 6)) % size, low)
+            level[size // 2 + k, 2 * k : 2 * k + 2] = [np.sqrt(0.5), -np.sqrt(0.5)]
+        one[:size] = level @ one[:size]
+        size //= 2
+    one /= np.linalg.norm(one, axis=1, keepdims=True)
     return torch.from_numpy(np.kron(one, one).astype(np.float32))
 
 
@@ -132,7 +136,7 @@ class _Matches:
     size: Tensor  # [references], blocks of the stack that count: a power of two
 
 
-def _match(table: Tensor, norm: Tensor, tile_row: int, shape: torch.Size, step: Step) -> _Matches:
+def _match(table: Tensor, norm: Tensor, tile_row: int, shape: torch.Size, stack: int, limit: float) -> _Matches:
     """The most similar blocks within the search window of every reference block in one row of tiles."""
     _, across, _, width = _grid(shape)
     top, jump = tile_row * TILE * STEP, TILE * STEP
@@ -151,12 +155,12 @@ def _match(table: Tensor, norm: Tensor, tile_row: int, shape: torch.Size, step: 
         (TILE * TILE * area, TILE * area + STEP * REACH, area + STEP, REACH, 1),
     ).reshape(across, TILE, TILE, side * side)
     window[..., side * RADIUS + RADIUS] = -FAR
-    best, index = window.topk(step.stack, largest=False)
+    best, index = window.topk(stack, largest=False)
     corner = top * width + torch.arange(across)[:, None, None] * jump
     corner = corner + torch.arange(TILE)[:, None] * STEP * width + torch.arange(TILE) * STEP
     position = corner[..., None] + index // side * width + index % side
     own = norm.view(-1)[position[..., 0]]
-    similar = (best + own[..., None] <= step.limit * AREA).sum(-1)
+    similar = (best + own[..., None] <= limit * AREA).sum(-1)
     exists = own < FAR
     size = 2 ** torch.log2(similar.clamp(min=1).float()).floor().long()
     return _Matches(position[exists], size[exists])
@@ -168,11 +172,11 @@ def _norms(table: Tensor, shape: torch.Size) -> Tensor:
     return table.square().sum(1).view(inside.shape).masked_fill_(~inside, FAR)
 
 
-def _stacks(table: Tensor, shape: torch.Size, step: Step) -> list[Tensor]:
+def _stacks(table: Tensor, shape: torch.Size, stack: int, limit: float) -> list[Tensor]:
     """All stacks as positions [n, size], sorted into one tensor per size and row of tiles."""
     norm, found = _norms(table, shape), []
     for tile_row in range(_grid(shape)[0]):
-        matches = _match(table, norm, tile_row, shape, step)
+        matches = _match(table, norm, tile_row, shape, stack, limit)
         for size in matches.size.unique().tolist():
             found.append(matches.position[matches.size == size][:, :size])
     return found
@@ -181,22 +185,22 @@ def _stacks(table: Tensor, shape: torch.Size, step: Step) -> list[Tensor]:
 def _first(table: Tensor, shape: torch.Size, sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
     """Hard thresholding: sums of weighted filtered rows [positions, 64] and of their weights [positions]."""
     total, weights = torch.zeros_like(table), torch.zeros(len(table))
-    limit = profile.first.prethreshold * sigma
-    seen = torch.where(table.abs() > limit, table, 0.0) if limit > 0 else table
-    for position in _stacks(seen, shape, profile.first):
+    to_wavelet = _wavelet() @ _dct().T
+    wavelets = table @ to_wavelet.T
+    for position in _stacks(table, shape, profile.stack, profile.limit + 2 * sigma**2):
         haar = _haar(position.shape[1])
-        stack = torch.einsum("ab,nbk->nak", haar, table[position])
+        stack = torch.einsum("ab,nbk->nak", haar, wavelets[position])
         stack.masked_fill_(stack.abs() < profile.threshold * sigma, 0)
         weight = 1 / (sigma**2 * torch.count_nonzero(stack, (1, 2)).clamp(min=1))
         _add(total, weights, position, torch.einsum("ab,nak->nbk", haar, stack), weight)
-    return total, weights
+    return total @ torch.linalg.inv(to_wavelet).T, weights
 
 
 def _second(table: Tensor, basic: Tensor, sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
     """Empirical Wiener filter, the spectrum taken from the basic estimate; returns what `_first` returns."""
     total, weights = torch.zeros_like(table), torch.zeros(len(table))
     pilot_table = _transform(basic)
-    for position in _stacks(pilot_table, basic.shape, profile.second):
+    for position in _stacks(pilot_table, basic.shape, profile.second_stack, profile.second_limit):
         haar = _haar(position.shape[1])
         power = torch.einsum("ab,nbk->nak", haar, pilot_table[position]).square_()
         gain = power / (power + sigma**2)
