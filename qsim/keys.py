@@ -4,8 +4,8 @@ The generator is Philox4x32 with 7 rounds (Salmon et al., "Parallel random numbe
 variant that Dr.Jit offers, so that NumPy (here, the reference) and compiled kernels draw the same 32-bit words.
 
 * The 64-bit Philox key is a hash of (seed, clip, stage).
-* A pixel's word is number ``x & 3`` of the block whose counters are ``(x >> 2, y, frame, redraw)``: four neighbours in a
-  row share one block, and x, y are coordinates of the **full** frame, so a crop sees the words of the whole.
+* A pixel's word is number ``x & 3`` of the block whose counters are ``(x >> 2, y, frame, redraw)``: four neighbours in
+  a row share one block, and x, y are coordinates of the **full** frame, so a crop sees the words of the whole.
 * ``redraw`` counts further words of the same pixel: 0 decides nearly every pixel, 1 refines it to 64 bits where the
   first cannot (tails), and pixels that need more than one number take as many as they like.
 """
@@ -79,7 +79,7 @@ def words(key: Key, shape: tuple[int, int], origin: tuple[int, int] = (0, 0), re
     first, last = x >> 2, (x + width + 3) >> 2
     rows = np.arange(y, y + height, dtype=np.uint64)[:, None]
     blocks = np.arange(first, last, dtype=np.uint64)[None, :]
-    counters = np.broadcast_arrays(blocks, rows, np.uint64(key.frame), np.uint64(redraw))
+    counters = np.stack(np.broadcast_arrays(blocks, rows, np.uint64(key.frame), np.uint64(redraw)))
     block = np.moveaxis(philox4x32(counters, key.philox_key), 0, -1).reshape(height, -1)
     return block[:, x - 4 * first : x - 4 * first + width]
 

@@ -1,0 +1,128 @@
+"""Poisson mixtures: sensors whose code depends on light only through a Poisson number n of electrons or arrivals.
+
+    P(code = k | lambda) = sum_n Pois(n; lambda) P(code = k | n)
+
+The second factor does not know the light, so it is one table per sensor, made once. Every term is positive: sums lose
+no digits, and the logarithm of a probability is as good at 1e-280 as at 1/2. The derivative is another such sum,
+d/dlambda sum_n Pois(n) C(n) = sum_n Pois(n) [C(n+1) - C(n)], if the differences are made without cancellation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy import ndarray as Array
+
+_UNDERFLOW = 1e-290  # below, products of two representable factors may have lost terms: sum logarithms instead
+_CHUNK = 1 << 21  # numbers in one block of work (16 MiB)
+
+
+def poisson_log_pmf(mean: Array, n: Array) -> Array:
+    """log Pois(n; mean), broadcast; exact at mean 0."""
+    from scipy.special import gammaln, xlogy
+
+    return xlogy(n, mean) - mean - gammaln(n + 1.0)
+
+
+def poisson_quantile(mean: Array, below: Array, above: Array) -> Array:
+    """The smallest n with P(N <= n) > u, as float64, from (u, 1 - u): exact inversion, as good as the cdf in float64.
+
+    A normal approximation gives the first guess; galloping steps and bisection on the regularised gamma function, from
+    whichever side of the distribution is the smaller, give the answer.
+    """
+    from scipy.special import ndtri, pdtr, pdtrc
+
+    def enough(n: Array) -> Array:  # P(N <= n) > u
+        with np.errstate(invalid="ignore"):
+            return (n >= 0) & np.where(below < 0.5, pdtr(n, mean) > below, pdtrc(n, mean) < above)
+
+    z = np.where(below < 0.5, ndtri(below), -ndtri(above))
+    guess = np.maximum(np.floor(mean + np.sqrt(mean) * z + (z * z - 1) / 6), 0.0)
+    low, high, step = guess - 1, guess, 1.0  # wanted: not enough(low), enough(high)
+    while (missing := ~enough(high)).any():
+        low, high = np.where(missing, high, low), np.where(missing, high + step, high)
+        step *= 2
+    step = 1.0
+    while (excess := enough(low)).any():
+        high, low = np.where(excess, low, high), np.where(excess, np.maximum(low - step, -1.0), low)
+        step *= 2
+    while (high - low > 1).any():
+        middle = np.floor((low + high) / 2)
+        good = enough(middle)
+        low, high = np.where(good, low, middle), np.where(good, middle, high)
+    return high
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """P(code | n) for n = first ... first + m - 1 and some codes: arrays [m, levels] and [levels].
+
+    Below `first` no code of the block occurs except beneath it (cdf 1, pmf 0); from `first` + m on the tail rows hold.
+    """
+
+    first: int
+    cdf: Array  # P(code <= k | n)
+    log_pmf: Array  # log P(code = k | n)
+    slope: Array  # P(code <= k | n + 1) - P(code <= k | n)
+    tail_cdf: Array  # for n >= first + m
+    tail_log_pmf: Array
+
+    def evaluate_cdf(self, mean: Array) -> Array:
+        """P(code <= k): [p] Poisson means -> [p, levels]."""
+        return np.minimum(self._below(mean)[:, None] + self._mix(mean, self.cdf, self.tail_cdf), 1.0)
+
+    def evaluate_slope(self, mean: Array) -> Array:
+        """d cdf / d mean: [p] -> [p, levels]."""
+        return self._mix(mean, self.slope, None)
+
+    def evaluate_log_pmf(self, mean: Array) -> Array:
+        """log P(code = k): [p] -> [p, levels]; -inf only where no n of the table gives the code."""
+        pmf = self._mix(mean, np.exp(self.log_pmf), np.exp(self.tail_log_pmf))
+        with np.errstate(divide="ignore"):
+            result = np.log(pmf)
+        rows, codes = np.nonzero(pmf < _UNDERFLOW)
+        step = max(1, _CHUNK // len(self.log_pmf))
+        for start in range(0, len(rows), step):
+            r, k = rows[start : start + step], codes[start : start + step]
+            result[r, k] = self._log_sum(mean[r], k)
+        return result
+
+    def _log_sum(self, mean: Array, codes: Array) -> Array:
+        """The same sum in logarithms, for single pairs of mean and code: [p], [p] -> [p]."""
+        from scipy.special import gammaincc, logsumexp
+
+        n = np.arange(self.first, self.first + len(self.log_pmf))
+        terms = poisson_log_pmf(mean[:, None], n) + self.log_pmf[:, codes].T
+        above = self._above(mean)
+        with np.errstate(divide="ignore"):
+            # gammainc near 1 is better as 1 - gammaincc; near 0 it is itself exact
+            log_above = np.where(above > 0.5, np.log1p(-gammaincc(max(self._last, 1), mean)), np.log(above))
+        return logsumexp(np.column_stack([terms, log_above + self.tail_log_pmf[codes]]), axis=1)
+
+    def _mix(self, mean: Array, table: Array, tail: Array | None) -> Array:
+        n = np.arange(self.first, self.first + len(table))
+        result = np.empty((len(mean), table.shape[1]))
+        step = max(1, _CHUNK // max(len(table), 1))
+        for start in range(0, len(mean), step):
+            block = mean[start : start + step]
+            result[start : start + step] = np.exp(poisson_log_pmf(block[:, None], n)) @ table
+        if tail is not None:
+            result += self._above(mean)[:, None] * tail
+        return result
+
+    @property
+    def _last(self) -> int:
+        return self.first + len(self.cdf)
+
+    def _below(self, mean: Array) -> Array:
+        """P(n < first)."""
+        from scipy.special import gammaincc
+
+        return gammaincc(self.first, mean) if self.first else np.zeros_like(mean)
+
+    def _above(self, mean: Array) -> Array:
+        """P(n >= first + m)."""
+        from scipy.special import gammainc
+
+        return gammainc(self._last, mean) if self._last else np.ones_like(mean)

@@ -1,0 +1,140 @@
+"""The quanta image sensor's pixel: Poisson electrons, Gaussian read noise, an ADC of few bits.
+
+    code = clip(round(gain (min(N, full_well) + read_noise z) + offset), 0, 2^b - 1),   N ~ Poisson(QE photons + dark t)
+
+Rounding is half to even: with read noise 0 ties happen, and gain n + offset is then what float64 makes of it.
+With t_k = (k + 1/2 - offset) / gain, the table of the mixture is P(code <= k | n) = Phi((t_k - min(n, full_well)) /
+read_noise).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from math import ceil, floor, inf
+from typing import ClassVar
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.keys import Key, uniform_pair, words
+from qsim.mixture import Mixture
+from qsim.sensor import Sensor, require_bits, require_number
+
+_REACH = 39.0  # sigmas: Phi(-39) = 1e-333 is 0 in float64
+_BLOCK = 256  # levels that share one table
+_PROCESS_BITS = 8  # above, codes are drawn step by step instead of through their cdf
+
+
+@dataclass(frozen=True)
+class QIS(Sensor):
+    """A quanta image sensor: one read-out of a few electrons per exposure."""
+
+    quantum_efficiency: float  # electrons per photon, 0 ... 1
+    dark_current: float  # e-/s
+    read_noise: float  # e- rms
+    bits: int  # 1 ... 16
+    gain: float = 1.0  # codes per electron
+    offset: float = 0.0  # codes
+    full_well: float | None = None  # e-
+
+    code_model: ClassVar[str] = "multibit"
+
+    def __post_init__(self) -> None:
+        require_number(self, "quantum_efficiency", 0, 1, open_low=True)
+        require_number(self, "dark_current", 0)
+        require_number(self, "read_noise", 0)
+        require_bits(self)
+        require_number(self, "gain", 0, open_low=True)
+        require_number(self, "offset", -inf)
+        if self.full_well is not None:
+            require_number(self, "full_well", 0, open_low=True)
+
+    @property
+    def efficiency(self) -> float:
+        return self.quantum_efficiency
+
+    @property
+    def dark_rate(self) -> float:
+        return self.dark_current
+
+    def white(self, exposure: float) -> float:
+        """Photons at which x = 1: top code / (gain QE); neither offset, dark current nor full well enters."""
+        return (self.levels - 1) / (self.gain * self.quantum_efficiency)
+
+    def _cdf(self, arrivals: Array, exposure: float) -> Array:
+        return np.concatenate([t.evaluate_cdf(arrivals) for t in self._tables()], axis=1)
+
+    def _log_pmf(self, arrivals: Array, exposure: float) -> Array:
+        return np.concatenate([t.evaluate_log_pmf(arrivals) for t in self._tables()], axis=1)
+
+    def _slope(self, arrivals: Array, exposure: float) -> Array:
+        return np.concatenate([t.evaluate_slope(arrivals) for t in self._tables()], axis=1)
+
+    def _tables(self) -> list[Mixture]:
+        return [electron_table(self, k, min(k + _BLOCK, self.levels)) for k in range(0, self.levels, _BLOCK)]
+
+    def codes_of(self, electrons: Array) -> Array:
+        """The ADC: float electrons, read noise included -> codes; the only place where gain and rounding happen."""
+        return np.clip(np.rint(self.gain * electrons + self.offset), 0, self.levels - 1).astype(self.dtype)
+
+    def _draw(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
+        if self.bits <= _PROCESS_BITS:
+            return super()._draw(photons, exposure, key, origin)
+        return self._draw_process(photons, exposure, key, origin)
+
+    def _draw_process(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
+        """Electrons, read noise and ADC one after the other, each by inverting its distribution at a 64-bit number."""
+        from scipy.special import ndtri
+
+        from qsim.mixture import poisson_quantile
+
+        w = [words(key, photons.shape, origin, redraw) for redraw in range(4)]
+        electrons = poisson_quantile(self.arrivals(photons, exposure), *uniform_pair(w[0], w[1]))
+        if self.full_well is not None:
+            electrons = np.minimum(electrons, self.full_well)
+        if self.read_noise:
+            below, above = uniform_pair(w[2], w[3])
+            electrons = electrons + self.read_noise * np.where(below < 0.5, ndtri(below), -ndtri(above))
+        return self.codes_of(electrons)
+
+
+@lru_cache(maxsize=64)
+def electron_table(sensor: QIS, start: int, stop: int) -> Mixture:
+    """P(code | n electrons) for the codes start ... stop - 1."""
+    from scipy.special import ndtr
+
+    top = sensor.levels - 1
+    low, high = ((k + 0.5 - sensor.offset) / sensor.gain for k in (start - 1, min(stop, top) - 1))
+    reach = _REACH * sensor.read_noise + 1
+    well = inf if sensor.full_well is None else sensor.full_well
+    first = max(floor(min(low - reach, well)), 0) if start else 0
+    last = max(ceil(min(high + reach, well)), first)
+    saturated = well if last >= well else inf  # what n >= last collects
+    electrons = np.append(np.arange(first, last, dtype=float), saturated)
+    z = _normal_thresholds(sensor, electrons, np.arange(start - 1, stop))
+    cdf, log_pmf = ndtr(z[:, 1:]), log_normal_difference(z[:, :-1], z[:, 1:])
+    slope = -np.exp(log_normal_difference(z[1:, 1:], z[:-1, 1:]))
+    return Mixture(first, cdf[:-1], log_pmf[:-1], slope, cdf[-1], log_pmf[-1])
+
+
+def _normal_thresholds(sensor: QIS, electrons: Array, codes: Array) -> Array:
+    """z such that P(code <= k | electrons) = Phi(z): [n, k]; -inf for k = -1, +inf for the top code."""
+    if sensor.read_noise == 0:
+        return np.where(sensor.codes_of(electrons)[:, None] <= codes, inf, -inf)
+    z = ((codes + 0.5 - sensor.offset) / sensor.gain - electrons[:, None]) / sensor.read_noise
+    z[:, codes < 0], z[:, codes >= sensor.levels - 1] = -inf, inf
+    return z
+
+
+def log_normal_difference(low: Array, high: Array) -> Array:
+    """log(Phi(high) - Phi(low)) for low <= high, without cancellation on either side of 0."""
+    from scipy.special import erf, log_ndtr
+
+    flip = low > 0  # Phi(b) - Phi(a) = Phi(-a) - Phi(-b): work on the side where both are small
+    low, high = np.where(flip, -high, low), np.where(flip, -low, high)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = log_ndtr(low), log_ndtr(high)
+        one_side = b + np.log1p(-np.exp(a - b))
+        astride = np.log((erf(high / np.sqrt(2)) + erf(-low / np.sqrt(2))) / 2)
+    return np.where(low == high, -inf, np.where(high > 0, astride, one_side))

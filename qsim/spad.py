@@ -1,0 +1,190 @@
+"""Single-photon avalanche diodes: clocked pixels (BinarySPAD) and free-running counters with dead time (CountingSPAD).
+
+Avalanches that the pixel could see are a Poisson process; arrivals = PDE photons + dark_count_rate exposure of them are
+expected in an exposure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.keys import Key
+from qsim.mixture import poisson_log_pmf
+from qsim.sensor import Sensor, require_bits, require_number
+
+
+@dataclass(frozen=True)
+class BinarySPAD(Sensor):
+    """A clocked pixel: one plane says whether anything arrived; a code is the sum of M = 2^bits - 1 planes.
+
+    **Planes are drawn one by one.** Frame f of a b-bit stream is the sum of the planes f M ... f M + M - 1, and plane p
+    is what a 1-bit sensor draws for frame p of the same key. So two bit depths of one plane rate use the same photons:
+    seven frames of the 1-bit stream add up to one frame of the 3-bit stream, at constant light and, with
+    `sample_planes`, when every plane sees its own instant of the motion.
+    """
+
+    pde: float  # avalanches per photon, 0 ... 1
+    dark_count_rate: float  # 1/s
+    bits: int = 1  # 1 ... 16
+
+    code_model: ClassVar[str] = "binary_sum"
+
+    def __post_init__(self) -> None:
+        require_number(self, "pde", 0, 1, open_low=True)
+        require_number(self, "dark_count_rate", 0)
+        require_bits(self)
+
+    @property
+    def efficiency(self) -> float:
+        return self.pde
+
+    @property
+    def dark_rate(self) -> float:
+        return self.dark_count_rate
+
+    @property
+    def planes(self) -> int:
+        """Binary planes in one code, M = 2^bits - 1."""
+        return self.levels - 1
+
+    def white(self, exposure: float) -> float:
+        """M / PDE: light that would bring one avalanche per plane if planes could count."""
+        return self.planes / self.pde
+
+    def _cdf(self, arrivals: Array, exposure: float) -> Array:
+        cdf = np.minimum(np.cumsum(np.exp(self._log_pmf(arrivals, exposure)), axis=1), 1.0)
+        cdf[:, -1] = 1.0
+        return cdf
+
+    def _log_pmf(self, arrivals: Array, exposure: float) -> Array:
+        """Binomial(M, p) with p = 1 - exp(-arrivals / M)."""
+        from scipy.special import xlogy
+
+        k, per_plane = np.arange(self.levels), arrivals[:, None] / self.planes
+        return _log_binomials(self.planes) + xlogy(k, -np.expm1(-per_plane)) - (self.planes - k) * per_plane
+
+    def _slope(self, arrivals: Array, exposure: float) -> Array:
+        """dF_k/dp = -M C(M-1, k) p^k (1-p)^(M-1-k), dp/darrivals = (1-p) / M."""
+        from scipy.special import xlogy
+
+        k, per_plane = np.arange(self.planes), arrivals[:, None] / self.planes
+        log_slope = _log_binomials(self.planes - 1) + xlogy(k, -np.expm1(-per_plane)) - (self.planes - k) * per_plane
+        return np.pad(-np.exp(log_slope), ((0, 0), (0, 1)))
+
+    def sample_planes(
+        self,
+        photons: Array,
+        exposure: float,
+        *,
+        key: Key,
+        origin: tuple[int, int] = (0, 0),
+        engine: str = "auto",
+    ) -> Array:
+        """Codes [T, H, W] from a clip at the plane rate: photons and exposure of each plane, [T M, H, W]."""
+        if photons.ndim != 3 or len(photons) % self.planes:
+            raise ValueError(
+                f"planes of a {self.bits}-bit code come in groups of {self.planes}: [T {self.planes}, H, W], "
+                f"got {list(photons.shape)}"
+            )
+        plane = BinarySPAD(self.pde, self.dark_count_rate)
+        codes = np.zeros((len(photons) // self.planes, *photons.shape[1:]), self.dtype)
+        for p, light in enumerate(photons):
+            at = key.at(key.frame * self.planes + p)
+            codes[p // self.planes] += plane.sample(light, exposure, key=at, origin=origin, engine=engine)
+        return codes
+
+    def _draw(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
+        if self.bits == 1:
+            return super()._draw(photons, exposure, key, origin)
+        planes = np.broadcast_to(np.asarray(photons) / self.planes, (self.planes, *photons.shape))
+        return self.sample_planes(planes, exposure / self.planes, key=key, origin=origin, engine="reference")[0]
+
+
+def _log_binomials(n: int) -> Array:
+    """log C(n, k), k = 0 ... n."""
+    from scipy.special import gammaln
+
+    k = np.arange(n + 1)
+    return gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
+
+
+@dataclass(frozen=True)
+class CountingSPAD(Sensor):
+    """A free-running counter, live at the start of the exposure; codes clip at 2^bits - 1.
+
+    Non-paralyzable: after a count the pixel is dead for `dead_time`, and k counts fit if the k-th arrival of the live
+    time comes soon enough: P(N >= k) = P(Gamma(k) <= arrivals (1 - (k - 1) dead_time / exposure)).
+    Paralyzable: every arrival, counted or not, starts a new dead time; see `deadtime.py`.
+    """
+
+    pde: float  # avalanches per photon, 0 ... 1
+    dark_count_rate: float  # 1/s
+    dead_time: float  # s
+    bits: int  # 1 ... 16
+    paralyzable: bool = False
+
+    code_model: ClassVar[str] = "counting"
+
+    def __post_init__(self) -> None:
+        require_number(self, "pde", 0, 1, open_low=True)
+        require_number(self, "dark_count_rate", 0)
+        require_number(self, "dead_time", 0)
+        require_bits(self)
+        if not isinstance(self.paralyzable, bool):
+            raise ValueError(f"CountingSPAD.paralyzable is true or false, got {self.paralyzable!r}")
+        if self.paralyzable:
+            raise NotImplementedError
+
+    @property
+    def efficiency(self) -> float:
+        return self.pde
+
+    @property
+    def dark_rate(self) -> float:
+        return self.dark_count_rate
+
+    def white(self, exposure: float) -> float:
+        """(2^bits - 1) / PDE: where the counter would be full if there were no dead time."""
+        return (self.levels - 1) / self.pde
+
+    def _live(self, arrivals: Array, exposure: float) -> Array:
+        """Arrivals expected in the live time that is left after k counts: [p, levels]."""
+        share = 1 - np.arange(self.levels) * (self.dead_time / exposure)
+        return arrivals[:, None] * np.maximum(share, 0)
+
+    def _cdf(self, arrivals: Array, exposure: float) -> Array:
+        """F_k = P(N < k + 1) = Q(k + 1, live_k): the regularised incomplete gamma function."""
+        from scipy.special import gammaincc
+
+        cdf = gammaincc(np.arange(1.0, self.levels + 1), self._live(arrivals, exposure))
+        cdf[:, -1] = 1.0
+        return cdf
+
+    def _log_pmf(self, arrivals: Array, exposure: float) -> Array:
+        """P(N = k) = Pois(k; live_(k-1)) + integral of Pois(k; x) from live_k to live_(k-1): two positive terms."""
+        from scipy.special import gammainc, gammaincc
+
+        live = self._live(arrivals, exposure)
+        before, k = np.column_stack([arrivals, live[:, :-1]]), np.arange(self.levels)
+        with np.errstate(divide="ignore"):
+            lower = gammainc(k + 1.0, before) - gammainc(k + 1.0, live)
+            upper = gammaincc(k + 1.0, live) - gammaincc(k + 1.0, before)
+            pmf = np.exp(poisson_log_pmf(before, k)) + np.where(before < k + 1, lower, upper)
+            pmf[:, 0] = np.exp(-arrivals)
+            if self.levels > 1:
+                pmf[:, -1] = gammainc(k[-1], before[:, -1])
+            result = np.log(pmf)
+        result[:, 0] = -arrivals
+        return result
+
+    def _slope(self, arrivals: Array, exposure: float) -> Array:
+        """dF_k/dlive_k = -Pois(k; live_k)."""
+        k = np.arange(self.levels)
+        share = np.maximum(1 - k * (self.dead_time / exposure), 0)
+        slope = -share * np.exp(poisson_log_pmf(arrivals[:, None] * share, k))
+        slope[:, -1] = 0.0
+        return slope
