@@ -107,12 +107,12 @@ PRESETS: dict[str, Config] = {
 
 @dataclass(frozen=True)
 class Output:
-    """What a network returns; all frames in units of x = photons/white, not clamped."""
+    """What a network returns, in units of x = photons/white, not clamped; None = the network has no such part."""
 
-    denoised: Tensor  # [B, T, 1, H, W], each frame on its own
+    denoised: Tensor | None  # [B, T, 1, H, W], each frame on its own
     scale1: Tensor  # [B, T-10, 1, H, W], restored frames 5 .. T-6
-    scale2: Tensor  # [B, T-10, 1, H/2, W/2]
-    scale4: Tensor  # [B, T-10, 1, H/4, W/4]
+    scale2: Tensor | None  # [B, T-10, 1, H/2, W/2]
+    scale4: Tensor | None  # [B, T-10, 1, H/4, W/4]
     flow: Tensor | None = None  # [B, T-1, 2, H, W], pixels, on the grid of frame t+1 and pointing into frame t
 
 
@@ -232,11 +232,12 @@ class QUIVER(nn.Module):
         if self.config.baseline:
             bases = [self.base(denoised[:, t - RADIUS : t + RADIUS + 1].unbind(1)) for t in centres]
             pictures = [add_base(p, base) for p, base in zip(pictures, bases, strict=True)]
-        scale1, scale2, scale4 = (self.unfold(torch.stack(p, dim=1)) for p in zip(*pictures, strict=True))
+        scales: list[Tensor | None] = [self.unfold(torch.stack(p, dim=1)) for p in zip(*pictures, strict=True)]
         if not self.config.multi_scale:
-            scale2, scale4 = (resize(scale1, x.shape[3] // k, x.shape[4] // k) for k in (2, 4))
+            scales[1:] = (None, None)
         flow = resize(flows[0], *x.shape[3:]) * self.config.fold if self.config.flow else None
-        return Output(self.unfold(denoised), scale1, scale2, scale4, flow)
+        assert scales[0] is not None
+        return Output(self.unfold(denoised) if self.config.pre_denoiser else None, scales[0], *scales[1:], flow)
 
     def _encode(
         self, frames: Tensor, denoised: Tensor, flows: Sequence[Tensor]

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor, nn
 
-from quiver.blocks import WINDOW, conv, resize
+from quiver.blocks import WINDOW, conv
 from quiver.model import Output, check_input
 
 
@@ -35,7 +35,7 @@ class UNetConfig:
 
 
 class UNet(nn.Module):
-    """The same call as QUIVER; `denoised` repeats the input and the smaller scales are the output resized."""
+    """The same call as QUIVER; its output has scale 1 only."""
 
     multiple = 4
 
@@ -57,14 +57,7 @@ class UNet(nn.Module):
         """[B, T, 1, H, W] with T >= 11 -> Output for the frames 5 .. T-6; ValueError as for QUIVER."""
         check_input(x, self.multiple)
         windows = [self._window(x[:, t : t + WINDOW, 0]) for t in range(x.shape[1] - WINDOW + 1)]
-        full = torch.stack(windows, dim=1)
-        half, quarter = (resize(full, x.shape[3] // k, x.shape[4] // k) for k in (2, 4))
-        return Output(x, full, half, quarter)
-
-    @torch.no_grad()
-    def windows_exact(self, x: Tensor) -> Tensor:
-        """As QUIVER's; windows share no work here."""
-        return self(x).scale1
+        return Output(None, torch.stack(windows, dim=1), None, None)
 
     def _window(self, stack: Tensor) -> Tensor:
         a = self.down1(stack)
