@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from numpy import ndarray as Array
 
-from quiver.baselines import mean, moment
+from quiver.baselines import mean, moment, transform_denoise
 from quiver.baselines.windows import look_ahead
 
 
@@ -37,5 +37,6 @@ METHODS: dict[str, Method] = {
     for method in (
         Method("naive", mean.restore, 11, "mean of the codes, taken as linear in light"),
         Method("moment", moment.restore, 11, "mean of the codes through the exact inverse response"),
+        Method("transform-denoise", transform_denoise.restore, 3, "variance stabilised, BM3D, exact unbiased inverse"),
     )
 }

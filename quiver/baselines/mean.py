@@ -14,17 +14,14 @@ from numpy import ndarray as Array
 
 from qsim.qis import QIS
 from qsim.sensor import Sensor
-from qsim.spad import BinarySPAD, CountingSPAD
 from quiver.baselines.windows import check_codes, check_window, window_sums
 
 
 def dark_codes(sensor: Sensor, exposure: float) -> float:
-    """What a linear sensor would read in the dark [codes]; for other models their exact mean code without light."""
-    if isinstance(sensor, QIS):
-        return sensor.gain * sensor.dark_current * exposure + sensor.offset
-    if isinstance(sensor, BinarySPAD | CountingSPAD):
-        return sensor.dark_count_rate * exposure
-    return float(sensor.mean(np.zeros(1), exposure)[0])
+    """What a linear sensor would read in the dark [codes]."""
+    slope = (sensor.levels - 1) / sensor.white(exposure)  # codes per photon
+    offset = sensor.offset if isinstance(sensor, QIS) else 0.0
+    return slope * sensor.dark_rate * exposure / sensor.efficiency + offset
 
 
 def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11) -> Array:
