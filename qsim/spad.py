@@ -12,6 +12,7 @@ from typing import ClassVar
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.deadtime import Paralyzable
 from qsim.keys import Key
 from qsim.mixture import poisson_log_pmf
 from qsim.sensor import Sensor, require_bits, require_number
@@ -136,8 +137,6 @@ class CountingSPAD(Sensor):
         require_bits(self)
         if not isinstance(self.paralyzable, bool):
             raise ValueError(f"CountingSPAD.paralyzable is true or false, got {self.paralyzable!r}")
-        if self.paralyzable:
-            raise NotImplementedError
 
     @property
     def efficiency(self) -> float:
@@ -151,6 +150,10 @@ class CountingSPAD(Sensor):
         """(2^bits - 1) / PDE: where the counter would be full if there were no dead time."""
         return (self.levels - 1) / self.pde
 
+    def _paralyzable(self, exposure: float) -> Paralyzable | None:
+        """The other dead-time law; without dead time the two are one."""
+        return Paralyzable(exposure / self.dead_time, self.levels) if self.paralyzable and self.dead_time else None
+
     def _live(self, arrivals: Array, exposure: float) -> Array:
         """Arrivals expected in the live time that is left after k counts: [p, levels]."""
         share = 1 - np.arange(self.levels) * (self.dead_time / exposure)
@@ -160,6 +163,8 @@ class CountingSPAD(Sensor):
         """F_k = P(N < k + 1) = Q(k + 1, live_k): the regularised incomplete gamma function."""
         from scipy.special import gammaincc
 
+        if (paralyzable := self._paralyzable(exposure)) is not None:
+            return paralyzable.cdf(arrivals)
         cdf = gammaincc(np.arange(1.0, self.levels + 1), self._live(arrivals, exposure))
         cdf[:, -1] = 1.0
         return cdf
@@ -168,6 +173,8 @@ class CountingSPAD(Sensor):
         """P(N = k) = Pois(k; live_(k-1)) + integral of Pois(k; x) from live_k to live_(k-1): two positive terms."""
         from scipy.special import gammainc, gammaincc
 
+        if (paralyzable := self._paralyzable(exposure)) is not None:
+            return paralyzable.log_pmf(arrivals)
         live = self._live(arrivals, exposure)
         before, k = np.column_stack([arrivals, live[:, :-1]]), np.arange(self.levels)
         with np.errstate(divide="ignore"):
@@ -183,6 +190,8 @@ class CountingSPAD(Sensor):
 
     def _slope(self, arrivals: Array, exposure: float) -> Array:
         """dF_k/dlive_k = -Pois(k; live_k)."""
+        if (paralyzable := self._paralyzable(exposure)) is not None:
+            return paralyzable.slope(arrivals)
         k = np.arange(self.levels)
         share = np.maximum(1 - k * (self.dead_time / exposure), 0)
         slope = -share * np.exp(poisson_log_pmf(arrivals[:, None] * share, k))

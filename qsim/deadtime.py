@@ -1,0 +1,208 @@
+"""The paralyzable counter: how many of n arrivals are counted.
+
+An arrival is counted if none came in the dead time before it, so the code is 1 + the number of gaps between successive
+arrivals that reach the dead time (the pixel is live at the start). Let n arrivals fall on an exposure that is R dead
+times long. Choose which k - 1 of the n - 1 gaps are long and take one dead time out of each: what remains are
+n uniform points on a line l = R - k + 1 dead times long whose m = n - k chosen gaps are all shorter than one,
+
+    P(k counted | n) = C(n-1, k-1) (l / R)^n H(m, k; l),
+
+H being the probability of the latter. The textbook sums this by inclusion and exclusion, which cancels. Here H comes
+from a recursion of positive terms. With A = E[(l - S)+^k] / k! = H l^(m+k) / (m+k)!, S the sum of m uniform numbers
+on [0, 1): integration by parts of E[(l - S) (l - S)+^(k-1)] gives
+
+    (m + k) A(m, k; l) = l A(m, k-1; l) + m A(m-1, k; l-1),
+
+which starts at the density of S (k = -1), itself a B-spline with the positive recursion of de Boor and Cox:
+(m - 1) A(m, -1; l) = l A(m-1, -1; l) + (m - l) A(m-1, -1; l-1).
+
+Light so bright that the table would be too long paralyses the pixel, if the dead time is not far below the exposure:
+the few counts after the first then follow from the series of binomial moments, which no longer cancels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from math import floor, gamma
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.mixture import Mixture
+
+_BEYOND_TOP = 64  # codes above the top one that are summed term by term
+_LONGEST = 1 << 14  # arrivals in the longest table
+_MOST = 120  # counts that the alternating series looks at; 120 of 3 expected have a probability of 1e-142
+_SPARSE = 3.0  # expected counts after the first up to which the alternating series keeps 13 digits
+
+
+class Paralyzable:
+    """cdf, log_pmf and slope of the clipped count for Poisson means [p]; `ratio` = exposure / dead time."""
+
+    def __init__(self, ratio: float, levels: int) -> None:
+        self.ratio, self.levels = ratio, levels
+
+    def cdf(self, mean: Array) -> Array:
+        """P(code <= k): [p] -> [p, levels]."""
+        return self._choose(mean, Mixture.evaluate_cdf, lambda m: _sparse(m, self.ratio, self.levels)[0])
+
+    def log_pmf(self, mean: Array) -> Array:
+        """log P(code = k): [p] -> [p, levels]."""
+        result = self._choose(mean, Mixture.evaluate_log_pmf, lambda m: _sparse(m, self.ratio, self.levels)[1])
+        result[:, 0] = -mean
+        return result
+
+    def slope(self, mean: Array) -> Array:
+        """dcdf/dmean: [p] -> [p, levels]."""
+        return self._choose(mean, Mixture.evaluate_slope, lambda m: _sparse(m, self.ratio, self.levels)[2])
+
+    def _choose(self, mean: Array, mix: Callable[[Mixture, Array], Array], sparse: Callable[[Array], Array]) -> Array:
+        """Light levels in groups, each with a table just long enough (the Poisson tail left out is below 1e-30)."""
+        length = np.exp2(np.ceil(np.log2(mean + 12 * np.sqrt(mean) + 60)))
+        result = np.empty((len(mean), self.levels))
+        for last in np.unique(length):
+            group = length == last
+            if last <= _LONGEST:
+                result[group] = mix(arrival_table(self.ratio, self.levels, int(last)), mean[group])
+            else:
+                result[group] = sparse(mean[group])
+        return result
+
+
+@lru_cache(maxsize=16)
+def arrival_table(ratio: float, levels: int, last: int) -> Mixture:
+    """P(code | n arrivals) for n < `last`; `ratio` = exposure / dead time; codes clip at levels - 1."""
+    most = floor(ratio) + 1  # counts that can fit
+    counted = min(most, levels - 1 + _BEYOND_TOP, last - 1)
+    log_pmf = _log_counts(ratio, counted, last)
+    pmf = np.exp(log_pmf)
+    top = levels - 1
+    codes = np.zeros((last, levels))
+    width = min(top, counted + 1)
+    codes[:, :width] = pmf[:, :width]
+    at_least_top = pmf[:, top:].sum(axis=1)
+    below_top = codes[:, :top].sum(axis=1)
+    codes[:, top] = np.where((below_top < 0.5) & (counted < most), 1 - below_top, at_least_top)
+    cdf = np.minimum(np.cumsum(codes, axis=1), 1.0)
+    cdf[:, -1] = 1.0
+    survival = np.pad(np.cumsum(codes[:, :0:-1], axis=1)[:, ::-1], ((0, 0), (0, 1)))
+    # A difference of whichever side of the distribution is small
+    slope = np.where(cdf[:-1] < 0.5, np.diff(cdf, axis=0), -np.diff(survival, axis=0))
+    with np.errstate(divide="ignore"):
+        log_codes = np.log(codes)
+    log_codes[:, :width] = log_pmf[:, :width]
+    return Mixture(0, cdf[:-1], log_codes[:-1], slope, cdf[-1], log_codes[-1])
+
+
+def _log_counts(ratio: float, counted: int, last: int) -> Array:
+    """log P(k counted | n), n = 0 ... last - 1 and k = 0 ... `counted`: [last, counted + 1]."""
+    from scipy.special import gammaln
+
+    log_shares = _log_shares(ratio, counted, last)
+    n, k = np.arange(last)[:, None], np.arange(counted + 1)[None, :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_choices = gammaln(n) - gammaln(k) - gammaln(n - k + 1)
+        log_length = np.log1p(-np.minimum((k - 1) / ratio, 1.0))
+        result = np.where((k >= 1) & (n >= k), log_choices + n * log_length + log_shares, -np.inf)
+    result[0, 0] = 0.0
+    return result
+
+
+def _log_shares(ratio: float, counted: int, last: int) -> Array:
+    """log H(n - k, k; ratio - k + 1) at [n, k]; zeros where n < k or k = 0."""
+    lengths = ratio - np.arange(min(floor(ratio), counted + last) + 1)  # l of each column
+    shorter = np.append(lengths[1:], -1.0)
+    fits = shorter >= 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shrink = np.where(fits, shorter / lengths, 0.0)  # (l - 1) / l
+        per_length = np.where(lengths > 0, 1 / lengths, 0.0)
+    powers = shrink ** np.arange(counted + 1)[:, None]  # shrink^k
+    result = np.zeros((last, counted + 1))
+    k = np.arange(1, counted + 1)
+    columns = np.minimum(k - 1, len(lengths) - 1)
+    h = np.ones((counted + 1, len(lengths)))  # m = 0
+    density = ((lengths >= 0) & (lengths < 1)).astype(float)  # m = 1
+    scale = np.ones(len(lengths))  # shrink^(m - 1)
+    for m in range(1, last):
+        if m > 1:
+            growth = np.where(fits, (m - lengths) * per_length * scale, 0.0)
+            density = np.where(lengths < m, density + growth * _next(density), 0.0)
+            scale = scale * shrink
+        added = m * per_length * scale * powers * _next(h)
+        h = density + np.cumsum(np.where(fits, added, 0.0), axis=0)
+        fitting = k[k + m < last]
+        with np.errstate(divide="ignore"):
+            result[fitting + m, fitting] = np.log(h[fitting, columns[fitting - 1]])
+    return result
+
+
+def _next(values: Array) -> Array:
+    """The values at l - 1, one column on."""
+    return np.concatenate([values[..., 1:], np.zeros_like(values[..., :1])], axis=-1)
+
+
+def _sparse(mean: Array, ratio: float, levels: int) -> tuple[Array, Array, Array]:
+    """cdf, log_pmf and slope where hardly a gap is long, from the binomial moments B_j = E[C(N, j)].
+
+    With a = 1 / ratio and rate = mean exp(-mean a), a count at x has the density mean exp(-mean min(x, a)) if it is the
+    first and `rate` if it comes a or more after the one before, so
+
+        B_j = rate^(j-1) [J(j-1, c) + rate (c - a)+^j / j!],   c = 1 - (j - 1) a,
+        J(r, c) = integral from 0 to min(a, c) of mean exp(-mean x) (c - x)^r / r! dx;
+        P(N = k) = sum_j (-1)^(j-k) C(j, k) B_j,   P(N > k) = sum_j (-1)^(j-k-1) C(j-1, k) B_j.
+    """
+    from scipy.special import binom
+
+    a = 1 / ratio
+    log_rate = np.log(mean) - mean * a
+    rate = np.exp(log_rate)
+    if (rate * (1 - a) > _SPARSE).any():
+        worst = float(mean[np.argmax(rate)])
+        raise ValueError(
+            f"CountingSPAD: {worst:.4g} arrivals in an exposure of {ratio:.6g} paralyzable dead times have no closed "
+            "form here; shorten the exposure or lower the light"
+        )
+    last = min(floor(ratio) + 1, _MOST)
+    moments, slopes = _moments(mean, a, last)  # of B_j / rate^(j-1)
+    j = np.arange(1, last + 1)
+    log_pmf = np.full((len(mean), levels), -np.inf)
+    survival, slope = np.zeros((len(mean), levels)), np.zeros((len(mean), levels))
+    log_pmf[:, 0] = -mean
+    for k in range(min(levels, last + 1)):
+        sign = (-1.0) ** (j - k)
+        if k:
+            counted = (
+                sign * np.where(j >= k, binom(j, k), 0) if k < levels - 1 else sign * binom(j - 1, k - 1) * (j >= k)
+            )
+            with np.errstate(divide="ignore"):
+                total = (counted * moments * rate[:, None] ** np.maximum(j - k, 0)).sum(axis=1)
+                log_pmf[:, k] = np.log(np.maximum(total, 0)) + (k - 1) * log_rate
+        if k < levels - 1:
+            beyond = -sign * np.where(j > k, binom(j - 1, k), 0)
+            powers = rate[:, None] ** (j - 1)
+            survival[:, k] = (beyond * moments * powers).sum(axis=1)
+            change = slopes + moments * (j - 1) * (1 / mean - a)[:, None]
+            slope[:, k] = -(beyond * change * powers).sum(axis=1)
+    cdf = 1 - survival
+    cdf[:, 0] = np.exp(-mean)
+    slope[:, 0] = -cdf[:, 0]
+    return cdf, log_pmf, slope
+
+
+def _moments(mean: Array, a: float, last: int) -> tuple[Array, Array]:
+    """B_j / rate^(j-1) and the part of its derivative in which rate^(j-1) is kept: [p, last] each, j = 1 ... last."""
+    moments, slopes = np.empty((len(mean), last)), np.empty((len(mean), last))
+    factor = np.exp(-mean * a)
+    for j in range(1, last + 1):
+        c = 1 - (j - 1) * a
+        end = min(a, c)
+        rest, fade = c - end, np.exp(-mean * end)
+        before, integral = np.zeros_like(mean), -np.expm1(-mean * end)  # J(r - 1), J(r), here r = 0
+        for r in range(1, j):
+            before, integral = integral, (c**r - fade * rest**r) / gamma(r + 1) - integral / mean
+        open_end = rest**j / gamma(j + 1)
+        moments[:, j - 1] = integral + mean * factor * open_end
+        slopes[:, j - 1] = (c * before - (j - 1) * integral) / mean + fade * end * rest ** (j - 1) / gamma(j)
+        slopes[:, j - 1] += factor * (1 - mean * a) * open_end
+    return moments, slopes
