@@ -1,7 +1,7 @@
 """Cloth in the wind: the one thing here that changes its shape.
 
-A `Flag` is a rigid motion (of its pole) that also moves the vertices of its mesh in body coordinates: travelling waves, in
-closed form, so that place and velocity are exact at any time. Left out: stretching, folds onto itself, gravity.
+A `Flag` is a rigid motion (of its pole) that also moves the vertices of its mesh in body coordinates: travelling waves,
+in closed form, so that place and velocity are exact at any time. Left out: stretching, folds onto itself, gravity.
 """
 
 from __future__ import annotations

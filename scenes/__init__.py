@@ -1,0 +1,46 @@
+"""The scene library: one file per family, each with `scene(seed=0, *, speed=1.0) -> Scene`.
+
+`speed` multiplies every motion; 1 moves about 1 to 7 pixels per frame at 512 x 1024 and 2000 frames per second.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+
+from qsim.scene import Scene
+from scenes import fan, tumble
+
+Family = Callable[..., Scene]
+
+FAMILIES: dict[str, Family] = {
+    "fan": fan.scene,
+    "tumble": tumble.scene,
+}
+
+
+def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
+    """The scene of a family by name, or of a Python file with a function `scene(seed, *, speed)`.
+
+    Raises ValueError for a name that is neither, FileNotFoundError for a missing file.
+    """
+    if str(name) in FAMILIES:
+        return FAMILIES[str(name)](seed, speed=speed)
+    if str(name).endswith(".py"):
+        return _from_file(Path(name))(seed, speed=speed)
+    raise ValueError(f"no scene family {str(name)!r}; there are {', '.join(FAMILIES)}, or give a .py file")
+
+
+def _from_file(path: Path) -> Family:
+    if not path.is_file():
+        raise FileNotFoundError(f"scene {path}: no such file")
+    spec = importlib.util.spec_from_file_location(f"scene_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    if not callable(getattr(module, "scene", None)):
+        raise ValueError(f"{path}: a scene file needs a function scene(seed=0, *, speed=1.0)")
+    family: Family = module.scene
+    return family

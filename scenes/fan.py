@@ -1,0 +1,61 @@
+"""Rotation: a spinning fan in front of a textured wall, in a wire guard or without."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from qsim.motion import Spin, Still
+from qsim.parts import rotor
+from qsim.rotation import exponential, pose_matrix
+from qsim.scene import Body, Conductor, Constant, Diffuse, Mesh, RoughPlastic, Scene, Texture
+from qsim.shapes import ball, cylinder, merged, moved, wire
+from scenes import stage
+
+
+def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
+    """About 5 to 9 turns per second at speed 1."""
+    rng = np.random.default_rng([seed, 1])
+    radius = float(rng.uniform(0.36, 0.43))
+    place = Still(
+        (float(rng.uniform(-0.06, 0.06)), float(rng.uniform(-0.03, 0.03)), 0.45), stage.upright(rng.uniform(-0.5, 0.5))
+    )
+    rate = speed * float(rng.uniform(30, 55)) * stage.pick(rng, (-1.0, 1.0))
+    spin = place @ Spin((0, 0, 1), rate, phase=float(rng.uniform(0, 6.28)))
+    blades = rotor(
+        blades=int(rng.integers(3, 7)),
+        radius=radius,
+        pitch=float(rng.uniform(0.3, 0.7)),
+        width=float(rng.uniform(0.6, 1.0)),
+        sweep=float(rng.uniform(-0.2, 0.5)),
+    )
+    facing = pose_matrix(exponential((np.pi / 2, 0, 0)))
+    behind = pose_matrix(facing[:3, :3], (0, 0, -0.17))
+    cap = moved(ball(0.12 * radius, 40), pose_matrix(None, (0, 0, 0.05)))
+    hub = merged([moved(cylinder(0.19 * radius, 0.1, 40), facing), cap])
+    bodies = [
+        stage.wall(Diffuse(stage.backdrop(rng)), 4.4, 2.2, z=-0.25),
+        Body("blades", blades, stage.paint(rng, stage.surface(rng, 0.12, 0.85)), spin),
+        Body("hub", hub, RoughPlastic(Texture(stage.surface(rng, 0.1, 0.6)), 0.2), spin),
+        Body("motor", moved(cylinder(0.24 * radius, 0.2, 40), behind), Conductor(roughness=0.35), place),
+    ]
+    if rng.random() < 0.5:
+        bodies.append(Body("guard", guard(1.08 * radius, int(rng.integers(3, 6))), Conductor(roughness=0.3), place))
+    lights = (Constant(float(rng.uniform(0.3, 0.7))), stage.lamp(rng, (0, 0, 0.3)))
+    view = stage.camera((float(rng.uniform(-0.3, 0.3)), float(rng.uniform(-0.2, 0.25)), 2.6), (0, 0, 0.3), 0.45)
+    return Scene("fan", seed, view, lights, tuple(bodies), speed)
+
+
+def guard(radius: float, rings: int) -> Mesh:
+    """Rings and spokes of wire in front of the blades."""
+    a = np.linspace(0, 2 * np.pi, 73)[:-1]
+    wires = []
+    for r in np.linspace(0.3, 1.0, rings):
+        z = 0.14 - 0.08 * r**2
+        wires.append(
+            wire(np.stack([r * radius * np.cos(a), r * radius * np.sin(a), np.full_like(a, z)], 1), 0.004, 6, True)
+        )
+    r = np.linspace(0.1, 1.0, 12)
+    for angle in np.linspace(0, 2 * np.pi, 13)[:-1]:
+        path = np.stack([r * radius * np.cos(angle), r * radius * np.sin(angle), 0.14 - 0.08 * r**2], 1)
+        wires.append(wire(path, 0.003, 6))
+    return merged(wires)

@@ -1,0 +1,130 @@
+"""What the families share: a camera, walls and floors, textures and lights, all chosen by the given generator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from qsim import textures
+from qsim.motion import Motion
+from qsim.rotation import UP, exponential, pose_matrix, unit, vector
+from qsim.scene import AreaLamp, Body, Camera, Diffuse, Material, RoughPlastic, SunSky, Texture
+from qsim.shapes import moved, sheet
+from qsim.textures import Picture
+
+HEIGHT, WIDTH = 512, 1024  # pixels; other sizes by Scene.resized, which keeps the height of the view
+FRAME_RATE = 2000.0  # Hz, for which speed = 1 is meant
+PITCH = 1.1e-6  # m
+PHOTOGRAPHS = ("cat", "coffee", "astronaut", "rocket", "coins", "moon", "camera")
+CLIP = 0.016  # s, 33 frames: things that are thrown pass their middle at half of it
+
+T = TypeVar("T")
+
+
+def camera(origin: ArrayLike, target: ArrayLike, view: float = 0.5, motion: Motion | None = None) -> Camera:
+    """A small f/2.8 camera with a vertical field of `view` [rad]."""
+    focal_length = HEIGHT * PITCH / 2 / np.tan(view / 2)
+    return Camera(
+        focal_length=float(focal_length),
+        f_number=2.8,
+        pixel_pitch=PITCH,
+        height=HEIGHT,
+        width=WIDTH,
+        origin=vector(origin),
+        target=vector(target),
+        motion=motion,
+    )
+
+
+def pick(rng: np.random.Generator, options: Sequence[T]) -> T:
+    """One of the options, all equally likely."""
+    return options[int(rng.integers(len(options)))]
+
+
+def direction(rng: np.random.Generator) -> tuple[float, float, float]:
+    """A random unit vector, all directions equally likely."""
+    return vector(unit(rng.standard_normal(3)))
+
+
+def surface(rng: np.random.Generator, low: float = 0.05, high: float = 0.85) -> Picture:
+    """A texture for a thing: one of many kinds, its range stretched to `low` .. `high`."""
+    kind = int(rng.integers(8))
+    if kind == 0:
+        return textures.checker(2 * int(rng.integers(2, 6)), 2 * int(rng.integers(2, 6)), low, high)
+    if kind == 1:
+        return textures.stripes(int(rng.integers(6, 20)), low, high)
+    if kind == 2:
+        return textures.dots(int(rng.integers(5, 14)), low, high)
+    if kind == 3:
+        return textures.levels(textures.speckles(rng, 900), low, high)
+    if kind == 4:
+        return textures.levels(textures.rings(rng), low, high)
+    if kind == 5:
+        return textures.levels(textures.cells(rng, 60), low, high)
+    if kind == 6:
+        return textures.levels(textures.noise(rng, slope=rng.uniform(0.7, 1.3)), low, high, contrast=2.0)
+    return textures.photograph(
+        pick(rng, ("cat", "coffee", "astronaut", "rocket", "coins", "moon", "camera")), low, high
+    )
+
+
+def backdrop(rng: np.random.Generator, low: float = 0.08, high: float = 0.75) -> Texture:
+    """A texture for a wall about one view high: it repeats where it tiles."""
+    kind = int(rng.integers(7))
+    if kind == 0:
+        return Texture(textures.levels(textures.bricks(rng), low, high), repeat=(2.0, 1.0))
+    if kind == 1:
+        return Texture(textures.levels(textures.cells(rng, 150, 768), low, high), repeat=(2.0, 1.0))
+    if kind == 2:
+        return Texture(textures.levels(textures.speckles(rng, 2500, 768), low, high), repeat=(2.0, 1.0))
+    if kind == 3:
+        return Texture(textures.levels(textures.noise(rng, (1024, 1024), 1.1), low, high, 1.5), repeat=(2.0, 1.0))
+    return Texture(textures.photograph(("brick", "gravel", "grass")[kind - 4], low, high), repeat=(2.0, 1.0))
+
+
+def wall(material: Material, width: float = 6.0, height: float = 3.0, z: float = 0.0, y: float = 0.0) -> Body:
+    """An upright rectangle that looks to +z."""
+    return Body("wall", moved(sheet(width, height), pose_matrix(None, (0.0, y, z))), material)
+
+
+def floor(material: Material, size: float = 6.0, y: float = 0.0, z: float = 0.0) -> Body:
+    """A horizontal square that looks up."""
+    return Body("floor", moved(sheet(size, size), pose_matrix(exponential((-np.pi / 2, 0, 0)), (0.0, y, z))), material)
+
+
+def paint(rng: np.random.Generator, picture: Picture, repeat: tuple[float, float] = (1.0, 1.0)) -> Material:
+    """Matt or slightly glossy, by chance."""
+    texture = Texture(picture, repeat)
+    return Diffuse(texture) if rng.random() < 0.5 else RoughPlastic(texture, roughness=float(rng.uniform(0.15, 0.4)))
+
+
+def sun(rng: np.random.Generator, low: float = 0.5, high: float = 1.1, strength: float = 6.0) -> SunSky:
+    """Sun and sky from in front, left or right of the camera (which looks to -z)."""
+    return SunSky(
+        elevation=float(rng.uniform(low, high)),
+        azimuth=float(rng.uniform(-1.0, 1.0)),
+        sun_irradiance=strength * float(rng.uniform(0.7, 1.3)),
+        sky_irradiance=strength * float(rng.uniform(0.2, 0.5)),
+    )
+
+
+def lamp(rng: np.random.Generator, target: ArrayLike, distance: float = 2.5, power: float = 12.0) -> AreaLamp:
+    """A soft lamp above and beside the camera that shines on `target`."""
+    side = pick(rng, (-1.0, 1.0)) * rng.uniform(0.4, 0.9)
+    away = unit((side, rng.uniform(0.5, 0.9), rng.uniform(0.7, 1.0)))
+    size = float(rng.uniform(0.5, 1.0))
+    return AreaLamp(
+        origin=vector(np.asarray(target) + distance * away),
+        target=vector(target),
+        width=size,
+        height=size,
+        radiance=power / size**2,
+    )
+
+
+def upright(yaw: float) -> tuple[float, float, float]:
+    """The rotation vector of a turn by `yaw` [rad] about the vertical."""
+    return vector(yaw * np.asarray(UP))
