@@ -290,6 +290,16 @@ class Camera:
         """Focal length in pixels: a point at (x, y, z) in camera axes falls on (W/2 + f x/z, H/2 + f y/z)."""
         return self.focal_length / self.pixel_pitch
 
+    @property
+    def focus(self) -> float:
+        """Distance of sharp focus [m] along the optical axis."""
+        return self.focus_distance or float(np.linalg.norm(np.subtract(self.target, self.origin)))
+
+    @property
+    def pupil_radius(self) -> float:
+        """Radius of the entrance pupil [m]."""
+        return self.focal_length / (2 * self.f_number)
+
     def resized(self, height: int, width: int) -> Camera:
         """The same vertical field of view, pixel pitch and f-number on another number of pixels."""
         return replace(self, height=height, width=width, focal_length=self.focal_length * height / self.height)

@@ -1,0 +1,321 @@
+"""A scene at given times: radiance with its error, and the ground truth of its motion.
+
+    Scene + frame rate + shutter + budget -> Frame(radiance, sharp, flow, flow_back, valid, depth, body_id, error)
+
+Frame t is exposed around t / frame_rate: K instants, evenly spread over shutter / frame_rate seconds, are averaged
+(Mitsuba's wheels have no motion blur). Every pixel integrates its own area (box filter). Samples come in independent
+passes, half of them to A and half to B; radiance is their mean, its error the rms of (A - B) / 2. The sampler's seeds
+are words of qsim.keys, so any frame can be rendered alone, in any order. With engine.py, the only importer of Mitsuba.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import engine as engines
+from qsim import truth
+from qsim.budget import Budget
+from qsim.clip import PHYSICAL, Clip, ClipWriter
+from qsim.keys import Key, hash_name, words
+from qsim.scene import Scene, describe
+from qsim.translate import Stage
+from qsim.truth import Hits
+
+Crop = tuple[int, int, int, int]  # y, x, height, width
+
+RENDER_STAGE = 16  # of the random keys: sampler seeds
+SHARP_STAGE = 17  # the sharp instant has seeds of its own
+MAX_LANES = 2**23  # samples in flight; more are split into passes
+FIREFLY = 10.0  # a pixel counts as a firefly where halves differ by this many rms of the frame's difference
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One exposure and what is known about it."""
+
+    radiance: Array  # float32 [H, W], W m^-2 sr^-1, mean over the exposure
+    error: float  # rms Monte-Carlo error of `radiance`, W m^-2 sr^-1, measured
+    fireflies: int  # pixels whose halves differ by more than FIREFLY rms
+    sharp: Array | None = None  # float32 [H, W], the instant at mid-exposure, only for an open shutter
+    flow: Array | None = None  # float32 [2, H, W], px, mid-exposure of t to that of t + 1
+    flow_back: Array | None = None  # float32 [2, H, W], px, mid-exposure of t to that of t - 1
+    valid: Array | None = None  # bool [H, W], the point is seen in frame t + 1
+    depth: Array | None = None  # float32 [H, W], m along the optical axis, inf where nothing is
+    body_id: Array | None = None  # int32 [H, W], bodies in order, then lamps; -1 where nothing is
+
+    @property
+    def truth(self) -> dict[str, Array]:
+        """The ground truth by name, as a clip stores it."""
+        names = ("flow", "flow_back", "valid", "depth", "body_id")
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
+
+
+class Renderer:
+    """A scene loaded once; `frame(t)` moves it and renders, in any order of t.
+
+    `shutter` is the share of the frame time that the shutter is open (0 is an instant), `crop` = (y, x, height, width)
+    renders that window of the camera's frame. `ValueError` for a crop outside the frame or rates that make no sense.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        frame_rate: float = 2000.0,
+        shutter: float = 0.0,
+        seed: int = 0,
+        budget: Budget | None = None,
+        crop: Crop | None = None,
+        engine: engines.Engine | None = None,
+    ) -> None:
+        if not frame_rate > 0:
+            raise ValueError(f"frame_rate: a positive number of frames per second is needed, got {frame_rate!r}")
+        if not 0 <= shutter <= 1:
+            raise ValueError(f"shutter: a share of the frame time, 0 to 1, got {shutter!r}")
+        self.scene, self.frame_rate, self.shutter, self.seed = scene, frame_rate, shutter, seed
+        self.budget = budget or Budget()
+        self.crop = _checked_crop(scene, crop)
+        self.engine = engine or engines.select()
+        engines.activate(self.engine)
+        import mitsuba as mi
+
+        self._mi = mi
+        self._key = Key(seed=seed, clip=hash_name(f"{scene.name}/{scene.seed}"), stage=RENDER_STAGE)
+        self._stage = Stage(mi, scene)
+        depth = self.budget.bounces + 1
+        self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 1000})
+        self._samplers: dict[int, Any] = {}
+        self._numbers = self._shape_table()
+
+    def time(self, t: int) -> float:
+        """Mid-exposure of frame t [s]."""
+        return t / self.frame_rate
+
+    def frame(self, t: int, *, with_truth: bool = True) -> Frame:
+        """Render frame t."""
+        engines.activate(self.engine)
+        found = self._truth(t) if with_truth else {}
+        instants = self._instants(t)
+        radiance, error, fireflies = self._exposed(instants, self._key.at(t))
+        sharp = None
+        if self.shutter > 0 and self.budget.sharp:
+            key = Key(self._key.seed, self._key.clip, t, SHARP_STAGE)
+            sharp = self._exposed([self.time(t)], key)[0]
+        return Frame(radiance, error, fireflies, sharp, **found)
+
+    def _instants(self, t: int) -> list[float]:
+        count = self.budget.sub_frames if self.shutter > 0 else 1
+        offsets = (np.arange(count) + 0.5) / count - 0.5
+        return [self.time(t) + float(offset) * self.shutter / self.frame_rate for offset in offsets]
+
+    def _exposed(self, instants: list[float], key: Key) -> tuple[Array, float, int]:
+        """Mean radiance over the instants, its rms error and the number of fireflies."""
+        height, width = self.crop[2:]
+        per_pass, passes = self.budget.passes(len(instants), height * width, MAX_LANES)
+        seeds = words(key, (1, len(instants) * passes))[0].reshape(len(instants), passes)
+        halves = np.zeros((2, height, width))
+        for instant, row in zip(instants, seeds, strict=True):
+            self._stage.place(instant)
+            pose = self.scene.camera.pose(instant)
+            for i, seed in enumerate(row):
+                halves[i % 2] += self._pass(pose, int(seed), per_pass)
+        halves /= len(instants) * passes / 2
+        difference = (halves[0] - halves[1]) / 2
+        error = float(np.sqrt(np.mean(difference**2)))
+        fireflies = int(np.count_nonzero(np.abs(difference) > FIREFLY * error)) if error > 0 else 0
+        return halves.mean(axis=0).astype(np.float32), error, fireflies
+
+    def _pass(self, pose: Array, seed: int, samples: int) -> Array:
+        """One independent estimate of the radiance of every pixel, float [H, W]."""
+        if self.engine.backend == "scalar":
+            return self._film_pass(pose, seed, samples)
+        import drjit as dr
+
+        mi = self._mi
+        y0, x0, height, width = self.crop
+        lanes = height * width * samples
+        sampler = self._sampler(samples)
+        sampler.seed(seed, lanes)
+        pixel = dr.arange(mi.UInt32, lanes) // samples
+        row = pixel // width
+        corner = mi.Point2f(mi.Float(pixel - row * width) + x0, mi.Float(row) + y0)
+        ray = self._camera_ray(pose, corner + sampler.next_2d(), sampler)
+        radiance, _, _ = self._integrator.sample(self._stage.loaded, sampler, ray)
+        mean = dr.block_sum(radiance[0], samples) / samples
+        return np.array(mean, np.float64).reshape(height, width)
+
+    def _camera_ray(self, pose: Array, position: Any, sampler: Any) -> Any:
+        """Rays through film positions [px]; the pose is data, not code, so that moving it compiles nothing."""
+        import drjit as dr
+
+        mi, camera = self._mi, self.scene.camera
+        axes = [mi.Vector3f(*(mi.Float([float(x)]) for x in pose[:3, i])) for i in range(4)]
+        f = camera.focal_pixels
+        across = (position.x - camera.width / 2) / f
+        down = (position.y - camera.height / 2) / f
+        direction = axes[0] * across + axes[1] * down + axes[2]
+        origin = axes[3]
+        if camera.aperture_blur:
+            focus = camera.focus
+            lens = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d()) * (camera.pupil_radius)
+            shift = axes[0] * lens.x + axes[1] * lens.y
+            origin = origin + shift
+            direction = direction * focus - shift
+        return mi.RayDifferential3f(o=mi.Point3f(origin), d=dr.normalize(direction))
+
+    def _sampler(self, samples: int) -> Any:
+        if samples not in self._samplers:
+            sampler = self._mi.load_dict({"type": "multijitter", "sample_count": samples})
+            sampler.set_samples_per_wavefront(samples)
+            self._samplers[samples] = sampler
+        return self._samplers[samples]
+
+    def _film_pass(self, pose: Array, seed: int, samples: int) -> Array:
+        """The scalar engine has no vector of rays: Mitsuba's own camera and film do the same."""
+        mi, camera = self._mi, self.scene.camera
+        y, x, height, width = self.crop
+        film: dict[str, Any] = {
+            "type": "hdrfilm",
+            "width": camera.width,
+            "height": camera.height,
+            "rfilter": {"type": "box"},
+        }
+        film |= {"crop_offset_x": x, "crop_offset_y": y, "crop_width": width, "crop_height": height}
+        view = pose @ np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's camera axes: left, up, forward
+        sensor: dict[str, Any] = {"type": "perspective", "film": film, "near_clip": 1e-4, "far_clip": 1e5}
+        sensor["to_world"] = mi.ScalarTransform4f(view.tolist())
+        sensor |= {"fov_axis": "x", "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.focal_pixels)))}
+        sensor["sampler"] = {"type": "multijitter", "sample_count": samples}
+        if camera.aperture_blur:
+            sensor |= {"type": "thinlens", "aperture_radius": camera.pupil_radius, "focus_distance": camera.focus}
+        image = mi.render(
+            self._stage.loaded, sensor=mi.load_dict(sensor), integrator=self._integrator, seed=seed, spp=samples
+        )
+        return np.array(image, np.float64)[..., 0]
+
+    def _truth(self, t: int) -> dict[str, Array]:
+        now, (height, width) = self.time(t), self.crop[2:]
+        rays = truth.pixel_rays(self.scene.camera, now, self.crop)
+        self._stage.place(now)
+        hits = self._cast(rays[0], rays[1].reshape(-1, 3))
+        flow, inside, points = truth.flow_between(self.scene, rays, hits, now, self.time(t + 1))
+        back, _, _ = truth.flow_between(self.scene, rays, hits, now, self.time(t - 1))
+        seen = hits.number >= 0
+        self._stage.place(self.time(t + 1))
+        eye = self.scene.camera.pose(self.time(t + 1))[:3, 3]
+        towards = np.where(seen[:, None], points - eye, points)
+        valid = inside & truth.visible(np.linalg.norm(towards, axis=1), seen, self._cast(eye, towards))
+        length = np.linalg.norm(rays[1].reshape(-1, 3), axis=1)
+        return {
+            "flow": flow.reshape(2, height, width).astype(np.float32),
+            "flow_back": back.reshape(2, height, width).astype(np.float32),
+            "valid": valid.reshape(height, width),
+            "depth": (hits.distance / length).reshape(height, width).astype(np.float32),
+            "body_id": hits.number.reshape(height, width),
+        }
+
+    def _cast(self, origin: Array, directions: Array) -> Hits:
+        """First hits along rays from one point; directions [N, 3] need no unit length."""
+        unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        if self.engine.backend == "scalar":
+            return self._cast_one_by_one(origin, unit)
+        import drjit as dr
+
+        mi = self._mi
+        ray = mi.Ray3f(mi.Point3f(*(float(x) for x in origin)), mi.Vector3f(unit.T.astype(np.float32)))
+        found = self._stage.loaded.ray_intersect_preliminary(ray, coherent=True)
+        shape = dr.reinterpret_array(mi.UInt32, found.shape)
+        instance = dr.reinterpret_array(mi.UInt32, found.instance)
+        index = np.array(dr.select(instance > 0, instance, shape))
+        number = self._numbers[np.minimum(index, len(self._numbers) - 1)]
+        distance = np.where(number >= 0, np.array(found.t, np.float64), np.inf)
+        weights = np.array(found.prim_uv, np.float64)
+        return Hits(distance, number, np.array(found.prim_index, np.int64), weights.reshape(2, -1).T)
+
+    def _cast_one_by_one(self, origin: Array, unit: Array) -> Hits:
+        mi = self._mi
+        numbers = self._stage.shape_numbers()
+        distance, number = np.full(len(unit), np.inf), np.full(len(unit), -1, np.int32)
+        triangle, weights = np.zeros(len(unit), np.int64), np.zeros((len(unit), 2))
+        for i, direction in enumerate(unit):
+            ray = mi.Ray3f(origin.tolist(), direction.tolist())
+            found = self._stage.loaded.ray_intersect_preliminary(ray)
+            if found.is_valid():
+                number[i] = numbers.get((found.instance or found.shape).id(), -1)
+                triangle[i], weights[i] = found.prim_index, found.prim_uv
+                distance[i] = found.t if number[i] >= 0 else np.inf
+        return Hits(distance, number, triangle, weights)
+
+    def _shape_table(self) -> Array:
+        """Body numbers by Dr.Jit's registry index; unknown shapes (the sun) are surroundings, -1."""
+        if self.engine.backend == "scalar":
+            return np.zeros(0, np.int32)
+        import drjit as dr
+
+        mi, numbers = self._mi, self._stage.shape_numbers()
+        shapes = self._stage.loaded.shapes()
+        indices = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
+        table = np.full(max([0, *indices]) + 2, -1, np.int32)
+        for index, shape in zip(indices, shapes, strict=True):
+            table[index] = numbers.get(shape.id(), -1)
+        return table
+
+
+def render_clip(
+    scene: Scene,
+    path: str | os.PathLike[str],
+    *,
+    frames: int,
+    frame_rate: float = 2000.0,
+    shutter: float = 0.0,
+    seed: int = 0,
+    budget: Budget | None = None,
+    crop: Crop | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    extra: dict[str, Any] | None = None,
+    force: bool = False,
+) -> Clip:
+    """Render frames 0 .. frames - 1 into a clip folder; an interrupted call with the same question is continued.
+
+    `progress(done, frames)` is called after each frame; `extra` joins clip.json (the split of a data set, say).
+    """
+    if frames < 1:
+        raise ValueError(f"{path}: a clip needs at least one frame, got {frames}")
+    renderer = Renderer(scene, frame_rate=frame_rate, shutter=shutter, seed=seed, budget=budget, crop=crop)
+    y, x, height, width = renderer.crop
+    meta = {
+        "shape": [frames, height, width],
+        "origin": [y, x],
+        "frame_rate": frame_rate,
+        "shutter": shutter,
+        "exposure": (shutter if shutter > 0 else 1.0) / frame_rate,
+        "radiance_unit": PHYSICAL,
+        "camera": describe(scene.camera),
+        "scene": {"family": scene.name, "seed": scene.seed, "speed": scene.speed},
+        "seed": seed,
+        "render": asdict(renderer.budget) | {"engine": renderer.engine.backend, "variant": renderer.engine.variant},
+    }
+    with ClipWriter(path, meta | (extra or {}), force=force) as writer:
+        for t in range(frames):
+            if not writer.has(t):
+                frame = renderer.frame(t)
+                writer.add(t, frame.radiance, frame.sharp, frame.truth, frame.error)
+            if progress is not None:
+                progress(t + 1, frames)
+    return Clip.open(path)
+
+
+def _checked_crop(scene: Scene, crop: Crop | None) -> Crop:
+    height, width = scene.camera.height, scene.camera.width
+    if crop is None:
+        return 0, 0, height, width
+    y, x, rows, columns = crop
+    if min(y, x) < 0 or min(rows, columns) < 1 or y + rows > height or x + columns > width:
+        raise ValueError(f"crop (y, x, height, width) = {crop} does not lie in the {height} x {width} frame")
+    return crop
