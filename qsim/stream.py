@@ -311,11 +311,20 @@ def replay(clip: Clip, stream: Stream, frame: int) -> tuple[Array, Array]:
 
     meta = stream.meta
     planes = int(meta.get("planes_per_code", 1))
-    plane = stream.sensor if planes == 1 else dataclasses.replace(stream.sensor, bits=1)
+    plane = stream.sensor if planes == 1 else _single_plane(stream.sensor, stream.name)
     level = optics.LightLevel(stream.photons_factor, meta["ppp"] / planes, meta["mean_photons_before"] / planes, None)
     key = Key(seed=meta["seed"], clip=meta["clip_key"])
     draw = Draw(stream.sensor, plane, level, key, planes, bool(meta.get("diffraction", False)))
     return draw.frames(clip, frame, frame + 1)[0], stream.codes(frame, frame + 1)[0]
+
+
+def _single_plane(sensor: Sensor, name: str) -> Sensor:
+    """The sensor of one binary plane of a sum of planes; `ValueError` if it does not sum planes."""
+    from qsim.spad import BinarySPAD
+
+    if not isinstance(sensor, BinarySPAD):
+        raise ValueError(f"{name}: only a clocked SPAD (BinarySPAD) sums planes, this is a {type(sensor).__name__}")
+    return dataclasses.replace(sensor, bits=1)
 
 
 def electrons_per_photon(sensor: Sensor) -> float:

@@ -1,0 +1,296 @@
+"""The command `qsim`: parse, call, print. Each command is a pair `_add_X` (its options) and `_run_X` (what it does)."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from qsim import __version__
+from qsim.console import Parser, bar, command, output, run
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command line; returns the exit code."""
+    parser = Parser(prog="qsim", description="Render moving scenes and turn them into few-bit quanta-sensor streams.")
+    parser.add_argument("--version", action="version", version=f"qsim {__version__}")
+    sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
+    for add in (_add_doctor, _add_render, _add_sense, _add_generate, _add_check):
+        add(sub)
+    return run(parser, argv)
+
+
+# doctor
+
+
+def _add_doctor(sub: Any) -> None:
+    parser = command(
+        sub, "doctor", _run_doctor, "Say which renderer, compiler and packages were found, and what is missing.",
+        "qsim doctor\nqsim doctor --devices",
+    )  # fmt: skip
+    parser.add_argument("--devices", action="store_true", help="list the named sensors and the source of each number")
+
+
+def _run_doctor(args: argparse.Namespace) -> int:
+    if args.devices:
+        from qsim import devices
+
+        listing = devices.listing()
+        output(args, {"devices": listing}, [_device_text(device) for device in listing])
+        return 0
+    from qsim import engine
+
+    report = engine.report()
+    width = max(len(key) for key in report)
+    output(args, report, [f"{key:{width}}  {value}" for key, value in report.items()])
+    return 0
+
+
+def _device_text(device: dict[str, Any]) -> str:
+    lines = [f"{device['name']}: {device['what']}"]
+    lines += [f"    {key}: {value}" for key, value in device.items() if key not in ("name", "what", "sources")]
+    lines += [f"    {key}, source: {text}" for key, text in dict(device.get("sources", {})).items()]
+    return "\n".join(lines)
+
+
+# render
+
+
+def _add_render(sub: Any) -> None:
+    parser = command(
+        sub, "render", _run_render, "Render a scene into a clip: radiance, sharp frames, flow, depth, body ids.",
+        "qsim render fan -o out/fan --frames 21 --height 128 --width 128",
+    )  # fmt: skip
+    parser.add_argument("scene", help="a family of scenes/, or a .py file with scene(seed, speed=...)")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="clip folder to make")
+    parser.add_argument("--seed", type=int, default=0, help="of the scene and its samples (default 0)")
+    parser.add_argument("--speed", type=float, default=1.0, help="factor on all motions (default 1)")
+    parser.add_argument("--frames", type=int, default=21, help="default 21")
+    parser.add_argument("--height", type=int, default=128, help="pixels (default 128)")
+    parser.add_argument("--width", type=int, default=128, help="pixels (default 128)")
+    parser.add_argument("--frame-rate", type=float, default=2000.0, help="frames per second (default 2000)")
+    parser.add_argument("--shutter", type=float, default=0.0, help="open share of a frame, 0..1 (default 0: sharp)")
+    parser.add_argument("--force", action="store_true", help="replace an existing clip")
+
+
+def _run_render(args: argparse.Namespace) -> int:
+    import scenes
+    from qsim import budget, render
+
+    if args.output.exists() and not args.force:
+        raise FileExistsError(f"{args.output}: exists; name another with -o, or use --force to replace it")
+    for name in ("frames", "height", "width"):
+        if getattr(args, name) < 1:
+            raise ValueError(f"--{name}: expected a whole number of at least 1, got {getattr(args, name)}")
+    scene = scenes.load(args.scene, seed=args.seed, speed=args.speed).resized(args.height, args.width)
+    with bar(args.output.name) as progress:
+        clip = render.render_clip(
+            scene,
+            args.output,
+            frames=args.frames,
+            frame_rate=args.frame_rate,
+            shutter=args.shutter,
+            seed=args.seed,
+            budget=budget.Budget(),
+            progress=progress,
+            force=args.force,
+        )
+    psnr = clip.meta.get("psnr_of_truth")
+    text = f"{clip.path}: {len(clip)} frames of {args.height} x {args.width}"
+    text += f", mean radiance {clip.mean_radiance:.4g} W/m2/sr"
+    text += f", {clip.mean_photons:.4g} photons per pixel" + (f", error {psnr:.1f} dB" if psnr else "")
+    output(args, {"clip": str(clip.path)} | {k: v for k, v in clip.meta.items() if k != "checksums"}, text)
+    return 0
+
+
+# sense
+
+
+def _add_sense(sub: Any) -> None:
+    parser = command(
+        sub, "sense", _run_sense, "Turn clips into few-bit streams, or draw one frame again and compare.",
+        "qsim sense out/fan --bits 3 --ppp 3.25\n"
+        "qsim sense out/starter --sensor spad-320x240 --bits 1 --ppp 0.5,3.25,26\n"
+        "qsim sense out/starter --name quiver-physical_3bit_3.25ppp --replay fan_0003:7",
+    )  # fmt: skip
+    parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="clips or data sets")
+    parser.add_argument(
+        "--sensor", default="quiver-physical", help="a name of `qsim doctor --devices`, or a .toml file"
+    )
+    parser.add_argument("--bits", type=int, help="bits per code (default: the sensor's own)")
+    parser.add_argument("--ppp", type=_numbers, help="photons per pixel and code over the whole clip; several: 3.25,26")
+    parser.add_argument("--lux", type=_numbers, help="faceplate lux at 555 nm instead of --ppp")
+    parser.add_argument("--seed", type=int, default=0, help="of the noise (default 0)")
+    parser.add_argument("-o", "--name", help="name of the stream (default: made from sensor, bits and light)")
+    parser.add_argument("--group", action="store_true", help="codes sum 2^bits - 1 clip frames as binary planes")
+    parser.add_argument("--diffraction", action="store_true", help="blur by the lens's Airy pattern")
+    parser.add_argument(
+        "--replay", metavar="CLIP:FRAME", help="draw one frame again and compare it with the stored one"
+    )
+    parser.add_argument("--force", action="store_true", help="replace a stream of the same name")
+
+
+def _run_sense(args: argparse.Namespace) -> int:
+    from qsim import stream
+
+    if args.ppp and args.lux:
+        raise ValueError("give the light level as --ppp or as --lux, not both")
+    levels = [{"ppp": ppp} for ppp in args.ppp or []] + [{"lux": lux} for lux in args.lux or []] or [{}]
+    if args.name and len(levels) > 1:
+        raise ValueError(f"--name {args.name}: one name for {len(levels)} light levels; leave it out")
+    wanted = [
+        stream.Sensing(args.sensor, args.bits, seed=args.seed, name=args.name, group=args.group,
+                       diffraction=args.diffraction, **level)
+        for level in levels
+    ]  # fmt: skip
+    clips = [clip for path in args.paths for clip in _clips(path)]
+    if args.replay:
+        return _replay(args, clips, wanted[0])
+    made = []
+    frames = sum(len(clip) for clip in clips) * len(wanted)
+    before = 0
+    with bar("sensing") as progress:
+        for clip in clips:
+            for sensing in wanted:
+                start = before
+                found, line = stream.sense(
+                    clip,
+                    sensing,
+                    force=args.force,
+                    progress=lambda done, _, start=start: progress(start + done, frames),
+                )
+                before += len(clip)
+                made.append({"clip": str(clip.path), "stream": found.name, "light": line, **_light(found.meta)})
+    output(args, {"streams": made}, [m["light"] for m in made])
+    return 0
+
+
+def _light(meta: dict[str, Any]) -> dict[str, Any]:
+    keys = ("ppp", "ppp_factor", "mean_photons_before", "equivalent_lux_555nm", "bits", "shape", "code_model")
+    return {key: meta[key] for key in keys}
+
+
+def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
+    from qsim import stream
+
+    name, _, number = args.replay.rpartition(":")
+    if not number.isdigit() or (not name and len(clips) != 1):
+        raise ValueError(f"--replay {args.replay}: expected CLIP:FRAME, as in fan_0003:7")
+    chosen = [clip for clip in clips if not name or clip.name == name]
+    if not chosen:
+        raise ValueError(f"--replay {args.replay}: no clip {name} among {', '.join(clip.name for clip in clips)}")
+    clip = chosen[0]
+    known = clip.streams
+    stored = clip.stream(known[0] if len(known) == 1 and not args.name else args.name or sensing.stream_name)
+    drawn, kept = stream.replay(clip, stored, int(number))
+    differ = int((drawn != kept).sum())
+    found = {"clip": clip.name, "stream": stored.name, "frame": int(number), "pixels": drawn.size, "differ": differ}
+    verdict = (
+        "equal to the stored frame" if differ == 0 else f"{differ} of {drawn.size} pixels DIFFER from the stored frame"
+    )
+    output(args, found, f"{clip.name}, {stored.name}, frame {number} drawn again: {verdict}")
+    return 0 if differ == 0 else 1
+
+
+def _clips(path: Path) -> list[Any]:
+    """The clips of a data set, or the one clip of a folder."""
+    from qsim.clip import Clip
+    from qsim.dataset import Dataset
+
+    if (path / "dataset.json").is_file():
+        clips = Dataset.open(path).clips()
+        if not clips:
+            raise ValueError(f"{path}: this data set has no finished clip yet; run `qsim generate`")
+        return list(clips)
+    return [Clip.open(path)]
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected numbers such as 3.25 or 0.5,3.25,26, got {text!r}") from None
+    if not all(0 < number < float("inf") for number in numbers):
+        raise argparse.ArgumentTypeError(f"expected numbers above 0, got {text!r}")
+    return numbers
+
+
+# generate
+
+
+def _add_generate(sub: Any) -> None:
+    parser = command(
+        sub, "generate", _run_generate, "Make a data set from a recipe; whatever is done already is kept.",
+        "qsim generate scenes/starter.toml -o out/starter --workers 2\n"
+        "qsim generate scenes/i2_2000fps.toml -o /data/i2 --shard 7/100",
+    )  # fmt: skip
+    parser.add_argument("recipe", type=Path, help="a .toml file; its format is described in qsim/recipe.py")
+    parser.add_argument("-o", "--output", type=Path, help="data set folder (default out/NAME of the recipe)")
+    parser.add_argument("--workers", type=int, default=1, help="processes, each with its own renderer (default 1)")
+    parser.add_argument("--shard", type=_part, metavar="I/N", help="only the I-th of N parts, as in 7/100")
+    parser.add_argument("--memory", type=float, default=4.0, help="GiB per process before it gives up (default 4)")
+    parser.add_argument("--retry", action="store_true", help="try failed jobs again")
+    parser.add_argument("--repair", action="store_true", help="check all files and make the damaged ones again")
+    parser.add_argument("--wait", action="store_true", help="wait while another generator is at work in the folder")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask scheduler, as in tcp://10.0.0.1:8786")
+
+
+def _run_generate(args: argparse.Namespace) -> int:
+    from qsim import dataset, jobs, recipe
+
+    wanted = recipe.load(args.recipe)
+    folder = args.output or Path("out") / wanted.name
+    if args.workers < 0:
+        raise ValueError(f"--workers: expected 0 (in this process) or more, got {args.workers}")
+    options = dataset.Options(
+        args.workers, args.shard, args.retry, args.repair, args.wait, jobs.Limits(memory=args.memory)
+    )
+    chosen = dataset.shard(wanted.jobs, args.shard)
+    with bar(wanted.name) as progress, dataset.watching(folder, chosen, progress):
+        summary = dataset.generate(wanted, folder, options)
+    lines = [f"{folder}: {summary.done} of {summary.jobs} clips done, {summary.made} made now"]
+    lines += [f"repaired {problem}" for problem in summary.repaired]
+    lines += [f"FAILED {name}: {why}" for name, why in sorted(summary.failed.items())]
+    if summary.failed:
+        lines.append("run again with --retry after mending the cause")
+    output(args, {"dataset": str(folder)} | dataclasses.asdict(summary), lines)
+    return 0 if summary.done == summary.jobs else 1
+
+
+def _part(text: str) -> tuple[int, int]:
+    first, _, last = text.partition("/")
+    if not (first.isdigit() and last.isdigit() and 1 <= int(first) <= int(last)):
+        raise argparse.ArgumentTypeError(f"expected I/N with 1 <= I <= N, as in 7/100, got {text!r}")
+    return int(first), int(last)
+
+
+# check
+
+
+def _add_check(sub: Any) -> None:
+    parser = command(
+        sub, "check", _run_check, "Compare clips and data sets with their checksums; exit code 1 if a file is damaged.",
+        "qsim check out/starter out/fan",
+    )  # fmt: skip
+    parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="clips or data sets")
+
+
+def _run_check(args: argparse.Namespace) -> int:
+    from qsim.clip import Clip
+    from qsim.dataset import Dataset
+
+    problems: list[str] = []
+    for path in args.paths:
+        opened = Dataset.open(path) if (path / "dataset.json").is_file() else Clip.open(path)
+        problems += opened.verify()
+    names = ", ".join(str(path) for path in args.paths)
+    lines = problems or [f"{names}: every file is what was written"]
+    output(args, {"paths": [str(path) for path in args.paths], "problems": problems}, lines)
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,335 @@
+"""Data sets: a folder of clips made from one recipe, whole, resumable, checkable.
+
+    dataset.json   recipe, splits by scene, state of every job; rewritten when a generation ends
+    clips/NAME     clip folders with their streams                       (clip.py)
+    jobs/NAME.json records with checksums; a clip counts from the moment its record is there (jobs.py)
+
+`generate` does what is missing: after a kill, in shards, on a cluster, or with nothing left to do. The finished folder
+has the same bytes in all these cases (logs/ apart), on machines of one kind.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from qsim import __version__, files
+from qsim.clip import Clip
+from qsim.jobs import Limits, Make, Result, record_path, render_job, run_here, run_local
+from qsim.recipe import SPLITS, Job, Recipe
+from qsim.stream import Progress
+
+FORMAT_VERSION = 1
+_FOLDERS = ("clips", "jobs", "failed", "logs", "locks", "work")
+
+Run = Callable[[list[Job], Path, Make], Generator[Result]]
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A data set folder; only clips whose record is there are seen."""
+
+    path: Path
+    meta: dict[str, Any]  # dataset.json
+
+    @staticmethod
+    def open(path: str | os.PathLike[str]) -> Dataset:
+        """`FileNotFoundError` or `ValueError` if this is not a data set of our version."""
+        path = Path(path)
+        manifest = path / "dataset.json"
+        if not manifest.is_file():
+            what = "not a data set folder (it has no dataset.json)" if path.exists() else "no such data set"
+            raise FileNotFoundError(f"{path}: {what}")
+        meta = files.read_json(manifest)
+        files.check_version(manifest, meta.get("format_version"), FORMAT_VERSION)
+        for key in ("name", "recipe", "jobs"):
+            if key not in meta:
+                raise ValueError(f"{manifest}: key '{key}' is missing; the file is damaged, run `qsim generate` again")
+        return Dataset(path, meta)
+
+    @property
+    def name(self) -> str:
+        return str(self.meta["name"])
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """The recipe as it was written."""
+        return dict(self.meta["recipe"])
+
+    def names(self, split: str | None = None) -> list[str]:
+        """Names of the finished clips of one split, or of all. `ValueError` for an unknown split."""
+        if split is not None and split not in SPLITS:
+            raise ValueError(f"{self.path}: unknown split {split!r}; there are {', '.join(SPLITS)}")
+        chosen = [name for name, job in self.meta["jobs"].items() if split in (None, job["split"])]
+        return [name for name in chosen if record_path(self.path, name).is_file()]
+
+    def clips(self, split: str | None = None) -> list[Clip]:
+        """The finished clips of one split, or of all."""
+        return [Clip.open(self.path / "clips" / name) for name in self.names(split)]
+
+    @property
+    def missing(self) -> list[str]:
+        """Names of the clips that the recipe asks for and that are not finished."""
+        return [name for name in self.meta["jobs"] if not record_path(self.path, name).is_file()]
+
+    def verify(self) -> list[str]:
+        """Problems of all files in words, one per file; clips not made yet are problems too."""
+        problems = [f"{self.path / 'clips' / name}: not made yet; run `qsim generate` again" for name in self.missing]
+        for name in self.names():
+            problems += verify_job(self.path, name)
+        return problems + self.shared_between_splits()
+
+    def shared_between_splits(self) -> list[str]:
+        """Scenes and textures of the test split that another split has too, in words; empty if the split is honest.
+
+        Meshes are not counted: every family may use a sphere.
+        """
+        elsewhere: dict[str, str] = {}
+        for name in self.names("train") + self.names("val"):
+            elsewhere |= dict.fromkeys(_seen_in(self.path / "clips" / name), name)
+        return [
+            f"{self.path / 'clips' / name}: its {asset} is also in {elsewhere[asset]}, which is not a test clip"
+            for name in self.names("test")
+            for asset in _seen_in(self.path / "clips" / name)
+            if asset in elsewhere
+        ]
+
+
+def _seen_in(path: Path) -> list[str]:
+    """Scene and textures of a clip; nothing if it cannot be read."""
+    try:
+        meta = Clip.open(path).meta
+        scene = f"scene {meta['scene']['family']}:{meta['scene']['seed']}"
+        return [scene, *(asset for asset in meta.get("assets", []) if asset.startswith("texture "))]
+    except (ValueError, OSError, KeyError):
+        return []
+
+
+def verify_job(folder: Path, name: str) -> list[str]:
+    """Problems of one finished job's files in words."""
+    try:
+        record = files.read_json(record_path(folder, name))
+        clip = Clip.open(folder / "clips" / name)
+    except (ValueError, OSError) as error:
+        return [str(error)]
+    problems = clip.verify()
+    if files.sha256(clip.path / "clip.json") != record.get("clip"):
+        problems.append(f"{clip.path / 'clip.json'}: contents changed (checksum differs)")
+    for stream, digest in record.get("streams", {}).items():
+        path = clip.path / "streams" / f"{stream}.json"
+        if not path.is_file():
+            problems.append(f"{path}: missing")
+        elif files.sha256(path) != digest:
+            problems.append(f"{path}: contents changed (checksum differs)")
+    return list(dict.fromkeys(problems))
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to generate; nothing here changes a byte of the result."""
+
+    workers: int = 1  # processes; 0: in this one
+    shard: tuple[int, int] | None = None  # (i, n): the i-th of n parts, i = 1 ... n
+    retry: bool = False  # try failed jobs again
+    repair: bool = False  # check all files first and make damaged ones again
+    wait: bool = False  # wait for another generator on the folder instead of refusing
+    limits: Limits = field(default_factory=Limits)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a generation did."""
+
+    jobs: int  # of this shard
+    done: int  # finished now or before
+    made: int  # finished now
+    failed: dict[str, str]  # name -> why, now or before
+    repaired: tuple[str, ...]  # problems that led to jobs done again
+
+
+def generate(
+    recipe: Recipe,
+    path: str | os.PathLike[str],
+    options: Options | None = None,
+    *,
+    make: Make = render_job,
+    run: Run | None = None,
+    on_result: Callable[[Result], None] | None = None,
+) -> Summary:
+    """Make what is missing of a recipe's data set in folder `path`.
+
+    `run` does the jobs (default: local processes; cluster.py has another), `make` renders one clip. `ValueError` if
+    the folder belongs to another recipe or another generator is at work, `OSError` if the disk is full.
+    """
+    options = options or Options()
+    folder = Path(path).resolve()
+    jobs = shard(recipe.jobs, options.shard)
+    with _locked(folder, options):
+        _begin(recipe, folder)
+        repaired = repair(folder, jobs) if options.repair else ()
+        failed = {} if options.retry else _failures(folder, jobs)
+        todo = [job for job in jobs if not record_path(folder, job.name).is_file() and job.name not in failed]
+        made = 0
+        runner = run or _runner(options)
+        with contextlib.closing(runner(todo, folder, make)) as results:
+            for result in results:
+                if result.state == "full":
+                    raise OSError(f"{folder}: {result.message}; nothing is lost: make space and run this again")
+                if result.state == "done":
+                    made += 1
+                else:
+                    failed[result.name] = result.message
+                if on_result is not None:
+                    on_result(result)
+        write_manifest(recipe, folder)
+        done = sum(record_path(folder, job.name).is_file() for job in jobs)
+    return Summary(len(jobs), done, made, failed, repaired)
+
+
+def shard(jobs: tuple[Job, ...], part: tuple[int, int] | None) -> list[Job]:
+    """Every n-th job from the i-th on, so that expensive families spread over the shards."""
+    if part is None:
+        return list(jobs)
+    i, n = part
+    if not 1 <= i <= n:
+        raise ValueError(f"shard {i}/{n}: expected i/n with 1 <= i <= n, as in --shard 7/100")
+    return list(jobs[i - 1 :: n])
+
+
+def repair(folder: Path, jobs: list[Job]) -> tuple[str, ...]:
+    """Check the finished jobs and take back those with damage, so that they are made again; returns the problems."""
+    found: list[str] = []
+    for job in jobs:
+        if not record_path(folder, job.name).is_file():
+            continue
+        problems = verify_job(folder, job.name)
+        if not problems:
+            continue
+        found += problems
+        record_path(folder, job.name).unlink()
+        clip = folder / "clips" / job.name
+        streams = clip / "streams"
+        if all(problem.startswith(str(streams)) for problem in problems):
+            for problem in problems:
+                damaged = Path(problem.split(": ")[0])
+                damaged.with_suffix(".json").unlink(missing_ok=True)
+                damaged.with_suffix(".npy").unlink(missing_ok=True)
+        elif clip.exists():
+            files.remove_folder(clip)
+    return tuple(found)
+
+
+def frames_done(folder: Path, jobs: list[Job]) -> int:
+    """Frames rendered so far, whoever renders them: finished clips and the journals of those at work."""
+    total = 0
+    for job in jobs:
+        if (folder / "clips" / job.name).is_dir():
+            total += job.settings.frames
+        else:
+            with contextlib.suppress(OSError):
+                total += (folder / "work" / f"{job.name}.part" / "journal.jsonl").read_bytes().count(b"\n")
+    return total
+
+
+def write_manifest(recipe: Recipe, folder: Path) -> None:
+    """dataset.json from the recipe and the records that are there now."""
+    lock = files.Lock(folder / "locks" / "manifest")
+    lock.acquire(wait=True)
+    with lock:
+        jobs = {}
+        for job in recipe.jobs:
+            entry: dict[str, Any] = {"split": job.split, "scene": job.scene, "digest": job.digest, "state": "missing"}
+            if record_path(folder, job.name).is_file():
+                entry |= {"state": "done", "record": files.sha256(record_path(folder, job.name))}
+            elif (folder / "failed" / f"{job.name}.json").is_file():
+                entry |= {"state": "failed", "error": files.read_json(folder / "failed" / f"{job.name}.json")["error"]}
+            jobs[job.name] = entry
+        manifest = {
+            "format_version": FORMAT_VERSION,
+            "name": recipe.name,
+            "recipe": recipe.source,
+            "splits": recipe.splits,
+            "jobs": jobs,
+            "complete": all(entry["state"] == "done" for entry in jobs.values()),
+            "software": {"qsim": __version__},
+        }
+        files.write_json(folder / "dataset.json", manifest)
+
+
+def _begin(recipe: Recipe, folder: Path) -> None:
+    for name in _FOLDERS:
+        (folder / name).mkdir(exist_ok=True)
+    if not (folder / "dataset.json").is_file():
+        write_manifest(recipe, folder)
+        return
+    old = Dataset.open(folder).meta["jobs"]
+    for job in recipe.jobs:
+        if job.name not in old:
+            raise ValueError(f"{folder}: was made from another recipe, without the clip {job.name}; use another folder")
+        if old[job.name]["digest"] != job.digest:
+            raise ValueError(f"{folder}: its clip {job.name} was asked for with other settings; use another folder")
+    extra = sorted(set(old) - {job.name for job in recipe.jobs})
+    if extra:
+        raise ValueError(f"{folder}: holds the clip {extra[0]}, which is not in this recipe; use another folder")
+
+
+@contextlib.contextmanager
+def _locked(folder: Path, options: Options) -> Iterator[None]:
+    """One generator per folder, or any number of different shards."""
+    if folder.exists() and not (folder / "locks").is_dir() and any(folder.iterdir()):
+        raise ValueError(f"{folder}: is not empty and not a data set; use another folder")
+    (folder / "locks").mkdir(parents=True, exist_ok=True)
+    locks = [files.Lock(folder / "locks" / "generate", shared=options.shard is not None)]
+    if options.shard is not None:
+        locks.append(files.Lock(folder / "locks" / "shard-{}-of-{}".format(*options.shard)))
+    try:
+        for lock in locks:
+            if not lock.acquire(wait=options.wait):
+                raise ValueError(f"{folder}: another generator is at work here; let it finish, or add --wait")
+        yield
+    finally:
+        for lock in locks:
+            lock.release()
+
+
+def _failures(folder: Path, jobs: list[Job]) -> dict[str, str]:
+    found = {}
+    for job in jobs:
+        path = folder / "failed" / f"{job.name}.json"
+        if path.is_file():
+            found[job.name] = str(files.read_json(path).get("error"))
+    return found
+
+
+def _runner(options: Options) -> Run:
+    if options.workers == 0:
+        return run_here
+
+    def run(jobs: list[Job], folder: Path, make: Make) -> Generator[Result]:
+        return run_local(jobs, folder, make, options.workers, options.limits)
+
+    return run
+
+
+@contextlib.contextmanager
+def watching(folder: Path, jobs: list[Job], report: Progress, every: float = 0.5) -> Iterator[None]:
+    """Report (frames done, frames in all), whatever process or machine does them, while the block runs."""
+    total = sum(job.settings.frames for job in jobs)
+    stop = threading.Event()
+
+    def watch() -> None:
+        while not stop.wait(every):
+            report(frames_done(folder, jobs), total)
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()

@@ -1,0 +1,433 @@
+"""Recipes: one TOML file -> the jobs of a data set. Strict: every mistake is named with file, line and key.
+
+    [recipe]
+    name = "starter"           # letters, digits, '.', '_', '-'
+    frames = 21                # per clip
+    height = 128               # pixels
+    width = 128
+    frame_rate = 2000.0        # frames per second of the scene's time
+    shutter = 0.0              # open share of a frame, 0..1; 0: a sharp instant with the light of a whole frame
+    psnr = 40.0                # wanted error of the radiance, dB
+    seed = 0                   # of the samples and of the noise
+
+    [[scenes]]                 # one clip per family, seed and speed
+    family = "fan"             # a family of scenes/, or a .py file beside the recipe
+    seeds = [0, 1, 2]          # or: count = 3 (seeds first ... first + count - 1; first = 0)
+    speed = [1.0, 2.0]         # factor on all motions, a number or a list; default 1
+    split = "train"            # train, val or test
+    # frames, height, width, frame_rate, shutter, psnr: as above, for these scenes only
+
+    [[streams]]                # optional; one stream per bits and light level, in every clip
+    sensor = "quiver-physical" # a name of `qsim doctor --devices`, or a .toml file beside the recipe
+    bits = 3                   # or a list
+    ppp = [3.25, 26.0]         # photons per pixel and code over the whole clip; or lux = ...; or absolute = true
+    # seed = 1, name = "...", group = true (codes sum clip frames as binary planes), diffraction = true
+
+Splits are by scene: a (family, seed) belongs to one split, whatever its speed, and a family of the test split occurs in
+no other split.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import hashlib
+import re
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from qsim.files import to_json
+from qsim.stream import Sensing, check_name
+
+SPLITS = ("train", "val", "test")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a clip is rendered."""
+
+    frames: int
+    height: int  # pixels
+    width: int  # pixels
+    frame_rate: float  # Hz
+    shutter: float = 0.0  # open share of a frame
+    psnr: float = 40.0  # dB, wanted error of the radiance
+
+
+@dataclass(frozen=True)
+class Job:
+    """One clip with its streams: a pure description; the same job gives the same files."""
+
+    name: str
+    family: str
+    scene_seed: int
+    speed: float
+    split: str
+    settings: Settings
+    seed: int
+    streams: tuple[Sensing, ...]
+
+    @property
+    def scene(self) -> str:
+        """What splits are made by: family and seed."""
+        return f"{Path(self.family).stem}:{self.scene_seed}"
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of everything that decides the job's files."""
+        described = dataclasses.asdict(self) | {"family": Path(self.family).stem}
+        described["streams"] = [stream | {"sensor": Path(stream["sensor"]).name} for stream in described["streams"]]
+        return hashlib.sha256(to_json(described)).hexdigest()
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A data set to be made."""
+
+    name: str
+    jobs: tuple[Job, ...]
+    source: dict[str, Any]  # the TOML file's content, as written
+
+    @property
+    def splits(self) -> dict[str, list[str]]:
+        """Split -> names of its clips."""
+        return {split: [job.name for job in self.jobs if job.split == split] for split in SPLITS}
+
+
+def load(path: str | Path) -> Recipe:
+    """`FileNotFoundError`, or `ValueError` as `FILE:LINE: what is wrong, what to do`."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such recipe")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: not a text file; a recipe is TOML in UTF-8") from None
+    return parse(text, path)
+
+
+def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
+    """A recipe from the text of a TOML file; `path` names it in errors and is where relative files are looked for."""
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        found = re.search(r"at line (\d+)", str(error))
+        line = f":{found[1]}" if found else ""
+        raise ValueError(f"{path}{line}: not valid TOML: {error}") from None
+    return _Reader(text, path).recipe(content)
+
+
+def check_splits(jobs: tuple[Job, ...]) -> None:
+    """`ValueError` if a scene is in two splits, or a family of the test split in another one."""
+    split_of: dict[str, Job] = {}
+    for job in jobs:
+        other = split_of.setdefault(job.scene, job)
+        if other.split != job.split:
+            raise ValueError(
+                f"scene {job.scene} is in the splits '{other.split}' and '{job.split}'; splits are by scene, "
+                "whatever the speed: give one of them other seeds"
+            )
+    tested = {Path(job.family).stem for job in jobs if job.split == "test"}
+    for job in jobs:
+        if job.split != "test" and Path(job.family).stem in tested:
+            raise ValueError(
+                f"family {Path(job.family).stem} is in the splits '{job.split}' and 'test'; the test split holds "
+                "families that training never sees: move its scenes"
+            )
+
+
+class _Reader:
+    """Turns parsed TOML into a `Recipe`; keeps the text to say in which line a mistake is."""
+
+    def __init__(self, text: str, path: Path) -> None:
+        self.lines = text.splitlines()
+        self.path = path
+
+    def recipe(self, content: dict[str, Any]) -> Recipe:
+        self.known(content, ("recipe", "scenes", "streams"), "the recipe", None, 0)
+        if not isinstance(content.get("recipe"), dict):
+            raise ValueError(f"{self.path}: the section [recipe] is missing")
+        head = content["recipe"]
+        self.known(head, ("name", "seed", *_SETTINGS), "[recipe]", "recipe", 0)
+        for key in ("name", "frames", "height", "width", "frame_rate"):
+            if key not in head:
+                raise ValueError(f"{self.where('recipe', 0)}: key '{key}' is missing in [recipe]")
+        name = self.value(head, "name", _text, "recipe", 0)
+        seed = self.value(head, "seed", _seed, "recipe", 0) if "seed" in head else 0
+        defaults = {key: self.value(head, key, check, "recipe", 0) for key, check in _SETTINGS.items() if key in head}
+        streams = [s for i, table in self.tables(content, "streams") for s in self.streams(table, i, seed)]
+        names = [s.stream_name for s in streams]
+        for i, stream in enumerate(names):
+            if stream in names[:i]:
+                raise ValueError(f"{self.path}: two [[streams]] are called '{stream}'; give one of them a name")
+        jobs = []
+        for i, table in self.tables(content, "scenes"):
+            jobs += self.jobs(table, i, defaults, seed, tuple(streams))
+        if not jobs:
+            raise ValueError(f"{self.path}: no [[scenes]], nothing to render")
+        self.check_jobs(jobs)
+        return Recipe(name, tuple(jobs), content)
+
+    def check_jobs(self, jobs: list[Job]) -> None:
+        seen: set[str] = set()
+        for job in jobs:
+            if job.name in seen:
+                raise ValueError(f"{self.path}: the clip {job.name} is asked for twice; give one of them other seeds")
+            seen.add(job.name)
+        try:
+            check_splits(tuple(jobs))
+        except ValueError as error:
+            raise ValueError(f"{self.path}: {error}") from None
+
+    def jobs(
+        self, table: dict[str, Any], i: int, defaults: dict[str, Any], seed: int, streams: tuple[Sensing, ...]
+    ) -> list[Job]:
+        self.known(
+            table, ("family", "seeds", "count", "first", "speed", "split", *_SETTINGS), "[[scenes]]", "scenes", i
+        )
+        if "family" not in table:
+            raise ValueError(f"{self.where('scenes', i)}: key 'family' is missing in [[scenes]]")
+        family = self.family(table, i)
+        seeds = self.seeds(table, i)
+        speeds = self.value(table, "speed", _list(_positive), "scenes", i) if "speed" in table else [1.0]
+        split = self.value(table, "split", _split, "scenes", i) if "split" in table else "train"
+        own = {key: self.value(table, key, check, "scenes", i) for key, check in _SETTINGS.items() if key in table}
+        settings = Settings(**(defaults | own))
+        stem = Path(family).stem
+        return [
+            Job(
+                name=f"{stem}_{s:04d}" + ("" if speed == 1 else f"_x{speed:g}"),
+                family=family,
+                scene_seed=s,
+                speed=speed,
+                split=split,
+                settings=settings,
+                seed=seed,
+                streams=streams,
+            )
+            for s in seeds
+            for speed in speeds
+        ]
+
+    def family(self, table: dict[str, Any], i: int) -> str:
+        family: str = self.value(table, "family", _text, "scenes", i)
+        if family.endswith(".py"):
+            file = (self.path.parent / family).resolve()
+            if not file.is_file():
+                raise ValueError(f"{self.where('scenes', i, 'family')}: no such scene file {file}")
+            return str(file)
+        from scenes import FAMILIES
+
+        if family not in FAMILIES:
+            known = ", ".join(sorted(FAMILIES))
+            raise ValueError(
+                f"{self.where('scenes', i, 'family')}: unknown family {family!r}{_suggest(family, FAMILIES)}; "
+                f"there are: {known}"
+            )
+        return family
+
+    def seeds(self, table: dict[str, Any], i: int) -> list[int]:
+        if "seeds" in table:
+            for key in ("count", "first"):
+                if key in table:
+                    raise ValueError(f"{self.where('scenes', i, key)}: give either seeds or count, not both")
+            return list(self.value(table, "seeds", _list(_seed), "scenes", i))
+        first = self.value(table, "first", _seed, "scenes", i) if "first" in table else 0
+        count = self.value(table, "count", _whole, "scenes", i) if "count" in table else 1
+        return list(range(first, first + count))
+
+    def streams(self, table: dict[str, Any], i: int, seed: int) -> list[Sensing]:
+        keys = ("sensor", "bits", "ppp", "lux", "absolute", "seed", "name", "group", "diffraction")
+        self.known(table, keys, "[[streams]]", "streams", i)
+        if "sensor" not in table:
+            raise ValueError(f"{self.where('streams', i)}: key 'sensor' is missing in [[streams]]")
+        lights = [key for key in ("ppp", "lux", "absolute") if key in table]
+        if len(lights) != 1:
+            given = " and ".join(lights) if lights else "none"
+            raise ValueError(
+                f"{self.where('streams', i)}: give one light level, ppp = ..., lux = ... or absolute = true; "
+                f"{given} given"
+            )
+        sensor = self.sensor(table, i)
+        bits = self.value(table, "bits", _list(_bits), "streams", i) if "bits" in table else [None]
+        flags = {key: self.value(table, key, _flag, "streams", i) for key in ("group", "diffraction") if key in table}
+        own = self.value(table, "seed", _seed, "streams", i) if "seed" in table else seed
+        levels: list[float | None] = [None]
+        if lights != ["absolute"]:
+            levels = self.value(table, lights[0], _list(_positive), "streams", i)
+        elif self.value(table, "absolute", _flag, "streams", i) is not True:
+            raise ValueError(f"{self.where('streams', i, 'absolute')}: absolute can only be true; or give a ppp")
+        name = self.value(table, "name", _text, "streams", i) if "name" in table else None
+        if name is not None and len(bits) * len(levels) > 1:
+            raise ValueError(f"{self.where('streams', i, 'name')}: one name for {len(bits) * len(levels)} streams")
+        return [
+            Sensing(
+                sensor,
+                bits=b,
+                ppp=level if lights == ["ppp"] else None,
+                lux=level if lights == ["lux"] else None,
+                seed=own,
+                name=name,
+                group=group,
+                diffraction=diffraction,
+            )
+            for b in bits
+            for level in levels
+        ]
+
+    def sensor(self, table: dict[str, Any], i: int) -> str:
+        from qsim import devices
+
+        sensor: str = self.value(table, "sensor", _text, "streams", i, plain=False)
+        where = self.where("streams", i, "sensor")
+        if sensor.endswith(".toml"):
+            sensor = str((self.path.parent / sensor).resolve())
+        bits = table.get("bits")
+        try:
+            devices.load(sensor, ppp=3.25, bits=bits if isinstance(bits, int) else None, exposure=5e-4)
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{where}: {error}") from None
+        return sensor
+
+    def tables(self, content: dict[str, Any], key: str) -> list[tuple[int, dict[str, Any]]]:
+        tables = content.get(key, [])
+        if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+            raise ValueError(f"{self.path}: '{key}' must be sections, each beginning with [[{key}]]")
+        return list(enumerate(tables))
+
+    def known(self, table: dict[str, Any], keys: tuple[str, ...], where: str, section: str | None, i: int) -> None:
+        for key in table:
+            if key not in keys:
+                raise ValueError(
+                    f"{self.where(section, i, key)}: unknown key '{key}' in {where}{_suggest(key, keys)}; "
+                    f"known are {', '.join(keys)}"
+                )
+
+    def value(
+        self, table: dict[str, Any], key: str, check: Callable[[Any], Any], section: str, i: int, plain: bool = True
+    ) -> Any:
+        try:
+            value = check(table[key])
+            return check_name(value) if plain and key == "name" else value
+        except ValueError as error:
+            raise ValueError(f"{self.where(section, i, key)}: {key}: {error}") from None
+
+    def where(self, section: str | None, i: int, key: str | None = None) -> str:
+        """`FILE:LINE` of a key in the i-th section of that name (of the section's head without a key)."""
+        number, inside, seen = 0, section is None, -1
+        for n, line in enumerate(self.lines, 1):
+            head = re.match(r"\s*\[\[?\s*([\w.-]+)\s*\]\]?", line)
+            if head:
+                seen += head[1] == section
+                inside = head[1] == (key if section is None else section) and (section is None or seen == i)
+                if inside:
+                    number = n
+                    if key is None or section is None:
+                        break
+            elif inside and key is not None and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*[=.]", line):
+                number = n
+                break
+        return f"{self.path}:{number}" if number else str(self.path)
+
+
+def _suggest(word: str, known: Any) -> str:
+    close = difflib.get_close_matches(word, list(known), n=1)
+    return f"; did you mean '{close[0]}'?" if close else ""
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or not value:
+        raise ValueError(f"expected a text in quotes, got {value!r}")
+    return value
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f"expected true or false, got {value!r}")
+    return value
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"expected a number, got {value!r}")
+    return float(value)
+
+
+def _positive(value: Any) -> float:
+    number = _number(value)
+    if not 0 < number < float("inf"):
+        raise ValueError(f"expected a number above 0, got {value!r}")
+    return number
+
+
+def _whole(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 100_000:
+        raise ValueError(f"expected a whole number from 1 to 100000, got {value!r}")
+    return value
+
+
+def _seed(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**31:
+        raise ValueError(f"expected a whole number from 0 to 2^31 - 1, got {value!r}")
+    return value
+
+
+def _bits(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 16:
+        raise ValueError(f"expected 1 to 16 bits per code, got {value!r}")
+    return value
+
+
+def _frame_rate(value: Any) -> float:
+    number = _positive(value)
+    if not 1 <= number <= 1e8:
+        raise ValueError(f"expected frames per second from 1 to 1e8, got {value!r}; 0.5 ms per frame is 2000.0")
+    return number
+
+
+def _shutter(value: Any) -> float:
+    number = _number(value)
+    if not 0 <= number <= 1:
+        raise ValueError(f"expected the open share of a frame, 0 to 1, got {value!r}; half of the frame is 0.5")
+    return number
+
+
+def _psnr(value: Any) -> float:
+    number = _number(value)
+    if not 10 <= number <= 80:
+        raise ValueError(f"expected the wanted error in dB, 10 to 80, got {value!r}; 40.0 is 1 % of the peak")
+    return number
+
+
+def _split(value: Any) -> str:
+    if value not in SPLITS:
+        raise ValueError(f"expected one of {', '.join(SPLITS)}, got {value!r}")
+    return str(value)
+
+
+def _list(check: Callable[[Any], Any]) -> Callable[[Any], list[Any]]:
+    """A check of one value or of a list of them, without repetitions."""
+
+    def checked(value: Any) -> list[Any]:
+        values = [check(item) for item in value] if isinstance(value, list) else [check(value)]
+        if not values:
+            raise ValueError("expected at least one value, got an empty list")
+        for n, item in enumerate(values):
+            if item in values[:n]:
+                raise ValueError(f"{item!r} is listed twice")
+        return values
+
+    return checked
+
+
+_SETTINGS: dict[str, Callable[[Any], Any]] = {
+    "frames": _whole,
+    "height": _whole,
+    "width": _whole,
+    "frame_rate": _frame_rate,
+    "shutter": _shutter,
+    "psnr": _psnr,
+}
