@@ -82,12 +82,17 @@ def select(prefer: str | None = None) -> Engine:
 
     Raises ValueError when the wanted engine does not work here, with the reason and what to install.
     """
+    engine = choose(prefer)
+    activate(engine)
+    return engine
+
+
+def choose(prefer: str | None = None) -> Engine:
+    """The engine that `select` would activate, without touching Mitsuba (which the sensor's kernels do not need)."""
     wanted = prefer or os.environ.get("QSIM_ENGINE") or None
     if wanted not in (None, *BACKENDS):
         raise ValueError(f"engine {wanted!r}: expected one of {', '.join(BACKENDS)}")
-    engine = _choose(wanted)
-    activate(engine)
-    return engine
+    return _choose(wanted)
 
 
 def activate(engine: Engine) -> None:

@@ -1,0 +1,110 @@
+"""The steps F_0 ... F_(top-1) of a sensor as short sums that a compiled kernel can afford.
+
+A pixel's code is the number of steps F_k that its uniform number u has passed. With lambda expected arrivals:
+
+    QIS            F_k = sum_n D[n, k] Pois(n; lambda)      D is 1 for few electrons, 0 for many, and in between only
+                                                            where read noise blurs the threshold: a narrow band
+    CountingSPAD   F_k = sum_(n <= k) Pois(n; lambda s_k)   s_k: share of the exposure that is live after k counts
+    BinarySPAD     F_0 = exp(-lambda) in each of M planes   a code is the number of planes that fired
+
+The Poisson weights are carried as q_n = exp(-shift) (lambda / scale)^n with coefficients scale^n / n!, so that one
+multiplication and one addition per term suffice and both sides of u exp(lambda - shift) >= sum stay within float32.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from math import ceil, e, lgamma, log, log2, sqrt
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.qis import QIS, electron_table
+from qsim.sensor import Sensor
+from qsim.spad import BinarySPAD, CountingSPAD
+
+_MAX_WORK = 1200  # terms of all sums of one kernel together
+_SINGLE_TERMS = 75  # electrons up to which float32 has the range
+_DOUBLE_TERMS = 500  # and float64
+_NEGLIGIBLE = 1e-12  # a coefficient that small moves no step by more than float64's rounding of the reference
+
+
+@dataclass(frozen=True)
+class Electrons:
+    """Sums over electrons: q_0 ... q_(n-1), and for each step how many come in full and which are weighted."""
+
+    shift: float
+    scale: float
+    full: Array  # [n] coefficient of a whole term, scale^n / n!
+    prefix: tuple[int, ...]  # per step: terms 0 ... prefix - 1 in full
+    band: tuple[Array, ...]  # per step: coefficients of terms prefix, prefix + 1, ...
+    floor: Array  # per step: what every number of electrons contributes (full well), else 0
+
+
+@dataclass(frozen=True)
+class Live:
+    """Sums over counts: step k has k + 1 terms and the live share s_k; steps without live time are never passed."""
+
+    shares: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)  # compared as objects: `plan` makes each once
+class Plan:
+    """How a kernel draws the codes of one sensor at one exposure."""
+
+    efficiency: float  # arrivals per photon, of one plane
+    dark: float  # arrivals without light, of one plane
+    planes: int  # summed into one code; 1 unless BinarySPAD
+    steps: Electrons | Live  # of one plane
+    double: bool  # float64 where float32 lacks the range
+    margin: float  # nearer than this to a step, float arithmetic does not decide
+
+
+@lru_cache(maxsize=256)
+def plan(sensor: Sensor, exposure: float) -> Plan | None:
+    """The plan of a sensor; None where no short form exists and the reference has to draw."""
+    efficiency, dark = sensor.efficiency, sensor.dark_rate * exposure
+    if isinstance(sensor, BinarySPAD) and sensor.bits <= 8:
+        m = sensor.planes
+        return Plan(efficiency / m, dark / m, m, Live((1.0,)), False, _margin(1))
+    if isinstance(sensor, CountingSPAD) and not sensor.paralyzable and sensor.bits <= 4:
+        shares = 1 - np.arange(sensor.levels - 1) * (sensor.dead_time / exposure)
+        live = tuple(float(s) for s in shares[shares > 0])
+        return Plan(efficiency, dark, 1, Live(live), False, _margin(len(live)))
+    if isinstance(sensor, QIS) and sensor.bits <= 8:
+        steps = electrons(sensor)
+        if steps is not None:
+            double = len(steps.full) > _SINGLE_TERMS
+            return Plan(efficiency, dark, 1, steps, double, 2.0**-31 if double else _margin(len(steps.full)))
+    return None
+
+
+def _margin(terms: int) -> float:
+    """Several times the largest float32 error of a step: rounding of u, exp and lambda, and of each term."""
+    return 2e-6 + 1.2e-7 * terms
+
+
+def electrons(sensor: QIS) -> Electrons | None:
+    """The sums of a QIS of at most 8 bits, or None if they are too long."""
+    table = electron_table(sensor, 0, sensor.levels)
+    floor = np.where(table.tail_cdf[:-1] > _NEGLIGIBLE, table.tail_cdf[:-1], 0.0)
+    weights = np.concatenate([np.ones((table.first, sensor.levels - 1)), table.cdf[:, :-1]]) - floor
+    terms = np.flatnonzero((weights > _NEGLIGIBLE).any(axis=1))[-1:] + 1
+    if not terms.size:
+        return None
+    n = int(terms[0])
+    if n > _DOUBLE_TERMS:
+        return None
+    weights = weights[:n]
+    prefix = [int(np.argmin(np.append(column > 1 - _NEGLIGIBLE, False))) for column in weights.T]
+    ends = [int(np.flatnonzero(np.append(True, column > _NEGLIGIBLE))[-1]) for column in weights.T]
+    if 2 * n + sum(max(end - start, 0) for start, end in zip(prefix, ends, strict=True)) > _MAX_WORK:
+        return None
+    # Above lambda = highest even the last step is certain to be passed; below, exp(lambda - shift) must not overflow
+    highest, limit = n + 7 * sqrt(n) + 30, 85.0 if n <= _SINGLE_TERMS else 700.0
+    scale = 2.0 ** max(0, ceil(log2(max(n / e, 1))))
+    numbers = np.arange(n)
+    full = np.exp(numbers * log(scale) - np.array([lgamma(m + 1) for m in numbers]))
+    band = [weights[a:b, k] * full[a:b] for k, (a, b) in enumerate(zip(prefix, ends, strict=True))]
+    return Electrons(max(0.0, highest - limit), scale, full, tuple(prefix), tuple(band), floor)
