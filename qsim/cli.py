@@ -155,13 +155,11 @@ def _run_sense(args: argparse.Namespace) -> int:
     with bar("sensing") as progress:
         for clip in clips:
             for sensing in wanted:
-                start = before
-                found, line = stream.sense(
-                    clip,
-                    sensing,
-                    force=args.force,
-                    progress=lambda done, _, start=start: progress(start + done, frames),
-                )
+
+                def count(done: int, _: int, start: int = before) -> None:
+                    progress(start + done, frames)
+
+                found, line = stream.sense(clip, sensing, force=args.force, progress=count)
                 before += len(clip)
                 made.append({"clip": str(clip.path), "stream": found.name, "light": line, **_light(found.meta)})
     output(args, {"streams": made}, [m["light"] for m in made])

@@ -253,7 +253,9 @@ class _Reader:
             )
         sensor = self.sensor(table, i)
         bits = self.value(table, "bits", _list(_bits), "streams", i) if "bits" in table else [None]
-        flags = {key: self.value(table, key, _flag, "streams", i) for key in ("group", "diffraction") if key in table}
+        group, diffraction = (
+            key in table and self.value(table, key, _flag, "streams", i) for key in ("group", "diffraction")
+        )
         own = self.value(table, "seed", _seed, "streams", i) if "seed" in table else seed
         levels: list[float | None] = [None]
         if lights != ["absolute"]:

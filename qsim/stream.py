@@ -249,11 +249,7 @@ def prepare(clip: Clip, sensing: Sensing) -> Draw:
     sensor = devices.load(sensing.sensor, ppp=level.ppp * planes, bits=sensing.bits, exposure=clip.exposure * planes)
     plane = sensor
     if planes > 1:
-        if sensor.code_model != "binary_sum":
-            raise ValueError(
-                f"{sensing.sensor}: only a clocked SPAD sums planes; its code model is {sensor.code_model}"
-            )
-        plane = dataclasses.replace(sensor, bits=1)
+        plane = _single_plane(sensor, sensing.sensor)
     key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
     return Draw(sensor, plane, level, key, planes, sensing.diffraction)
 
