@@ -1,0 +1,137 @@
+"""Statistics of a stack of frames, one block at a time: everything that a calibration needs, in constant memory.
+
+    codes [t, H, W], block after block  ->  histogram, per-pixel sums of x, x^2 and x_t x_(t+1)
+
+A million frames cost the same memory as one. Codes are integers; float arrays are taken if every value is one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy import ndarray as Array
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """What is kept of T frames at one exposure and one light level."""
+
+    frames: int
+    exposure: float  # s
+    photons: float | None  # per pixel and exposure by a light standard; 0 is dark, None an unknown steady light
+    histogram: Array  # int64 [levels], all pixels and frames
+    total: Array  # float64 [H, W], sum of codes over frames
+    square: Array  # float64 [H, W], sum of squared codes
+    lagged: Array  # float64 [H, W], sum of code(t) code(t + 1)
+    first: Array  # float64 [H, W], the first and the last frame
+    last: Array
+
+    @property
+    def pixels(self) -> int:
+        return self.total.size
+
+    @property
+    def is_dark(self) -> bool:
+        return self.photons == 0
+
+    @property
+    def mean(self) -> float:
+        """Mean code over pixels and frames."""
+        return float(self.total.sum()) / (self.pixels * self.frames)
+
+    @property
+    def pixel_variance(self) -> Array:
+        """Unbiased variance over time of every pixel, [H, W]; NaN for a single frame."""
+        if self.frames < 2:
+            return np.full(self.total.shape, np.nan)
+        return np.maximum(self.square - self.total**2 / self.frames, 0) / (self.frames - 1)
+
+    @property
+    def variance(self) -> float:
+        """Mean over pixels of the variance over time, codes^2: free of the fixed pattern; NaN for a single frame."""
+        return float(self.pixel_variance.mean())
+
+    @property
+    def fixed_pattern(self) -> float:
+        """Variance between the pixels' expected codes: spread of means less what time noise explains; may be < 0."""
+        if self.pixels < 2 or self.frames < 2:
+            return float("nan")
+        return float((self.total / self.frames).var(ddof=1)) - self.variance / self.frames
+
+    def central_moment(self, order: int) -> float:
+        """Pooled central moment of the codes over pixels and frames."""
+        codes = np.arange(self.histogram.size, dtype=float)
+        share = self.histogram / self.histogram.sum()
+        return float(share @ (codes - share @ codes) ** order)
+
+    @property
+    def saturated(self) -> float:
+        """Share of codes at the top level."""
+        return float(self.histogram[-1] / self.histogram.sum())
+
+    @property
+    def lag_covariance(self) -> float:
+        """Mean over pixels of the covariance of neighbouring frames, corrected for the fitted means; NaN below 3."""
+        t = self.frames
+        if t < 3:
+            return float("nan")
+        mean = self.total / t
+        products = self.lagged - mean * (2 * self.total - self.first - self.last) + (t - 1) * mean**2
+        return float((products / (t - 1)).mean()) + self.variance / t
+
+
+def measure(
+    blocks: Iterable[Array], *, bits: int, exposure: float, photons: float | None, name: str = "stack"
+) -> Stack:
+    """Statistics of frames [t, H, W] or [H, W] that come block by block.
+
+    `ValueError` naming the stack, the frame and the pixel for codes that are no integers 0 ... 2^bits - 1, for frames
+    of different sizes, and for a stack without frames.
+    """
+    if not (np.isfinite(exposure) and exposure > 0):
+        raise ValueError(f"{name}: the exposure is in seconds and above 0, got {exposure!r}")
+    if photons is not None and not (np.isfinite(photons) and photons >= 0):
+        raise ValueError(f"{name}: photons are a number of at least 0 (0 = dark), got {photons!r}")
+    frames, sums = 0, None
+    histogram = np.zeros(1 << bits, np.int64)
+    for block in blocks:
+        codes = _as_codes(block, bits, name, frames)
+        histogram += np.bincount(codes.ravel(), minlength=histogram.size)
+        values = codes.astype(np.float64)
+        if sums is None:
+            sums = {key: np.zeros(values.shape[1:]) for key in ("total", "square", "lagged")}
+            first = previous = values[0]
+        elif values.shape[1:] != previous.shape:
+            raise ValueError(f"{name}: frame {frames} is {values.shape[1:]}, the frames before are {previous.shape}")
+        else:
+            sums["lagged"] += previous * values[0]
+        sums["total"] += values.sum(axis=0)
+        sums["square"] += np.einsum("tyx,tyx->yx", values, values)
+        sums["lagged"] += np.einsum("tyx,tyx->yx", values[1:], values[:-1])
+        previous = values[-1]
+        frames += len(values)
+    if sums is None:
+        raise ValueError(f"{name}: has no frames")
+    return Stack(frames, float(exposure), photons, histogram, first=first, last=previous, **sums)
+
+
+def _as_codes(block: Array, bits: int, name: str, frame: int) -> Array:
+    """A block as integers [t, H, W]."""
+    block = np.asarray(block)
+    block = block[None] if block.ndim == 2 else block
+    if block.ndim != 3 or block.size == 0:
+        raise ValueError(f"{name}: expected frames [t, H, W] with at least one pixel, got shape {block.shape}")
+    wrong = ~((block >= 0) & (block < 1 << bits))
+    if block.dtype.kind == "f":
+        wrong |= block != np.floor(block)
+    elif block.dtype.kind not in "uib":
+        raise ValueError(f"{name}: expected numbers, got {block.dtype}")
+    if wrong.any():
+        t, y, x = (int(i) for i in np.argwhere(wrong)[0])
+        raise ValueError(
+            f"{name}: {block[t, y, x]} at (t, y, x) = ({frame + t}, {y}, {x}) is no code of {bits} bits, "
+            f"0..{(1 << bits) - 1}"
+        )
+    return block.astype(np.int64)
