@@ -21,10 +21,17 @@ from torch import Tensor
 class MultiScale(Protocol):
     """Output of the network: every frame pre-denoised, the restored ones at scale 1, 1/2, 1/4 (None = not built)."""
 
-    denoised: Tensor | None
-    scale1: Tensor
-    scale2: Tensor | None
-    scale4: Tensor | None
+    @property
+    def denoised(self) -> Tensor | None: ...
+
+    @property
+    def scale1(self) -> Tensor: ...
+
+    @property
+    def scale2(self) -> Tensor | None: ...
+
+    @property
+    def scale4(self) -> Tensor | None: ...
 
 
 @dataclass(frozen=True)
@@ -46,7 +53,7 @@ class Loss:
 PUBLISHED = Loss(gradient_weight=0.5, gradient="sobel", resize="bilinear")
 # "horizontal and vertical gradients": read as first differences; "bicubic" as the kernel alone
 PAPER = Loss(gradient_weight=1.0, gradient="difference", resize="bicubic")
-L1 = Loss(gradient_weight=0.0, gradient="difference", resize="bilinear")  # of plain controls
+L1 = Loss(0.0, gradient="difference", resize="bilinear", scales=(1.0, 0.0, 0.0), denoised=0.0)  # of plain controls
 PRESETS = {"published": PUBLISHED, "paper": PAPER, "l1": L1}
 
 

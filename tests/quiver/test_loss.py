@@ -66,6 +66,7 @@ def test_outputs_that_are_not_built_cost_nothing():
     target = draw(1, 11, 1, 8, 8)
     bare = Output(None, target[:, 5:6] + 0.1, None, None)
     assert training_loss(bare, target, PUBLISHED, first=5).item() == pytest.approx(0.085, rel=1e-4)
+    assert training_loss(bare, target, L1, first=5).item() == pytest.approx(0.1, rel=1e-4)
     assert training_loss(target[:, 5:6] + 0.1, target, L1, first=5).item() == pytest.approx(0.1, rel=1e-4)
 
 

@@ -1,0 +1,224 @@
+"""The one door from quiver to qsim: clips, light levels, streams, noise, files and console.
+
+    clip, light -> codes [T, H, W] with all that a restorer must know; and the sharp photons it should return
+
+Nothing here needs torch. Training windows, a `torch` data set, are in samples.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import devices, keys
+from qsim.clip import Clip
+from qsim.console import Parser, bar, command, output, run, suggest
+from qsim.dataset import Dataset
+from qsim.files import read_json, replacing, write_bytes, write_json
+from qsim.keys import Key
+from qsim.optics import clip_photons, light_level
+from qsim.sensor import Sensor
+from qsim.stream import Sensing, Stream, prepare
+from quiver.code_table import TABLE_BITS, CodeTable
+
+__all__ = [
+    "Clip",
+    "Codes",
+    "Key",
+    "Light",
+    "Parser",
+    "Sensor",
+    "array_codes",
+    "bar",
+    "clip_photons",
+    "command",
+    "cube_codes",
+    "draw_codes",
+    "has_sharp",
+    "light_level",
+    "open_clips",
+    "output",
+    "read_json",
+    "replacing",
+    "run",
+    "sensed",
+    "stream_codes",
+    "suggest",
+    "truth",
+    "write_bytes",
+    "write_json",
+]
+
+
+@dataclass(frozen=True)
+class Light:
+    """A light level and the sensor that sees it."""
+
+    sensor: str = "quiver-physical"  # a named device of qsim, or a TOML file
+    ppp: float | None = 3.25  # mean photons per pixel and exposure over the clip; None = the clip's own light
+    bits: int | None = 3  # None = the device's own
+
+    def device(self, exposure: float) -> Sensor:
+        """The sensor for clips with this exposure [s]."""
+        return _device(self, exposure)
+
+    @property
+    def label(self) -> str:
+        """`3.25 PPP, 3 bit`, as tables show it."""
+        return ", ".join(
+            (
+                "own light" if self.ppp is None else f"{self.ppp:g} PPP",
+                "own bits" if self.bits is None else f"{self.bits} bit",
+            )
+        )
+
+
+@lru_cache(maxsize=64)
+def _device(light: Light, exposure: float) -> Sensor:
+    return devices.load(light.sensor, ppp=light.ppp, bits=light.bits, exposure=exposure)
+
+
+@lru_cache(maxsize=64)
+def _code_table(sensor: Sensor, exposure: float) -> CodeTable | None:
+    """None for a sensor that a table cannot hold."""
+    if sensor.bits > TABLE_BITS:
+        return None
+    try:
+        return CodeTable(sensor, exposure)
+    except ValueError:
+        return None
+
+
+def draw_codes(sensor: Sensor, photons: Array, exposure: float, key: Key) -> Array:
+    """Codes [T, H, W] of expected photons [T, H, W], frame t under `key.at(key.frame + t)`.
+
+    The numbers of `sensor.sample(..., engine="reference")`, without Dr.Jit and quickly for few-bit sensors.
+    """
+    table = _code_table(sensor, exposure)
+    if table is None or not photons.min() >= 0:  # the sensor names the bad pixel
+        return sensor.sample(photons, exposure, key=key, engine="reference")
+
+    def words(redraw: int) -> Array:
+        frames = (keys.words(key.at(key.frame + t), photons.shape[1:], redraw=redraw) for t in range(len(photons)))
+        return np.stack(list(frames))
+
+    first = words(0)
+    try:
+        return table.draw(photons, first)
+    except LookupError:
+        return table.draw(photons, first, words(1))
+
+
+def open_clips(path: Path | str, split: str | None = None) -> list[Clip]:
+    """The finished clips of a data set folder, all or of one split; or the one clip of a clip folder."""
+    path = Path(path)
+    return [Clip.open(path)] if (path / "clip.json").exists() else Dataset.open(path).clips(split)
+
+
+def has_sharp(clip: Clip) -> bool:
+    """Whether the clip stores sharp frames beside the exposed ones."""
+    return "sharp/000000.exr" in clip.meta["checksums"]
+
+
+@dataclass(frozen=True)
+class Codes:
+    """A few-bit stream with all that a restorer must know; frames are read when asked for."""
+
+    name: str
+    shape: tuple[int, int, int]  # T, H, W
+    sensor: Sensor
+    exposure: float  # s, of one code
+    frame_rate: float  # codes per second
+    read: Callable[[int, int], Array]  # codes uint8 [stop - start, H, W] of frames start .. stop - 1
+    source: str  # where they come from, for provenance
+
+    @property
+    def white(self) -> float:
+        """Photons at which x = 1."""
+        return self.sensor.white(self.exposure)
+
+
+def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "codes", source: str = "memory") -> Codes:
+    """Codes [T, H, W] in memory or a memory map; `ValueError` if empty or with codes the sensor cannot produce."""
+    if codes.ndim != 3 or codes.size == 0 or not np.issubdtype(codes.dtype, np.integer):
+        raise ValueError(f"{name}: expected integer codes [T, H, W], none of them 0, got {codes.dtype} {codes.shape}")
+
+    def read(start: int, stop: int) -> Array:
+        part = np.asarray(codes[start:stop])
+        if part.max() >= sensor.levels or part.min() < 0:
+            t, y, x = (int(i) for i in np.argwhere((part < 0) | (part >= sensor.levels))[0])
+            raise ValueError(
+                f"{name}: code {part[t, y, x]} at (t, y, x) = {(t + start, y, x)}; a {sensor.bits}-bit sensor has "
+                f"0..{sensor.levels - 1}; give the right --bits"
+            )
+        return part
+
+    return Codes(name, codes.shape, sensor, exposure, 1 / exposure, read, source)
+
+
+def sensed(clip: Clip, light: Light, seed: int = 0) -> tuple[Codes, float]:
+    """A clip as a sensor sees it, drawn when read, and the light factor: the codes that `qsim sense` would store."""
+    draw = prepare(clip, Sensing(light.sensor, bits=light.bits, ppp=light.ppp, seed=seed))
+    codes = Codes(
+        name=f"{clip.name}, {light.label}",
+        shape=clip.shape,
+        sensor=draw.sensor,
+        exposure=clip.exposure,
+        frame_rate=clip.frame_rate,
+        read=lambda start, stop: draw.frames(clip, start, stop),
+        source=f"{clip.path} seen by {light.sensor} ({light.label}), seed {seed}",
+    )
+    return codes, draw.level.factor
+
+
+def stream_codes(stream: Stream) -> Codes:
+    """A stored stream."""
+    meta = stream.meta
+    return Codes(
+        stream.name,
+        stream.shape,
+        stream.sensor,
+        stream.exposure,
+        float(meta["frame_rate"]),
+        stream.codes,
+        str(stream.path),
+    )
+
+
+def truth(clip: Clip, factor: float, start: int, stop: int) -> Array:
+    """Sharp expected photons [stop - start, H, W] of a clip under a light factor: what a restorer should return."""
+    return np.stack([clip_photons(clip, t, factor, sharp=True) for t in range(start, stop)])
+
+
+def cube_codes(
+    path: Path, light: Light, frame_rate: float, *, planes: int | None = None, width: int | None = None
+) -> Codes:
+    """Codes from a bare .npy: uint8 codes [T, H, W], or with `width` binary planes [T, H, ceil(W/8)], first pixel in
+    the highest bit. `planes` = 2^b - 1 of them are summed to one b-bit code; `frame_rate` counts codes per second.
+    """
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"{path}: not readable as an array ({error})") from None
+    if width is not None:
+        array = _summed_planes(path, array, planes or 1, width)
+    sensor = light.device(1 / frame_rate)
+    return array_codes(array, sensor, 1 / frame_rate, name=path.name, source=str(path))
+
+
+def _summed_planes(path: Path, cube: Array, planes: int, width: int) -> Array:
+    if cube.ndim != 3 or cube.dtype != np.uint8 or cube.shape[2] != (width + 7) // 8:
+        raise ValueError(
+            f"{path}: {cube.dtype} {list(cube.shape)} is no cube of packed planes {width} px wide; "
+            f"that would be uint8 [T, H, {(width + 7) // 8}]"
+        )
+    frames = len(cube) // planes
+    if frames == 0:
+        raise ValueError(f"{path}: {len(cube)} planes are fewer than the {planes} of one code")
+    groups = (np.unpackbits(cube[t * planes : (t + 1) * planes], axis=2, count=width) for t in range(frames))
+    return np.stack([group.sum(axis=0, dtype=np.uint8) for group in groups])

@@ -1,0 +1,307 @@
+"""Restoring streams of any length and size, with any method, in bounded memory.
+
+    codes [T, H, W] -> restored photons [T, H, W], float32
+
+Edges are padded inside: time by reflection, so that every frame is restored; space by repetition up to the multiple the
+network needs. A frame too large for the memory bound is cut into overlapping tiles whose results are blended. No ground
+truth is needed. `restorer(NAME)` finds a classical method, shipped weights, a weights file or a training folder.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from quiver.baselines import METHODS
+from quiver.baselines.windows import look_ahead, window_frames
+from quiver.data import Codes, write_json
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor, nn
+
+PRETRAINED = Path(__file__).parent / "pretrained"  # weights that ship with the package
+DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory beside the weights
+CLASSICAL_BYTES = 200  # per pixel and frame held at once, about, of the hungriest classical method
+OVERLAP = 32  # px that neighbouring tiles share
+MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/reuse.py
+
+Progress = Callable[[int, int], None]  # (steps done, steps in all)
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to run, not what to compute: apart from `mode` and `precision` the numbers agree to rounding."""
+
+    memory: int = DEFAULT_MEMORY  # bytes
+    mode: str = "exact"  # exact = the published windows; streaming = state carried on, faster; windows = recomputed
+    device: str = "auto"  # auto, cpu, cuda
+    precision: str = "float32"  # or bfloat16
+
+    def __post_init__(self) -> None:
+        if self.mode not in MODES:
+            raise ValueError(f"mode {self.mode!r}; known are {', '.join(MODES)}")
+        if self.precision not in ("float32", "bfloat16"):
+            raise ValueError(f"precision {self.precision!r}; known are float32 and bfloat16")
+        if self.memory < 1:
+            raise ValueError(f"memory is a number of bytes above 0, got {self.memory}")
+
+
+@dataclass(frozen=True)
+class Restorer:
+    """A method ready to run, and what a table says about it."""
+
+    name: str
+    window: int  # frames used for one restored frame
+    look_ahead: int  # of these, future ones
+    learned: bool
+    description: str
+    fill: Callable[[Codes, Array, Progress | None], None]  # writes photons into [T, H, W]
+
+    def restore(self, codes: Codes, progress: Progress | None = None) -> Array:
+        """Restored photons float32 [T, H, W]."""
+        out = np.zeros(codes.shape, np.float32)
+        self.fill(codes, out, progress)
+        return out
+
+
+def restorer(name: str, options: Options | None = None) -> Restorer:
+    """A method by name, shipped preset, weights file or training folder; ValueError or FileNotFoundError otherwise."""
+    options = options or Options()
+    if name in METHODS:
+        method = METHODS[name]
+
+        def fill(codes: Codes, out: Array, progress: Progress | None) -> None:
+            fill_classical(method.restore, method.window, codes, out, options.memory, progress)
+
+        return Restorer(name, method.window, look_ahead(method.window), False, method.description, fill)
+    return network_restorer(weights_path(name), name, options)
+
+
+def weights_path(name: str) -> Path:
+    """The weights file meant by a name, a file or a training folder."""
+    path = Path(name)
+    if path.suffix == ".safetensors":
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such weights file")
+        return path
+    if path.is_dir():
+        if not (path / "best.safetensors").is_file():
+            raise FileNotFoundError(f"{path}: holds no best.safetensors; is it a folder of `quiver train`?")
+        return path / "best.safetensors"
+    shipped = sorted(file.stem for file in PRETRAINED.glob("*.safetensors"))
+    if name in shipped:
+        return PRETRAINED / f"{name}.safetensors"
+    raise ValueError(
+        f"no method {name!r}; known are {', '.join([*METHODS, *shipped])}, a .safetensors file, "
+        "and a folder of `quiver train`"
+    )
+
+
+def network_restorer(path: Path, name: str, options: Options) -> Restorer:
+    """The network stored in a weights file."""
+    import torch
+
+    from quiver.model import RADIUS, WINDOW
+    from quiver.weights import load
+
+    device = torch.device(pick_device(options.device))
+    model = load(path).to(device)
+    shown = path.parent.name if path.name == "best.safetensors" else path.stem
+
+    def fill(codes: Codes, out: Array, progress: Progress | None) -> None:
+        fill_network(model, codes, out, options, progress)
+
+    return Restorer(shown, WINDOW, RADIUS, True, f"{type(model).__name__}, {name}", fill)
+
+
+def pick_device(wanted: str) -> str:
+    """`auto` is CUDA where there is one."""
+    import torch
+
+    if wanted == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: torch finds no CUDA device here; use --device cpu")
+    return wanted
+
+
+def fill_classical(
+    restore: Callable[..., Array], window: int, codes: Codes, out: Array, memory: int, progress: Progress | None
+) -> None:
+    """Run a classical method over blocks of frames with `window` frames of context on both sides."""
+    length, height, width = codes.shape
+    block = max(1, memory // (CLASSICAL_BYTES * height * width) - 2 * window)
+    for start in range(0, length, block):
+        stop = min(start + block, length)
+        first, last = max(0, start - window), min(length, stop + window)
+        restored = restore(codes.read(first, last), codes.sensor, codes.exposure)
+        out[start:stop] = restored[start - first : stop - first]
+        if progress is not None:
+            progress(stop, length)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A part of the frame and how much its result counts, [h, w]; the weights of all tiles sum to 1 at every pixel."""
+
+    y: int
+    x: int
+    weight: Array
+
+
+def spans(length: int, side: int, overlap: int) -> list[tuple[int, Array]]:
+    """Starts and weights of spans of `side` that cover `length` with at least `overlap` shared; weights sum to 1."""
+    if length <= side:
+        return [(0, np.ones(length, np.float32))]
+    count = -(-(length - overlap) // (side - overlap))
+    starts = [round(i * (length - side) / (count - 1)) for i in range(count)]
+    ramp = np.minimum(1.0, np.arange(1, side + 1) / (overlap + 1))
+    total = np.zeros(length)
+    shapes = []
+    for i, start in enumerate(starts):
+        rise = ramp if i > 0 else np.ones(side)
+        fall = ramp[::-1] if i < count - 1 else np.ones(side)
+        shapes.append(rise * fall)
+        total[start : start + side] += shapes[-1]
+    return [
+        (start, (shape / total[start : start + side]).astype(np.float32))
+        for start, shape in zip(starts, shapes, strict=True)
+    ]
+
+
+def plan_tiles(height: int, width: int, pixels: int, overlap: int = OVERLAP) -> list[Tile]:
+    """Tiles of at most `pixels` pixels, near-square unless the frame is flat. ValueError if less than a tile fits."""
+    if height * width <= pixels:
+        return [Tile(0, 0, np.ones((height, width), np.float32))]
+    least = 2 * overlap + 16
+    side = int(pixels**0.5)
+    tall = height if height <= side else max(min(side, height), min(least, height))
+    wide = min(width, pixels // tall)
+    tall = min(height, pixels // wide) if wide else 0
+    if (tall < least and tall < height) or (wide < least and wide < width):
+        raise ValueError(
+            f"the memory bound holds {pixels} pixels at a time; a tile needs at least {least} x {least}; raise --memory"
+        )
+    return [
+        Tile(y, x, rows[:, None] * columns[None, :])
+        for y, rows in spans(height, tall, overlap)
+        for x, columns in spans(width, wide, overlap)
+    ]
+
+
+def fill_network(model: nn.Module, codes: Codes, out: Array, options: Options, progress: Progress | None) -> None:
+    """Restore tile by tile, frame by frame; `out` must be zero and collects the weighted tiles."""
+    import torch
+
+    length, height, width = codes.shape
+    device = next(model.parameters()).device
+    dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
+    tiles = plan_tiles(height, width, options.memory // bytes_per_pixel(model))
+    done = 0
+    for tile in tiles:
+        rows, columns = tile.weight.shape
+        part = (slice(tile.y, tile.y + rows), slice(tile.x, tile.x + columns))
+        frames = (pad_space(frame, int(model.multiple)).to(device) for frame in padded_frames(codes, part))  # type: ignore[arg-type]
+        with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
+            for t, picture in enumerate(pictures(model, frames, options.mode)):
+                restored = picture[0, 0, :rows, :columns].float().cpu().numpy()
+                out[(t, *part)] += tile.weight * restored * np.float32(codes.white)
+                done += 1
+                if progress is not None:
+                    progress(done, length * len(tiles))
+
+
+def padded_frames(codes: Codes, part: tuple[slice, slice]) -> Iterator[Tensor]:
+    """Frames -5 ... T+4 of a stream (reflected at its ends) as networks see them, [1, 1, h, w]."""
+    import torch
+
+    length, top = codes.shape[0], codes.sensor.levels - 1
+    before, after = window_frames(0, 11, length)[:5], window_frames(length - 1, 11, length)[6:]
+    for t in (*before, *range(length), *after):
+        frame = codes.read(int(t), int(t) + 1)[(0, *part)].astype(np.float32) / np.float32(top)
+        yield torch.from_numpy(frame)[None, None]
+
+
+def pad_space(frame: Tensor, multiple: int) -> Tensor:
+    """[1, 1, h, w] continued to the right and down by its last pixels, up to multiples of `multiple`."""
+    import torch.nn.functional as functional
+
+    height, width = frame.shape[-2:]
+    return functional.pad(frame, (0, -width % multiple, 0, -height % multiple), mode="replicate")
+
+
+def pictures(model: nn.Module, frames: Iterable[Tensor], mode: str) -> Iterator[Tensor]:
+    """Restored frames [1, 1, h, w], one for each frame that has five before and five after it."""
+    import torch
+
+    from quiver import reuse
+    from quiver.model import QUIVER, WINDOW
+
+    if isinstance(model, QUIVER) and mode != "windows":
+        yield from (reuse.exact if mode == "exact" else reuse.stream)(model, frames)
+        return
+    window: deque[torch.Tensor] = deque(maxlen=WINDOW)
+    for frame in frames:
+        window.append(frame)
+        if len(window) == WINDOW:
+            yield model(torch.stack(list(window), dim=1)).scale1[:, 0]
+
+
+def bytes_per_pixel(model: nn.Module) -> int:
+    """Working memory of a network per pixel of the tile, float32; measured on CPU (peak of the process)."""
+    from quiver.model import QUIVER
+
+    if isinstance(model, QUIVER):
+        return int((2500 + 1100 * model.config.channels) / model.config.fold**2)
+    return 12_000
+
+
+def restore_to_file(codes: Codes, method: Restorer, path: Path, progress: Progress | None = None) -> dict[str, Any]:
+    """Restore a stream into PATH.npy (float32 photons [T, H, W]) and PATH.json; both appear when whole, the json last.
+
+    Returns what the json says. Works on disk: the result never has to fit into memory.
+    """
+    description, temporary = path.with_suffix(".json"), path.with_name(f"{path.name}.tmp-{os.getpid()}")
+    started = time.perf_counter()
+    try:
+        with open(temporary, "wb") as file:
+            out = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.float32, shape=codes.shape)
+            method.fill(codes, out, progress)
+            check_finite(out, method.name)
+            out.flush()
+            os.fsync(file.fileno())
+        description.unlink(missing_ok=True)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    meta = {
+        "format": "quiver-restored-1",
+        "method": method.name,
+        "description": method.description,
+        "unit": "photons",
+        "white": codes.white,
+        "shape": list(codes.shape),
+        "frame_rate": codes.frame_rate,
+        "exposure": codes.exposure,
+        "sensor": codes.sensor.to_dict(),
+        "source": codes.source,
+        "seconds_per_frame": (time.perf_counter() - started) / codes.shape[0],
+    }
+    write_json(description, meta)
+    return meta
+
+
+def check_finite(restored: Array, name: str) -> None:
+    """ValueError naming the first frame with a value that is not finite."""
+    for t, frame in enumerate(restored):
+        if not np.isfinite(frame).all():
+            raise ValueError(f"{name}: restored frame {t} holds NaN or Inf; are the weights damaged?")

@@ -1,0 +1,186 @@
+"""Training windows from the clips of any data set folder: a plain `torch` data set, usable without our loop.
+
+    clip -> photons of a window and its sharp truth -> codes, drawn on the fly -> codes/(2^b - 1), photons/white
+
+Sample n is a function of (seed, n) alone: which clip, where, how turned, at which light level, and every bit of its
+noise; so 0, 1 or 8 workers give the same bytes and a killed run goes on with the sample it would have drawn. Sample
+n + e * len(windows) is sample n of epoch e: count on to get fresh noise. Dr.Jit, which does not survive a fork, is
+never touched.
+
+    windows = Windows(open_clips("out/starter", "train"), WindowSettings(crop=64))
+    loader = DataLoader(windows, batch_sampler=Batches(8, first=0, last=1000))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy import ndarray as Array
+from torch.utils.data import Dataset, Sampler
+
+from quiver.data import Clip, Key, Light, Sensor, clip_photons, draw_codes, has_sharp, light_level
+
+TRAINING, VALIDATION = 1, 2  # stages of the random keys: no two uses share noise (0 is `qsim sense`)
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """What a training sample is."""
+
+    lights: tuple[Light, ...] = (Light(),)  # each sample draws one
+    frames: int = 11
+    crop: int = 64  # px, side of the square; validation takes the centre
+    flips: bool = True  # the eight flips and quarter turns
+    reverse: bool = True  # half of the windows run backwards in time
+    force_exposure: bool = False  # published: every window is brought to the light level on its own
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.frames < 1 or self.crop < 1:
+            raise ValueError(f"WindowSettings: frames and crop must be at least 1, got {self.frames} and {self.crop}")
+        if not self.lights:
+            raise ValueError("WindowSettings.lights is empty; give at least one light level")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where sample n comes from and how it is turned: enough to make it again."""
+
+    clip: int
+    start: int
+    y: int
+    x: int
+    light: int
+    turn: int  # quarter turns 0..3, + 4 = mirrored first
+    backwards: bool
+    key: Key
+
+
+class Windows(Dataset[dict[str, Any]]):
+    """Windows of `frames` frames from the clips of a folder, with fresh noise: a map-style `torch` data set.
+
+    item: codes float32 [T, 1, h, w] in [0, 1], target float32 [T, 1, h, w] = sharp photons / white (may exceed 1), and
+    white [photons], ppp, sample (its number), key (text: clip, place, light, random key). `ValueError` for a folder
+    without clips and for clips shorter or smaller than a window.
+    """
+
+    def __init__(
+        self, clips: Sequence[Clip], settings: WindowSettings, *, fixed: bool = False, repeats: int = 1
+    ) -> None:
+        """`fixed` is for validation: sample n is the same in every epoch, from the middle of its clip, not turned.
+
+        An epoch holds `repeats` windows of every clip (fixed: one per clip and light level).
+        """
+        check_clips(clips, settings)
+        self.clips, self.settings, self.fixed = tuple(clips), settings, fixed
+        self.length = len(clips) * (len(settings.lights) if fixed else repeats)
+        self._factors: dict[tuple[int, int], float] = {}
+
+    def __len__(self) -> int:
+        return self.length
+
+    def place(self, n: int) -> Place:
+        """Where sample n lies, without reading it."""
+        if self.fixed:
+            return self._middle(n % self.length)
+        settings, (epoch, index) = self.settings, divmod(n, self.length)
+        clip = int(np.random.default_rng((settings.seed, epoch)).permutation(self.length)[index]) % len(self.clips)
+        rng = np.random.default_rng((settings.seed, epoch, index))
+        length, height, width = self.clips[clip].shape
+        return Place(
+            clip=clip,
+            start=int(rng.integers(length - settings.frames + 1)),
+            y=int(rng.integers(height - settings.crop + 1)),
+            x=int(rng.integers(width - settings.crop + 1)),
+            light=int(rng.integers(len(settings.lights))),
+            turn=int(rng.integers(8)) if settings.flips else 0,
+            backwards=bool(rng.integers(2)) if settings.reverse else False,
+            key=Key(seed=settings.seed, clip=n, stage=TRAINING),
+        )
+
+    def _middle(self, index: int) -> Place:
+        settings, clip = self.settings, index % len(self.clips)
+        length, height, width = self.clips[clip].shape
+        start, y, x = (length - settings.frames) // 2, (height - settings.crop) // 2, (width - settings.crop) // 2
+        key = Key(seed=settings.seed, clip=index, stage=VALIDATION)
+        return Place(clip, start, y, x, index // len(self.clips), 0, False, key)
+
+    def __getitem__(self, n: int) -> dict[str, Any]:
+        place = self.place(n)
+        clip, light = self.clips[place.clip], self.settings.lights[place.light]
+        sensor = light.device(clip.exposure)
+        photons, sharp = self._photons(place)
+        exposed = photons
+        if self.settings.force_exposure and light.ppp is not None:
+            exposed = photons * (light.ppp / max(float(photons.mean()), 1e-9))
+        codes = draw_codes(sensor, exposed, clip.exposure, place.key)
+        white = sensor.white(clip.exposure)
+        return {
+            "codes": as_input(codes, sensor),
+            "target": torch.from_numpy((sharp / white).astype(np.float32))[:, None],
+            "white": white,
+            "ppp": float(exposed.mean()),
+            "sample": n,
+            "key": f"{clip.name} frame {place.start}, (y, x) ({place.y}, {place.x}), turn {place.turn}, "
+            f"{'backwards, ' if place.backwards else ''}{light.label}, {place.key}",
+        }
+
+    def _photons(self, place: Place) -> tuple[Array, Array]:
+        """Expected photons of the exposed and of the sharp window, [T, h, w], turned."""
+        clip, side = self.clips[place.clip], self.settings.crop
+        times, crop = range(place.start, place.start + self.settings.frames), (place.y, place.x, side, side)
+        factor = self._factor(place.clip, place.light)
+        exposed = np.stack([clip_photons(clip, t, factor, crop) for t in times])
+        sharp = (
+            np.stack([clip_photons(clip, t, factor, crop, sharp=True) for t in times]) if has_sharp(clip) else exposed
+        )
+        return turned(exposed, place), turned(sharp, place)
+
+    def _factor(self, clip: int, light: int) -> float:
+        if (clip, light) not in self._factors:
+            self._factors[clip, light] = light_level(self.clips[clip], ppp=self.settings.lights[light].ppp).factor
+        return self._factors[clip, light]
+
+
+def turned(window: Array, place: Place) -> Array:
+    """A window [T, h, w] flipped, turned and reversed as its place says."""
+    window = window[:, :, ::-1] if place.turn >= 4 else window
+    window = np.rot90(window, place.turn % 4, axes=(1, 2))
+    return np.ascontiguousarray(window[::-1] if place.backwards else window)
+
+
+def as_input(codes: Array, sensor: Sensor) -> torch.Tensor:
+    """Codes [T, H, W] as networks see them: float32 [T, 1, H, W], codes / (2^b - 1)."""
+    return torch.from_numpy(codes.astype(np.float32) / np.float32(sensor.levels - 1))[:, None]
+
+
+def check_clips(clips: Sequence[Clip], settings: WindowSettings) -> None:
+    """ValueError naming the first clip that holds no window."""
+    if not clips:
+        raise ValueError("no complete clip to draw windows from; is the split right, has `qsim generate` finished?")
+    for clip in clips:
+        length, height, width = clip.shape
+        if length < settings.frames or min(height, width) < settings.crop:
+            raise ValueError(
+                f"clip {clip.name} is {length} x {height} x {width}; a window needs {settings.frames} frames of "
+                f"{settings.crop} x {settings.crop} px; choose a smaller --crop or longer clips"
+            )
+
+
+class Batches(Sampler[list[int]]):
+    """Sample numbers of batch after batch, from batch `first` on; of `world` processes each gets its own share."""
+
+    def __init__(self, batch: int, first: int, last: int, rank: int = 0, world: int = 1) -> None:
+        self.batch, self.first, self.last, self.rank, self.world = batch, first, last, rank, world
+
+    def __iter__(self) -> Iterator[list[int]]:
+        for step in range(self.first, self.last):
+            start = (step * self.world + self.rank) * self.batch
+            yield list(range(start, start + self.batch))
+
+    def __len__(self) -> int:
+        return self.last - self.first
