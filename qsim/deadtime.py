@@ -22,7 +22,7 @@ the few counts after the first then follow from the series of binomial moments, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from functools import lru_cache
 from math import floor, gamma
 
@@ -45,29 +45,36 @@ class Paralyzable:
 
     def cdf(self, mean: Array) -> Array:
         """P(code <= k): [p] -> [p, levels]."""
-        return self._choose(mean, Mixture.evaluate_cdf, lambda m: _sparse(m, self.ratio, self.levels)[0])
+        result = np.empty((len(mean), self.levels))
+        for rows, table in self._tables(mean):
+            result[rows] = table.evaluate_cdf(mean[rows]) if table else self._sparse(mean[rows])[0]
+        return result
 
-    def log_pmf(self, mean: Array) -> Array:
-        """log P(code = k): [p] -> [p, levels]."""
-        result = self._choose(mean, Mixture.evaluate_log_pmf, lambda m: _sparse(m, self.ratio, self.levels)[1])
+    def log_pmf(self, mean: Array, wanted: Array | None = None) -> Array:
+        """log P(code = k): [p] -> [p, levels]; `wanted` as in Mixture."""
+        result = np.empty((len(mean), self.levels))
+        for rows, table in self._tables(mean):
+            some = None if wanted is None else wanted[rows]
+            result[rows] = table.evaluate_log_pmf(mean[rows], some) if table else self._sparse(mean[rows])[1]
         result[:, 0] = -mean
         return result
 
     def slope(self, mean: Array) -> Array:
         """dcdf/dmean: [p] -> [p, levels]."""
-        return self._choose(mean, Mixture.evaluate_slope, lambda m: _sparse(m, self.ratio, self.levels)[2])
+        result = np.empty((len(mean), self.levels))
+        for rows, table in self._tables(mean):
+            result[rows] = table.evaluate_slope(mean[rows]) if table else self._sparse(mean[rows])[2]
+        return result
 
-    def _choose(self, mean: Array, mix: Callable[[Mixture, Array], Array], sparse: Callable[[Array], Array]) -> Array:
+    def _tables(self, mean: Array) -> Iterator[tuple[Array, Mixture | None]]:
         """Light levels in groups, each with a table just long enough (the Poisson tail left out is below 1e-30)."""
         length = np.exp2(np.ceil(np.log2(mean + 12 * np.sqrt(mean) + 60)))
-        result = np.empty((len(mean), self.levels))
         for last in np.unique(length):
-            group = length == last
-            if last <= _LONGEST:
-                result[group] = mix(arrival_table(self.ratio, self.levels, int(last)), mean[group])
-            else:
-                result[group] = sparse(mean[group])
-        return result
+            table = arrival_table(self.ratio, self.levels, int(last)) if last <= _LONGEST else None
+            yield np.flatnonzero(length == last), table
+
+    def _sparse(self, mean: Array) -> tuple[Array, Array, Array]:
+        return _sparse(mean, self.ratio, self.levels)
 
 
 @lru_cache(maxsize=16)

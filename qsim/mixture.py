@@ -76,29 +76,45 @@ class Mixture:
         """d cdf / d mean: [p] -> [p, levels]."""
         return self._mix(mean, self.slope, None)
 
-    def evaluate_log_pmf(self, mean: Array) -> Array:
-        """log P(code = k): [p] -> [p, levels]; -inf only where no n of the table gives the code."""
+    def evaluate_log_pmf(self, mean: Array, wanted: Array | None = None) -> Array:
+        """log P(code = k): [p] -> [p, levels]; -inf only where no n of the table gives the code.
+
+        Probabilities below 1e-290 are summed in logarithms, which is slow: `wanted`, bool [p, levels], can excuse some.
+        """
         pmf = self._mix(mean, np.exp(self.log_pmf), np.exp(self.tail_log_pmf))
+        deep = pmf < _UNDERFLOW
+        if wanted is not None:
+            deep &= wanted
         with np.errstate(divide="ignore"):
             result = np.log(pmf)
-        rows, codes = np.nonzero(pmf < _UNDERFLOW)
-        step = max(1, _CHUNK // len(self.log_pmf))
+        rows = np.flatnonzero(deep.any(axis=1))
+        step = max(1, _CHUNK // (len(self.log_pmf) + 1) // 16)
         for start in range(0, len(rows), step):
-            r, k = rows[start : start + step], codes[start : start + step]
-            result[r, k] = self._log_sum(mean[r], k)
+            block = rows[start : start + step]
+            within, codes = np.nonzero(deep[block])
+            result[block[within], codes] = self._log_sum(mean[block], within, codes)
         return result
 
-    def _log_sum(self, mean: Array, codes: Array) -> Array:
-        """The same sum in logarithms, for single pairs of mean and code: [p], [p] -> [p]."""
-        from scipy.special import gammaincc, logsumexp
+    def _log_sum(self, mean: Array, rows: Array, codes: Array) -> Array:
+        """The same sum in logarithms for pairs (rows, codes) of means [r] and codes: -> [pairs]."""
+        from scipy.special import gammaincc
 
         n = np.arange(self.first, self.first + len(self.log_pmf))
-        terms = poisson_log_pmf(mean[:, None], n) + self.log_pmf[:, codes].T
         above = self._above(mean)
         with np.errstate(divide="ignore"):
             # gammainc near 1 is better as 1 - gammaincc; near 0 it is itself exact
             log_above = np.where(above > 0.5, np.log1p(-gammaincc(max(self._last, 1), mean)), np.log(above))
-        return logsumexp(np.column_stack([terms, log_above + self.tail_log_pmf[codes]]), axis=1)
+        weights = np.column_stack([poisson_log_pmf(mean[:, None], n), log_above])
+        table = np.vstack([self.log_pmf, self.tail_log_pmf]).T
+        result = np.empty(len(rows))
+        step = max(1, _CHUNK // table.shape[1])
+        for start in range(0, len(rows), step):
+            pairs = slice(start, start + step)
+            terms = weights[rows[pairs]] + table[codes[pairs]]
+            largest = np.maximum(terms.max(axis=1), -1e300)  # keeps -inf - -inf away
+            with np.errstate(divide="ignore"):
+                result[pairs] = largest + np.log(np.exp(terms - largest[:, None]).sum(axis=1))
+        return result
 
     def _mix(self, mean: Array, table: Array, tail: Array | None) -> Array:
         n = np.arange(self.first, self.first + len(table))

@@ -65,8 +65,12 @@ class QIS(Sensor):
     def _cdf(self, arrivals: Array, exposure: float) -> Array:
         return np.concatenate([t.evaluate_cdf(arrivals) for t in self._tables()], axis=1)
 
-    def _log_pmf(self, arrivals: Array, exposure: float) -> Array:
-        return np.concatenate([t.evaluate_log_pmf(arrivals) for t in self._tables()], axis=1)
+    def _log_pmf(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
+        parts = []
+        for start, table in zip(range(0, self.levels, _BLOCK), self._tables(), strict=True):
+            some = None if wanted is None else wanted[:, start : start + _BLOCK]
+            parts.append(table.evaluate_log_pmf(arrivals, some))
+        return np.concatenate(parts, axis=1)
 
     def _slope(self, arrivals: Array, exposure: float) -> Array:
         return np.concatenate([t.evaluate_slope(arrivals) for t in self._tables()], axis=1)

@@ -19,13 +19,15 @@ import warnings
 from abc import ABC, abstractmethod
 from dataclasses import asdict
 from functools import cache
-from math import isfinite
+from math import inf, isfinite
 from operator import index
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import estimate
+from qsim.estimate import Estimate, Response
 from qsim.keys import Key, uniform, uniform_pair, words
 
 _CHUNK = 1 << 18  # probabilities in one block of a draw (2 MiB)
@@ -57,8 +59,8 @@ class Sensor(ABC):
         """F: Poisson means [p] -> [p, levels]."""
 
     @abstractmethod
-    def _log_pmf(self, arrivals: Array, exposure: float) -> Array:
-        """log P(code = k): Poisson means [p] -> [p, levels]."""
+    def _log_pmf(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
+        """log P(code = k): Poisson means [p] -> [p, levels]; entries not `wanted` may come out as -inf below 1e-290."""
 
     @abstractmethod
     def _slope(self, arrivals: Array, exposure: float) -> Array:
@@ -92,9 +94,19 @@ class Sensor(ABC):
         """P(code <= k): photons [...] -> float64 [..., levels]."""
         return self._over_levels(self._cdf, photons, exposure)
 
-    def log_pmf(self, photons: Array, exposure: float) -> Array:
-        """log P(code = k): photons [...] -> float64 [..., levels]; exact in the tails, where differences of F are 0."""
-        return self._over_levels(self._log_pmf, photons, exposure)
+    def log_pmf(self, photons: Array, exposure: float, wanted: Array | None = None) -> Array:
+        """log P(code = k): photons [...] -> float64 [..., levels]; exact in the tails, where differences of F are 0.
+
+        Below 1e-290 sums in logarithms take their time; entries that `wanted` (bool, same shape) excuses may be -inf.
+        """
+        arrivals = self.arrivals(photons, exposure)
+        some = None if wanted is None else np.asarray(wanted).reshape(-1, self.levels)
+        return self._log_pmf(arrivals.ravel(), exposure, some).reshape(*arrivals.shape, self.levels)
+
+    def pmf(self, photons: Array, exposure: float) -> Array:
+        """P(code = k): photons [...] -> float64 [..., levels]; what is below 1e-290 may be 0."""
+        nothing = np.zeros((*np.shape(photons), self.levels), bool)
+        return np.exp(self.log_pmf(photons, exposure, nothing))
 
     def dcdf(self, photons: Array, exposure: float) -> Array:
         """dF_k/dphotons: photons [...] -> float64 [..., levels]."""
@@ -106,11 +118,11 @@ class Sensor(ABC):
 
     def mean(self, photons: Array, exposure: float) -> Array:
         """Expected code, [...]."""
-        return np.exp(self.log_pmf(photons, exposure)) @ np.arange(self.levels, dtype=float)
+        return self.pmf(photons, exposure) @ np.arange(self.levels, dtype=float)
 
     def variance(self, photons: Array, exposure: float) -> Array:
         """Variance of the code, [...]."""
-        pmf, codes = np.exp(self.log_pmf(photons, exposure)), np.arange(self.levels, dtype=float)
+        pmf, codes = self.pmf(photons, exposure), np.arange(self.levels, dtype=float)
         return np.sum(pmf * (codes - (pmf @ codes)[..., None]) ** 2, axis=-1)
 
     def log_likelihood(self, codes: Array, photons: Array, exposure: float) -> Array:
@@ -126,11 +138,27 @@ class Sensor(ABC):
 
     def fisher_information(self, photons: Array, exposure: float) -> Array:
         """Of one code about photons [1/photons^2]; infinite at 0 photons where light makes a code possible."""
-        log_pmf = self.log_pmf(photons, exposure)
         slope = np.diff(self.dcdf(photons, exposure), axis=-1, prepend=0.0)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            terms = np.exp(2 * np.log(np.abs(slope)) - log_pmf)
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            terms = np.exp(2 * np.log(np.abs(slope)) - self.log_pmf(photons, exposure, slope != 0))
         return np.where(slope == 0, 0.0, terms).sum(axis=-1)
+
+    def maximum_likelihood(self, histogram: Array, exposure: float, confidence: float = 0.95) -> Estimate:
+        """Light from codes of the same light: counts of each code [..., levels] -> Estimate of arrays [...] in photons.
+
+        `lower` and `upper` bound the likelihood-ratio interval of this confidence; at all-dark and all-saturated
+        histograms the estimate is finite and the bound one-sided (see Estimate). ValueError for an empty histogram.
+        Where the mean code falls again with light (paralyzable pixels) the answer is the darker of the two.
+        """
+        return estimate.maximum_likelihood(self, histogram, exposure, confidence)
+
+    def response(self, exposure: float) -> Response:
+        """Tables of mean, variance and variance-stabilised code over light, and their inverses."""
+        return estimate.response(self, exposure)
+
+    def brightest(self, exposure: float) -> float:
+        """Photons up to which the mean code grows with light."""
+        return inf
 
     def sample(
         self, photons: Array, exposure: float, *, key: Key, origin: tuple[int, int] = (0, 0), engine: str = "auto"
@@ -176,7 +204,7 @@ class Sensor(ABC):
     def codes_at(self, first: Array, second: Array, photons: Array, exposure: float) -> Array:
         """Codes of single pixels [p] from two words each: a 64-bit number, compared from the nearer end."""
         below, above = (u[:, None] for u in uniform_pair(first, second))
-        pmf = np.exp(self.log_pmf(photons, exposure))
+        pmf = self.pmf(photons, exposure)
         cdf, survival = np.cumsum(pmf, axis=1)[:, :-1], np.cumsum(pmf[:, :0:-1], axis=1)[:, ::-1]
         return np.count_nonzero(np.where(below < 0.5, below >= cdf, above <= survival), axis=1)
 

@@ -7,6 +7,7 @@ expected in an exposure.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import ClassVar
 
 import numpy as np
@@ -16,6 +17,8 @@ from qsim.deadtime import Paralyzable
 from qsim.keys import Key
 from qsim.mixture import poisson_log_pmf
 from qsim.sensor import Sensor, require_bits, require_number
+
+_UNDERFLOW = 1e-290  # below, sums in floating point may have lost terms
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class BinarySPAD(Sensor):
         cdf[:, -1] = 1.0
         return cdf
 
-    def _log_pmf(self, arrivals: Array, exposure: float) -> Array:
+    def _log_pmf(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
         """Binomial(M, p) with p = 1 - exp(-arrivals / M)."""
         from scipy.special import xlogy
 
@@ -150,6 +153,15 @@ class CountingSPAD(Sensor):
         """(2^bits - 1) / PDE: where the counter would be full if there were no dead time."""
         return (self.levels - 1) / self.pde
 
+    def brightest(self, exposure: float) -> float:
+        """Paralyzable: E[N] = 1 - exp(-n a) + n (1 - a) exp(-n a) of n arrivals, a = dead time / exposure < 1, peaks at
+        n a (1 - a) = 1.
+        """
+        a = self.dead_time / exposure
+        if not (self.paralyzable and 0 < a < 1):
+            return inf
+        return (1 / (a * (1 - a)) - self.dark_count_rate * exposure) / self.pde
+
     def _paralyzable(self, exposure: float) -> Paralyzable | None:
         """The other dead-time law; without dead time the two are one."""
         return Paralyzable(exposure / self.dead_time, self.levels) if self.paralyzable and self.dead_time else None
@@ -169,22 +181,23 @@ class CountingSPAD(Sensor):
         cdf[:, -1] = 1.0
         return cdf
 
-    def _log_pmf(self, arrivals: Array, exposure: float) -> Array:
+    def _log_pmf(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
         """P(N = k) = Pois(k; live_(k-1)) + integral of Pois(k; x) from live_k to live_(k-1): two positive terms."""
         from scipy.special import gammainc, gammaincc
 
         if (paralyzable := self._paralyzable(exposure)) is not None:
-            return paralyzable.log_pmf(arrivals)
+            return paralyzable.log_pmf(arrivals, wanted)
         live = self._live(arrivals, exposure)
         before, k = np.column_stack([arrivals, live[:, :-1]]), np.arange(self.levels)
+        at_once = poisson_log_pmf(before, k)
         with np.errstate(divide="ignore"):
             lower = gammainc(k + 1.0, before) - gammainc(k + 1.0, live)
             upper = gammaincc(k + 1.0, live) - gammaincc(k + 1.0, before)
-            pmf = np.exp(poisson_log_pmf(before, k)) + np.where(before < k + 1, lower, upper)
-            pmf[:, 0] = np.exp(-arrivals)
-            if self.levels > 1:
-                pmf[:, -1] = gammainc(k[-1], before[:, -1])
-            result = np.log(pmf)
+            pmf = np.exp(at_once) + np.where(before < k + 1, lower, upper)
+            pmf[:, -1] = gammainc(k[-1], before[:, -1])
+            result = np.where(
+                pmf > _UNDERFLOW, np.log(np.maximum(pmf, _UNDERFLOW)), _log_tail(at_once, before, live, k)
+            )
         result[:, 0] = -arrivals
         return result
 
@@ -197,3 +210,13 @@ class CountingSPAD(Sensor):
         slope = -share * np.exp(poisson_log_pmf(arrivals[:, None] * share, k))
         slope[:, -1] = 0.0
         return slope
+
+
+def _log_tail(at_once: Array, before: Array, live: Array, k: Array) -> Array:
+    """log P(N = k) below 1e-290, to a few per cent of P: the integral from its larger end and its slope there."""
+    bright = live > k
+    end = np.where(bright, live, before)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rate = np.maximum(np.abs(1 - k / end), 1e-9)
+        integral = poisson_log_pmf(end, k) + np.log(-np.expm1(-rate * (before - live)) / rate)
+    return np.logaddexp(at_once, np.where(end > 0, integral, -np.inf))
