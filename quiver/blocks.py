@@ -41,6 +41,11 @@ def resize(frames: Tensor, height: int, width: int) -> Tensor:
     return small.view(*frames.shape[:-2], height, width)
 
 
+def join(*tensors: Tensor) -> Tensor:
+    """Concatenate along channels, with the channels innermost in memory: convolutions are about twice as fast on a CPU."""
+    return torch.cat(tensors, dim=1).contiguous(memory_format=torch.channels_last)
+
+
 class ResidualDenseBlock(nn.Module):
     """Three dense layers, each adding `growth` channels; then back to `channels`, plus the input."""
 
@@ -53,7 +58,7 @@ class ResidualDenseBlock(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         y = x
         for layer in self.layers:
-            y = torch.cat((y, self.activation(layer(y))), dim=1)
+            y = join(y, self.activation(layer(y)))
         return self.merge(y) + x
 
 
@@ -71,25 +76,24 @@ class PreDenoiser(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """[N, f2, H, W] -> the same."""
-        shallow = self.lift(x)
+        shallow = self.lift(join(x))
         results = [self.enter(shallow)]
         for _ in range(self.passes):
             results.append(self.block(results[-1]))
-        return self.leave(self.fuse(torch.cat(results[1:], dim=1)) + shallow) + x
+        return self.leave(self.fuse(join(*results[1:])) + shallow) + x
 
 
 class FlowNetwork(nn.Module):
-    """Coarse-to-fine flow of grey frames (Ranjan & Black 2017, "SpyNet"), four levels."""
+    """Coarse-to-fine flow of grey frames (Ranjan & Black 2017, "SpyNet")."""
 
     mean: Tensor
     deviation: Tensor
-    LEVELS = 4
 
-    def __init__(self, channels: Sequence[int], kernel: int) -> None:
+    def __init__(self, channels: Sequence[int], kernel: int, levels: int = 4) -> None:
         super().__init__()
         self.register_buffer("mean", torch.full((1, 1, 1, 1), GREY_MEAN, dtype=torch.float32))
         self.register_buffer("deviation", torch.full((1, 1, 1, 1), GREY_DEVIATION, dtype=torch.float32))
-        self.levels = nn.ModuleList(self._level(channels, kernel) for _ in range(self.LEVELS))
+        self.levels = nn.ModuleList(self._level(channels, kernel) for _ in range(levels))
 
     @staticmethod
     def _level(channels: Sequence[int], kernel: int) -> nn.Sequential:
@@ -101,16 +105,17 @@ class FlowNetwork(nn.Module):
     def forward(self, reference: Tensor, support: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Grey frames [N, 1, H, W] -> flows on the grid of `reference` into `support` at scales 1, 2, 4."""
         height, width = reference.shape[2:]
-        padded = (32 * math.ceil(height / 32), 32 * math.ceil(width / 32))
+        coarsest = 2 ** len(self.levels)  # pixels per pixel of the zero flow at the start
+        padded = tuple(2 * coarsest * math.ceil(side / (2 * coarsest)) for side in (height, width))
         pyramid = [torch.cat([(resize(v, *padded) - self.mean) / self.deviation for v in (reference, support)], dim=1)]
-        for _ in range(self.LEVELS - 1):
+        for _ in range(len(self.levels) - 1):
             pyramid.insert(0, F.avg_pool2d(pyramid[0], 2))
-        flow = reference.new_zeros(reference.shape[0], 2, padded[0] // 16, padded[1] // 16)
+        flow = reference.new_zeros(reference.shape[0], 2, padded[0] // coarsest, padded[1] // coarsest)
         flows = []
         for level, pair in zip(self.levels, pyramid, strict=True):
             up = 2 * F.interpolate(flow, scale_factor=2, mode="bilinear", align_corners=True)
             warped = warp(pair[:, 1:], up, "border")
-            flow = level(torch.cat((pair[:, :1], warped.to(up.dtype), up), dim=1)) + up
+            flow = level(join(pair[:, :1], warped.to(up.dtype), up)) + up
             flows.append(flow)
         return tuple(self._to_size(flows[-1 - i], height // k, width // k) for i, k in enumerate((1, 2, 4)))  # type: ignore[return-value]
 
@@ -145,6 +150,7 @@ class Extractor(nn.Module):
 
     def forward(self, stacks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """[N, f2*5, H, W] (see `neighbourhoods`) -> features [N, C, H/s, W/s] for s = 1, 2, 4."""
+        stacks = join(stacks)
         half = resize(stacks, stacks.shape[2] // 2, stacks.shape[3] // 2)
         return (
             self._convolve(stacks, self.scale1, 1),
@@ -185,7 +191,7 @@ class Alignment(nn.Module):
     def forward(self, previous: Tensor, current: Tensor, flow: Tensor) -> Tensor:
         """Features [N, C, h, w] of frames t-1 and t, flow [N, 2, h, w] -> aligned features [N, C, h, w]."""
         warped = warp(previous, flow, "zeros")
-        raw = self.offsets(torch.cat((warped.to(current.dtype), current, flow), dim=1))
+        raw = self.offsets(join(warped.to(current.dtype), current, flow))
         pairs = 18 * self.groups
         own = OFFSET_LIMIT * torch.tanh(raw[:, :pairs])
         offset = own + flow.flip(1).repeat(1, 9 * self.groups, 1, 1)
@@ -204,7 +210,7 @@ class GatedFusion(nn.Module):
 
     def forward(self, denoised: Tensor, noisy: Tensor) -> Tensor:
         """Two [N, C, h, w] -> [N, C, h, w]; the linear layers run as 1 x 1 convolutions, without moving the axes."""
-        z = torch.cat((denoised, noisy), dim=1)
+        z = join(denoised, noisy)
         return self._linear(self.merge, F.gelu(self._linear(self.gate, z)) * self._linear(self.value, z))
 
     @staticmethod
@@ -238,20 +244,20 @@ class RecurrentCell(nn.Module):
 
     def encode(self, images: Sequence[Tensor], fused: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Images [N, f2, h, w] and fused features [N, C, h, w] at scales 1, 2, 4 -> R1, R2 (4C), entry (6C at 1/4)."""
-        r1 = self.fuse1(torch.cat((self.image1(images[0]), fused[0]), dim=1))
+        r1 = self.fuse1(join(self.image1(images[0]), fused[0]))
         r2 = self.down1(self.block1(r1))
-        middle = torch.cat((r2, self.image2(images[1]), fused[1]), dim=1)
-        entry = torch.cat((self.down2(self.block2(middle)), self.image4(images[2]), fused[2]), dim=1)
+        middle = join(r2, self.image2(images[1]), fused[1])
+        entry = join(self.down2(self.block2(middle)), self.image4(images[2]), fused[2])
         return r1, r2, entry
 
     def step(self, entry: Tensor, state: Tensor) -> Tensor:
         """Entry (6C) and state (2C) at 1/4 scale -> R4 (4C)."""
-        y = self.shrink(self.join(torch.cat((entry, state), dim=1)))
+        y = self.shrink(self.join(join(entry, state)))
         results = []
         for block in self.blocks:
             y = block(y)
             results.append(y)
-        return self.smooth(self.collect(torch.cat(results, dim=1)))
+        return self.smooth(self.collect(join(*results)))
 
 
 class TemporalAttention(nn.Module):
@@ -269,7 +275,7 @@ class TemporalAttention(nn.Module):
     def forward(self, window: Sequence[Tensor]) -> Tensor:
         """R4 [N, 4C, h, w] of the frames in time order, an odd number -> [N, 4C, h, w] for the centre frame."""
         centre = len(window) // 2
-        c = self.enter(torch.cat((*window[:centre], *window[centre + 1 :], window[centre]), dim=1))
+        c = self.enter(join(*window[:centre], *window[centre + 1 :], window[centre]))
         q, k, v = self.qkv(self.spread(c)).flatten(2).chunk(3, dim=1)
         logits = F.normalize(q, dim=2) @ F.normalize(k, dim=2).transpose(1, 2)
         if self.temperature is not None:
@@ -296,7 +302,7 @@ class Refinement(nn.Module):
 
     def forward(self, feature: Tensor, hidden: Tensor, picture: Tensor) -> tuple[Tensor, Tensor]:
         """feature, hidden [N, 4C, h, w], picture [N, f2, h, w] -> (new picture, the input of `onward`)."""
-        g0 = self.enter(torch.cat((feature, hidden), dim=1))
+        g0 = self.enter(join(feature, hidden))
         b = self.body(g0)
         g = self.gate(b.mean(dim=(2, 3), keepdim=True)) * b + g0
         return self.picture(g) + picture, g

@@ -47,6 +47,7 @@ class Config:
     denoiser_passes: int = 5  # times its one block is passed
     flow_channels: tuple[int, ...] = (32, 64, 32, 16)  # widths of each flow level
     flow_kernel: int = 7
+    flow_levels: int = 4  # of the pyramid, at least 3
     cell_blocks: int = 11  # residual dense blocks of the recurrent cell
     cell_growth: int | None = None  # channels added by their layers; None = 2C as published
     attention_width: int | None = None  # channels of the temporal attention; None = 44C as published
@@ -66,6 +67,8 @@ class Config:
         for name in ("denoiser_growth", "denoiser_passes", "cell_blocks", "fold", "flow_kernel"):
             if getattr(self, name) < 1:
                 raise ValueError(f"Config.{name} must be at least 1, got {getattr(self, name)}")
+        if self.flow_levels < 3:
+            raise ValueError(f"Config.flow_levels must be at least 3, one for each scale, got {self.flow_levels}")
         if self.flow_kernel % 2 == 0:
             raise ValueError(f"Config.flow_kernel must be odd, got {self.flow_kernel}")
 
@@ -127,7 +130,7 @@ class QUIVER(nn.Module):
         self.denoiser = (
             PreDenoiser(image, c, config.denoiser_growth, config.denoiser_passes) if config.pre_denoiser else None
         )
-        self.flow = FlowNetwork(config.flow_channels, config.flow_kernel) if config.flow else None
+        self.flow = FlowNetwork(config.flow_channels, config.flow_kernel, config.flow_levels) if config.flow else None
         self.noisy_features = Extractor(image, c)
         self.denoised_features = Extractor(image, c)
         self.alignment = Alignment(c, config.deformable_groups)
@@ -237,7 +240,7 @@ class QUIVER(nn.Module):
             scales[1:] = (None, None)
         flow = resize(flows[0], *x.shape[3:]) * self.config.fold if self.config.flow else None
         assert scales[0] is not None
-        return Output(self.unfold(denoised) if self.config.pre_denoiser else None, scales[0], *scales[1:], flow)
+        return Output(self.unfold(denoised) if self.config.pre_denoiser else None, scales[0], scales[1], scales[2], flow)
 
     def _encode(
         self, frames: Tensor, denoised: Tensor, flows: Sequence[Tensor]
