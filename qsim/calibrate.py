@@ -305,7 +305,15 @@ def calibrate_qis(darks: Sequence[Stack], flats: Sequence[Stack], *, bits: int) 
     Values named `..._transfer` come from means and variances, the others from the histograms. `ValueError` if there is
     no dark or no flat stack, or if nothing varies.
     """
-    _check(darks, flats)
+    check_stacks(darks, flats)
+    if not darks or not flats:
+        missing = "dark" if not darks else "flat"
+        raise ValueError(f"calibrate: no {missing} frames; at least one dark and one flat stack are needed")
+    for i, stack in enumerate((*darks, *flats)):
+        if np.count_nonzero(stack.histogram) < 2:
+            where = f"dark {i}" if i < len(darks) else f"flat {i - len(darks)}"
+            code = int(np.argmax(stack.histogram))
+            raise ValueError(f"calibrate: every code of {where} is {code}: nothing varies, nothing can be told")
     warnings = _advice(darks, flats)
     transfer = photon_transfer(darks, flats)
     if not (isfinite(transfer.gain) and transfer.gain > 1e-8):
@@ -325,10 +333,12 @@ def calibrate_qis(darks: Sequence[Stack], flats: Sequence[Stack], *, bits: int) 
         "read_noise": log_interval(read_noise, spread[2], "e-", method),
         "dark_current": normal_interval(float(fit.parameters[3]), spread[3], "e-/s", method, floor=0.0),
         "gain_transfer": normal_interval(transfer.gain, transfer.gain_variance, "codes/e-", "mean-variance", floor=0.0),
-        "read_noise_transfer": _root(transfer.read_variance, transfer.read_variance_variance, "e-", "mean-variance"),
+        "read_noise_transfer": root_interval(
+            transfer.read_variance, transfer.read_variance_variance, "e-", "mean-variance"
+        ),
     }
     if isfinite(square_variance):
-        values["prnu"] = _root(square, square_variance, "of the signal", "spread of pixel means")
+        values["prnu"] = root_interval(square, square_variance, "of the signal", "spread of pixel means")
     if len({stack.exposure for stack in darks}) > 1:
         values["dark_current_transfer"] = normal_interval(
             transfer.dark_current, transfer.dark_current_variance, "e-/s", "dark mean over exposure", floor=0.0
@@ -374,25 +384,20 @@ def _efficiency(flats: Sequence[Stack], fit: _Fit) -> dict[str, Value]:
     return {"quantum_efficiency": normal_interval(value, variance, "e-/photon", "light standard", floor=0.0)}
 
 
-def _root(square: float, variance: float, unit: str, method: str) -> Value:
+def root_interval(square: float, variance: float, unit: str, method: str) -> Value:
     """Interval of a standard deviation from that of its square; the square may be below 0 by noise."""
     reach = Z95 * sqrt(variance)
     low, middle, high = (sqrt(max(x, 0.0)) for x in (square - reach, square, square + reach))
     return Value(middle, low, high, unit, method)
 
 
-def _check(darks: Sequence[Stack], flats: Sequence[Stack]) -> None:
-    if not darks or not flats:
-        missing = "dark" if not darks else "flat"
-        raise ValueError(f"calibrate: no {missing} frames; at least one dark and one flat stack are needed")
+def check_stacks(darks: Sequence[Stack], flats: Sequence[Stack]) -> None:
+    """`ValueError` unless there are stacks, all of one size."""
+    if not darks and not flats:
+        raise ValueError("calibrate: no frames at all; give dark and flat frames")
     shapes = {stack.total.shape for stack in (*darks, *flats)}
     if len(shapes) > 1:
         raise ValueError(f"calibrate: stacks of different sizes {sorted(shapes)}; use the same part of the sensor")
-    for stack in (*darks, *flats):
-        if np.count_nonzero(stack.histogram) < 2:
-            code = int(np.argmax(stack.histogram))
-            kind = "dark" if stack.is_dark else "flat"
-            raise ValueError(f"calibrate: every code of a {kind} stack is {code}: nothing varies, nothing can be told")
 
 
 def _advice(darks: Sequence[Stack], flats: Sequence[Stack]) -> list[str]:

@@ -1,0 +1,345 @@
+"""Dark and flat counts of a SPAD array -> dark-count map, detection efficiency, PRNU, dead time, afterpulsing.
+
+    1-bit planes:  arrivals of a pixel = -ln(1 - ones/frames)          counts: arrivals = counts, dead time corrected
+
+Every number describes this array: DCR and PDE are means over its pixels, so their intervals hold shot noise alone.
+Detection efficiency times fill factor is found up to the light standard that gave the photons of the flats.
+Dead time comes from the Fano factor against flux: counts spread less than Poisson where avalanches block their
+followers. Afterpulsing comes from the correlation of neighbouring frames. Left out: a spread of dead time between
+pixels, crosstalk, afterpulses within one frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, isfinite, nan, sqrt
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.calibrate import (
+    NODES,
+    WEIGHTS,
+    Z95,
+    Calibration,
+    Value,
+    check_stacks,
+    goodness,
+    normal_interval,
+    root_interval,
+)
+from qsim.spad import CountingSPAD
+from qsim.stacks import Stack
+
+HOT = 10.0  # times the median dark-count rate
+PERCENTILES = (1, 10, 25, 50, 75, 90, 99, 99.9)
+
+
+def calibrate_spad(
+    darks: Sequence[Stack], flats: Sequence[Stack], *, bits: int, dead_time: bool = True, paralyzable: bool = False
+) -> Calibration:
+    """DCR (and its map), PDE x fill, PRNU, afterpulsing and, for counts of more than one bit, dead time.
+
+    `dead_time=False` takes the counts as Poisson; the p-value tells whether that holds. `darks` may be missing (DCR is
+    then taken as 0 and said so), and so may `flats`. `ValueError` if both are.
+    """
+    check_stacks(darks, flats)
+    warnings: list[str] = []
+    values: dict[str, Value] = {}
+    maps: dict[str, Array] = {}
+    fano = _dead_time(flats, bits, paralyzable) if bits > 1 and flats and dead_time else None
+    ratio = 0.0 if fano is None else fano.value
+    response = Response(bits, ratio, paralyzable)
+    if darks:
+        dcr_map, variance = _dark_rates(darks, response)
+        maps["dark_count_rate"] = dcr_map
+        values["dark_count_rate"] = normal_interval(float(dcr_map.mean()), variance, "1/s", "array mean", floor=0.0)
+        values |= _distribution(dcr_map)
+        if all(stack.total.sum() == 0 for stack in darks):
+            time = sum(stack.frames * stack.exposure * stack.pixels for stack in darks)
+            values["dark_count_rate"] = Value(0.0, 0.0, 3.688879454113936 / time, "1/s", "no dark count: upper bound")
+            warnings.append("no dark count at all: the dark-count rate has an upper bound only")
+    else:
+        warnings.append("no dark frames: dark counts are taken as 0 and end up in the efficiency")
+    if flats:
+        warnings += _saturation(flats)
+        values |= _efficiency(flats, darks, response, 0.0 if fano is None else fano.variance)
+        square, square_variance = _pattern(flats, darks, response)
+        if isfinite(square_variance):
+            values["prnu"] = root_interval(square, square_variance, "of the signal", "spread of pixel means")
+        else:
+            warnings.append("PRNU: one frame, or no light above the dark counts, tells nothing of it")
+    if fano is not None:
+        exposure = flats[0].exposure
+        method = "Fano factor against flux" + (", paralyzable" if paralyzable else "")
+        values["dead_time"] = normal_interval(ratio * exposure, fano.variance * exposure**2, "s", method, floor=0.0)
+    values |= _afterpulsing([*darks, *flats], bits)
+    pattern = values["prnu"].value if "prnu" in values else 0.0
+    p_value, residuals = _goodness(flats, bits, ratio, pattern, paralyzable, len(flats) + (fano is not None))
+    if p_value < 1e-3:
+        warnings.append(
+            f"the fitted histograms do not describe the counts (p = {p_value:.1g}): the model is wrong here"
+        )
+    model = "BinarySPAD" if bits == 1 else "CountingSPAD"
+    return Calibration(model, bits, values, p_value, tuple(warnings), residuals, maps)
+
+
+# Arrivals of every pixel
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Mean code against arrivals of one pixel, and back: exact, with the dead time found."""
+
+    bits: int
+    ratio: float  # dead time in exposures; 0 for 1-bit planes
+    paralyzable: bool
+
+    def table(self, largest: float) -> tuple[Array, Array]:
+        """(arrivals, mean code), rising, up to a mean of `largest` or to where the mean stops rising."""
+        top = 2 * largest + 10
+        for _ in range(12):
+            arrivals = np.linspace(0, np.sqrt(top), 1500) ** 2
+            codes = self.mean(arrivals)
+            end = int(np.argmax(codes))
+            if codes[end] >= largest or end < len(codes) - 1:
+                break
+            top *= 2
+        return arrivals[: end + 1], codes[: end + 1]
+
+    def mean(self, arrivals: Array) -> Array:
+        """Expected code, exact."""
+        if self.bits == 1:
+            return -np.expm1(-arrivals)
+        return CountingSPAD(1.0, 0.0, self.ratio, self.bits, self.paralyzable).mean(arrivals, 1.0)
+
+    def of_stack(self, stack: Stack) -> tuple[Array, float, float]:
+        """Arrivals per exposure of every pixel [H, W], the variance of their mean over pixels, and d code / d arrivals.
+
+        The bias of a curved inverse, f''/2 times the variance of the pixel's mean, is taken off.
+        """
+        t = stack.frames
+        mean = stack.total / t
+        if self.bits == 1:
+            mean = np.minimum(mean, 1 - 0.5 / t)
+        arrivals, codes = self.table(float(mean.max()))
+        found = np.interp(mean, codes, arrivals)
+        at = np.interp(stack.mean, codes, arrivals)
+        slope_table = np.gradient(codes, arrivals)
+        slope = float(np.interp(at, arrivals, slope_table))
+        variance = np.where(stack.pixel_variance > 0, stack.pixel_variance, 0.0) if t > 1 else mean
+        slopes = np.interp(found, arrivals, slope_table)
+        curvature = np.interp(found, arrivals, np.gradient(slope_table, arrivals))
+        found = found + 0.5 * curvature / slopes**3 * variance / t
+        return np.maximum(found, 0.0), float(np.sum(variance / (t * slopes**2))) / stack.pixels**2, slope
+
+
+def _dark_rates(darks: Sequence[Stack], response: Response) -> tuple[Array, float]:
+    """DCR of every pixel [1/s] from all exposures, and the variance of its mean over the array."""
+    weight = np.array([stack.frames * stack.exposure for stack in darks])
+    weight = weight / weight.sum()
+    rate = np.zeros(darks[0].total.shape)
+    variance = 0.0
+    for stack, share in zip(darks, weight, strict=True):
+        arrivals, of_mean, _ = response.of_stack(stack)
+        rate += share * arrivals / stack.exposure
+        variance += of_mean * (share / stack.exposure) ** 2
+    return rate, variance
+
+
+def _distribution(rates: Array) -> dict[str, Value]:
+    """Median of the DCR map (order statistics) and the share of hot pixels (Wilson's interval)."""
+    ordered = np.sort(rates.ravel())
+    n = ordered.size
+    reach = Z95 * sqrt(n) / 2
+    low, high = (int(np.clip(round(n / 2 + sign * reach), 0, n - 1)) for sign in (-1, 1))
+    median = float(np.median(ordered))
+    found = {"dark_count_rate_median": Value(median, ordered[low], ordered[high], "1/s", "order statistics")}
+    if median > 0:
+        hot = float(np.mean(ordered > HOT * median))
+        centre = (hot + Z95**2 / (2 * n)) / (1 + Z95**2 / n)
+        half = Z95 / (1 + Z95**2 / n) * sqrt(hot * (1 - hot) / n + Z95**2 / (4 * n * n))
+        found["hot_pixels"] = Value(hot, max(centre - half, 0.0), centre + half, f"above {HOT:g} medians", "counting")
+    return found
+
+
+def _efficiency(
+    flats: Sequence[Stack], darks: Sequence[Stack], response: Response, ratio_variance: float
+) -> dict[str, Value]:
+    """PDE x fill: avalanches per photon of the light standard, flats weighed by their certainty.
+
+    The dead time's own uncertainty moves all flats together.
+    """
+    known = [flat for flat in flats if flat.photons]
+    if not known:
+        return {}
+
+    def slopes(used: Response) -> tuple[Array, Array]:
+        rate, rate_variance = _dark_rates(darks, used) if darks else (np.zeros(1), 0.0)
+        values, variances = [], []
+        for flat in known:
+            arrivals, of_mean, _ = used.of_stack(flat)
+            values.append(float(arrivals.mean() - rate.mean() * flat.exposure) / flat.photons)
+            variances.append((of_mean + rate_variance * flat.exposure**2) / flat.photons**2)
+        return np.array(values), np.maximum(variances, 1e-300)
+
+    values, variances = slopes(response)
+    moved = np.zeros_like(values)
+    if ratio_variance > 0:
+        step = max(1e-4 * response.ratio, 1e-7)
+        moved = (slopes(Response(response.bits, response.ratio + step, response.paralyzable))[0] - values) / step
+    covariance = np.diag(variances) + ratio_variance * np.outer(moved, moved)
+    weights = np.linalg.solve(covariance, np.ones(len(known)))
+    weights /= weights.sum()
+    variance = float(weights @ covariance @ weights)
+    return {
+        "pde_fill": normal_interval(float(weights @ values), variance, "counts/photon", "light standard", floor=0.0)
+    }
+
+
+def _pattern(flats: Sequence[Stack], darks: Sequence[Stack], response: Response) -> tuple[float, float]:
+    """PRNU^2 and its variance: spread of the pixels' mean codes, less noise and dark pattern, over the light's share.
+
+    All levels share the pixels' pattern, so the level that tells most speaks; (0, inf) where nothing tells.
+    """
+    rate, _ = _dark_rates(darks, response) if darks else (np.zeros(1), 0.0)
+    dark_spread = sum(max(s.fixed_pattern, 0.0) / s.exposure**2 for s in darks if s.frames > 1) / max(len(darks), 1)
+    best = (0.0, inf)
+    for flat in flats:
+        if flat.frames < 2 or flat.pixels < 3:
+            continue
+        arrivals, _, slope = response.of_stack(flat)
+        signal = slope * float(arrivals.mean() - rate.mean() * flat.exposure)
+        if signal <= 0:
+            continue
+        between = float((flat.total / flat.frames).var(ddof=1))
+        variance = 2 * between**2 / (flat.pixels - 1) / signal**4
+        if variance < best[1]:
+            best = ((flat.fixed_pattern - dark_spread * (slope * flat.exposure) ** 2) / signal**2, variance)
+    return best
+
+
+def _saturation(flats: Sequence[Stack]) -> list[str]:
+    """Flats in which some pixels never leave the top code."""
+    words = []
+    for i, flat in enumerate(flats):
+        full = float((flat.total >= flat.frames * (flat.histogram.size - 1)).mean())
+        if full > 0:
+            words.append(f"flat {i}: {full:.1%} of the pixels are saturated in every frame; use less light")
+    return words
+
+
+# Dead time
+
+
+@dataclass(frozen=True)
+class _Ratio:
+    """Dead time in exposures, and its variance."""
+
+    value: float
+    variance: float
+
+
+def _dead_time(flats: Sequence[Stack], bits: int, paralyzable: bool) -> _Ratio | None:
+    """tau/T from the time variance of every flat against its mean: weighted least squares on exact moments."""
+    from scipy.optimize import minimize_scalar
+
+    usable = [flat for flat in flats if flat.frames > 1 and flat.mean > 0]
+    if not usable:
+        return None
+    if len({flat.exposure for flat in usable}) > 1:
+        raise ValueError("calibrate: the flats have different exposures; give dead-time flats of one exposure")
+
+    def misfit(ratio: float) -> float:
+        return float(sum(r * r for r in _fano_residuals(usable, bits, ratio, paralyzable)))
+
+    # A pixel counts at most about T/tau, or T/(e tau) if every arrival blocks it: the largest mean bounds the ratio.
+    ceiling = min((0.45 if paralyzable else 0.9) / max(flat.mean for flat in usable), 2.0)
+    found = minimize_scalar(misfit, bounds=(0.0, ceiling), method="bounded", options={"xatol": 1e-9})
+    ratio = float(found.x) if misfit(float(found.x)) < misfit(0.0) else 0.0
+    step = max(ratio * 1e-3, 1e-7)
+    slope = [
+        (a - b) / step
+        for a, b in zip(
+            _fano_residuals(usable, bits, ratio + step, paralyzable),
+            _fano_residuals(usable, bits, ratio, paralyzable),
+            strict=True,
+        )
+    ]
+    return _Ratio(ratio, 1 / max(float(np.dot(slope, slope)), 1e-300))
+
+
+def _fano_residuals(flats: Sequence[Stack], bits: int, ratio: float, paralyzable: bool) -> list[float]:
+    """(observed variance - that of a dead-time pixel of the same mean) / sigma, per flat."""
+    residuals = []
+    for flat in flats:
+        n = flat.pixels * (flat.frames - 1)
+        _, expected, slope = matched_variance(flat.mean, bits, ratio, paralyzable)
+        third, fourth = flat.central_moment(3), flat.central_moment(4)
+        v = flat.variance
+        spread = max(fourth - v**2 + slope**2 * v - 2 * slope * third, 1e-12) / n
+        residuals.append((v - expected) / sqrt(spread))
+    return residuals
+
+
+def matched_variance(mean: float, bits: int, ratio: float, paralyzable: bool) -> tuple[float, float, float]:
+    """(arrivals, variance, d variance / d mean) of a counting pixel of this mean code; tau/T = `ratio`.
+
+    Newton on the rising branch; where no light gives this mean the variance is 0, which no data match.
+    """
+    sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
+    arrivals = mean
+    for _ in range(40):
+        at = np.array(arrivals)
+        slope = -float(np.sum(sensor.dcdf(at, 1.0)[:-1]))
+        excess = float(sensor.mean(at, 1.0)) - mean
+        if slope < 0.02:  # the mean hardly rises or falls again: no light gives it with this dead time
+            return arrivals, 0.0, 0.0
+        step = float(np.clip(excess / slope, -0.5 * arrivals - 0.1, 0.5 * arrivals))
+        arrivals -= step
+        if abs(step) < 1e-9 * max(arrivals, 1e-6):
+            break
+    h = 1e-4 * max(arrivals, 1e-3)
+    at = np.array([arrivals - h, arrivals, arrivals + h])
+    variance, means = sensor.variance(at, 1.0), sensor.mean(at, 1.0)
+    return arrivals, float(variance[1]), float((variance[2] - variance[0]) / (means[2] - means[0]))
+
+
+# Afterpulsing, and the test of the model
+
+
+def _afterpulsing(stacks: Sequence[Stack], bits: int) -> dict[str, Value]:
+    """Chance that a count is followed by an extra one in the next frame, from neighbouring frames, all stacks together.
+
+    Counts: Cov(x_t, x_t+1) = a Var(x). Planes: P(1 | 1 before) - P(1 | 0 before) = a (1 - P(1 | 0 before)).
+    """
+    estimates, variances = [], []
+    for stack in stacks:
+        if stack.frames < 3 or not stack.variance > 0:
+            continue
+        correlation = stack.lag_covariance / stack.variance
+        room = 1 - stack.mean * (1 - correlation) if bits == 1 else 1.0
+        estimates.append(correlation / room)
+        variances.append(1 / (stack.pixels * (stack.frames - 1)) / room**2)
+    if not estimates:
+        return {}
+    weights = 1 / np.array(variances)
+    value = float(np.average(estimates, weights=weights))
+    found = normal_interval(value, 1 / float(weights.sum()), "per count, next frame", "lag-1 correlation", floor=0.0)
+    return {"afterpulsing": found}
+
+
+def _goodness(
+    flats: Sequence[Stack], bits: int, ratio: float, s: float, paralyzable: bool, fitted: int
+) -> tuple[float, tuple[Array, ...]]:
+    """Flats' histograms against the model at each flat's own mean and PRNU `s`; NaN for 1-bit planes."""
+    if bits == 1 or not flats:
+        return nan, ()
+    sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
+    shares = []
+    for flat in flats:
+        arrivals, _, _ = matched_variance(flat.mean, bits, ratio, paralyzable)
+        pmf = np.exp(sensor.log_pmf(np.maximum(arrivals * (1 + s * NODES), 0.0), 1.0))
+        shares.append(WEIGHTS @ pmf)
+    return goodness(flats, shares, fitted)
