@@ -11,6 +11,7 @@ from typing import Any
 
 from qsim import __version__
 from qsim.console import Parser, bar, command, output, run
+from qsim.convert import add_convert
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -18,7 +19,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = Parser(prog="qsim", description="Render moving scenes and turn them into few-bit quanta-sensor streams.")
     parser.add_argument("--version", action="version", version=f"qsim {__version__}")
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
-    for add in (_add_doctor, _add_render, _add_sense, _add_generate, _add_check):
+    for add in (_add_doctor, _add_render, _add_sense, _add_generate, _add_check, add_convert):
         add(sub)
     return run(parser, argv)
 

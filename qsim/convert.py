@@ -1,0 +1,112 @@
+"""The command `qsim convert`: foreign files into clips and streams, ours into files for others."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from qsim import files, formats
+from qsim.clip import Clip
+from qsim.console import bar, command, output
+from qsim.dataset import Dataset
+from qsim.footage import TRANSFERS, Hints
+from qsim.recipe import SPLITS
+from qsim.stream import Stream, check_name
+
+_SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr"}
+
+
+def add_convert(sub: Any) -> None:
+    """The options of `qsim convert`."""
+    parser = command(
+        sub, "convert", _run_convert, "Read foreign recordings as clips or streams; write ours for others.",
+        "qsim convert ball.npy out/ball --frame-rate 30000 --exposure 20e-6 --transfer linear\n"
+        "qsim convert I2-2000FPS/test out/i2_test --frame-rate 2000 --transfer 'gamma 2.2' --split test\n"
+        "qsim convert capture.bin out/capture --layout swissspad2-half --frame-rate 96800\n"
+        "qsim convert out/starter out/starter_mp4 --to mp4\n"
+        "qsim convert out/fan/streams/spad.json out/fan_cube.npy",
+    )  # fmt: skip
+    parser.add_argument("input", type=Path, help="a file, a folder, a clip, a stream's .json, or a data set")
+    parser.add_argument(
+        "output", type=Path, help="clip folder, stream name, .npy, .mp4 or .zarr, or a folder with --to"
+    )
+    reading = parser.add_argument_group("what a foreign file may not say")
+    reading.add_argument("--layout", help=f"kind of the input: {', '.join(formats.LAYOUTS)}")
+    reading.add_argument("--frame-rate", type=float, help="frames per second of the capture (not of a video file)")
+    reading.add_argument("--exposure", type=float, help="seconds of light per frame (default: the whole frame)")
+    reading.add_argument("--transfer", help=f"how pictures code light: {', '.join(TRANSFERS)} (also for writing)")
+    reading.add_argument("--height", type=int, help="pixels")
+    reading.add_argument("--width", type=int, help="pixels, before packing")
+    reading.add_argument("--bits", type=int, help="the input holds codes of so many bits")
+    reading.add_argument("--stretched", action="store_true", help="codes were stretched to 0..255")
+    reading.add_argument("--channel", type=int, help="of a colour cube: 0, 1 or 2")
+    reading.add_argument("--flip", choices=("none", "lr", "ud", "both"), default="none", help="turn the frames")
+    reading.add_argument("--columns", type=int, help="keep only the first columns (Vidar dumps: 400 of 416)")
+    reading.add_argument("--sensor", help="that made the codes, by name or file (default: an ideal binary counter)")
+    reading.add_argument("--ppp", type=float, help="light level the sensor's gain was set for")
+    reading.add_argument("--split", choices=SPLITS, help="stored in the clips")
+    writing = parser.add_argument_group("writing for others")
+    writing.add_argument("--to", choices=sorted(formats.EXPORTS), help="kind of the output, if its name does not say")
+    writing.add_argument(
+        "--lossy", action="store_true", help="mp4 with FFmpeg's ordinary settings: noise does not survive"
+    )
+    writing.add_argument("--white", type=float, help="light that becomes full scale (default: the 99.9th percentile)")
+    parser.add_argument("--force", action="store_true", help="replace what is there")
+
+
+def _run_convert(args: argparse.Namespace) -> int:
+    source = args.input
+    ours = source.is_dir() and any((source / name).is_file() for name in ("clip.json", "dataset.json"))
+    made = _export(args) if ours or _is_stream(source) else _import(args)
+    output(args, {"made": [str(path) for path in made]}, [f"{path}" for path in made])
+    return 0
+
+
+def _is_stream(path: Path) -> bool:
+    return path.suffix == ".json" and path.is_file() and "ppp_factor" in files.read_json(path)
+
+
+def _export(args: argparse.Namespace) -> list[Path]:
+    kind = args.to or _SUFFIXES.get(args.output.suffix)
+    if kind is None:
+        known = ", ".join(sorted(formats.EXPORTS))
+        raise ValueError(f"{args.output}: say what to write with --to: {known}")
+    wanted = formats.Export(kind, args.transfer or "gamma 2.2", args.white, not args.lossy)
+    if not (args.input / "dataset.json").is_file():
+        opened = Stream.open(args.input) if args.input.suffix == ".json" else Clip.open(args.input)
+        return [formats.export(opened, args.output, wanted, force=args.force)]
+    suffix = {"cube": ".npy", "mp4": ".mp4", "zarr": ".zarr"}.get(kind, "")
+    made = []
+    clips = Dataset.open(args.input).clips()
+    with bar("converting", "clip") as progress:
+        for n, clip in enumerate(clips, 1):
+            split = clip.meta.get("split") or "all"
+            target = args.output / split / f"{clip.name}{suffix}"
+            made.append(formats.export(clip, target, wanted, force=args.force))
+            progress(n, len(clips))
+    return made
+
+
+def _import(args: argparse.Namespace) -> list[Path]:
+    if args.frame_rate is None:
+        raise ValueError(f"{args.input}: files do not say how fast the capture was; add --frame-rate, as in 2000")
+    hints = Hints(args.layout, args.height, args.width, args.bits, args.transfer, args.channel, args.flip, args.columns,
+                  args.stretched)  # fmt: skip
+    capture = formats.Capture(args.frame_rate, args.exposure, args.sensor, args.ppp, args.split)
+    pairs = [(args.input, args.output)]
+    if args.input.is_dir() and args.layout in (None, "video"):
+        videos = sorted(file for file in args.input.rglob("*") if file.suffix.lower() in formats.VIDEOS)
+        pairs = [(file, args.output / check_name(_flat_name(file, args.input))) for file in videos] or pairs
+    made = []
+    with bar("converting") as progress:
+        for source, target in pairs:
+            footage = formats.read(source, hints)
+            make = formats.to_clip if footage.is_light else formats.to_stream
+            made.append(make(footage, target, capture, force=args.force, progress=progress).path)
+    return made
+
+
+def _flat_name(file: Path, folder: Path) -> str:
+    """`scene/clip.mp4` below `folder` as `scene_clip`."""
+    return "_".join(file.relative_to(folder).with_suffix("").parts).replace(" ", "_")

@@ -1,0 +1,163 @@
+"""Frames from anywhere: one small record between foreign files and ours, and the care that reading them needs.
+
+A `Footage` is either codes (0 ... 2^bits - 1, of a photon counting sensor) or light (linear, in arbitrary units).
+Readers trust no header: sizes are compared with the file before anything is allocated, and whatever a decoder raises or
+warns about becomes one `ValueError` with the file's name.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import struct
+import warnings
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+MAX_PIXELS = 1 << 26  # of one frame: 8192 x 8192
+TRANSFERS = ("linear", "srgb", "gamma 2.2")
+
+
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """Frames [T, H, W] that are read when asked for."""
+
+    shape: tuple[int, int, int]
+    read: Callable[[int, int], Array]  # frames start ... stop - 1: codes (uint8, uint16), or light (float32)
+    source: str  # the format it came from
+    bits: int | None = None  # of codes; None: light
+    code_model: str = "binary_sum"
+    meta: dict[str, Any] = field(default_factory=dict)  # what else the file said
+
+    @property
+    def is_light(self) -> bool:
+        return self.bits is None
+
+
+@dataclass(frozen=True)
+class Hints:
+    """What the user knows and a file may not say."""
+
+    layout: str | None = None  # a name of formats.LAYOUTS
+    height: int | None = None
+    width: int | None = None  # before packing
+    bits: int | None = None
+    transfer: str | None = None  # how the light in a picture was coded: linear, srgb, gamma 2.2
+    channel: int | None = None  # of a colour cube: 0, 1, 2
+    flip: str = "none"  # lr, ud or both: put right what a reader of unknown convention turned
+    columns: int | None = None  # keep only the first columns (raw Vidar dumps have 416, of which 400 are pixels)
+    stretched: bool = False  # codes were stretched to 0 ... 255
+
+
+@contextlib.contextmanager
+def reading(path: Path, what: str) -> Iterator[None]:
+    """Turn whatever a decoder raises or warns about into one `ValueError`; a missing file stays `FileNotFoundError`."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            yield
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path}: no such file") from None
+    except (
+        ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, MemoryError, NotImplementedError,
+        OSError, RuntimeError, SyntaxError, TypeError, ValueError, Warning, struct.error, zlib.error,
+    ) as error:  # fmt: skip
+        text = " ".join(str(error).split())
+        if text.startswith(str(path)):
+            raise ValueError(text) from None
+        raise ValueError(f"{path}: not readable as {what} ({text or type(error).__name__})") from None
+
+
+def check_shape(path: Path, shape: tuple[int, ...]) -> tuple[int, int, int]:
+    """(T, H, W) if there is at least one frame of a sane size, else `ValueError`."""
+    if len(shape) != 3:
+        raise ValueError(f"{path}: expected frames [T, H, W], found an array of shape {list(shape)}")
+    frames, height, width = (int(n) for n in shape)
+    if frames < 1:
+        raise ValueError(f"{path}: has no frames")
+    if not (0 < height * width <= MAX_PIXELS and height > 0):
+        raise ValueError(f"{path}: frames of {height} x {width} pixels; between 1 and {MAX_PIXELS} pixels are read")
+    return frames, height, width
+
+
+def check_size(path: Path, size: int, frame_bytes: int, what: str, footer: tuple[int, ...] = (0,)) -> int:
+    """Frames in a raw file of `size` bytes; `ValueError` with the size if it is not a whole number of them."""
+    frames, rest = divmod(size, frame_bytes)
+    if rest not in footer or frames < 1:
+        raise ValueError(
+            f"{path}: {size} bytes are not a whole number of {what} frames of {frame_bytes} bytes; "
+            "the file is truncated, has bytes too many, or has another layout"
+        )
+    return frames
+
+
+def numbered(paths: list[Path]) -> list[Path]:
+    """Files in the order of the last number in their names: a text sort puts 10 before 2."""
+
+    def key(path: Path) -> tuple[str, int, str]:
+        numbers = re.findall(r"\d+", path.stem)
+        return str(path.parent), int(numbers[-1]) if numbers else -1, path.name
+
+    return sorted(paths, key=key)
+
+
+def to_linear(values: Array, transfer: str, top: float) -> Array:
+    """Linear light, float32 in 0..1, from coded values 0 ... top (IEC 61966-2-1 for srgb)."""
+    coded = np.asarray(values, np.float32) / np.float32(top)
+    if transfer == "linear":
+        return coded
+    if transfer == "gamma 2.2":
+        return coded**2.2
+    if transfer == "srgb":
+        return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    raise ValueError(f"transfer {transfer!r}: known are {', '.join(TRANSFERS)}")
+
+
+def from_linear(light: Array, transfer: str, top: int) -> Array:
+    """Coded values 0 ... top, rounded, of linear light in 0..1 (clipped): the inverse of `to_linear`."""
+    light = np.clip(np.asarray(light, np.float64), 0, 1)
+    if transfer == "linear":
+        coded = light
+    elif transfer == "gamma 2.2":
+        coded = light ** (1 / 2.2)
+    elif transfer == "srgb":
+        coded = np.where(light <= 0.04045 / 12.92, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
+    else:
+        raise ValueError(f"transfer {transfer!r}: known are {', '.join(TRANSFERS)}")
+    return np.rint(coded * top).astype(np.uint8 if top < 256 else np.uint16)
+
+
+def need_transfer(path: Path, hints: Hints) -> str:
+    """The declared transfer curve; `ValueError` if the user did not say."""
+    if hints.transfer is None:
+        known = " or ".join(f"--transfer '{name}'" for name in TRANSFERS)
+        raise ValueError(f"{path}: a picture does not say how light was coded; add {known}")
+    if hints.transfer not in TRANSFERS:
+        raise ValueError(f"transfer {hints.transfer!r}: known are {', '.join(TRANSFERS)}")
+    return hints.transfer
+
+
+def turned(footage: Footage, hints: Hints) -> Footage:
+    """The footage with the user's flips and column cut applied."""
+    frames, height, width = footage.shape
+    columns = hints.columns or width
+    if not 0 < columns <= width:
+        raise ValueError(f"--columns {columns}: the frames have {width} columns")
+    if hints.flip not in ("none", "lr", "ud", "both"):
+        raise ValueError(f"--flip {hints.flip!r}: known are lr, ud, both")
+    if hints.flip == "none" and columns == width:
+        return footage
+    rows = slice(None, None, -1 if hints.flip in ("ud", "both") else 1)
+    across = slice(None, None, -1 if hints.flip in ("lr", "both") else 1)
+
+    def read(start: int, stop: int) -> Array:
+        return np.ascontiguousarray(footage.read(start, stop)[..., :columns][:, rows, across])
+
+    meta = footage.meta | {"flip": hints.flip, "columns_kept": columns}
+    return Footage((frames, height, columns), read, footage.source, footage.bits, footage.code_model, meta)

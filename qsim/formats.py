@@ -1,0 +1,369 @@
+"""Foreign files in and out: which format is it, read it, write it as ours, write ours as it.
+
+    in:  photon cube .npy (.gz), codes and light .npy, mp4, PNG, TIFF, SwissSPAD2 and SPAD512S .bin, visionsim, zarr,
+         .mat, spike .dat
+    out: photon cube, mp4 (lossless or not), PNG, EXR, zarr - from a clip's light or a stream's codes
+
+Light becomes a clip of relative radiance, codes become a stream: NAME.npy and NAME.json. What a file does not say
+(size, rate, transfer curve, which of two layouts) is asked for, never guessed.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import __version__, files, planes, video
+from qsim.clip import RELATIVE, Clip, ClipWriter
+from qsim.footage import Footage, Hints, turned
+from qsim.stream import FORMAT_VERSION, Progress, Stream
+
+Reader = Callable[[Path, Hints], Footage]
+LAYOUTS: dict[str, Reader] = {  # the names of --layout
+    "cube": planes.read_cube,
+    "codes": planes.read_codes_npy,
+    "light": video.read_light_npy,
+    "video": video.read_video,
+    "png": video.read_png,
+    "tiff": video.read_tiff,
+    "swissspad2-half": planes.read_swissspad2_half,
+    "swissspad2-full": planes.read_swissspad2_full,
+    "spad512s": planes.read_spad512s,
+    "visionsim": planes.read_visionsim,
+    "zarr": planes.read_zarr,
+    "mat": planes.read_mat,
+    "spike": planes.read_spike,
+}
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv")
+_SMALL = 8_388_608  # bytes that three raw layouts share
+
+
+def detect(path: Path) -> str:
+    """The layout's name, from names, signatures, side files and sizes; `ValueError` that lists the candidates."""
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file")
+    if path.is_dir():
+        return _detect_folder(path)
+    suffix = "".join(path.suffixes[-2:]) if path.suffix == ".gz" else path.suffix.lower()
+    simple = {".png": "png", ".tif": "tiff", ".tiff": "tiff", ".mat": "mat", ".dat": "spike", ".npy.gz": "cube"}
+    if suffix in simple:
+        return simple[suffix]
+    if suffix in VIDEOS:
+        return "video"
+    if suffix == ".npy":
+        return _detect_npy(path)
+    if suffix == ".bin":
+        return _detect_raw(path)
+    raise ValueError(f"{path}: unknown kind of file; say which with --layout: {', '.join(LAYOUTS)}")
+
+
+def read(path: Path, hints: Hints | None = None) -> Footage:
+    """Open a foreign file or folder; frames are read when asked for."""
+    hints = hints or Hints()
+    layout = hints.layout or detect(path)
+    if layout not in LAYOUTS:
+        raise ValueError(f"layout {layout!r}: known are {', '.join(LAYOUTS)}")
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file")
+    return turned(LAYOUTS[layout](path, hints), hints)
+
+
+@dataclass(frozen=True)
+class Capture:
+    """How footage was taken, which files rarely say."""
+
+    frame_rate: float  # Hz
+    exposure: float | None = None  # s; None: the whole frame
+    sensor: str | None = None  # of codes: a name of qsim.devices, or a .toml file
+    ppp: float | None = None  # of codes: mean light level, where the sensor's gain follows it
+    split: str | None = None  # of light: train, val or test
+
+    def __post_init__(self) -> None:
+        if not 0 < self.frame_rate < float("inf"):
+            raise ValueError(f"frame rate: expected frames per second above 0, got {self.frame_rate!r}")
+        if self.exposure is not None and not 0 < self.exposure <= 1 / self.frame_rate * (1 + 1e-9):
+            raise ValueError(
+                f"exposure {self.exposure!r} s: expected more than 0 and at most a frame's {1 / self.frame_rate:g} s"
+            )
+
+    @property
+    def seconds(self) -> float:
+        return self.exposure if self.exposure is not None else 1 / self.frame_rate
+
+
+def to_clip(
+    footage: Footage, path: Path, capture: Capture, *, force: bool = False, progress: Progress | None = None
+) -> Clip:
+    """Light as a clip of relative radiance. `ValueError` for codes: they are not light."""
+    if not footage.is_light:
+        raise ValueError(
+            f"{path}: {footage.source} holds codes, not light; name a stream to make, as in out/capture.npy"
+        )
+    frames, height, width = footage.shape
+    meta: dict[str, Any] = {
+        "shape": [frames, height, width],
+        "frame_rate": capture.frame_rate,
+        "shutter": capture.seconds * capture.frame_rate,
+        "exposure": capture.seconds,
+        "radiance_unit": RELATIVE,
+        "camera": None,
+        "source": {"format": footage.source} | footage.meta,
+        "split": capture.split,
+    }
+    with ClipWriter(path, meta, force=force) as writer:
+        for start, block in _blocks(footage):
+            for i, image in enumerate(block):
+                if not writer.has(start + i):
+                    writer.add(start + i, image)
+            if progress is not None:
+                progress(start + len(block), frames)
+    return Clip.open(path)
+
+
+def to_stream(
+    footage: Footage, path: Path, capture: Capture, *, force: bool = False, progress: Progress | None = None
+) -> Stream:
+    """Codes as a stream beside no clip: PATH.npy and PATH.json. The sensor is the given one, else an ideal counter."""
+    if footage.bits is None:
+        raise ValueError(f"{path}: {footage.source} holds light, not codes; name a clip folder to make, as in out/clip")
+    from qsim import codes, devices
+
+    stem = path.with_suffix("") if path.suffix in (".npy", ".json") else path
+    npy, description = stem.with_suffix(".npy"), stem.with_suffix(".json")
+    for file in (npy, description):
+        if file.exists() and not force:
+            raise FileExistsError(f"{file}: exists; name another, or use --force to replace it")
+    frames, height, width = footage.shape
+    sensor = _sensor(footage, capture, devices)
+    npy.parent.mkdir(parents=True, exist_ok=True)
+    description.unlink(missing_ok=True)
+    with files.replacing(npy) as target:
+        packed = (frames, height, codes.packed_width(width, footage.bits))
+        np.lib.format.write_array_header_1_0(target, {"descr": "|u1", "fortran_order": False, "shape": packed})
+        for start, block in _blocks(footage):
+            target.write(codes.pack(block, footage.bits).tobytes())
+            if progress is not None:
+                progress(start + len(block), frames)
+    meta = {
+        "format_version": FORMAT_VERSION,
+        "shape": [frames, height, width],
+        "width": width,
+        "bits": footage.bits,
+        "bit_order": "msb",
+        "orientation": footage.meta.get("orientation", "upright"),
+        "code_model": footage.code_model,
+        "planes_per_code": 2**footage.bits - 1 if footage.code_model == "binary_sum" else 1,
+        "frame_rate": capture.frame_rate,
+        "exposure": capture.seconds,
+        "sensor": sensor.to_dict(),
+        "sensor_name": capture.sensor,
+        "ppp_target": None,
+        "ppp_factor": None,
+        "radiance_unit": RELATIVE,
+        "transfer": "linear",
+        "seed": None,
+        "source": {"format": footage.source} | footage.meta,
+        "sha256": files.sha256(npy),
+        "software": {"qsim": __version__},
+    }
+    files.write_json(description, meta)
+    return Stream.open(description)
+
+
+@dataclass(frozen=True)
+class Export:
+    """How to write ours for others."""
+
+    kind: str  # cube, mp4, png, exr, zarr
+    transfer: str = "gamma 2.2"  # of pictures of light
+    white: float | None = None  # light that becomes full scale; None: the 99.9th percentile
+    lossless: bool = True  # of mp4
+    playback: float = 30.0  # frames per second of an mp4; the capture rate stands in its .json
+
+
+def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = False) -> Path:
+    """Write a clip's light or a stream's codes for other programs, with PATH.json (or PATH/meta.json) beside it.
+
+    `ValueError` if the kind cannot hold it: a photon cube holds one bit, an EXR holds light.
+    """
+    if wanted.kind not in EXPORTS:
+        raise ValueError(f"{path}: unknown kind {wanted.kind!r}; there are {', '.join(EXPORTS)}")
+    if path.exists() and not force:
+        raise FileExistsError(f"{path}: exists; name another, or use --force to replace it")
+    meta = _export_meta(source, wanted)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if wanted.kind in ("cube", "mp4"):
+        EXPORTS[wanted.kind](source, path, wanted, meta)
+        files.write_json(path.with_name(path.name + ".json"), meta)
+        return path
+    part = path.with_name(path.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    EXPORTS[wanted.kind](source, part, wanted, meta)
+    files.write_json(part / "meta.json", meta)
+    if path.exists():
+        files.remove_folder(path)
+    part.rename(path)
+    files.sync_folder(path.parent)
+    return path
+
+
+def _cube(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+    if isinstance(source, Clip) or source.bits != 1:
+        what = "a clip holds light" if isinstance(source, Clip) else f"this stream has {source.bits}"
+        raise ValueError(f"{source.path}: a photon cube holds one bit per pixel, {what}; sense it with --bits 1")
+    video.write_cube(path, _code_blocks(source), source.shape)
+
+
+def _mp4(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+    video.write_video(path, _grey(source, wanted, meta), wanted.playback, lossless=wanted.lossless)
+
+
+def _png(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+    if isinstance(source, Clip):
+        video.write_png(path, _grey(source, wanted, meta))
+    else:
+        images = (image for block in _code_blocks(source) for image in block)
+        video.write_png(path, (image.astype(bool) if source.bits == 1 else image for image in images))
+
+
+def _exr(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+    if not isinstance(source, Clip):
+        raise ValueError(f"{source.path}: EXR holds light, this is a stream of codes; use png, zarr or mp4")
+    video.write_exr(path, (source.radiance(t) for t in range(len(source))))
+
+
+def _zarr(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+    frames, height, width = source.shape
+    rate = float(meta["frame_rate"])
+    # quanta-spad-sim calls the length of the whole recording T_exp.
+    attributes = {"fps": rate, "T_exp": frames / rate, "T": frames, "H": height, "W": width, "shape": [*source.shape]}
+    blocks = _light_blocks(source) if isinstance(source, Clip) else _code_blocks(source)
+    video.write_zarr(path, blocks, source.shape, attributes | {"qsim": meta})
+
+
+EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
+    "cube": _cube,
+    "mp4": _mp4,
+    "png": _png,
+    "exr": _exr,
+    "zarr": _zarr,
+}
+
+
+def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
+    meta = source.meta
+    keys = ("shape", "frame_rate", "exposure", "radiance_unit", "scene", "split", "bits", "code_model", "sensor",
+            "seed", "ppp_target", "ppp_factor", "width", "planes_per_code")  # fmt: skip
+    found = {key: meta[key] for key in keys if key in meta}
+    found |= {"format_version": 1, "orientation": "upright", "bit_order": "msb", "software": {"qsim": __version__}}
+    if isinstance(source, Clip):
+        found["transfer"] = "linear" if wanted.kind in ("exr", "zarr") else wanted.transfer
+        if wanted.kind in ("mp4", "png"):
+            found["white"] = wanted.white if wanted.white is not None else _white(source)
+    elif wanted.kind == "mp4":
+        found["stretched"] = True
+    return found | ({"lossless": wanted.lossless} if wanted.kind == "mp4" else {})
+
+
+def _grey(source: Clip | Stream, wanted: Export, meta: dict[str, Any]) -> Iterator[Array]:
+    if isinstance(source, Clip):
+        for block in _light_blocks(source):
+            yield from video.grey(block, meta["white"], wanted.transfer)
+    else:
+        for block in _code_blocks(source):
+            yield from video.stretch(block, source.bits)
+
+
+def _white(clip: Clip) -> float:
+    step = max(1, len(clip) // 32)
+    samples = np.stack([clip.radiance(t)[::2, ::2] for t in range(0, len(clip), step)])
+    white = float(np.percentile(samples, 99.9))
+    return white if white > 0 else 1.0
+
+
+def _light_blocks(clip: Clip) -> Iterator[Array]:
+    for start in range(0, len(clip), video.BLOCK):
+        yield np.stack([clip.radiance(t) for t in range(start, min(start + video.BLOCK, len(clip)))])
+
+
+def _code_blocks(stream: Stream) -> Iterator[Array]:
+    for start in range(0, len(stream), video.BLOCK):
+        yield stream.codes(start, min(start + video.BLOCK, len(stream)))
+
+
+def _blocks(footage: Footage) -> Iterator[tuple[int, Array]]:
+    frames, height, width = footage.shape
+    step = max(1, min(256, (1 << 25) // (height * width)))
+    for start in range(0, frames, step):
+        yield start, footage.read(start, min(start + step, frames))
+
+
+def _sensor(footage: Footage, capture: Capture, devices: Any) -> Any:
+    if capture.sensor is not None:
+        return devices.load(capture.sensor, ppp=capture.ppp, bits=footage.bits, exposure=capture.seconds)
+    from qsim.spad import BinarySPAD
+
+    return BinarySPAD(pde=1.0, dark_count_rate=0.0, bits=footage.bits or 1)
+
+
+def _detect_folder(path: Path) -> str:
+    if (path / "transforms.json").is_file():
+        return "visionsim"
+    if any((path / name).is_file() for name in ("zarr.json", ".zgroup", ".zarray")):
+        return "zarr"
+    if (path / "info.json").is_file() or any(path.glob("part_*.mat")):
+        return "mat"
+    for pattern, layout in (("*.png", "png"), ("*.tif*", "tiff")):
+        if any(path.glob(pattern)):
+            return layout
+    if any(path.rglob("*.bin")):
+        return _detect_raw(planes.raw_files(path)[0], many=True)
+    raise ValueError(f"{path}: a folder of no known kind; say which with --layout: {', '.join(LAYOUTS)}")
+
+
+def _detect_npy(path: Path) -> str:
+    array = planes.load_npy(path)
+    if array.dtype == bool:
+        return "codes"
+    if array.dtype != np.uint8:
+        return "light"
+    if array.ndim == 4:
+        return "cube"
+    top = max((int(array[t].max()) for t in range(len(array)) if array[t].size), default=0)
+    bits = (top + 1).bit_length() - 1
+    if top + 1 == 1 << bits and bits < 8:
+        raise ValueError(
+            f"{path}: uint8 up to {top}: codes of {bits} bits, packed planes or dark pictures; choose with "
+            f"--layout codes (and --bits {max(bits, 1)}), --layout cube or --layout light"
+        )
+    return "cube"
+
+
+def _detect_raw(path: Path, many: bool = False) -> str:
+    size = path.stat().st_size
+    if size == _SMALL + 4 or path.name.startswith("acq_"):
+        return "spad512s"
+    candidates = ["swissspad2-half", "swissspad2-full", "spad512s"]
+    if many and path.name.startswith("filename"):
+        candidates.pop()
+    fitting = [
+        name for name in candidates if size % (planes.RAW_FRAME // (1 + (name == "swissspad2-half"))) == 0 < size
+    ]
+    if not fitting:
+        raise ValueError(
+            f"{path}: {size} bytes fit none of {', '.join(candidates)}; the file is truncated, or another kind"
+        )
+    evidence = []
+    for name in fitting:
+        sample = LAYOUTS[name](path, Hints()).read(0, min(64, size // planes.RAW_FRAME) or 1)
+        evidence.append(f"{name} (roughness {planes.roughness(sample):.2f})")
+    raise ValueError(
+        f"{path}: {size} bytes fit {', '.join(evidence)}; choose one with --layout (the right one is usually near 1)"
+    )

@@ -1,0 +1,304 @@
+"""Pictures and video: PNG, TIFF, mp4 in; mp4, PNG, EXR, zarr, photon cubes out.
+
+A picture holds light (grey or colour, coded by a declared transfer curve) or codes (a given number of bits, one code a
+pixel, or stretched to 0 ... 255). Colour becomes linear luminance (Rec. 709). Memory does not grow with T.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import codes, exr, files
+from qsim.footage import Footage, Hints, check_shape, from_linear, need_transfer, numbered, reading, to_linear
+from qsim.planes import checked_codes
+
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709
+BLOCK = 16  # frames read at a time
+
+
+def read_png(path: Path, hints: Hints) -> Footage:
+    """A PNG, or a folder of PNGs in the order of their numbers: 1-bit pictures are codes, others as `picture` says."""
+    pictures = [path] if path.is_file() else numbered(list(path.glob("*.png")))
+    if not pictures:
+        raise FileNotFoundError(f"{path}: holds no .png")
+    first = _png(pictures[0])
+    shape = check_shape(path, (len(pictures), *first.shape[:2]))
+
+    def raw(start: int, stop: int) -> Array:
+        return _same_size(pictures[start:stop], [_png(p) for p in pictures[start:stop]], first.shape, first.dtype)
+
+    return picture(path, shape, raw, first.dtype, "PNG", hints)
+
+
+def read_tiff(path: Path, hints: Hints) -> Footage:
+    """A TIFF with one page per frame, or a folder of single-page TIFFs; MinIsWhite is turned to MinIsBlack."""
+    found = [path] if path.is_file() else numbered([*path.glob("*.tif"), *path.glob("*.tiff")])
+    if not found:
+        raise FileNotFoundError(f"{path}: holds no .tif or .tiff")
+    counts = [_tiff_pages(file) for file in found]
+    where = [(file, page) for file, count in zip(found, counts, strict=True) for page in range(count)]
+    first = _tiff(*where[0])
+    shape = check_shape(path, (len(where), *first.shape[:2]))
+
+    def raw(start: int, stop: int) -> Array:
+        chosen = where[start:stop]
+        return _same_size([file for file, _ in chosen], [_tiff(*place) for place in chosen], first.shape, first.dtype)
+
+    return picture(path, shape, raw, first.dtype, "TIFF", hints)
+
+
+def read_video(path: Path, hints: Hints) -> Footage:
+    """An mp4 (or what else FFmpeg decodes) as light; the container's frame rate is not the capture rate.
+
+    Frames are decoded in order and kept only while they are needed: ask for them in order.
+    """
+    transfer = need_transfer(path, hints)
+    with reading(path, "video"):
+        frames, height, width = _video_shape(path)
+    shape = check_shape(path, (frames, height, width))
+    decoder = _Decoder(path, height, width)
+
+    def read(start: int, stop: int) -> Array:
+        with reading(path, "video"):
+            return np.stack([to_luminance(frame, transfer, 255) for frame in decoder.frames(start, stop)])
+
+    return Footage(shape, read, "video", meta={"transfer": transfer})
+
+
+def read_light_npy(path: Path, hints: Hints) -> Footage:
+    """Numbers [T, H, W] as light: integers are coded by --transfer (full scale of their type), floats are linear."""
+    from qsim.planes import load_npy
+
+    array = load_npy(path)
+    shape = check_shape(path, array.shape)
+    if array.dtype.kind == "f" and hints.transfer in (None, "linear"):
+        return Footage(shape, lambda a, b: np.asarray(array[a:b], np.float32), ".npy", meta={"transfer": "linear"})
+    transfer = need_transfer(path, hints)
+    top = 1.0 if array.dtype.kind == "f" else float(np.iinfo(array.dtype).max)
+
+    def read(start: int, stop: int) -> Array:
+        return to_linear(np.asarray(array[start:stop]), transfer, top)
+
+    return Footage(shape, read, ".npy", meta={"transfer": transfer})
+
+
+def picture(path: Path, shape: tuple[int, int, int], raw: Any, dtype: np.dtype, source: str, hints: Hints) -> Footage:
+    """Pictures as codes, if they are 1-bit or --bits is given, else as light by --transfer.
+
+    `ValueError` if codes seem to be stretched to 0 ... 255 and the user did not say so: the counts would be lost.
+    """
+    one_bit = dtype.kind == "b"
+    if one_bit or hints.bits is not None:
+        bits = 1 if one_bit else int(hints.bits or 0)
+        top = 2**bits - 1
+
+        def read_codes(start: int, stop: int) -> Array:
+            values = raw(start, stop)
+            if values.ndim == 4:
+                raise ValueError(f"{path}: colour pictures hold no codes")
+            if hints.stretched and not one_bit:
+                return _unstretch(path, values, top, start)
+            return checked_codes(path, values, bits, start)
+
+        return Footage(shape, read_codes, source, bits)
+    if dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{path}: pixels of {dtype}; 1-, 8- and 16-bit pictures are read")
+    transfer = need_transfer(path, hints)
+    full = float(np.iinfo(dtype).max)
+
+    def read(start: int, stop: int) -> Array:
+        return to_luminance(raw(start, stop), transfer, full)
+
+    return Footage(shape, read, source, meta={"transfer": transfer})
+
+
+def to_luminance(values: Array, transfer: str, top: float) -> Array:
+    """Linear light of grey [..., H, W] or colour [..., H, W, 3] pictures: linearised first, then weighted."""
+    linear = to_linear(values, transfer, top)
+    if values.shape[-1] == 3 and values.ndim > 2:
+        return linear @ _LUMINANCE
+    return linear
+
+
+def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossless: bool) -> None:
+    """8-bit grey frames [H, W] as H.264: bit-exact grey (`qp 0`), or FFmpeg's ordinary lossy settings, in yuv420p."""
+    import av
+
+    with files.replacing(path) as file, av.open(file, "w", format="mp4") as container:
+        stream: Any = None
+        for image in frames:
+            if stream is None:
+                stream = container.add_stream(
+                    "libx264", rate=round(frame_rate), options={"qp": "0"} if lossless else {}
+                )
+                stream.height, stream.width = image.shape
+                stream.pix_fmt = "gray" if lossless else "yuv420p"
+                if not lossless and (image.shape[0] % 2 or image.shape[1] % 2):
+                    raise ValueError(
+                        f"{path}: lossy H.264 needs even sizes, the frames are {image.shape}; use --lossless"
+                    )
+            for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="gray")):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+
+
+def write_png(folder: Path, images: Iterator[Array]) -> None:
+    """One PNG per image, 000000.png ...: bool as 1-bit, uint8 and uint16 as they are."""
+    from PIL import Image
+
+    for t, image in enumerate(images):
+        with files.replacing(folder / f"{t:06d}.png") as file:
+            Image.fromarray(image).save(file, format="png")
+
+
+def write_exr(folder: Path, images: Iterator[Array]) -> None:
+    """One float32 EXR with the channel Y per image, losslessly zipped."""
+    for t, image in enumerate(images):
+        files.write_bytes(folder / f"{t:06d}.exr", exr.encode({"Y": image.astype("<f4")}, compress=True))
+
+
+def write_zarr(folder: Path, blocks: Iterator[Array], shape: tuple[int, int, int], attributes: dict[str, Any]) -> None:
+    """A zarr v3 group with `frames` [T, H, W], chunks of whole frames; binary codes as quanta-spad-sim stores them."""
+    import zarr
+
+    group = zarr.open_group(str(folder), mode="w", zarr_format=3)
+    group.attrs.update(attributes)
+    per_chunk = max(1, min(max(shape[0], 1), (8 << 20) // (shape[1] * shape[2])))
+    array = None
+    start = 0
+    for block in blocks:
+        if array is None:
+            array = group.create_array("frames", shape=shape, chunks=(per_chunk, *shape[1:]), dtype=block.dtype)
+        array[start : start + len(block)] = block
+        start += len(block)
+
+
+def write_cube(path: Path, blocks: Iterator[Array], shape: tuple[int, int, int]) -> None:
+    """Binary planes as a photon cube: uint8 [T, H, ceil(W/8)], rows padded, most significant bit first."""
+    frames, height, width = shape
+    with files.replacing(path) as file:
+        header = {"descr": "|u1", "fortran_order": False, "shape": (frames, height, codes.packed_width(width, 1))}
+        np.lib.format.write_array_header_1_0(file, header)
+        for block in blocks:
+            file.write(codes.pack(block, 1).tobytes())
+
+
+def stretch(values: Array, bits: int) -> Array:
+    """Codes 0 ... 2^bits - 1 as 8-bit grey 0 ... 255, rounded; `_unstretch` inverts it exactly up to 8 bits."""
+    return np.rint(values.astype(np.float64) * 255 / (2**bits - 1)).astype(np.uint8)
+
+
+def grey(light: Array, white: float, transfer: str) -> Array:
+    """Linear light as 8-bit grey, `white` becoming 255."""
+    return from_linear(light / white, transfer, 255)
+
+
+class _Decoder:
+    """Frames of a video in order; going back starts again."""
+
+    def __init__(self, path: Path, height: int, width: int) -> None:
+        self.path, self.size = path, (height, width)
+        self.next = 0
+        self.source: Iterator[Array] | None = None
+
+    def frames(self, start: int, stop: int) -> list[Array]:
+        if self.source is None or start < self.next:
+            self.source, self.next = self._decode(), 0
+        found = []
+        while self.next < stop:
+            frame = next(self.source, None)
+            if frame is None:
+                raise ValueError(f"{self.path}: ends after {self.next} frames, though it says more; it is truncated")
+            if self.next >= start:
+                found.append(frame)
+            self.next += 1
+        return found
+
+    def _decode(self) -> Iterator[Array]:
+        import av
+
+        with av.open(str(self.path)) as container:
+            for frame in container.decode(video=0):
+                if (frame.height, frame.width) != self.size:
+                    raise ValueError(f"{self.path}: a frame of {frame.height} x {frame.width} among {self.size}")
+                yield frame.to_ndarray(format="gray" if frame.format.name.startswith("gray") else "rgb24")
+
+
+def _video_shape(path: Path) -> tuple[int, int, int]:
+    import av
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    with av.open(str(path)) as container:
+        if not container.streams.video:
+            raise ValueError(f"{path}: has no video stream")
+        stream = container.streams.video[0]
+        height, width = stream.codec_context.height, stream.codec_context.width
+        frames = sum(1 for packet in container.demux(stream) if packet.size)
+    return frames, height, width
+
+
+def _png(path: Path) -> Array:
+    from PIL import Image
+
+    with reading(path, "PNG"), Image.open(path, formats=["PNG"]) as opened:
+        check_shape(path, (1, opened.height, opened.width))
+        if opened.mode in ("RGB", "RGBA", "P", "LA"):
+            return np.asarray(opened.convert("RGB"))
+        if opened.mode not in ("1", "L", "I;16", "I"):
+            raise ValueError(f"{path}: pixels of mode {opened.mode}; 1-, 8- and 16-bit pictures are read")
+        pixels = np.asarray(opened)
+        return pixels.astype(np.uint16) if pixels.dtype.kind == "i" or pixels.dtype.itemsize > 1 else pixels
+
+
+def _tiff_pages(path: Path) -> int:
+    import tifffile
+
+    with reading(path, "TIFF"), tifffile.TiffFile(path) as opened:
+        return len(opened.pages)
+
+
+def _tiff(path: Path, page: int) -> Array:
+    import tifffile
+
+    with reading(path, "TIFF"), tifffile.TiffFile(path) as opened:
+        found: Any = opened.pages[page]
+        check_shape(path, (1, found.imagelength, found.imagewidth))
+        promised, size = found.nbytes, path.stat().st_size
+        if promised > 1032 * size or (found.compression == 1 and found.bitspersample >= 8 and promised > size):
+            raise ValueError(f"{path}: page {page} promises {promised} bytes, the file has {size}")
+        pixels: Array = found.asarray()
+        if found.bitspersample == 1:
+            pixels = pixels.astype(bool)
+        if found.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
+            pixels = ~pixels if pixels.dtype == bool else np.iinfo(pixels.dtype).max - pixels
+        if pixels.ndim == 3 and pixels.shape[2] > 3:
+            pixels = pixels[..., :3]
+        return pixels
+
+
+def _same_size(paths: list[Path], images: list[Array], shape: tuple[int, ...], dtype: np.dtype) -> Array:
+    for path, image in zip(paths, images, strict=True):
+        if image.shape != shape or image.dtype != dtype:
+            raise ValueError(
+                f"{path}: {image.dtype} {list(image.shape)}, but the first picture is {dtype} {list(shape)}"
+            )
+    return np.stack(images)
+
+
+def _unstretch(path: Path, values: Array, top: int, first: int) -> Array:
+    found = np.rint(values.astype(np.float64) * top / 255).astype(np.uint8 if top < 256 else np.uint16)
+    back = np.rint(found.astype(np.float64) * 255 / top)
+    if (back != values).any():
+        t, y, x = (int(i) for i in np.argwhere(back != values)[0])
+        raise ValueError(
+            f"{path}: value {int(values[t, y, x])} at (t, y, x) = ({first + t}, {y}, {x}) is no code 0..{top} "
+            "stretched to 0..255; the pictures were coded with loss"
+        )
+    return found
