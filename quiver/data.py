@@ -7,7 +7,7 @@ Nothing here needs torch. Training windows, a `torch` data set, are in samples.p
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -20,8 +20,9 @@ from qsim.clip import Clip
 from qsim.console import Parser, bar, command, output, run, suggest
 from qsim.dataset import Dataset
 from qsim.files import read_json, replacing, write_bytes, write_json
-from qsim.keys import Key
+from qsim.keys import Key, hash_name
 from qsim.optics import clip_photons, light_level
+from qsim.qis import QIS
 from qsim.sensor import Sensor
 from qsim.stream import Sensing, Stream, prepare
 from quiver.code_table import TABLE_BITS, CodeTable
@@ -40,19 +41,26 @@ __all__ = [
     "cube_codes",
     "draw_codes",
     "has_sharp",
+    "ideal_counter",
     "light_level",
     "open_clips",
+    "open_stream",
     "output",
     "read_json",
     "replacing",
     "run",
     "sensed",
+    "stored",
     "stream_codes",
     "suggest",
     "truth",
+    "windows_sensed",
     "write_bytes",
     "write_json",
 ]
+
+
+WINDOW_STAGE = 1000  # of the random keys of published test windows, + frame; 0 is `qsim sense`
 
 
 @dataclass(frozen=True)
@@ -190,6 +198,22 @@ def stream_codes(stream: Stream) -> Codes:
     )
 
 
+def open_stream(path: Path) -> Stream:
+    """The stored stream whose .npy or .json this is."""
+    return Stream.open(path.with_suffix(".json"))
+
+
+def stored(clip: Clip, name: str) -> tuple[Codes, float]:
+    """A stored stream of a clip, and its light factor; `ValueError` where a code sums several clip frames."""
+    stream = clip.stream(name)
+    if stream.shape != clip.shape:
+        raise ValueError(
+            f"{stream.path}: {list(stream.shape)}, but its clip is {list(clip.shape)}; only streams with one code per "
+            "clip frame can be scored"
+        )
+    return stream_codes(stream), stream.photons_factor
+
+
 def truth(clip: Clip, factor: float, start: int, stop: int) -> Array:
     """Sharp expected photons [stop - start, H, W] of a clip under a light factor: what a restorer should return."""
     return np.stack([clip_photons(clip, t, factor, sharp=True) for t in range(start, stop)])
@@ -222,3 +246,27 @@ def _summed_planes(path: Path, cube: Array, planes: int, width: int) -> Array:
         raise ValueError(f"{path}: {len(cube)} planes are fewer than the {planes} of one code")
     groups = (np.unpackbits(cube[t * planes : (t + 1) * planes], axis=2, count=width) for t in range(frames))
     return np.stack([group.sum(axis=0, dtype=np.uint8) for group in groups])
+
+
+def windows_sensed(clip: Clip, light: Light, seed: int, centres: range) -> Iterator[Codes]:
+    """The published test: each window of 11 frames brought to the light level on its own, with noise of its own.
+
+    `ValueError` for a light without a level (the clip's own), which cannot be forced.
+    """
+    if light.ppp is None:
+        raise ValueError("the published protocol forces the exposure of every window; give --ppp")
+    sensor = light.device(clip.exposure)
+    for t in centres:
+        photons = np.stack([clip_photons(clip, i) for i in range(t - 5, t + 6)])
+        codes = draw_codes(
+            sensor,
+            photons * (light.ppp / max(float(photons.mean()), 1e-9)),
+            clip.exposure,
+            Key(seed=seed, clip=hash_name(clip.name), stage=WINDOW_STAGE + t),
+        )
+        yield array_codes(codes, sensor, clip.exposure, name=f"{clip.name} window {t}")
+
+
+def ideal_counter(bits: int) -> Sensor:
+    """A sensor that counts every detected photon up to 2^bits - 1, for measured photon counts."""
+    return QIS(quantum_efficiency=1.0, dark_current=0.0, read_noise=0.0, bits=bits)

@@ -9,11 +9,13 @@ truth is needed. `restorer(NAME)` finds a classical method, shipped weights, a w
 
 from __future__ import annotations
 
+import hashlib
 import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +23,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from quiver.baselines import METHODS
-from quiver.baselines.windows import look_ahead, window_frames
+from quiver.baselines.windows import look_ahead, reflect
 from quiver.data import Codes, write_json
 
 if TYPE_CHECKING:
@@ -31,10 +33,12 @@ if TYPE_CHECKING:
 PRETRAINED = Path(__file__).parent / "pretrained"  # weights that ship with the package
 DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory beside the weights
 CLASSICAL_BYTES = 200  # per pixel and frame held at once, about, of the hungriest classical method
+CONTEXT = 5  # frames that a network needs before and after the one it restores
 OVERLAP = 32  # px that neighbouring tiles share
 MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/reuse.py
 
 Progress = Callable[[int, int], None]  # (steps done, steps in all)
+Fill = Callable[[Codes, Array, int, Progress | None], None]  # adds photons of frames `first` ... to zeros [t, H, W]
 
 
 @dataclass(frozen=True)
@@ -64,26 +68,35 @@ class Restorer:
     look_ahead: int  # of these, future ones
     learned: bool
     description: str
-    fill: Callable[[Codes, Array, Progress | None], None]  # writes photons into [T, H, W]
+    fill: Fill
 
-    def restore(self, codes: Codes, progress: Progress | None = None) -> Array:
-        """Restored photons float32 [T, H, W]."""
-        out = np.zeros(codes.shape, np.float32)
-        self.fill(codes, out, progress)
+    def restore(self, codes: Codes, first: int = 0, last: int | None = None, progress: Progress | None = None) -> Array:
+        """Restored photons float32 [last - first, H, W] of frames first ... last - 1, all of them by default."""
+        length, height, width = codes.shape
+        out = np.zeros(((length if last is None else last) - first, height, width), np.float32)
+        self.fill(codes, out, first, progress)
         return out
 
 
 def restorer(name: str, options: Options | None = None) -> Restorer:
-    """A method by name, shipped preset, weights file or training folder; ValueError or FileNotFoundError otherwise."""
+    """A method by name, shipped preset, weights file or training folder; ValueError or FileNotFoundError otherwise.
+
+    A classical method may be followed by its window in frames, as in `moment:5`.
+    """
     options = options or Options()
-    if name in METHODS:
-        method = METHODS[name]
+    base, _, window = name.partition(":")
+    if base not in METHODS:
+        return network_restorer(weights_path(name), name, options)
+    method = METHODS[base]
+    if window and not (window.isdecimal() and int(window) > 0):
+        raise ValueError(f"method {name!r}: the window after the colon is a number of frames, as in {base}:5")
+    frames = int(window) if window else method.window
+    run = partial(method.restore, window=frames) if window else method.restore
 
-        def fill(codes: Codes, out: Array, progress: Progress | None) -> None:
-            fill_classical(method.restore, method.window, codes, out, options.memory, progress)
+    def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
+        fill_classical(run, frames, codes, out, first, options.memory, progress)
 
-        return Restorer(name, method.window, look_ahead(method.window), False, method.description, fill)
-    return network_restorer(weights_path(name), name, options)
+    return Restorer(name, frames, look_ahead(frames), False, method.description, fill)
 
 
 def weights_path(name: str) -> Path:
@@ -116,11 +129,12 @@ def network_restorer(path: Path, name: str, options: Options) -> Restorer:
     device = torch.device(pick_device(options.device))
     model = load(path).to(device)
     shown = path.parent.name if path.name == "best.safetensors" else path.stem
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
 
-    def fill(codes: Codes, out: Array, progress: Progress | None) -> None:
-        fill_network(model, codes, out, options, progress)
+    def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
+        fill_network(model, codes, out, first, options, progress)
 
-    return Restorer(shown, WINDOW, RADIUS, True, f"{type(model).__name__}, {name}", fill)
+    return Restorer(shown, WINDOW, RADIUS, True, f"{type(model).__name__}, weights {digest}, {options.mode}", fill)
 
 
 def pick_device(wanted: str) -> str:
@@ -135,18 +149,25 @@ def pick_device(wanted: str) -> str:
 
 
 def fill_classical(
-    restore: Callable[..., Array], window: int, codes: Codes, out: Array, memory: int, progress: Progress | None
+    restore: Callable[..., Array],
+    window: int,
+    codes: Codes,
+    out: Array,
+    first: int,
+    memory: int,
+    progress: Progress | None,
 ) -> None:
     """Run a classical method over blocks of frames with `window` frames of context on both sides."""
     length, height, width = codes.shape
+    last = first + len(out)
     block = max(1, memory // (CLASSICAL_BYTES * height * width) - 2 * window)
-    for start in range(0, length, block):
-        stop = min(start + block, length)
-        first, last = max(0, start - window), min(length, stop + window)
-        restored = restore(codes.read(first, last), codes.sensor, codes.exposure)
-        out[start:stop] = restored[start - first : stop - first]
+    for start in range(first, last, block):
+        stop = min(start + block, last)
+        before, after = max(0, start - window), min(length, stop + window)
+        restored = restore(codes.read(before, after), codes.sensor, codes.exposure)
+        out[start - first : stop - first] = restored[start - before : stop - before]
         if progress is not None:
-            progress(stop, length)
+            progress(stop - first, len(out))
 
 
 @dataclass(frozen=True)
@@ -198,35 +219,36 @@ def plan_tiles(height: int, width: int, pixels: int, overlap: int = OVERLAP) -> 
     ]
 
 
-def fill_network(model: nn.Module, codes: Codes, out: Array, options: Options, progress: Progress | None) -> None:
+def fill_network(
+    model: nn.Module, codes: Codes, out: Array, first: int, options: Options, progress: Progress | None
+) -> None:
     """Restore tile by tile, frame by frame; `out` must be zero and collects the weighted tiles."""
     import torch
 
-    length, height, width = codes.shape
     device = next(model.parameters()).device
     dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
-    tiles = plan_tiles(height, width, options.memory // bytes_per_pixel(model))
+    tiles = plan_tiles(*codes.shape[1:], options.memory // bytes_per_pixel(model))
+    multiple = int(model.multiple)  # type: ignore[arg-type]
     done = 0
     for tile in tiles:
         rows, columns = tile.weight.shape
         part = (slice(tile.y, tile.y + rows), slice(tile.x, tile.x + columns))
-        frames = (pad_space(frame, int(model.multiple)).to(device) for frame in padded_frames(codes, part))  # type: ignore[arg-type]
+        frames = (pad_space(frame, multiple).to(device) for frame in padded_frames(codes, part, first, len(out)))
         with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
             for t, picture in enumerate(pictures(model, frames, options.mode)):
                 restored = picture[0, 0, :rows, :columns].float().cpu().numpy()
                 out[(t, *part)] += tile.weight * restored * np.float32(codes.white)
                 done += 1
                 if progress is not None:
-                    progress(done, length * len(tiles))
+                    progress(done, len(out) * len(tiles))
 
 
-def padded_frames(codes: Codes, part: tuple[slice, slice]) -> Iterator[Tensor]:
-    """Frames -5 ... T+4 of a stream (reflected at its ends) as networks see them, [1, 1, h, w]."""
+def padded_frames(codes: Codes, part: tuple[slice, slice], first: int, count: int) -> Iterator[Tensor]:
+    """Frames first-5 ... first+count+4 (reflected at the ends of the stream) as networks see them, [1, 1, h, w]."""
     import torch
 
-    length, top = codes.shape[0], codes.sensor.levels - 1
-    before, after = window_frames(0, 11, length)[:5], window_frames(length - 1, 11, length)[6:]
-    for t in (*before, *range(length), *after):
+    top = codes.sensor.levels - 1
+    for t in reflect(np.arange(first - CONTEXT, first + count + CONTEXT), codes.shape[0]):
         frame = codes.read(int(t), int(t) + 1)[(0, *part)].astype(np.float32) / np.float32(top)
         yield torch.from_numpy(frame)[None, None]
 
@@ -275,7 +297,7 @@ def restore_to_file(codes: Codes, method: Restorer, path: Path, progress: Progre
     try:
         with open(temporary, "wb") as file:
             out = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.float32, shape=codes.shape)
-            method.fill(codes, out, progress)
+            method.fill(codes, out, 0, progress)
             check_finite(out, method.name)
             out.flush()
             os.fsync(file.fileno())

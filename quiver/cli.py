@@ -1,0 +1,399 @@
+"""The command `quiver`: parse, call, print. Each command is a pair `_add_X` (its options) and `_run_X` (what it does)."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+NETWORKS = ("nano", "quiver-s", "quiver", "unet")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command line; returns the exit code."""
+    from quiver.data import Parser, run
+
+    parser = Parser(
+        prog="quiver", description="Restore blur-free video from few-bit quanta streams; train and compare."
+    )
+    sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
+    for add in (_add_train, _add_restore, _add_evaluate, _add_bench, _add_convert_weights):
+        add(sub)
+    return run(parser, argv)
+
+
+def _command(sub: Any, name: str, action: Any, what: str, example: str) -> argparse.ArgumentParser:
+    from quiver.data import command
+
+    return command(sub, name, action, what, example)
+
+
+# Types of options
+
+
+def numbers(text: str) -> tuple[float, ...]:
+    """`3.25,9.75` -> (3.25, 9.75)"""
+    return tuple(positive(part) for part in text.split(","))
+
+
+def whole_numbers(text: str) -> tuple[int, ...]:
+    """`1,3` -> (1, 3)"""
+    return tuple(count(part) for part in text.split(","))
+
+
+def positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
+    return value
+
+
+def count(text: str) -> int:
+    if not text.strip().isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
+    return int(text)
+
+
+def size(text: str) -> int:
+    """Bytes of `2GB`, `500MB`, `1.5GiB` or a bare number."""
+    units = {"kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2**10, "mib": 2**20, "gib": 2**30, "b": 1, "": 1}
+    number = text.rstrip("KMGiBkmgb")
+    unit = text[len(number) :].lower()
+    try:
+        value = float(number) * units[unit]
+    except (ValueError, KeyError):
+        value = float("nan")
+    if not 1 <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"expected a size such as 2GB or 500MB, got {text!r}")
+    return int(value)
+
+
+def words(text: str) -> tuple[str, ...]:
+    """`naive,moment:3,out/run` -> its parts; none may be empty."""
+    parts = tuple(part.strip() for part in text.split(","))
+    if not all(parts):
+        raise argparse.ArgumentTypeError(f"expected names with commas between them, got {text!r}")
+    return parts
+
+
+def _add_light(parser: argparse.ArgumentParser, several: bool) -> None:
+    kind, many = (numbers, "; several: 3.25,9.75,26") if several else (positive, "")
+    whole = whole_numbers if several else count
+    parser.add_argument("--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default quiver-physical)")
+    parser.add_argument("--ppp", type=kind, help=f"mean photons per pixel and exposure (default 3.25){many}")
+    parser.add_argument("--bits", type=whole, help="bits per code (default 3)")
+
+
+def _add_running(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--memory", type=size, default="2GB", help="working memory, as in 500MB (default 2GB)")
+    parser.add_argument(
+        "--mode", default="exact", choices=("exact", "streaming", "windows"), help="how frames share work"
+    )
+    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
+    parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"), help="default float32")
+
+
+def _options(args: argparse.Namespace) -> Any:
+    from quiver.restore import Options
+
+    return Options(args.memory, args.mode, args.device, args.precision)
+
+
+def _renew(folder: Path, mark: str) -> None:
+    """Remove a folder of ours (it holds `mark`), to start anew."""
+    if (folder / mark).is_file():
+        shutil.rmtree(folder)
+    elif folder.exists():
+        raise FileExistsError(f"{folder} holds no {mark}; --force removes only what this command made")
+
+
+# train
+
+
+def _add_train(sub: Any) -> None:
+    parser = _command(
+        sub, "train", _run_train, "Train a network on the clips of a data set; the same command again goes on.",
+        "quiver train out/starter -o out/nano --minutes 20\n"
+        "quiver train out/starter -o out/unet --preset unet --protocol control --minutes 20\n"
+        "torchrun --nproc-per-node 4 -m quiver train out/starter -o out/s --preset quiver-s --protocol published",
+    )  # fmt: skip
+    parser.add_argument("data", help="data set folder")
+    parser.add_argument("-o", "--output", required=True, help="folder of the run")
+    parser.add_argument("--preset", default="nano", choices=NETWORKS, help="network (default nano)")
+    parser.add_argument(
+        "--protocol",
+        default="quick",
+        help="bundle of defaults: quick, control, published, paper, spad-sum (default quick)",
+    )
+    parser.add_argument("--steps", type=count, help="optimiser steps")
+    parser.add_argument("--minutes", type=positive, help="wall-clock limit; the learning rate is planned for it")
+    _add_light(parser, several=True)
+    parser.add_argument("--crop", type=count, help="px, side of the training windows")
+    parser.add_argument("--batch", type=count, help="windows per step and process")
+    parser.add_argument("--learning-rate", type=positive, help="of Adam")
+    parser.add_argument("--schedule", choices=("cosine", "plateau"), help="of the learning rate")
+    parser.add_argument("--loss", choices=("published", "paper", "l1"))
+    parser.add_argument("--validate-every", type=count, help="steps")
+    parser.add_argument("--validation-split", choices=("train", "val", "test"), help="default val")
+    parser.add_argument("--workers", type=int, help="processes that draw samples (default 0: this one)")
+    parser.add_argument("--precision", choices=("auto", "float32", "bfloat16"), help="default auto: bfloat16 on CUDA")
+    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
+    parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
+    parser.add_argument("--force", action="store_true", help="start anew where a run is")
+
+
+def _run_train(args: argparse.Namespace) -> int:
+    import torch
+
+    from quiver.data import output
+    from quiver.restore import pick_device
+    from quiver.run import PROTOCOLS, Settings
+    from quiver.train import Diverged, train
+
+    if args.protocol not in PROTOCOLS:
+        from quiver.data import suggest
+
+        raise ValueError(
+            f"no protocol {args.protocol!r}{suggest(args.protocol, list(PROTOCOLS))}; known: {', '.join(PROTOCOLS)}"
+        )
+    given = {f.name: getattr(args, f.name, None) for f in fields(Settings)}
+    given |= {"data": args.data, "out": args.output, "network": args.preset}
+    settings = Settings(
+        **(PROTOCOLS[args.protocol] | {name: value for name, value in given.items() if value is not None})
+    )
+    folder = Path(args.output)
+    if args.force and folder.exists():
+        _renew(folder, "settings.json")
+    torch.manual_seed(settings.seed)
+    interrupted: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda found, _: interrupted.append(found))
+    try:
+        state = train(
+            build_network(args.preset),
+            settings,
+            device=pick_device(args.device),
+            should_stop=lambda: bool(interrupted),
+            progress=not args.json,
+        )
+    except Diverged as error:
+        print(f"quiver: {error}", file=sys.stderr)
+        return 1
+    best = state.history[-1] if state.history else {}
+    found = {"run": str(folder), "steps": state.step, "seconds": state.elapsed, "last_validation": best}
+    text = f"{folder}: {state.step} steps in {state.elapsed / 60:.1f} min"
+    if state.history:
+        found |= {"best_psnr_matched": state.best, "weights": str(folder / "best.safetensors")}
+        text += f", validation PSNR {state.best:.2f} dB (after the best factor); weights in best.safetensors"
+    output(args, found, text)
+    if interrupted:
+        print("quiver: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        return 130
+    return 0
+
+
+def build_network(name: str) -> Any:
+    """A network with random weights by preset name."""
+    from quiver.model import build
+    from quiver.unet import UNet
+
+    return UNet() if name == "unet" else build(name)
+
+
+# restore
+
+
+def _add_restore(sub: Any) -> None:
+    parser = _command(
+        sub, "restore", _run_restore, "Restore a stream, a clip or a photon cube; no ground truth is needed.",
+        "quiver restore out/starter/clips/fan_0003 -o out/fan.npy\n"
+        "quiver restore out/fan/streams/quiver-physical_3bit_3.25ppp.npy -o out/fan.npy --method out/nano\n"
+        "quiver restore out/fan --ppp 3.25 -o out/fan.npy --method moment\n"
+        "quiver restore cube.npy --width 320 --planes 7 --sensor spad-320x240 --frame-rate 1428 -o out/cube.npy",
+    )  # fmt: skip
+    parser.add_argument("source", type=Path, help="stream (.npy with its .json), clip folder, or bare .npy array")
+    parser.add_argument("-o", "--output", type=Path, required=True, help=".npy to write; a .json appears beside it")
+    parser.add_argument(
+        "--method", default="nano", help="classical method, shipped weights, file or run (default nano)"
+    )
+    parser.add_argument("--stream", help="which stream of a clip (default: the only one)")
+    _add_light(parser, several=False)
+    parser.add_argument("--seed", type=int, default=0, help="of the noise, where a clip is sensed now (default 0)")
+    parser.add_argument("--width", type=count, help="bare array: packed binary planes of this many pixels per row")
+    parser.add_argument("--planes", type=count, help="packed planes: so many are summed to one code, as in 7")
+    parser.add_argument(
+        "--frame-rate", type=positive, default=2000.0, help="bare array: codes per second (default 2000)"
+    )
+    _add_running(parser)
+    parser.add_argument("--force", action="store_true", help="replace an existing result")
+
+
+def _run_restore(args: argparse.Namespace) -> int:
+    from quiver.data import bar, output
+    from quiver.restore import restore_to_file, restorer
+
+    if args.output.suffix != ".npy":
+        raise ValueError(f"{args.output}: restored video is written as .npy")
+    for path in (args.output, args.output.with_suffix(".json")):
+        if path.exists() and not args.force:
+            raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
+    codes = _source(args)
+    method = restorer(args.method, _options(args))
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+    with bar(method.name) as progress:
+        meta = restore_to_file(codes, method, args.output, progress)
+    length, height, width = codes.shape
+    output(
+        args,
+        {"restored": str(args.output)} | meta,
+        f"{args.output}: {length} frames of {height} x {width} by {method.name}, "
+        f"{meta['seconds_per_frame']:.3g} s per frame; photons, white = {codes.white:.4g}",
+    )
+    return 0
+
+
+def _source(args: argparse.Namespace) -> Any:
+    """The codes that a path and the options mean."""
+    from quiver.data import Light, cube_codes, open_clips, open_stream, sensed, stream_codes
+
+    light = Light(args.sensor or "quiver-physical", args.ppp, args.bits)
+    path: Path = args.source
+    if path.is_dir():
+        clip = open_clips(path)[0]
+        if len(open_clips(path)) > 1 or not (path / "clip.json").exists():
+            raise ValueError(f"{path}: is a data set; name one of its clips, as in {clip.path}")
+        if args.ppp is None and args.stream is None and len(clip.streams) != 1:
+            there = ", ".join(clip.streams) or "none"
+            raise ValueError(f"{path}: choose one of its streams with --stream ({there}), or sense it now with --ppp")
+        if args.stream is not None or args.ppp is None:
+            return stream_codes(clip.stream(args.stream or clip.streams[0]))
+        return sensed(clip, Light(light.sensor, args.ppp, args.bits or 3), args.seed)[0]
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    if path.with_suffix(".json").is_file() and args.width is None:
+        return stream_codes(open_stream(path))
+    bits = args.bits or (args.planes.bit_length() if args.planes else 3)
+    return cube_codes(path, Light(light.sensor, args.ppp, bits), args.frame_rate, planes=args.planes, width=args.width)
+
+
+# evaluate
+
+
+def _add_evaluate(sub: Any) -> None:
+    parser = _command(
+        sub, "evaluate", _run_evaluate, "Compare methods on held-out clips, or on real photons of a static object.",
+        "quiver evaluate out/starter -o out/table --methods naive,moment,out/nano,out/unet --ppp 3.25,9.75,26\n"
+        "quiver evaluate out/starter/clips/fan_0003 -o out/fan_table --methods moment,nano --split all\n"
+        "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,nano",
+    )  # fmt: skip
+    parser.add_argument("source", nargs="?", help="data set or clip folder")
+    parser.add_argument("-o", "--output", type=Path, help="folder for evaluation.md, .json, .png (needed for clips)")
+    parser.add_argument("--methods", type=words, default="naive,moment", help="with commas; window as in moment:3")
+    parser.add_argument("--split", default="test", choices=("train", "val", "test", "all"), help="default test")
+    parser.add_argument("--stream", help="score this stored stream of every clip instead of sensing now")
+    _add_light(parser, several=True)
+    parser.add_argument("--seed", type=int, default=0, help="of the test noise or of the random splits (default 0)")
+    parser.add_argument("--published", action="store_true", help="every window exposed, scaled and scored on its own")
+    parser.add_argument(
+        "--static", type=Path, metavar="COUNTS", help="photon counts [N,H,W] or [T,K,H,W], .npy or .npz"
+    )
+    parser.add_argument("--frames", type=count, default=11, help="static: frames to restore from (default 11)")
+    parser.add_argument("--splits", type=count, default=3, help="static: random splits (default 3)")
+    _add_running(parser)
+    parser.add_argument("--force", action="store_true", help="start anew where an evaluation is")
+
+
+def _run_evaluate(args: argparse.Namespace) -> int:
+    from quiver.restore import restorer
+
+    methods = [restorer(name, _options(args)) for name in args.methods]
+    if args.static is not None:
+        return _run_static(args, methods)
+    if args.source is None or args.output is None:
+        raise ValueError("give a data set or clip folder and -o, or --static COUNTS")
+    from quiver import table
+    from quiver.data import Light, bar, output
+    from quiver.evaluate import Plan, evaluate
+
+    sensor = args.sensor or ("quiver-published" if args.published else "quiver-physical")
+    lights = tuple(Light(sensor, ppp, bits) for bits in args.bits or (3,) for ppp in args.ppp or (3.25,))
+    plan = Plan(
+        args.source, None if args.split == "all" else args.split, lights, args.seed, args.published, args.stream
+    )
+    if args.force and args.output.exists():
+        _renew(args.output, "plan.json")
+    with bar("rows", "row") as progress:
+        rows = evaluate(plan, methods, args.output, lambda what, done, total: progress(done, total))
+    table.write(args.output, plan, methods, rows)
+    output(args, table.as_dict(plan, methods, rows), table.markdown(plan, methods, rows))
+    return 1 if any(row.failure for row in rows) else 0
+
+
+def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
+    from quiver.data import output
+    from quiver.evaluate import json_safe
+    from quiver.static import evaluate_static, markdown, read_counts
+
+    if not args.static.is_file():
+        raise FileNotFoundError(f"{args.static}: no such file")
+    counts = read_counts(args.static)
+    bits = (args.bits or (3,))[0]
+    scores = evaluate_static(counts, methods, frames=args.frames, bits=bits, splits=args.splits, seed=args.seed)
+    found = {"counts": str(args.static), "frames": args.frames, "bits": bits, "scores": [asdict(s) for s in scores]}
+    output(args, json_safe(found), markdown(counts, scores, args.frames, bits))
+    return 1 if any(score.failure for score in scores) else 0
+
+
+# bench
+
+
+def _add_bench(sub: Any) -> None:
+    parser = _command(
+        sub, "bench", _run_bench, "Measure seconds, memory and multiply-accumulates per restored frame.",
+        "quiver bench\nquiver bench --methods moment,nano,quiver-s --size 256x256 --json",
+    )  # fmt: skip
+    parser.add_argument("--methods", type=words, default="nano,quiver-s", help="with commas")
+    parser.add_argument("--force", action="store_true", help="replace an existing result")
+
+
+def _run_bench(args: argparse.Namespace) -> int:
+    raise ValueError("bench: not there yet")
+
+
+# convert-weights
+
+
+def _add_convert_weights(sub: Any) -> None:
+    parser = _command(
+        sub, "convert-weights", _run_convert_weights, "Turn a checkpoint of the published QUIVER into our weights file.",
+        "quiver convert-weights quiver.pth -o out/quiver.safetensors",
+    )  # fmt: skip
+    parser.add_argument("source", type=Path, help="checkpoint (.pt, .pth, .ckpt, .safetensors); never unpickled")
+    parser.add_argument("-o", "--output", type=Path, required=True, help=".safetensors to write")
+    parser.add_argument("--force", action="store_true", help="replace an existing file")
+
+
+def _run_convert_weights(args: argparse.Namespace) -> int:
+    from quiver.data import output
+    from quiver.weights import convert_weights
+
+    if args.force and args.output.exists():
+        fresh = args.output.with_name(f".{args.output.stem}.new.safetensors")
+        fresh.unlink(missing_ok=True)
+        network = convert_weights(args.source, fresh)
+        os.replace(fresh, args.output)
+    else:
+        network = convert_weights(args.source, args.output)
+    parameters = sum(p.numel() for p in network.parameters())
+    found = {"weights": str(args.output), "channels": network.config.channels, "parameters": parameters}
+    output(args, found, f"{args.output}: {network.config.channels} channels, {parameters:,} parameters")
+    return 0

@@ -1,0 +1,219 @@
+"""One table for all methods: scores on held-out clips at several light levels, with what the truth itself is worth.
+
+    clips x lights -> codes (fixed keys) -> restored -> Score per clip -> mean and 95 % interval over scenes
+
+All methods see the same codes of the same frames. Every result is written down when it is there, so an interrupted
+evaluation goes on; a method that fails keeps its row, with the reason. Tables and figures: table.py. Real photons of a
+static object: static.py.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quiver import metrics
+from quiver.data import (
+    Clip,
+    Codes,
+    Light,
+    array_codes,
+    open_clips,
+    read_json,
+    sensed,
+    truth,
+    windows_sensed,
+    write_json,
+)
+from quiver.restore import Restorer
+
+FORMAT = "quiver-evaluation-1"
+PUBLISHED_EDGE = 5  # frames at each end that the published evaluation leaves out
+
+Progress = Callable[[str, int, int], None]  # (what is restored, rows done, rows in all)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is evaluated; stored beside the results."""
+
+    source: str  # data set or clip folder
+    split: str | None = "test"  # None = all clips
+    lights: tuple[Light, ...] = (Light(),)
+    seed: int = 0  # of the test noise: the same for all methods and all runs
+    published: bool = False  # every window exposed, drawn, scaled and scored on its own; ends of clips left out
+    stream: str | None = None  # score this stored stream instead of sensing at `lights`
+
+    def to_dict(self) -> dict[str, Any]:
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        return plain
+
+
+@dataclass(frozen=True)
+class Row:
+    """One clip restored by one method at one light level; either a score or the reason why there is none."""
+
+    method: str
+    description: str  # of the method, with a digest of its weights
+    light: str
+    clip: str
+    scene: str
+    score: metrics.Score | None = None
+    seconds_per_frame: float = math.nan
+    truth_psnr: float | None = None  # dB; what a perfect restorer would score against this truth
+    failure: str | None = None
+
+    @property
+    def key(self) -> tuple[str, str, str, str]:
+        """What must agree for an old result to count."""
+        return self.method, self.description, self.light, self.clip
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON has no NaN and no infinity: they become null."""
+        return json_safe(asdict(self))
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Row:
+        score = values.pop("score")
+        if score is not None:
+            numbers: dict[str, Any] = {name: math.nan if v is None else v for name, v in score.items()}
+            score = metrics.Score(**numbers)
+        seconds = values.pop("seconds_per_frame")
+        return cls(score=score, seconds_per_frame=math.nan if seconds is None else seconds, **values)
+
+
+def json_safe(value: Any) -> Any:
+    """The same with null for numbers that JSON cannot hold."""
+    if isinstance(value, dict):
+        return {name: json_safe(v) for name, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_safe(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def scored_frames(length: int, published: bool) -> range:
+    """Frames of a clip that are scored: all, or, as published, those with five frames before and five after."""
+    return range(PUBLISHED_EDGE, max(PUBLISHED_EDGE, length - PUBLISHED_EDGE)) if published else range(length)
+
+
+def scene_of(clip: Clip) -> str:
+    """Family and seed: clips of one scene are no independent evidence."""
+    scene = clip.meta.get("scene") or {}
+    return f"{scene['family']}:{scene.get('seed', 0)}" if "family" in scene else clip.name
+
+
+def truth_psnr(clip: Clip, factor: float, white: float) -> float | None:
+    """PSNR [dB] of the clip's own truth in units of white, from its measured error; None if that was not measured.
+
+    The error is measured in radiance; photons are proportional to it.
+    """
+    errors = clip.meta.get("error_per_frame")
+    if not errors or clip.mean_radiance <= 0:
+        return None
+    photons_per_radiance = clip.mean_photons / clip.mean_radiance if clip.camera is not None else 1.0
+    rms = math.sqrt(math.fsum(e * e for e in errors) / len(errors))
+    return metrics.truth_psnr(rms * photons_per_radiance * factor / white)
+
+
+def restore_clip(method: Restorer, clip: Clip, light: Light, plan: Plan, codes: Codes, factor: float) -> Row:
+    """Restore and score one clip; a failure of the method becomes the row's reason."""
+    row = Row(method.name, method.description, plan.stream or light.label, clip.name, scene_of(clip))
+    frames = scored_frames(len(clip), plan.published)
+    target = truth(clip, factor, frames.start, frames.stop) / codes.white
+    windows = list(windows_sensed(clip, light, plan.seed, frames)) if plan.published else []
+    started = time.perf_counter()
+    try:
+        if plan.published:
+            pieces = [method.restore(window, PUBLISHED_EDGE, PUBLISHED_EDGE + 1) for window in windows]
+            restored = np.concatenate(pieces)
+        else:
+            restored = method.restore(codes)
+        seconds = (time.perf_counter() - started) / len(frames)
+        score = metrics.score(restored / np.float32(codes.white), target, per_frame_scale=plan.published)
+    except Exception as error:  # whatever a method dies of is its result
+        return replace(row, failure=f"{type(error).__name__}: {' '.join(str(error).split())}")
+    return replace(row, score=score, seconds_per_frame=seconds, truth_psnr=truth_psnr(clip, factor, codes.white))
+
+
+def evaluate(
+    plan: Plan, methods: Sequence[Restorer], out: Path | None = None, progress: Progress | None = None
+) -> list[Row]:
+    """Every method on every clip at every light level; rows are kept in OUT/rows.jsonl and taken from there.
+
+    ValueError if there is nothing to score, FileExistsError if OUT holds another evaluation.
+    """
+    if plan.stream is not None and (plan.published or len(plan.lights) > 1):
+        raise ValueError("a stored stream has one light level and one exposure; leave out --ppp and --published")
+    clips = open_clips(plan.source, plan.split)
+    if not clips:
+        raise ValueError(f"{plan.source}: no finished clip in split {plan.split!r}")
+    for clip in clips:
+        if not scored_frames(len(clip), plan.published):
+            raise ValueError(f"clip {clip.name}: {len(clip)} frames are too few, the published windows have 11")
+    known = {row.key: row for row in begin(plan, out)} if out is not None else {}
+    rows: list[Row] = []
+    total = len(plan.lights) * len(clips) * len(methods)
+    for light in plan.lights:
+        for clip in clips:
+            drawn, factor = sensed(clip, light, plan.seed) if plan.stream is None else stored(clip, plan.stream)
+            label = plan.stream or light.label
+            codes: Codes | None = None
+            for method in methods:
+                key = (method.name, method.description, label, clip.name)
+                if progress is not None:
+                    progress(f"{method.name}, {clip.name}, {label}", len(rows), total)
+                if key not in known:
+                    codes = codes or in_memory(drawn)
+                    known[key] = restore_clip(method, clip, light, plan, codes, factor)
+                    if out is not None:
+                        append(out / "rows.jsonl", known[key])
+                rows.append(known[key])
+    if progress is not None:
+        progress("done", total, total)
+    return rows
+
+
+def in_memory(codes: Codes) -> Codes:
+    """The same, drawn once for all methods."""
+    return replace(codes, read=array_codes(codes.read(0, codes.shape[0]), codes.sensor, codes.exposure).read)
+
+
+def begin(plan: Plan, out: Path) -> list[Row]:
+    """Make the folder of an evaluation, or take the finished rows of an interrupted one."""
+    path = out / "plan.json"
+    wanted = {"format": FORMAT} | plan.to_dict()
+    if not path.exists():
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise FileExistsError(f"{out} exists and is no evaluation; choose another -o")
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(path, wanted)
+    elif read_json(path) != wanted:
+        raise FileExistsError(f"{out} holds another evaluation; choose another -o, or start anew with --force")
+    rows = out / "rows.jsonl"
+    return list(finished(rows.read_text().splitlines())) if rows.exists() else []
+
+
+def finished(lines: Sequence[str]) -> Iterator[Row]:
+    """Rows of a file whose last line may be torn; failures are left out, so that they are tried again."""
+    for line in lines:
+        try:
+            row = Row.from_dict(json.loads(line))
+        except (json.JSONDecodeError, KeyError, TypeError):
+            continue
+        if row.failure is None:
+            yield row
+
+
+def append(path: Path, row: Row) -> None:
+    with open(path, "a", encoding="utf-8") as file:
+        file.write(json.dumps(row.to_dict(), sort_keys=True, allow_nan=False) + "\n")
+        file.flush()
+        os.fsync(file.fileno())

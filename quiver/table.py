@@ -1,0 +1,178 @@
+"""An evaluation as people read it: means with 95 % intervals over scenes, per scene, as Markdown and as a figure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from quiver.data import replacing, write_bytes, write_json
+from quiver.evaluate import FORMAT, Plan, Row, json_safe
+from quiver.metrics import Interval, over_scenes
+from quiver.restore import Restorer
+
+PAPER_METHODS = ("Student-Teacher", "RVRT", "EMVD", "FloRNN", "MemDeblur", "Spk2ImgNet", "bit2bit")
+COLUMNS = (
+    "method",
+    "frames (future)",
+    "light",
+    "PSNR",
+    "PSNR matched",
+    "SSIM",
+    "SSIM matched",
+    "factor",
+    "s/frame",
+    "truth's own PSNR",
+)
+SCORES = ("psnr", "psnr_matched", "ssim", "ssim_matched")
+
+
+@dataclass(frozen=True)
+class Line:
+    """One method at one light level, over all clips."""
+
+    method: str
+    light: str
+    scores: dict[str, Interval]  # over scenes
+    psnr_matched_per_frame: float  # dB, mean over all frames of all clips alike
+    scale: float  # best factor, mean over clips
+    scale_spread: float  # standard deviation over clips, or over windows where every window has its own
+    seconds_per_frame: float
+    truth_psnr: float | None  # dB, mean over clips
+    failures: tuple[str, ...]  # clip: reason
+
+
+def mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else math.nan
+
+
+def summarise(rows: Sequence[Row]) -> list[Line]:
+    """One line per method and light level, in the order of the rows."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row.light, row.method), []).append(row)
+    return [_line(method, light, group) for (light, method), group in groups.items()]
+
+
+def _line(method: str, light: str, rows: Sequence[Row]) -> Line:
+    good = [(row, row.score) for row in rows if row.score is not None]
+    scales = [score.scale for _, score in good]
+    spread = math.sqrt(mean([(s - mean(scales)) ** 2 for s in scales])) if good else math.nan
+    within = mean([score.scale_spread for _, score in good])
+    frames = sum(score.frames for _, score in good)
+    truths = [row.truth_psnr for row, _ in good if row.truth_psnr is not None]
+    return Line(
+        method=method,
+        light=light,
+        scores={name: over_scenes([getattr(s, name) for _, s in good], [r.scene for r, _ in good]) for name in SCORES},
+        psnr_matched_per_frame=sum(s.psnr_matched * s.frames for _, s in good) / frames if frames else math.nan,
+        scale=mean(scales),
+        scale_spread=within if within > 0 else spread,
+        seconds_per_frame=mean([row.seconds_per_frame for row, _ in good]),
+        truth_psnr=mean(truths) if truths else None,
+        failures=tuple(f"{row.clip}: {row.failure}" for row in rows if row.failure is not None),
+    )
+
+
+def _number(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _interval(found: Interval, digits: int) -> str:
+    text = _number(found.mean, digits)
+    return text if math.isnan(found.half_width) else f"{text} ± {found.half_width:.{digits}f}"
+
+
+def markdown(plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row]) -> str:
+    """The whole evaluation as Markdown: means, failures, per scene, what was not built."""
+    by_name = {method.name: method for method in methods}
+    text = [
+        f"# Evaluation of {plan.source}, split {plan.split or 'all'}",
+        "",
+        f"Noise seed {plan.seed}; "
+        + ("published protocol: every window exposed, scaled and scored on its own" if plan.published else "all frames")
+        + "; mean ± half-width of the 95 % interval over scenes (clips of one scene averaged first). PSNR in dB, peak ="
+        " white; matched = after the best factor per " + ("window" if plan.published else "clip") + ".",
+        "",
+        "| " + " | ".join(COLUMNS) + " |",
+        "|---" * len(COLUMNS) + "|",
+    ]
+    lines = summarise(rows)
+    for line in lines:
+        method = by_name[line.method]
+        cells = [line.method, f"{method.window} ({method.look_ahead})", line.light]
+        if line.scores["psnr"].scenes == 0:
+            cells += [f"failed: {line.failures[0]}", *[""] * 6]
+        else:
+            cells += [_interval(line.scores[name], 2 if "psnr" in name else 3) for name in SCORES]
+            cells += [f"{line.scale:.3f} (spread {line.scale_spread:.3f})", f"{line.seconds_per_frame:.3g}"]
+            cells += ["not measured" if line.truth_psnr is None else f"{line.truth_psnr:.1f}"]
+        text.append("| " + " | ".join(cells) + " |")
+    text += ["", f"Not built yet (learned methods of the paper): {', '.join(PAPER_METHODS)}.", ""]
+    failures = [f"- {line.method}, {line.light}, {reason}" for line in lines for reason in line.failures]
+    text += ["## Failures", "", *failures, ""] if failures else []
+    return "\n".join([*text, *_per_scene(rows)]) + "\n"
+
+
+def _per_scene(rows: Sequence[Row]) -> list[str]:
+    methods = list(dict.fromkeys(row.method for row in rows))
+    text = ["## Per scene: matched PSNR in dB", "", "| scene | light | " + " | ".join(methods) + " |"]
+    text.append("|---" * (len(methods) + 2) + "|")
+    for scene, light in dict.fromkeys((row.scene, row.light) for row in rows):
+        cells = []
+        for method in methods:
+            chosen = [row.score for row in rows if (row.scene, row.light, row.method) == (scene, light, method)]
+            cells.append(_number(mean([score.psnr_matched for score in chosen if score is not None]), 2))
+        text.append(f"| {scene} | {light} | " + " | ".join(cells) + " |")
+    return text
+
+
+def as_dict(plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row]) -> dict[str, Any]:
+    """The whole evaluation for programs."""
+    found: dict[str, Any] = json_safe(
+        {
+            "format": FORMAT,
+            "plan": plan.to_dict(),
+            "methods": [
+                {"name": m.name, "frames": m.window, "future": m.look_ahead, "learned": m.learned, "is": m.description}
+                for m in methods
+            ],
+            "not_built_yet": list(PAPER_METHODS),
+            "table": [asdict(line) for line in summarise(rows)],
+            "rows": [row.to_dict() for row in rows],
+        }
+    )
+    return found
+
+
+def figure(rows: Sequence[Row], path: Path) -> None:
+    """Matched PSNR of each method with its interval, one group of bars per light level, as PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    lines = [line for line in summarise(rows) if line.scores["psnr"].scenes]
+    lights, methods = list(dict.fromkeys(x.light for x in lines)), list(dict.fromkeys(x.method for x in lines))
+    canvas = FigureCanvasAgg(
+        Figure(figsize=(2 + 1.2 * max(3, len(lights) * len(methods) / 2), 4), layout="constrained")
+    )
+    axes = canvas.figure.subplots()
+    width = 0.8 / max(1, len(methods))
+    for i, method in enumerate(methods):
+        own = {line.light: line.scores["psnr_matched"] for line in lines if line.method == method}
+        places = [lights.index(light) + (i - (len(methods) - 1) / 2) * width for light in own]
+        error = [0.0 if math.isnan(x.half_width) else x.half_width for x in own.values()]
+        axes.bar(places, [x.mean for x in own.values()], width, yerr=error, capsize=3, label=method)
+    axes.set_xticks(range(len(lights)), lights)
+    axes.set_ylabel("PSNR after the best factor [dB]")
+    axes.legend(fontsize="small", ncols=2)
+    with replacing(path) as file:
+        canvas.figure.savefig(file, format="png", dpi=120)
+
+
+def write(out: Path, plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row]) -> None:
+    """evaluation.json, evaluation.md and evaluation.png in the folder of an evaluation."""
+    write_bytes(out / "evaluation.md", markdown(plan, methods, rows).encode())
+    figure(rows, out / "evaluation.png")
+    write_json(out / "evaluation.json", as_dict(plan, methods, rows))
