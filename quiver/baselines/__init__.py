@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from numpy import ndarray as Array
 
-from quiver.baselines import mean, moment, transform_denoise
+from quiver.baselines import likelihood, mean, moment, qbp, qbp_bm3d, transform_denoise
 from quiver.baselines.windows import look_ahead
 
 
@@ -37,6 +37,9 @@ METHODS: dict[str, Method] = {
     for method in (
         Method("naive", mean.restore, 11, "mean of the codes, taken as linear in light"),
         Method("moment", moment.restore, 11, "mean of the codes through the exact inverse response"),
+        Method("likelihood", likelihood.restore, 11, "most likely light given the codes of one pixel"),
         Method("transform-denoise", transform_denoise.restore, 3, "variance stabilised, BM3D, exact unbiased inverse"),
+        Method("qbp", qbp.restore, 11, "align, Wiener merge, exact inverse response"),
+        Method("qbp-bm3d", qbp_bm3d.restore, 11, "align, Wiener merge, stabilise, BM3D, exact unbiased inverse"),
     )
 }

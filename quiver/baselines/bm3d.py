@@ -105,8 +105,8 @@ def _haar(size: int) -> Tensor:
 
 def _grid(shape: torch.Size) -> tuple[int, int, int, int]:
     """Tiles down and across, and height and width of the table of positions: the image's, bordered for the search."""
-    tiles = [-(-((side - BLOCK) // STEP + 1) // TILE) for side in shape]
-    return tiles[0], tiles[1], *(STEP * TILE * (n - 1) + REACH for n in tiles)
+    down, across = (-(-((side - BLOCK) // STEP + 1) // TILE) for side in shape)
+    return down, across, STEP * TILE * (down - 1) + REACH, STEP * TILE * (across - 1) + REACH
 
 
 def _transform(image: Tensor) -> Tensor:

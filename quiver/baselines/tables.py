@@ -27,6 +27,7 @@ class ResponseTable:
     photons: Array  # [G], expected photons per pixel and exposure, from 0
     mean: Array  # [G], codes, strictly rising
     variance: Array  # [G], codes^2
+    top: int  # the largest code of the sensor
 
     def cap(self, samples: int) -> float:
         """The largest estimate [photons] from the mean of `samples` codes: half a count below saturation."""
@@ -54,4 +55,4 @@ def response_table(sensor: Sensor, exposure: float, points: int = POINTS) -> Res
     photons = np.linspace(0, np.sqrt(brightest(sensor, exposure)), points) ** 2
     mean, variance = sensor.mean(photons, exposure), sensor.variance(photons, exposure)
     rising = np.concatenate([[True], mean[1:] > np.maximum.accumulate(mean)[:-1]])
-    return ResponseTable(photons[rising], mean[rising], variance[rising])
+    return ResponseTable(photons[rising], mean[rising], variance[rising], sensor.levels - 1)

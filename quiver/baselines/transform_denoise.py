@@ -3,9 +3,9 @@
     mean code -> f -> BM3D with sigma = 1/sqrt(window) -> D^-1 -> photons
 
 Source: Chan, Elgendy, Wang, "Images from Bits: Non-Iterative Image Reconstruction for Quanta Image Sensors", Sensors
-16(11):1961, 2016; written from the description. Our reading for few-bit pixels: stabiliser and inverse are tables from the
-sensor's exact distribution (vst.py); the article's binary form is `kind="binomial"`. A window longer than one frame
-blurs what moves: short windows suit motion, long ones static scenes.
+16(11):1961, 2016; written from the description. Our reading for few-bit pixels: stabiliser and inverse are tables
+from the sensor's exact distribution (vst.py); the article's binary form is `kind="binomial"`. A window longer than
+one frame blurs what moves: short windows suit motion, long ones static scenes.
 """
 
 from __future__ import annotations

@@ -1,0 +1,192 @@
+"""Patch alignment of two images, coarse to fine: how far each patch of the reference has moved in the other image.
+
+    pyramid (1/1, 1/2, 1/8) -> exhaustive search at 1/8 -> Lucas-Kanade -> three candidates per patch at 1/2, search,
+    Lucas-Kanade -> three candidates at 1/1, search -> (v, u) of 16x16 patches at a stride of 8
+
+Source: Ma, Gupta, Ulku, Bruschini, Charbon, Gupta, "Quanta Burst Photography", ACM TOG 39(4), 2020, with the parameters
+its authors use; alignment after Hasinoff et al. 2016 and Lucas and Kanade 1981; written from the description. Our
+reading: a candidate that would leave the image is moved to the nearest place inside.
+
+Everything runs on all patches at once. Patches lie in the last dimension, [patch height, patch width, N], so that
+shifted views of a search window are as fast as whole arrays. Shifts are (v, u) = (down, right), in pixels, and lead
+from the reference to the other image: reference(p) is like other(p + shift).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, pad
+
+MULTIPLE = 64  # sides of an image that the pyramid and all patch sizes divide
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of the pyramid."""
+
+    ratio: int  # pixels of the next finer level per pixel, along one side; 1 at the finest
+    patch: int  # pixels, side of a patch
+    stride: int  # pixels between patches
+    radius: int  # pixels, of the search around each candidate
+    refine: bool  # sub-pixel step after the search
+
+
+# Finest first. The integer search alone reaches 8 * 8 + 4 * 2 + 1 = 73 pixels.
+LEVELS = (Level(1, 16, 8, 1, False), Level(2, 16, 16, 4, True), Level(4, 8, 8, 8, True))
+ITERATIONS = 3  # of Lucas-Kanade
+
+
+def pad_image(image: Tensor) -> Tensor:
+    """Replicate bottom and right until both sides are multiples of 64."""
+    height, width = image.shape
+    return pad(image[None, None], (0, -width % MULTIPLE, 0, -height % MULTIPLE), mode="replicate")[0, 0]
+
+
+def pyramid(image: Tensor, levels: tuple[Level, ...] = LEVELS) -> list[Tensor]:
+    """Box means of an image [H, W] with sides that are multiples of 64, finest first."""
+    images = [image]
+    for level in levels[1:]:
+        images.append(avg_pool2d(images[-1][None], level.ratio)[0])
+    return images
+
+
+def grid(shape: torch.Size, level: Level) -> tuple[Tensor, int, int]:
+    """Upper left corners [2, N] (y, x) of the patches in raster order, and their number down and across."""
+    down, across = ((side - level.patch) // level.stride + 1 for side in shape)
+    y, x = torch.meshgrid(torch.arange(down), torch.arange(across), indexing="ij")
+    return torch.stack([y.flatten(), x.flatten()]) * level.stride, down, across
+
+
+def gather(image: Tensor, corner: Tensor, size: int) -> Tensor:
+    """Squares of `size` pixels with these upper left corners [2, N] -> [size, size, N]; outside, the border repeats."""
+    height, width = image.shape
+    step = torch.arange(size)
+    y = (corner[0] + step[:, None]).clamp_(0, height - 1) * width
+    x = (corner[1] + step[:, None]).clamp_(0, width - 1)
+    return image.flatten()[y[:, None] + x[None]]
+
+
+def search(patches: Tensor, other: Tensor, corner: Tensor, centre: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+    """Best integer shift [2, N] within `radius` of each `centre`, and its sum of absolute differences [N].
+
+    Only shifts that keep the patch inside the image; among equals the first in raster order.
+    """
+    size, limit = patches.shape[0], torch.tensor(other.shape)[:, None]
+    low, high = -corner, limit - patches.shape[0] - corner
+    centre = torch.maximum(torch.minimum(centre, high + radius), low - radius)
+    window = gather(other, corner + centre - radius, size + 2 * radius)
+    best, least = centre.clone(), torch.full(corner.shape[1:], torch.inf)
+    for v in range(2 * radius + 1):
+        for u in range(2 * radius + 1):
+            shift = centre + torch.tensor([[v - radius], [u - radius]])
+            cost = (window[v : v + size, u : u + size] - patches).abs_().sum((0, 1))
+            better = (cost < least) & ((shift >= low) & (shift <= high)).all(0)
+            best, least = torch.where(better, shift, best), torch.where(better, cost, least)
+    return best, least
+
+
+def derivatives(image: Tensor) -> tuple[Tensor, Tensor]:
+    """(d/dy, d/dx) by (f(x-2) - 8 f(x-1) + 8 f(x+1) - f(x+2)) / 12, borders mirrored."""
+    kernel = (1 / 12, -8 / 12, 0.0, 8 / 12, -1 / 12)
+    found = []
+    for axis in (0, 1):
+        ends = image.narrow(axis, 0, 2).flip(axis), image, image.narrow(axis, image.shape[axis] - 2, 2).flip(axis)
+        wide, side = torch.cat(ends, axis), image.shape[axis]
+        found.append(sum((k * wide.narrow(axis, i, side) for i, k in enumerate(kernel) if k), torch.zeros(())))
+    return found[0], found[1]
+
+
+def cubic_weights(fraction: Tensor) -> Tensor:
+    """Weights [4, N] of the pixels -1, 0, 1, 2 for a position between 0 and 1 (Catmull-Rom)."""
+    t = fraction
+    return torch.stack([((2 - t) * t - 1) * t, (3 * t - 5) * t**2 + 2, ((4 - 3 * t) * t + 1) * t, (t - 1) * t**2]) / 2
+
+
+def sample_cubic(image: Tensor, position: Tensor, size: int) -> Tensor:
+    """Bicubic patches [size, size, N] with upper left corners at real positions [2, N]."""
+    whole = position.floor()
+    square = gather(image, whole.long() - 1, size + 3)
+    y, x = cubic_weights(position[0] - whole[0]), cubic_weights(position[1] - whole[1])
+    zero = torch.zeros(())
+    rows = sum((y[k] * square[k : k + size] for k in range(4)), zero)
+    return sum((x[k] * rows[:, k : k + size] for k in range(4)), zero)
+
+
+def sample_linear(image: Tensor, position: Tensor, size: int) -> Tensor:
+    """Bilinear patches [size, size, N] with upper left corners at real positions [2, N]."""
+    whole = position.floor()
+    square = gather(image, whole.long(), size + 1)
+    y, x = position - whole
+    rows = torch.lerp(square[:-1], square[1:], y)
+    return torch.lerp(rows[:, :-1], rows[:, 1:], x)
+
+
+def inside(shape: torch.Size, position: Tensor, size: int) -> Tensor:
+    """Which pixels of patches at real positions [2, N] lie in the image: bool [size, size, N]."""
+    at = position[:, None] + torch.arange(size)[:, None]
+    y, x = ((at[k] >= 0) & (at[k] <= shape[k] - 1) for k in (0, 1))
+    return y[:, None] & x[None]
+
+
+def lucas_kanade(reference: Tensor, other: Tensor, corner: Tensor, shift: Tensor, size: int) -> Tensor:
+    """Refine shifts [2, N] to fractions of a pixel: template Lucas-Kanade, translation only.
+
+    The gradient is the mean of both images'. Steps are at most one pixel long; a patch without structure in two
+    directions stays where it is.
+    """
+    template, flats = gather(reference, corner, size), derivatives(other)
+    slopes = [gather(image, corner, size) for image in derivatives(reference)]
+    shift = shift.to(torch.float32)
+    moving = torch.ones(corner.shape[1:], dtype=torch.bool)
+    for _ in range(ITERATIONS):
+        position = corner + shift
+        valid = inside(other.shape, position, size)
+        error = (template - sample_cubic(other, position, size)) * valid
+        gy, gx = ((s + sample_cubic(f, position, size)) / 2 * valid for s, f in zip(slopes, flats, strict=True))
+        yy, xy, xx, ye, xe = ((a * b).sum((0, 1)) for a, b in ((gy, gy), (gy, gx), (gx, gx), (gy, error), (gx, error)))
+        det = yy * xx - xy**2
+        moving = moving & (det > 1e-6 * (yy + xx) ** 2) & (det > 1e-12)
+        step = torch.stack([xx * ye - xy * xe, yy * xe - xy * ye]) / torch.where(moving, det, 1.0)
+        step = step / step.norm(dim=0).clamp(min=1.0)
+        shift = torch.where(moving, shift + step, shift)
+    return shift
+
+
+def candidates(parent: Tensor, down: int, across: int, fine: Level, coarse: Level) -> list[Tensor]:
+    """Integer shifts [2, N] for the patches of the finer level from their parent and two of its neighbours."""
+    scaled = (parent * coarse.ratio).round().long()
+
+    def parents(count: int, limit: int) -> tuple[Tensor, Tensor]:
+        place = torch.arange(count) * fine.stride / (coarse.ratio * coarse.patch)
+        first = place.floor().long().clamp(max=limit - 1)
+        onward = ((place - first >= 0.5) & (first + 1 < limit)) | (first == 0)
+        return first, torch.where(onward, first + 1, first - 1).clamp(0, limit - 1)
+
+    y, other_y = parents(down, parent.shape[1])
+    x, other_x = parents(across, parent.shape[2])
+    return [scaled[:, rows][:, :, columns].flatten(1) for rows, columns in ((y, x), (other_y, x), (y, other_x))]
+
+
+def align(reference: list[Tensor], other: list[Tensor], *, refine_finest: bool = False) -> Tensor:
+    """Shifts [2, N] of the finest level's patches between two pyramids; integers (as floats) unless refined."""
+    shifts = torch.zeros(2, 1, 1)
+    for depth in range(len(LEVELS) - 1, -1, -1):
+        level, image = LEVELS[depth], reference[depth]
+        corner, down, across = grid(image.shape, level)
+        patches = gather(image, corner, level.patch)
+        if depth == len(LEVELS) - 1:
+            starts = [torch.zeros_like(corner)]
+        else:
+            starts = candidates(shifts, down, across, level, LEVELS[depth + 1])
+        found, least = search(patches, other[depth], corner, starts[0], level.radius)
+        for start in starts[1:]:
+            shift, cost = search(patches, other[depth], corner, start, level.radius)
+            found, least = torch.where(cost < least, shift, found), torch.minimum(cost, least)
+        fine = found.to(torch.float32)
+        if level.refine or (depth == 0 and refine_finest):
+            fine = lucas_kanade(image, other[depth], corner, fine, level.patch)
+        shifts = fine.view(2, down, across)
+    return shifts.flatten(1)
