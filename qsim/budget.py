@@ -1,19 +1,57 @@
-"""How much work a scene needs: bounces, instants per exposure, samples, from the error that is asked for."""
+"""How much work a scene needs: bounces, instants per exposure and samples, from the error that is asked for.
+
+    choose(scene, ..., psnr=40, ppp=26) -> Budget;  explain(budget) -> what is modelled, left out, and how large it is
+
+A pilot renders every n-th pixel in its true size at three times of the clip. The allowed rms error E is the stricter of
+
+    target:  peak * 10^(-psnr / 20), peak = 99.9th percentile of the radiance
+    sensor:  Monte-Carlo variance in electrons^2 at most 1 % of the shot variance: mean * sqrt(0.01 / (QE * PPP))
+
+and is shared: bounces and blur may each take 30 % of it (rms), the samples get the rest.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy import ndarray as Array
+
+if TYPE_CHECKING:
+    from qsim.render import Renderer
+    from qsim.scene import Camera, Scene
+
+PILOT_PIXELS = 6000
+PILOT_STAGE = 18  # of the random keys
+SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
+SENSOR_SHARE = 0.01  # of the shot variance that Monte-Carlo noise may add
+DEPTHS = (1, 2, 3, 4, 6, 8, 12)  # bounces tried, against
+DEEPEST = 16
+FEW, SEVERAL, MANY = 16, 32, 64  # samples of pilots; FEW and MANY give the law error = c * samples^-a
+MOST_SAMPLES = 16384
+SHARP_FROM = 0.05  # px of motion in the exposure from which a sharp instant is stored too
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a clip models or leaves out, and how large the rest is."""
+
+    effect: str
+    chosen: str
+    size: str
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What a frame costs; the same record is stored in clip.json."""
+    """What a frame costs, and why; the same record is stored in clip.json."""
 
     samples: int = 32  # per pixel and frame, all instants and both halves together
     bounces: int = 6  # scatterings along a path
     sub_frames: int = 9  # instants per exposure when the shutter is open
     sharp: bool = True  # also render the instant at mid-exposure when the shutter is open
+    findings: tuple[Finding, ...] = field(default=())
 
     def __post_init__(self) -> None:
         for name in ("samples", "bounces", "sub_frames"):
@@ -27,6 +65,47 @@ class Budget:
         return grid_samples(math.ceil(wanted / split)), 2 * split
 
 
+def choose(
+    scene: Scene,
+    *,
+    frame_rate: float = 2000.0,
+    shutter: float = 0.0,
+    frames: int = 21,
+    psnr: float = 40.0,
+    ppp: float | None = None,
+    quantum_efficiency: float = 1.0,
+    seed: int = 0,
+) -> Budget:
+    """The smallest budget that keeps the error below `psnr` [dB] and, at `ppp` photons, below the sensor's noise.
+
+    `ppp` is the highest light level that the clip will be sensed at (None: only `psnr` counts). Depends on nothing but
+    its arguments, so that an interrupted clip is continued with the same budget.
+    """
+    if not 10 <= psnr <= 80:
+        raise ValueError(f"psnr: 10 to 80 dB can be asked for, got {psnr!r}")
+    pilot = _pilot(scene, frame_rate, seed)
+    times = sorted({0, frames // 2, frames - 1})
+    bright = np.stack([_mean(pilot, t, Budget(SEVERAL, DEEPEST)) for t in times])
+    peak, mean = float(np.percentile(bright, 99.9)), float(bright.mean())
+    if not mean > 0:
+        raise ValueError(f"scene {scene.name}: the pilot saw no light in frames {times}; is a lamp behind a wall?")
+    allowed, limit = _allowed(peak, mean, psnr, ppp, quantum_efficiency)
+    bounces, about_bounces = _bounces(pilot, times, bright, SHARE * allowed)
+    truths = [pilot.truth(t) for t in times]
+    contrast = peak - float(np.percentile(bright, 0.1))
+    sub_frames, travel, about_blur = _sub_frames(truths, shutter, SHARE * allowed / contrast if contrast > 0 else 1.0)
+    instants = sub_frames if shutter > 0 else 1
+    samples, about_samples = _samples(pilot, times, bounces, instants, allowed * math.sqrt(1 - 2 * SHARE**2), peak)
+    findings = (limit, about_samples, about_bounces, about_blur, *_left_out(scene.camera, truths))
+    return Budget(samples, bounces, sub_frames, travel >= SHARP_FROM, findings)
+
+
+def explain(budget: Budget) -> str:
+    """What was modelled, what was left out, and how large it would have been; one line each."""
+    width = max((len(finding.effect) for finding in budget.findings), default=0)
+    return "\n".join(f"{f.effect:{width}}  {f.chosen}; {f.size}" for f in budget.findings)
+
+
 def grid_samples(samples: int) -> int:
     """The smallest count of at least `samples` that multijitter can lay out as a nearly square grid."""
     while True:
@@ -34,3 +113,115 @@ def grid_samples(samples: int) -> int:
         if columns * math.ceil(samples / columns) == samples:
             return samples
         samples += 1
+
+
+def blur_error(travel: float, instants: int) -> float:
+    """Largest error of the mean of K instants at a moving edge, as a share of its contrast.
+
+    An edge that travels m px in the exposure steps by d = m / K. While d < 1 px, a pixel's coverage is piecewise linear
+    in time and the midpoint rule errs by at most d^2 / (8 m) per kink; coarser steps leave separate ghosts of 1 / K.
+    """
+    step = travel / instants
+    return step**2 / (8 * travel) if 0 < step <= 1 else 1 / instants if step > 1 else 0.0
+
+
+def _pilot(scene: Scene, frame_rate: float, seed: int) -> Renderer:
+    """A renderer of every n-th pixel; render.py needs Budget, hence the late import."""
+    from qsim.render import Renderer
+
+    camera = scene.camera
+    thinned = max(1, math.isqrt(camera.height * camera.width // PILOT_PIXELS))
+    return Renderer(scene, frame_rate=frame_rate, seed=seed, budget=Budget(), thinned=thinned)
+
+
+def _halves(pilot: Renderer, t: int, budget: Budget) -> Array:
+    return pilot.halves([pilot.time(t)], budget, pilot.key(t, PILOT_STAGE))
+
+
+def _mean(pilot: Renderer, t: int, budget: Budget) -> Array:
+    return _halves(pilot, t, budget).mean(axis=0)
+
+
+def _allowed(peak: float, mean: float, psnr: float, ppp: float | None, efficiency: float) -> tuple[float, Finding]:
+    """The stricter of the two limits [W m^-2 sr^-1]."""
+    target = peak * 10 ** (-psnr / 20)
+    text = f"target {psnr:g} dB allows {target:.3g}"
+    allowed = target
+    if ppp is not None:
+        sensor = mean * math.sqrt(SENSOR_SHARE / (efficiency * ppp))
+        allowed = min(target, sensor)
+        text += f", the sensor at {ppp:g} photons per pixel {sensor:.3g}"
+    return allowed, Finding("error", f"rms {allowed:.3g} W/m2/sr", f"{text}; peak {peak:.3g}, mean {mean:.3g}")
+
+
+def _bounces(pilot: Renderer, times: list[int], full: Array, tolerance: float) -> tuple[int, Finding]:
+    """The smallest depth whose radiance differs from that of DEEPEST by an rms below the tolerance (same paths)."""
+    for bounces in DEPTHS:
+        cut = np.stack([_mean(pilot, t, Budget(SEVERAL, bounces)) for t in times])
+        left_out = float(np.sqrt(np.mean((full - cut) ** 2)))
+        if left_out <= tolerance:
+            break
+    else:
+        bounces, left_out, cut = DEEPEST, 0.0, full
+    share = 100 * float((full - cut).mean() / full.mean())
+    size = f"later bounces up to {DEEPEST} would add rms {left_out:.2g} ({share:.2g} % of the light)"
+    return bounces, Finding("bounces", f"{bounces}", size)
+
+
+def _sub_frames(truths: list[dict[str, Array]], shutter: float, tolerance: float) -> tuple[int, float, Finding]:
+    """Instants, largest travel in the exposure [px] and the finding; the tolerance is rms error / contrast."""
+    speeds = np.concatenate([np.hypot(*truth["flow"]).ravel() for truth in truths])
+    travel = float(np.percentile(speeds, 99.9)) * shutter
+    moving = float(np.mean(speeds > 0.1))
+    motion = f"motion up to {travel / shutter if shutter else np.percentile(speeds, 99.9):.2f} px/frame"
+    if travel < 1e-3:
+        return 1, travel, Finding("motion blur", "none, one instant", motion + f", shutter {shutter:g}")
+    edge = tolerance / math.sqrt(moving) if moving > 0 else tolerance
+    count = 1
+    while blur_error(travel, count) > edge and count < 4096:
+        count += 2  # odd: one instant lies at mid-exposure
+    size = f"{motion}, {travel:.2f} px in the exposure; an edge errs by {100 * blur_error(travel, count):.2g} %"
+    return count, travel, Finding("motion blur", f"mean of {count} instants", size)
+
+
+def _samples(
+    pilot: Renderer, times: list[int], bounces: int, instants: int, target: float, peak: float
+) -> tuple[int, Finding]:
+    """Samples per pixel and frame from error = c * samples^-a, measured with FEW and MANY samples."""
+    errors = []
+    for count in (FEW, MANY):
+        halves = np.stack([_halves(pilot, t, Budget(count, bounces)) for t in times])
+        errors.append(float(np.sqrt(np.mean((halves[:, 0] - halves[:, 1]) ** 2))) / 2)
+    if errors[1] <= 0:
+        return 2 * instants, Finding("samples", f"{2 * instants} per pixel", "the pilot found no noise at all")
+    # Between plain Monte Carlo (1/2) and what a stratified pattern may gain on smooth pixels.
+    power = min(max(math.log(errors[0] / errors[1]) / math.log(MANY / FEW), 0.5), 0.9)
+    # K instants of n samples each: error(n) / sqrt(K).
+    each = MANY * (errors[1] / (target * math.sqrt(instants))) ** (1 / power)
+    wanted = min(max(each, 2.0), MOST_SAMPLES / instants)
+    samples = 2 * instants * grid_samples(math.ceil(wanted / 2))
+    expected = errors[1] * (samples / instants / MANY) ** -power / math.sqrt(instants)
+    size = f"expected rms {expected:.2g} = {20 * math.log10(peak / expected):.1f} dB (error ~ samples^-{power:.2f})"
+    if each > wanted:
+        size += f", the limit of {MOST_SAMPLES} samples is reached"
+    return samples, Finding("samples", f"{samples} per pixel", size)
+
+
+def _left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, ...]:
+    """Effects that the renderer does not draw, with their size where the pilot knows it."""
+    from qsim import optics
+
+    depths = np.concatenate([truth["depth"].ravel() for truth in truths])
+    depths = depths[np.isfinite(depths) & (depths > camera.focal_length)]
+    focus = camera.focus
+    # Circle of confusion of a thin lens: (f^2 / N) / (s - f) * |z - s| / z.
+    circle = camera.focal_length**2 / camera.f_number / abs(focus - camera.focal_length)
+    blur = float(np.max(circle * np.abs(depths - focus) / depths, initial=0.0)) / camera.pixel_pitch
+    how = "thin lens" if camera.aperture_blur else "left out, pinhole"
+    airy = optics.airy_diameter(camera)
+    nyquist = float(optics.mtf(np.array([0.5]), camera)[0])
+    return (
+        Finding("depth of field", how, f"largest blur circle {blur:.2g} px at f/{camera.f_number:g}"),
+        Finding("diffraction", "left out here", f"Airy disk {airy:.2g} px wide, MTF {nyquist:.2f} at Nyquist"),
+        Finding("lens aberrations, polarisation, spectra", "not modelled", "size unknown"),
+    )

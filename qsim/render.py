@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -60,7 +60,8 @@ class Renderer:
     """A scene loaded once; `frame(t)` moves it and renders, in any order of t.
 
     `shutter` is the share of the frame time that the shutter is open (0 is an instant), `crop` = (y, x, height, width)
-    renders that window of the camera's frame. `ValueError` for a crop outside the frame or rates that make no sense.
+    renders that window of the camera's frame, `thinned` = n only every n-th row and column of it (pixels of their true
+    size, for pilots). `ValueError` for a crop outside the frame or rates that make no sense.
     """
 
     def __init__(
@@ -72,6 +73,7 @@ class Renderer:
         seed: int = 0,
         budget: Budget | None = None,
         crop: Crop | None = None,
+        thinned: int = 1,
         engine: engines.Engine | None = None,
     ) -> None:
         if not frame_rate > 0:
@@ -80,7 +82,8 @@ class Renderer:
             raise ValueError(f"shutter: a share of the frame time, 0 to 1, got {shutter!r}")
         self.scene, self.frame_rate, self.shutter, self.seed = scene, frame_rate, shutter, seed
         self.budget = budget or Budget()
-        self.crop = _checked_crop(scene, crop)
+        self.crop, self.thinned = _checked_crop(scene, crop), thinned
+        self.shape = -(-self.crop[2] // thinned), -(-self.crop[3] // thinned)
         self.engine = engine or engines.select()
         engines.activate(self.engine)
         import mitsuba as mi
@@ -88,8 +91,7 @@ class Renderer:
         self._mi = mi
         self._key = Key(seed=seed, clip=hash_name(f"{scene.name}/{scene.seed}"), stage=RENDER_STAGE)
         self._stage = Stage(mi, scene)
-        depth = self.budget.bounces + 1
-        self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 1000})
+        self._integrators: dict[int, Any] = {}
         self._samplers: dict[int, Any] = {}
         self._numbers = self._shape_table()
 
@@ -100,55 +102,71 @@ class Renderer:
     def frame(self, t: int, *, with_truth: bool = True) -> Frame:
         """Render frame t."""
         engines.activate(self.engine)
-        found = self._truth(t) if with_truth else {}
-        instants = self._instants(t)
-        radiance, error, fireflies = self._exposed(instants, self._key.at(t))
+        found = self.truth(t) if with_truth else {}
+        instants = self.instants(t)
+        radiance, error, fireflies = self._exposed(instants, self.key(t))
         sharp = None
         if self.shutter > 0 and self.budget.sharp:
-            key = Key(self._key.seed, self._key.clip, t, SHARP_STAGE)
-            sharp = self._exposed([self.time(t)], key)[0]
+            sharp = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))[0]
         return Frame(radiance, error, fireflies, sharp, **found)
 
-    def _instants(self, t: int) -> list[float]:
+    def instants(self, t: int) -> list[float]:
+        """The times [s] whose mean is the exposure of frame t."""
         count = self.budget.sub_frames if self.shutter > 0 else 1
         offsets = (np.arange(count) + 0.5) / count - 0.5
         return [self.time(t) + float(offset) * self.shutter / self.frame_rate for offset in offsets]
 
-    def _exposed(self, instants: list[float], key: Key) -> tuple[Array, float, int]:
-        """Mean radiance over the instants, its rms error and the number of fireflies."""
-        height, width = self.crop[2:]
-        per_pass, passes = self.budget.passes(len(instants), height * width, MAX_LANES)
+    def halves(self, instants: list[float], budget: Budget, key: Key) -> Array:
+        """Two independent estimates A, B of the mean radiance over the instants [s], float64 [2, H, W]."""
+        height, width = self.shape
+        per_pass, passes = budget.passes(len(instants), height * width, MAX_LANES)
         seeds = words(key, (1, len(instants) * passes))[0].reshape(len(instants), passes)
-        halves = np.zeros((2, height, width))
+        sums = np.zeros((2, height, width))
         for instant, row in zip(instants, seeds, strict=True):
             self._stage.place(instant)
             pose = self.scene.camera.pose(instant)
             for i, seed in enumerate(row):
-                halves[i % 2] += self._pass(pose, int(seed), per_pass)
-        halves /= len(instants) * passes / 2
+                sums[i % 2] += self._pass(pose, int(seed), per_pass, budget.bounces)
+        return sums / (len(instants) * passes / 2)
+
+    def key(self, t: int, stage: int = RENDER_STAGE) -> Key:
+        """The random key of frame t: another seed, scene or stage draws other samples."""
+        return replace(self._key, frame=t, stage=stage)
+
+    def _exposed(self, instants: list[float], key: Key) -> tuple[Array, float, int]:
+        """Mean radiance over the instants, its rms error and the number of fireflies."""
+        halves = self.halves(instants, self.budget, key)
         difference = (halves[0] - halves[1]) / 2
         error = float(np.sqrt(np.mean(difference**2)))
         fireflies = int(np.count_nonzero(np.abs(difference) > FIREFLY * error)) if error > 0 else 0
         return halves.mean(axis=0).astype(np.float32), error, fireflies
 
-    def _pass(self, pose: Array, seed: int, samples: int) -> Array:
-        """One independent estimate of the radiance of every pixel, float [H, W]."""
+    def _pass(self, pose: Array, seed: int, samples: int, bounces: int) -> Array:
+        """One independent estimate of the radiance of every pixel, float64 [H, W]."""
+        integrator = self._integrator(bounces)
         if self.engine.backend == "scalar":
-            return self._film_pass(pose, seed, samples)
+            return self._film_pass(pose, seed, samples, integrator)
         import drjit as dr
 
         mi = self._mi
-        y0, x0, height, width = self.crop
+        (y0, x0), (height, width), step = self.crop[:2], self.shape, self.thinned
         lanes = height * width * samples
         sampler = self._sampler(samples)
         sampler.seed(seed, lanes)
         pixel = dr.arange(mi.UInt32, lanes) // samples
         row = pixel // width
-        corner = mi.Point2f(mi.Float(pixel - row * width) + x0, mi.Float(row) + y0)
+        corner = mi.Point2f(mi.Float(pixel - row * width) * step + x0, mi.Float(row) * step + y0)
         ray = self._camera_ray(pose, corner + sampler.next_2d(), sampler)
-        radiance, _, _ = self._integrator.sample(self._stage.loaded, sampler, ray)
+        radiance, _, _ = integrator.sample(self._stage.loaded, sampler, ray)
         mean = dr.block_sum(radiance[0], samples) / samples
         return np.array(mean, np.float64).reshape(height, width)
+
+    def _integrator(self, bounces: int) -> Any:
+        """A path tracer without Russian roulette, so that the same seed draws the same paths at every depth."""
+        if bounces not in self._integrators:
+            plugin = {"type": "path", "max_depth": bounces + 1, "rr_depth": 1000}
+            self._integrators[bounces] = self._mi.load_dict(plugin)
+        return self._integrators[bounces]
 
     def _camera_ray(self, pose: Array, position: Any, sampler: Any) -> Any:
         """Rays through film positions [px]; the pose is data, not code, so that moving it compiles nothing."""
@@ -176,7 +194,7 @@ class Renderer:
             self._samplers[samples] = sampler
         return self._samplers[samples]
 
-    def _film_pass(self, pose: Array, seed: int, samples: int) -> Array:
+    def _film_pass(self, pose: Array, seed: int, samples: int, integrator: Any) -> Array:
         """The scalar engine has no vector of rays: Mitsuba's own camera and film do the same."""
         mi, camera = self._mi, self.scene.camera
         y, x, height, width = self.crop
@@ -195,13 +213,14 @@ class Renderer:
         if camera.aperture_blur:
             sensor |= {"type": "thinlens", "aperture_radius": camera.pupil_radius, "focus_distance": camera.focus}
         image = mi.render(
-            self._stage.loaded, sensor=mi.load_dict(sensor), integrator=self._integrator, seed=seed, spp=samples
+            self._stage.loaded, sensor=mi.load_dict(sensor), integrator=integrator, seed=seed, spp=samples
         )
-        return np.array(image, np.float64)[..., 0]
+        return np.array(image, np.float64)[:: self.thinned, :: self.thinned, 0]
 
-    def _truth(self, t: int) -> dict[str, Array]:
-        now, (height, width) = self.time(t), self.crop[2:]
-        rays = truth.pixel_rays(self.scene.camera, now, self.crop)
+    def truth(self, t: int) -> dict[str, Array]:
+        """Flow, validity, depth and body of frame t at mid-exposure, as in `Frame`."""
+        now, (height, width) = self.time(t), self.shape
+        rays = truth.pixel_rays(self.scene.camera, now, self.crop, self.thinned)
         self._stage.place(now)
         hits = self._cast(rays[0], rays[1].reshape(-1, 3))
         flow, inside, points = truth.flow_between(self.scene, rays, hits, now, self.time(t + 1))

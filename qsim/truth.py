@@ -29,13 +29,11 @@ class Hits:
     weights: Array  # float64 [N, 2], barycentric weights of the triangle's second and third vertex
 
 
-def pixel_rays(camera: Camera, t: float, crop: tuple[int, int, int, int] | None = None) -> tuple[Array, Array]:
+def pixel_rays(camera: Camera, t: float, crop: tuple[int, int, int, int], thinned: int = 1) -> tuple[Array, Array]:
     """Camera position [3] and world ray directions [h, w, 3] with unit z in camera axes, through pixel centres."""
     pose = camera.pose(t)
-    local = camera.directions()
-    if crop is not None:
-        y, x, height, width = crop
-        local = local[y : y + height, x : x + width]
+    y, x, height, width = crop
+    local = camera.directions()[y : y + height : thinned, x : x + width : thinned]
     return pose[:3, 3], local @ pose[:3, :3].T
 
 
