@@ -7,8 +7,9 @@ With channels = 64 or 16 this is the published network to the last digit (tests/
 else in `Config` is our own variation; the preset `nano` uses it to fit two CPU cores.
 """
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 
 import torch
 import torch.nn.functional as F
@@ -240,7 +241,9 @@ class QUIVER(nn.Module):
             scales[1:] = (None, None)
         flow = resize(flows[0], *x.shape[3:]) * self.config.fold if self.config.flow else None
         assert scales[0] is not None
-        return Output(self.unfold(denoised) if self.config.pre_denoiser else None, scales[0], scales[1], scales[2], flow)
+        return Output(
+            self.unfold(denoised) if self.config.pre_denoiser else None, scales[0], scales[1], scales[2], flow
+        )
 
     def _encode(
         self, frames: Tensor, denoised: Tensor, flows: Sequence[Tensor]
@@ -298,6 +301,42 @@ class QUIVER(nn.Module):
         return torch.stack(list(reuse.stream(self, x.unbind(1))), dim=1)
 
 
+# Rows of the paper's ablation (its Table 4, without the pretrained flow): pre-denoiser, flow, multi-scale outputs.
+ABLATIONS: dict[str, tuple[bool, bool, bool]] = {
+    "none": (False, False, False),
+    "denoiser+flow": (True, True, False),
+    "scales": (False, False, True),
+    "flow+scales": (False, True, True),
+    "denoiser+scales": (True, False, True),
+    "all": (True, True, True),
+}
+
+
+def ablated(config: Config, row: str) -> Config:
+    """The network without some of its parts, at similar capacity: the recurrent cell grows by what was taken away.
+
+    The growth of the cell's blocks is the whole number that brings the count of parameters closest to that of
+    `config`. ValueError for an unknown row.
+    """
+    if row not in ABLATIONS:
+        raise ValueError(f"no ablation is called {row!r}; known: {', '.join(ABLATIONS)}")
+    pre_denoiser, flow, multi_scale = ABLATIONS[row]
+    wanted = parameter_count(config)
+    smaller = replace(config, pre_denoiser=pre_denoiser, flow=flow, multi_scale=multi_scale)
+    growth = config.cell_growth or 2 * config.channels
+    while parameter_count(smaller) < wanted:
+        smaller, before, growth = replace(smaller, cell_growth=growth + 1), smaller, growth + 1
+        if abs(parameter_count(before) - wanted) < abs(parameter_count(smaller) - wanted):
+            return before
+    return smaller
+
+
+def parameter_count(config: Config) -> int:
+    """Number of learnt values, counted without allocating them."""
+    with torch.device("meta"):
+        return sum(parameter.numel() for parameter in QUIVER(config).parameters())
+
+
 def build(name: str) -> nn.Module:
     """A network with random weights by preset name, or the control "unet"; ValueError names them."""
     if name == "unet":
@@ -327,19 +366,22 @@ def add_base(pictures: Sequence[Tensor], base: Tensor | None) -> tuple[Tensor, T
 def start_from_baseline(network: QUIVER) -> nn.Parameter:
     """Weights over the window such that the untrained network returns about the mean of the middle frames.
 
-    The last layers of the picture branches are shrunk, those of the pictures handed on are set to zero.
+    The last layers of the pre-denoiser and of the picture branches are shrunk, pictures handed on start at zero.
     """
-    for refinement in (network.refine4, network.refine):
-        last = refinement.picture[-1]
-        assert isinstance(last, nn.Conv2d)
-        assert last.bias is not None
-        assert refinement.next_picture.bias is not None
-        with torch.no_grad():
-            last.weight.mul_(0.1)
-        for tensor in (last.bias, refinement.next_picture.weight, refinement.next_picture.bias):
-            nn.init.zeros_(tensor)
-    weights = torch.exp(-0.5 * (torch.arange(WINDOW) - RADIUS).float().square() / BASELINE_SIGMA**2)
-    return nn.Parameter(weights / weights.sum())
+    last = [refinement.picture[-1] for refinement in (network.refine4, network.refine)]
+    if network.denoiser is not None:
+        last.append(network.denoiser.leave)
+    with torch.no_grad():
+        for layer in last:
+            assert isinstance(layer, nn.Conv2d)
+            assert layer.bias is not None
+            layer.weight.mul_(0.1)
+            layer.bias.zero_()
+        for refinement in (network.refine4, network.refine):
+            for tensor in refinement.next_picture.parameters():
+                tensor.zero_()
+    weights = [math.exp(-0.5 * ((t - RADIUS) / BASELINE_SIGMA) ** 2) for t in range(WINDOW)]
+    return nn.Parameter(torch.tensor(weights) / sum(weights))
 
 
 def _flat(stack: Tensor) -> Tensor:

@@ -51,7 +51,7 @@ def fill_by_rule(model: nn.Module) -> nn.Module:
     """Lively weights for any network of ours: nothing is near zero, offsets and masks included."""
     with torch.no_grad():
         for name, parameter in model.named_parameters():
-            parameter.copy_(torch.from_numpy(rule(name, tuple(parameter.shape))))
+            parameter.copy_(torch.as_tensor(rule(name, tuple(parameter.shape))))
     return model
 
 
