@@ -1,11 +1,11 @@
 """The compiled engine: the codes of the NumPy reference, many times faster.
 
-    photons of one frame -> a lane per 2 pixels (or 8, for packed codes) -> codes
+    photons of one frame -> a lane per 2 neighbours -> 2 codes, as bytes or as bits
 
 Every pixel compares the same Philox word with the same cdf as `Sensor.sample(engine="reference")`, but in float32 and
 without ever writing the cdf down (ladders.py). A pixel whose word comes so near to a step F_k that float32 could not
-decide (about 40 in a million) is flagged by the kernel and decided by the reference in float64, so the codes are the
-reference's on every kind of machine; tails, where a second word is drawn, come out right for the same reason.
+decide (about 40 in a million) is flagged by the kernel and drawn by the reference in float64 (pixels.py), so the codes
+are the reference's on every kind of machine; tails, where a second word is drawn, come out right for the same reason.
 
 Where no short form exists (codes above 8 bits, paralyzable pixels, very long sums) or a block is tiny, the reference
 itself draws. Peak memory: the output and one frame.
@@ -16,8 +16,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
 from functools import cache, lru_cache
 from typing import Any
 
@@ -26,14 +25,16 @@ from numpy import ndarray as Array
 
 from qsim import engine
 from qsim.codes import pack, packed_width
-from qsim.keys import ROUNDS, Key, philox4x32, uniform
+from qsim.keys import ROUNDS, Key
 from qsim.ladders import Electrons, Live, Plan, plan
+from qsim.pixels import draw_at
 from qsim.sensor import Sensor
-from qsim.spad import BinarySPAD
 
 SMALLEST = 1 << 14  # pixels; below, compiling costs more than it brings
 _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # of Philox4x32; see keys.py
 _KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
+_INFINITY = 0x7F800000  # float32; larger bit patterns are NaN or negative
+_CONSTANT_PLANS = 32
 
 
 def available() -> bool:
@@ -55,30 +56,21 @@ def sample(
     chosen = plan(sensor, exposure) if stack.size >= max(smallest, 1) and available() else None
     if chosen is None:
         return sensor.sample(photons, exposure, key=key, origin=origin, engine="reference")
-    frames, height, width = stack.shape
-    # Blocks of four start at multiples of four in the full frame: pad the crop to whole blocks
-    left = origin[1] & 3
-    padded = -(-(left + width) // 4) * 4
-    light = np.zeros((height, padded), np.float32)
-    direct = padded == width and stack.dtype == np.float32 and stack.flags.c_contiguous
+    left, width = origin[1] & 3, stack.shape[2]
     codes = np.empty(stack.shape, sensor.dtype)
     doubtful = []
-    for t in range(frames):
-        if not direct:
-            with np.errstate(over="ignore"):  # beyond float32 the reference decides
-                light[:, left : left + width] = stack[t]
-        frame = stack[t] if direct else light
-        place = (key.frame + t, origin[0], origin[1] >> 2)
-        pairs, flags = _launch(chosen, [frame.reshape(-1).view(np.uint64)], padded, key, place)
-        drawn = pairs.astype(np.uint16).view(np.uint8).reshape(height, padded)
-        codes[t] = drawn[:, left : left + width]
-        lanes = np.flatnonzero(flags)
+    for t, pairs, lanes in _frames(chosen, stack, key, origin, blocks=1):
+        padded = 2 * pairs.shape[1]
+        if padded == width:
+            codes[t].view(np.uint16)[...] = pairs
+        else:
+            codes[t] = pairs.astype(np.uint16).view(np.uint8)[:, left : left + width]
         y, x = np.divmod(np.repeat(2 * lanes, 2) + np.tile([0, 1], lanes.size), padded)
         inside = (x >= left) & (x < left + width)
         doubtful.append(np.stack([np.full(inside.sum(), t), y[inside], x[inside] - left]))
     at = np.concatenate(doubtful, axis=1)
     if at.size:
-        codes[tuple(at)] = decide(sensor, stack, exposure, key, origin, at)
+        codes[tuple(at)] = draw_at(sensor, stack, exposure, key, origin, at)
     return codes if photons.ndim == 3 else codes[0]
 
 
@@ -91,7 +83,7 @@ def sample_packed(
     origin: tuple[int, int] = (0, 0),
     smallest: int = SMALLEST,
 ) -> Array:
-    """Packed codes uint8 [..., H, ceil(W bits / 8)] (codes.py), in one step where a kernel serves.
+    """Packed codes uint8 [..., H, ceil(W bits / 8)] (codes.py), without writing a byte per code where a kernel serves.
 
     Equal to `codes.pack(sensor.sample(...), sensor.bits)`. Crops that do not start at a multiple of 4 take that way.
     """
@@ -101,71 +93,31 @@ def sample_packed(
     if chosen is None:
         return pack(sensor.sample(photons, exposure, key=key, origin=origin), sensor.bits)
     frames, height, width = stack.shape
-    groups, bits = -(-width // 8), sensor.bits
-    row = packed_width(width, bits)
-    light = np.zeros((4, height, groups), np.uint64)  # two photons each: columns 8 i + 0 and 1, 2 and 3, ...
-    padded = np.zeros((height, groups * 8), np.float32)
-    whole = width % 8 == 0 and stack.dtype == np.float32 and stack.flags.c_contiguous
+    bits, row = sensor.bits, packed_width(width, sensor.bits)
     packed = np.empty((frames, height, row), np.uint8)
     doubtful = []
-    for t in range(frames):
-        if not whole:
-            with np.errstate(over="ignore"):
-                padded[:, :width] = stack[t]
-        pairs = (stack[t] if whole else padded).view(np.uint64)
-        for j in range(4):
-            light[j] = pairs[:, j::4]
-        place = (key.frame + t, origin[0], origin[1] >> 2)
-        octets, flags = _launch(chosen, [part.reshape(-1) for part in light], groups * 8, key, place, bits)
-        # The eight codes of a lane are the low `bits` bytes of a number, first pixel highest
-        size = octets.dtype.itemsize
-        rows = octets.byteswap().view(np.uint8).reshape(height, groups, size)[..., size - bits :]
-        packed[t] = rows.reshape(height, groups * bits)[:, :row]
-        lanes = np.flatnonzero(flags)
-        doubtful.append(np.stack([np.full(lanes.size, t), *np.divmod(lanes, groups)]))
+    for t, pairs, lanes in _frames(chosen, stack, key, origin, blocks=2, bits=bits):
+        eights = _join(_join(pairs, 2 * bits), 4 * bits)
+        size = eights.dtype.itemsize
+        whole = eights.byteswap().view(np.uint8).reshape(height, -1, size)[..., size - bits :]
+        packed[t] = whole.reshape(height, -1)[:, :row]
+        octets = np.unique(lanes // 4)
+        doubtful.append(np.stack([np.full(octets.size, t), *np.divmod(octets, eights.shape[1])]))
     if width * bits % 8:
         packed[..., -1] &= 0xFF << (8 * row - width * bits) & 0xFF
     at = np.concatenate(doubtful, axis=1)
     if at.size:
-        _decide_lanes(sensor, stack, exposure, key, origin, at, packed)
+        _write_octets(sensor, stack, exposure, key, origin, at, packed)
     return packed if photons.ndim == 3 else packed[0]
 
 
-def decide(sensor: Sensor, photons: Array, exposure: float, key: Key, origin: tuple[int, int], at: Array) -> Array:
-    """The reference draw at single pixels: `at` int [3, p] = (t, y, x) in photons [T, H, W] -> codes [p].
-
-    `ValueError` if any of these photons is no light level (all such pixels are among the doubtful ones).
-    """
-    t, y, x = at
-    light = np.asarray(photons[t, y, x], np.float64)
-    if not (np.isfinite(light) & (light >= 0)).all():
-        sensor.arrivals(photons, exposure)
-    frames, rows, columns = key.frame + t, y + origin[0], x + origin[1]
-    if not (isinstance(sensor, BinarySPAD) and sensor.bits > 1):
-        return _decide(sensor, light, exposure, key, (columns, rows, frames))
-    single, m = replace(sensor, bits=1), sensor.planes
-    planes = (_decide(single, light / m, exposure / m, key, (columns, rows, frames * m + plane)) for plane in range(m))
-    return np.sum(list(planes), axis=0)
+def _join(numbers: Array, bits: int) -> Array:
+    """Neighbours side by side: [H, 2 n] numbers of `bits` bits -> [H, n] of twice as many, the first one highest."""
+    dtype = np.min_scalar_type(2 ** (2 * bits) - 1)
+    return numbers[:, ::2].astype(dtype) << dtype.type(bits) | numbers[:, 1::2].astype(dtype)
 
 
-def _decide(sensor: Sensor, light: Array, exposure: float, key: Key, place: tuple[Array, Array, Array]) -> Array:
-    first, second = (_words(key, place, redraw) for redraw in (0, 1))
-    cdf, u = sensor.cdf(light, exposure)[..., :-1], uniform(first)[:, None]
-    drawn = np.count_nonzero(u >= cdf, axis=-1)
-    tail = (np.abs(u - cdf) <= 2.0**-32).any(axis=-1)
-    if tail.any():
-        drawn[tail] = sensor.codes_at(first[tail], second[tail], light[tail], exposure)
-    return drawn
-
-
-def _words(key: Key, place: tuple[Array, Array, Array], redraw: int) -> Array:
-    """The words of single pixels (x, y, frame) of the full frame: uint32 [p]."""
-    x, y, frame = place
-    blocks = philox4x32(np.stack(np.broadcast_arrays(x >> 2, y, frame, redraw)), key.philox_key)
-    return blocks[x & 3, np.arange(x.size)]
-
-
-def _decide_lanes(
+def _write_octets(
     sensor: Sensor,
     stack: Array,
     exposure: float,
@@ -174,65 +126,94 @@ def _decide_lanes(
     at: Array,
     packed: Array,
 ) -> None:
-    """Write the reference's bytes of the lanes (t, y, group of 8 columns) `at` [3, lanes] into `packed`."""
+    """Write the reference's bytes of the octets of pixels `at` int [3, n] = (t, y, x // 8) into `packed`."""
     width, bits = stack.shape[2], sensor.bits
     pixels = np.repeat(at, 8, axis=1)
     pixels[2] = 8 * pixels[2] + np.tile(np.arange(8), at.shape[1])
     inside = pixels[2] < width
     codes = np.zeros(pixels.shape[1], sensor.dtype)
-    codes[inside] = decide(sensor, stack, exposure, key, origin, pixels[:, inside])
-    for (t, y, group), octet in zip(at.T, pack(codes.reshape(-1, 8), bits), strict=True):
-        end = min((group + 1) * bits, packed.shape[2])
-        packed[t, y, group * bits : end] = octet[: end - group * bits]
+    codes[inside] = draw_at(sensor, stack, exposure, key, origin, pixels[:, inside])
+    for (t, y, octet), written in zip(at.T, pack(codes.reshape(-1, 8), bits), strict=True):
+        end = min((octet + 1) * bits, packed.shape[2])
+        packed[t, y, octet * bits : end] = written[: end - octet * bits]
+
+
+def _frames(
+    chosen: Plan, stack: Array, key: Key, origin: tuple[int, int], blocks: int, bits: int | None = None
+) -> Iterator[tuple[int, Array, Array]]:
+    """For each frame t: t, what the kernel wrote [H, lanes of a row], indices of the doubtful lanes.
+
+    Rows are padded to whole groups of `blocks` Philox blocks of the full frame.
+    """
+    frames, height, width = stack.shape
+    left = origin[1] & 3
+    padded = -(-(left + width) // (4 * blocks)) * 4 * blocks
+    direct = padded == width and stack.dtype == np.float32 and stack.flags.c_contiguous
+    light = np.zeros((0 if direct else height, padded), np.float32)
+
+    def launch(t: int) -> list[Any]:
+        if not direct:
+            with np.errstate(over="ignore"):  # beyond float32 the reference decides
+                light[:, left : left + width] = stack[t]
+        frame = (stack[t] if direct else light).reshape(-1).view(np.uint64)
+        return _launch(chosen, frame, padded // 2, key, (key.frame + t, origin[0], origin[1] >> 2), bits)
+
+    # While the host finishes a frame the next kernel runs, unless both need the buffer
+    running: list[Any] = []
+    for t in range(frames + 1):
+        done = [out.numpy() for out in running] if not direct else []
+        started = launch(t) if t < frames else []
+        if running:
+            pairs, flags = done or [out.numpy() for out in running]
+            yield t - 1, pairs.reshape(height, -1), _set(flags)
+        running = started
+
+
+def _set(flags: Array) -> Array:
+    """Indices of the few non-zero bytes among many, found eight at a time."""
+    whole = flags.size // 8 * 8
+    eights = np.flatnonzero(flags[:whole].view(np.uint64))
+    near = np.append(8 * eights[:, None] + np.arange(8), np.arange(whole, flags.size))
+    return near[flags[near] != 0]
 
 
 # ---- What a kernel computes
 
 
-def _launch(
-    plan: Plan, light: list[Array], width: int, key: Key, place: tuple[int, int, int], bits: int | None = None
-) -> tuple[Array, Array]:
-    """One frame: photons as uint64 pairs of float32, [lanes] per pair -> codes of each lane, 1 where one is doubtful.
+def _launch(plan: Plan, light: Array, lanes: int, key: Key, place: tuple[int, int, int], bits: int | None) -> list[Any]:
+    """Start one frame: pairs of float32 photons as uint64 [n] -> what each lane writes, and 1 where it is doubtful.
 
-    `width` is that of the padded rows, `place` = (frame, first row, first block). Without `bits` the codes of a pair
-    are the bytes of a number, first pixel lowest; with `bits` they follow each other bit by bit, first pixel highest.
+    `lanes` are in a row, `place` = (frame, first row, first block). Without `bits` a lane writes a byte per code, the
+    first one lowest; with `bits` the codes follow each other bit by bit, the first one highest.
     """
     import drjit as dr
 
     jit = _backend()
-    per_lane = 2 * len(light)
     frame, row, block, high, low = (
         dr.opaque(jit.UInt32, value & 0xFFFFFFFF)
         for value in (place[0] * plan.planes, place[1], place[2], key.philox_key >> 32, key.philox_key)
     )
-    lane = dr.arange(jit.UInt32, light[0].size)
-    y = lane // (width // per_lane)
-    x = lane - y * (width // per_lane)
-    pairs = [jit.UInt64(pair) for pair in light]
-    halves = [jit.UInt32(half) for pair in pairs for half in (pair, pair >> 32)]
-    photons = [dr.reinterpret_array(jit.Float, half) for half in halves]
+    lane = dr.arange(jit.UInt32, light.size)
+    y = lane // lanes
+    x = lane - y * lanes
+    pair = jit.UInt64(light)
+    photons = [dr.reinterpret_array(jit.Float, jit.UInt32(half)) for half in (pair, pair >> 32)]
 
     def words(plane: Any) -> list[Any]:
-        """One word per pixel of the lane; two lanes share the block of four."""
-        counter = frame + plane
-        if per_lane == 2:
-            w, right = _philox(x // 2 + block, y + row, counter, high, low), (x & 1) == 1
-            return [dr.select(right, w[2], w[0]), dr.select(right, w[3], w[1])]
-        first = x * (per_lane // 4) + block
-        return [word for i in range(per_lane // 4) for word in _philox(first + i, y + row, counter, high, low)]
+        """Two neighbouring lanes share a block of four words."""
+        w = _philox(x // 2 + block, y + row, frame + plane, high, low)
+        right = (x & 1) == 1
+        return [dr.select(right, w[2], w[0]), dr.select(right, w[3], w[1])]
 
     codes, doubt = _count(plan, photons, words)
     if bits is None:
         out = codes[0] | (codes[1] << 8)
     else:
-        number = jit.UInt32 if bits <= 4 else jit.UInt64
-        out = number(0)
-        for code in codes:
-            out = (out << bits) | number(code)
-        out = jit.UInt8(out) if bits == 1 else out
+        out = (codes[0] << bits) | codes[1]
+        out = jit.UInt8(out) if bits <= 4 else out
     flags = jit.UInt8(dr.select(doubt, jit.UInt32(1), jit.UInt32(0)))
     dr.eval(out, flags)
-    return out.numpy(), flags.numpy()
+    return [out, flags]
 
 
 def _philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
@@ -254,81 +235,95 @@ def _count(plan: Plan, photons: list[Any], words: Callable[[Any], list[Any]]) ->
 
     jit = _backend()
     real = jit.Float64 if plan.double else jit.Float
-    scalar = _scalars(plan)
-    efficiency, dark, margin = scalar[:3]
-    doubt = jit.Bool(False)
-    for theta in photons:
-        doubt |= ~((theta >= 0) & (theta < dr.inf))  # NaN too: the reference says what is wrong
+    efficiency, dark, margin, *scalars = _scalars(plan)
+    doubt: Any = jit.Bool(False)
+    for theta in photons:  # negative, infinite and NaN by their bits: the reference says what is wrong
+        doubt |= dr.reinterpret_array(jit.UInt32, theta) >= _INFINITY
     arrivals = [dr.fma(real(theta), efficiency, dark) for theta in photons]
 
-    def around(word: Any) -> tuple[Any, Any]:
-        u = (real(word) + 0.5) * 2.0**-32
-        return u - margin, u + margin
+    def uniform32(word: Any) -> Any:
+        return dr.fma(real(word), 2.0**-32, 2.0**-33)
 
-    counts = [jit.UInt32(0) for _ in photons]
     if plan.planes == 1:
-        for i, word in enumerate(words(jit.UInt32(0))):
-            counts[i], passed = _passed(plan.steps, arrivals[i], *around(word), scalar[3:])
-            doubt |= counts[i] != passed
-        return counts, doubt
+        codes = []
+        for mean, word in zip(arrivals, words(jit.UInt32(0)), strict=True):
+            steps, unit = _steps(plan.steps, mean, scalars)
+            code, near = _search(steps, uniform32(word) * unit)
+            codes.append(code)
+            doubt |= near < margin * unit
+        return codes, doubt
     nothing = [dr.exp(-mean) for mean in arrivals]
 
-    def add_plane(plane: Any, doubt: Any, *counts: Any) -> tuple[Any, ...]:
+    def add_plane(plane: Any, near: Any, *counts: Any) -> tuple[Any, ...]:
         sums = []
         for count, word, step in zip(counts, words(plane), nothing, strict=True):
-            below, above = around(word)
-            fired = below >= step
-            doubt |= fired != (above >= step)
-            sums.append(count + dr.select(fired, jit.UInt32(1), jit.UInt32(0)))
-        return (plane + 1, doubt, *sums)
+            code, distance = _search([step], uniform32(word))
+            sums.append(count + code)
+            near = dr.minimum(near, distance)
+        return (plane + 1, near, *sums)
 
-    state = (jit.UInt32(0), doubt, *counts)
-    _, doubt, *counts = dr.while_loop(state, lambda plane, *_: plane < plan.planes, add_plane)
-    return counts, doubt
+    state = (jit.UInt32(0), real(1), *(jit.UInt32(0) for _ in photons))
+    _, near, *codes = dr.while_loop(state, lambda plane, *_: plane < plan.planes, add_plane)
+    return codes, doubt | (near < margin)
 
 
-def _passed(steps: Electrons | Live, mean: Any, below: Any, above: Any, scalar: list[Any]) -> tuple[Any, Any]:
-    """How many steps lie at or under `below`, and under `above`."""
+def _search(steps: list[Any], u: Any) -> tuple[Any, Any]:
+    """How many of 2^b - 1 ascending steps are at or under u, by bisection, and the distance to the nearest step.
+
+    The step before u and the one behind it are both on the way, so nothing else need be looked at.
+    """
     import drjit as dr
 
-    one, zero = _backend().UInt32(1), _backend().UInt32(0)
-    counts = [zero, zero]
+    count = _backend().UInt32
+    code, near = count(0), dr.inf
+    while steps:
+        half = len(steps) // 2
+        distance = u - steps[half]
+        passed = distance >= 0
+        near = dr.minimum(near, dr.abs(distance))
+        code += dr.select(passed, count(half + 1), count(0))
+        steps = [dr.select(passed, steps[half + 1 + i], steps[i]) for i in range(half)]
+    return code, near
 
-    def compare(step: Any, factor: Any, floor: Any = None) -> None:
-        for i, u in enumerate((below, above)):
-            u = u if floor is None else u - floor
-            counts[i] = counts[i] + dr.select(u * factor >= step, one, zero)
 
+def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list[Any], Any]:
+    """The steps F_k of one pixel, in a unit of its own."""
+    import drjit as dr
+
+    real = type(mean)
     if isinstance(steps, Live):
+        result = []
         for k in range(len(steps.shares)):
-            live = mean * scalar[k]
-            total = type(mean)(1)
+            live = mean * scalars[k]
+            total = real(1)
             for n in range(k, 0, -1):
                 total = dr.fma(total, live * (1 / n), 1)
-            compare(total, dr.exp(live))
-        return counts[0], counts[1]
-    shift, scale, seed, *scalar = scalar
+            result.append(total * dr.exp(-live))
+        return result + [real(2)] * (steps.levels - 1 - len(result)), real(1)  # no live time: never passed
     n = len(steps.full)
-    full, bands = scalar[:n], iter(scalar[n:])
-    terms = [type(mean)(seed)]
+    highest, shift, scale, seed = scalars[:4]
+    full, bands = scalars[4 : 4 + n], iter(scalars[4 + n :])
+    mean = dr.minimum(mean, highest)
+    unit, grow = dr.exp(mean - shift), mean * scale
+    terms = [seed]
     for _ in range(1, n):
-        terms.append(terms[-1] * (mean * scale))
-    factor = dr.exp(mean - shift)
-    total, summed = type(mean)(0), 0
+        terms.append(terms[-1] * grow)
+    result, total, summed = [], real(0), 0
     for prefix, band, floor in zip(steps.prefix, steps.band, steps.floor, strict=True):
         for m in range(summed, prefix):
             total = dr.fma(terms[m], full[m], total)
         summed = max(summed, prefix)
-        step = total if prefix else type(mean)(0)
+        step = total if prefix else real(0)
         for m in range(len(band)):
             step = dr.fma(terms[prefix + m], next(bands), step)
-        compare(step, factor, next(bands) if floor else None)
-    return counts[0], counts[1]
+        result.append(dr.fma(unit, next(bands), step) if floor else step)
+    return result, unit
 
 
 @lru_cache(maxsize=64)
 def _scalars(plan: Plan) -> list[Any]:
-    """The plan's numbers as kernel arguments: sensors of one structure share one compiled kernel."""
+    """The plan's numbers: constants of a kernel of its own for the first sensors of a process, arguments of a shared
+    (about 20 % slower) kernel for the rest, so that a training that varies its sensors does not compile for ever."""
     import drjit as dr
 
     jit = _backend()
@@ -337,10 +332,17 @@ def _scalars(plan: Plan) -> list[Any]:
     if isinstance(plan.steps, Live):
         values += plan.steps.shares
     else:
-        values += [plan.steps.shift, 1 / plan.steps.scale, np.exp(-plan.steps.shift), *plan.steps.full]
+        values += [
+            plan.steps.highest,
+            plan.steps.shift,
+            1 / plan.steps.scale,
+            np.exp(-plan.steps.shift),
+            *plan.steps.full,
+        ]
         for band, floor in zip(plan.steps.band, plan.steps.floor, strict=True):
             values += [*band, floor] if floor else [*band]
-    return [dr.opaque(real, float(value)) for value in values]
+    constant = _scalars.cache_info().misses <= _CONSTANT_PLANS
+    return [real(float(value)) if constant else dr.opaque(real, float(value)) for value in values]
 
 
 # ---- Which Dr.Jit

@@ -34,6 +34,7 @@ _NEGLIGIBLE = 1e-12  # a coefficient that small moves no step by more than float
 class Electrons:
     """Sums over electrons: q_0 ... q_(n-1), and for each step how many come in full and which are weighted."""
 
+    highest: float  # arrivals beyond which every step without a floor is 0; more light changes nothing
     shift: float
     scale: float
     full: Array  # [n] coefficient of a whole term, scale^n / n!
@@ -46,7 +47,8 @@ class Electrons:
 class Live:
     """Sums over counts: step k has k + 1 terms and the live share s_k; steps without live time are never passed."""
 
-    shares: tuple[float, ...]
+    levels: int
+    shares: tuple[float, ...]  # above 0
 
 
 @dataclass(frozen=True, eq=False)  # compared as objects: `plan` makes each once
@@ -67,11 +69,11 @@ def plan(sensor: Sensor, exposure: float) -> Plan | None:
     efficiency, dark = sensor.efficiency, sensor.dark_rate * exposure
     if isinstance(sensor, BinarySPAD) and sensor.bits <= 8:
         m = sensor.planes
-        return Plan(efficiency / m, dark / m, m, Live((1.0,)), False, _margin(1))
+        return Plan(efficiency / m, dark / m, m, Live(2, (1.0,)), False, _margin(1))
     if isinstance(sensor, CountingSPAD) and not sensor.paralyzable and sensor.bits <= 4:
         shares = 1 - np.arange(sensor.levels - 1) * (sensor.dead_time / exposure)
         live = tuple(float(s) for s in shares[shares > 0])
-        return Plan(efficiency, dark, 1, Live(live), False, _margin(len(live)))
+        return Plan(efficiency, dark, 1, Live(sensor.levels, live), False, _margin(len(live)))
     if isinstance(sensor, QIS) and sensor.bits <= 8:
         steps = electrons(sensor)
         if steps is not None:
@@ -107,4 +109,4 @@ def electrons(sensor: QIS) -> Electrons | None:
     numbers = np.arange(n)
     full = np.exp(numbers * log(scale) - np.array([lgamma(m + 1) for m in numbers]))
     band = [weights[a:b, k] * full[a:b] for k, (a, b) in enumerate(zip(prefix, ends, strict=True))]
-    return Electrons(max(0.0, highest - limit), scale, full, tuple(prefix), tuple(band), floor)
+    return Electrons(highest, max(0.0, highest - limit), scale, full, tuple(prefix), tuple(band), floor)
