@@ -42,45 +42,52 @@ class Paralyzable:
 
     def __init__(self, ratio: float, levels: int) -> None:
         self.ratio, self.levels = ratio, levels
+        self.possible = min(levels, most_counts(ratio) + 1)  # levels that can occur
 
     def cdf(self, mean: Array) -> Array:
         """P(code <= k): [p] -> [p, levels]."""
-        result = np.empty((len(mean), self.levels))
+        result = np.ones((len(mean), self.levels))
         for rows, table in self._tables(mean):
-            result[rows] = table.evaluate_cdf(mean[rows]) if table else self._sparse(mean[rows])[0]
+            result[rows, : self.possible] = table.evaluate_cdf(mean[rows]) if table else self._sparse(mean[rows])[0]
         return result
 
     def log_pmf(self, mean: Array, wanted: Array | None = None) -> Array:
         """log P(code = k): [p] -> [p, levels]; `wanted` as in Mixture."""
-        result = np.empty((len(mean), self.levels))
+        result = np.full((len(mean), self.levels), -np.inf)
         for rows, table in self._tables(mean):
-            some = None if wanted is None else wanted[rows]
-            result[rows] = table.evaluate_log_pmf(mean[rows], some) if table else self._sparse(mean[rows])[1]
+            some = None if wanted is None else wanted[rows, : self.possible]
+            part = table.evaluate_log_pmf(mean[rows], some) if table else self._sparse(mean[rows])[1]
+            result[rows, : self.possible] = part
         result[:, 0] = -mean
         return result
 
     def slope(self, mean: Array) -> Array:
         """dcdf/dmean: [p] -> [p, levels]."""
-        result = np.empty((len(mean), self.levels))
+        result = np.zeros((len(mean), self.levels))
         for rows, table in self._tables(mean):
-            result[rows] = table.evaluate_slope(mean[rows]) if table else self._sparse(mean[rows])[2]
+            result[rows, : self.possible] = table.evaluate_slope(mean[rows]) if table else self._sparse(mean[rows])[2]
         return result
 
     def _tables(self, mean: Array) -> Iterator[tuple[Array, Mixture | None]]:
         """Light levels in groups, each with a table just long enough (the Poisson tail left out is below 1e-30)."""
         length = np.exp2(np.ceil(np.log2(mean + 12 * np.sqrt(mean) + 60)))
         for last in np.unique(length):
-            table = arrival_table(self.ratio, self.levels, int(last)) if last <= _LONGEST else None
+            table = arrival_table(self.ratio, self.possible, int(last)) if last <= _LONGEST else None
             yield np.flatnonzero(length == last), table
 
     def _sparse(self, mean: Array) -> tuple[Array, Array, Array]:
-        return _sparse(mean, self.ratio, self.levels)
+        return _sparse(mean, self.ratio, self.possible)
+
+
+def most_counts(ratio: float) -> int:
+    """The most counts that fit into an exposure of `ratio` dead times, the pixel being live at its start."""
+    return floor(ratio) + 1
 
 
 @lru_cache(maxsize=16)
 def arrival_table(ratio: float, levels: int, last: int) -> Mixture:
     """P(code | n arrivals) for n < `last`; `ratio` = exposure / dead time; codes clip at levels - 1."""
-    most = floor(ratio) + 1  # counts that can fit
+    most = most_counts(ratio)
     counted = min(most, levels - 1 + _BEYOND_TOP, last - 1)
     log_pmf = _log_counts(ratio, counted, last)
     pmf = np.exp(log_pmf)
@@ -170,7 +177,7 @@ def _sparse(mean: Array, ratio: float, levels: int) -> tuple[Array, Array, Array
             f"CountingSPAD: {worst:.4g} arrivals in an exposure of {ratio:.6g} paralyzable dead times have no closed "
             "form here; shorten the exposure or lower the light"
         )
-    last = min(floor(ratio) + 1, _MOST)
+    last = min(most_counts(ratio), _MOST)
     moments, slopes = _moments(mean, a, last)  # of B_j / rate^(j-1)
     j = np.arange(1, last + 1)
     log_pmf = np.full((len(mean), levels), -np.inf)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from hashlib import blake2b
+from math import prod
 from operator import index
 
 import numpy as np
@@ -22,6 +23,7 @@ from numpy import ndarray as Array
 ROUNDS = 7  # of Philox4x32; Dr.Jit's default
 _MULTIPLIERS = (np.uint64(0xD2511F53), np.uint64(0xCD9E8D57))
 _KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
+_BATCH = 1 << 13  # blocks that stay in the cache
 _LOW, _SHIFT = np.uint64(0xFFFFFFFF), np.uint64(32)
 
 
@@ -60,28 +62,42 @@ def hash_name(name: str) -> int:
 
 
 def philox4x32(counters: Array, key: int) -> Array:
-    """Four random words per counter: uint32 [4, ...] -> uint32 [4, ...] under a 64-bit key."""
-    c0, c1, c2, c3 = (np.asarray(c, np.uint64) for c in counters)
+    """Four random words per counter: integers [4, ...] below 2^32 -> uint32 [4, ...] under a 64-bit key."""
+    c0, c1, c2, c3 = np.array(counters, np.uint64)
+    even, odd = np.empty_like(c0), np.empty_like(c2)
     k0, k1 = key >> 32 & 0xFFFFFFFF, key & 0xFFFFFFFF
-    for _ in range(ROUNDS):
-        even, odd = _MULTIPLIERS[0] * c0, _MULTIPLIERS[1] * c2
-        c0, c2 = (odd >> _SHIFT) ^ c1 ^ np.uint64(k0), (even >> _SHIFT) ^ c3 ^ np.uint64(k1)
-        c1, c3 = odd & _LOW, even & _LOW
+    for _ in range(ROUNDS):  # in place: this is the inner loop of the reference engine
+        np.multiply(_MULTIPLIERS[0], c0, out=even)
+        np.multiply(_MULTIPLIERS[1], c2, out=odd)
+        for c, old, product, k in ((c0, c1, odd, k0), (c2, c3, even, k1)):
+            np.right_shift(product, _SHIFT, out=c)
+            np.bitwise_xor(c, old, out=c)
+            np.bitwise_xor(c, np.uint64(k), out=c)
+        np.bitwise_and(odd, _LOW, out=c1)
+        np.bitwise_and(even, _LOW, out=c3)
         k0, k1 = (k0 + _KEY_STEPS[0]) & 0xFFFFFFFF, (k1 + _KEY_STEPS[1]) & 0xFFFFFFFF
     return np.stack([c0, c1, c2, c3]).astype(np.uint32)
 
 
-def words(key: Key, shape: tuple[int, int], origin: tuple[int, int] = (0, 0), redraw: int = 0) -> Array:
-    """One word per pixel of the frame `key.frame`: uint32 [H, W] of the crop that starts at `origin` = (y, x)."""
-    (height, width), (y, x) = shape, origin
-    if min(y, x, redraw) < 0 or max(y + height, x + width, redraw) > 2**32:
-        raise ValueError(f"origin {origin} and redraw {redraw} are counted from 0 to 2^32 - 1 in the full frame")
+def words(key: Key, shape: tuple[int, ...], origin: tuple[int, int] = (0, 0), redraw: int = 0) -> Array:
+    """One word per pixel of the crop at `origin` = (y, x): uint32 [H, W], or [T, H, W] = frames key.frame + t."""
+    *frames, height, width = shape
+    y, x = origin
+    last_frame = key.frame + (frames[0] if frames else 1)
+    if min(y, x, redraw) < 0 or max(y + height, x + width, redraw + 1, last_frame) > 2**32:
+        raise ValueError(
+            f"frame {key.frame}, origin {origin} and redraw {redraw} are counted from 0 to 2^32 - 1 in the full frame"
+        )
     first, last = x >> 2, (x + width + 3) >> 2
-    rows = np.arange(y, y + height, dtype=np.uint64)[:, None]
-    blocks = np.arange(first, last, dtype=np.uint64)[None, :]
-    counters = np.stack(np.broadcast_arrays(blocks, rows, np.uint64(key.frame), np.uint64(redraw)))
-    block = np.moveaxis(philox4x32(counters, key.philox_key), 0, -1).reshape(height, -1)
-    return block[:, x - 4 * first : x - 4 * first + width]
+    blocks = (last_frame - key.frame, height, last - first)
+    result = np.empty((prod(blocks), 4), np.uint32)
+    for start in range(0, len(result), _BATCH):
+        some = np.arange(start, min(start + _BATCH, len(result)))
+        frame, row, column = np.unravel_index(some, blocks)
+        counters = np.stack([column + first, row + y, frame + key.frame, np.full_like(some, redraw)])
+        result[start : start + _BATCH] = philox4x32(counters, key.philox_key).T
+    crop = result.reshape(*blocks[:2], -1)[..., x - 4 * first : x - 4 * first + width]
+    return crop if frames else crop[0]
 
 
 def uniform(first: Array, second: Array | None = None) -> Array:

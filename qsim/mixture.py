@@ -15,6 +15,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 _UNDERFLOW = 1e-290  # below, products of two representable factors may have lost terms: sum logarithms instead
+_DIM = 600.0  # Poisson mean up to which the recursion from exp(-mean) does not underflow; n steps lose n 1e-16
 _CHUNK = 1 << 21  # numbers in one block of work (16 MiB)
 
 
@@ -70,7 +71,12 @@ class Mixture:
 
     def evaluate_cdf(self, mean: Array) -> Array:
         """P(code <= k): [p] Poisson means -> [p, levels]."""
-        return np.minimum(self._below(mean)[:, None] + self._mix(mean, self.cdf, self.tail_cdf), 1.0)
+        certain = (self.tail_cdf == 1) & (self.cdf == 1).all(axis=0)  # the top code
+        result = self._mix(mean, self.cdf, np.where(certain, 0.0, self.tail_cdf))
+        if self.first:
+            result += self._below(mean)[:, None]
+        result[:, certain] = 1.0
+        return np.minimum(result, 1.0)
 
     def evaluate_slope(self, mean: Array) -> Array:
         """d cdf / d mean: [p] -> [p, levels]."""
@@ -117,25 +123,34 @@ class Mixture:
         return result
 
     def _mix(self, mean: Array, table: Array, tail: Array | None) -> Array:
-        n = np.arange(self.first, self.first + len(table))
         result = np.empty((len(mean), table.shape[1]))
         step = max(1, _CHUNK // max(len(table), 1))
         for start in range(0, len(mean), step):
-            block = mean[start : start + step]
-            result[start : start + step] = np.exp(poisson_log_pmf(block[:, None], n)) @ table
-        if tail is not None:
+            result[start : start + step] = self._weights(mean[start : start + step]).T @ table
+        if tail is not None and tail.any():
             result += self._above(mean)[:, None] * tail
         return result
 
+    def _weights(self, mean: Array) -> Array:
+        """Pois(n; mean) of the table's n: [p] -> [m, p]."""
+        n = np.arange(self.first, self._last)
+        if self.first or not len(n) or (mean > _DIM).any():
+            return np.exp(poisson_log_pmf(mean, n[:, None]))
+        weights = np.empty((len(n), len(mean)))
+        weights[0] = np.exp(-mean)
+        for i in n[1:]:
+            np.multiply(weights[i - 1], mean / i, out=weights[i])
+        return weights
+
     @property
     def _last(self) -> int:
-        return self.first + len(self.cdf)
+        return self.first + len(self.log_pmf)
 
     def _below(self, mean: Array) -> Array:
-        """P(n < first)."""
+        """P(n < first), first > 0."""
         from scipy.special import gammaincc
 
-        return gammaincc(self.first, mean) if self.first else np.zeros_like(mean)
+        return gammaincc(self.first, mean)
 
     def _above(self, mean: Array) -> Array:
         """P(n >= first + m)."""

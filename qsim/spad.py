@@ -6,18 +6,19 @@ expected in an exposure.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import ClassVar
 
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.deadtime import Paralyzable
-from qsim.keys import Key
+from qsim.deadtime import Paralyzable, most_counts
+from qsim.keys import Key, uniform, uniform_pair, words
 from qsim.mixture import poisson_log_pmf
 from qsim.sensor import Sensor, require_bits, require_number
 
+_BATCH = 1 << 17  # words of a batch of planes
 _UNDERFLOW = 1e-290  # below, sums in floating point may have lost terms
 
 
@@ -94,18 +95,36 @@ class BinarySPAD(Sensor):
                 f"planes of a {self.bits}-bit code come in groups of {self.planes}: [T {self.planes}, H, W], "
                 f"got {list(photons.shape)}"
             )
-        plane = BinarySPAD(self.pde, self.dark_count_rate)
-        codes = np.zeros((len(photons) // self.planes, *photons.shape[1:]), self.dtype)
-        for p, light in enumerate(photons):
-            at = key.at(key.frame * self.planes + p)
-            codes[p // self.planes] += plane.sample(light, exposure, key=at, origin=origin, engine=engine)
+        single = replace(self, bits=1)
+        codes = np.empty((len(photons) // self.planes, *photons.shape[1:]), self.dtype)
+        for t in range(len(codes)):
+            group = photons[t * self.planes : (t + 1) * self.planes]
+            at = key.at((key.frame + t) * self.planes)
+            codes[t] = single.sample(group, exposure, key=at, origin=origin, engine=engine).sum(axis=0)
         return codes
 
     def _draw(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
-        if self.bits == 1:
-            return super()._draw(photons, exposure, key, origin)
-        planes = np.broadcast_to(np.asarray(photons) / self.planes, (self.planes, *photons.shape))
-        return self.sample_planes(planes, exposure / self.planes, key=key, origin=origin, engine="reference")[0]
+        """Many planes of a few rows at a time: all planes of a code share their light."""
+        single, m = replace(self, bits=1), self.planes
+        codes = np.zeros(photons.shape, self.dtype)
+        rows = max(1, _BATCH // max(photons.shape[1], 1))
+        for y in range(0, len(photons), rows):
+            light = np.asarray(photons[y : y + rows], np.float64) / m
+            dark = single.cdf(light, exposure / m)[..., 0]
+            step = max(1, _BATCH // max(light.size, 1))
+            for plane in range(0, m, step):
+                at = key.at(key.frame * m + plane)
+                batch, place = (min(step, m - plane), *light.shape), (origin[0] + y, origin[1])
+                first = words(at, batch, place)
+                u = uniform(first)
+                fires = u >= dark
+                tail = np.abs(u - dark) <= 2.0**-32
+                if tail.any():
+                    second = words(at, batch, place, redraw=1)[tail]
+                    lit = np.broadcast_to(light, batch)[tail]
+                    fires[tail] = single.codes_at(first[tail], second, lit, exposure / m)
+                codes[y : y + rows] += fires.sum(axis=0, dtype=self.dtype)
+        return codes
 
 
 def _log_binomials(n: int) -> Array:
@@ -200,6 +219,29 @@ class CountingSPAD(Sensor):
             )
         result[:, 0] = -arrivals
         return result
+
+    def _draw(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
+        if self.bits <= 8:
+            return super()._draw(photons, exposure, key, origin)
+        if self.paralyzable and self.dead_time:
+            enough = min(self.bits, most_counts(exposure / self.dead_time).bit_length())
+            draw = super()._draw if enough == self.bits else replace(self, bits=enough)._draw
+            return draw(photons, exposure, key, origin).astype(self.dtype)
+        return self._draw_by_bisection(photons, exposure, key, origin)
+
+    def _draw_by_bisection(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
+        """The smallest code k with u < F_k without looking at all 2^bits of them; u has 64 bits."""
+        from scipy.special import gammainc, gammaincc
+
+        below, above = uniform_pair(*(words(key, photons.shape, origin, redraw) for redraw in (0, 1)))
+        arrivals, share = self.arrivals(photons, exposure), self.dead_time / exposure
+        low, high = np.full(photons.shape, -1), np.full(photons.shape, self.levels - 1)
+        while (high - low > 1).any():
+            middle = (low + high) // 2
+            live = arrivals * np.maximum(1 - middle * share, 0)
+            reached = np.where(below < 0.5, below < gammaincc(middle + 1, live), above > gammainc(middle + 1, live))
+            low, high = np.where(reached, low, middle), np.where(reached, middle, high)
+        return high.astype(self.dtype)
 
     def _slope(self, arrivals: Array, exposure: float) -> Array:
         """dF_k/dlive_k = -Pois(k; live_k)."""
