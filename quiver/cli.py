@@ -1,18 +1,21 @@
-"""The command `quiver`: parse, call, print. Each command is a pair `_add_X` (its options) and `_run_X` (what it does)."""
+"""The command `quiver`: parse, call, print. Each command is a pair `_add_X` (options) and `_run_X` (what it does)."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import shutil
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 NETWORKS = ("nano", "quiver-s", "quiver", "unet")
+PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see run.py
+MODES = ("exact", "streaming", "windows")  # see restore.py
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -63,6 +66,12 @@ def count(text: str) -> int:
     return int(text)
 
 
+def nonnegative(text: str) -> int:
+    if not text.strip().isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, got {text!r}")
+    return int(text)
+
+
 def size(text: str) -> int:
     """Bytes of `2GB`, `500MB`, `1.5GiB` or a bare number."""
     units = {"kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2**10, "mib": 2**20, "gib": 2**30, "b": 1, "": 1}
@@ -95,9 +104,7 @@ def _add_light(parser: argparse.ArgumentParser, several: bool) -> None:
 
 def _add_running(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--memory", type=size, default="2GB", help="working memory, as in 500MB (default 2GB)")
-    parser.add_argument(
-        "--mode", default="exact", choices=("exact", "streaming", "windows"), help="how frames share work"
-    )
+    parser.add_argument("--mode", default="exact", choices=MODES, help="how frames share work (default exact)")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
     parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"), help="default float32")
 
@@ -129,11 +136,7 @@ def _add_train(sub: Any) -> None:
     parser.add_argument("data", help="data set folder")
     parser.add_argument("-o", "--output", required=True, help="folder of the run")
     parser.add_argument("--preset", default="nano", choices=NETWORKS, help="network (default nano)")
-    parser.add_argument(
-        "--protocol",
-        default="quick",
-        help="bundle of defaults: quick, control, published, paper, spad-sum (default quick)",
-    )
+    parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
     parser.add_argument("--steps", type=count, help="optimiser steps")
     parser.add_argument("--minutes", type=positive, help="wall-clock limit; the learning rate is planned for it")
     _add_light(parser, several=True)
@@ -144,7 +147,7 @@ def _add_train(sub: Any) -> None:
     parser.add_argument("--loss", choices=("published", "paper", "l1"))
     parser.add_argument("--validate-every", type=count, help="steps")
     parser.add_argument("--validation-split", choices=("train", "val", "test"), help="default val")
-    parser.add_argument("--workers", type=int, help="processes that draw samples (default 0: this one)")
+    parser.add_argument("--workers", type=nonnegative, help="processes that draw samples (default 0: this one)")
     parser.add_argument("--precision", choices=("auto", "float32", "bfloat16"), help="default auto: bfloat16 on CUDA")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
     parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
@@ -156,49 +159,62 @@ def _run_train(args: argparse.Namespace) -> int:
 
     from quiver.data import output
     from quiver.restore import pick_device
-    from quiver.run import PROTOCOLS, Settings
     from quiver.train import Diverged, train
 
-    if args.protocol not in PROTOCOLS:
-        from quiver.data import suggest
-
-        raise ValueError(
-            f"no protocol {args.protocol!r}{suggest(args.protocol, list(PROTOCOLS))}; known: {', '.join(PROTOCOLS)}"
-        )
-    given = {f.name: getattr(args, f.name, None) for f in fields(Settings)}
-    given |= {"data": args.data, "out": args.output, "network": args.preset}
-    settings = Settings(
-        **(PROTOCOLS[args.protocol] | {name: value for name, value in given.items() if value is not None})
-    )
-    folder = Path(args.output)
-    if args.force and folder.exists():
+    settings = _settings(args)
+    folder, leads = Path(settings.out), os.environ.get("RANK", "0") == "0"
+    if args.force and folder.exists() and leads:
         _renew(folder, "settings.json")
     torch.manual_seed(settings.seed)
-    interrupted: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda found, _: interrupted.append(found))
     try:
-        state = train(
-            build_network(args.preset),
-            settings,
-            device=pick_device(args.device),
-            should_stop=lambda: bool(interrupted),
-            progress=not args.json,
-        )
+        with _signals() as interrupted:
+            state = train(
+                build_network(args.preset),
+                settings,
+                device=pick_device(args.device),
+                should_stop=lambda: bool(interrupted),
+                progress=not args.json,
+            )
     except Diverged as error:
         print(f"quiver: {error}", file=sys.stderr)
         return 1
-    best = state.history[-1] if state.history else {}
-    found = {"run": str(folder), "steps": state.step, "seconds": state.elapsed, "last_validation": best}
-    text = f"{folder}: {state.step} steps in {state.elapsed / 60:.1f} min"
-    if state.history:
-        found |= {"best_psnr_matched": state.best, "weights": str(folder / "best.safetensors")}
-        text += f", validation PSNR {state.best:.2f} dB (after the best factor); weights in best.safetensors"
-    output(args, found, text)
+    if leads:
+        output(args, *_summary(folder, state))
     if interrupted:
         print("quiver: interrupted; the same command goes on where it stopped", file=sys.stderr)
         return 130
     return 0
+
+
+def _settings(args: argparse.Namespace) -> Any:
+    """The protocol's settings, overridden by the options that were given."""
+    from quiver.run import PROTOCOLS, Settings
+
+    given = {field.name: getattr(args, field.name, None) for field in fields(Settings)}
+    given |= {"data": args.data, "out": args.output, "network": args.preset}
+    return Settings(**PROTOCOLS[args.protocol] | {name: value for name, value in given.items() if value is not None})
+
+
+@contextlib.contextmanager
+def _signals() -> Iterator[list[int]]:
+    """Collects Ctrl-C and termination instead of dying of them: the loop ends after its step and saves its state."""
+    found: list[int] = []
+    before = {n: signal.signal(n, lambda number, _: found.append(number)) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield found
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _summary(folder: Path, state: Any) -> tuple[dict[str, Any], str]:
+    found = {"run": str(folder), "steps": state.step, "seconds": state.elapsed}
+    text = f"{folder}: {state.step} steps in {state.elapsed / 60:.1f} min"
+    if state.history:
+        weights = str(folder / "best.safetensors")
+        found |= {"best_psnr_matched": state.best, "weights": weights, "last_validation": state.history[-1]}
+        text += f", best validation PSNR {state.best:.2f} dB (after the best factor): {weights}"
+    return found, text
 
 
 def build_network(name: str) -> Any:
@@ -374,7 +390,7 @@ def _run_bench(args: argparse.Namespace) -> int:
 
 def _add_convert_weights(sub: Any) -> None:
     parser = _command(
-        sub, "convert-weights", _run_convert_weights, "Turn a checkpoint of the published QUIVER into our weights file.",
+        sub, "convert-weights", _run_convert_weights, "Turn a checkpoint of the published network into ours.",
         "quiver convert-weights quiver.pth -o out/quiver.safetensors",
     )  # fmt: skip
     parser.add_argument("source", type=Path, help="checkpoint (.pt, .pth, .ckpt, .safetensors); never unpickled")

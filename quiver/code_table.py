@@ -3,9 +3,9 @@
     code = #{k : u >= F_k(photons)},  u uniform: grows with u and with photons
 
 The plane of (sqrt(photons), u) is cut into cells. Where a code is the same in the two extreme corners of a cell it is
-the same everywhere in it; the few pixels in other cells (1 to 2 % at 3 bits) ask the sensor itself. So the codes are
-those of the sensor's reference engine, to the last one (tested), several times faster and in plain NumPy: worker
-processes that must not touch Dr.Jit can use it.
+the same everywhere in it; the few pixels in other cells (1 to 2 % at 3 bits) ask the sensor itself. So nothing is
+approximated: the codes are those of the sensor's reference engine, to the last one (tested), several times faster and
+in plain NumPy, for worker processes that must not touch Dr.Jit.
 """
 
 from __future__ import annotations

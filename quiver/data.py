@@ -103,23 +103,19 @@ def _code_table(sensor: Sensor, exposure: float) -> CodeTable | None:
 
 
 def draw_codes(sensor: Sensor, photons: Array, exposure: float, key: Key) -> Array:
-    """Codes [T, H, W] of expected photons [T, H, W], frame t under `key.at(key.frame + t)`.
+    """Codes [T, H, W] of expected photons [T, H, W], frame t under `key.at(key.frame + t)`; quick, without Dr.Jit.
 
-    The numbers of `sensor.sample(..., engine="reference")`, without Dr.Jit and quickly for few-bit sensors.
+    The codes of `sensor.sample(..., engine="reference")` where a sensor draws one number per pixel. A clocked SPAD
+    draws one per plane: its codes have the same exact distribution, from other numbers.
     """
     table = _code_table(sensor, exposure)
-    if table is None or not photons.min() >= 0:  # the sensor names the bad pixel
+    if table is None or not (photons.min() >= 0 and photons.max() < np.inf):  # the sensor names the bad pixel
         return sensor.sample(photons, exposure, key=key, engine="reference")
-
-    def words(redraw: int) -> Array:
-        frames = (keys.words(key.at(key.frame + t), photons.shape[1:], redraw=redraw) for t in range(len(photons)))
-        return np.stack(list(frames))
-
-    first = words(0)
+    first = keys.words(key, photons.shape)
     try:
         return table.draw(photons, first)
     except LookupError:
-        return table.draw(photons, first, words(1))
+        return table.draw(photons, first, keys.words(key, photons.shape, redraw=1))
 
 
 def open_clips(path: Path | str, split: str | None = None) -> list[Clip]:

@@ -29,6 +29,7 @@ from quiver.data import (
     open_clips,
     read_json,
     sensed,
+    stored,
     truth,
     windows_sensed,
     write_json,
