@@ -238,7 +238,8 @@ def _count(plan: Plan, photons: list[Any], words: Callable[[Any], list[Any]]) ->
     efficiency, dark, margin, *scalars = _scalars(plan)
     doubt: Any = jit.Bool(False)
     for theta in photons:  # negative, infinite and NaN by their bits: the reference says what is wrong
-        doubt |= dr.reinterpret_array(jit.UInt32, theta) >= _INFINITY
+        pattern: Any = dr.reinterpret_array(jit.UInt32, theta)
+        doubt |= pattern >= _INFINITY
     arrivals = [dr.fma(real(theta), efficiency, dark) for theta in photons]
 
     def uniform32(word: Any) -> Any:
