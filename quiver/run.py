@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -153,8 +154,8 @@ class Run:
             if content["cuda_rng"] and torch.cuda.is_available():
                 torch.cuda.set_rng_state_all([state.cpu() for state in content["cuda_rng"]])
             return State(**content["state"])
-        except (RuntimeError, EOFError, KeyError, ValueError, TypeError) as error:
-            reason = str(error).splitlines()[0]
+        except (RuntimeError, EOFError, KeyError, ValueError, TypeError, pickle.UnpicklingError) as error:
+            reason = str(error).split(". ")[0].splitlines()[0]
             raise ValueError(
                 f"{self.checkpoint}: not a state of this run ({reason}); start anew with --force"
             ) from None

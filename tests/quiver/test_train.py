@@ -1,0 +1,284 @@
+"""One loop: killed and resumed equals uninterrupted, NaN stops it, schedules, files, low precision, two processes."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from clips import write_dataset
+from torch import Tensor, nn
+
+from quiver import train as training
+from quiver.model import Output
+from quiver.run import PROTOCOLS, Run, Settings, State
+from quiver.train import Diverged, learning_rate, make_windows, note_plateau, train
+from quiver.unet import UNet, UNetConfig
+from quiver.weights import load, read_notes
+
+ROOT = Path(__file__).parents[2]
+
+
+def settings(data: Path, out: Path, **changes: object) -> Settings:
+    defaults = {"steps": 6, "crop": 16, "batch": 2, "validate_every": 4, "warmup": 2, "validation_windows": 2}
+    return Settings(str(data), str(out), **defaults | changes)
+
+
+def small_network(seed: int = 0) -> UNet:
+    torch.manual_seed(seed)
+    return UNet(UNetConfig(4))
+
+
+def same_weights(a: nn.Module, b: nn.Module) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
+
+
+class Killed(Exception):
+    """Stands for a process that dies: nothing is cleaned up by the loop."""
+
+
+@pytest.mark.parametrize("schedule", ["cosine", "plateau"])
+def test_killed_and_resumed_equals_uninterrupted(tiny_dataset, tmp_path, monkeypatch, schedule):
+    """Killed after step 5 with the last state saved at step 3: steps 4 and 5 are done again, to the same bits."""
+    through = small_network()
+    whole = train(through, settings(tiny_dataset, tmp_path / "a", schedule=schedule), progress=False)
+
+    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
+    asked = []
+
+    def die() -> bool:
+        asked.append(1)
+        if len(asked) == 3:
+            monkeypatch.setattr(training, "CHECKPOINT_SECONDS", math.inf)
+        if len(asked) == 5:
+            raise Killed
+        return False
+
+    again = settings(tiny_dataset, tmp_path / "b", schedule=schedule)
+    with pytest.raises(Killed):
+        train(small_network(), again, should_stop=die, progress=False)
+    assert torch.load(tmp_path / "b/checkpoint.pt", weights_only=True)["state"]["step"] in (2, 3)
+    resumed = small_network(seed=99)  # its own weights must not matter
+    state = train(resumed, again, progress=False)
+    assert same_weights(through, resumed)
+    assert state.step == whole.step == 6
+    timeless = [{k: v for k, v in entry.items() if k != "elapsed"} for entry in state.history]
+    assert timeless == [{k: v for k, v in entry.items() if k != "elapsed"} for entry in whole.history]
+    assert same_weights(load(tmp_path / "a/best.safetensors"), load(tmp_path / "b/best.safetensors"))
+
+
+def test_an_interruption_saves_its_step(tiny_dataset, tmp_path):
+    steps = []
+
+    def stop() -> bool:
+        steps.append(1)
+        return len(steps) == 2
+
+    state = train(small_network(), settings(tiny_dataset, tmp_path / "r"), should_stop=stop, progress=False)
+    assert state.step == 2
+    assert torch.load(tmp_path / "r/checkpoint.pt", weights_only=True)["state"]["step"] == 2
+    assert train(small_network(), settings(tiny_dataset, tmp_path / "r"), progress=False).step == 6
+
+
+def test_a_finished_run_stays_finished(tiny_dataset, tmp_path):
+    first = train(small_network(), settings(tiny_dataset, tmp_path / "r"), progress=False)
+    again = train(small_network(1), settings(tiny_dataset, tmp_path / "r"), progress=False)
+    assert again.history == first.history
+
+
+@pytest.mark.slow
+def test_workers_do_not_change_the_run(tiny_dataset, tmp_path):
+    alone, helped = small_network(), small_network()
+    train(alone, settings(tiny_dataset, tmp_path / "a", steps=2), progress=False)
+    train(helped, settings(tiny_dataset, tmp_path / "b", steps=2, workers=1), progress=False)
+    assert same_weights(alone, helped)
+
+
+def test_it_learns(tiny_dataset, tmp_path):
+    """Forty steps at a high rate halve the root mean squared error of the untrained network, on held-out clips."""
+    quick = settings(tiny_dataset, tmp_path / "r", steps=40, learning_rate=1e-2, loss="l1")
+    state = train(small_network(), quick, progress=False)
+    before, _ = training.validate(small_network(), make_windows(quick, 4)[1], torch.device("cpu"))
+    assert state.history[-1]["psnr"] > before.psnr + 6
+
+
+def test_files_of_a_run(tiny_dataset, tmp_path):
+    train(small_network(), settings(tiny_dataset, tmp_path / "r"), progress=False)
+    names = {path.name for path in (tmp_path / "r").iterdir()}
+    assert {"settings.json", "checkpoint.pt", "best.safetensors", "last.safetensors", "history.json"} <= names
+    assert any(name.startswith("events.out.tfevents") for name in names)
+    notes = read_notes(tmp_path / "r/best.safetensors")
+    assert json.loads(notes["settings"])["ppp"] == [3.25]
+    history = json.loads((tmp_path / "r/history.json").read_text())["history"]
+    assert [entry["step"] for entry in history] == [4, 6]
+
+
+class Poisoned(nn.Module):
+    """Turns to NaN at its third call with gradients, as a network does whose weights have left the road."""
+
+    multiple = 4
+    config = UNetConfig(1)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.factor = nn.Parameter(torch.ones(()))
+        self.calls = 0
+
+    def forward(self, x: Tensor) -> Output:
+        self.calls += torch.is_grad_enabled()
+        bad = math.nan if self.calls == 3 and torch.is_grad_enabled() else 1.0
+        full = x[:, 5:-5] * self.factor * bad
+        return Output(x * self.factor, full, full[..., ::2, ::2], full[..., ::4, ::4])
+
+
+def test_nan_stops_with_step_samples_and_state(tiny_dataset, tmp_path):
+    network = Poisoned()
+    with pytest.raises(Diverged, match=r"step 2: loss nan.*samples \[4, 5\] \(train_\d frame .*failed\.pt") as error:
+        train(network, settings(tiny_dataset, tmp_path / "r"), progress=False)
+    assert "\n" not in str(error.value)
+    saved = torch.load(tmp_path / "r/failed.pt", weights_only=True)
+    assert saved["samples"] == [4, 5]
+    assert len(saved["keys"]) == 2
+    assert saved["state"]["step"] == 2
+    assert math.isfinite(float(saved["model"]["factor"]))
+
+
+def test_ten_times_the_rate_stays_finite_or_stops(tiny_dataset, tmp_path):
+    fast = settings(tiny_dataset, tmp_path / "r", steps=40, learning_rate=1e-2)
+    try:
+        state = train(small_network(), fast, progress=False)
+    except Diverged:
+        return
+    assert all(math.isfinite(entry["loss"]) for entry in state.history)
+
+
+def test_other_settings_are_refused(tiny_dataset, tmp_path):
+    Run(settings(tiny_dataset, tmp_path / "r")).open()
+    Run(settings(tiny_dataset, tmp_path / "r", workers=3)).open()  # decides nothing
+    with pytest.raises(FileExistsError, match="holds a run with seed 0, now it is 1"):
+        Run(settings(tiny_dataset, tmp_path / "r", seed=1)).open()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/file").write_text("mine")
+    with pytest.raises(FileExistsError, match="no training run"):
+        Run(settings(tiny_dataset, tmp_path / "other")).open()
+
+
+def test_a_damaged_state_is_named(tiny_dataset, tmp_path):
+    small = settings(tiny_dataset, tmp_path / "r", steps=2)
+    train(small_network(), small, progress=False)
+    (tmp_path / "r/checkpoint.pt").write_bytes(b"PK\x03\x04 half a file")
+    with pytest.raises(ValueError, match=r"checkpoint\.pt: not a state of this run"):
+        train(small_network(), small, progress=False)
+
+
+def test_cosine_follows_steps_or_time():
+    by_steps = Settings("d", "o", steps=1000, learning_rate=1.0, warmup=10)
+    assert learning_rate(by_steps, State(step=0)) == pytest.approx(0.1)
+    assert learning_rate(by_steps, State(step=500)) == pytest.approx(0.5)
+    assert learning_rate(by_steps, State(step=1000)) == pytest.approx(0.01)  # never quite zero
+    by_time = Settings("d", "o", minutes=10, learning_rate=1.0, warmup=0)
+    assert learning_rate(by_time, State(step=77, elapsed=300)) == pytest.approx(0.5)
+
+
+def test_plateau_halves_at_the_ninth_validation_without_gain():
+    """Patience 8: eight validations without a relative gain of 1e-4 are borne, the ninth halves the rate."""
+    state, plan = State(), Settings("d", "o", steps=9, schedule="plateau", warmup=0, learning_rate=1.0)
+    note_plateau(8, state, 30.0)
+    for _ in range(8):
+        note_plateau(8, state, 30.002)
+    assert state.halvings == 0
+    note_plateau(8, state, 30.002)
+    assert state.halvings == 1
+    assert learning_rate(plan, state) == 0.5
+    note_plateau(8, state, 30.004)
+    assert state.plateau_bad == 0
+
+
+def test_a_time_limit_ends_the_run(tiny_dataset, tmp_path):
+    state = train(small_network(), settings(tiny_dataset, tmp_path / "r", steps=None, minutes=0.01), progress=False)
+    assert 0.6 <= state.elapsed < 10
+    assert state.history[-1]["step"] == state.step
+
+
+def test_protocols_are_those_of_the_paper_and_its_program():
+    published = Settings("d", "o", **PROTOCOLS["published"])
+    assert (published.learning_rate, published.batch, published.crop, published.patience) == (1e-4, 8, 128, 8)
+    assert (published.schedule, published.validate_every, published.clip_norm) == ("plateau", 300, 20)
+    assert published.force_exposure
+    assert not published.reverse
+    paper = Settings("d", "o", **PROTOCOLS["paper"])
+    assert (paper.learning_rate, paper.batch, paper.loss, paper.sensor) == (2.5e-5, 4, "paper", "quiver-paper")
+    assert Settings("d", "o", steps=1, **PROTOCOLS["spad-sum"]).lights[0].device(7e-4).white(7e-4) == 7
+
+
+def test_every_level_and_depth_is_mixed():
+    lights = Settings("d", "o", steps=1, ppp=(3.25, 26.0), bits=(1, 3)).lights
+    assert {(light.ppp, light.bits) for light in lights} == {(3.25, 1), (3.25, 3), (26.0, 1), (26.0, 3)}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps": None}, "give --steps or --minutes"),
+        ({"steps": 0}, "--steps must be above 0"),
+        ({"learning_rate": math.nan}, "--learning-rate must be above 0, got nan"),
+        ({"loss": "l3"}, "no loss is called 'l3'; known are published, paper, l1"),
+    ],
+)
+def test_bad_settings_are_named(tmp_path, changes, message):
+    with pytest.raises(ValueError, match=message):
+        settings(tmp_path, tmp_path, **changes)
+
+
+def test_a_crop_must_fit_the_network(tiny_dataset, tmp_path):
+    with pytest.raises(ValueError, match="--crop 18: this network needs a multiple of 4"):
+        train(small_network(), settings(tiny_dataset, tmp_path / "r", crop=18), progress=False)
+    assert not (tmp_path / "r").exists()
+
+
+def test_without_validation_clips_the_training_clips_serve(tmp_path):
+    data = write_dataset(tmp_path / "d", {"train": 1})
+    with pytest.warns(UserWarning, match="no clip in split 'val'; validating on training clips"):
+        make_windows(settings(data, tmp_path), 4)
+
+
+def test_bfloat16_trains_with_float32_losses(tiny_dataset, tmp_path):
+    """Same samples, same start: the first losses differ by less than bfloat16's 2^-8 of them."""
+    full = train(small_network(), settings(tiny_dataset, tmp_path / "a", steps=1), progress=False)
+    low = train(small_network(), settings(tiny_dataset, tmp_path / "b", steps=1, precision="bfloat16"), progress=False)
+    a, b = full.history[0]["loss"], low.history[0]["loss"]
+    assert a != b
+    assert abs(a - b) < a * 2**-8
+
+
+@pytest.mark.slow
+def test_two_processes_train_as_one_with_twice_the_batch(tiny_dataset, tmp_path):
+    """torchrun, gloo: gradients are averaged over both shares, so weights agree with a batch of four to rounding."""
+    alone = small_network()
+    train(alone, settings(tiny_dataset, tmp_path / "a", batch=4, steps=3), progress=False)
+    program = tmp_path / "run.py"
+    program.write_text(
+        "import torch\n"
+        "from quiver.run import Settings\nfrom quiver.train import train\nfrom quiver.unet import UNet, UNetConfig\n"
+        "torch.set_num_threads(1)\ntorch.manual_seed(0)\n"
+        f"train(UNet(UNetConfig(4)), Settings({str(tiny_dataset)!r}, {str(tmp_path / 'b')!r}, steps=3, crop=16,"
+        " batch=2, validate_every=4, warmup=2, validation_windows=2), progress=False)\n"
+    )
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    shared = os.environ | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
+    crew = [
+        subprocess.Popen([sys.executable, str(program)], cwd=ROOT, env=shared | {"RANK": str(i), "LOCAL_RANK": str(i)})
+        for i in (0, 1)
+    ]
+    assert [process.wait(timeout=300) for process in crew] == [0, 0]
+    together = load(tmp_path / "b/last.safetensors")
+    for ours, theirs in zip(alone.state_dict().values(), together.state_dict().values(), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
