@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import __version__
+from qsim.cli_studies import add_report, add_tradeoff
 from qsim.console import Parser, bar, command, output, run
 from qsim.convert import add_convert
 
@@ -19,7 +20,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = Parser(prog="qsim", description="Render moving scenes and turn them into few-bit quanta-sensor streams.")
     parser.add_argument("--version", action="version", version=f"qsim {__version__}")
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
-    for add in (_add_doctor, _add_render, _add_sense, _add_generate, _add_check, add_convert):
+    for add in (_add_doctor, _add_render, _add_sense, _add_generate, _add_check, add_convert, add_report, add_tradeoff):
         add(sub)
     return run(parser, argv)
 
@@ -235,21 +236,24 @@ def _add_generate(sub: Any) -> None:
     parser.add_argument("--repair", action="store_true", help="check all files and make the damaged ones again")
     parser.add_argument("--wait", action="store_true", help="wait while another generator is at work in the folder")
     parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask scheduler, as in tcp://10.0.0.1:8786")
+    parser.add_argument(
+        "--gpus", type=float, default=0, help="GPU resource that each job takes on the cluster (default 0)"
+    )
 
 
 def _run_generate(args: argparse.Namespace) -> int:
-    from qsim import dataset, jobs, recipe
+    from qsim import dataset, recipe, workers
 
     wanted = recipe.load(args.recipe)
     folder = args.output or Path("out") / wanted.name
     if args.workers < 0:
         raise ValueError(f"--workers: expected 0 (in this process) or more, got {args.workers}")
     options = dataset.Options(
-        args.workers, args.shard, args.retry, args.repair, args.wait, jobs.Limits(memory=args.memory)
+        args.workers, args.shard, args.retry, args.repair, args.wait, workers.Limits(memory=args.memory)
     )
     chosen = dataset.shard(wanted.jobs, args.shard)
     with bar(wanted.name) as progress, dataset.watching(folder, chosen, progress):
-        summary = dataset.generate(wanted, folder, options)
+        summary = dataset.generate(wanted, folder, options, run=_cluster(args))
     lines = [f"{folder}: {summary.done} of {summary.jobs} clips done, {summary.made} made now"]
     lines += [f"repaired {problem}" for problem in summary.repaired]
     lines += [f"FAILED {name}: {why}" for name, why in sorted(summary.failed.items())]
@@ -257,6 +261,14 @@ def _run_generate(args: argparse.Namespace) -> int:
         lines.append("run again with --retry after mending the cause")
     output(args, {"dataset": str(folder)} | dataclasses.asdict(summary), lines)
     return 0 if summary.done == summary.jobs else 1
+
+
+def _cluster(args: argparse.Namespace) -> Any:
+    if args.cluster is None:
+        return None
+    from qsim.cluster import Cluster
+
+    return Cluster(args.cluster, gpus=args.gpus)
 
 
 def _part(text: str) -> tuple[int, int]:

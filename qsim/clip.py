@@ -247,13 +247,18 @@ class ClipWriter:
         self.part.mkdir(parents=True, exist_ok=True)
         if not self._lock.acquire():
             raise ValueError(f"{self.part}: another process is writing this clip; wait for it, or name another with -o")
-        begun = self.part / "begun.json"
-        if not begun.is_file() or begun.read_bytes() != identity:
-            for item in self.part.iterdir():
-                if item.name != "lock":
-                    shutil.rmtree(item) if item.is_dir() else item.unlink()
-            files.write_bytes(begun, identity)
-        self._frames = _read_journal(self.part)
+        try:
+            begun = self.part / "begun.json"
+            if not begun.is_file() or begun.read_bytes() != identity:
+                for item in self.part.iterdir():
+                    if item.name != "lock":
+                        shutil.rmtree(item) if item.is_dir() else item.unlink()
+                files.write_bytes(begun, identity)
+            files.sweep(self.part)
+            self._frames = _read_journal(self.part)
+        except BaseException:
+            self._lock.release()
+            raise
         return self
 
     def has(self, t: int) -> bool:

@@ -11,6 +11,7 @@ has the same bytes in all these cases (logs/ apart), on machines of one kind.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import threading
 from collections.abc import Callable, Generator, Iterator
@@ -20,9 +21,10 @@ from typing import Any
 
 from qsim import __version__, files
 from qsim.clip import Clip
-from qsim.jobs import Limits, Make, Result, record_path, render_job, run_here, run_local
+from qsim.jobs import FULL, Make, Result, record_path, render_job
 from qsim.recipe import SPLITS, Job, Recipe
 from qsim.stream import Progress
+from qsim.workers import Limits, run_here, run_local
 
 FORMAT_VERSION = 1
 _FOLDERS = ("clips", "jobs", "failed", "logs", "locks", "work")
@@ -169,25 +171,30 @@ def generate(
     options = options or Options()
     folder = Path(path).resolve()
     jobs = shard(recipe.jobs, options.shard)
-    with _locked(folder, options):
-        _begin(recipe, folder)
-        repaired = repair(folder, jobs) if options.repair else ()
-        failed = {} if options.retry else _failures(folder, jobs)
-        todo = [job for job in jobs if not record_path(folder, job.name).is_file() and job.name not in failed]
-        made = 0
-        runner = run or _runner(options)
-        with contextlib.closing(runner(todo, folder, make)) as results:
-            for result in results:
-                if result.state == "full":
-                    raise OSError(f"{folder}: {result.message}; nothing is lost: make space and run this again")
-                if result.state == "done":
-                    made += 1
-                else:
-                    failed[result.name] = result.message
-                if on_result is not None:
-                    on_result(result)
-        write_manifest(recipe, folder)
-        done = sum(record_path(folder, job.name).is_file() for job in jobs)
+    try:
+        with _locked(folder, options):
+            _begin(recipe, folder)
+            repaired = repair(folder, jobs) if options.repair else ()
+            failed = {} if options.retry else _failures(folder, jobs)
+            todo = [job for job in jobs if not record_path(folder, job.name).is_file() and job.name not in failed]
+            made = 0
+            with contextlib.closing((run or _runner(options))(todo, folder, make)) as results:
+                for result in results:
+                    if result.state == "full":
+                        raise OSError(errno.ENOSPC, result.message)
+                    if result.state == "done":
+                        made += 1
+                    else:
+                        failed[result.name] = result.message
+                    if on_result is not None:
+                        on_result(result)
+            write_manifest(recipe, folder)
+            done = sum(record_path(folder, job.name).is_file() for job in jobs)
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        message = f"{folder}: {error.strerror}; nothing is lost: make space and run the same command again"
+        raise OSError(message) from None
     return Summary(len(jobs), done, made, failed, repaired)
 
 
@@ -241,6 +248,8 @@ def write_manifest(recipe: Recipe, folder: Path) -> None:
     lock = files.Lock(folder / "locks" / "manifest")
     lock.acquire(wait=True)
     with lock:
+        for leftover in folder.glob("dataset.json.tmp-*"):
+            leftover.unlink()
         jobs = {}
         for job in recipe.jobs:
             entry: dict[str, Any] = {"split": job.split, "scene": job.scene, "digest": job.digest, "state": "missing"}

@@ -53,6 +53,18 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     sync_folder(path.parent)
 
 
+def sweep(folder: Path, pattern: str = "*") -> None:
+    """Delete what killed writers of `folder` left: temporary files and half-removed folders of files named `pattern`.
+
+    Only for a caller who holds the lock that all writers of the folder take.
+    """
+    for leftover in [*folder.rglob(f"{pattern}.tmp-*"), *folder.glob(f"{pattern}.removed-*")]:
+        if leftover.is_dir():
+            shutil.rmtree(leftover)
+        else:
+            leftover.unlink(missing_ok=True)
+
+
 def write_bytes(path: Path, content: bytes) -> str:
     """Write a whole file atomically; returns its SHA-256."""
     with replacing(path) as file:

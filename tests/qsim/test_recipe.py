@@ -1,0 +1,174 @@
+"""Recipes: what they mean, and every mistake named with file, line and key."""
+
+from pathlib import Path
+
+import pytest
+
+from qsim import recipe
+from qsim.recipe import Recipe, parse
+
+HEAD = """[recipe]
+name = "tiny"
+frames = 3
+height = 8
+width = 10
+frame_rate = 2000.0
+"""
+SCENES = """
+[[scenes]]
+family = "fan"
+seeds = [0, 2]
+speed = [1.0, 2.5]
+
+[[scenes]]
+family = "tumble"
+first = 5
+count = 2
+split = "test"
+frames = 4
+"""
+STREAMS = """
+[[streams]]
+sensor = "quiver-physical"
+bits = [1, 3]
+ppp = [0.5, 3.25]
+"""
+
+
+def test_a_recipe_becomes_jobs():
+    found = parse(HEAD + SCENES + STREAMS)
+    names = ["fan_0000", "fan_0000_x2.5", "fan_0002", "fan_0002_x2.5", "tumble_0005", "tumble_0006"]
+    assert [job.name for job in found.jobs] == names
+    assert [job.settings.frames for job in found.jobs] == [3, 3, 3, 3, 4, 4]
+    assert found.splits == {"train": names[:4], "val": [], "test": names[4:]}
+    streams = found.jobs[0].streams
+    assert [(s.bits, s.ppp) for s in streams] == [(1, 0.5), (1, 3.25), (3, 0.5), (3, 3.25)]
+    assert [s.stream_name for s in streams][3] == "quiver-physical_3bit_3.25ppp"
+    assert found.jobs[1].scene == "fan:0"
+
+
+def test_lux_and_light_as_it_is():
+    text = (
+        '[[streams]]\nsensor = "quiver-physical"\nlux = 1.5\n[[streams]]\nsensor = "quiver-physical"\nabsolute = true\n'
+    )
+    streams = parse(HEAD + SCENES + text).jobs[0].streams
+    assert [(s.ppp, s.lux) for s in streams] == [(None, 1.5), (None, None)]
+    assert [s.stream_name for s in streams] == ["quiver-physical_1.5lx", "quiver-physical_asis"]
+
+
+def test_a_digest_changes_with_everything_that_decides_the_files():
+    def digests(text: str) -> set[str]:
+        return {job.digest for job in parse(text).jobs}
+
+    base = HEAD + SCENES + STREAMS
+    assert digests(base) == digests(base + "\n# a comment\n")
+    for old, new in [("frames = 3", "frames = 5"), ("bits = [1, 3]", "bits = 3"), ("2000.0", "1000.0")]:
+        assert old in base
+        changed = digests(base.replace(old, new))
+        assert len(changed - digests(base)) >= 4
+    assert digests(base.replace('name = "tiny"\n', 'name = "tiny"\nseed = 1\n')).isdisjoint(digests(base))
+
+
+MISTAKES = [
+    # (text in the good recipe, its replacement, line, what the message says)
+    ("frames = 3", "frame = 3", 3, r"unknown key 'frame' in \[recipe\]; did you mean 'frames'\?"),
+    ("frame_rate = 2000.0\n", "", 1, r"key 'frame_rate' is missing in \[recipe\]"),
+    ("frame_rate = 2000.0", "frame_rate = 0.0005", 6, r"frames per second .* 0\.5 ms per frame is 2000\.0"),
+    ("frame_rate = 2000.0", 'frame_rate = "2000 fps"', 6, r"frame_rate: expected a number, got '2000 fps'"),
+    ("height = 8", "height = 0", 4, r"height: expected a whole number from 1"),
+    ("height = 8", "height = 8.5", 4, r"height: expected a whole number"),
+    ("height = 8", "height = true", 4, r"height: expected a whole number"),
+    ("width = 10", "width = -10", 5, r"width: expected a whole number"),
+    ("width = 10", "width = 10\nshutter = 50", 6, r"open share of a frame, 0 to 1, got 50"),
+    ("width = 10", "width = 10\npsnr = 0.01", 6, r"wanted error in dB"),
+    ('name = "tiny"', 'name = "../tiny"', 2, r"letters, digits"),
+    ('"fan"', '"fann"', 9, r"unknown family 'fann'; did you mean 'fan'\?"),
+    ("seeds = [0, 2]", "seeds = [0, 0]", 10, r"seeds: 0 is listed twice"),
+    ("seeds = [0, 2]", "seeds = []", 10, r"expected at least one value"),
+    ("seeds = [0, 2]", "seeds = [-1]", 10, r"whole number from 0"),
+    ("seeds = [0, 2]", "seeds = [0]\ncount = 3", 11, r"either seeds or count"),
+    ("speed = [1.0, 2.5]", "speed = 0", 11, r"expected a number above 0, got 0"),
+    ("speed = [1.0, 2.5]", "speed = inf", 11, r"expected a number above 0, got inf"),
+    ("first = 5", 'first = "5"', 15, r"first: expected a whole number"),
+    ('split = "test"', 'split = "tset"', 17, r"expected one of train, val, test, got 'tset'"),
+    ('sensor = "quiver-physical"', 'sensor = "quiver-phisical"', 21, r"quiver-physical"),
+    ("bits = [1, 3]", "bits = [1, 17]", 22, r"1 to 16 bits per code, got 17"),
+    ("ppp = [0.5, 3.25]", "ppp = [0.5, -3.25]", 23, r"expected a number above 0, got -3\.25"),
+    ("ppp = [0.5, 3.25]", "pp = [0.5, 3.25]", 23, r"unknown key 'pp' in \[\[streams\]\]; did you mean 'ppp'\?"),
+    ("ppp = [0.5, 3.25]", "ppp = 1.0\nlux = 1.0", 20, r"give one light level, .* ppp and lux given"),
+    ("ppp = [0.5, 3.25]", "absolute = false", 23, r"absolute can only be true"),
+    ("ppp = [0.5, 3.25]", 'ppp = [1, 2]\nname = "x"', 24, r"one name for 4 streams"),
+    ("[[streams]]", "[[stream]]", 20, r"unknown key 'stream' in the recipe; did you mean 'streams'\?"),
+    ("[[streams]]", "[[streams]", 20, r"not valid TOML"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "line", "message"), MISTAKES, ids=[m[1].replace("\n", " ") for m in MISTAKES])
+def test_each_mistake_is_named_with_file_and_line(tmp_path: Path, old: str, new: str, line: int, message: str):
+    text = HEAD + SCENES + STREAMS
+    assert text.count(old) >= 1
+    path = tmp_path / "bad.toml"
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(ValueError, match=message) as caught:
+        recipe.load(path)
+    assert str(caught.value).startswith(f"{path}:{line}: "), str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"section \[recipe\] is missing"),
+        ("recipe = 3", r"section \[recipe\] is missing"),
+        (HEAD, r"no \[\[scenes\]\], nothing to render"),
+        (HEAD + "[scenes]\nfamily = 'fan'\n", r"must be sections, each beginning with \[\[scenes\]\]"),
+        (HEAD + "[[scenes]]\nseeds = [1]\n", r"key 'family' is missing"),
+        (HEAD + SCENES + SCENES, r"the clip fan_0000 is asked for twice"),
+        (HEAD + SCENES + STREAMS + STREAMS, r"two \[\[streams\]\] are called"),
+        (HEAD + SCENES + "[[streams]]\nppp = 3\n", r"key 'sensor' is missing"),
+    ],
+)
+def test_recipes_without_sense(text: str, message: str):
+    with pytest.raises(ValueError, match=message):
+        parse(text)
+
+
+def test_splits_are_by_scene_whatever_the_speed():
+    text = HEAD + "".join(
+        f'[[scenes]]\nfamily = "fan"\nseeds = [0]\nspeed = {speed}\nsplit = "{split}"\n'
+        for speed, split in [(1.0, "train"), (2.0, "val")]
+    )
+    with pytest.raises(ValueError, match="scene fan:0 is in the splits 'train' and 'val'"):
+        parse(text)
+
+
+def test_training_never_sees_a_family_of_the_test_split():
+    text = HEAD + '[[scenes]]\nfamily = "fan"\n[[scenes]]\nfamily = "fan"\nfirst = 9\nsplit = "{}"\n'
+    with pytest.raises(ValueError, match="family fan is in the splits 'train' and 'test'"):
+        parse(text.format("test"))
+    assert isinstance(parse(text.format("val")), Recipe)
+
+
+def test_files_that_are_no_recipes(tmp_path: Path):
+    with pytest.raises(FileNotFoundError, match="no such recipe"):
+        recipe.load(tmp_path / "none.toml")
+    path = tmp_path / "binary.toml"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match="not a text file"):
+        recipe.load(path)
+
+
+def test_a_scene_file_beside_the_recipe(tmp_path: Path):
+    path = tmp_path / "own.toml"
+    path.write_text(HEAD + '[[scenes]]\nfamily = "mine.py"\n')
+    with pytest.raises(ValueError, match=r"own\.toml:8: no such scene file"):
+        recipe.load(path)
+    (tmp_path / "mine.py").write_text("")
+    job = recipe.load(path).jobs[0]
+    assert job.name == "mine_0000"
+    assert Path(job.family).is_absolute()
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "scenes").glob("*.toml")), ids=lambda p: p.stem)
+def test_the_recipes_of_the_library_are_valid(path: Path):
+    assert recipe.load(path).jobs
