@@ -103,6 +103,7 @@ def maximum_likelihood(sensor: Sensor, histogram: Array, exposure: float, confid
     counts = _checked(sensor, histogram)
     if not 0 < confidence < 1:
         raise ValueError(f"confidence is a probability above 0 and below 1, got {confidence!r}")
+    _refuse_impossible(sensor, exposure, counts)
     distinct, where = np.unique(counts.reshape(-1, sensor.levels), axis=0, return_inverse=True)
     grid, parts = _grid(sensor, exposure), []
     for start in range(0, len(distinct), _CHUNK):
@@ -124,14 +125,18 @@ def _checked(sensor: Sensor, histogram: Array) -> Array:
     return counts
 
 
+def _refuse_impossible(sensor: Sensor, exposure: float, counts: Array) -> None:
+    impossible = (counts > 0) & (_grid(sensor, exposure).log_pmf <= _NEVER).all(axis=0)
+    if impossible.any():
+        *where, code = (int(i) for i in np.argwhere(impossible)[0])
+        raise ValueError(f"histogram{where or ''} holds code {code}, which no light gives with this {sensor!r}")
+
+
 def _estimate(sensor: Sensor, exposure: float, grid: _Grid, counts: Array, confidence: float) -> Array:
     """photons, lower, upper [3, p] of histograms [p, levels]."""
     table = counts @ grid.log_pmf.T
     best = table.argmax(axis=1)
     at_best = np.take_along_axis(table, best[:, None], axis=1)[:, 0]
-    if (at_best < _NEVER / 2).any():
-        impossible = counts[np.argmax(at_best < _NEVER / 2)]
-        raise ValueError(f"no light gives these codes with this {type(sensor).__name__}: histogram {impossible}")
     end = len(grid.photons) - 1
     bright = (table[:, end] >= at_best - 1e-6) if grid.saturates else (best == end)
     left, right = grid.photons[np.maximum(best - 1, 0)], grid.photons[np.minimum(best + 1, end)]

@@ -63,7 +63,8 @@ def hash_name(name: str) -> int:
 
 def philox4x32(counters: Array, key: int) -> Array:
     """Four random words per counter: integers [4, ...] below 2^32 -> uint32 [4, ...] under a 64-bit key."""
-    c0, c1, c2, c3 = np.array(counters, np.uint64)
+    state = np.array(counters, np.uint64)
+    c0, c1, c2, c3 = (state[i, ...] for i in range(4))
     even, odd = np.empty_like(c0), np.empty_like(c2)
     k0, k1 = key >> 32 & 0xFFFFFFFF, key & 0xFFFFFFFF
     for _ in range(ROUNDS):  # in place: this is the inner loop of the reference engine
@@ -76,7 +77,7 @@ def philox4x32(counters: Array, key: int) -> Array:
         np.bitwise_and(odd, _LOW, out=c1)
         np.bitwise_and(even, _LOW, out=c3)
         k0, k1 = (k0 + _KEY_STEPS[0]) & 0xFFFFFFFF, (k1 + _KEY_STEPS[1]) & 0xFFFFFFFF
-    return np.stack([c0, c1, c2, c3]).astype(np.uint32)
+    return state.astype(np.uint32)
 
 
 def words(key: Key, shape: tuple[int, ...], origin: tuple[int, int] = (0, 0), redraw: int = 0) -> Array:
