@@ -199,7 +199,13 @@ def begin(plan: Plan, out: Path) -> list[Row]:
     elif read_json(path) != wanted:
         raise FileExistsError(f"{out} holds another evaluation; choose another -o, or start anew with --force")
     rows = out / "rows.jsonl"
-    return list(finished(rows.read_text().splitlines())) if rows.exists() else []
+    if not rows.exists():
+        return []
+    text = rows.read_text()
+    if not text.endswith("\n"):  # a killed writer tore its last line: close it, so that the next one stands alone
+        with open(rows, "a", encoding="utf-8") as file:
+            file.write("\n")
+    return list(finished(text.splitlines()))
 
 
 def finished(lines: Sequence[str]) -> Iterator[Row]:

@@ -1,0 +1,267 @@
+"""One table: equal codes for all, resumed rows, failures with reasons, the truth's own worth, real static photons."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clips import ClipMaker
+from numpy import ndarray as Array
+
+from quiver import table
+from quiver.data import Codes, Light, array_codes, ideal_counter, open_clips, sensed, truth
+from quiver.evaluate import Plan, Row, append, begin, evaluate, finished, scored_frames, truth_psnr
+from quiver.restore import Restorer, restorer
+from quiver.static import Counts, evaluate_static, markdown, mean_square, read_counts, reference
+
+HAZELNUT = Path(__file__).parents[1] / "data" / "hazelnut_gates6.npz"
+
+
+def method(name: str, restore: object, learned: bool = False) -> Restorer:
+    """A restorer from a function of (codes) -> photons [T, H, W]."""
+
+    def fill(codes: Codes, out: Array, first: int, progress: object) -> None:
+        out += restore(codes)[first : first + len(out)]
+
+    return Restorer(name, 1, 0, learned, f"test {name}", fill)
+
+
+def oracle(source: Path, factor: float = 1.0) -> Restorer:
+    """Knows the truth of every clip at 3.25 PPP; `factor` is its error of brightness."""
+    known = {clip.name: clip for clip in open_clips(source)}
+
+    def restore(codes: Codes) -> Array:
+        clip = known[codes.name.split(",")[0]]
+        return factor * truth(clip, sensed(clip, Light())[1], 0, len(clip))
+
+    return method(f"oracle {factor:g}", restore)
+
+
+def broken(codes: Codes) -> Array:
+    raise RuntimeError("no road\nleads there")
+
+
+def test_a_known_truth_scores_what_it_should(tiny_dataset):
+    """Perfect: infinite. One tenth too dark: 20 log10 of a tenth of the truth's rms; matched: infinite."""
+    plan = Plan(str(tiny_dataset))
+    rows = evaluate(plan, [oracle(tiny_dataset), oracle(tiny_dataset, 0.9)])
+    assert [row.method for row in rows] == ["oracle 1", "oracle 0.9"] * 2
+    perfect, dark = rows[0].score, rows[1].score
+    assert perfect.psnr > 120
+    assert dark.psnr_matched > 120
+    clip = open_clips(tiny_dataset, "test")[0]
+    x = truth(clip, sensed(clip, Light())[1], 0, 14) / 8.125
+    assert x.max() < 1
+    expected = np.mean([-20 * math.log10(0.1 * math.sqrt(np.mean(frame**2))) for frame in x])
+    assert dark.psnr == pytest.approx(expected, abs=1e-3)
+    assert dark.scale == pytest.approx(1 / 0.9, rel=1e-6)
+
+
+def test_all_methods_see_the_same_codes(tiny_dataset):
+    seen: list[Array] = []
+
+    def look(codes: Codes) -> Array:
+        seen.append(codes.read(0, codes.shape[0]))
+        return np.ones(codes.shape)
+
+    evaluate(Plan(str(tiny_dataset)), [method("a", look), method("b", look)])
+    evaluate(Plan(str(tiny_dataset)), [method("c", look)])
+    np.testing.assert_array_equal(seen[0], seen[1])
+    np.testing.assert_array_equal(seen[0], seen[4])
+    assert not np.array_equal(seen[0], seen[2])
+
+
+def test_an_interrupted_evaluation_goes_on(tiny_dataset, tmp_path):
+    calls: list[str] = []
+
+    def count(codes: Codes) -> Array:
+        calls.append(codes.name)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return np.ones(codes.shape)
+
+    plan, out = Plan(str(tiny_dataset)), tmp_path / "table"
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(plan, [method("slow", count)], out)
+    with open(out / "rows.jsonl", "a") as file:
+        file.write('{"method": "slow", "torn')
+    rows = evaluate(plan, [method("slow", count)], out)
+    assert len(rows) == 2
+    assert len(calls) == 3
+    assert evaluate(plan, [method("slow", count)], out) == rows
+    assert len(calls) == 3
+    evaluate(plan, [replace(method("slow", count), description="other weights")], out)
+    assert len(calls) == 5
+    with pytest.raises(FileExistsError, match="holds another evaluation"):
+        evaluate(replace(plan, seed=1), [method("slow", count)], out)
+    with pytest.raises(FileExistsError, match="is no evaluation"):
+        begin(plan, tmp_path)
+
+
+def test_a_failure_keeps_its_row_and_reason(tiny_dataset, tmp_path):
+    plan, methods = Plan(str(tiny_dataset)), [method("broken", broken), restorer("moment:1")]
+    rows = evaluate(plan, methods, tmp_path / "t")
+    assert [row.failure for row in rows[:2]] == ["RuntimeError: no road leads there", None]
+    table.write(tmp_path / "t", plan, methods, rows)
+    text = (tmp_path / "t/evaluation.md").read_text()
+    assert "failed: test_0: RuntimeError: no road leads there" in text
+    assert "- broken, 3.25 PPP, 3 bit, test_1: RuntimeError" in text
+    assert [row.method for row in finished((tmp_path / "t/rows.jsonl").read_text().splitlines())] == ["moment:1"] * 2
+
+
+def test_the_table_holds_what_was_promised(tiny_dataset, tmp_path):
+    plan = Plan(str(tiny_dataset), lights=(Light(), Light(ppp=26.0)))
+    methods = [restorer("naive"), restorer("moment:3")]
+    rows = evaluate(plan, methods, tmp_path / "t")
+    table.write(tmp_path / "t", plan, methods, rows)
+    found = json.loads((tmp_path / "t/evaluation.json").read_text())
+    assert len(found["rows"]) == 2 * 2 * 2
+    assert "RVRT" in found["not_built_yet"]
+    line = found["table"][1]
+    assert (line["method"], line["light"], line["scores"]["psnr"]["scenes"]) == ("moment:3", "3.25 PPP, 3 bit", 2)
+    assert line["scores"]["psnr"]["half_width"] > 0
+    assert line["truth_psnr"] == pytest.approx(rows[0].truth_psnr, abs=3)
+    text = (tmp_path / "t/evaluation.md").read_text()
+    assert "| moment:3 | 3 (1) | 26 PPP, 3 bit |" in text
+    assert "| sliding:400 | 3.25 PPP, 3 bit |" in text
+    assert "Not built yet (learned methods of the paper): Student-Teacher" in text
+    assert (tmp_path / "t/evaluation.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_truth_psnr_is_the_radiance_error_in_units_of_white(make_clip: ClipMaker):
+    """Relative clip, mean 1 by construction of the factor: rms 0.01 of radiance is 0.01 * 3.25 / mean of 8.125."""
+    clip = make_clip(relative=True, error=0.01)
+    _, factor = sensed(clip, Light())
+    expected = -20 * math.log10(0.01 * (3.25 / clip.mean_radiance) / 8.125)
+    assert truth_psnr(clip, factor, 8.125) == pytest.approx(expected)
+    assert truth_psnr(make_clip("unknown", error=None), 1.0, 8.125) is None
+
+
+def test_published_windows_are_counted_as_published():
+    """All but the first and last five frames: 345 of 15 clips of 33; 6017 of 31 clips with 6327 frames."""
+    assert sum(len(scored_frames(33, True)) for _ in range(15)) == 345
+    lengths = [204] * 30 + [6327 - 30 * 204]
+    assert sum(len(scored_frames(n, True)) for n in lengths) == 6017
+    assert list(scored_frames(12, True)) == [5, 6]
+    assert len(scored_frames(9, True)) == 0
+    assert len(scored_frames(9, False)) == 9
+
+
+def test_published_protocol_forces_every_window(tiny_dataset):
+    """Every restored frame comes from a window of eleven with a mean of 3.25 PPP; each has its own factor."""
+    levels: list[float] = []
+
+    def look(codes: Codes) -> Array:
+        stack = codes.read(0, codes.shape[0])
+        levels.append(float(stack.mean()))
+        return stack.astype(np.float32)
+
+    rows = evaluate(Plan(str(tiny_dataset), published=True), [method("look", look)])
+    assert rows[0].score.frames == 14 - 10
+    assert len(levels) == 2 * 4
+    assert max(levels) - min(levels) < 0.1
+    assert rows[0].score.scale_spread > 0
+    with pytest.raises(ValueError, match="give --ppp"):
+        evaluate(Plan(str(tiny_dataset), lights=(Light("quiver-paper", None),), published=True), [method("x", look)])
+
+
+def test_stored_streams_are_scored(tiny_dataset, make_clip: ClipMaker):
+    from qsim.stream import Sensing, sense
+
+    clip = make_clip()
+    sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25, name="mine"))
+    stored = evaluate(Plan(str(clip.path), None, stream="mine"), [restorer("moment")])
+    drawn = evaluate(Plan(str(clip.path), None), [restorer("moment")])
+    assert stored[0].score == drawn[0].score
+    assert stored[0].light == "mine"
+    with pytest.raises(FileNotFoundError, match="no stream 'none'; there are: mine"):
+        evaluate(Plan(str(clip.path), None, stream="none"), [restorer("moment")])
+
+
+def test_nothing_to_score_is_an_error(tmp_path, tiny_dataset):
+    with pytest.raises(FileNotFoundError, match="no such data set"):
+        evaluate(Plan(str(tmp_path / "none")), [restorer("moment")])
+    with pytest.raises(ValueError, match="unknown split 'tset'"):
+        evaluate(Plan(str(tiny_dataset), "tset"), [restorer("moment")])
+
+
+def test_rows_survive_json(tmp_path):
+    row = Row("m", "d", "l", "c", "s", failure="why")
+    append(tmp_path / "rows", row)
+    assert math.isnan(Row.from_dict(json.loads((tmp_path / "rows").read_text())).seconds_per_frame)
+
+
+# Static real photons
+
+
+def static_counts(light: float, shares: Array, seed: int = 0) -> tuple[Counts, Array]:
+    rng = np.random.default_rng(seed)
+    true = light * rng.uniform(0.2, 1.6, (60, 70))
+    return Counts(rng.poisson(shares[:, None, None] * true), shares, "synthetic"), true
+
+
+def test_the_reference_takes_off_its_own_noise():
+    """An oracle's error against 19 noisy frames is all reference noise: what is left is zero within its own spread."""
+    shares = np.tile([1.2, 0.9, 0.9], 10)
+    left, measured = [], []
+    for seed in range(40):
+        counts, true = static_counts(5.0, shares, seed)
+        estimate, variance = reference(counts, np.arange(11, 30))
+        left.append(mean_square(true / 7, estimate / 7, variance / 49))
+        measured.append(mean_square(true / 7, estimate / 7, np.zeros_like(variance)))
+    sigma = np.std(left, ddof=1) / math.sqrt(40)
+    assert abs(np.mean(left)) < 5 * sigma  # includes the clamp: a fifth of the pixels is above white
+    assert np.mean(measured) > 100 * sigma
+
+
+def test_flicker_is_divided_out():
+    """Frames of unequal light: the mean of eleven, divided by their shares, is unbiased."""
+    shares = np.tile([1.5, 0.5], 15)
+    counts, _ = static_counts(2.0, shares)
+    found = evaluate_static(counts, [restorer("moment")], splits=4)[0]
+    assert found.scale == pytest.approx(1.0, abs=0.05)
+    flat = evaluate_static(replace(counts, shares=np.ones(30)), [restorer("moment")], splits=4)[0]
+    assert flat.psnr < found.psnr
+
+
+def test_real_photons():
+    """The hazelnut: 30 frames of 3.08 photons; eleven averaged beat three, and shares are the gates' means."""
+    counts = read_counts(HAZELNUT)
+    assert counts.frames.shape[0] == 30
+    assert counts.shares[:6] == pytest.approx(
+        np.array([3.5431, 3.1394, 2.7712, 2.6510, 2.9083, 3.4963]) / 3.0849, rel=0.05
+    )
+    eleven, three, bad = evaluate_static(counts, [restorer("moment"), restorer("moment:3"), method("bad", broken)])
+    assert eleven.psnr_matched > three.psnr_matched + 3
+    assert eleven.psnr_matched > eleven.psnr_as_measured > 20
+    assert bad.failure == "RuntimeError: no road leads there"
+    text = markdown(counts, [eleven, three, bad], 11, 3)
+    assert "| bad | failed: RuntimeError" in text
+
+
+def test_bad_counts_are_named(tmp_path):
+    np.save(tmp_path / "float.npy", np.ones((3, 4, 5)))
+    with pytest.raises(ValueError, match=r"expected whole counts \[N, H, W\] or \[T, K, H, W\], got float64"):
+        read_counts(tmp_path / "float.npy")
+    dark = np.ones((3, 4, 5), np.uint8)
+    dark[1] = 0
+    np.save(tmp_path / "dark.npy", dark)
+    with pytest.raises(ValueError, match="frame or gate 1 holds no photon"):
+        read_counts(tmp_path / "dark.npy")
+    (tmp_path / "text.npy").write_text("hello")
+    with pytest.raises(ValueError, match="not readable as an array"):
+        read_counts(tmp_path / "text.npy")
+    with pytest.raises(ValueError, match="leave none of 3 for the reference"):
+        evaluate_static(Counts(dark, np.ones(3), "x"), [restorer("moment")], frames=3)
+
+
+def test_an_ideal_counter_counts():
+    """White is the top code; codes up to it are the counts themselves."""
+    sensor = ideal_counter(3)
+    assert sensor.white(1.0) == 7
+    codes = array_codes(np.full((1, 4, 4), 3, np.uint8), sensor, 1.0)
+    np.testing.assert_allclose(restorer("naive:1").restore(codes), 3.0)

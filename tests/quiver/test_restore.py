@@ -1,0 +1,244 @@
+"""Any length, any size, tiles, ranges of frames, files that are whole or absent."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy import ndarray as Array
+from torch import Tensor, nn
+
+from qsim.qis import QIS
+from quiver.baselines import METHODS
+from quiver.data import Codes, array_codes
+from quiver.model import Output, build
+from quiver.restore import (
+    Options,
+    Restorer,
+    bytes_per_pixel,
+    fill_network,
+    network_restorer,
+    plan_tiles,
+    restore_to_file,
+    restorer,
+    spans,
+    weights_path,
+)
+from quiver.unet import UNet, UNetConfig
+from quiver.weights import save
+
+EXPOSURE = 5e-4
+DEFAULTS = Options()
+SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
+
+
+def random_codes(frames: int, height: int, width: int, seed: int = 0) -> Codes:
+    drawn = np.random.default_rng(seed).integers(0, 8, (frames, height, width), dtype=np.uint8)
+    return array_codes(drawn, SENSOR, EXPOSURE)
+
+
+class CentreFrame(nn.Module):
+    """Returns the centre of its window untouched: whatever padding and tiling do, the codes must come back."""
+
+    multiple = 8
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.unused = nn.Parameter(torch.zeros(1))
+        self.seen: list[tuple[int, ...]] = []
+
+    def forward(self, x: Tensor) -> Output:
+        self.seen.append(tuple(x.shape))
+        centre = x[:, 5:6]
+        return Output(x, centre, centre, centre)
+
+
+class WindowMean(CentreFrame):
+    """The mean of its window: shows which frames a window held."""
+
+    def forward(self, x: Tensor) -> Output:
+        mean = x.mean(dim=1, keepdim=True)
+        return Output(x, mean, mean, mean)
+
+
+def run(
+    model: nn.Module, codes: Codes, options: Options | None = None, first: int = 0, count: int | None = None
+) -> Array:
+    out = np.zeros((count or codes.shape[0], *codes.shape[1:]), np.float32)
+    fill_network(model, codes, out, first, options or Options(), None)
+    return out
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 3, 5), (8, 10, 7), (13, 33, 18)])
+def test_every_frame_of_any_size_comes_back(shape):
+    codes, model = random_codes(*shape), CentreFrame()
+    expected = codes.read(0, shape[0]) * (codes.white / 7)
+    np.testing.assert_allclose(run(model, codes), expected, rtol=1e-6)
+    assert all(seen[3] % 8 == seen[4] % 8 == 0 for seen in model.seen)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 4, 14])
+def test_time_is_continued_by_reflection(frames):
+    """Frame 0 sees frames 5 4 3 2 1 0 1 2 3 4 5 (folded again where the clip is shorter)."""
+    codes = random_codes(frames, 4, 4)
+    period = max(1, 2 * frames - 2)
+    for t in (0, frames - 1):
+        folded = [min(i % period, period - i % period) for i in range(t - 5, t + 6)]
+        mean = np.mean([codes.read(i, i + 1)[0] for i in folded], axis=0) * (codes.white / 7)
+        np.testing.assert_allclose(run(WindowMean(), codes)[t], mean, rtol=1e-5)
+
+
+def test_a_range_of_frames_equals_that_part_of_the_whole():
+    codes = random_codes(14, 10, 7)
+    np.testing.assert_array_equal(run(WindowMean(), codes, first=4, count=3), run(WindowMean(), codes)[4:7])
+    moment = restorer("moment")
+    np.testing.assert_array_equal(moment.restore(codes, 4, 7), moment.restore(codes)[4:7])
+
+
+@pytest.mark.parametrize("length", [1, 79, 80, 81, 100, 333])
+def test_weights_of_overlapping_spans_sum_to_one(length):
+    total = np.zeros(length)
+    for start, weight in spans(length, 80, 32):
+        assert len(weight) == min(80, length)
+        total[start : start + len(weight)] += weight
+    np.testing.assert_allclose(total, 1, atol=1e-6)
+
+
+@pytest.mark.parametrize(("height", "width"), [(100, 300), (512, 1024), (20, 2000), (2000, 20)])
+def test_tiles_cover_the_frame_within_the_bound(height, width):
+    tiles = plan_tiles(height, width, 10_000)
+    total = np.zeros((height, width))
+    for tile in tiles:
+        rows, columns = tile.weight.shape
+        assert rows * columns <= 10_000
+        total[tile.y : tile.y + rows, tile.x : tile.x + columns] += tile.weight
+    assert len(tiles) > 1
+    np.testing.assert_allclose(total, 1, atol=1e-5)
+
+
+def test_tiles_are_blended_to_what_one_frame_gives():
+    codes, model = random_codes(2, 100, 130), CentreFrame()
+    small = Options(memory=bytes_per_pixel(model) * 7000)
+    np.testing.assert_allclose(run(model, codes, small), run(model, codes), rtol=1e-5)
+    assert max(seen[3] * seen[4] for seen in model.seen[: len(model.seen) // 2]) < 100 * 130
+
+
+def test_a_bound_below_one_tile_is_refused():
+    with pytest.raises(ValueError, match=r"tile needs at least 80 x 80; raise --memory"):
+        plan_tiles(200, 200, 1000)
+
+
+def test_a_convolutional_network_does_not_see_the_tiles():
+    """The U-Net reaches less than half the overlap in places of full weight: tiles change nothing there."""
+    torch.manual_seed(0)
+    codes, model = random_codes(1, 120, 96), UNet(UNetConfig(2)).eval()
+    tiled = run(model, codes, Options(memory=bytes_per_pixel(model) * 96 * 100))
+    whole = run(model, codes)
+    assert np.abs(tiled - whole).max() < 0.05 * np.abs(whole).max()
+    np.testing.assert_allclose(tiled[:, :20], whole[:, :20], atol=1e-4)
+
+
+def test_modes_of_the_network():
+    """Exact equals windows recomputed; streaming is another schedule; bfloat16 stays near float32."""
+    torch.manual_seed(0)
+    codes, model = random_codes(4, 16, 16), build("nano").eval()
+    windows = run(model, codes, Options(mode="windows"))
+    np.testing.assert_allclose(run(model, codes, Options(mode="exact")), windows, atol=2e-4)
+    assert np.isfinite(run(model, codes, Options(mode="streaming"))).all()
+    low = run(model, codes, Options(mode="windows", precision="bfloat16"))
+    assert 0 < np.abs(low - windows).max() < 0.1 * codes.white
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_classical_methods_are_found_by_name(name):
+    method = restorer(name)
+    assert not method.learned
+    assert method.look_ahead == (method.window - 1) // 2
+    assert "frames" not in method.name
+
+
+def test_a_window_after_the_colon():
+    codes = random_codes(6, 4, 5)
+    three = restorer("moment:3")
+    assert (three.window, three.look_ahead, three.name) == (3, 1, "moment:3")
+    expected = METHODS["moment"].restore(codes.read(0, 6), SENSOR, EXPOSURE, window=3)
+    np.testing.assert_array_equal(three.restore(codes), expected)
+    with pytest.raises(ValueError, match="as in moment:5"):
+        restorer("moment:many")
+
+
+def test_blocks_of_frames_do_not_show():
+    """A memory bound that holds 30 frames at a time: same result as all at once."""
+    codes = random_codes(70, 6, 7)
+    whole = restorer("moment").restore(codes)
+    calls: list[int] = []
+    blocks = restorer("moment", Options(memory=200 * 6 * 7 * 30))
+    np.testing.assert_array_equal(blocks.restore(codes, progress=lambda done, total: calls.append(done)), whole)
+    assert len(calls) > 3
+
+
+def test_weights_are_found_by_file_folder_and_name(tmp_path):
+    network = UNet(UNetConfig(2))
+    save(network, network.config, tmp_path / "best.safetensors")
+    assert weights_path(str(tmp_path)) == weights_path(str(tmp_path / "best.safetensors"))
+    found = network_restorer(tmp_path / "best.safetensors", str(tmp_path), Options(device="cpu"))
+    assert found.name == tmp_path.name
+    assert found.learned
+    assert "UNet, weights " in found.description
+    with pytest.raises(FileNotFoundError, match="no such weights file"):
+        restorer(str(tmp_path / "none.safetensors"))
+    with pytest.raises(ValueError, match=r"no method 'momnt'; known are naive, moment"):
+        restorer("momnt")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileNotFoundError, match=r"holds no best\.safetensors"):
+        restorer(str(tmp_path / "empty"))
+
+
+def test_a_restored_file_says_what_it_is(tmp_path):
+    codes, path = random_codes(5, 6, 7), tmp_path / "video.npy"
+    meta = restore_to_file(codes, restorer("moment"), path)
+    stored = np.load(path)
+    assert stored.dtype == np.float32
+    np.testing.assert_array_equal(stored, restorer("moment").restore(codes))
+    assert json.loads((tmp_path / "video.json").read_text()) == meta
+    assert (meta["method"], meta["unit"], meta["shape"]) == ("moment", "photons", [5, 6, 7])
+    assert meta["white"] == pytest.approx(8.125)
+
+
+def test_a_failed_restoration_leaves_nothing(tmp_path):
+    def fill(codes: Codes, out: Array, first: int, progress: object) -> None:
+        out[:] = np.nan
+
+    broken = Restorer("broken", 1, 0, True, "", fill)
+    with pytest.raises(ValueError, match="broken: restored frame 0 holds NaN or Inf"):
+        restore_to_file(random_codes(2, 3, 4), broken, tmp_path / "video.npy")
+    dying = replace(broken, fill=lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        restore_to_file(random_codes(2, 3, 4), dying, tmp_path / "video.npy")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mode": "fast"}, "mode 'fast'; known are exact, streaming, windows"),
+        ({"precision": "float16"}, "precision 'float16'"),
+        ({"memory": 0}, "memory is a number of bytes"),
+    ],
+)
+def test_bad_options_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Options(**changes)
+
+
+def test_cuda_is_asked_for_by_name(tmp_path: Path):
+    if torch.cuda.is_available():
+        pytest.skip("this machine has CUDA")
+    network = UNet(UNetConfig(2))
+    save(network, network.config, tmp_path / "w.safetensors")
+    with pytest.raises(ValueError, match="--device cuda: torch finds no CUDA"):
+        restorer(str(tmp_path / "w.safetensors"), Options(device="cuda"))
