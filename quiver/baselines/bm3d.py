@@ -6,7 +6,8 @@
 Source: Dabov, Foi, Katkovnik, Egiazarian, "Image denoising by sparse 3-D transform-domain collaborative filtering",
 IEEE TIP 16(8), 2007; written from the description, with the parameters of its normal profile. Our reading: in the
 first step blocks are similar if their distance exceeds that of two noisy copies of one block, 2 sigma^2, by at most
-3000. That replaces the article's second set of parameters for strong noise, and needs no filter before matching.
+3000. That replaces the article's second set of parameters for strong noise, and needs no filter before matching. The
+mean of a stack is never shrunk, so that nothing depends on where grey level 0 lies.
 
 How it is fast without a loop over pixels: the transformed block at every position is one row of a table [positions,
 64]. Distances are matrix products of rows (a DCT keeps distances), stacks are gathered rows, and filtered rows are
@@ -56,13 +57,14 @@ def denoise(image: Array, sigma: float, *, peak: float = 1.0, profile: Profile =
     if sigma == 0:
         return image.astype(np.float32)
     grey = 255.0 / peak
-    noisy = torch.from_numpy(_pad(image * grey).astype(np.float32))
+    level = float(image.mean(dtype=np.float64))  # taken off for the sake of float32
+    noisy = torch.from_numpy(_pad((image - level) * grey).astype(np.float32))
     with torch.no_grad():
         coefficients = _transform(noisy)
         basic = _aggregate(*_first(coefficients, noisy.shape, sigma * grey, profile), noisy.shape)
         final = _aggregate(*_second(coefficients, basic, sigma * grey, profile), noisy.shape)
     height, width = image.shape
-    return (final[:height, :width] / grey).numpy()
+    return (final[:height, :width] / grey + level).numpy()
 
 
 def _pad(image: Array) -> Array:
@@ -190,7 +192,9 @@ def _first(table: Tensor, shape: torch.Size, sigma: float, profile: Profile) -> 
     for position in _stacks(table, shape, profile.stack, profile.limit + 2 * sigma**2):
         haar = _haar(position.shape[1])
         stack = torch.einsum("ab,nbk->nak", haar, wavelets[position])
+        mean = stack[:, 0, 0].clone()
         stack.masked_fill_(stack.abs() < profile.threshold * sigma, 0)
+        stack[:, 0, 0] = mean
         weight = 1 / (sigma**2 * torch.count_nonzero(stack, (1, 2)).clamp(min=1))
         _add(total, weights, position, torch.einsum("ab,nak->nbk", haar, stack), weight)
     return total @ torch.linalg.inv(to_wavelet).T, weights
@@ -204,7 +208,8 @@ def _second(table: Tensor, basic: Tensor, sigma: float, profile: Profile) -> tup
         haar = _haar(position.shape[1])
         power = torch.einsum("ab,nbk->nak", haar, pilot_table[position]).square_()
         gain = power / (power + sigma**2)
-        weight = 1 / (sigma**2 * gain.square().sum((1, 2)).clamp(min=1e-6))
+        gain[:, 0, 0] = 1
+        weight = 1 / (sigma**2 * gain.square().sum((1, 2)))
         stack = gain.mul_(torch.einsum("ab,nbk->nak", haar, table[position]))
         _add(total, weights, position, torch.einsum("ab,nak->nbk", haar, stack), weight)
     return total, weights
