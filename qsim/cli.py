@@ -20,7 +20,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = Parser(prog="qsim", description="Render moving scenes and turn them into few-bit quanta-sensor streams.")
     parser.add_argument("--version", action="version", version=f"qsim {__version__}")
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
-    for add in (_add_doctor, _add_render, _add_sense, _add_generate, _add_check, add_convert, add_report, add_tradeoff):
+    for add in (
+        _add_doctor,
+        _add_render,
+        _add_sense,
+        _add_generate,
+        _add_plan,
+        _add_check,
+        add_convert,
+        add_report,
+        add_tradeoff,
+    ):
         add(sub)
     return run(parser, argv)
 
@@ -75,6 +85,8 @@ def _add_render(sub: Any) -> None:
     parser.add_argument("--width", type=int, default=128, help="pixels (default 128)")
     parser.add_argument("--frame-rate", type=float, default=2000.0, help="frames per second (default 2000)")
     parser.add_argument("--shutter", type=float, default=0.0, help="open share of a frame, 0..1 (default 0: sharp)")
+    parser.add_argument("--psnr", type=float, default=40.0, help="wanted error of the radiance, dB (default 40)")
+    parser.add_argument("--ppp", type=float, help="brightest light level that will be sensed, photons per pixel")
     parser.add_argument("--force", action="store_true", help="replace an existing clip")
 
 
@@ -89,6 +101,15 @@ def _run_render(args: argparse.Namespace) -> int:
             raise ValueError(f"--{name}: expected a whole number of at least 1, got {getattr(args, name)}")
     scene = scenes.load(args.scene, seed=args.seed, speed=args.speed).resized(args.height, args.width)
     with bar(args.output.name) as progress:
+        chosen = budget.choose(
+            scene,
+            frame_rate=args.frame_rate,
+            shutter=args.shutter,
+            frames=args.frames,
+            psnr=args.psnr,
+            ppp=args.ppp,
+            seed=args.seed,
+        )
         clip = render.render_clip(
             scene,
             args.output,
@@ -96,7 +117,7 @@ def _run_render(args: argparse.Namespace) -> int:
             frame_rate=args.frame_rate,
             shutter=args.shutter,
             seed=args.seed,
-            budget=budget.Budget(),
+            budget=chosen,
             progress=progress,
             force=args.force,
         )
@@ -104,6 +125,7 @@ def _run_render(args: argparse.Namespace) -> int:
     text = f"{clip.path}: {len(clip)} frames of {args.height} x {args.width}"
     text += f", mean radiance {clip.mean_radiance:.4g} W/m2/sr"
     text += f", {clip.mean_photons:.4g} photons per pixel" + (f", error {psnr:.1f} dB" if psnr else "")
+    text += "\n" + budget.explain(chosen)
     output(args, {"clip": str(clip.path)} | {k: v for k, v in clip.meta.items() if k != "checksums"}, text)
     return 0
 
@@ -276,6 +298,31 @@ def _part(text: str) -> tuple[int, int]:
     if not (first.isdigit() and last.isdigit() and 1 <= int(first) <= int(last)):
         raise argparse.ArgumentTypeError(f"expected I/N with 1 <= I <= N, as in 7/100, got {text!r}")
     return int(first), int(last)
+
+
+# plan
+
+
+def _add_plan(sub: Any) -> None:
+    parser = command(
+        sub, "plan", _run_plan, "Render one tiny job of each kind and say what the whole recipe will cost.",
+        "qsim plan scenes/i2_2000fps.toml --machines 10",
+    )  # fmt: skip
+    parser.add_argument("recipe", type=Path, help="a .toml file")
+    parser.add_argument("--machines", type=int, default=10, help="to spread the work over (default 10)")
+    parser.add_argument("--frames", type=int, default=3, help="frames rendered per kind (default 3)")
+
+
+def _run_plan(args: argparse.Namespace) -> int:
+    from qsim import plan, recipe
+
+    if args.machines < 1:
+        raise ValueError(f"--machines: expected at least 1, got {args.machines}")
+    wanted = recipe.load(args.recipe)
+    with bar("planning", "kind") as progress:
+        found = plan.plan(wanted, frames=args.frames, progress=progress)
+    output(args, {"recipe": wanted.name} | found.to_dict(), found.lines(args.machines))
+    return 0
 
 
 # check

@@ -21,11 +21,15 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from qsim import files, stream
 from qsim.clip import Clip
 from qsim.recipe import Job
+
+if TYPE_CHECKING:
+    from qsim.budget import Budget
+    from qsim.scene import Scene
 
 Make = Callable[[Job, Path], object]  # renders a job's clip to a path; tests hand in a quick one
 
@@ -57,21 +61,62 @@ def provenance(job: Job) -> dict[str, Any]:
 
 
 def render_job(job: Job, path: Path) -> object:
-    """Render a job's clip with the budget that its wanted error asks for."""
-    import scenes
-    from qsim import budget, keys, render
+    """Render a job's clip with the budget that its wanted error and its brightest stream ask for."""
+    from qsim import render
 
     settings = job.settings
-    scene = scenes.load(job.family, seed=job.scene_seed, speed=job.speed).resized(settings.height, settings.width)
+    scene = load_scene(job)
     return render.render_clip(
         scene,
         path,
         frames=settings.frames,
         frame_rate=settings.frame_rate,
         shutter=settings.shutter,
-        seed=(keys.hash_name(job.name) ^ job.seed) & 0x7FFFFFFF,  # no two clips share their samples
-        budget=budget.Budget(),
+        seed=render_seed(job),
+        budget=choose_budget(job, scene),
         extra=provenance(job) | {"assets": assets(scene.to_dict())},
+    )
+
+
+def load_scene(job: Job) -> Scene:
+    """The job's scene at its size."""
+    import scenes
+
+    scene = scenes.load(job.family, seed=job.scene_seed, speed=job.speed)
+    return scene.resized(job.settings.height, job.settings.width)
+
+
+def render_seed(job: Job) -> int:
+    """Seed of the job's samples: no two clips share theirs."""
+    from qsim import keys
+
+    return (keys.hash_name(job.name) ^ job.seed) & 0x7FFFFFFF
+
+
+def choose_budget(job: Job, scene: Scene) -> Budget:
+    """What the scene needs for the wanted error, and for the noise of the stream that collects most electrons.
+
+    Streams whose light is given in lux or as it is do not count: their photons are known only after rendering.
+    """
+    from qsim import budget, devices
+
+    settings = job.settings
+    electrons, ppp = 0.0, None
+    for sensing in job.streams:
+        if sensing.ppp is not None:
+            sensor = devices.load(sensing.sensor, ppp=sensing.ppp, bits=sensing.bits, exposure=1 / settings.frame_rate)
+            share = stream.electrons_per_photon(sensor)
+            if sensing.ppp * share > electrons:
+                electrons, ppp = sensing.ppp * share, sensing.ppp
+    return budget.choose(
+        scene,
+        frame_rate=settings.frame_rate,
+        shutter=settings.shutter,
+        frames=settings.frames,
+        psnr=settings.psnr,
+        ppp=ppp,
+        quantum_efficiency=1.0 if ppp is None else electrons / ppp,
+        seed=render_seed(job),
     )
 
 
