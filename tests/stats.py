@@ -60,8 +60,13 @@ def assert_share(hits: int, n: int, share: float, *, false_alarm: float = FALSE_
 
 
 def histogram_p_value(codes: np.ndarray, pmf: np.ndarray, fitted: int = 0) -> float:
-    """Chi-square p-value of codes 0 ... K-1 against `pmf`; neighbouring bins expected below 5 are pooled."""
+    """Chi-square p-value of codes 0 ... K-1 against `pmf`; neighbouring bins expected below 5 are pooled.
+
+    A code that cannot occur but does has the p-value 0: pooling must not hide it.
+    """
     counts = np.bincount(np.ravel(codes), minlength=pmf.size).astype(float)
+    if counts.size > pmf.size or counts[pmf == 0].any():
+        return 0.0
     expected = pmf * codes.size
     observed_bins, expected_bins, o, e = [], [], 0.0, 0.0
     for c, x in zip(counts, expected, strict=True):
