@@ -48,7 +48,9 @@ class Paralyzable:
         """P(code <= k): [p] -> [p, levels]."""
         result = np.ones((len(mean), self.levels))
         for rows, table in self._tables(mean):
-            result[rows, : self.possible] = table.evaluate_cdf(mean[rows]) if table else self._sparse(mean[rows])[0]
+            result[rows, : self.possible] = (
+                table.evaluate_cdf(mean[rows]) if table else self._paralysed(mean[rows]).cdf()
+            )
         return result
 
     def log_pmf(self, mean: Array, wanted: Array | None = None) -> Array:
@@ -56,7 +58,7 @@ class Paralyzable:
         result = np.full((len(mean), self.levels), -np.inf)
         for rows, table in self._tables(mean):
             some = None if wanted is None else wanted[rows, : self.possible]
-            part = table.evaluate_log_pmf(mean[rows], some) if table else self._sparse(mean[rows])[1]
+            part = table.evaluate_log_pmf(mean[rows], some) if table else self._paralysed(mean[rows]).log_pmf()
             result[rows, : self.possible] = part
         result[:, 0] = -mean
         return result
@@ -65,7 +67,9 @@ class Paralyzable:
         """dcdf/dmean: [p] -> [p, levels]."""
         result = np.zeros((len(mean), self.levels))
         for rows, table in self._tables(mean):
-            result[rows, : self.possible] = table.evaluate_slope(mean[rows]) if table else self._sparse(mean[rows])[2]
+            result[rows, : self.possible] = (
+                table.evaluate_slope(mean[rows]) if table else self._paralysed(mean[rows]).slope()
+            )
         return result
 
     def _tables(self, mean: Array) -> Iterator[tuple[Array, Mixture | None]]:
@@ -75,8 +79,8 @@ class Paralyzable:
             table = arrival_table(self.ratio, self.possible, int(last)) if last <= _LONGEST else None
             yield np.flatnonzero(length == last), table
 
-    def _sparse(self, mean: Array) -> tuple[Array, Array, Array]:
-        return _sparse(mean, self.ratio, self.possible)
+    def _paralysed(self, mean: Array) -> _Paralysed:
+        return _Paralysed(mean, self.ratio, self.possible)
 
 
 def most_counts(ratio: float) -> int:
@@ -156,8 +160,8 @@ def _next(values: Array) -> Array:
     return np.concatenate([values[..., 1:], np.zeros_like(values[..., :1])], axis=-1)
 
 
-def _sparse(mean: Array, ratio: float, levels: int) -> tuple[Array, Array, Array]:
-    """cdf, log_pmf and slope where hardly a gap is long, from the binomial moments B_j = E[C(N, j)].
+class _Paralysed:
+    """Light in which hardly a gap is long: the distribution from the binomial moments B_j = E[C(N, j)].
 
     With a = 1 / ratio and rate = mean exp(-mean a), a count at x has the density mean exp(-mean min(x, a)) if it is the
     first and `rate` if it comes a or more after the one before, so
@@ -165,43 +169,58 @@ def _sparse(mean: Array, ratio: float, levels: int) -> tuple[Array, Array, Array
         B_j = rate^(j-1) [J(j-1, c) + rate (c - a)+^j / j!],   c = 1 - (j - 1) a,
         J(r, c) = integral from 0 to min(a, c) of mean exp(-mean x) (c - x)^r / r! dx;
         P(N = k) = sum_j (-1)^(j-k) C(j, k) B_j,   P(N > k) = sum_j (-1)^(j-k-1) C(j-1, k) B_j.
-    """
-    from scipy.special import binom
 
-    a = 1 / ratio
-    log_rate = np.log(mean) - mean * a
-    rate = np.exp(log_rate)
-    if (rate * (1 - a) > _SPARSE).any():
-        worst = float(mean[np.argmax(rate)])
-        raise ValueError(
-            f"CountingSPAD: {worst:.4g} arrivals in an exposure of {ratio:.6g} paralyzable dead times have no closed "
-            "form here; shorten the exposure or lower the light"
-        )
-    last = min(most_counts(ratio), _MOST)
-    moments, slopes = _moments(mean, a, last)  # of B_j / rate^(j-1)
-    j = np.arange(1, last + 1)
-    log_pmf = np.full((len(mean), levels), -np.inf)
-    survival, slope = np.zeros((len(mean), levels)), np.zeros((len(mean), levels))
-    log_pmf[:, 0] = -mean
-    for k in range(min(levels, last + 1)):
-        sign = (-1.0) ** (j - k)
-        if k:
-            counted = (
-                sign * np.where(j >= k, binom(j, k), 0) if k < levels - 1 else sign * binom(j - 1, k - 1) * (j >= k)
+    `moments` holds B_j / rate^(j-1), j = 1, 2, ...: [p, j].
+    """
+
+    def __init__(self, mean: Array, ratio: float, levels: int) -> None:
+        self.mean, self.levels, a = mean, levels, 1 / ratio
+        self.log_rate = np.log(mean) - mean * a
+        self.rate = np.exp(self.log_rate)
+        if (self.rate * (1 - a) > _SPARSE).any():
+            worst = float(mean[np.argmax(self.rate)])
+            raise ValueError(
+                f"CountingSPAD: {worst:.4g} arrivals in an exposure of {ratio:.6g} paralyzable dead times have no "
+                "closed form here; shorten the exposure or lower the light"
             )
+        self.j = np.arange(1, min(most_counts(ratio), _MOST) + 1)
+        self.moments, change = _moments(mean, a, len(self.j))
+        self.changes = change + self.moments * (self.j - 1) * (1 / mean - a)[:, None]  # of B_j / rate^(j-1) by the mean
+
+    def log_pmf(self) -> Array:
+        """[p, levels]; the last code is this count or more."""
+        from scipy.special import binom
+
+        result = np.full((len(self.mean), self.levels), -np.inf)
+        result[:, 0] = -self.mean
+        for k in range(1, min(self.levels, len(self.j) + 1)):
+            ways = binom(self.j, k) if k < self.levels - 1 else binom(self.j - 1, k - 1)
+            signed = np.where(self.j >= k, (-1.0) ** (self.j - k) * ways, 0.0)
+            total = (signed * self.moments * self.rate[:, None] ** np.maximum(self.j - k, 0)).sum(axis=1)
             with np.errstate(divide="ignore"):
-                total = (counted * moments * rate[:, None] ** np.maximum(j - k, 0)).sum(axis=1)
-                log_pmf[:, k] = np.log(np.maximum(total, 0)) + (k - 1) * log_rate
-        if k < levels - 1:
-            beyond = -sign * np.where(j > k, binom(j - 1, k), 0)
-            powers = rate[:, None] ** (j - 1)
-            survival[:, k] = (beyond * moments * powers).sum(axis=1)
-            change = slopes + moments * (j - 1) * (1 / mean - a)[:, None]
-            slope[:, k] = -(beyond * change * powers).sum(axis=1)
-    cdf = 1 - survival
-    cdf[:, 0] = np.exp(-mean)
-    slope[:, 0] = -cdf[:, 0]
-    return cdf, log_pmf, slope
+                result[:, k] = np.log(np.maximum(total, 0.0)) + (k - 1) * self.log_rate
+        return result
+
+    def cdf(self) -> Array:
+        """[p, levels]"""
+        cdf = 1 - self._beyond(self.moments)
+        cdf[:, 0] = np.exp(-self.mean)
+        return cdf
+
+    def slope(self) -> Array:
+        """dcdf/dmean, [p, levels]"""
+        slope = -self._beyond(self.changes)
+        slope[:, 0] = -np.exp(-self.mean)
+        return slope
+
+    def _beyond(self, moments: Array) -> Array:
+        """The series of P(N > k), or of its derivative, for every code below the last: [p, levels]."""
+        from scipy.special import binom
+
+        terms, result = moments * self.rate[:, None] ** (self.j - 1), np.zeros((len(self.mean), self.levels))
+        for k in range(min(self.levels - 1, len(self.j))):
+            result[:, k] = terms @ np.where(self.j > k, (-1.0) ** (self.j - k - 1) * binom(self.j - 1, k), 0.0)
+        return result
 
 
 def _moments(mean: Array, a: float, last: int) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ from numpy import ndarray as Array
 if TYPE_CHECKING:
     from qsim.sensor import Sensor
 
-_DECADES, _PER_DECADE = 12, 64  # of the grid
+_DECADES, _PER_DECADE = 8, 128  # of the grid: linear interpolation between its points is good to 4e-5
 _FLAT = 1e-14  # change of the cdf per doubling of light at which a sensor is taken as saturated
 _NEVER = -1e290  # stands for log 0 where it may be multiplied by 0
 _STEPS = 100  # of root finding; 10 are usual
@@ -107,7 +107,8 @@ def maximum_likelihood(sensor: Sensor, histogram: Array, exposure: float, confid
     distinct, where = np.unique(counts.reshape(-1, sensor.levels), axis=0, return_inverse=True)
     grid, parts = _grid(sensor, exposure), []
     for start in range(0, len(distinct), _CHUNK):
-        parts.append(_estimate(sensor, exposure, grid, distinct[start : start + _CHUNK], confidence))
+        likelihood = _Likelihood(sensor, exposure, distinct[start : start + _CHUNK])
+        parts.append(_estimate(likelihood, grid, confidence))
     found = np.concatenate(parts, axis=1)[:, where.ravel()] if parts else np.zeros((3, 0))
     return Estimate(*found.reshape(3, *counts.shape[:-1]))
 
@@ -132,53 +133,55 @@ def _refuse_impossible(sensor: Sensor, exposure: float, counts: Array) -> None:
         raise ValueError(f"histogram{where or ''} holds code {code}, which no light gives with this {sensor!r}")
 
 
-def _estimate(sensor: Sensor, exposure: float, grid: _Grid, counts: Array, confidence: float) -> Array:
-    """photons, lower, upper [3, p] of histograms [p, levels]."""
-    table = counts @ grid.log_pmf.T
-    best = table.argmax(axis=1)
-    at_best = np.take_along_axis(table, best[:, None], axis=1)[:, 0]
-    end = len(grid.photons) - 1
-    bright = (table[:, end] >= at_best - 1e-6) if grid.saturates else (best == end)
-    left, right = grid.photons[np.maximum(best - 1, 0)], grid.photons[np.minimum(best + 1, end)]
+@dataclass(frozen=True)
+class _Likelihood:
+    """Histograms [h, levels] as functions of light: for some rows at one light level each, [p], [p] -> [p]."""
 
-    def log_pmf(photons: Array, rows: Array) -> Array:
-        return np.maximum(sensor.log_pmf(photons, exposure, counts[rows] > 0), _NEVER)
+    sensor: Sensor
+    exposure: float
+    counts: Array
 
-    def score(photons: Array, rows: Array) -> Array:
-        slope = np.diff(sensor.dcdf(photons, exposure), axis=-1, prepend=0.0)
+    def value(self, photons: Array, rows: Array) -> Array:
+        """Log-likelihood."""
+        return (self.counts[rows] * self._log_pmf(photons, rows)).sum(axis=1)
+
+    def score(self, photons: Array, rows: Array) -> Array:
+        """Its derivative by photons."""
+        slope = np.diff(self.sensor.dcdf(photons, self.exposure), axis=-1, prepend=0.0)
         with np.errstate(over="ignore", invalid="ignore"):
-            ratio = slope * np.exp(-log_pmf(photons, rows))
-        ratio[(slope == 0) | (counts[rows] == 0)] = 0.0
-        return (counts[rows] * ratio).sum(axis=1)
+            ratio = slope * np.exp(-self._log_pmf(photons, rows))
+        ratio[(slope == 0) | (self.counts[rows] == 0)] = 0.0
+        return (self.counts[rows] * ratio).sum(axis=1)
 
-    def log_likelihood(photons: Array, rows: Array) -> Array:
-        return (counts[rows] * log_pmf(photons, rows)).sum(axis=1)
+    def _log_pmf(self, photons: Array, rows: Array) -> Array:
+        return np.maximum(self.sensor.log_pmf(photons, self.exposure, self.counts[rows] > 0), _NEVER)
 
-    everything = np.arange(len(counts))
+
+def _estimate(likelihood: _Likelihood, grid: _Grid, confidence: float) -> Array:
+    """photons, lower, upper of every histogram: [3, h]."""
+    table = likelihood.counts @ grid.log_pmf.T
+    best, end, everything = table.argmax(axis=1), len(grid.photons) - 1, np.arange(len(table))
+    if grid.saturates:
+        bright = table[:, end] >= table.max(axis=1) - 1e-6
+    else:
+        bright = best == end
+        bright[bright] = likelihood.score(np.full(bright.sum(), grid.photons[end]), everything[bright]) >= 0
     dark = (best == 0) & ~bright
-    dark[dark] = score(np.zeros(dark.sum()), everything[dark]) <= 0
-    photons = np.where(dark, 0.0, grid.photons[best])
+    dark[dark] = likelihood.score(np.zeros(dark.sum()), everything[dark]) <= 0
     inner = everything[~dark & ~bright]
-    photons[inner] = _root(score, left[inner], right[inner], inner)
-    peak = log_likelihood(photons, everything)
-    peak[bright] = table[bright, end]
-    one_sided = log(1 - confidence)
-    drop = np.where(dark | bright, one_sided, -(NormalDist().inv_cdf((1 + confidence) / 2) ** 2) / 2)
-    photons[bright] = grid.photons[end]
-    lower = _crossing(log_likelihood, grid, table, photons, peak + drop, -1)
-    upper = _crossing(log_likelihood, grid, table, photons, peak + drop, +1)
-    photons[bright] = _crossing(log_likelihood, grid, table, photons, peak - log(2), -1)[bright]
-    return np.stack([photons, np.where(dark, 0.0, lower), np.where(bright, np.inf, upper)])
+    left, right = (grid.photons[np.clip(best[inner] + step, 0, end)] for step in (-1, 1))
+    photons = np.where(bright, grid.photons[end], 0.0)
+    photons[inner] = _root(likelihood.score, left, right, inner)
+    peak = np.where(bright, table[:, end], likelihood.value(photons, everything))
+    two_sided = -(NormalDist().inv_cdf((1 + confidence) / 2) ** 2) / 2
+    level = peak + np.where(dark | bright, log(1 - confidence), two_sided)
+    lower = _crossing(likelihood, grid, table, photons, level, -1)
+    upper = _crossing(likelihood, grid, table, photons, level, +1)
+    half = _crossing(likelihood, grid, table, photons, peak - log(2), -1)
+    return np.stack([np.where(bright, half, photons), np.where(dark, 0.0, lower), np.where(bright, np.inf, upper)])
 
 
-def _crossing(
-    function: Callable[[Array, Array], Array],
-    grid: _Grid,
-    table: Array,
-    start: Array,
-    target: Array,
-    direction: int,
-) -> Array:
+def _crossing(likelihood: _Likelihood, grid: _Grid, table: Array, start: Array, target: Array, direction: int) -> Array:
     """Where the log-likelihood first falls to `target` on the way down (-1) or up (+1) from `start`; else 0 or inf."""
     photons, size = grid.photons, len(grid.photons)
     low_enough = table < target[:, None]
@@ -193,7 +196,7 @@ def _crossing(
     result = np.full(len(start), 0.0 if direction < 0 else np.inf)
     rows = np.flatnonzero(there.any(axis=1))
     ends = np.sort(np.stack([inner[rows], photons[outer[rows]]]), axis=0)
-    result[rows] = _root(lambda x, r: direction * (function(x, r) - target[r]), ends[0], ends[1], rows)
+    result[rows] = _root(lambda x, r: direction * (likelihood.value(x, r) - target[r]), ends[0], ends[1], rows)
     return result
 
 

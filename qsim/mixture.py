@@ -10,6 +10,7 @@ d/dlambda sum_n Pois(n) C(n) = sum_n Pois(n) [C(n+1) - C(n)], if the differences
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy import ndarray as Array
@@ -55,7 +56,7 @@ def poisson_quantile(mean: Array, below: Array, above: Array) -> Array:
     return high
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mixture:
     """P(code | n) for n = first ... first + m - 1 and some codes: arrays [m, levels] and [levels].
 
@@ -68,6 +69,10 @@ class Mixture:
     slope: Array  # P(code <= k | n + 1) - P(code <= k | n)
     tail_cdf: Array  # for n >= first + m
     tail_log_pmf: Array
+
+    @cached_property
+    def _pmf(self) -> tuple[Array, Array]:
+        return np.exp(self.log_pmf), np.exp(self.tail_log_pmf)
 
     def evaluate_cdf(self, mean: Array) -> Array:
         """P(code <= k): [p] Poisson means -> [p, levels]."""
@@ -87,7 +92,7 @@ class Mixture:
 
         Probabilities below 1e-290 are summed in logarithms, which is slow: `wanted`, bool [p, levels], can excuse some.
         """
-        pmf = self._mix(mean, np.exp(self.log_pmf), np.exp(self.tail_log_pmf))
+        pmf = self._mix(mean, *self._pmf)
         deep = pmf < _UNDERFLOW
         if wanted is not None:
             deep &= wanted

@@ -88,7 +88,10 @@ class QIS(Sensor):
         return self._draw_process(photons, exposure, key, origin)
 
     def _draw_process(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
-        """Electrons, read noise and ADC one after the other, each by inverting its distribution at a 64-bit number."""
+        """Electrons, read noise and ADC one after the other, each by inverting its distribution at a 64-bit number.
+
+        Error: that of the inverted functions, below 1e-13 in any probability (tested for means to 65 000).
+        """
         from scipy.special import ndtri
 
         from qsim.mixture import poisson_quantile
@@ -103,7 +106,7 @@ class QIS(Sensor):
         return self.codes_of(electrons)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=32)
 def electron_table(sensor: QIS, start: int, stop: int) -> Mixture:
     """P(code | n electrons) for the codes start ... stop - 1."""
     from scipy.special import ndtr

@@ -8,6 +8,7 @@ from math import inf
 import mpmath as mp
 import numpy as np
 import pytest
+from scipy.special import ndtri, pdtr, pdtrc
 from stats import assert_histogram, assert_mean
 
 from qsim.keys import Key
@@ -158,6 +159,25 @@ def test_the_process_has_the_distribution_of_the_cdf(bits, read_noise, photons):
     light = np.full((300, 401), photons)
     codes = sensor._draw_process(light, EXPOSURE, Key(7, bits), (0, 0))
     assert_histogram(codes, sensor.pmf(photons, EXPOSURE), checks=3)
+
+
+@pytest.mark.parametrize("mean", [0.01, 3.0, 100.0, 2500.0, 65_000.0])
+def test_the_error_of_the_process_is_below_1e_13(mean):
+    """Drawing by inversion is as exact as the functions it inverts: P(N <= n) and P(N > n) against 40 digits."""
+    n = np.unique(np.maximum(np.floor(mean + np.sqrt(mean) * np.arange(-9, 12)), 0)).astype(int)
+    below, above = pdtr(n, mean), pdtrc(n, mean)
+    with mp.workdps(40):
+        exact = [_poisson_cdf(int(i), mean) for i in n]
+        assert max(abs(below[i] - float(p)) for i, p in enumerate(exact)) < 1e-13
+        assert max(abs(above[i] - float(1 - p)) for i, p in enumerate(exact)) < 1e-13
+
+
+def test_the_error_of_the_read_noise_is_below_1e_13():
+    """Phi(z(u)) = u relative to u, down to u = 2^-65: the other half of the process."""
+    u = np.concatenate([2.0 ** -np.arange(1.0, 66), np.linspace(0.001, 0.499, 50)])
+    with mp.workdps(40):
+        back = [mp.ncdf(mp.mpf(z)) for z in ndtri(u)]
+        assert max(abs(float(b / mp.mpf(x) - 1)) for b, x in zip(back, u, strict=True)) < 1e-13
 
 
 def test_poisson_quantiles_invert_the_distribution_in_both_tails():
