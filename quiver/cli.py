@@ -86,6 +86,14 @@ def size(text: str) -> int:
     return int(value)
 
 
+def height_width(text: str) -> tuple[int, int]:
+    """`128x256` -> (128, 256)"""
+    height, cross, width = text.partition("x")
+    if not cross:
+        raise argparse.ArgumentTypeError(f"expected HEIGHTxWIDTH as in 128x256, got {text!r}")
+    return count(height), count(width)
+
+
 def words(text: str) -> tuple[str, ...]:
     """`naive,moment:3,out/run` -> its parts; none may be empty."""
     parts = tuple(part.strip() for part in text.split(","))
@@ -158,6 +166,7 @@ def _run_train(args: argparse.Namespace) -> int:
     import torch
 
     from quiver.data import output
+    from quiver.model import build
     from quiver.restore import pick_device
     from quiver.train import Diverged, train
 
@@ -169,7 +178,7 @@ def _run_train(args: argparse.Namespace) -> int:
     try:
         with _signals() as interrupted:
             state = train(
-                build_network(args.preset),
+                build(args.preset),
                 settings,
                 device=pick_device(args.device),
                 should_stop=lambda: bool(interrupted),
@@ -215,14 +224,6 @@ def _summary(folder: Path, state: Any) -> tuple[dict[str, Any], str]:
         found |= {"best_psnr_matched": state.best, "weights": weights, "last_validation": state.history[-1]}
         text += f", best validation PSNR {state.best:.2f} dB (after the best factor): {weights}"
     return found, text
-
-
-def build_network(name: str) -> Any:
-    """A network with random weights by preset name."""
-    from quiver.model import build
-    from quiver.unet import UNet
-
-    return UNet() if name == "unet" else build(name)
 
 
 # restore
@@ -374,15 +375,45 @@ def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
 
 def _add_bench(sub: Any) -> None:
     parser = _command(
-        sub, "bench", _run_bench, "Measure seconds, memory and multiply-accumulates per restored frame.",
-        "quiver bench\nquiver bench --methods moment,nano,quiver-s --size 256x256 --json",
+        sub, "bench", _run_bench, "Measure what a restored frame costs, beside its PSNR.",
+        "quiver bench\n"
+        "quiver bench --methods moment,nano,quiver-s --modes exact,streaming,windows --size 128x128 -o out/bench",
     )  # fmt: skip
-    parser.add_argument("--methods", type=words, default="nano,quiver-s", help="with commas")
+    parser.add_argument(
+        "--methods", type=words, default="moment,unet,nano", help="with commas (default moment,unet,nano)"
+    )
+    parser.add_argument("--modes", type=words, default="exact,streaming", help="of networks (default exact,streaming)")
+    parser.add_argument("--precisions", type=words, default="float32", help="float32, bfloat16 or both")
+    parser.add_argument("--size", type=height_width, default="64x64", help="HEIGHTxWIDTH in px (default 64x64)")
+    parser.add_argument("--ppp", type=positive, default=3.25, help="light of the fixed clip (default 3.25)")
+    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
+    parser.add_argument("--threads", type=count, help="of torch on the CPU (default: its own choice)")
+    parser.add_argument("-o", "--output", type=Path, help="folder for bench.md, bench.json, bench.png")
     parser.add_argument("--force", action="store_true", help="replace an existing result")
 
 
 def _run_bench(args: argparse.Namespace) -> int:
-    raise ValueError("bench: not there yet")
+    from quiver.bench import Setting, bench, cases_of, figure, markdown
+    from quiver.data import bar, output, write_bytes, write_json
+    from quiver.evaluate import json_safe
+
+    if args.output is not None and (args.output / "bench.json").exists() and not args.force:
+        raise FileExistsError(
+            f"{args.output / 'bench.json'}: exists; name another with -o, or use --force to replace it"
+        )
+    height, width = args.size
+    setting = Setting(height, width, ppp=args.ppp, device=args.device, threads=args.threads)
+    with bar("cases", "case") as progress:
+        costs = bench(cases_of(args.methods, args.modes, args.precisions), setting, progress)
+    text = markdown(costs, setting)
+    found = json_safe({"setting": asdict(setting), "costs": [asdict(cost) for cost in costs]})
+    if args.output is not None:
+        args.output.mkdir(parents=True, exist_ok=True)
+        write_bytes(args.output / "bench.md", text.encode())
+        figure(costs, args.output / "bench.png")
+        write_json(args.output / "bench.json", found)
+    output(args, found, text)
+    return 1 if any(cost.failure for cost in costs) else 0
 
 
 # convert-weights

@@ -86,7 +86,7 @@ def restorer(name: str, options: Options | None = None) -> Restorer:
     options = options or Options()
     base, _, window = name.partition(":")
     if base not in METHODS:
-        return network_restorer(weights_path(name), name, options)
+        return network_restorer(weights_path(name), options)
     method = METHODS[base]
     if window and not (window.isdecimal() and int(window) > 0):
         raise ValueError(f"method {name!r}: the window after the colon is a number of frames, as in {base}:5")
@@ -119,22 +119,26 @@ def weights_path(name: str) -> Path:
     )
 
 
-def network_restorer(path: Path, name: str, options: Options) -> Restorer:
-    """The network stored in a weights file."""
-    import torch
-
-    from quiver.model import RADIUS, WINDOW
+def network_restorer(path: Path, options: Options) -> Restorer:
+    """The network stored in a weights file; a training run is named after its folder."""
     from quiver.weights import load
 
-    device = torch.device(pick_device(options.device))
-    model = load(path).to(device)
-    shown = path.parent.name if path.name == "best.safetensors" else path.stem
+    model = load(path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    name = path.parent.name if path.name == "best.safetensors" else path.stem
+    return wrap_network(model, name, f"{type(model).__name__}, weights {digest}, {options.mode}", options)
+
+
+def wrap_network(model: nn.Module, name: str, description: str, options: Options) -> Restorer:
+    """A network as a method."""
+    from quiver.model import RADIUS, WINDOW
+
+    model.to(pick_device(options.device)).eval()
 
     def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
         fill_network(model, codes, out, first, options, progress)
 
-    return Restorer(shown, WINDOW, RADIUS, True, f"{type(model).__name__}, weights {digest}, {options.mode}", fill)
+    return Restorer(name, WINDOW, RADIUS, True, description, fill)
 
 
 def pick_device(wanted: str) -> str:

@@ -185,7 +185,7 @@ def test_weights_are_found_by_file_folder_and_name(tmp_path):
     network = UNet(UNetConfig(2))
     save(network, network.config, tmp_path / "best.safetensors")
     assert weights_path(str(tmp_path)) == weights_path(str(tmp_path / "best.safetensors"))
-    found = network_restorer(tmp_path / "best.safetensors", str(tmp_path), Options(device="cpu"))
+    found = network_restorer(tmp_path / "best.safetensors", Options(device="cpu"))
     assert found.name == tmp_path.name
     assert found.learned
     assert "UNet, weights " in found.description
