@@ -52,6 +52,7 @@ class Calibration:
     warnings: tuple[str, ...] = ()
     residuals: tuple[Array, ...] = field(default=(), repr=False)  # per stack, (observed - fitted) / sigma per level
     maps: Mapping[str, Array] = field(default_factory=dict, repr=False)  # [H, W]
+    paralyzable: bool = False  # of a CountingSPAD
 
 
 def normal_interval(value: float, variance: float, unit: str, method: str, *, floor: float = -inf) -> Value:

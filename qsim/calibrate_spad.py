@@ -82,7 +82,7 @@ def calibrate_spad(
             f"the fitted histograms do not describe the counts (p = {p_value:.1g}): the model is wrong here"
         )
     model = "BinarySPAD" if bits == 1 else "CountingSPAD"
-    return Calibration(model, bits, values, p_value, tuple(warnings), residuals, maps)
+    return Calibration(model, bits, values, p_value, tuple(warnings), residuals, maps, paralyzable)
 
 
 # Arrivals of every pixel

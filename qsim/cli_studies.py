@@ -1,4 +1,4 @@
-"""Commands that look and study: `report`, `tradeoff`. The pairs `add_X` and `_run_X` of cli.py."""
+"""Commands that look and study: `report`, `tradeoff`, `calibrate`. The pairs `add_X` and `_run_X` of cli.py."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from qsim.console import command, output
 
 def add_report(sub: Any) -> None:
     parser = command(
-        sub, "report", _run_report, "Draw one self-contained page of clips, data sets, training, restored video and scores.",
+        sub, "report", _run_report, "Draw one self-contained page of clips, data sets, runs, restored video, scores.",
         "qsim report out/fan -o out/fan.html\nqsim report out/demo -o out/demo/index.html --title 'My run'",
     )  # fmt: skip
     parser.add_argument("path", type=Path, help="clip, data set, or any folder with such things in it")
@@ -78,6 +78,77 @@ def _run_tradeoff(args: argparse.Namespace) -> int:
     ]
     output(args, {"rows": [asdict(r) for r in rows]}, text)
     return 0
+
+
+# calibrate
+
+
+def add_calibrate(sub: Any) -> None:
+    parser = command(
+        sub, "calibrate", _run_calibrate, "Dark and flat frames -> a sensor file, each number with its 95 % interval.",
+        "qsim calibrate --bits 8 --dark d1.npy 1e-3 --dark d2.npy 0.1 --flat f.npy 1e-3 --flat g.npy 1e-3 -o my.toml\n"
+        "qsim calibrate --model spad --bits 1 --dark dark.npy 1e-5 --flat flat.npy 1e-5 0.8 -o spad.toml",
+    )  # fmt: skip
+    stack = {"action": "append", "nargs": "+", "default": []}
+    parser.add_argument("--dark", metavar=("FILE", "SECONDS"), help="frames without light, and their exposure", **stack)
+    parser.add_argument(
+        "--flat",
+        metavar=("FILE", "SECONDS"),
+        help="evenly lit frames, exposure, and the photons per pixel if known",
+        **stack,
+    )
+    parser.add_argument("--bits", type=int, required=True, help="of a code; 1 for binary planes")
+    parser.add_argument("--model", choices=("qis", "spad"), default="qis", help="default qis")
+    parser.add_argument("--paralyzable", action="store_true", help="spad: every arrival restarts the dead time")
+    parser.add_argument("--ignore-dead-time", action="store_true", help="spad: take the counts as Poisson")
+    parser.add_argument("--width", type=int, help=".npy files are photon cubes (packed planes) of so many pixels")
+    parser.add_argument("-o", "--output", type=Path, required=True, help=".toml to write; .json and .png beside it")
+    parser.add_argument("--force", action="store_true", help="replace existing files")
+
+
+def _run_calibrate(args: argparse.Namespace) -> int:
+    from qsim import calibrate_files
+    from qsim.calibrate import calibrate_qis
+    from qsim.calibrate_spad import calibrate_spad
+
+    if args.output.suffix != ".toml":
+        raise ValueError(f"{args.output}: the sensor file is a .toml, as in -o my_sensor.toml")
+    if args.output.exists() and not args.force:
+        raise FileExistsError(f"{args.output}: exists; name another with -o, or use --force to replace it")
+    darks = [_stack(words, args, dark=True) for words in args.dark]
+    flats = [_stack(words, args, dark=False) for words in args.flat]
+    if args.model == "qis":
+        found = calibrate_qis(darks, flats, bits=args.bits)
+    else:
+        found = calibrate_spad(
+            darks, flats, bits=args.bits, dead_time=not args.ignore_dead_time, paralyzable=args.paralyzable
+        )
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+    written = calibrate_files.write(
+        found, args.output, f"calibrated from {len(darks)} dark and {len(flats)} flat stacks"
+    )
+    width = max(len(name) for name in found.values)
+    text = [f"{name:{width}}  {value}  ({value.method})" for name, value in found.values.items()]
+    text += [f"warning: {words}" for words in found.warnings]
+    text += ["written: " + ", ".join(str(path) for path in written)]
+    output(args, calibrate_files.as_dict(found) | {"files": [str(path) for path in written]}, text)
+    return 0
+
+
+def _stack(words: list[str], args: argparse.Namespace, *, dark: bool) -> Any:
+    from qsim.calibrate_files import read_stack
+
+    kind, most = ("--dark", 2) if dark else ("--flat", 3)
+    if not 2 <= len(words) <= most:
+        raise ValueError(
+            f"{kind} {' '.join(words)}: give a file and its exposure in seconds, as in {kind} frames.npy 1e-3"
+        )
+    try:
+        numbers = [float(word) for word in words[1:]]
+    except ValueError:
+        raise ValueError(f"{kind} {' '.join(words)}: {words[1:]} are no numbers; give seconds, as in 1e-3") from None
+    photons = 0.0 if dark else numbers[1] if len(numbers) > 1 else None
+    return read_stack(Path(words[0]), bits=args.bits, exposure=numbers[0], photons=photons, width=args.width)
 
 
 def size(text: str) -> tuple[int, int]:

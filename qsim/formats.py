@@ -117,7 +117,7 @@ def to_clip(
         "split": capture.split,
     }
     with ClipWriter(path, meta, force=force) as writer:
-        for start, block in _blocks(footage):
+        for start, block in blocks(footage):
             for i, image in enumerate(block):
                 if not writer.has(start + i):
                     writer.add(start + i, image)
@@ -146,7 +146,7 @@ def to_stream(
     with files.replacing(npy) as target:
         packed = (frames, height, codes.packed_width(width, footage.bits))
         np.lib.format.write_array_header_1_0(target, {"descr": "|u1", "fortran_order": False, "shape": packed})
-        for start, block in _blocks(footage):
+        for start, block in blocks(footage):
             target.write(codes.pack(block, footage.bits).tobytes())
             if progress is not None:
                 progress(start + len(block), frames)
@@ -298,7 +298,8 @@ def _code_blocks(stream: Stream) -> Iterator[Array]:
         yield stream.codes(start, min(start + video.BLOCK, len(stream)))
 
 
-def _blocks(footage: Footage) -> Iterator[tuple[int, Array]]:
+def blocks(footage: Footage) -> Iterator[tuple[int, Array]]:
+    """The frames in order, some at a time: (number of the first, frames)."""
     frames, height, width = footage.shape
     step = max(1, min(256, (1 << 25) // (height * width)))
     for start in range(0, frames, step):

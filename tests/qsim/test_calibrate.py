@@ -1,0 +1,233 @@
+"""Calibration: intervals hold the truth as often as promised, wrong models are noticed, hard data are refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stats import assert_share
+from synthetic import QISCase, SPADCase
+
+from qsim import devices
+from qsim.calibrate import Calibration, calibrate_qis
+from qsim.calibrate_files import read_stack, sensor_of, write
+from qsim.calibrate_spad import calibrate_spad, matched_variance
+from qsim.spad import CountingSPAD
+from qsim.stacks import measure
+
+COUNTER = SPADCase(bits=5, photons=(2.0, 6.0, 14.0))
+QIS_CASES = {
+    "resolved peaks": QISCase(),
+    "few frames, few pixels": QISCase(frames=6, side=20, prnu=0.05),
+    "peaks hidden": QISCase(read_noise=0.8, frames=30, gain=6.0),
+    "low gain": QISCase(gain=3.0, offset=10.0, bits=7),
+}
+SPAD_CASES = {
+    "planes": SPADCase(),
+    "planes, many frames": SPADCase(frames=150, side=16),
+    "counts": COUNTER,
+    "paralyzable counts": replace(COUNTER, dead_time=0.08, paralyzable=True),
+}
+
+
+def covered(found: Calibration, truth: dict[str, float]) -> dict[str, bool]:
+    return {name: found.values[name].low <= value <= found.values[name].high for name, value in truth.items()}
+
+
+def coverage(case: QISCase | SPADCase, runs: int, seed: int) -> tuple[dict[str, int], list[float]]:
+    """How often the intervals hold the truth, and the p-values of the fits."""
+    rng = np.random.default_rng(seed)
+    hits: dict[str, int] = {}
+    p_values = []
+    for _ in range(runs):
+        found, truth = case.calibrate(rng)
+        p_values.append(found.p_value)
+        for name, hit in covered(found, truth).items():
+            hits[name] = hits.get(name, 0) + hit
+    return hits, p_values
+
+
+def test_one_calibration_of_each_kind_comes_near_the_truth():
+    """Not coverage, but sanity: within eight half-widths, which a right program leaves once in 10^50 times."""
+    rng = np.random.default_rng(5)
+    for case in (QISCase(), SPADCase(), COUNTER):
+        found, truth = case.calibrate(rng)
+        for name, value in truth.items():
+            v = found.values[name]
+            assert abs(v.value - value) <= 8 * max(v.high - v.value, v.value - v.low), (name, v, value)
+
+
+@pytest.mark.parametrize("name", ["resolved peaks"])
+def test_quick_coverage(name):
+    """30 calibrations: a coverage of 95 % is not told from 93 %, but a broken interval is."""
+    hits, _ = coverage(QIS_CASES[name], 30, seed=1)
+    for count in hits.values():
+        assert_share(count, 30, 0.95, checks=len(hits))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*QIS_CASES, *SPAD_CASES])
+def test_intervals_cover_as_promised(name):
+    """400 calibrations of each case: within the promised 93 ... 97 % as far as 400 can tell, and honest p-values."""
+    case = (QIS_CASES | SPAD_CASES)[name]
+    hits, p_values = coverage(case, 400, seed=7)
+    for parameter, count in hits.items():
+        assert count / 400 > 0.90, (parameter, count / 400)
+        assert count / 400 < 0.995, (parameter, count / 400)
+    if not np.isnan(p_values[0]):
+        assert_share(int(np.sum(np.array(p_values) < 0.05)), 400, 0.05, false_alarm=1e-4)
+
+
+def test_ignored_dead_time_is_flagged_and_the_right_model_is_not():
+    rng = np.random.default_rng(3)
+    right, _ = COUNTER.calibrate(rng)
+    wrong, _ = COUNTER.calibrate(rng, ignore_dead_time=True)
+    assert right.p_value > 1e-4
+    assert wrong.p_value < 1e-6
+    assert any("the model is wrong" in words for words in wrong.warnings)
+
+
+def test_hidden_peaks_are_announced():
+    found, _ = QISCase(read_noise=0.8, frames=10, side=16).calibrate(np.random.default_rng(2))
+    assert any("hides the electron peaks" in words for words in found.warnings)
+    clear, _ = QISCase(frames=10, side=16).calibrate(np.random.default_rng(2))
+    assert not clear.warnings
+
+
+@pytest.mark.parametrize("paralyzable", [False, True])
+def test_matched_variance_inverts_the_exact_mean(paralyzable):
+    sensor = CountingSPAD(1.0, 0.0, 0.05, 6, paralyzable)
+    arrivals = 4.2
+    mean = float(sensor.mean(np.array(arrivals), 1.0))
+    found, variance, slope = matched_variance(mean, 6, 0.05, paralyzable)
+    assert found == pytest.approx(arrivals, rel=1e-7)
+    assert variance == pytest.approx(float(sensor.variance(np.array(arrivals), 1.0)), rel=1e-6)
+    h = 1e-3
+    steps = [matched_variance(mean + sign * h, 6, 0.05, paralyzable)[1] for sign in (1, -1)]
+    assert slope == pytest.approx((steps[0] - steps[1]) / (2 * h), rel=1e-3)
+
+
+# Statistics, block by block
+
+
+def test_blocks_do_not_matter():
+    codes = np.random.default_rng(0).integers(0, 8, (11, 5, 7))
+    whole = measure([codes], bits=3, exposure=1e-3, photons=None)
+    parts = measure([codes[:1], codes[1:4], codes[4], codes[5:]], bits=3, exposure=1e-3, photons=None)
+    for name in ("total", "square", "lagged", "histogram"):
+        assert np.array_equal(getattr(whole, name), getattr(parts, name))
+    assert whole.frames == parts.frames == 11
+    assert whole.variance == pytest.approx(codes.var(axis=0, ddof=1).mean())
+    centred = codes - codes.mean(axis=0)
+    lag = (centred[1:] * centred[:-1]).sum(axis=0) / 10
+    assert whole.lag_covariance == pytest.approx(lag.mean() + whole.variance / 11)
+
+
+def test_float_frames_are_taken_if_whole():
+    codes = np.random.default_rng(0).integers(0, 8, (3, 4, 5))
+    assert np.array_equal(
+        measure([codes.astype(np.float32)], bits=3, exposure=1.0, photons=0.0).total, codes.sum(axis=0)
+    )
+    with pytest.raises(ValueError, match=r"dark.npy: 0.5 at \(t, y, x\) = \(0, 0, 0\) is no code of 3 bits"):
+        measure([np.full((1, 2, 2), 0.5, np.float32)], bits=3, exposure=1.0, photons=0.0, name="dark.npy")
+
+
+def test_a_million_frames_take_no_more_memory():
+    """The same block a thousand times: what is kept does not grow."""
+    block = np.random.default_rng(0).integers(0, 2, (1000, 2, 3)).astype(bool)
+    stack = measure((block for _ in range(1000)), bits=1, exposure=1e-5, photons=None)
+    assert stack.frames == 1_000_000
+    assert stack.mean == pytest.approx(block.mean())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"exposure": 0.0}, "exposure is in seconds and above 0"),
+        ({"photons": -1.0}, "photons are a number of at least 0"),
+    ],
+)
+def test_impossible_stacks_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        measure([np.zeros((2, 2, 2), int)], **({"bits": 3, "exposure": 1.0, "photons": 0.0} | change))
+
+
+# Hard data
+
+
+def stack(codes: np.ndarray, bits: int = 3, photons: float | None = 0.0):
+    return measure([codes], bits=bits, exposure=1e-3, photons=photons)
+
+
+def noise(frames: int = 8, top: int = 8, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, top, (frames, 6, 7))
+
+
+def test_all_zero_darks_of_a_qis_are_refused():
+    with pytest.raises(ValueError, match="every code of dark 0 is 0"):
+        calibrate_qis([stack(noise() * 0)], [stack(noise(), photons=None)], bits=3)
+
+
+def test_saturated_flats_are_refused_or_announced():
+    with pytest.raises(ValueError, match="every code of flat 0 is 7"):
+        calibrate_qis([stack(noise(top=3))], [stack(noise() * 0 + 7, photons=None)], bits=3)
+    dark, flat = stack(noise(40, 2) * 0, 1), stack(noise(40, 2) * 0 + 1, 1, 3.0)
+    found = calibrate_spad([dark], [flat], bits=1)
+    assert any("saturated in every frame" in words for words in found.warnings)
+    assert np.isfinite(found.values["pde_fill"].value)
+
+
+def test_one_frame_is_refused_with_the_cure():
+    with pytest.raises(ValueError, match="take at least 2 frames"):
+        calibrate_qis([stack(noise(1))], [stack(noise(1, seed=1), photons=None)], bits=3)
+
+
+def test_no_dark_count_gives_a_one_sided_bound():
+    """No event in time t: the rate is below -ln(0.025)/t with 97.5 %."""
+    found = calibrate_spad([stack(np.zeros((100, 6, 7), int), 1)], [], bits=1)
+    rate = found.values["dark_count_rate"]
+    assert (rate.value, rate.low) == (0.0, 0.0)
+    assert rate.high == pytest.approx(-np.log(0.025) / (100 * 1e-3 * 42))
+
+
+def test_one_hot_pixel_a_hundred_thousand_times_the_median():
+    """It stands in the map and in the share of hot pixels, and leaves the median alone."""
+    rng = np.random.default_rng(0)
+    rate = np.full((20, 20), 1e-2)
+    rate[3, 4] = 1e3  # per frame: always on
+    planes = rng.random((400, 20, 20)) < -np.expm1(-rate)
+    found = calibrate_spad([stack(planes, 1)], [], bits=1)
+    assert np.unravel_index(np.argmax(found.maps["dark_count_rate"]), (20, 20)) == (3, 4)
+    assert found.values["dark_count_rate_median"].value < 3e-2 / 1e-3
+    assert found.values["hot_pixels"].value == pytest.approx(1 / 400)
+
+
+def test_calibration_without_frames_is_refused():
+    with pytest.raises(ValueError, match="no frames at all"):
+        calibrate_spad([], [], bits=1)
+    with pytest.raises(ValueError, match="no flat frames"):
+        calibrate_qis([stack(noise())], [], bits=3)
+
+
+# Files
+
+
+def test_files_of_a_calibration_load_as_a_device(tmp_path):
+    found, _ = SPADCase().calibrate(np.random.default_rng(4))
+    path = tmp_path / "mine.toml"
+    written = write(found, path, "a test")
+    assert {p.suffix for p in written} == {".toml", ".json", ".png", ".npy"}
+    loaded = devices.load(path)
+    assert loaded == sensor_of(found)
+    assert np.load(tmp_path / "mine_dark.npy").shape == (24, 24)
+
+
+def test_frames_are_read_from_npy_and_from_a_photon_cube(tmp_path):
+    planes = np.random.default_rng(0).integers(0, 2, (9, 5, 11)).astype(np.uint8)
+    np.save(tmp_path / "codes.npy", planes)
+    np.save(tmp_path / "cube.npy", np.packbits(planes, axis=-1))
+    one = read_stack(tmp_path / "codes.npy", bits=1, exposure=1e-5, photons=None)
+    two = read_stack(tmp_path / "cube.npy", bits=1, exposure=1e-5, photons=None, width=11)
+    assert np.array_equal(one.total, planes.sum(axis=0))
+    assert np.array_equal(one.total, two.total)
+    with pytest.raises(FileNotFoundError, match=r"nothing\.npy"):
+        read_stack(tmp_path / "nothing.npy", bits=1, exposure=1e-5, photons=None)

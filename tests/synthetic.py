@@ -1,0 +1,104 @@
+"""Synthetic dark and flat stacks of sensors whose every parameter is known: the truth that calibration must cover."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from qsim.calibrate import Calibration, calibrate_qis
+from qsim.calibrate_spad import calibrate_spad
+from qsim.spad import BinarySPAD, CountingSPAD
+from qsim.stacks import Stack, measure
+
+
+@dataclass(frozen=True)
+class QISCase:
+    """A few-electron sensor with a fine ADC, and how it is measured."""
+
+    gain: float = 8.0  # codes/e-
+    offset: float = 40.0  # codes
+    read_noise: float = 0.25  # e-
+    dark_current: float = 20.0  # e-/s
+    prnu: float = 0.03
+    bits: int = 8
+    frames: int = 20
+    side: int = 24  # px
+    lights: tuple[float, ...] = (0.5, 2.0, 6.0)  # e- per exposure
+    exposures: tuple[float, ...] = (1e-3, 5e-2)  # s, of the darks
+
+    def codes(self, light: float, exposure: float, pattern: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Drawn by NumPy from the definition, not by our sensor."""
+        expected = np.maximum(light * (1 + self.prnu * pattern), 0) + self.dark_current * exposure
+        shape = (self.frames, *pattern.shape)
+        electrons = rng.poisson(expected, shape) + self.read_noise * rng.standard_normal(shape)
+        return np.clip(np.rint(self.gain * electrons + self.offset), 0, 2**self.bits - 1).astype(np.int64)
+
+    def stacks(self, rng: np.random.Generator) -> tuple[list[Stack], list[Stack]]:
+        pattern = rng.standard_normal((self.side, self.side))
+        darks = [
+            measure([self.codes(0.0, t, pattern, rng)], bits=self.bits, exposure=t, photons=0.0) for t in self.exposures
+        ]
+        flats = [
+            measure([self.codes(light, 1e-3, pattern, rng)], bits=self.bits, exposure=1e-3, photons=light / 0.8)
+            for light in self.lights
+        ]
+        return darks, flats
+
+    def calibrate(self, rng: np.random.Generator) -> tuple[Calibration, dict[str, float]]:
+        truth = {
+            "gain": self.gain,
+            "offset": self.offset,
+            "read_noise": self.read_noise,
+            "dark_current": self.dark_current,
+            "prnu": self.prnu,
+            "quantum_efficiency": 0.8,
+            "gain_transfer": self.gain,
+            "read_noise_transfer": self.read_noise,
+            "dark_current_transfer": self.dark_current,
+        }
+        return calibrate_qis(*self.stacks(rng), bits=self.bits), truth
+
+
+@dataclass(frozen=True)
+class SPADCase:
+    """A SPAD array with a spread of dark counts and of efficiency."""
+
+    bits: int = 1
+    dead_time: float = 0.05  # of the exposure
+    paralyzable: bool = False
+    pde: float = 0.4
+    dark_rate: float = 20.0  # 1/s
+    prnu: float = 0.05
+    frames: int = 40
+    side: int = 24
+    photons: tuple[float, ...] = (0.5, 1.5, 3.0)
+    exposure: float = 1e-3
+
+    def calibrate(
+        self, rng: np.random.Generator, *, ignore_dead_time: bool = False
+    ) -> tuple[Calibration, dict[str, float]]:
+        sensor = (
+            BinarySPAD(1.0, 0.0, 1)
+            if self.bits == 1
+            else CountingSPAD(1.0, 0.0, self.dead_time * self.exposure, self.bits, self.paralyzable)
+        )
+        shape = (self.side, self.side)
+        pattern = 1 + self.prnu * rng.standard_normal(shape)
+        pattern /= pattern.mean()
+        rates = self.dark_rate * rng.lognormal(0, 0.5, shape)
+
+        def stack(light: float, frames: int) -> Stack:
+            arrivals = light * self.pde * pattern + rates * self.exposure
+            cdf = sensor.cdf(arrivals, self.exposure)[..., :-1]
+            codes = np.stack([(rng.random((*shape, 1)) >= cdf).sum(axis=-1) for _ in range(frames)])
+            return measure([codes], bits=self.bits, exposure=self.exposure, photons=light)
+
+        darks, flats = [stack(0.0, 4 * self.frames)], [stack(light, self.frames) for light in self.photons]
+        found = calibrate_spad(
+            darks, flats, bits=self.bits, dead_time=not ignore_dead_time, paralyzable=self.paralyzable
+        )
+        truth = {"dark_count_rate": float(rates.mean()), "pde_fill": self.pde, "prnu": self.prnu, "afterpulsing": 0.0}
+        if self.bits > 1:
+            truth["dead_time"] = self.dead_time * self.exposure
+        return found, truth
