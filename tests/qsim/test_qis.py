@@ -121,7 +121,17 @@ def test_tails_are_probabilities_not_differences():
 
 
 @pytest.mark.parametrize("photons", [0.0, 1e-12, 1e3, 1e12])
-@pytest.mark.parametrize("sensor", [QIS(1.0, 0.0, 0.0, 1), QIS(0.8, 1.6, 0.05, 8, 0.1), QIS(0.8, 1.6, 5.1, 5, 10.0)])
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        QIS(1.0, 0.0, 0.0, 1),
+        QIS(0.8, 1.6, 0.05, 8, 0.1),
+        QIS(0.8, 1.6, 5.1, 5, 10.0),
+        QIS(0.8, 1e7, 1e-3, 3, full_well=0.4),
+        QIS(0.8, 1.6, 0.2, 3, offset=50.0),
+        QIS(0.8, 1.6, 0.2, 3, offset=-50.0),
+    ],
+)
 def test_extreme_light_is_a_distribution(sensor, photons):
     cdf, pmf = sensor.cdf(photons, EXPOSURE), sensor.pmf(photons, EXPOSURE)
     assert np.all(np.diff(cdf) >= -1e-15)
