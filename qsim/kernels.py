@@ -34,7 +34,8 @@ SMALLEST = 1 << 14  # pixels; below, compiling costs more than it brings
 _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # of Philox4x32; see keys.py
 _KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 _INFINITY = 0x7F800000  # float32; larger bit patterns are NaN or negative
-_CONSTANT_PLANS = 32
+_CERTAIN = 80.0  # arrivals that are sure to bring 15: P(N < 15) = 1e-19
+_CONSTANT_PLANS = 32  # sensors of a process that get kernels of their own
 
 
 def available() -> bool:
@@ -193,9 +194,10 @@ def _launch(plan: Plan, light: Array, lanes: int, key: Key, place: tuple[int, in
         dr.opaque(jit.UInt32, value & 0xFFFFFFFF)
         for value in (place[0] * plan.planes, place[1], place[2], key.philox_key >> 32, key.philox_key)
     )
+    # Rows by a product in float64, exact to 2^32 lanes: a division by a constant would compile anew for every width
     lane = dr.arange(jit.UInt32, light.size)
-    y = lane // lanes
-    x = lane - y * lanes
+    y = jit.UInt32((jit.Float64(lane) + 0.5) * dr.opaque(jit.Float64, 1 / lanes))
+    x = lane - y * dr.opaque(jit.UInt32, lanes)
     pair = jit.UInt64(light)
     photons = [dr.reinterpret_array(jit.Float, jit.UInt32(half)) for half in (pair, pair >> 32)]
 
@@ -251,7 +253,7 @@ def _count(plan: Plan, photons: list[Any], words: Callable[[Any], list[Any]]) ->
             steps, unit = _steps(plan.steps, mean, scalars)
             code, near = _search(steps, uniform32(word) * unit)
             codes.append(code)
-            doubt |= near < margin * unit
+            doubt |= ~(near >= margin * unit)
         return codes, doubt
     nothing = [dr.exp(-mean) for mean in arrivals]
 
@@ -265,7 +267,7 @@ def _count(plan: Plan, photons: list[Any], words: Callable[[Any], list[Any]]) ->
 
     state = (jit.UInt32(0), real(1), *(jit.UInt32(0) for _ in photons))
     _, near, *codes = dr.while_loop(state, lambda plane, *_: plane < plan.planes, add_plane)
-    return codes, doubt | (near < margin)
+    return codes, doubt | ~(near >= margin)
 
 
 def _search(steps: list[Any], u: Any) -> tuple[Any, Any]:
@@ -295,7 +297,7 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
     if isinstance(steps, Live):
         result = []
         for k in range(len(steps.shares)):
-            live = mean * scalars[k]
+            live = dr.minimum(mean * scalars[k], _CERTAIN)
             total = real(1)
             for n in range(k, 0, -1):
                 total = dr.fma(total, live * (1 / n), 1)

@@ -1,0 +1,289 @@
+"""The compiled engine draws the reference's codes: every model, crop, depth and light, packed or not."""
+
+import re
+import subprocess
+import sys
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stats import assert_histogram
+
+from qsim import kernels
+from qsim.codes import pack
+from qsim.keys import Key, philox4x32
+from qsim.ladders import Electrons, electrons, plan
+from qsim.pixels import draw_at
+from qsim.qis import QIS
+from qsim.sensor import Sensor
+from qsim.spad import BinarySPAD, CountingSPAD
+
+KEY = Key(seed=3, clip=5, frame=7)
+EXPOSURE = 5e-4  # s
+needs_engine = pytest.mark.skipif(not kernels.available(), reason="no usable LLVM or CUDA on this machine")
+
+SENSORS: dict[str, Sensor] = {
+    "3 bits, gain 1": QIS(0.8, 1.6, 0.2, 3),
+    "published gain": QIS(0.8, 3200.0, 0.2, 3, gain=0.5 * 7 / 3.25),
+    "low gain": QIS(0.8, 1.6, 0.2, 3, gain=0.1346),
+    "no read noise": QIS(0.8, 1.6, 0.0, 3),
+    "one bit": QIS(0.8, 1.6, 0.2, 1),
+    "five bits": QIS(0.8, 1.6, 0.2, 5),
+    "float64": QIS(0.8, 1.6, 0.3, 5, gain=0.3),
+    "noisy, with offset": QIS(0.8, 1.6, 5.1, 3, gain=0.3, offset=2.0),
+    "full well": QIS(0.8, 1.6, 0.2, 3, full_well=4.0),
+    "one plane": BinarySPAD(0.5, 10.0),
+    "seven planes": BinarySPAD(0.5, 10.0, 3),
+    "dead time": CountingSPAD(0.5, 100.0, 1e-4, 3),
+    "four-bit counter": CountingSPAD(0.5, 100.0, 1e-6, 4),
+}
+# Where no kernel serves
+OTHERS: dict[str, Sensor] = {
+    "ten bits": QIS(0.8, 1.6, 5.1, 10, offset=32.0),
+    "paralyzable": CountingSPAD(0.5, 100.0, 1e-4, 3, paralyzable=True),
+    "long sums": QIS(0.8, 1.6, 0.2, 8, gain=0.2),
+}
+
+
+def light(sensor: Sensor, shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
+    """Photons from dark to twice white, float32."""
+    top = 2 * sensor.white(EXPOSURE)
+    return np.random.default_rng(seed).uniform(0, top, shape).astype(np.float32)
+
+
+def fast(sensor: Sensor, photons: np.ndarray, **settings: object) -> np.ndarray:
+    return kernels.sample(sensor, photons, EXPOSURE, **({"key": KEY, "smallest": 1} | settings))
+
+
+def reference(sensor: Sensor, photons: np.ndarray, **settings: object) -> np.ndarray:
+    return sensor.sample(photons, EXPOSURE, **({"key": KEY} | settings), engine="reference")
+
+
+# ---- The sums
+
+
+@pytest.mark.parametrize("name", [name for name, s in SENSORS.items() if isinstance(s, QIS)])
+def test_the_sums_are_the_cdf(name):
+    """Evaluated in float64 they differ by the coefficients left out (1e-12) and by rounding."""
+    sensor = SENSORS[name]
+    steps = electrons(sensor)
+    assert isinstance(steps, Electrons)
+    mean = np.minimum(np.linspace(0, 1.2 * steps.highest, 200), steps.highest)[:, None]
+    terms = np.exp(-steps.shift) * (mean / steps.scale) ** np.arange(len(steps.full))
+    for k, (prefix, band, floor) in enumerate(zip(steps.prefix, steps.band, steps.floor, strict=True)):
+        total = terms[:, :prefix] @ steps.full[:prefix] + terms[:, prefix : prefix + len(band)] @ band
+        step = floor + total * np.exp(steps.shift - mean[:, 0])
+        np.testing.assert_allclose(step, sensor._cdf(mean[:, 0], EXPOSURE)[:, k], atol=1e-10)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_sensors_without_short_sums_have_no_plan(name):
+    assert plan(OTHERS[name], EXPOSURE) is None
+
+
+# ---- The same codes
+
+
+@needs_engine
+def test_the_compiled_generator_gives_the_same_words():
+    jit = kernels._backend()
+    counters = np.random.default_rng(0).integers(0, 2**32, (3, 1000), dtype=np.uint32)
+    key = KEY.philox_key
+    words = kernels._philox(*(jit.UInt32(c) for c in counters), jit.UInt32(key >> 32), jit.UInt32(key & 0xFFFFFFFF))
+    expected = philox4x32(np.vstack([counters, np.zeros((1, 1000), np.uint32)]), key)
+    np.testing.assert_array_equal(np.stack([w.numpy() for w in words]), expected)
+
+
+@needs_engine
+@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize(("shape", "origin"), [((2, 9, 13), (3, 5)), ((1, 40, 64), (0, 0)), ((3, 7, 10), (2, 8))])
+def test_codes_equal_the_reference_packed_or_not(name, shape, origin):
+    sensor = SENSORS[name]
+    photons = light(sensor, shape)
+    expected = reference(sensor, photons, origin=origin)
+    np.testing.assert_array_equal(fast(sensor, photons, origin=origin), expected, strict=True)
+    packed = kernels.sample_packed(sensor, photons, EXPOSURE, key=KEY, origin=origin, smallest=1)
+    np.testing.assert_array_equal(packed, pack(expected, sensor.bits), strict=True)
+
+
+@needs_engine
+@pytest.mark.parametrize("name", ["3 bits, gain 1", "low gain", "one plane", "dead time"])
+def test_a_quarter_of_a_million_pixels_are_all_the_same(name):
+    sensor = SENSORS[name]
+    photons = light(sensor, (2, 256, 511), seed=1)
+    np.testing.assert_array_equal(fast(sensor, photons), reference(sensor, photons))
+
+
+@needs_engine
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SENSORS)
+def test_two_million_pixels_are_all_the_same(name):
+    sensor = SENSORS[name]
+    photons = light(sensor, (8, 512, 512), seed=2)
+    np.testing.assert_array_equal(fast(sensor, photons), reference(sensor, photons))
+
+
+@needs_engine
+@pytest.mark.parametrize("name", SENSORS)
+def test_float32_alone_stays_well_within_its_margin(name, monkeypatch):
+    """With a quarter of the margin nothing changes; with none a few pixels in a million differ."""
+    sensor = SENSORS[name]
+    photons = light(sensor, (2, 300, 500), seed=3)
+    expected = fast(sensor, photons)
+    whole = plan(sensor, EXPOSURE)
+    monkeypatch.setattr(kernels, "plan", lambda *_: replace(whole, margin=whole.margin / 4))
+    np.testing.assert_array_equal(fast(sensor, photons), expected)
+    monkeypatch.setattr(kernels, "plan", lambda *_: replace(whole, margin=0.0))
+    assert (fast(sensor, photons) != expected).mean() <= 2e-5
+
+
+@needs_engine
+@pytest.mark.parametrize("name", SENSORS)
+def test_extreme_light_has_the_reference_codes(name):
+    sensor = SENSORS[name]
+    levels = [0.0, 1e-300, 1e-12, 1e-6, 1e-3, 87.0, 88.8, 130.0, 1e3, 1e6, 1e12, 1e30, 1e39, 1e200]
+    photons = np.repeat(np.array(levels)[:, None], 64, axis=1)
+    np.testing.assert_array_equal(fast(sensor, photons), reference(sensor, photons))
+
+
+@needs_engine
+@pytest.mark.parametrize("bits", range(1, 9))
+def test_packing_at_every_width_and_depth(bits):
+    sensor = QIS(0.8, 1.6, 0.2, bits)
+    for width in (1, 2, 3, 5, 8, 9, 16, 31, 70) if bits < 6 else (3, 31):
+        photons = light(sensor, (2, 3, width), seed=width)
+        packed = kernels.sample_packed(sensor, photons, EXPOSURE, key=KEY, smallest=1)
+        np.testing.assert_array_equal(packed, pack(reference(sensor, photons), bits), strict=True)
+
+
+@needs_engine
+@pytest.mark.parametrize("width", range(1, 71))
+def test_one_bit_planes_of_every_width(width):
+    sensor = BinarySPAD(0.5, 1000.0)
+    photons = light(sensor, (1, 2, width))
+    packed = kernels.sample_packed(sensor, photons, EXPOSURE, key=KEY, smallest=1)
+    np.testing.assert_array_equal(packed, np.packbits(reference(sensor, photons), axis=-1), strict=True)
+
+
+@needs_engine
+def test_layout_and_type_of_the_photons_do_not_matter():
+    sensor = SENSORS["3 bits, gain 1"]
+    photons = light(sensor, (4, 16, 24))
+    expected = fast(sensor, photons)
+    for other in (photons.astype(float), photons.astype(">f4"), np.asfortranarray(photons), photons.astype(np.float16)):
+        given = fast(sensor, other)
+        np.testing.assert_array_equal(given, reference(sensor, other))
+        if other.dtype != np.float16:
+            np.testing.assert_array_equal(given, expected)
+    np.testing.assert_array_equal(fast(sensor, photons[::2, ::-1, 3:20]), reference(sensor, photons[::2, ::-1, 3:20]))
+    np.testing.assert_array_equal(fast(sensor, np.full((2, 8, 8), 3)), reference(sensor, np.full((2, 8, 8), 3.0)))
+
+
+@needs_engine
+@pytest.mark.parametrize("draw", [kernels.sample, kernels.sample_packed])
+def test_frames_can_be_drawn_in_any_order(draw):
+    sensor = SENSORS["seven planes"]
+    photons = np.broadcast_to(light(sensor, (1, 9, 16)), (5, 9, 16))
+    whole = draw(sensor, photons, EXPOSURE, key=KEY, smallest=1)
+    for t in (4, 0, 2):
+        alone = draw(sensor, photons[t], EXPOSURE, key=KEY.at(KEY.frame + t), smallest=1)
+        np.testing.assert_array_equal(alone, whole[t])
+    assert len({frame.tobytes() for frame in whole}) == 5
+
+
+@needs_engine
+def test_sensors_share_kernels_after_the_first_few(monkeypatch):
+    """Numbers as arguments of a common kernel instead of constants: the same codes."""
+    monkeypatch.setattr(kernels, "_CONSTANT_PLANS", 0)
+    kernels._scalars.cache_clear()
+    for name in ("published gain", "full well", "dead time", "seven planes"):
+        sensor = SENSORS[name]
+        photons = light(sensor, (2, 20, 30))
+        np.testing.assert_array_equal(fast(sensor, photons), reference(sensor, photons))
+    kernels._scalars.cache_clear()
+
+
+@needs_engine
+def test_the_drawn_codes_follow_the_closed_form():
+    sensor = SENSORS["published gain"]
+    codes = fast(sensor, np.full((1, 300, 400), 3.25, np.float32))
+    assert_histogram(codes, np.exp(sensor.log_pmf(np.array(3.25), EXPOSURE)))
+
+
+# ---- Around the kernel
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_sensors_are_drawn_by_the_reference(name):
+    sensor = OTHERS[name]
+    photons = light(sensor, (2, 5, 7))
+    np.testing.assert_array_equal(fast(sensor, photons), reference(sensor, photons), strict=True)
+    packed = kernels.sample_packed(sensor, photons, EXPOSURE, key=KEY, smallest=1)
+    np.testing.assert_array_equal(packed, pack(reference(sensor, photons), sensor.bits))
+
+
+@needs_engine
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -1e-3, -np.inf])
+def test_what_is_no_light_level_is_named(wrong):
+    photons = np.ones((2, 8, 10))
+    photons[1, 2, 3] = wrong
+    text = re.escape(f"photons[1, 2, 3] is {wrong}")
+    for draw in (kernels.sample, kernels.sample_packed):
+        with pytest.raises(ValueError, match=text):
+            draw(SENSORS["3 bits, gain 1"], photons, EXPOSURE, key=KEY, smallest=1)
+
+
+def test_empty_stacks_stay_empty():
+    sensor = SENSORS["3 bits, gain 1"]
+    assert fast(sensor, np.zeros((0, 4, 5))).shape == (0, 4, 5)
+    assert kernels.sample_packed(sensor, np.zeros((2, 0, 5)), EXPOSURE, key=KEY).shape == (2, 0, 2)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_single_pixels_are_those_of_the_frame(name):
+    sensor = SENSORS[name]
+    photons = light(sensor, (3, 6, 9))
+    at = np.array([[0, 2, 2, 1], [5, 0, 3, 3], [8, 0, 4, 4]])
+    expected = reference(sensor, photons, origin=(2, 3))[tuple(at)]
+    np.testing.assert_array_equal(draw_at(sensor, photons, EXPOSURE, KEY, (2, 3), at), expected)
+
+
+@needs_engine
+def test_memory_is_the_output_and_one_frame():
+    """40 frames in float64: beyond the codes NumPy may hold one frame's worth (float32 light and what it becomes)."""
+    sensor = SENSORS["3 bits, gain 1"]
+    photons = np.full((40, 256, 255), 2.0)
+    frame = photons[0].nbytes
+    for draw in (kernels.sample, kernels.sample_packed):
+        draw(sensor, photons[:2], EXPOSURE, key=KEY)
+        tracemalloc.start()
+        codes = draw(sensor, photons, EXPOSURE, key=KEY)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < codes.nbytes + frame
+
+
+FORK = """
+import os, sys, warnings
+import numpy as np
+from qsim import kernels
+from qsim.keys import Key
+from qsim.qis import QIS
+sensor, photons = QIS(0.8, 1.6, 0.2, 3), np.full((1, 128, 128), 2.0, np.float32)
+def draw():
+    return sensor.sample(photons, 5e-4, key=Key(1, 2))
+before = draw()
+warnings.simplefilter("ignore")  # Python warns of forks while other threads run
+child = os.fork()
+if child == 0:
+    os._exit(0 if (draw() == before).all() and not kernels.available() else 1)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@needs_engine
+@pytest.mark.skipif(not hasattr(__import__("os"), "fork"), reason="no fork on this system")
+def test_a_forked_child_draws_the_same_codes_without_the_threads_it_lost():
+    done = subprocess.run([sys.executable, "-c", FORK], timeout=120, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
