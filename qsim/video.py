@@ -18,6 +18,7 @@ from qsim.footage import Footage, Hints, check_shape, from_linear, need_transfer
 from qsim.planes import checked_codes
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709
+_FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG
 BLOCK = 16  # frames read at a time
 
 
@@ -65,7 +66,7 @@ def read_video(path: Path, hints: Hints) -> Footage:
 
     def read(start: int, stop: int) -> Array:
         with reading(path, "video"):
-            return np.stack([to_luminance(frame, transfer, 255) for frame in decoder.frames(start, stop)])
+            return np.stack([to_luminance(f, transfer, 255, f.ndim == 3) for f in decoder.frames(start, stop)])
 
     return Footage(shape, read, "video", meta={"transfer": transfer})
 
@@ -112,17 +113,19 @@ def picture(path: Path, shape: tuple[int, int, int], raw: Any, dtype: np.dtype, 
     full = float(np.iinfo(dtype).max)
 
     def read(start: int, stop: int) -> Array:
-        return to_luminance(raw(start, stop), transfer, full)
+        values = raw(start, stop)
+        return to_luminance(values, transfer, full, values.ndim == 4)
 
     return Footage(shape, read, source, meta={"transfer": transfer})
 
 
-def to_luminance(values: Array, transfer: str, top: float) -> Array:
+def to_luminance(values: Array, transfer: str, top: float, colour: bool) -> Array:
     """Linear light of grey [..., H, W] or colour [..., H, W, 3] pictures: linearised first, then weighted."""
-    linear = to_linear(values, transfer, top)
-    if values.shape[-1] == 3 and values.ndim > 2:
-        return linear @ _LUMINANCE
-    return linear
+    if not colour:
+        return to_linear(values, transfer, top)
+    if (values == values[..., :1]).all():  # grey in three channels: exact without weights
+        return to_linear(values[..., 0], transfer, top)
+    return to_linear(values, transfer, top) @ _LUMINANCE
 
 
 def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossless: bool) -> None:
@@ -137,12 +140,15 @@ def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossl
                     "libx264", rate=round(frame_rate), options={"qp": "0"} if lossless else {}
                 )
                 stream.height, stream.width = image.shape
-                stream.pix_fmt = "gray" if lossless else "yuv420p"
+                stream.codec_context.pix_fmt = "gray" if lossless else "yuv420p"
                 if not lossless and (image.shape[0] % 2 or image.shape[1] % 2):
                     raise ValueError(
                         f"{path}: lossy H.264 needs even sizes, the frames are {image.shape}; use --lossless"
                     )
-            for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="gray")):
+            picture = av.VideoFrame.from_ndarray(image, format="gray")
+            if lossless:  # say that 0 ... 255 are meant, or decoders stretch 16 ... 235
+                picture.color_range = stream.codec_context.color_range = _FULL_RANGE
+            for packet in stream.encode(picture):
                 container.mux(packet)
         for packet in stream.encode():
             container.mux(packet)

@@ -1,0 +1,533 @@
+"""Foreign files: golden bytes, round trips at odd sizes, ambiguity asked about, damage refused."""
+
+import gzip
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from qsim import formats, planes, video
+from qsim.cli import main
+from qsim.clip import RELATIVE, Clip, ClipWriter
+from qsim.footage import Hints, from_linear, numbered, to_linear
+from qsim.formats import Capture, Export
+from qsim.stream import Stream
+
+CAPTURE = Capture(frame_rate=1000.0)
+
+
+def random_planes(*shape: int, seed: int = 0) -> np.ndarray:
+    return (np.random.default_rng(seed).random(shape) < 0.3).astype(np.uint8)
+
+
+def one(shape: tuple[int, ...], *places: tuple[int, ...]) -> np.ndarray:
+    found = np.zeros(shape, np.uint8)
+    for place in places:
+        found[place] = 1
+    return found
+
+
+def everything(path: Path, **hints: Any) -> np.ndarray:
+    footage = formats.read(path, Hints(**hints))
+    return footage.read(0, footage.shape[0])
+
+
+# Golden bytes of formats known from the field
+
+
+def test_golden_photon_cube(tmp_path: Path):
+    planes_ = one((1, 2, 10), (0, 0, 0), (0, 1, 9))
+    video.write_cube(tmp_path / "a.npy", iter([planes_]), (1, 2, 10))
+    cube = np.load(tmp_path / "a.npy")
+    assert cube.tolist() == [[[128, 0], [0, 64]]]
+    assert cube.dtype == np.uint8
+    np.testing.assert_array_equal(everything(tmp_path / "a.npy", layout="cube", width=10), planes_)
+
+
+def test_golden_lsb_first_stream():
+    assert list(np.packbits(one((1, 2, 10), (0, 0, 0), (0, 1, 9)).ravel(), bitorder="little")) == [1, 0, 8]
+    assert list(planes.encode_half(one((1, 256, 512), (0, 0, 0), (0, 0, 9)))[:2]) == [1, 2]
+
+
+def test_golden_spike():
+    assert list(planes.encode_spike(one((1, 2, 8), (0, 1, 0)))) == [1, 0]
+
+
+@pytest.mark.parametrize(
+    ("y", "x", "byte", "value"),
+    [(0, 0, 0, 1), (0, 127, 15, 0x80), (0, 128, 32, 1), (255, 0, 32640, 1), (256, 0, 32656, 1), (511, 0, 16, 1),
+     (511, 511, 127, 0x80)],
+)  # fmt: skip
+def test_golden_swissspad2_full(tmp_path: Path, y: int, x: int, byte: int, value: int):
+    raw = bytearray(32768)
+    raw[byte] = value
+    (tmp_path / "a.bin").write_bytes(raw)
+    expected = one((1, 512, 512), (0, y, x))
+    np.testing.assert_array_equal(everything(tmp_path / "a.bin", layout="swissspad2-full"), expected)
+    assert planes.encode_full(expected) == bytes(raw)
+
+
+def test_golden_spad512s():
+    assert planes.encode_spad512s(one((1, 512, 512), (0, 0, 0)))[:2] == b"\x80\x00"
+
+
+# Round trips
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    codes=st.integers(1, 70).flatmap(
+        lambda width: hnp.arrays(np.uint8, st.tuples(st.integers(1, 4), st.integers(1, 9), st.just(width)),
+                                 elements=st.integers(0, 1))
+    )
+)  # fmt: skip
+def test_photon_cubes_of_every_width(tmp_path_factory: pytest.TempPathFactory, codes: np.ndarray):
+    path = tmp_path_factory.getbasetemp() / "cube.npy"
+    video.write_cube(path, iter([codes]), codes.shape)
+    np.testing.assert_array_equal(everything(path, layout="cube", width=codes.shape[2]), codes)
+    whole = everything(path, layout="cube")
+    assert whole.shape[2] == -(-codes.shape[2] // 8) * 8
+    assert not whole[..., codes.shape[2] :].any()
+
+
+@pytest.mark.parametrize("bits", range(1, 9))
+@pytest.mark.parametrize("width", [1, 7, 10, 33, 70])
+def test_codes_through_our_stream_and_every_export(tmp_path: Path, bits: int, width: int):
+    codes = np.random.default_rng(bits).integers(0, 2**bits, (3, 5, width)).astype(np.uint8)
+    codes[0, 0, 0], codes[0, 1, 0], codes[0, 2, 0] = 0, 1, 2**bits - 1
+    np.save(tmp_path / "codes.npy", codes)
+    footage = formats.read(tmp_path / "codes.npy", Hints("codes", bits=bits))
+    stream = formats.to_stream(footage, tmp_path / "s", CAPTURE)
+    np.testing.assert_array_equal(stream.codes(), codes)
+    np.testing.assert_array_equal(
+        stream.codes(1, 3, (1, width // 2, 3, width - width // 2)), codes[1:, 1:4, width // 2 :]
+    )
+    exports = [Export("png"), Export("zarr")] + ([Export("cube")] if bits == 1 else [])
+    for wanted in exports:
+        path = formats.export(stream, tmp_path / wanted.kind, wanted)
+        layout = {"png": "png", "zarr": "zarr", "cube": "cube"}[wanted.kind]
+        np.testing.assert_array_equal(everything(path, layout=layout, bits=bits, width=width), codes)
+        side = path / "meta.json" if path.is_dir() else path.with_name(path.name + ".json")
+        meta = json.loads(side.read_text())
+        assert (meta["bits"], meta["width"], meta["code_model"], meta["format_version"]) == (
+            bits,
+            width,
+            "binary_sum",
+            1,
+        )
+
+
+@pytest.mark.parametrize("kind", ["half", "full", "spad512s", "spad512s with footer"])
+@pytest.mark.parametrize("frames", [1, 3])
+def test_raw_camera_files(tmp_path: Path, kind: str, frames: int):
+    height = 256 if kind == "half" else 512
+    expected = random_planes(frames, height, 512)
+    encode = {"half": planes.encode_half, "full": planes.encode_full}.get(kind, planes.encode_spad512s)
+    layout = {"half": "swissspad2-half", "full": "swissspad2-full"}.get(kind, "spad512s")
+    content = encode(expected) + (b"\0\0\0\0" if "footer" in kind else b"")
+    (tmp_path / "a.bin").write_bytes(content)
+    np.testing.assert_array_equal(everything(tmp_path / "a.bin", layout=layout), expected)
+    for wrong in (content[:-1], content + b"\0", b""):
+        (tmp_path / "a.bin").write_bytes(wrong)
+        with pytest.raises(ValueError, match=rf"a\.bin: {len(wrong)} bytes are not a whole number"):
+            formats.read(tmp_path / "a.bin", Hints(layout))
+
+
+def test_numbered_files_are_read_in_the_order_of_their_numbers(tmp_path: Path):
+    expected = random_planes(22, 256, 512)
+    for n in range(11):
+        folder = tmp_path / "0" / str(n // 4)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"filename{n}.bin").write_bytes(planes.encode_half(expected[2 * n : 2 * n + 2]))
+    footage = formats.read(tmp_path, Hints("swissspad2-half"))
+    assert footage.shape == (22, 256, 512)
+    np.testing.assert_array_equal(footage.read(0, 22), expected)
+    np.testing.assert_array_equal(footage.read(5, 13), expected[5:13])
+    assert [p.name for p in numbered([Path("a10.png"), Path("a9.png"), Path("a1.png")])] == [
+        "a1.png",
+        "a9.png",
+        "a10.png",
+    ]
+
+
+@settings(max_examples=40, deadline=None)
+@given(height=st.integers(1, 12), width=st.integers(1, 5).map(lambda n: 8 * n), seed=st.integers(0, 99))
+def test_spike_files(tmp_path_factory: pytest.TempPathFactory, height: int, width: int, seed: int):
+    folder = tmp_path_factory.getbasetemp()
+    expected = random_planes(3, height, width, seed=seed)
+    path = folder / "a.dat"
+    path.write_bytes(planes.encode_spike(expected))
+    np.testing.assert_array_equal(everything(path, height=height, width=width), expected)
+    np.testing.assert_array_equal(everything(path, height=height, width=width, columns=width - 1), expected[..., :-1])
+
+
+def test_spike_size_from_the_side_file(tmp_path: Path):
+    expected = random_planes(2, 6, 8)
+    (tmp_path / "a.dat").write_bytes(planes.encode_spike(expected))
+    with pytest.raises(ValueError, match="does not hold its size"):
+        formats.read(tmp_path / "a.dat")
+    (tmp_path / "config.yaml").write_text("data:\n  spike_h: 6\n  spike_w: 8\n")
+    np.testing.assert_array_equal(everything(tmp_path / "a.dat"), expected)
+    with pytest.raises(ValueError, match="12 bytes are not a whole number"):
+        formats.read(tmp_path / "a.dat", Hints(height=5, width=8))
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("root", [False, True])
+def test_zarr_of_both_versions(tmp_path: Path, version: int, root: bool):
+    zarr = pytest.importorskip("zarr")
+    expected = random_planes(11, 5, 7)
+    path = str(tmp_path / "a.zarr")
+    if root:
+        array = zarr.open_array(path, mode="w", shape=expected.shape, chunks=(4, 5, 7), dtype="u1", zarr_format=version)
+    else:
+        group = zarr.open_group(path, mode="w", zarr_format=version)
+        group.attrs["fps"] = 1000
+        array = group.create_array("frames", shape=expected.shape, chunks=(4, 5, 7), dtype="u1")
+    array[...] = expected
+    footage = formats.read(Path(path))
+    np.testing.assert_array_equal(footage.read(0, 11), expected)
+    if not root:
+        assert footage.meta["attributes"]["fps"] == 1000
+
+
+def test_zarr_without_frames_or_with_missing_chunks(tmp_path: Path):
+    zarr = pytest.importorskip("zarr")
+    zarr.open_group(str(tmp_path / "e.zarr"), mode="w").create_array("frames", shape=(0, 5, 7), dtype="u1")
+    with pytest.raises(ValueError, match="has no frames"):
+        formats.read(tmp_path / "e.zarr")
+    video.write_zarr(tmp_path / "m.zarr", iter([random_planes(4, 5, 7)]), (4, 5, 7), {})
+    shutil.rmtree(tmp_path / "m.zarr" / "frames" / "c")
+    with pytest.raises(ValueError, match="0 of 1 chunks are there; the recording is incomplete"):
+        formats.read(tmp_path / "m.zarr")
+
+
+@pytest.mark.parametrize("level", ["5", "7.3"])
+def test_mat_parts_of_unequal_length(tmp_path: Path, level: str):
+    expected = random_planes(8, 5, 7)
+    for k, part in ((1, expected[:5]), (2, expected[5:])):
+        path = tmp_path / f"part_{k}.mat"
+        if level == "5":
+            from scipy.io import savemat
+
+            savemat(path, {"OUTPUT": part.transpose(1, 2, 0)}, do_compression=k == 2)
+        else:
+            h5py = pytest.importorskip("h5py")
+            with h5py.File(path, "w", userblock_size=512) as file:
+                file["OUTPUT"] = part.transpose(0, 2, 1)  # MATLAB's columns first, as HDF5 sees it: [T, W, H]
+    (tmp_path / "info.json").write_text('{"no_parts": 2}')
+    np.testing.assert_array_equal(everything(tmp_path), expected)
+    (tmp_path / "part_2.mat").unlink()
+    with pytest.raises(FileNotFoundError, match=r"part_2\.mat: missing, though info\.json speaks of 2 parts"):
+        formats.read(tmp_path)
+
+
+@pytest.mark.parametrize("width", [7, 10, 16])
+@pytest.mark.parametrize("sharded", [False, True])
+def test_visionsim_folders(tmp_path: Path, width: int, sharded: bool):
+    expected = random_planes(9, 5, width, 3)
+    packed = np.packbits(expected, axis=2)
+    if sharded:
+        for n in range(3):
+            np.save(tmp_path / f"{n:04d}.npy", packed[4 * n : 4 * n + 4])
+    else:
+        np.save(tmp_path / "frames.npy", packed)
+    info = {"w": width, "h": 5, "c": 3, "bitpack": True, "bitpack_dim": 2}
+    (tmp_path / "transforms.json").write_text(json.dumps(info))
+    with pytest.raises(ValueError, match="3 colour planes; choose one with --channel"):
+        formats.read(tmp_path)
+    for channel in range(3):
+        np.testing.assert_array_equal(everything(tmp_path, channel=channel), expected[..., channel])
+    footage = formats.read(tmp_path, Hints(channel=1))
+    np.testing.assert_array_equal(footage.read(3, 6), expected[3:6, ..., 1])
+    (tmp_path / "transforms.json").write_text(json.dumps(info | {"w": width + 8}))
+    with pytest.raises(ValueError, match="do not hold the width"):
+        formats.read(tmp_path, Hints(channel=0))
+
+
+def test_single_photon_challenge_cubes(tmp_path: Path):
+    expected = random_planes(16, 6, 16, 3)
+    np.save(tmp_path / "000.npy", np.packbits(expected, axis=2))
+    np.testing.assert_array_equal(everything(tmp_path / "000.npy", layout="cube", channel=2), expected[..., 2])
+    with pytest.raises(ValueError, match="a colour cube of 3 channels; choose one with --channel 0"):
+        formats.read(tmp_path / "000.npy", Hints("cube"))
+
+
+def test_gzipped_cubes(tmp_path: Path):
+    expected = random_planes(3, 5, 16)
+    np.save(tmp_path / "a.npy", np.packbits(expected, axis=-1))
+    (tmp_path / "a.npy.gz").write_bytes(gzip.compress((tmp_path / "a.npy").read_bytes()))
+    np.testing.assert_array_equal(everything(tmp_path / "a.npy.gz"), expected)
+
+
+def test_flips(tmp_path: Path):
+    expected = random_planes(2, 512, 512)
+    (tmp_path / "acq_0.bin").write_bytes(planes.encode_spad512s(expected))
+    np.testing.assert_array_equal(everything(tmp_path / "acq_0.bin", flip="lr"), expected[..., ::-1])
+    np.testing.assert_array_equal(everything(tmp_path / "acq_0.bin", flip="ud"), expected[:, ::-1])
+
+
+# Pictures and video
+
+
+@pytest.mark.parametrize("transfer", ["linear", "srgb", "gamma 2.2"])
+@pytest.mark.parametrize("top", [255, 65535])
+def test_transfer_curves_are_inverted_exactly(transfer: str, top: int):
+    coded = np.arange(top + 1)
+    linear = to_linear(coded, transfer, top)
+    assert (np.diff(linear) >= 0).all()
+    assert (linear[0], linear[-1]) == (0, pytest.approx(1))
+    back = from_linear(linear, transfer, top).astype(int)
+    assert np.abs(back - coded).max() <= (0 if top == 255 else 1)
+
+
+def clip_of(path: Path, frames: np.ndarray) -> Clip:
+    meta = {
+        "shape": list(frames.shape),
+        "frame_rate": 2000.0,
+        "exposure": 5e-4,
+        "radiance_unit": RELATIVE,
+        "camera": None,
+    }
+    with ClipWriter(path, meta) as writer:
+        for t, frame in enumerate(frames):
+            writer.add(t, frame)
+    return Clip.open(path)
+
+
+def test_png_and_tiff_pictures_of_light(tmp_path: Path):
+    tifffile = pytest.importorskip("tifffile")
+    rng = np.random.default_rng(0)
+    for dtype in (np.uint8, np.uint16):
+        images = rng.integers(0, np.iinfo(dtype).max, (3, 9, 7)).astype(dtype)
+        folder = tmp_path / f"png{np.dtype(dtype).name}"
+        folder.mkdir()
+        video.write_png(folder, iter(images))
+        expected = to_linear(images, "srgb", np.iinfo(dtype).max)
+        np.testing.assert_array_equal(everything(folder, transfer="srgb"), expected)
+        for photometric, stored in [("minisblack", images), ("miniswhite", np.iinfo(dtype).max - images)]:
+            path = tmp_path / f"{photometric}.tif"
+            tifffile.imwrite(path, stored, photometric=photometric)
+            np.testing.assert_array_equal(everything(path, transfer="srgb"), expected)
+        with pytest.raises(ValueError, match="does not say how light was coded"):
+            formats.read(folder)
+
+
+def test_colour_becomes_luminance(tmp_path: Path):
+    from PIL import Image
+
+    colour = np.random.default_rng(0).integers(0, 255, (9, 7, 3)).astype(np.uint8)
+    Image.fromarray(colour).save(tmp_path / "a.png")
+    expected = to_linear(colour, "gamma 2.2", 255) @ np.array([0.2126, 0.7152, 0.0722])
+    np.testing.assert_allclose(everything(tmp_path / "a.png", transfer="gamma 2.2")[0], expected, rtol=1e-5)
+
+
+def test_codes_in_pictures(tmp_path: Path):
+    """One-bit PNG, codes as they are, stretched codes; a stretched file is refused unless it is said."""
+    bits1 = random_planes(2, 5, 7).astype(bool)
+    codes = np.random.default_rng(1).integers(0, 8, (2, 5, 7)).astype(np.uint8)
+    codes[0, 0, :2] = 0, 7
+    for name, images in [("one", bits1), ("three", codes), ("wide", video.stretch(codes, 3))]:
+        (tmp_path / name).mkdir()
+        video.write_png(tmp_path / name, iter(images))
+    np.testing.assert_array_equal(everything(tmp_path / "one"), bits1)
+    np.testing.assert_array_equal(everything(tmp_path / "three", bits=3), codes)
+    np.testing.assert_array_equal(everything(tmp_path / "wide", bits=3, stretched=True), codes)
+    with pytest.raises(ValueError, match=r"value \d+ at \(t, y, x\) = .* is no 3-bit code .* --stretched"):
+        everything(tmp_path / "wide", bits=3)
+    lossy = video.stretch(codes, 3)
+    lossy[1, 2, 3] ^= 2
+    (tmp_path / "lossy").mkdir()
+    video.write_png(tmp_path / "lossy", iter(lossy))
+    with pytest.raises(ValueError, match=r"\(t, y, x\) = \(1, 2, 3\).*coded with loss"):
+        everything(tmp_path / "lossy", bits=3, stretched=True)
+
+
+def test_one_bit_tiff_of_both_polarities(tmp_path: Path):
+    tifffile = pytest.importorskip("tifffile")
+    bits = random_planes(1, 5, 11)[0].astype(bool)
+    for photometric, stored in [("minisblack", bits), ("miniswhite", ~bits)]:
+        path = tmp_path / f"{photometric}.tif"
+        tifffile.imwrite(path, stored, photometric=photometric)
+        np.testing.assert_array_equal(everything(path)[0], bits)
+
+
+def test_lossless_video_is_bit_exact_and_ordinary_video_is_not(tmp_path: Path):
+    """A noisy 8-bit clip through our writer and back; the lossy default must differ, or the test tests nothing."""
+    pytest.importorskip("av")
+    codes = np.random.default_rng(0).integers(0, 8, (6, 34, 46)).astype(np.uint8)
+    np.save(tmp_path / "c.npy", codes)
+    stream = formats.to_stream(formats.read(tmp_path / "c.npy", Hints("codes", bits=3)), tmp_path / "s", CAPTURE)
+    exact = formats.export(stream, tmp_path / "exact.mp4", Export("mp4"))
+    found = everything(exact, transfer="linear") * 255
+    np.testing.assert_array_equal(np.rint(found), video.stretch(codes, 3))
+    lossy = formats.export(stream, tmp_path / "lossy.mp4", Export("mp4", lossless=False))
+    difference = np.rint(everything(lossy, transfer="linear") * 255) - video.stretch(codes, 3)
+    assert np.abs(difference).max() > 8
+    assert json.loads((tmp_path / "exact.mp4.json").read_text())["frame_rate"] == 1000.0
+
+
+def test_odd_sizes_of_video(tmp_path: Path):
+    pytest.importorskip("av")
+    frames = np.random.default_rng(0).random((3, 17, 23)).astype(np.float16).astype(np.float32)
+    clip = clip_of(tmp_path / "c", frames)
+    path = formats.export(clip, tmp_path / "c.mp4", Export("mp4", white=1.0))
+    np.testing.assert_array_equal(
+        np.rint(everything(path, transfer="linear") * 255), from_linear(frames, "gamma 2.2", 255)
+    )
+    with pytest.raises(ValueError, match=r"lossy H\.264 needs even sizes"):
+        formats.export(clip, tmp_path / "l.mp4", Export("mp4", lossless=False))
+    assert not (tmp_path / "l.mp4").exists()
+
+
+def test_a_folder_of_videos_becomes_clips(tmp_path: Path):
+    pytest.importorskip("av")
+    frames = np.random.default_rng(0).random((2, 16, 24))
+    clip = clip_of(tmp_path / "c", frames)
+    for name in ("test_00000.mp4", "occ/a.mp4"):
+        formats.export(clip, tmp_path / "in" / name, Export("mp4", white=1.0))
+    options = ["--frame-rate", "2000", "--transfer", "gamma 2.2", "--split", "test"]
+    assert main(["convert", str(tmp_path / "in"), str(tmp_path / "out"), *options]) == 0
+    found = Clip.open(tmp_path / "out" / "occ_a")
+    assert found.meta["split"] == "test"
+    assert found.camera is None
+    np.testing.assert_allclose(found.radiance(1), clip.radiance(1), atol=0.012)  # half a step of 8 bits at the top
+    assert Clip.open(tmp_path / "out" / "test_00000").frame_rate == 2000.0
+
+
+def test_light_out_as_exr_png_and_zarr(tmp_path: Path):
+    from qsim import exr
+
+    frames = np.random.default_rng(0).random((3, 9, 7)).astype(np.float16).astype(np.float32)
+    clip = clip_of(tmp_path / "c", frames)
+    folder = formats.export(clip, tmp_path / "exr", Export("exr"))
+    np.testing.assert_array_equal(exr.read(folder / "000002.exr")["Y"], frames[2])
+    folder = formats.export(clip, tmp_path / "png", Export("png", transfer="srgb", white=1.0))
+    np.testing.assert_allclose(everything(folder, transfer="srgb"), frames, atol=0.005)
+    zarr = pytest.importorskip("zarr")
+    folder = formats.export(clip, tmp_path / "c.zarr", Export("zarr"))
+    np.testing.assert_array_equal(zarr.open_group(str(folder), mode="r")["frames"][...], frames)
+
+
+def test_the_ball_becomes_a_clip_of_relative_light(tmp_path: Path):
+    """A falling ball at 30 000 fps, 12 bits in 16: half precision keeps it to 1 part in 2048."""
+    with np.load(Path(__file__).parents[1] / "data" / "ball_12bit.npz") as archive:
+        stored = archive["frames"][:3]
+    np.save(tmp_path / "ball.npy", stored)
+    line = f"convert {tmp_path}/ball.npy {tmp_path}/ball --frame-rate 30000 --exposure 20e-6 --transfer linear"
+    assert main(line.split()) == 0
+    clip = Clip.open(tmp_path / "ball")
+    assert clip.shape == stored.shape
+    assert clip.meta["radiance_unit"] == RELATIVE
+    assert (clip.frame_rate, clip.exposure) == (30000.0, 20e-6)
+    np.testing.assert_allclose(clip.radiance(1), stored[1] / 65535, rtol=2**-11)
+    assert main(["sense", str(tmp_path / "ball"), "--bits", "3", "--ppp", "3.25"]) == 0
+
+
+# What a file does not say
+
+
+def test_three_raw_layouts_of_one_size_are_not_guessed(tmp_path: Path):
+    """Evidence is shown (here the right reading is the smoothest), the decision is the user's."""
+    bright = 0.3 + 0.25 * np.sin(2 * np.pi * np.arange(512) / 32)
+    waves = (np.random.default_rng(0).random((256, 512, 512), np.float32) < bright).astype(np.uint8)
+    path = tmp_path / "capture.bin"
+    path.write_bytes(planes.encode_spad512s(waves))
+    assert path.stat().st_size == 8_388_608
+    with pytest.raises(ValueError, match=r"8388608 bytes fit .*; choose one with --layout") as caught:
+        formats.read(path)
+    evidence = dict(re.findall(r"([\w-]+) \(roughness ([\d.]+)\)", str(caught.value)))
+    assert sorted(evidence) == ["spad512s", "swissspad2-full", "swissspad2-half"]
+    assert min(evidence, key=lambda name: float(evidence[name])) == "spad512s"
+    path.write_bytes(planes.encode_spad512s(waves) + b"\0\0\0\0")
+    assert formats.detect(path) == "spad512s"
+    path.rename(tmp_path / "acq_000.bin")
+    assert formats.detect(tmp_path / "acq_000.bin") == "spad512s"
+
+
+@pytest.mark.parametrize("top", [1, 3, 7, 15, 127])
+def test_counts_that_look_like_a_cube_are_asked_about(tmp_path: Path, top: int):
+    array = np.zeros((3, 5, 7), np.uint8)
+    array[1, 2, 3] = top
+    np.save(tmp_path / "a.npy", array)
+    with pytest.raises(ValueError, match=rf"uint8 up to {top}: codes of .* choose with --layout codes"):
+        formats.read(tmp_path / "a.npy")
+
+
+def test_detection_by_name_signature_and_type(tmp_path: Path):
+    np.save(tmp_path / "cube.npy", np.full((2, 3, 4), 200, np.uint8))
+    np.save(tmp_path / "light.npy", np.full((2, 3, 4), 0.5, np.float32))
+    np.save(tmp_path / "counts.npy", np.full((2, 3, 4), 5, np.uint16))
+    np.save(tmp_path / "planes.npy", np.ones((2, 3, 4), bool))
+    kinds = {"cube": "cube", "light": "light", "counts": "light", "planes": "codes"}
+    assert {name: formats.detect(tmp_path / f"{name}.npy") for name in kinds} == kinds
+    (tmp_path / "x.xyz").touch()
+    with pytest.raises(ValueError, match="unknown kind of file; say which with --layout: cube, "):
+        formats.read(tmp_path / "x.xyz")
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        formats.read(tmp_path / "none.npy")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="a folder of no known kind"):
+        formats.read(tmp_path / "empty")
+
+
+def test_captures_without_sense():
+    with pytest.raises(ValueError, match="frame rate: expected frames per second above 0"):
+        Capture(0)
+    with pytest.raises(ValueError, match=r"at most a frame's 0\.001 s"):
+        Capture(1000, exposure=2e-3)
+
+
+def test_wrong_kinds_are_refused_with_advice(tmp_path: Path):
+    np.save(tmp_path / "planes.npy", np.ones((2, 3, 4), bool))
+    np.save(tmp_path / "light.npy", np.ones((2, 3, 4), np.float32))
+    codes, light = formats.read(tmp_path / "planes.npy"), formats.read(tmp_path / "light.npy")
+    with pytest.raises(ValueError, match="holds codes, not light"):
+        formats.to_clip(codes, tmp_path / "c", CAPTURE)
+    with pytest.raises(ValueError, match="holds light, not codes"):
+        formats.to_stream(light, tmp_path / "s", CAPTURE)
+    stream = formats.to_stream(codes, tmp_path / "s", CAPTURE)
+    clip = formats.to_clip(light, tmp_path / "c", CAPTURE)
+    for source, kind, message in [(clip, "cube", "a clip holds light"), (stream, "exr", "EXR holds light")]:
+        with pytest.raises(ValueError, match=message):
+            formats.export(source, tmp_path / "out", Export(kind))
+        assert not (tmp_path / "out").exists()
+    with pytest.raises(FileExistsError, match="--force"):
+        formats.to_stream(codes, tmp_path / "s", CAPTURE)
+
+
+def test_our_one_bit_stream_is_a_photon_cube_for_others(tmp_path: Path):
+    """The independent reader of the field's own tool, where its wheel is installed."""
+    photoncube = pytest.importorskip("photoncube", reason="the package photoncube is not installed")
+    expected = random_planes(4, 6, 16)
+    np.save(tmp_path / "p.npy", expected.astype(bool))
+    stream = formats.to_stream(formats.read(tmp_path / "p.npy"), tmp_path / "cube", CAPTURE)
+    cube = photoncube.PhotonCube.open(str(stream.path))
+    images = cube.process_cube if hasattr(cube, "process_cube") else cube.to_numpy
+    np.testing.assert_array_equal(np.asarray(images()) > 0, expected > 0)
+
+
+def test_streams_survive_an_interrupted_conversion(tmp_path: Path):
+    np.save(tmp_path / "p.npy", np.ones((4, 6, 16), bool))
+
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        formats.to_stream(formats.read(tmp_path / "p.npy"), tmp_path / "s", CAPTURE, progress=stop)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["p.npy"]
+
+
+def test_opening_an_unfinished_stream(tmp_path: Path):
+    with pytest.raises(FileNotFoundError, match="no such stream"):
+        Stream.open(tmp_path / "s.json")
+    (tmp_path / "s.json").write_text('{"format_version": 1}')
+    with pytest.raises(ValueError, match="key 'shape' is missing"):
+        Stream.open(tmp_path / "s.json")
