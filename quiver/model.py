@@ -3,13 +3,13 @@
     codes/(2^b - 1) [B, T, 1, H, W] -> denoised frames, flows, aligned and fused features, recurrent fusion,
     temporal attention, refinement from 1/4 to full scale -> Output
 
-With channels = 64 or 16 this is the published network to the last digit (tests/quiver/test_golden.py). Everything
-else in `Config` is our own variation; the preset `nano` uses it to fit two CPU cores.
+With the presets `quiver` and `quiver-s` this is the published network to the last digit
+(tests/quiver/test_golden.py); what else can be set, and the preset `nano`, is in config.py.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -30,83 +30,13 @@ from quiver.blocks import (
     neighbourhoods,
     resize,
 )
+from quiver.config import ABLATIONS, PRESETS, Config
 
 BASELINE_SIGMA = 1.5  # frames, width of the learnt mean before training
 CHUNK_PIXELS = 2**16  # without gradients, frames are taken together up to this many pixels
 
 Pair = tuple[Tensor, Tensor]  # of the previous and the current frame
 Encoded = tuple[Tensor, Tensor, Tensor]  # R1, R2 and the recurrent cell's entry
-
-
-@dataclass(frozen=True)
-class Config:
-    """A QUIVER network. The defaults are the published design at full width."""
-
-    channels: int = 64  # the unit C of all widths
-    deformable_groups: int = 16  # groups of channels with offsets of their own
-    denoiser_growth: int = 64  # channels added per dense layer of the pre-denoiser
-    denoiser_passes: int = 5  # times its one block is passed
-    flow_channels: tuple[int, ...] = (32, 64, 32, 16)  # widths of each flow level
-    flow_kernel: int = 7
-    flow_levels: int = 4  # of the pyramid, at least 3
-    cell_blocks: int = 11  # residual dense blocks of the recurrent cell
-    cell_growth: int | None = None  # channels added by their layers; None = 2C as published
-    attention_width: int | None = None  # channels of the temporal attention; None = 44C as published
-    attention_temperature: float | None = None  # start of a learnt factor on the logits; None = none, as published
-    fold: int = 1  # side of the blocks of pixels that become channels before everything else (1 = none)
-    baseline: bool = False  # add a learnt mean over time of the pre-denoised frames to the output
-    pre_denoiser: bool = True  # ablation: False feeds the noisy frames to both streams and to the flow
-    flow: bool = True  # ablation: False aligns by the learnt offsets alone
-    multi_scale: bool = True  # ablation: False makes a picture at full scale only
-
-    def __post_init__(self) -> None:
-        if self.channels < 2 or self.channels % 2 or self.channels % self.deformable_groups:
-            raise ValueError(
-                f"Config.channels must be even and a multiple of the {self.deformable_groups} deformable groups, "
-                f"got {self.channels}"
-            )
-        for name in ("denoiser_growth", "denoiser_passes", "cell_blocks", "fold", "flow_kernel"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"Config.{name} must be at least 1, got {getattr(self, name)}")
-        if self.flow_levels < 3:
-            raise ValueError(f"Config.flow_levels must be at least 3, one for each scale, got {self.flow_levels}")
-        if self.flow_kernel % 2 == 0:
-            raise ValueError(f"Config.flow_kernel must be odd, got {self.flow_kernel}")
-
-    def to_dict(self) -> dict[str, object]:
-        """Plain values, for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, object]) -> "Config":
-        """Inverse of `to_dict`; ValueError for a field that does not exist."""
-        names = {field.name for field in fields(cls)}
-        for name in values:
-            if name not in names:
-                raise ValueError(f"QUIVER Config has no field {name!r}; known: {', '.join(sorted(names))}")
-        values = dict(values)
-        if "flow_channels" in values:
-            values["flow_channels"] = tuple(values["flow_channels"])  # type: ignore[arg-type]
-        return cls(**values)  # type: ignore[arg-type]
-
-
-PRESETS: dict[str, Config] = {
-    "quiver": Config(),
-    "quiver-s": Config(channels=16),
-    "nano": Config(
-        channels=8,
-        deformable_groups=2,
-        denoiser_growth=8,
-        denoiser_passes=3,
-        flow_channels=(16, 16, 16),
-        flow_kernel=5,
-        cell_blocks=3,
-        attention_width=64,
-        attention_temperature=8.0,
-        fold=2,
-        baseline=True,
-    ),
-}
 
 
 @dataclass(frozen=True)
@@ -134,7 +64,7 @@ class QUIVER(nn.Module):
         self.flow = FlowNetwork(config.flow_channels, config.flow_kernel, config.flow_levels) if config.flow else None
         self.noisy_features = Extractor(image, c)
         self.denoised_features = Extractor(image, c)
-        self.alignment = Alignment(c, config.deformable_groups)
+        self.alignment = Alignment(c, config.deformable_groups, config.deformable_kernel)
         self.fusions = nn.ModuleList(GatedFusion(c) for _ in range(3))
         self.cell = RecurrentCell(image, c, config.cell_blocks, config.cell_growth or 2 * c)
         stacked = 4 * c * WINDOW
@@ -143,6 +73,8 @@ class QUIVER(nn.Module):
         )
         self.refine4 = Refinement(image, c)
         self.refine = Refinement(image, c)
+        if config.lecun:
+            start_from_lecun(self)
         self.baseline = start_from_baseline(self) if config.baseline else None
 
     @property
@@ -168,17 +100,9 @@ class QUIVER(nn.Module):
         if self.flow is None:
             count, _, height, width = reference.shape
             return tuple(reference.new_zeros(count, 2, height // s, width // s) for s in (1, 2, 4))  # type: ignore[return-value]
-        grey = (
-            (reference, support) if self.config.fold == 1 else (v.mean(1, keepdim=True) for v in (reference, support))
-        )
-        return self.flow(*grey)
+        return self.flow(reference.mean(1, keepdim=True), support.mean(1, keepdim=True))
 
-    def fuse(
-        self,
-        noisy: Sequence[Pair],
-        denoised: Sequence[Pair],
-        flows: Sequence[Tensor],
-    ) -> list[Tensor]:
+    def fuse(self, noisy: Sequence[Pair], denoised: Sequence[Pair], flows: Sequence[Tensor]) -> list[Tensor]:
         """(previous, current) features of both streams and flows, per scale -> fused features [N, C, h/s, w/s]."""
         return [
             fusion(self.alignment(*of_denoised, flow), self.alignment(*of_noisy, flow))
@@ -301,17 +225,6 @@ class QUIVER(nn.Module):
         return torch.stack(list(reuse.stream(self, x.unbind(1))), dim=1)
 
 
-# Rows of the paper's ablation (its Table 4, without the pretrained flow): pre-denoiser, flow, multi-scale outputs.
-ABLATIONS: dict[str, tuple[bool, bool, bool]] = {
-    "none": (False, False, False),
-    "denoiser+flow": (True, True, False),
-    "scales": (False, False, True),
-    "flow+scales": (False, True, True),
-    "denoiser+scales": (True, False, True),
-    "all": (True, True, True),
-}
-
-
 def ablated(config: Config, row: str) -> Config:
     """The network without some of its parts, at similar capacity: the recurrent cell grows by what was taken away.
 
@@ -361,6 +274,22 @@ def add_base(pictures: Sequence[Tensor], base: Tensor | None) -> tuple[Tensor, T
     if base is not None:
         pictures = [p + resize(base, *p.shape[2:]) for p in pictures]
     return pictures[0], pictures[1], pictures[2]
+
+
+def start_from_lecun(network: QUIVER) -> None:
+    """Normal weights of variance 1/fan-in and zero biases; the alignment still starts from the flow alone.
+
+    PyTorch's own start has a third of that variance: through the products of the gated fusion, little is left of it.
+    """
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d | nn.Conv3d | nn.Linear):
+            nn.init.normal_(module.weight, std=module.weight[0].numel() ** -0.5)
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+    nn.init.normal_(network.alignment.weight, std=2 * network.alignment.weight[0].numel() ** -0.5)  # masks start at 1/2
+    last = network.alignment.offsets[-1]
+    assert isinstance(last, nn.Conv2d)
+    nn.init.zeros_(last.weight)
 
 
 def start_from_baseline(network: QUIVER) -> nn.Parameter:
