@@ -128,7 +128,9 @@ def test_missing_things_are_named(capsys, tmp_path, tiny_dataset, clip):
     assert f"{gone}: no such file" in mistake(capsys, "restore", gone, "-o", tmp_path / "v.npy", "--method", "moment")
     assert f"{gone}: no such data set" in mistake(capsys, "evaluate", gone, "-o", tmp_path / "t")
     assert f"{gone}: no such data set" in mistake(capsys, "train", gone, "-o", tmp_path / "r", "--steps", 1)
-    assert "no method 'momnt'; known are" in mistake(capsys, "evaluate", tiny_dataset, "-o", gone, "--methods", "momnt")
+    assert "no method 'momnt'; did you mean 'moment'?" in mistake(
+        capsys, "evaluate", tiny_dataset, "-o", gone, "--methods", "momnt"
+    )
     assert "no such file" in mistake(capsys, "evaluate", "--static", gone)
     assert "give a data set" in mistake(capsys, "evaluate")
     assert "--steps or --minutes" in mistake(capsys, "train", tiny_dataset, "-o", tmp_path / "r")
