@@ -149,6 +149,7 @@ def _add_train(sub: Any) -> None:
     parser.add_argument("--minutes", type=positive, help="wall-clock limit; the learning rate is planned for it")
     _add_light(parser, several=True)
     parser.add_argument("--crop", type=count, help="px, side of the training windows")
+    parser.add_argument("--frames", type=count, help="of a training window (default 11, one restored frame; 16: six)")
     parser.add_argument("--batch", type=count, help="windows per step and process")
     parser.add_argument("--learning-rate", type=positive, help="of Adam")
     parser.add_argument("--schedule", choices=("cosine", "plateau"), help="of the learning rate")

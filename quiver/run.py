@@ -39,6 +39,7 @@ class Settings:
     ppp: tuple[float, ...] = (3.25,)  # light levels; every sample draws one
     bits: tuple[int, ...] = (3,)  # bit depths; every sample draws one
     crop: int = 64  # px
+    frames: int = 11  # of a training window; each one beyond eleven is one more restored frame for little more work
     batch: int = 8  # of each process
     learning_rate: float = 1e-3
     betas: tuple[float, float] = (0.9, 0.99)  # of Adam
@@ -64,6 +65,8 @@ class Settings:
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise ValueError(f"--{name.replace('_', '-')} must be above 0, got {value!r}")
+        if self.frames < 11:
+            raise ValueError(f"--frames must be at least 11, the window of the networks, got {self.frames}")
         for name, known in (("schedule", SCHEDULES), ("precision", PRECISIONS), ("loss", tuple(LOSSES))):
             if getattr(self, name) not in known:
                 raise ValueError(f"no {name} is called {getattr(self, name)!r}; known are {', '.join(known)}")

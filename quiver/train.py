@@ -116,7 +116,7 @@ def make_windows(settings: Settings, multiple: int) -> tuple[Windows, Subset[dic
         raise ValueError(f"--crop {settings.crop}: this network needs a multiple of {multiple}")
     window = WindowSettings(
         lights=settings.lights,
-        frames=WINDOW,
+        frames=settings.frames,
         crop=settings.crop,
         flips=settings.flips,
         reverse=settings.reverse,
@@ -130,7 +130,7 @@ def make_windows(settings: Settings, multiple: int) -> tuple[Windows, Subset[dic
         warnings.warn(f"{settings.data}: no clip in split '{split}'; validating on training clips", stacklevel=2)
         validation = training
     side = min(VALIDATION_SIDE, *(min(clip.shape[1:]) for clip in validation)) // multiple * multiple
-    fixed = Windows(validation, replace(window, crop=max(side, multiple)), fixed=True)
+    fixed = Windows(validation, replace(window, frames=WINDOW, crop=max(side, multiple)), fixed=True)
     return windows, Subset(fixed, range(0, len(fixed), -(-len(fixed) // settings.validation_windows)))
 
 
