@@ -258,14 +258,16 @@ def _model(
     return shares, list(jacobians), list(s * light[:, None] * by_dark)
 
 
-def _log_likelihood(stacks: Sequence[Stack], shares: Sequence[Array]) -> float:
+def _log_likelihood(stacks: Sequence[Stack], shares: Sequence[Array] | Array) -> float:
     return sum(
         float(np.sum(np.where(s.histogram > 0, s.histogram * np.log(np.maximum(p, 1e-300)), 0.0)))
         for s, p in zip(stacks, shares, strict=True)
     )
 
 
-def _information(stacks: Sequence[Stack], shares: Sequence[Array], jacobians: Sequence[Array]) -> tuple[Array, Array]:
+def _information(
+    stacks: Sequence[Stack], shares: Sequence[Array] | Array, jacobians: Sequence[Array]
+) -> tuple[Array, Array]:
     """Fisher information of the pooled histograms [m, m] and the score [m]."""
     size = jacobians[0].shape[0]
     information, score = np.zeros((size, size)), np.zeros(size)

@@ -171,17 +171,17 @@ def _efficiency(
 
     The dead time's own uncertainty moves all flats together.
     """
-    known = [flat for flat in flats if flat.photons]
+    known = [(flat, flat.photons) for flat in flats if flat.photons]
     if not known:
         return {}
 
     def slopes(used: Response) -> tuple[Array, Array]:
         rate, rate_variance = _dark_rates(darks, used) if darks else (np.zeros(1), 0.0)
         values, variances = [], []
-        for flat in known:
+        for flat, photons in known:
             arrivals, of_mean, _ = used.of_stack(flat)
-            values.append(float(arrivals.mean() - rate.mean() * flat.exposure) / flat.photons)
-            variances.append((of_mean + rate_variance * flat.exposure**2) / flat.photons**2)
+            values.append(float(arrivals.mean() - rate.mean() * flat.exposure) / photons)
+            variances.append((of_mean + rate_variance * flat.exposure**2) / photons**2)
         return np.array(values), np.maximum(variances, 1e-300)
 
     values, variances = slopes(response)

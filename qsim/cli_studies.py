@@ -1,4 +1,4 @@
-"""Commands that look and study: `report`, `tradeoff`, `calibrate`. The pairs `add_X` and `_run_X` of cli.py."""
+"""Commands that look and study: `report`, `tradeoff`, `calibrate`, `validate`; pairs `add_X`, `_run_X` as in cli.py."""
 
 from __future__ import annotations
 
@@ -89,14 +89,11 @@ def add_calibrate(sub: Any) -> None:
         "qsim calibrate --bits 8 --dark d1.npy 1e-3 --dark d2.npy 0.1 --flat f.npy 1e-3 --flat g.npy 1e-3 -o my.toml\n"
         "qsim calibrate --model spad --bits 1 --dark dark.npy 1e-5 --flat flat.npy 1e-5 0.8 -o spad.toml",
     )  # fmt: skip
-    stack = {"action": "append", "nargs": "+", "default": []}
-    parser.add_argument("--dark", metavar=("FILE", "SECONDS"), help="frames without light, and their exposure", **stack)
-    parser.add_argument(
-        "--flat",
-        metavar=("FILE", "SECONDS"),
-        help="evenly lit frames, exposure, and the photons per pixel if known",
-        **stack,
-    )
+    for option, names, what in (
+        ("--dark", ("FILE", "SECONDS"), "frames without light, and their exposure"),
+        ("--flat", ("FILE", "SECONDS"), "evenly lit frames, their exposure, and the photons per pixel if known"),
+    ):
+        parser.add_argument(option, metavar=names, help=what, action="append", nargs="+", default=[])
     parser.add_argument("--bits", type=int, required=True, help="of a code; 1 for binary planes")
     parser.add_argument("--model", choices=("qis", "spad"), default="qis", help="default qis")
     parser.add_argument("--paralyzable", action="store_true", help="spad: every arrival restarts the dead time")
@@ -165,3 +162,33 @@ def integers(text: str) -> list[int]:
     if not all(word.strip().isdecimal() for word in words):
         raise argparse.ArgumentTypeError(f"whole numbers with commas, as in 1,3,5; got {text!r}")
     return [int(word) for word in words]
+
+
+# validate
+
+
+def add_validate(sub: Any) -> None:
+    parser = command(
+        sub, "validate", _run_validate, "Measure the sensor engines here: speed against error, statistics, hard cases.",
+        "qsim validate sensor\nqsim validate sensor --json -o out/sensor.png",
+    )  # fmt: skip
+    parser.add_argument("what", choices=["sensor"], help="what to validate")
+    parser.add_argument("-o", "--output", type=Path, help="figure of speed against error (.png, .svg or .pdf)")
+    parser.add_argument("--pixels", type=int, default=1 << 20, help="pixels of a draw (default 1048576)")
+    parser.add_argument("--seed", type=int, default=0, help="of the draws (default 0)")
+    parser.add_argument("--require-speed", action="store_true", help="a speed below its target is a failure too")
+    parser.add_argument("--force", action="store_true", help="replace an existing figure")
+
+
+def _run_validate(args: argparse.Namespace) -> int:
+    from qsim import validate
+
+    if args.output is not None:
+        validate.check_figure(args.output)
+        if args.output.exists() and not args.force:
+            raise FileExistsError(f"{args.output}: exists; name another with -o, or use --force to replace it")
+    report = validate.run(args.pixels, args.seed, require_speed=args.require_speed)
+    if args.output is not None:
+        validate.figure(report, args.output)
+    output(args, report.to_dict(), validate.table(report))
+    return 0 if report.ok else 1
