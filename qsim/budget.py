@@ -19,17 +19,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.denoise import DENOISE_COST, available, denoised, denoised_error
+
 if TYPE_CHECKING:
     from qsim.render import Renderer
     from qsim.scene import Camera, Scene
 
-PILOT_PIXELS = 6000
+PILOT_PIXELS = 3000
+WINDOW = 192  # px, largest side of the window in which the denoiser is tried
+DENOISED = (8, 32, 128)  # samples tried with it
 PILOT_STAGE = 18  # of the random keys
 SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
 SENSOR_SHARE = 0.01  # of the shot variance that Monte-Carlo noise may add
-DEPTHS = (1, 2, 3, 4, 6, 8, 12)  # bounces tried, against
+DEPTHS = (2, 4, 6, 9, 12)  # bounces tried, against (each depth is a kernel to compile)
 DEEPEST = 16
-FEW, SEVERAL, MANY = 16, 32, 64  # samples of pilots; FEW and MANY give the law error = c * samples^-a
+FEW, MANY = 32, 128  # samples of the two pilots that give the law error = c * samples^-a
 MOST_SAMPLES = 16384
 SHARP_FROM = 0.05  # px of motion in the exposure from which a sharp instant is stored too
 
@@ -51,6 +55,7 @@ class Budget:
     bounces: int = 6  # scatterings along a path
     sub_frames: int = 9  # instants per exposure when the shutter is open
     sharp: bool = True  # also render the instant at mid-exposure when the shutter is open
+    denoise: bool = False  # Open Image Denoise; its error is measured against raw halves
     findings: tuple[Finding, ...] = field(default=())
 
     def __post_init__(self) -> None:
@@ -74,18 +79,20 @@ def choose(
     psnr: float = 40.0,
     ppp: float | None = None,
     quantum_efficiency: float = 1.0,
+    denoise: bool | None = None,
     seed: int = 0,
 ) -> Budget:
     """The smallest budget that keeps the error below `psnr` [dB] and, at `ppp` photons, below the sensor's noise.
 
-    `ppp` is the highest light level that the clip will be sensed at (None: only `psnr` counts). Depends on nothing but
-    its arguments, so that an interrupted clip is continued with the same budget.
+    `ppp` is the highest light level that the clip will be sensed at (None: only `psnr` counts). `denoise` None means:
+    where it is installed and, at the same measured error, cheaper. Depends on nothing but its arguments and on what is
+    installed, so that an interrupted clip is continued with the same budget.
     """
     if not 10 <= psnr <= 80:
         raise ValueError(f"psnr: 10 to 80 dB can be asked for, got {psnr!r}")
     pilot = _pilot(scene, frame_rate, seed)
     times = sorted({0, frames // 2, frames - 1})
-    bright = np.stack([_mean(pilot, t, Budget(SEVERAL, DEEPEST)) for t in times])
+    bright = np.stack([_mean(pilot, t, Budget(FEW, DEEPEST)) for t in times])
     peak, mean = float(np.percentile(bright, 99.9)), float(bright.mean())
     if not mean > 0:
         raise ValueError(f"scene {scene.name}: the pilot saw no light in frames {times}; is a lamp behind a wall?")
@@ -95,9 +102,16 @@ def choose(
     contrast = peak - float(np.percentile(bright, 0.1))
     sub_frames, travel, about_blur = _sub_frames(truths, shutter, SHARE * allowed / contrast if contrast > 0 else 1.0)
     instants = sub_frames if shutter > 0 else 1
-    samples, about_samples = _samples(pilot, times, bounces, instants, allowed * math.sqrt(1 - 2 * SHARE**2), peak)
-    findings = (limit, about_samples, about_bounces, about_blur, *_left_out(scene.camera, truths))
-    return Budget(samples, bounces, sub_frames, travel >= SHARP_FROM, findings)
+    noise = allowed * math.sqrt(1 - 2 * SHARE**2)
+    samples, about_samples = _samples(pilot, times, bounces, instants, noise, peak)
+    fewer, about_denoiser = None, Finding("denoiser", "off", "not asked for")
+    if denoise is not False:
+        fewer, about_denoiser = _denoiser(pilot, times[len(times) // 2], bounces, noise, samples / instants, denoise)
+    if fewer is not None:
+        samples = fewer * instants
+        about_samples = Finding("samples", f"{samples} per pixel, denoised", f"without: {about_samples.chosen}")
+    findings = (limit, about_samples, about_denoiser, about_bounces, about_blur, *_left_out(scene.camera, truths))
+    return Budget(samples, bounces, sub_frames, travel >= SHARP_FROM, fewer is not None, findings)
 
 
 def explain(budget: Budget) -> str:
@@ -107,12 +121,9 @@ def explain(budget: Budget) -> str:
 
 
 def grid_samples(samples: int) -> int:
-    """The smallest count of at least `samples` that multijitter can lay out as a nearly square grid."""
-    while True:
-        columns = round(math.sqrt(samples))
-        if columns * math.ceil(samples / columns) == samples:
-            return samples
-        samples += 1
+    """The count that multijitter rounds `samples` up to: a grid of floor(sqrt(samples)) columns."""
+    columns = math.isqrt(samples)
+    return columns * math.ceil(samples / columns)
 
 
 def blur_error(travel: float, instants: int) -> float:
@@ -157,7 +168,7 @@ def _allowed(peak: float, mean: float, psnr: float, ppp: float | None, efficienc
 def _bounces(pilot: Renderer, times: list[int], full: Array, tolerance: float) -> tuple[int, Finding]:
     """The smallest depth whose radiance differs from that of DEEPEST by an rms below the tolerance (same paths)."""
     for bounces in DEPTHS:
-        cut = np.stack([_mean(pilot, t, Budget(SEVERAL, bounces)) for t in times])
+        cut = np.stack([_mean(pilot, t, Budget(FEW, bounces)) for t in times])
         left_out = float(np.sqrt(np.mean((full - cut) ** 2)))
         if left_out <= tolerance:
             break
@@ -205,6 +216,35 @@ def _samples(
     if each > wanted:
         size += f", the limit of {MOST_SAMPLES} samples is reached"
     return samples, Finding("samples", f"{samples} per pixel", size)
+
+
+def _denoiser(
+    pilot: Renderer, t: int, bounces: int, target: float, raw: float, wanted: bool | None
+) -> tuple[int | None, Finding]:
+    """Samples per instant with which the denoised window has the error asked for, or None where raw ones cost less."""
+    if pilot.engine.backend == "scalar" or not available():
+        return None, Finding("denoiser", "off", "not installed" if not available() else "needs LLVM or CUDA")
+    camera = pilot.scene.camera
+    height, width = min(camera.height, WINDOW), min(camera.width, WINDOW)
+    crop = ((camera.height - height) // 2, (camera.width - width) // 2, height, width)
+    window = pilot.window(crop)
+    instants, key = [window.time(t)], window.key(t, PILOT_STAGE)
+    albedo, normal = window.surfaces(instants, key)
+    before = error = math.inf
+    for samples in DENOISED:
+        if wanted is None and samples + DENOISE_COST >= raw:
+            break
+        halves = window.halves(instants, Budget(samples, bounces), key)
+        before, error = error, denoised_error(halves, denoised(halves[0], albedo, normal))
+        if error <= target:
+            if math.isfinite(before):  # between the last two trials error is a power of the samples
+                share = math.log(before / target) / math.log(before / error)
+                samples = math.ceil(samples * 0.25 ** (1 - share))
+            size = f"rms {min(target, error):.2g} in the middle of frame {t}"
+            return 2 * grid_samples(math.ceil(samples / 2)), Finding("denoiser", "on", size)
+    if wanted:
+        return DENOISED[-1], Finding("denoiser", "on", f"rms {error:.2g}, above the target")
+    return None, Finding("denoiser", "off", f"{raw:.0f} raw samples cost no more")
 
 
 def _left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, ...]:

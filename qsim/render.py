@@ -10,6 +10,7 @@ are words of qsim.keys, so any frame can be rendered alone, in any order. With e
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -20,8 +21,9 @@ from numpy import ndarray as Array
 
 from qsim import engine as engines
 from qsim import truth
-from qsim.budget import Budget
+from qsim.budget import Budget, grid_samples
 from qsim.clip import PHYSICAL, Clip, ClipWriter
+from qsim.denoise import denoised, denoised_error
 from qsim.keys import Key, hash_name, words
 from qsim.scene import Scene, describe
 from qsim.translate import Stage
@@ -31,6 +33,7 @@ Crop = tuple[int, int, int, int]  # y, x, height, width
 
 RENDER_STAGE = 16  # of the random keys: sampler seeds
 SHARP_STAGE = 17  # the sharp instant has seeds of its own
+SURFACE_SAMPLES = 16  # per pixel, for the denoiser's albedo and normals
 MAX_LANES = 2**23  # samples in flight; more are split into passes
 FIREFLY = 10.0  # a pixel counts as a firefly where halves differ by this many rms of the frame's difference
 
@@ -110,6 +113,12 @@ class Renderer:
             sharp = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))[0]
         return Frame(radiance, error, fireflies, sharp, **found)
 
+    def window(self, crop: Crop) -> Renderer:
+        """The same loaded scene seen through another crop, every pixel of it."""
+        other = copy.copy(self)
+        other.crop, other.thinned, other.shape = _checked_crop(self.scene, crop), 1, crop[2:]
+        return other
+
     def instants(self, t: int) -> list[float]:
         """The times [s] whose mean is the exposure of frame t."""
         count = self.budget.sub_frames if self.shutter > 0 else 1
@@ -139,7 +148,37 @@ class Renderer:
         difference = (halves[0] - halves[1]) / 2
         error = float(np.sqrt(np.mean(difference**2)))
         fireflies = int(np.count_nonzero(np.abs(difference) > FIREFLY * error)) if error > 0 else 0
-        return halves.mean(axis=0).astype(np.float32), error, fireflies
+        radiance = halves.mean(axis=0)
+        if self.budget.denoise:
+            albedo, normal = self.surfaces(instants, key)
+            error = denoised_error(halves, denoised(halves[0], albedo, normal))
+            radiance = denoised(radiance, albedo, normal)
+        return radiance.astype(np.float32), error, fireflies
+
+    def surfaces(self, instants: list[float], key: Key) -> tuple[Array, Array]:
+        """Albedo [H, W] (1 where nothing or a mirror is) and normals [H, W, 3] of first surfaces, for the denoiser."""
+        if self.engine.backend == "scalar":
+            raise ValueError("the scalar engine cannot denoise; leave Budget.denoise off or install LLVM")
+        import drjit as dr
+
+        mi, (height, width) = self._mi, self.shape
+        samples = grid_samples(max(2, SURFACE_SAMPLES // len(instants)))
+        sums = np.zeros((4, height, width))
+        for instant, seed in zip(instants, words(key, (1, len(instants)), redraw=1)[0], strict=True):
+            self._stage.place(instant)
+            sampler, position = self._film_positions(int(seed), samples)
+            ray = self._camera_ray(self.scene.camera.pose(instant), position, sampler)
+            found = self._stage.loaded.ray_intersect(ray)
+            bsdf = found.bsdf(ray)
+            seen = found.is_valid()
+            matt = seen & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
+            albedo = dr.select(matt, bsdf.eval_diffuse_reflectance(found)[0], 1)
+            normal = dr.select(seen, found.sh_frame.n, 0)
+            means = [dr.block_sum(value, samples) / samples for value in (albedo, normal.x, normal.y, normal.z)]
+            dr.eval(*means)
+            sums += np.stack([np.array(mean, np.float64).reshape(height, width) for mean in means])
+        albedo, *normals = sums / len(instants)
+        return albedo, np.stack(normals, axis=-1)
 
     def _pass(self, pose: Array, seed: int, samples: int, bounces: int) -> Array:
         """One independent estimate of the radiance of every pixel, float64 [H, W]."""
@@ -148,18 +187,28 @@ class Renderer:
             return self._film_pass(pose, seed, samples, integrator)
         import drjit as dr
 
-        mi = self._mi
-        (y0, x0), (height, width), step = self.crop[:2], self.shape, self.thinned
+        sampler, position = self._film_positions(seed, samples)
+        ray = self._camera_ray(pose, position, sampler)
+        radiance, _, _ = integrator.sample(self._stage.loaded, sampler, ray)
+        mean = dr.block_sum(radiance[0], samples) / samples
+        return np.array(mean, np.float64).reshape(self.shape)
+
+    def _film_positions(self, seed: int, samples: int) -> tuple[Any, Any]:
+        """A seeded sampler and film positions [px], uniform in each pixel, whose samples are neighbours in memory.
+
+        Size and place of the window are data, not code: a pilot and a whole frame share one compiled kernel.
+        """
+        import drjit as dr
+
+        mi, (height, width) = self._mi, self.shape
         lanes = height * width * samples
         sampler = self._sampler(samples)
         sampler.seed(seed, lanes)
+        columns, step, y0, x0 = (mi.UInt32([value]) for value in (width, self.thinned, *self.crop[:2]))
         pixel = dr.arange(mi.UInt32, lanes) // samples
-        row = pixel // width
-        corner = mi.Point2f(mi.Float(pixel - row * width) * step + x0, mi.Float(row) * step + y0)
-        ray = self._camera_ray(pose, corner + sampler.next_2d(), sampler)
-        radiance, _, _ = integrator.sample(self._stage.loaded, sampler, ray)
-        mean = dr.block_sum(radiance[0], samples) / samples
-        return np.array(mean, np.float64).reshape(height, width)
+        row = pixel // columns
+        corner = mi.Point2f(mi.Float((pixel - row * columns) * step + x0), mi.Float(row * step + y0))
+        return sampler, corner + sampler.next_2d()
 
     def _integrator(self, bounces: int) -> Any:
         """A path tracer without Russian roulette, so that the same seed draws the same paths at every depth."""
@@ -250,7 +299,7 @@ class Renderer:
         ray = mi.Ray3f(mi.Point3f(*(float(x) for x in origin)), mi.Vector3f(unit.T.astype(np.float32)))
         found = self._stage.loaded.ray_intersect_preliminary(ray, coherent=True)
         shape = dr.reinterpret_array(mi.UInt32, found.shape)
-        instance = dr.reinterpret_array(mi.UInt32, found.instance)
+        instance: Any = dr.reinterpret_array(mi.UInt32, found.instance)
         index = np.array(dr.select(instance > 0, instance, shape))
         number = self._numbers[np.minimum(index, len(self._numbers) - 1)]
         distance = np.where(number >= 0, np.array(found.t, np.float64), np.inf)
@@ -279,7 +328,8 @@ class Renderer:
 
         mi, numbers = self._mi, self._stage.shape_numbers()
         shapes = self._stage.loaded.shapes()
-        indices = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
+        pointers: list[Any] = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)) for shape in shapes]
+        indices = [int(pointer[0]) for pointer in pointers]
         table = np.full(max([0, *indices]) + 2, -1, np.int32)
         for index, shape in zip(indices, shapes, strict=True):
             table[index] = numbers.get(shape.id(), -1)
