@@ -11,7 +11,7 @@ import pytest
 from stats import assert_histogram, assert_mean, assert_share, critical_z
 
 import qsim.sensor
-from qsim.keys import Key
+from qsim.keys import Key, uniform, uniform_pair, words
 from qsim.qis import QIS
 from qsim.sensor import Sensor
 from qsim.spad import BinarySPAD, CountingSPAD
@@ -43,6 +43,19 @@ def test_the_three_descriptions_agree(sensor: Sensor):
     h = 1e-3
     near, far = (sensor.cdf(light + d, EXPOSURE) - sensor.cdf(light - d, EXPOSURE) for d in (h, 2 * h))
     np.testing.assert_allclose(sensor.dcdf(light, EXPOSURE), (8 * near - far) / (12 * h), atol=1e-9)
+
+
+@each
+@pytest.mark.parametrize("light", [0.0, 1e-12, 1e4, 1e12])
+def test_extreme_light_is_a_distribution(sensor: Sensor, light):
+    """One pixel among them, and a whole frame drawn: no NaN, no code without probability, nothing above 1."""
+    cdf, pmf, log_pmf = (f(light, EXPOSURE) for f in (sensor.cdf, sensor.pmf, sensor.log_pmf))
+    assert np.all((cdf >= 0) & (cdf <= 1) & (np.diff(cdf, prepend=0.0) >= -1e-15))
+    assert pmf.sum() == pytest.approx(1.0, abs=1e-12)
+    assert not np.isnan(log_pmf).any()
+    assert not np.isnan(sensor.fisher_information(light, EXPOSURE))
+    codes = sensor.sample(np.full((5, 9), light), EXPOSURE, key=Key(0, 1), engine="reference")
+    assert np.all(pmf[codes] > 0)
 
 
 @each
@@ -297,11 +310,10 @@ def test_tails_are_drawn_to_two_to_the_minus_64():
     assert sensor.codes_at(lowest, lowest, np.array([30.0]), EXPOSURE)[0] == 0
 
 
-def test_the_second_word_is_drawn_when_the_first_cannot_decide():
+@pytest.mark.parametrize("sensor", [BinarySPAD(1.0, 0.0), QIS(1.0, 0.0, 0.0, 1)])
+def test_the_second_word_is_drawn_when_the_first_cannot_decide(sensor: Sensor):
     """A pixel whose F_0 lies in the middle of the cell of its first word is decided by the second word alone."""
-    from qsim.keys import uniform, uniform_pair, words
-
-    key, sensor = Key(9, 9), BinarySPAD(1.0, 0.0)
+    key = Key(9, 9)
     first, second = (words(key, (16, 16), redraw=r) for r in (0, 1))
     light = -np.log(uniform(first))  # F_0 = exp(-photons) = u of the first word
     codes = sensor.sample(light, EXPOSURE, key=key, engine="reference")

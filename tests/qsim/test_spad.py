@@ -97,6 +97,14 @@ def test_planes_that_see_their_own_instant_are_summed_in_groups():
     np.testing.assert_array_equal(codes[0], steady)
 
 
+def test_planes_at_constant_light_are_the_codes_of_a_stack():
+    """A clip at the plane rate whose light holds still for each code: the same codes as at the code rate."""
+    sensor, light = BinarySPAD(0.4, 50.0, 2), np.random.default_rng(1).uniform(0, 9, (3, 6, 9))
+    key = Key(2, 3, frame=4)
+    planes = sensor.sample_planes(np.repeat(light / 3, 3, axis=0), 1e-4, key=key, engine="reference")
+    np.testing.assert_array_equal(planes, sensor.sample(light, 3e-4, key=key, engine="reference"))
+
+
 def test_planes_in_the_wrong_number_are_refused():
     with pytest.raises(ValueError, match=r"planes of a 3-bit code come in groups of 7: \[T 7, H, W\], got \[8, 2, 2\]"):
         BinarySPAD(0.5, 0.0, 3).sample_planes(np.ones((8, 2, 2)), 1e-4, key=Key(0, 0))
