@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from numpy import ndarray as Array
 
@@ -41,5 +42,17 @@ METHODS: dict[str, Method] = {
         Method("transform-denoise", transform_denoise.restore, 3, "variance stabilised, BM3D, exact unbiased inverse"),
         Method("qbp", qbp.restore, 11, "align, Wiener merge, exact inverse response"),
         Method("qbp-bm3d", qbp_bm3d.restore, 11, "align, Wiener merge, stabilise, BM3D, exact unbiased inverse"),
+        Method(
+            "transform-denoise-published",
+            partial(transform_denoise.restore, kind="binomial"),
+            3,
+            "Transform Denoise with the arcsine for sums of binary samples",
+        ),
+        Method(
+            "qbp-published",
+            partial(qbp.restore, settings=qbp.AS_PUBLISHED),
+            11,
+            "QBP with the article's noise estimate and whole-pixel shifts",
+        ),
     )
 }
