@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import __version__
-from qsim.cli_studies import add_calibrate, add_report, add_tradeoff
+from qsim.cli_studies import add_calibrate, add_report, add_tradeoff, add_validate
 from qsim.console import Parser, bar, command, output, run
 from qsim.convert import add_convert
 
@@ -31,6 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         add_report,
         add_tradeoff,
         add_calibrate,
+        add_validate,
     ):
         add(sub)
     return run(parser, argv)

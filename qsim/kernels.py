@@ -112,6 +112,25 @@ def sample_packed(
     return packed if photons.ndim == 3 else packed[0]
 
 
+def steps(sensor: Sensor, photons: Array, exposure: float) -> Array:
+    """The steps F_0 ... as the kernel has them, for validation: photons [p] -> float64 [p, steps] of one plane.
+
+    `ValueError` if no kernel serves this sensor.
+    """
+    chosen = plan(sensor, exposure) if available() else None
+    if chosen is None:
+        raise ValueError(f"no compiled kernel serves {sensor}")
+    import drjit as dr
+
+    jit = _backend()
+    real = jit.Float64 if chosen.double else jit.Float
+    efficiency, dark, _, *scalars = _scalars(chosen)
+    mean = dr.fma(real(jit.Float(np.asarray(photons, np.float32))), efficiency, dark)
+    values, unit = _steps(chosen.steps, mean, scalars)
+    columns = [(value / unit).numpy().astype(float) for value in values]
+    return np.stack(np.broadcast_arrays(*columns, photons)[:-1], axis=1)
+
+
 def _join(numbers: Array, bits: int) -> Array:
     """Neighbours side by side: [H, 2 n] numbers of `bits` bits -> [H, n] of twice as many, the first one highest."""
     dtype = np.min_scalar_type(2 ** (2 * bits) - 1)
@@ -255,7 +274,7 @@ def _count(plan: Plan, photons: list[Any], words: Callable[[Any], list[Any]]) ->
             codes.append(code)
             doubt |= ~(near >= margin * unit)
         return codes, doubt
-    nothing = [dr.exp(-mean) for mean in arrivals]
+    nothing = [_steps(plan.steps, mean, scalars)[0][0] for mean in arrivals]
 
     def add_plane(plane: Any, near: Any, *counts: Any) -> tuple[Any, ...]:
         sums = []
