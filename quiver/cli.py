@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="quiver", description="Restore blur-free video from few-bit quanta streams; train and compare."
     )
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
-    for add in (_add_train, _add_restore, _add_evaluate, _add_bench, _add_convert_weights):
+    for add in (_add_train, _add_restore, _add_evaluate, _add_ablate, _add_bench, _add_convert_weights):
         add(sub)
     return run(parser, argv)
 
@@ -369,6 +369,49 @@ def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
     found = {"counts": str(args.static), "frames": args.frames, "bits": bits, "scores": [asdict(s) for s in scores]}
     output(args, json_safe(found), markdown(counts, scores, args.frames, bits))
     return 1 if any(score.failure for score in scores) else 0
+
+
+# ablate
+
+
+def _add_ablate(sub: Any) -> None:
+    parser = _command(
+        sub, "ablate", _run_ablate, "Train the network without some of its parts, six ways, and compare them.",
+        "quiver ablate out/starter -o out/ablation --minutes 20",
+    )  # fmt: skip
+    parser.add_argument("data", help="data set folder")
+    parser.add_argument("-o", "--output", required=True, help="folder of the six runs and their table")
+    parser.add_argument("--preset", default="nano", choices=NETWORKS[:-1], help="network (default nano)")
+    parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
+    parser.add_argument("--steps", type=count, help="optimiser steps of each")
+    parser.add_argument("--minutes", type=positive, help="wall-clock limit of each")
+    parser.add_argument("--crop", type=count, help="px, side of the training windows")
+    parser.add_argument("--batch", type=count, help="windows per step and process")
+    parser.add_argument("--split", default="test", choices=("train", "val", "test"), help="to score on (default test)")
+    parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
+    _add_running(parser)
+
+
+def _run_ablate(args: argparse.Namespace) -> int:
+    from quiver import table
+    from quiver.ablate import markdown, run_ablation
+    from quiver.data import output
+    from quiver.evaluate import Plan
+
+    args.precision, precision = None, args.precision  # of restoring; training keeps its own default
+    settings = _settings(args)
+    args.precision = precision
+    plan = Plan(args.data, args.split, settings.lights, settings.seed)
+    with _signals() as interrupted:
+        options, show = _options(args), not args.json
+        found = run_ablation(settings, plan, options, should_stop=lambda: bool(interrupted), progress=show)
+    if found is None:
+        print("quiver: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        return 130
+    methods, rows = found
+    table.write(Path(args.output) / "table", plan, methods, rows)
+    output(args, table.as_dict(plan, methods, rows), markdown(args.preset, rows))
+    return 1 if any(row.failure for row in rows) else 0
 
 
 # bench

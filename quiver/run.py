@@ -44,14 +44,14 @@ class Settings:
     learning_rate: float = 1e-3
     betas: tuple[float, float] = (0.9, 0.99)  # of Adam
     schedule: str = "cosine"  # or plateau
-    warmup: int = 100  # steps of linear rise
+    warmup: int = 100  # steps of linear rise, at most a twentieth of the run
     patience: int = 8  # plateau: validations without gain before the rate is halved
     clip_norm: float = 20.0  # L2 norm of the gradient
     loss: str = "published"  # published, paper or l1
     flips: bool = True  # the eight flips and quarter turns
     reverse: bool = True  # time reversal
     force_exposure: bool = False  # published: every window at the light level on its own
-    validate_every: int = 300  # steps
+    validate_every: int = 300  # steps; a run without `steps` validates after every tenth of its time
     validation_split: str = "val"
     validation_windows: int = 16  # at most
     workers: int = 0  # processes that draw samples, beside the training one
@@ -104,6 +104,8 @@ class State:
     plateau_best: float = -math.inf
     plateau_bad: int = 0
     halvings: int = 0
+    tenths: int = 0  # of a timed run, validated so far
+    finished: bool = False
     history: list[dict[str, float]] = field(default_factory=list)  # one entry per validation
 
 

@@ -34,6 +34,7 @@ from quiver.samples import Batches, Windows, WindowSettings
 
 CHECKPOINT_SECONDS = 120.0
 FOREVER = 10**9  # steps of a run that is limited by time
+WARMUP_SHARE = 0.05  # of a run; no warm-up is longer
 PLATEAU_GAIN = 1e-4  # relative gain of PSNR that counts
 VALIDATION_SIDE = 128  # px, at most
 
@@ -89,15 +90,37 @@ def joined(device: str) -> Iterator[Process]:
             torch.distributed.destroy_process_group()
 
 
+def share_used(settings: Settings, state: State) -> float:
+    """How much of the run is over, 0 to 1, by steps or by time, whichever is further."""
+    steps = state.step / settings.steps if settings.steps else 0.0
+    minutes = state.elapsed / (60 * settings.minutes) if settings.minutes else 0.0
+    return min(1.0, max(steps, minutes))
+
+
 def learning_rate(settings: Settings, state: State) -> float:
-    """The rate of the next step: linear warm-up, then a cosine over the share of steps or time used up, or halvings."""
-    rate = settings.learning_rate * min(1.0, (state.step + 1) / max(1, settings.warmup))
+    """The rate of the next step: linear rise, then a cosine over the share of steps or time used up, or halvings.
+
+    The rise ends after `warmup` steps, or after a twentieth of a run so short that this comes first.
+    """
+    share = share_used(settings, state)
+    rise = max((state.step + 1) / max(1, settings.warmup), share / WARMUP_SHARE)
+    rate = settings.learning_rate * min(1.0, rise)
     if settings.schedule == "plateau":
         return rate * 0.5**state.halvings
-    share = state.step / settings.steps if settings.steps else 0.0
-    if settings.minutes:
-        share = max(share, state.elapsed / (60 * settings.minutes))
-    return rate * max(0.01, 0.5 * (1 + math.cos(math.pi * min(1.0, share))))
+    return rate * max(0.01, 0.5 * (1 + math.cos(math.pi * share)))
+
+
+def validation_due(settings: Settings, state: State) -> bool:
+    """Every `validate_every` steps; in a run that only time limits, after every tenth of it."""
+    if settings.steps is not None:
+        return state.step % settings.validate_every == 0
+    before, state.tenths = state.tenths, int(10 * share_used(settings, state))
+    return state.tenths > before
+
+
+def time_is_up(settings: Settings, state: State, validation: float) -> bool:
+    """Whether the last validation, as long as the one before, would no longer fit into the time limit."""
+    return settings.minutes is not None and state.elapsed + validation >= 60 * settings.minutes
 
 
 def note_plateau(patience: int, state: State, psnr: float) -> None:
@@ -134,9 +157,10 @@ def make_windows(settings: Settings, multiple: int) -> tuple[Windows, Subset[dic
     return windows, Subset(fixed, range(0, len(fixed), -(-len(fixed) // settings.validation_windows)))
 
 
-def batches(windows: Windows, settings: Settings, first: int, process: Process) -> Iterator[dict[str, Any]]:
-    """Batch after batch from step `first` on, drawn in this process or in workers: the same bytes."""
-    numbers = Batches(settings.batch, first, settings.steps or FOREVER, process.rank, process.world)
+def batches(windows: Windows, settings: Settings, state: State, process: Process) -> Iterator[dict[str, Any]]:
+    """Batch after batch from the present step on, drawn in this process or in workers: the same bytes."""
+    last = state.step if state.finished else settings.steps or FOREVER
+    numbers = Batches(settings.batch, state.step, last, process.rank, process.world)
     loader = DataLoader(
         windows,
         batch_sampler=numbers,
@@ -257,8 +281,9 @@ def train(
             stack.callback(board.close)
         low = settings.precision == "bfloat16" or (settings.precision == "auto" and process.device.type == "cuda")
         started, saved = time.monotonic() - state.elapsed, time.monotonic()
+        validation = 0.0  # s, that the last one took
 
-        for batch in batches(windows, settings, state.step, process):
+        for batch in batches(windows, settings, state, process):
             # Forward, backward, step
             rate = learning_rate(settings, state)
             for group in optimiser.param_groups:
@@ -278,14 +303,16 @@ def train(
 
             # Now and then: validation, files, the end
             interrupted = process.any(should_stop())
-            out_of_time = settings.minutes is not None and process.any(state.elapsed >= 60 * settings.minutes)
-            ended = state.step == settings.steps or out_of_time
-            if state.step % settings.validate_every == 0 or ended:
+            out_of_time = process.any(time_is_up(settings, state, validation))
+            ended = state.finished = state.step == settings.steps or out_of_time
+            if process.any(validation_due(settings, state)) or ended:
+                began = time.monotonic()
                 if board is not None:
                     score, picture = validate(model, fixed, process.device)
                     board.validation(state, score, picture)
                     record(run, model, state, score, value, rate)
                 state.halvings = process.from_leader(state.halvings)
+                validation = time.monotonic() - began
             if process.leads and (ended or interrupted or time.monotonic() - saved > CHECKPOINT_SECONDS):
                 run.save(run.checkpoint, model, optimiser, state)
                 saved = time.monotonic()

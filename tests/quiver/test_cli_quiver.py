@@ -14,7 +14,7 @@ from quiver.cli import main, size
 from quiver.data import open_clips
 
 ROOT = Path(__file__).parents[2]
-COMMANDS = ("train", "restore", "evaluate", "bench", "convert-weights")
+COMMANDS = ("train", "restore", "evaluate", "ablate", "bench", "convert-weights")
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
@@ -226,3 +226,42 @@ def test_a_checkpoint_that_is_none_is_refused(capsys, tmp_path):
 @pytest.mark.parametrize(("text", "bytes_"), [("2GB", 2e9), ("500MB", 5e8), ("1.5GiB", 1.5 * 2**30), ("4096", 4096)])
 def test_sizes(text, bytes_):
     assert size(text) == bytes_
+
+
+@pytest.mark.slow
+def test_the_ablation(capsys, tiny_dataset, tmp_path):
+    """Six networks of nearly one size, one table; done again at once, because everything is there."""
+    words = [
+        "ablate",
+        tiny_dataset,
+        "-o",
+        tmp_path / "a",
+        "--steps",
+        1,
+        "--crop",
+        16,
+        "--batch",
+        1,
+        "--mode",
+        "streaming",
+    ]
+    code, out, _ = run(capsys, *words)
+    assert code == 0
+    lines = out.strip().splitlines()[2:]
+    assert lines[0].startswith("| no | no | no |")
+    sizes = [int(line.split("|")[4].replace(",", "")) for line in lines]
+    assert max(sizes) < 1.05 * min(sizes)
+    assert run(capsys, *words)[1] == out
+
+
+@pytest.mark.slow
+def test_bench(capsys, tmp_path):
+    words = ["bench", "--methods", "moment,unet", "--size", "32x24", "--threads", 1, "-o", tmp_path / "b"]
+    code, out, _ = run(capsys, *words, "--json")
+    moment, unet = json.loads(out)["costs"]
+    assert code == 0
+    assert moment["psnr_matched"] > 15
+    assert unet["psnr_matched"] is None  # random weights: a cost, no score
+    assert 0.05 < unet["gmac_per_frame"] < 0.2
+    assert {path.name for path in (tmp_path / "b").iterdir()} == {"bench.json", "bench.md", "bench.png"}
+    assert "use --force" in mistake(capsys, *words)

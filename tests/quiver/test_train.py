@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from quiver import train as training
 from quiver.model import Output
 from quiver.run import PROTOCOLS, Run, Settings, State
-from quiver.train import Diverged, learning_rate, make_windows, note_plateau, train
+from quiver.train import Diverged, learning_rate, make_windows, note_plateau, time_is_up, train
 from quiver.unet import UNet, UNetConfig
 from quiver.weights import load, read_notes
 
@@ -86,10 +86,12 @@ def test_an_interruption_saves_its_step(tiny_dataset, tmp_path):
     assert train(small_network(), settings(tiny_dataset, tmp_path / "r"), progress=False).step == 6
 
 
-def test_a_finished_run_stays_finished(tiny_dataset, tmp_path):
-    first = train(small_network(), settings(tiny_dataset, tmp_path / "r"), progress=False)
-    again = train(small_network(1), settings(tiny_dataset, tmp_path / "r"), progress=False)
-    assert again.history == first.history
+@pytest.mark.parametrize("end", [{"steps": 2}, {"steps": None, "minutes": 0.005}])
+def test_a_finished_run_stays_finished(tiny_dataset, tmp_path, end):
+    ended = settings(tiny_dataset, tmp_path / "r", **end)
+    first = train(small_network(), ended, progress=False)
+    again = train(small_network(1), ended, progress=False)
+    assert (again.history, again.step) == (first.history, first.step)
 
 
 @pytest.mark.slow
@@ -180,6 +182,9 @@ def test_a_damaged_state_is_named(tiny_dataset, tmp_path):
 def test_cosine_follows_steps_or_time():
     by_steps = Settings("d", "o", steps=1000, learning_rate=1.0, warmup=10)
     assert learning_rate(by_steps, State(step=0)) == pytest.approx(0.1)
+    short = Settings("d", "o", steps=100, learning_rate=1.0, warmup=1000, schedule="plateau")
+    assert learning_rate(short, State(step=2)) == pytest.approx(0.4)  # the rise ends after a twentieth: at step 5
+    assert learning_rate(short, State(step=5)) == 1.0
     assert learning_rate(by_steps, State(step=500)) == pytest.approx(0.5)
     assert learning_rate(by_steps, State(step=1000)) == pytest.approx(0.01)  # never quite zero
     by_time = Settings("d", "o", minutes=10, learning_rate=1.0, warmup=0)
@@ -202,8 +207,16 @@ def test_plateau_halves_at_the_ninth_validation_without_gain():
 
 def test_a_time_limit_ends_the_run(tiny_dataset, tmp_path):
     state = train(small_network(), settings(tiny_dataset, tmp_path / "r", steps=None, minutes=0.01), progress=False)
-    assert 0.6 <= state.elapsed < 10
+    assert state.elapsed < 10
     assert state.history[-1]["step"] == state.step
+    assert 2 <= len(state.history) <= 12  # after every tenth of the time that a step ended in, and at the end
+
+
+def test_the_last_validation_fits_into_the_limit():
+    plan = Settings("d", "o", minutes=1)
+    assert not time_is_up(plan, State(elapsed=50.0), 5.0)
+    assert time_is_up(plan, State(elapsed=50.0), 11.0)
+    assert not time_is_up(Settings("d", "o", steps=1), State(elapsed=1e9), 1.0)
 
 
 def test_protocols_are_those_of_the_paper_and_its_program():

@@ -1,0 +1,60 @@
+"""The paper's ablation: the network without some of its parts, at similar capacity, as one command and one table.
+
+for each of six combinations of pre-denoiser, flow and multi-scale outputs: train, then score on held-out clips
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from quiver.evaluate import Plan, Row, evaluate
+from quiver.model import ABLATIONS, PRESETS, QUIVER, ablated, parameter_count
+from quiver.restore import Options, Restorer, pick_device, restorer
+from quiver.run import Settings
+from quiver.train import train
+
+
+def run_ablation(
+    settings: Settings,
+    plan: Plan,
+    options: Options,
+    *,
+    should_stop: Callable[[], bool] = lambda: False,
+    progress: bool = True,
+) -> tuple[list[Restorer], list[Row]] | None:
+    """Train every combination in OUT/NAME (finished ones are kept) and score them in OUT/table.
+
+    None if `should_stop` ended it; the same call goes on. ValueError if the preset has no ablation.
+    """
+    if settings.network not in PRESETS:
+        raise ValueError(f"no ablation of {settings.network!r}; there is one of {', '.join(PRESETS)}")
+    out = Path(settings.out)
+    for name in ABLATIONS:
+        torch.manual_seed(settings.seed)
+        network = QUIVER(ablated(PRESETS[settings.network], name))
+        own = replace(settings, out=str(out / name), network=f"{settings.network} {name}")
+        train(network, own, device=pick_device(options.device), should_stop=should_stop, progress=progress)
+        if should_stop():
+            return None
+    methods = [restorer(str(out / name), options) for name in ABLATIONS]
+    return methods, evaluate(plan, methods, out / "table")
+
+
+def markdown(preset: str, rows: Sequence[Row]) -> str:
+    """The paper's table: what is built in, parameters, PSNR after the best factor and SSIM."""
+    text = ["| pre-denoiser | flow | multi-scale | parameters | PSNR matched | SSIM |", "|---|---|---|---|---|---|"]
+    for name, parts in ABLATIONS.items():
+        scores = [row.score for row in rows if row.method == name and row.score is not None]
+        cells = ["yes" if part else "no" for part in parts]
+        cells.append(f"{parameter_count(ablated(PRESETS[preset], name)):,}")
+        if scores:
+            cells += [f"{sum(s.psnr_matched for s in scores) / len(scores):.2f} dB"]
+            cells += [f"{sum(s.ssim for s in scores) / len(scores):.3f}"]
+        else:
+            cells += ["failed", ""]
+        text.append("| " + " | ".join(cells) + " |")
+    return "\n".join(text) + "\n"
