@@ -51,7 +51,7 @@ def test_extreme_light_is_a_distribution(sensor: Sensor, light):
     """One pixel among them, and a whole frame drawn: no NaN, no code without probability, nothing above 1."""
     cdf, pmf, log_pmf = (f(light, EXPOSURE) for f in (sensor.cdf, sensor.pmf, sensor.log_pmf))
     assert np.all((cdf >= 0) & (cdf <= 1) & (np.diff(cdf, prepend=0.0) >= -1e-15))
-    assert pmf.sum() == pytest.approx(1.0, abs=2e-11)
+    assert pmf.sum() == pytest.approx(1.0, abs=1e-12)
     assert not np.isnan(log_pmf).any()
     assert not np.isnan(sensor.fisher_information(light, EXPOSURE))
     codes = sensor.sample(np.full((5, 9), light), EXPOSURE, key=Key(0, 1), engine="reference")
