@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
 import sys
 import warnings
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -269,6 +273,22 @@ def test_frames_may_be_drawn_in_any_order(sensor: Sensor):
     for t in (4, 0, 5, 2):
         alone = sensor.sample(light[t], EXPOSURE, key=Key(5, 6, t), engine="reference")
         np.testing.assert_array_equal(alone, whole[t])
+
+
+def test_another_process_draws_the_same():
+    """Frames 3 and 1 by a fresh interpreter with another hash seed: neither state, order nor worker is in the noise."""
+    light = np.full((4, 7, 9), 3.25)
+    here = SENSORS[0].sample(light, EXPOSURE, key=Key(5, 6), engine="reference")
+    program = (
+        "import numpy as np; from qsim.keys import Key; from qsim.qis import QIS\n"
+        f"sensor, light = {SENSORS[0]!r}, np.full((7, 9), 3.25)\n"
+        f"print([sensor.sample(light, {EXPOSURE}, key=Key(5, 6, t), engine='reference').tolist() for t in (3, 1)])"
+    )
+    environment = {**os.environ, "PYTHONHASHSEED": "7", "PYTHONPATH": str(Path(__file__).parents[2])}
+    there = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True, timeout=120
+    )
+    np.testing.assert_array_equal(json.loads(there.stdout), here[[3, 1]])
 
 
 @each
