@@ -8,7 +8,8 @@ import os
 import shutil
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
     for add in (_add_train, _add_restore, _add_evaluate, _add_ablate, _add_bench, _add_convert_weights):
         add(sub)
-    return run(parser, argv)
+    with _handling(signal.default_int_handler, signal.SIGTERM):  # termination cleans up like Ctrl-C
+        return run(parser, argv)
+
+
+@contextlib.contextmanager
+def _handling(handler: Callable[[int, Any], Any], *numbers: signal.Signals) -> Iterator[None]:
+    """Signals go to `handler` inside the block (only the main thread may say so; elsewhere nothing changes)."""
+    main_thread = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, handler) for number in numbers if main_thread}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
 
 
 def _command(sub: Any, name: str, action: Any, what: str, example: str) -> argparse.ArgumentParser:
@@ -209,12 +223,8 @@ def _settings(args: argparse.Namespace) -> Any:
 def _signals() -> Iterator[list[int]]:
     """Collects Ctrl-C and termination instead of dying of them: the loop ends after its step and saves its state."""
     found: list[int] = []
-    before = {n: signal.signal(n, lambda number, _: found.append(number)) for n in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with _handling(lambda number, _: found.append(number), signal.SIGINT, signal.SIGTERM):
         yield found
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _summary(folder: Path, state: Any) -> tuple[dict[str, Any], str]:

@@ -24,7 +24,7 @@ from numpy import ndarray as Array
 
 from quiver.baselines import METHODS
 from quiver.baselines.windows import look_ahead, reflect
-from quiver.data import Codes, suggest, write_json
+from quiver.data import Codes, read_json, suggest, write_json
 
 if TYPE_CHECKING:
     import torch
@@ -34,6 +34,7 @@ PRETRAINED = Path(__file__).parent / "pretrained"  # weights that ship with the 
 DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory beside the weights
 CLASSICAL_BYTES = 200  # per pixel and frame held at once, about, of the hungriest classical method
 BLOCK_PIXELS = 1 << 22  # codes read at a time: 4 MB
+BLOCK_FRAMES = 256  # restored between two notes of how far a file has come
 CONTEXT = 5  # frames that a network needs before and after the one it restores
 OVERLAP = 32  # px that neighbouring tiles share
 MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/reuse.py
@@ -70,6 +71,7 @@ class Restorer:
     learned: bool
     description: str
     fill: Fill
+    seamless: bool = True  # a range of frames restored alone equals that part of the whole
 
     def restore(self, codes: Codes, first: int = 0, last: int | None = None, progress: Progress | None = None) -> Array:
         """Restored photons float32 [last - first, H, W] of frames first ... last - 1, all of them by default."""
@@ -139,7 +141,7 @@ def wrap_network(model: nn.Module, name: str, description: str, options: Options
     def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
         fill_network(model, codes, out, first, options, progress)
 
-    return Restorer(name, WINDOW, RADIUS, True, description, fill)
+    return Restorer(name, WINDOW, RADIUS, True, description, fill, seamless=options.mode != "streaming")
 
 
 def pick_device(wanted: str) -> str:
@@ -303,21 +305,9 @@ def bytes_per_pixel(model: nn.Module, mode: str) -> int:
 def restore_to_file(codes: Codes, method: Restorer, path: Path, progress: Progress | None = None) -> dict[str, Any]:
     """Restore a stream into PATH.npy (float32 photons [T, H, W]) and PATH.json; both appear when whole, the json last.
 
-    Returns what the json says. Works on disk: the result never has to fit into memory.
+    Returns what the json says. Works on disk, BLOCK_FRAMES at a time, in PATH.npy.part: an interrupted restoration that
+    has finished a block goes on there. A failure leaves nothing behind.
     """
-    description, temporary = path.with_suffix(".json"), path.with_name(f"{path.name}.tmp-{os.getpid()}")
-    started = time.perf_counter()
-    try:
-        with open(temporary, "wb") as file:
-            out = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.float32, shape=codes.shape)
-            method.fill(codes, out, 0, progress)
-            check_finite(out, method.name)
-            out.flush()
-            os.fsync(file.fileno())
-        description.unlink(missing_ok=True)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
     meta = {
         "format": "quiver-restored-1",
         "method": method.name,
@@ -329,14 +319,62 @@ def restore_to_file(codes: Codes, method: Restorer, path: Path, progress: Progre
         "exposure": codes.exposure,
         "sensor": codes.sensor.to_dict(),
         "source": codes.source,
-        "seconds_per_frame": (time.perf_counter() - started) / codes.shape[0],
     }
-    write_json(description, meta)
+    part, journal = path.with_name(path.name + ".part"), path.with_name(path.name + ".part.json")
+    try:
+        seconds = _fill_file(codes, method, part, journal, meta, progress)
+    except BaseException as error:
+        if isinstance(error, Exception) or not journal.exists():
+            part.unlink(missing_ok=True)
+            journal.unlink(missing_ok=True)
+        raise
+    path.with_suffix(".json").unlink(missing_ok=True)
+    os.replace(part, path)
+    meta["seconds_per_frame"] = seconds / codes.shape[0]
+    write_json(path.with_suffix(".json"), meta)
+    journal.unlink(missing_ok=True)
     return meta
 
 
-def check_finite(restored: Array, name: str) -> None:
-    """ValueError naming the first frame with a value that is not finite."""
-    for t, frame in enumerate(restored):
+def _fill_file(
+    codes: Codes, method: Restorer, part: Path, journal: Path, meta: dict[str, Any], progress: Progress | None
+) -> float:
+    """Restore what is missing of PART, block by block, noting each in JOURNAL; the seconds it took, all in all."""
+    length = codes.shape[0]
+    done, seconds = _done(part, journal, meta)
+    out = np.lib.format.open_memmap(part, mode="r+" if done else "w+", dtype=np.float32, shape=codes.shape)
+    for first in range(done, length, BLOCK_FRAMES if method.seamless else length):
+        block = out[first : first + BLOCK_FRAMES if method.seamless else length]
+        block[:] = 0  # an interrupted block may have left something
+        started = time.perf_counter()
+        method.fill(codes, block, first, _shifted(progress, first, length, len(block)))
+        check_finite(block, method.name, first)
+        out.flush()
+        seconds += time.perf_counter() - started
+        write_json(journal, meta | {"done": first + len(block), "seconds": seconds})
+    with open(part, "rb") as file:
+        os.fsync(file.fileno())
+    return seconds
+
+
+def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float]:
+    """Frames that an interrupted restoration of the same thing has finished, and the seconds they took."""
+    if not (part.exists() and journal.exists()):
+        return 0, 0.0
+    found = read_json(journal)
+    done, seconds = int(found.pop("done", 0)), float(found.pop("seconds", 0.0))
+    return (done, seconds) if found == meta else (0, 0.0)
+
+
+def _shifted(progress: Progress | None, first: int, length: int, block: int) -> Progress | None:
+    """Progress of a block as progress of the whole, in frames."""
+    if progress is None:
+        return None
+    return lambda done, total: progress(first + done * block // total, length)
+
+
+def check_finite(restored: Array, name: str, first: int = 0) -> None:
+    """ValueError naming the first frame with a value that is not finite; `first` is the number of the first one."""
+    for t, frame in enumerate(restored, start=first):
         if not np.isfinite(frame).all():
             raise ValueError(f"{name}: restored frame {t} holds NaN or Inf; are the weights damaged?")

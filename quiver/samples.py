@@ -37,6 +37,7 @@ class WindowSettings:
     flips: bool = True  # the eight flips and quarter turns
     reverse: bool = True  # half of the windows run backwards in time
     force_exposure: bool = False  # published: every window is brought to the light level on its own
+    ceiling: float = 2.0  # targets end here, in units of white: 11 codes tell no light above from saturation
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -63,7 +64,7 @@ class Place:
 class Windows(Dataset[dict[str, Any]]):
     """Windows of `frames` frames from the clips of a folder, with fresh noise: a map-style `torch` data set.
 
-    item: codes float32 [T, 1, h, w] in [0, 1], target float32 [T, 1, h, w] = sharp photons / white (may exceed 1), and
+    item: codes float32 [T, 1, h, w] in [0, 1], target float32 [T, 1, h, w] = sharp photons / white (up to `ceiling`),
     white [photons], ppp, sample (its number), key (text: clip, place, light, random key). `ValueError` for a folder
     without clips and for clips shorter or smaller than a window.
     """
@@ -121,7 +122,7 @@ class Windows(Dataset[dict[str, Any]]):
         white = sensor.white(clip.exposure)
         return {
             "codes": as_input(codes, sensor),
-            "target": torch.from_numpy((sharp / white).astype(np.float32))[:, None],
+            "target": torch.from_numpy(np.minimum(sharp / white, self.settings.ceiling).astype(np.float32))[:, None],
             "white": white,
             "ppp": float(exposed.mean()),
             "sample": n,

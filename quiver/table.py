@@ -20,6 +20,7 @@ COLUMNS = (
     "light",
     "PSNR",
     "PSNR matched",
+    "by frames",
     "SSIM",
     "SSIM matched",
     "factor",
@@ -94,7 +95,10 @@ def markdown(plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row]) -> st
         f"Noise seed {plan.seed}; "
         + ("published protocol: every window exposed, scaled and scored on its own" if plan.published else "all frames")
         + "; mean ± half-width of the 95 % interval over scenes (clips of one scene averaged first). PSNR in dB, peak ="
-        " white; matched = after the best factor per " + ("window" if plan.published else "clip") + ".",
+        " white; matched = after the best factor per "
+        + ("window" if plan.published else "clip")
+        + "; by frames = its mean "
+        "over all frames of all clips alike.",
         "",
         "| " + " | ".join(COLUMNS) + " |",
         "|---" * len(COLUMNS) + "|",
@@ -104,9 +108,10 @@ def markdown(plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row]) -> st
         method = by_name[line.method]
         cells = [line.method, f"{method.window} ({method.look_ahead})", line.light]
         if line.scores["psnr"].scenes == 0:
-            cells += [f"failed: {line.failures[0]}", *[""] * 6]
+            cells += [f"failed: {line.failures[0]}", *[""] * 7]
         else:
-            cells += [_interval(line.scores[name], 2 if "psnr" in name else 3) for name in SCORES]
+            scores = [_interval(line.scores[name], 2 if "psnr" in name else 3) for name in SCORES]
+            cells += [*scores[:2], _number(line.psnr_matched_per_frame, 2), *scores[2:]]
             cells += [f"{line.scale:.3f} (spread {line.scale_spread:.3f})", f"{line.seconds_per_frame:.3g}"]
             cells += ["not measured" if line.truth_psnr is None else f"{line.truth_psnr:.1f}"]
         text.append("| " + " | ".join(cells) + " |")

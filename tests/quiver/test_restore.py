@@ -13,6 +13,7 @@ from numpy import ndarray as Array
 from torch import Tensor, nn
 
 from qsim.qis import QIS
+from quiver import restore as restoring
 from quiver.baselines import METHODS
 from quiver.data import Codes, array_codes
 from quiver.model import Output, build
@@ -221,6 +222,33 @@ def test_a_failed_restoration_leaves_nothing(tmp_path):
     with pytest.raises(ZeroDivisionError):
         restore_to_file(random_codes(2, 3, 4), dying, tmp_path / "video.npy")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_restoration_goes_on(tmp_path, monkeypatch):
+    """Blocks of four frames, stopped in the third: the next call starts with frame 8 and ends with the same bytes."""
+    monkeypatch.setattr(restoring, "BLOCK_FRAMES", 4)
+    codes, moment, starts = random_codes(14, 5, 6), restorer("moment"), []
+
+    def fill(codes: Codes, out: Array, first: int, progress: object) -> None:
+        starts.append(first)
+        moment.fill(codes, out, first, None)
+        if len(starts) == 3:
+            raise KeyboardInterrupt
+
+    slow, path = replace(moment, fill=fill), tmp_path / "video.npy"
+    with pytest.raises(KeyboardInterrupt):
+        restore_to_file(codes, slow, path)
+    assert not path.exists()
+    restore_to_file(codes, slow, path)
+    assert starts == [0, 4, 8, 8, 12]
+    np.testing.assert_array_equal(np.load(path), moment.restore(codes))
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["video.json", "video.npy"]
+
+    starts.clear()
+    with pytest.raises(KeyboardInterrupt):
+        restore_to_file(codes, slow, path)
+    restore_to_file(random_codes(14, 5, 6), replace(slow, description="another"), path)
+    assert starts[3:] == [0, 4, 8, 12]  # another method does not go on with the frames of this one
 
 
 @pytest.mark.parametrize(
