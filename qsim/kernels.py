@@ -190,10 +190,11 @@ def _frames(
 
 
 def _set(flags: Array) -> Array:
-    """Indices of the few non-zero bytes among many, found eight at a time."""
-    whole = flags.size // 8 * 8
-    eights = np.flatnonzero(flags[:whole].view(np.uint64))
-    near = np.append(8 * eights[:, None] + np.arange(8), np.arange(whole, flags.size))
+    """Indices of the few non-zero bytes among many, found in blocks of 512."""
+    whole = flags.size // 512 * 512
+    eights = flags[:whole].view(np.uint64).reshape(-1, 64)
+    blocks = np.flatnonzero(np.bitwise_or.reduce(eights, axis=1))
+    near = np.append(512 * blocks[:, None] + np.arange(512), np.arange(whole, flags.size))
     return near[flags[near] != 0]
 
 
@@ -209,32 +210,42 @@ def _launch(plan: Plan, light: Array, lanes: int, key: Key, place: tuple[int, in
     import drjit as dr
 
     jit = _backend()
-    frame, row, block, high, low = (
-        dr.opaque(jit.UInt32, value & 0xFFFFFFFF)
-        for value in (place[0] * plan.planes, place[1], place[2], key.philox_key >> 32, key.philox_key)
-    )
-    # Rows by a product in float64, exact to 2^32 lanes: a division by a constant would compile anew for every width
-    lane = dr.arange(jit.UInt32, light.size)
-    y = jit.UInt32((jit.Float64(lane) + 0.5) * dr.opaque(jit.Float64, 1 / lanes))
-    x = lane - y * dr.opaque(jit.UInt32, lanes)
-    pair = jit.UInt64(light)
-    photons = [dr.reinterpret_array(jit.Float, jit.UInt32(half)) for half in (pair, pair >> 32)]
-
-    def words(plane: Any) -> list[Any]:
-        """Two neighbouring lanes share a block of four words."""
-        w = _philox(x // 2 + block, y + row, frame + plane, high, low)
-        right = (x & 1) == 1
-        return [dr.select(right, w[2], w[0]), dr.select(right, w[3], w[1])]
-
-    codes, doubt = _count(plan, photons, words)
-    if bits is None:
-        out = codes[0] | (codes[1] << 8)
-    else:
-        out = (codes[0] << bits) | codes[1]
-        out = jit.UInt8(out) if bits <= 4 else out
-    flags = jit.UInt8(dr.select(doubt, jit.UInt32(1), jit.UInt32(0)))
-    dr.eval(out, flags)
+    numbers = (place[0] * plan.planes, place[1], place[2], key.philox_key >> 32, key.philox_key, lanes)
+    scalars = [dr.opaque(jit.UInt32, number & 0xFFFFFFFF) for number in numbers]
+    out, flags = _kernel(plan, bits)(jit.UInt64(light), dr.opaque(jit.Float64, 1 / lanes), *scalars)
     return [out, flags]
+
+
+@lru_cache(maxsize=64)
+def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
+    """The kernel of a plan, traced once and replayed after that (`drjit.freeze`)."""
+    import drjit as dr
+
+    jit = _backend()
+
+    def draw(pair: Any, inverse: Any, *scalars: Any) -> tuple[Any, Any]:
+        frame, row, block, high, low, lanes = scalars
+        # Rows by a product in float64, exact to 2^32 lanes: no division, and one kernel for every width
+        lane = dr.arange(jit.UInt32, dr.width(pair))
+        y = jit.UInt32((jit.Float64(lane) + 0.5) * inverse)
+        x = lane - y * lanes
+        photons = [dr.reinterpret_array(jit.Float, jit.UInt32(half)) for half in (pair, pair >> 32)]
+
+        def words(plane: Any) -> list[Any]:
+            """Two neighbouring lanes share a block of four words."""
+            w = _philox(x // 2 + block, y + row, frame + plane, high, low)
+            right = (x & 1) == 1
+            return [dr.select(right, w[2], w[0]), dr.select(right, w[3], w[1])]
+
+        codes, doubt = _count(plan, photons, words)
+        if bits is None:
+            out = codes[0] | (codes[1] << 8)
+        else:
+            out = (codes[0] << bits) | codes[1]
+            out = jit.UInt8(out) if bits <= 4 else out
+        return out, jit.UInt8(dr.select(doubt, jit.UInt32(1), jit.UInt32(0)))
+
+    return dr.freeze(draw, warn_after=1000)
 
 
 def _philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
