@@ -9,6 +9,7 @@ read_noise).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from math import ceil, floor, inf
@@ -22,7 +23,7 @@ from qsim.mixture import Mixture
 from qsim.sensor import Sensor, require_bits, require_number
 
 _REACH = 39.0  # sigmas: Phi(-39) = 1e-333 is 0 in float64
-_BLOCK = 256  # levels that share one table
+_BLOCK, _SPAN = 256, 4096  # most levels, and electrons between them, that share one table
 _PROCESS_BITS = 8  # above, codes are drawn step by step instead of through their cdf
 
 
@@ -63,20 +64,23 @@ class QIS(Sensor):
         return (self.levels - 1) / (self.gain * self.quantum_efficiency)
 
     def _cdf(self, arrivals: Array, exposure: float) -> Array:
-        return np.concatenate([t.evaluate_cdf(arrivals) for t in self._tables()], axis=1)
+        return np.concatenate([t.evaluate_cdf(arrivals) for _, t in self._tables()], axis=1)
 
     def _log_pmf(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
         parts = []
-        for start, table in zip(range(0, self.levels, _BLOCK), self._tables(), strict=True):
-            some = None if wanted is None else wanted[:, start : start + _BLOCK]
-            parts.append(table.evaluate_log_pmf(arrivals, some))
+        for codes, table in self._tables():
+            parts.append(table.evaluate_log_pmf(arrivals, None if wanted is None else wanted[:, codes]))
         return np.concatenate(parts, axis=1)
 
     def _slope(self, arrivals: Array, exposure: float) -> Array:
-        return np.concatenate([t.evaluate_slope(arrivals) for t in self._tables()], axis=1)
+        return np.concatenate([t.evaluate_slope(arrivals) for _, t in self._tables()], axis=1)
 
-    def _tables(self) -> list[Mixture]:
-        return [electron_table(self, k, min(k + _BLOCK, self.levels)) for k in range(0, self.levels, _BLOCK)]
+    def _tables(self) -> Iterator[tuple[slice, Mixture]]:
+        """Some codes at a time, so few that a table stays below 20 MB: all in one for 8 bits and a gain above 1/16."""
+        step = min(_BLOCK, max(1, int(_SPAN * self.gain)))
+        for start in range(0, self.levels, step):
+            stop = min(start + step, self.levels)
+            yield slice(start, stop), electron_table(self, start, stop)
 
     def codes_of(self, electrons: Array) -> Array:
         """The ADC: float electrons, read noise included -> codes; the only place where gain and rounding happen."""

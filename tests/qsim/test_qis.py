@@ -8,7 +8,7 @@ from math import inf
 import mpmath as mp
 import numpy as np
 import pytest
-from scipy.special import ndtri, pdtr, pdtrc
+from scipy.special import ndtr, ndtri, pdtr, pdtrc
 from stats import assert_histogram, assert_mean
 
 from qsim.keys import Key
@@ -151,6 +151,17 @@ def test_wide_codes_are_computed_in_blocks_that_fit():
     np.testing.assert_allclose(pmf @ codes, mean, rtol=1e-9)
     # Rounding to whole codes adds 1/12: at a sigma of 2.6 codes that law holds to exp(-2 pi^2 2.6^2) = 1e-58
     np.testing.assert_allclose(sensor.variance(photons, EXPOSURE), 1.69 * (0.6 * photons + 4) + 1 / 12, rtol=1e-7)
+
+
+def test_many_electrons_per_code_are_computed_in_blocks_that_fit():
+    """A hundredth of a code per electron: tables of 40 codes and 4000 electrons each, against one sum over all."""
+    sensor, light = QIS(0.8, 0.0, 7.0, 8, gain=0.01), np.array([0.0, 900.0, 12_000.0])
+    pmf, codes = sensor.pmf(light, EXPOSURE), np.arange(256)
+    np.testing.assert_allclose(np.cumsum(pmf, axis=1), sensor.cdf(light, EXPOSURE), atol=1e-11)
+    electrons = np.arange(12_000)
+    weights = np.exp(poisson_log_pmf(0.8 * light[2], electrons))
+    below = ndtr(((codes[:-1] + 0.5) / 0.01 - electrons[:, None]) / 7.0)
+    np.testing.assert_allclose(sensor.cdf(light[2], EXPOSURE)[:-1], weights @ below, atol=1e-11)
 
 
 def test_sixteen_bits_draw_the_process():
