@@ -30,6 +30,7 @@ class Stage:
         self.loaded = mi.load_dict(_scene_dict(mi, scene))
         self._parameters = mi.traverse(self.loaded)
         self._placed: dict[str, bytes] = {}
+        self._normals: dict[str, Array] = {}  # of deformed smooth bodies, set after Mitsuba has made its own
 
     def place(self, t: float) -> None:
         """Move everything to time t [s]; what did not change since the last call is left alone."""
@@ -41,6 +42,11 @@ class Stage:
             if motion is not None:
                 self._place_light(f"light{i}", light, motion.pose(t))
         self._parameters.update()
+        if self._normals:
+            for key, normals in self._normals.items():
+                self._parameters[key] = normals.ravel()
+            self._normals.clear()
+            self._parameters.update()
 
     def shape_numbers(self) -> dict[str, int]:
         """Shape id -> body number; lamps follow the bodies; the sun's disk is -1 (surroundings)."""
@@ -54,7 +60,9 @@ class Stage:
             self._set(f"{name}.to_world", pose, lambda: self._transform(pose))
         else:
             world = _to_world(pose, body.vertices(t)).astype(np.float32)
-            self._set(f"{name}.vertex_positions", world, lambda: world.ravel())
+            moved = self._set(f"{name}.vertex_positions", world, lambda: world.ravel())
+            if moved and body.mesh.smooth:
+                self._normals[f"{name}.vertex_normals"] = vertex_normals(world, body.mesh.faces)
 
     def _place_light(self, name: str, light: records.Light, pose: Array) -> None:
         if isinstance(light, records.AreaLamp):
@@ -64,11 +72,13 @@ class Stage:
             position = _to_world(pose, np.array([light.position]))[0]
             self._set(f"{name}.position", position, lambda: self.mi.Point3f(*(float(x) for x in position)))
 
-    def _set(self, key: str, value: Array, make: Any) -> None:
+    def _set(self, key: str, value: Array, make: Any) -> bool:
         stamp = value.tobytes()
-        if self._placed.get(key) != stamp:
-            self._parameters[key] = make()
-            self._placed[key] = stamp
+        if self._placed.get(key) == stamp:
+            return False
+        self._parameters[key] = make()
+        self._placed[key] = stamp
+        return True
 
     def _transform(self, matrix: Array) -> Any:
         kind = self.mi.ScalarTransform4f if self.mi.variant().startswith("scalar") else self.mi.Transform4f
@@ -132,7 +142,25 @@ def _mesh(mi: Any, body: Body, name: str, vertices: Array) -> Any:
     if uv is not None:
         parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
     parameters.update()
+    if body.mesh.smooth:
+        # Mitsuba sums normals over faces in parallel, in an order that changes from run to run.
+        parameters["vertex_normals"] = vertex_normals(vertices, body.mesh.faces).ravel()
+        parameters.update()
     return mesh
+
+
+def vertex_normals(vertices: Array, faces: Array) -> Array:
+    """Unit normals, float32 [V, 3]: face normals weighted by the corner's angle, always summed in the same order."""
+    corners = np.asarray(vertices, np.float64)[faces]  # [F, 3, 3]
+    edges = np.roll(corners, -1, axis=1) - corners
+    face = np.cross(edges[:, 0], -edges[:, 2])
+    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-300)
+    unit = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
+    angles = np.arccos(np.clip(-np.einsum("fik,fik->fi", unit, np.roll(unit, 1, axis=1)), -1, 1))
+    summed = np.zeros((len(vertices), 3))
+    np.add.at(summed, faces, angles[..., None] * face[:, None])
+    length = np.linalg.norm(summed, axis=1, keepdims=True)
+    return np.where(length > 0, summed / np.maximum(length, 1e-300), (0.0, 0.0, 1.0)).astype(np.float32)
 
 
 def _light(mi: Any, scene: Scene, light: records.Light, name: str) -> dict[str, Any]:
