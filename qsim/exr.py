@@ -10,6 +10,7 @@ Layout (openexr.com, "OpenEXR File Layout"): magic, version, attributes, offset 
 
 from __future__ import annotations
 
+import functools
 import os
 import struct
 import zlib
@@ -117,6 +118,7 @@ def _header(types: dict[str, np.dtype], height: int, width: int, compress: bool)
     )
 
 
+@functools.lru_cache(maxsize=16)
 def _half_header(height: int, width: int) -> bytes:
     return _header({"Y": np.dtype("<f2")}, height, width, compress=False)
 

@@ -78,12 +78,16 @@ def read_light_npy(path: Path, hints: Hints) -> Footage:
     array = load_npy(path)
     shape = check_shape(path, array.shape)
     if array.dtype.kind == "f" and hints.transfer in (None, "linear"):
-        return Footage(shape, lambda a, b: np.asarray(array[a:b], np.float32), ".npy", meta={"transfer": "linear"})
+
+        def linear(start: int, stop: int) -> Array:
+            return _checked_light(path, array[start:stop], start).astype(np.float32)
+
+        return Footage(shape, linear, ".npy", meta={"transfer": "linear"})
     transfer = need_transfer(path, hints)
     top = 1.0 if array.dtype.kind == "f" else float(np.iinfo(array.dtype).max)
 
     def read(start: int, stop: int) -> Array:
-        return to_linear(np.asarray(array[start:stop]), transfer, top)
+        return to_linear(_checked_light(path, array[start:stop], start), transfer, top)
 
     return Footage(shape, read, ".npy", meta={"transfer": transfer})
 
@@ -287,6 +291,16 @@ def _tiff(path: Path, page: int) -> Array:
         if pixels.ndim == 3 and pixels.shape[2] > 3:
             pixels = pixels[..., :3]
         return pixels
+
+
+def _checked_light(path: Path, values: Array, first: int) -> Array:
+    """The values if they are light: finite, not negative, within single precision; else `ValueError` with the place."""
+    good = (values >= 0) & (values < 3e38)
+    if not good.all():
+        t, y, x = (int(i) for i in np.argwhere(~good)[0])
+        place = f"(t, y, x) = ({first + t}, {y}, {x})"
+        raise ValueError(f"{path}: value {values[t, y, x]!r} at {place} is no light: expected finite numbers from 0 up")
+    return np.asarray(values)
 
 
 def _same_size(paths: list[Path], images: list[Array], shape: tuple[int, ...], dtype: np.dtype) -> Array:

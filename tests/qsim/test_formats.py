@@ -504,14 +504,32 @@ def test_wrong_kinds_are_refused_with_advice(tmp_path: Path):
 
 
 def test_our_one_bit_stream_is_a_photon_cube_for_others(tmp_path: Path):
-    """The independent reader of the field's own tool, where its wheel is installed."""
+    """Read by the field's own tool, where its wheel is installed (`pip install photoncube`)."""
     photoncube = pytest.importorskip("photoncube", reason="the package photoncube is not installed")
+    from PIL import Image
+
     expected = random_planes(4, 6, 16)
     np.save(tmp_path / "p.npy", expected.astype(bool))
     stream = formats.to_stream(formats.read(tmp_path / "p.npy"), tmp_path / "cube", CAPTURE)
     cube = photoncube.PhotonCube.open(str(stream.path))
-    images = cube.process_cube if hasattr(cube, "process_cube") else cube.to_numpy
-    np.testing.assert_array_equal(np.asarray(images()) > 0, expected > 0)
+    assert cube.shape == (4, 6, 2)
+    cube.set_range(0, 4, 1)
+    (tmp_path / "images").mkdir()
+    cube.save_images(str(tmp_path / "images"))
+    for image, plane in zip(numbered(list((tmp_path / "images").iterdir())), expected, strict=True):
+        np.testing.assert_array_equal(np.asarray(Image.open(image).convert("L")) > 0, plane > 0)
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_our_camera_files_are_read_alike_by_others(tmp_path: Path, full: bool):
+    photoncube = pytest.importorskip("photoncube", reason="the package photoncube is not installed")
+    frames, height = (256, 512) if full else (512, 256)
+    expected = random_planes(frames, height, 512)
+    (tmp_path / "raw").mkdir()
+    encode = planes.encode_full if full else planes.encode_half
+    (tmp_path / "raw" / "filename0.bin").write_bytes(encode(expected))
+    photoncube.PhotonCube.convert_to_npy(str(tmp_path / "raw"), str(tmp_path / "theirs.npy"), is_full_array=full)
+    np.testing.assert_array_equal(everything(tmp_path / "theirs.npy", layout="cube"), expected)
 
 
 def test_streams_survive_an_interrupted_conversion(tmp_path: Path):
