@@ -14,7 +14,7 @@ from numpy import ndarray as Array
 
 from qsim.qis import QIS
 from qsim.sensor import Sensor
-from quiver.baselines.windows import check_codes, check_window, window_sums
+from quiver.baselines.windows import check_codes, check_window, restore_by_sum
 
 
 def dark_codes(sensor: Sensor, exposure: float) -> float:
@@ -34,5 +34,4 @@ def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11) 
     top = sensor.levels - 1
     mean_code = np.arange(window * top + 1) / window
     photons = np.maximum(0, mean_code - dark_codes(sensor, exposure)) * (sensor.white(exposure) / top)
-    table = photons.astype(np.float32)
-    return np.stack([table[total] for total in window_sums(codes, window, top)])
+    return restore_by_sum(codes, window, photons)

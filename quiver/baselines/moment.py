@@ -14,7 +14,7 @@ from numpy import ndarray as Array
 
 from qsim.sensor import Sensor
 from quiver.baselines.tables import response_table
-from quiver.baselines.windows import check_codes, check_window, window_sums
+from quiver.baselines.windows import check_codes, check_window, restore_by_sum
 
 
 def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11) -> Array:
@@ -26,5 +26,4 @@ def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11) 
     check_window(window)
     top = sensor.levels - 1
     mean_code = np.arange(window * top + 1) / window
-    table = response_table(sensor, exposure).invert(mean_code, window).astype(np.float32)
-    return np.stack([table[total] for total in window_sums(codes, window, top)])
+    return restore_by_sum(codes, window, response_table(sensor, exposure).invert(mean_code, window))

@@ -65,6 +65,15 @@ def window_sums(codes: Array, window: int, top: int) -> Iterator[Array]:
     yield total
     for frame in range(1, length):
         leaves, enters = reflect(np.array([frame - 1 - window // 2, frame + look_ahead(window)]), length)
-        total = total + codes[enters].astype(dtype)
-        total -= codes[leaves].astype(dtype)
+        total = np.add(total, codes[enters], dtype=dtype, casting="unsafe")
+        np.subtract(total, codes[leaves], out=total, casting="unsafe")
         yield total
+
+
+def restore_by_sum(codes: Array, window: int, table: Array) -> Array:
+    """Restored frames [T, H, W], float32, where a frame depends on the sum of its window only: table [sums]."""
+    restored = np.empty(codes.shape, np.float32)
+    entries = table.astype(np.float32)
+    for frame, total in enumerate(window_sums(codes, window, (len(table) - 1) // window)):
+        np.take(entries, total, out=restored[frame], mode="clip")  # clip never happens, but is the unbuffered mode
+    return restored

@@ -58,13 +58,13 @@ def test_flat_fields_have_the_mean_the_exact_distribution_predicts(name, photons
 @pytest.mark.parametrize("method", ["moment", "likelihood"])
 @pytest.mark.parametrize("photons", LEVELS)
 def test_a_flat_field_is_recovered_within_four_standard_errors(method, photons):
-    """300 frames of 20 pixels; variance is the Cramer-Rao bound 1/(n I), bias of order 1/n far below.
+    """100 frames of 8 pixels; variance is the Cramer-Rao bound 1/(n I), bias of order 1/n far below.
 
-    A window of 599 frames around frame 0 holds frame 0 once and all others twice, which averages like 299.75 frames.
+    A window of 199 frames around frame 0 holds frame 0 once and all others twice, which averages like 99.75 frames.
     At 19.5 and 26 photons (6 and 8 times the level the gain is made for) nearly all codes are the top one: light is
     known only as a bound, and the estimate must reach it, up to the cap half a count below saturation.
     """
-    sensor, frames, shape = quiver_physical(3.25), 300, (4, 5)
+    sensor, frames, shape = quiver_physical(3.25), 100, (2, 4)
     codes = flat(sensor, photons, frames, shape)
     middle = METHODS[method].restore(codes, sensor, EXPOSURE, window=2 * frames - 1)[0]
     information = float(sensor.fisher_information(np.array([photons]), EXPOSURE)[0])
@@ -118,12 +118,12 @@ def test_the_naive_mean_is_as_biased_as_clipping_makes_it(factor, bias):
 
 @pytest.mark.parametrize(("photons", "ratio"), [(3.25, 1.017), (6.5, 1.10)])
 def test_maximum_likelihood_comes_close_to_the_bound(photons, ratio):
-    """Variance of 11-frame estimates over 1/(11 I): worked by simulation elsewhere; 4 % is 5 sigma of 30 000 pixels."""
+    """Variance of 11-frame estimates over 1/(11 I): worked by simulation elsewhere; 7 % is 5 sigma of 10 000 pixels."""
     sensor = quiver_physical(3.25)
-    codes = flat(sensor, photons, 11, (150, 200))
+    codes = flat(sensor, photons, 11, (100, 100))
     restored = likelihood.restore(codes, sensor, EXPOSURE)[5].astype(float)
     bound = 1 / (11 * float(sensor.fisher_information(np.array([photons]), EXPOSURE)[0]))
-    assert abs(restored.var() / bound - ratio) < 0.04
+    assert abs(restored.var() / bound - ratio) < 0.07
     assert abs(restored.mean() / photons - 1) < 0.01
 
 
