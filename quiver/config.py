@@ -61,18 +61,22 @@ class Config:
 PRESETS: dict[str, Config] = {
     "quiver": Config(),
     "quiver-s": Config(channels=16),
+    # Half of the pixels' side, an eighth of the channels: 88 frames of 64 x 64 forward and back in about 0.8 s on two
+    # cores. One position per pixel in the alignment, because sampling nine taps was the largest single cost.
     "nano": Config(
         channels=8,
-        deformable_groups=2,
+        deformable_groups=1,
+        deformable_kernel=1,
         denoiser_growth=8,
-        denoiser_passes=3,
-        flow_channels=(16, 16, 16),
+        denoiser_passes=1,
+        flow_channels=(8, 16, 8),
         flow_kernel=5,
         cell_blocks=3,
         attention_width=64,
         attention_temperature=8.0,
         fold=2,
         baseline=True,
+        lecun=True,
     ),
 }
 

@@ -73,7 +73,7 @@ class QUIVER(nn.Module):
         )
         self.refine4 = Refinement(image, c)
         self.refine = Refinement(image, c)
-        if config.lecun:
+        if config.lecun and not self.alignment.weight.is_meta:  # nothing to draw without memory
             start_from_lecun(self)
         self.baseline = start_from_baseline(self) if config.baseline else None
 
@@ -310,7 +310,7 @@ def start_from_baseline(network: QUIVER) -> nn.Parameter:
             for tensor in refinement.next_picture.parameters():
                 tensor.zero_()
     weights = [math.exp(-0.5 * ((t - RADIUS) / BASELINE_SIGMA) ** 2) for t in range(WINDOW)]
-    return nn.Parameter(torch.tensor(weights) / sum(weights))
+    return nn.Parameter(torch.tensor([weight / sum(weights) for weight in weights]))
 
 
 def _flat(stack: Tensor) -> Tensor:

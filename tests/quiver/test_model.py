@@ -129,6 +129,36 @@ def test_an_untrained_nano_returns_about_the_mean_of_the_middle_frames():
     assert float((out - mean).square().mean()) < 0.04 * float(x.var())
 
 
+@pytest.mark.parametrize("lecun", [False, True])
+@pytest.mark.parametrize("kernel", [1, 3])
+def test_alignment_starts_from_the_flow_alone(kernel, lecun):
+    """Offsets of zero and masks of one half: half a convolution of the image moved by the flow."""
+    torch.manual_seed(0)
+    alignment = QUIVER(replace(SMALL, deformable_kernel=kernel, lecun=lecun)).double().alignment
+    previous, current, flow = draw(1, 4, 8, 8), draw(1, 4, 8, 8, seed=1), torch.zeros(1, 2, 8, 8, dtype=torch.float64)
+    moved = torch.nn.functional.pad(previous[..., 1:], (0, 1))
+    wanted = torch.nn.functional.conv2d(previous, alignment.weight / 2, padding=kernel // 2)
+    assert torch.allclose(alignment(previous, current, flow), wanted)
+    flow[:, 0] = 1
+    inside = (slice(None), slice(None), slice(1, -1), slice(1, -2))
+    wanted = torch.nn.functional.conv2d(moved, alignment.weight / 2, padding=kernel // 2)
+    assert torch.allclose(alignment(previous, current, flow)[inside], wanted[inside])
+
+
+def test_the_lecun_start_keeps_the_fused_features_alive():
+    """Spread over space: default weights leave a few thousandths, because two faded signals are multiplied."""
+    x, spread = draw(1, 11, 1, 32, 32, dtype=torch.float32), {}
+    for lecun in (False, True):
+        torch.manual_seed(0)
+        started = QUIVER(replace(FOLDED, lecun=lecun))
+        fused: list[Tensor] = []
+        started.fusions[0].register_forward_hook(lambda _m, _i, out, fused=fused: fused.append(out))
+        with torch.no_grad():
+            started(x)
+        spread[lecun] = float(fused[1].flatten(2).std(dim=2).mean())
+    assert spread[True] > 20 * spread[False], spread
+
+
 # The same numbers by other roads
 
 
