@@ -14,9 +14,17 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-NETWORKS = ("nano", "quiver-s", "quiver", "unet")
-PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see run.py
-MODES = ("exact", "streaming", "windows")  # see restore.py
+from quiver.options import (
+    NETWORKS,
+    PROTOCOLS,
+    add_light,
+    add_running,
+    count,
+    height_width,
+    nonnegative,
+    positive,
+    words,
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,84 +59,7 @@ def _command(sub: Any, name: str, action: Any, what: str, example: str) -> argpa
     return command(sub, name, action, what, example)
 
 
-# Types of options
-
-
-def numbers(text: str) -> tuple[float, ...]:
-    """`3.25,9.75` -> (3.25, 9.75)"""
-    return tuple(positive(part) for part in text.split(","))
-
-
-def whole_numbers(text: str) -> tuple[int, ...]:
-    """`1,3` -> (1, 3)"""
-    return tuple(count(part) for part in text.split(","))
-
-
-def positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
-    return value
-
-
-def count(text: str) -> int:
-    if not text.strip().isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
-    return int(text)
-
-
-def nonnegative(text: str) -> int:
-    if not text.strip().isdecimal():
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, got {text!r}")
-    return int(text)
-
-
-def size(text: str) -> int:
-    """Bytes of `2GB`, `500MB`, `1.5GiB` or a bare number."""
-    units = {"kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2**10, "mib": 2**20, "gib": 2**30, "b": 1, "": 1}
-    number = text.rstrip("KMGiBkmgb")
-    unit = text[len(number) :].lower()
-    try:
-        value = float(number) * units[unit]
-    except (ValueError, KeyError):
-        value = float("nan")
-    if not 1 <= value < 2**63:
-        raise argparse.ArgumentTypeError(f"expected a size such as 2GB or 500MB, got {text!r}")
-    return int(value)
-
-
-def height_width(text: str) -> tuple[int, int]:
-    """`128x256` -> (128, 256)"""
-    height, cross, width = text.partition("x")
-    if not cross:
-        raise argparse.ArgumentTypeError(f"expected HEIGHTxWIDTH as in 128x256, got {text!r}")
-    return count(height), count(width)
-
-
-def words(text: str) -> tuple[str, ...]:
-    """`naive,moment:3,out/run` -> its parts; none may be empty."""
-    parts = tuple(part.strip() for part in text.split(","))
-    if not all(parts):
-        raise argparse.ArgumentTypeError(f"expected names with commas between them, got {text!r}")
-    return parts
-
-
-def _add_light(parser: argparse.ArgumentParser, several: bool) -> None:
-    kind, many = (numbers, "; several: 3.25,9.75,26") if several else (positive, "")
-    whole = whole_numbers if several else count
-    parser.add_argument("--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default quiver-physical)")
-    parser.add_argument("--ppp", type=kind, help=f"mean photons per pixel and exposure (default 3.25){many}")
-    parser.add_argument("--bits", type=whole, help="bits per code (default 3)")
-
-
-def _add_running(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--memory", type=size, default="2GB", help="working memory, as in 500MB (default 2GB)")
-    parser.add_argument("--mode", default="exact", choices=MODES, help="how frames share work (default exact)")
-    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
-    parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"), help="default float32")
+# Shared by the commands
 
 
 def _options(args: argparse.Namespace) -> Any:
@@ -161,7 +92,7 @@ def _add_train(sub: Any) -> None:
     parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
     parser.add_argument("--steps", type=count, help="optimiser steps")
     parser.add_argument("--minutes", type=positive, help="wall-clock limit; the learning rate is planned for it")
-    _add_light(parser, several=True)
+    add_light(parser, several=True)
     parser.add_argument("--crop", type=count, help="px, side of the training windows")
     parser.add_argument("--frames", type=count, help="of a training window (default 11, one restored frame; 16: six)")
     parser.add_argument("--batch", type=count, help="windows per step and process")
@@ -254,14 +185,14 @@ def _add_restore(sub: Any) -> None:
         "--method", default="nano", help="classical method, shipped weights, file or run (default nano)"
     )
     parser.add_argument("--stream", help="which stream of a clip (default: the only one)")
-    _add_light(parser, several=False)
+    add_light(parser, several=False)
     parser.add_argument("--seed", type=int, default=0, help="of the noise, where a clip is sensed now (default 0)")
     parser.add_argument("--width", type=count, help="bare array: packed binary planes of this many pixels per row")
     parser.add_argument("--planes", type=count, help="packed planes: so many are summed to one code, as in 7")
     parser.add_argument(
         "--frame-rate", type=positive, default=2000.0, help="bare array: codes per second (default 2000)"
     )
-    _add_running(parser)
+    add_running(parser)
     parser.add_argument("--force", action="store_true", help="replace an existing result")
 
 
@@ -328,7 +259,7 @@ def _add_evaluate(sub: Any) -> None:
     parser.add_argument("--methods", type=words, default="naive,moment", help="with commas; window as in moment:3")
     parser.add_argument("--split", default="test", choices=("train", "val", "test", "all"), help="default test")
     parser.add_argument("--stream", help="score this stored stream of every clip instead of sensing now")
-    _add_light(parser, several=True)
+    add_light(parser, several=True)
     parser.add_argument("--seed", type=int, default=0, help="of the test noise or of the random splits (default 0)")
     parser.add_argument("--published", action="store_true", help="every window exposed, scaled and scored on its own")
     parser.add_argument(
@@ -336,7 +267,7 @@ def _add_evaluate(sub: Any) -> None:
     )
     parser.add_argument("--frames", type=count, default=11, help="static: frames to restore from (default 11)")
     parser.add_argument("--splits", type=count, default=3, help="static: random splits (default 3)")
-    _add_running(parser)
+    add_running(parser)
     parser.add_argument("--force", action="store_true", help="start anew where an evaluation is")
 
 
@@ -399,7 +330,7 @@ def _add_ablate(sub: Any) -> None:
     parser.add_argument("--batch", type=count, help="windows per step and process")
     parser.add_argument("--split", default="test", choices=("train", "val", "test"), help="to score on (default test)")
     parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
-    _add_running(parser)
+    add_running(parser)
 
 
 def _run_ablate(args: argparse.Namespace) -> int:

@@ -168,13 +168,20 @@ def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "code
 def sensed(clip: Clip, light: Light, seed: int = 0) -> tuple[Codes, float]:
     """A clip as a sensor sees it, drawn when read, and the light factor: the codes that `qsim sense` would store."""
     draw = prepare(clip, Sensing(light.sensor, bits=light.bits, ppp=light.ppp, seed=seed))
+
+    def read(start: int, stop: int) -> Array:
+        try:
+            return draw.frames(clip, start, stop)
+        except ValueError as error:
+            raise ValueError(f"{clip.path}: frames {start}..{stop - 1}: {error}") from None
+
     codes = Codes(
         name=f"{clip.name}, {light.label}",
         shape=clip.shape,
         sensor=draw.sensor,
         exposure=clip.exposure,
         frame_rate=clip.frame_rate,
-        read=lambda start, stop: draw.frames(clip, start, stop),
+        read=read,
         source=f"{clip.path} seen by {light.sensor} ({light.label}), seed {seed}",
     )
     return codes, draw.level.factor

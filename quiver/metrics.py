@@ -79,9 +79,12 @@ def best_scale(output: np.ndarray, target: np.ndarray) -> float:
 
 
 def _box(image: np.ndarray, size: int) -> np.ndarray:
-    """Mean over every size x size window that lies inside, [T, H - size + 1, W - size + 1], columns then rows."""
-    views = np.lib.stride_tricks.sliding_window_view
-    return views(views(image, size, axis=1).mean(axis=-1), size, axis=2).mean(axis=-1)
+    """Mean over every size x size window that lies inside, [..., H - size + 1, W - size + 1], by running sums."""
+    for axis in (-1, -2):
+        image = np.moveaxis(image, axis, -1)
+        sums = np.cumsum(np.concatenate([np.zeros((*image.shape[:-1], 1)), image], axis=-1), axis=-1)
+        image = np.moveaxis((sums[..., size:] - sums[..., :-size]) / size, -1, axis)
+    return image
 
 
 def ssim(output: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -93,7 +96,7 @@ def ssim(output: np.ndarray, target: np.ndarray) -> np.ndarray:
     one, two = (np.clip(image, 0, 1) for image in _pair(output, target))
     if min(one.shape[1:]) < SSIM_WINDOW:
         return np.full(len(one), nan)
-    return np.array([_ssim_frame(a[None], b[None]) for a, b in zip(one, two, strict=True)])
+    return np.array([_ssim_frame(a, b) for a, b in zip(one, two, strict=True)])
 
 
 def _ssim_frame(a: np.ndarray, b: np.ndarray) -> float:

@@ -118,7 +118,10 @@ class Windows(Dataset[dict[str, Any]]):
         exposed = photons
         if self.settings.force_exposure and light.ppp is not None:
             exposed = photons * (light.ppp / max(float(photons.mean()), 1e-9))
-        codes = draw_codes(sensor, exposed, clip.exposure, place.key)
+        try:
+            codes = draw_codes(sensor, exposed, clip.exposure, place.key)
+        except ValueError as error:
+            raise ValueError(f"{clip.path}: window from frame {place.start}: {error}") from None
         white = sensor.white(clip.exposure)
         return {
             "codes": as_input(codes, sensor),

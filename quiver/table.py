@@ -92,7 +92,7 @@ def markdown(plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row]) -> st
     text = [
         f"# Evaluation of {plan.source}, split {plan.split or 'all'}",
         "",
-        f"Noise seed {plan.seed}; "
+        f"{_seen_by(plan)}, noise seed {plan.seed}; "
         + ("published protocol: every window exposed, scaled and scored on its own" if plan.published else "all frames")
         + "; mean ± half-width of the 95 % interval over scenes (clips of one scene averaged first). PSNR in dB, peak ="
         " white; matched = after the best factor per "
@@ -119,6 +119,11 @@ def markdown(plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row]) -> st
     failures = [f"- {line.method}, {line.light}, {reason}" for line in lines for reason in line.failures]
     text += ["## Failures", "", *failures, ""] if failures else []
     return "\n".join([*text, *_per_scene(rows)]) + "\n"
+
+
+def _seen_by(plan: Plan) -> str:
+    sensors = dict.fromkeys(light.sensor for light in plan.lights)
+    return f"Stream {plan.stream}" if plan.stream is not None else f"Sensor {', '.join(sensors)}"
 
 
 def _per_scene(rows: Sequence[Row]) -> list[str]:

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quiver.cli import main, size
+from quiver.cli import main
 from quiver.data import open_clips
+from quiver.options import size
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = ("train", "restore", "evaluate", "ablate", "bench", "convert-weights")

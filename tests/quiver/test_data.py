@@ -257,3 +257,13 @@ def test_the_pattern_moves():
     """The fixture itself: frame t is frame 0 shifted by 1.5 px per frame, away from the disk's wrap-around."""
     clip = sliding_pattern(5, 36, 44, seed=0)
     assert np.abs(clip[2][:, 3:] - clip[0][:, :-3]).mean() < 0.02 < np.abs(clip[2] - clip[0]).mean()
+
+
+def test_bad_radiance_names_its_clip(make_clip: ClipMaker, monkeypatch):
+    """A damaged file may hold NaN: both ways to codes say which clip, and which frames."""
+    clip = make_clip()
+    monkeypatch.setattr(type(clip), "radiance", lambda self, t, crop=None: np.full((36, 44), np.nan, np.float32))
+    with pytest.raises(ValueError, match=r"sliding_0: frames 2\.\.3: photons"):
+        sensed(clip, Light())[0].read(2, 4)
+    with pytest.raises(ValueError, match=r"sliding_0: window from frame \d: photons"):
+        Windows([clip], WindowSettings(crop=36))[0]

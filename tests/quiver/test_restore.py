@@ -23,12 +23,11 @@ from quiver.restore import (
     bytes_per_pixel,
     fill_network,
     network_restorer,
-    plan_tiles,
     restore_to_file,
     restorer,
-    spans,
     weights_path,
 )
+from quiver.tiles import plan_tiles, spans
 from quiver.unet import UNet, UNetConfig
 from quiver.weights import save
 

@@ -1,0 +1,89 @@
+"""Options that several commands share, and what their values mean.
+
+Every function from text to value raises `argparse.ArgumentTypeError`, which becomes one line that names the option.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+NETWORKS = ("nano", "quiver-s", "quiver", "unet")  # see model.py
+PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see run.py
+MODES = ("exact", "streaming", "windows")  # see restore.py
+
+
+def numbers(text: str) -> tuple[float, ...]:
+    """`3.25,9.75` -> (3.25, 9.75)"""
+    return tuple(positive(part) for part in text.split(","))
+
+
+def whole_numbers(text: str) -> tuple[int, ...]:
+    """`1,3` -> (1, 3)"""
+    return tuple(count(part) for part in text.split(","))
+
+
+def positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
+    return value
+
+
+def count(text: str) -> int:
+    if not text.strip().isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
+    return int(text)
+
+
+def nonnegative(text: str) -> int:
+    if not text.strip().isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, got {text!r}")
+    return int(text)
+
+
+def size(text: str) -> int:
+    """Bytes of `2GB`, `500MB`, `1.5GiB` or a bare number."""
+    units = {"kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2**10, "mib": 2**20, "gib": 2**30, "b": 1, "": 1}
+    number = text.rstrip("KMGiBkmgb")
+    unit = text[len(number) :].lower()
+    try:
+        value = float(number) * units[unit]
+    except (ValueError, KeyError):
+        value = float("nan")
+    if not 1 <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"expected a size such as 2GB or 500MB, got {text!r}")
+    return int(value)
+
+
+def height_width(text: str) -> tuple[int, int]:
+    """`128x256` -> (128, 256)"""
+    height, cross, width = text.partition("x")
+    if not cross:
+        raise argparse.ArgumentTypeError(f"expected HEIGHTxWIDTH as in 128x256, got {text!r}")
+    return count(height), count(width)
+
+
+def words(text: str) -> tuple[str, ...]:
+    """`naive,moment:3,out/run` -> its parts; none may be empty."""
+    parts = tuple(part.strip() for part in text.split(","))
+    if not all(parts):
+        raise argparse.ArgumentTypeError(f"expected names with commas between them, got {text!r}")
+    return parts
+
+
+def add_light(parser: argparse.ArgumentParser, several: bool) -> None:
+    kind, many = (numbers, "; several: 3.25,9.75,26") if several else (positive, "")
+    whole = whole_numbers if several else count
+    parser.add_argument("--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default quiver-physical)")
+    parser.add_argument("--ppp", type=kind, help=f"mean photons per pixel and exposure (default 3.25){many}")
+    parser.add_argument("--bits", type=whole, help="bits per code (default 3)")
+
+
+def add_running(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--memory", type=size, default="2GB", help="working memory, as in 500MB (default 2GB)")
+    parser.add_argument("--mode", default="exact", choices=MODES, help="how frames share work (default exact)")
+    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
+    parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"), help="default float32")
