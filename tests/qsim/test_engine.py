@@ -17,7 +17,8 @@ from qsim import engine
 chosen = engine.select()
 import mitsuba as mi, numpy as np
 scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "light": {"type": "constant"},
-    "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 3, "height": 3, "pixel_format": "luminance"}}})
+    "sensor": {"type": "perspective",
+    "film": {"type": "hdrfilm", "width": 3, "height": 3, "pixel_format": "luminance"}}})
 print(chosen.backend, float(np.mean(np.array(mi.render(scene, spp=1)))))
 """
 

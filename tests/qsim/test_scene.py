@@ -124,7 +124,7 @@ def test_resizing_keeps_the_view_pitch_and_f_number():
 
 
 def test_off_axis_cosines_of_a_wide_view():
-    wide = Camera(focal_length=1e-3, f_number=2, pixel_pitch=1e-3, height=1, width=3)
+    wide = Camera(focal_length=1e-4, f_number=2, pixel_pitch=1e-4, height=1, width=3)
     np.testing.assert_allclose(wide.cosines(), [[2**-0.5, 1, 2**-0.5]])
 
 

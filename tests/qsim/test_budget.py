@@ -1,0 +1,162 @@
+"""The budget: its choices hold the error asked for, its formulae are checked by brute force."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from small_scenes import CAMERA, plate, renderer, scene, square
+
+from qsim import budget
+from qsim.budget import Budget, blur_error, choose, explain, grid_samples
+from qsim.denoise import available, denoised_error
+from qsim.motion import Spin
+from qsim.render import Renderer
+from qsim.scene import Body, Diffuse, Glow, PointLight, Scene, SunSky
+
+
+def test_sample_counts_are_those_of_the_sampler(capfd):
+    """Mitsuba warns on its console when it rounds a count that its grid cannot hold."""
+    for samples in range(1, 60):
+        count = grid_samples(samples)
+        assert samples <= count <= (math.sqrt(samples) + 2) ** 2
+        assert grid_samples(count) == count
+    from qsim import engine
+
+    engine.select()
+    import mitsuba as mi
+
+    for samples in (1, 2, 3, 5, 7, 11, 13, 17, 23, 31, 32, 60, 127):
+        mi.load_dict({"type": "multijitter", "sample_count": grid_samples(samples)})
+    assert "rounded" not in capfd.readouterr().out
+
+
+@pytest.mark.parametrize(("travel", "instants"), [(0.5, 1), (3.0, 5), (3.0, 9), (4.2, 7), (1.0, 1)])
+def test_the_blur_error_bounds_the_midpoint_rule_at_an_edge(travel, instants):
+    """A pixel whose coverage grows while an edge passes it: exact integral against K instants, at any offset."""
+    offsets = np.linspace(-travel, 1 + travel, 801)
+    fine = (np.arange(4000) + 0.5) / 4000
+    coarse = (np.arange(instants) + 0.5) / instants
+
+    def mean(times):
+        return np.clip(offsets[:, None] + travel * (times - 0.5), 0, 1).mean(axis=1)
+
+    worst = np.abs(mean(fine) - mean(coarse)).max()
+    # Two kinks of the coverage may fall into the exposure: at most twice the error of one.
+    assert worst <= 2 * blur_error(travel, instants) + 1e-6
+    assert worst >= 0.3 * blur_error(travel, instants)
+
+
+def test_no_motion_needs_one_instant():
+    assert blur_error(0.0, 1) == 0
+    chosen = choose(plate(None, light=SunSky()), shutter=1.0, psnr=30, denoise=False)
+    assert chosen.sub_frames == 1
+    assert not chosen.sharp
+
+
+@pytest.mark.parametrize("psnr", [32.0, 42.0])
+def test_the_error_asked_for_is_reached_without_waste(psnr):
+    made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
+    chosen = choose(made, psnr=psnr, denoise=False)
+    frames = [Renderer(made, budget=chosen).frame(t, with_truth=False) for t in (1, 9)]
+    peak = np.percentile([frame.radiance for frame in frames], 99.9)
+    reached = -20 * math.log10(math.sqrt(np.mean([frame.error**2 for frame in frames])) / peak)
+    assert psnr - 1 < reached < psnr + 10  # samples come in even squares: 4, 16, 36
+
+
+def test_more_light_on_the_sensor_asks_for_more_samples():
+    made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
+    plain, bright = (choose(made, psnr=25, ppp=ppp, denoise=False) for ppp in (None, 300.0))
+    assert bright.samples > plain.samples
+    assert "the sensor at 300 photons" in explain(bright)
+
+
+def test_bounces_follow_the_scene():
+    """One matt plate in the open needs one bounce or few; the inside of a bright corner needs more."""
+    open_air = choose(scene(Body("plate", square(1.5), Diffuse(0.5))), psnr=30, denoise=False)
+    lamp = Body("lamp", square(0.4, -0.9), Glow(20.0))
+    walls = [Body(f"wall{i}", square(2.2, -1.1), Diffuse(0.95), turned) for i, turned in enumerate(BOX)]
+    closed = choose(Scene("box", 0, CAMERA, (), (lamp, *walls)), psnr=30, denoise=False)
+    assert open_air.bounces < closed.bounces
+    assert "bounces" in explain(closed)
+
+
+BOX = [Spin((0, 1, 0), 0.0, angle) for angle in (0.0, math.pi / 2, -math.pi / 2)] + [
+    Spin((1, 0, 0), 0.0, angle) for angle in (math.pi / 2, -math.pi / 2)
+]
+
+
+def test_an_open_shutter_gets_an_odd_number_of_instants():
+    made = plate(Spin((0, 0, 1), 400.0), light=PointLight((1, 2, 4), 30.0))
+    chosen = choose(made, shutter=1.0, psnr=35, denoise=False)
+    assert chosen.sub_frames % 2 == 1
+    assert chosen.sub_frames > 1
+    assert chosen.sharp
+    assert "mean of" in explain(chosen)
+
+
+def test_the_choice_is_a_function_of_the_question():
+    made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
+    assert choose(made, psnr=25) == choose(made, psnr=25)
+
+
+def test_a_lamp_behind_a_wall_is_said():
+    made = scene(Body("wall", square(50, -1), Diffuse(0.5)), light=PointLight((0, 0, -2), 1.0))
+    with pytest.raises(ValueError, match="the pilot saw no light"):
+        choose(made)
+
+
+@pytest.mark.parametrize("psnr", [0.0, 200.0])
+def test_an_error_nobody_can_ask_for_is_refused(psnr):
+    with pytest.raises(ValueError, match="10 to 80 dB"):
+        choose(plate(None), psnr=psnr)
+
+
+def test_a_budget_of_nothing_is_refused():
+    with pytest.raises(ValueError, match=r"Budget.samples: at least 1, got 0"):
+        Budget(samples=0)
+
+
+def test_samples_in_flight_are_bounded():
+    per_pass, passes = Budget(samples=4096).passes(1, 512 * 1024, 2**23)
+    assert per_pass * 512 * 1024 <= 2**23
+    assert passes % 2 == 0
+    assert per_pass * passes >= 4096
+
+
+def test_the_error_of_a_biased_filter_is_seen_by_raw_halves():
+    """A filter that adds 0.3 to the truth: A - B knows nothing of it, D(A) against raw B does. Noise sigma 0.5."""
+    rng = np.random.default_rng(3)
+    truth = rng.random((200, 200))
+    halves = truth + 0.5 * rng.standard_normal((2, 200, 200))
+    error = denoised_error(halves, truth + 0.3)
+    # mean((0.3 + 0.5 z)^2) - 0.25 over 40 000 pixels: sigma of the square is about 0.0033, of the root 0.0055.
+    assert error == pytest.approx(0.3, abs=0.03)
+
+
+@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
+def test_denoising_helps_where_it_says_so():
+    """A matt plate under sun and sky: the stated error of a denoised frame covers its distance from the truth."""
+    made = plate(Spin((0, 0, 1), 200.0), light=SunSky(), camera=CAMERA.resized(96, 132))
+    raw, clean = (renderer(made, budget=Budget(8, 2, denoise=on)).frame(0, with_truth=False) for on in (False, True))
+    converged = renderer(made, seed=9, budget=Budget(512, 2)).frame(0, with_truth=False).radiance
+    distance = math.sqrt(np.mean((clean.radiance - converged) ** 2))
+    assert distance < 0.7 * raw.error
+    assert clean.error == pytest.approx(distance, rel=0.6)
+    assert clean.error > 0.8 * distance  # measured with half of the samples: rather too much than too little
+
+
+def test_denoising_without_the_package_is_refused(monkeypatch):
+    from qsim import denoise
+
+    monkeypatch.setattr(denoise, "available", lambda: False)
+    with pytest.raises(ValueError, match="Open Image Denoise is missing"):
+        renderer(plate(None), budget=Budget(2, 1, denoise=True)).frame(0)
+
+
+def test_effects_left_out_are_listed_with_their_size():
+    text = explain(choose(plate(None), psnr=25, denoise=False))
+    for word in ("depth of field", "diffraction", "Airy disk", "bounces", "samples", "motion blur"):
+        assert word in text
+    assert budget.explain(Budget()) == ""
