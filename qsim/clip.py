@@ -12,40 +12,24 @@ A clip grows in NAME.part and gets its name when it is whole; an interrupted one
 from __future__ import annotations
 
 import functools
-import importlib.metadata
-import json
-import math
 import os
-import shutil
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import __version__, exr, files, optics
-from qsim.stream import Stream, check_crop, check_name, write_stream
+from qsim import exr, files, optics
+from qsim.stream import Stream, check_crop, write_stream
+from qsim.writer import FORMAT_VERSION, PHYSICAL, RELATIVE, TRUTH, ClipWriter, camera_of
 
 if TYPE_CHECKING:
     from qsim.scene import Camera
 
 __all__ = ["FORMAT_VERSION", "PHYSICAL", "RELATIVE", "Clip", "ClipWriter", "Stream", "write_stream"]
 
-FORMAT_VERSION = 1
-PHYSICAL = "W m^-2 sr^-1"
-RELATIVE = "relative"
-_TRUTH = {
-    "u": "flow",
-    "v": "flow",
-    "bu": "flow_back",
-    "bv": "flow_back",
-    "valid": "valid",
-    "Z": "depth",
-    "id": "body_id",
-}
 _REQUIRED = ("shape", "frame_rate", "exposure", "radiance_unit", "mean_radiance", "checksums")
 
 
@@ -122,19 +106,7 @@ class Clip:
     @cached_property
     def camera(self) -> Camera | None:
         """The camera without its motion; None for relative radiance."""
-        described = self.meta.get("camera")
-        if described is None:
-            return None
-        from qsim.scene import Camera
-
-        values = {key: value for key, value in described.items() if key not in ("kind", "motion")}
-        for key in ("origin", "target", "up"):
-            if key in values:
-                values[key] = tuple(values[key])
-        try:
-            return Camera(**values)
-        except TypeError as error:
-            raise ValueError(f"{self.path / 'clip.json'}: camera: {error}") from None
+        return camera_of(self.meta, self.path / "clip.json")
 
     def radiance(self, t: int, crop: optics.Crop | None = None) -> Array:
         """What the sensor integrates in frame t, float32 [H, W]; crop = (y, x, height, width)."""
@@ -213,165 +185,12 @@ class Clip:
         status = path.stat()
         channels = _read_truth(path, status.st_mtime_ns, status.st_size)
         if channel not in channels:
-            raise ValueError(f"{path}: has no channel '{channel}' ({_TRUTH[channel]})")
+            raise ValueError(f"{path}: has no channel '{channel}' ({TRUTH[channel]})")
         return channels[channel]
 
     def _check_frame(self, t: int) -> None:
         if not 0 <= t < len(self):
             raise ValueError(f"{self.path}: frame {t} asked for, the clip has frames 0..{len(self) - 1}")
-
-
-class ClipWriter:
-    """Writes a clip frame by frame into PATH.part and gives it its name when all frames are there.
-
-    `meta` is clip.json without what the writer measures (means, errors, checksums); it must hold shape, frame_rate,
-    exposure and radiance_unit, and camera (a dict) unless the unit is relative. A writer with the same meta goes on
-    where an interrupted one stopped: `has(t)` tells. `FileExistsError` if the clip exists and `force` is not set.
-    """
-
-    def __init__(self, path: str | os.PathLike[str], meta: dict[str, Any], *, force: bool = False) -> None:
-        self.path = Path(path)
-        self.force = force
-        check_name(self.path.name)
-        if self.path.exists() and not force:
-            raise FileExistsError(f"{self.path}: exists; name another with -o, or use --force to replace it")
-        self.meta = json.loads(files.to_json({"format_version": FORMAT_VERSION, "name": self.path.name} | meta))
-        _check_new(self.path, self.meta)
-        self.part = self.path.with_name(self.path.name + ".part")
-        self._camera = Clip(self.path, self.meta).camera
-        self._frames: dict[int, dict[str, Any]] = {}
-        self._lock = files.Lock(self.part / "lock")
-
-    def __enter__(self) -> ClipWriter:
-        identity = files.to_json(self.meta)
-        self.part.mkdir(parents=True, exist_ok=True)
-        if not self._lock.acquire():
-            raise ValueError(f"{self.part}: another process is writing this clip; wait for it, or name another with -o")
-        try:
-            begun = self.part / "begun.json"
-            if not begun.is_file() or begun.read_bytes() != identity:
-                for item in self.part.iterdir():
-                    if item.name != "lock":
-                        shutil.rmtree(item) if item.is_dir() else item.unlink()
-                files.write_bytes(begun, identity)
-            files.sweep(self.part)
-            self._frames = _read_journal(self.part)
-        except BaseException:
-            self._lock.release()
-            raise
-        return self
-
-    def has(self, t: int) -> bool:
-        """Whether an earlier, interrupted writer already finished frame t."""
-        return t in self._frames
-
-    def add(
-        self,
-        t: int,
-        radiance: Array,
-        sharp: Array | None = None,
-        truth: dict[str, Array] | None = None,
-        error: float | None = None,
-    ) -> None:
-        """Store frame t: radiance [H, W], optionally the sharp instant, ground truth and the rms error of the radiance.
-
-        `truth` may hold flow [2, H, W], flow_back [2, H, W], valid, depth, body_id [H, W]. `ValueError` for radiance
-        that is negative or not finite, naming frame and pixel.
-        """
-        if not 0 <= t < self.meta["shape"][0]:
-            raise ValueError(f"{self.path}: frame {t} does not belong to a clip of {self.meta['shape'][0]} frames")
-        contents: dict[str, bytes] = {}
-        half, clipped = self._encode(t, "radiance", radiance, contents)
-        if sharp is not None:
-            self._encode(t, "sharp", sharp, contents)
-        if truth:
-            contents[f"truth/{t:06d}.exr"] = exr.encode(_truth_channels(truth), compress=True)
-        checksums = {}
-        for relative, content in contents.items():
-            target = self.part / relative
-            target.parent.mkdir(exist_ok=True)
-            checksums[relative] = files.write_bytes(target, content)
-        stored = half.astype(np.float64)
-        entry: dict[str, Any] = {
-            "t": t,
-            "checksums": checksums,
-            "mean_radiance": float(stored.mean()),
-            "clipped": clipped,
-        }
-        if error is not None:
-            entry["error"] = float(error)
-        if self._camera is not None:
-            origin = tuple(self.meta.get("origin", (0, 0)))
-            photons = optics.expected_photons(stored, self._camera, self.meta["exposure"], origin=origin)
-            entry["mean_photons"] = float(photons.mean())
-        self._frames[t] = entry
-        with open(self.part / "journal.jsonl", "ab") as journal:
-            journal.write(json.dumps(entry, sort_keys=True).encode() + b"\n")
-            journal.flush()
-            os.fsync(journal.fileno())
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
-            if kind is None:
-                self._finish()
-            elif not self._frames:
-                shutil.rmtree(self.part)
-        finally:
-            self._lock.release()
-
-    def _encode(self, t: int, folder: str, image: Array, contents: dict[str, bytes]) -> tuple[Array, int]:
-        _, height, width = self.meta["shape"]
-        if image.shape != (height, width):
-            raise ValueError(f"{self.path}: {folder} of frame {t} is {image.shape}, expected {(height, width)}")
-        bad = ~(np.isfinite(image) & (image >= 0))
-        if bad.any():
-            y, x = (int(i) for i in np.argwhere(bad)[0])
-            raise ValueError(
-                f"{self.path}: {folder} of frame {t} is {float(image[y, x])!r} at (y, x) = ({y}, {x}); "
-                "radiance is finite and not negative"
-            )
-        half, clipped = exr.to_half(image)
-        contents[f"{folder}/{t:06d}.exr"] = exr.encode({"Y": half})
-        return half, clipped
-
-    def _finish(self) -> None:
-        frames = self.meta["shape"][0]
-        missing = [t for t in range(frames) if t not in self._frames]
-        if missing:
-            raise ValueError(
-                f"{self.path}: frame {missing[0]} was never written ({len(missing)} of {frames} are missing)"
-            )
-        entries = [self._frames[t] for t in range(frames)]
-        meta = dict(self.meta)
-        meta["mean_radiance"] = math.fsum(e["mean_radiance"] for e in entries) / frames
-        if self._camera is not None:
-            meta["mean_photons"] = math.fsum(e["mean_photons"] for e in entries) / frames
-        meta["clipped_pixels"] = sum(e["clipped"] for e in entries)
-        meta["checksums"] = {name: digest for e in entries for name, digest in e["checksums"].items()}
-        meta["software"] = _software()
-        if all("error" in e for e in entries):
-            meta["error_per_frame"] = [e["error"] for e in entries]
-            meta["psnr_of_truth"] = self._psnr(meta["error_per_frame"])
-        files.write_json(self.part / "clip.json", meta)
-        for name in ("begun.json", "journal.jsonl", "lock"):
-            (self.part / name).unlink(missing_ok=True)
-        if self.path.exists():
-            files.remove_folder(self.path)
-        os.replace(self.part, self.path)
-        files.sync_folder(self.path.parent)
-
-    def _psnr(self, errors: list[float]) -> float | None:
-        """PSNR of the radiance, dB; the peak is the clip's 99.9th percentile (over at most 4 million even samples)."""
-        frames, height, width = self.meta["shape"]
-        step = max(1, math.isqrt(frames * height * width // 4_000_000))
-        samples = [
-            exr.read_half(self.part / "radiance" / f"{t:06d}.exr", height, width)[::step, ::step] for t in range(frames)
-        ]
-        peak = float(np.percentile(np.stack(samples), 99.9))
-        rms = math.sqrt(math.fsum(e * e for e in errors) / frames)
-        return 20 * math.log10(peak / rms) if peak > 0 and rms > 0 else None
 
 
 def _why_not(path: Path) -> str:
@@ -384,74 +203,9 @@ def _why_not(path: Path) -> str:
     return f"{path}: not a clip folder (it has no clip.json)"
 
 
-def _check_new(path: Path, meta: dict[str, Any]) -> None:
-    shape = meta.get("shape")
-    if not (isinstance(shape, list) and len(shape) == 3 and all(isinstance(n, int) for n in shape)):
-        raise ValueError(f"{path}: shape must be [frames, height, width], got {shape!r}")
-    if min(shape) < 1:
-        raise ValueError(
-            f"{path}: a clip needs at least one frame of one pixel, got {shape[0]} of {shape[1]} x {shape[2]}"
-        )
-    for key in ("frame_rate", "exposure"):
-        value = meta.get(key)
-        if not (isinstance(value, int | float) and value > 0):
-            raise ValueError(f"{path}: {key} must be a number above 0, got {value!r}")
-    if meta.get("radiance_unit") not in (PHYSICAL, RELATIVE):
-        raise ValueError(
-            f"{path}: radiance_unit must be '{PHYSICAL}' or '{RELATIVE}', got {meta.get('radiance_unit')!r}"
-        )
-    if (meta.get("camera") is None) != (meta["radiance_unit"] == RELATIVE):
-        raise ValueError(f"{path}: a clip in {PHYSICAL} needs a camera, and a relative one has none")
-
-
-def _truth_channels(truth: dict[str, Array]) -> dict[str, Array]:
-    unknown = set(truth) - set(_TRUTH.values())
-    if unknown:
-        raise ValueError(
-            f"truth: unknown key {sorted(unknown)[0]!r}; known are {', '.join(sorted(set(_TRUTH.values())))}"
-        )
-    channels: dict[str, Array] = {}
-    for key, names in (("flow", ("u", "v")), ("flow_back", ("bu", "bv"))):
-        if key in truth:
-            for name, plane in zip(names, truth[key], strict=True):
-                channels[name] = plane.astype("<f4")
-    if "valid" in truth:
-        channels["valid"] = truth["valid"].astype("<u4")
-    if "depth" in truth:
-        channels["Z"] = truth["depth"].astype("<f4")
-    if "body_id" in truth:
-        channels["id"] = truth["body_id"].astype("<i4").view("<u4")
-    return channels
-
-
-def _read_journal(part: Path) -> dict[int, dict[str, Any]]:
-    """Frames that an earlier writer finished; a line or file cut short by its death is dropped."""
-    path = part / "journal.jsonl"
-    if not path.is_file():
-        return {}
-    frames = {}
-    kept = []
-    for line in path.read_bytes().split(b"\n"):
-        try:
-            entry = json.loads(line)
-        except ValueError:
-            continue
-        if all((part / name).is_file() and files.sha256(part / name) == d for name, d in entry["checksums"].items()):
-            frames[int(entry["t"])] = entry
-            kept.append(line)
-    files.write_bytes(path, b"".join(line + b"\n" for line in kept))
-    return frames
-
-
 @functools.lru_cache(maxsize=2)
 def _read_truth(path: Path, modified: int, size: int) -> dict[str, Array]:
     channels = exr.read(path)
     for array in channels.values():
         array.setflags(write=False)
     return channels
-
-
-@functools.cache
-def _software() -> dict[str, str]:
-    versions = {name: importlib.metadata.version(name) for name in ("numpy", "mitsuba", "drjit")}
-    return {"qsim": __version__} | versions

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from qsim import files, formats
+from qsim import export, files, formats
 from qsim.clip import Clip
 from qsim.console import bar, command, output
 from qsim.dataset import Dataset
@@ -47,7 +47,7 @@ def add_convert(sub: Any) -> None:
     reading.add_argument("--ppp", type=float, help="light level the sensor's gain was set for")
     reading.add_argument("--split", choices=SPLITS, help="stored in the clips")
     writing = parser.add_argument_group("writing for others")
-    writing.add_argument("--to", choices=sorted(formats.EXPORTS), help="kind of the output, if its name does not say")
+    writing.add_argument("--to", choices=sorted(export.EXPORTS), help="kind of the output, if its name does not say")
     writing.add_argument(
         "--lossy", action="store_true", help="mp4 with FFmpeg's ordinary settings: noise does not survive"
     )
@@ -70,12 +70,12 @@ def _is_stream(path: Path) -> bool:
 def _export(args: argparse.Namespace) -> list[Path]:
     kind = args.to or _SUFFIXES.get(args.output.suffix)
     if kind is None:
-        known = ", ".join(sorted(formats.EXPORTS))
+        known = ", ".join(sorted(export.EXPORTS))
         raise ValueError(f"{args.output}: say what to write with --to: {known}")
-    wanted = formats.Export(kind, args.transfer or "gamma 2.2", args.white, not args.lossy)
+    wanted = export.Export(kind, args.transfer or "gamma 2.2", args.white, not args.lossy)
     if not (args.input / "dataset.json").is_file():
         opened = Stream.open(args.input) if args.input.suffix == ".json" else Clip.open(args.input)
-        return [formats.export(opened, args.output, wanted, force=args.force)]
+        return [export.export(opened, args.output, wanted, force=args.force)]
     suffix = {"cube": ".npy", "mp4": ".mp4", "zarr": ".zarr"}.get(kind, "")
     made = []
     clips = Dataset.open(args.input).clips()
@@ -83,7 +83,7 @@ def _export(args: argparse.Namespace) -> list[Path]:
         for n, clip in enumerate(clips, 1):
             split = clip.meta.get("split") or "all"
             target = args.output / split / f"{clip.name}{suffix}"
-            made.append(formats.export(clip, target, wanted, force=args.force))
+            made.append(export.export(clip, target, wanted, force=args.force))
             progress(n, len(clips))
     return made
 

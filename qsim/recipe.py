@@ -39,10 +39,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from qsim import checks
 from qsim.files import to_json
 from qsim.stream import Sensing, check_name
 
-SPLITS = ("train", "val", "test")
+SPLITS = checks.SPLITS
 
 
 @dataclass(frozen=True)
@@ -155,8 +156,8 @@ class _Reader:
         for key in ("name", "frames", "height", "width", "frame_rate"):
             if key not in head:
                 raise ValueError(f"{self.where('recipe', 0)}: key '{key}' is missing in [recipe]")
-        name = self.value(head, "name", _text, "recipe", 0)
-        seed = self.value(head, "seed", _seed, "recipe", 0) if "seed" in head else 0
+        name = self.value(head, "name", checks.text, "recipe", 0)
+        seed = self.value(head, "seed", checks.seed, "recipe", 0) if "seed" in head else 0
         defaults = {key: self.value(head, key, check, "recipe", 0) for key, check in _SETTINGS.items() if key in head}
         streams = [s for i, table in self.tables(content, "streams") for s in self.streams(table, i, seed)]
         names = [s.stream_name for s in streams]
@@ -192,8 +193,8 @@ class _Reader:
             raise ValueError(f"{self.where('scenes', i)}: key 'family' is missing in [[scenes]]")
         family = self.family(table, i)
         seeds = self.seeds(table, i)
-        speeds = self.value(table, "speed", _list(_positive), "scenes", i) if "speed" in table else [1.0]
-        split = self.value(table, "split", _split, "scenes", i) if "split" in table else "train"
+        speeds = self.value(table, "speed", checks.list_of(checks.positive), "scenes", i) if "speed" in table else [1.0]
+        split = self.value(table, "split", checks.split, "scenes", i) if "split" in table else "train"
         own = {key: self.value(table, key, check, "scenes", i) for key, check in _SETTINGS.items() if key in table}
         settings = Settings(**(defaults | own))
         stem = Path(family).stem
@@ -213,7 +214,7 @@ class _Reader:
         ]
 
     def family(self, table: dict[str, Any], i: int) -> str:
-        family: str = self.value(table, "family", _text, "scenes", i)
+        family: str = self.value(table, "family", checks.text, "scenes", i)
         if family.endswith(".py"):
             file = (self.path.parent / family).resolve()
             if not file.is_file():
@@ -234,9 +235,9 @@ class _Reader:
             for key in ("count", "first"):
                 if key in table:
                     raise ValueError(f"{self.where('scenes', i, key)}: give either seeds or count, not both")
-            return list(self.value(table, "seeds", _list(_seed), "scenes", i))
-        first = self.value(table, "first", _seed, "scenes", i) if "first" in table else 0
-        count = self.value(table, "count", _whole, "scenes", i) if "count" in table else 1
+            return list(self.value(table, "seeds", checks.list_of(checks.seed), "scenes", i))
+        first = self.value(table, "first", checks.seed, "scenes", i) if "first" in table else 0
+        count = self.value(table, "count", checks.whole, "scenes", i) if "count" in table else 1
         return list(range(first, first + count))
 
     def streams(self, table: dict[str, Any], i: int, seed: int) -> list[Sensing]:
@@ -252,17 +253,17 @@ class _Reader:
                 f"{given} given"
             )
         sensor = self.sensor(table, i)
-        bits = self.value(table, "bits", _list(_bits), "streams", i) if "bits" in table else [None]
+        bits = self.value(table, "bits", checks.list_of(checks.bits), "streams", i) if "bits" in table else [None]
         group, diffraction = (
-            key in table and self.value(table, key, _flag, "streams", i) for key in ("group", "diffraction")
+            key in table and self.value(table, key, checks.flag, "streams", i) for key in ("group", "diffraction")
         )
-        own = self.value(table, "seed", _seed, "streams", i) if "seed" in table else seed
+        own = self.value(table, "seed", checks.seed, "streams", i) if "seed" in table else seed
         levels: list[float | None] = [None]
         if lights != ["absolute"]:
-            levels = self.value(table, lights[0], _list(_positive), "streams", i)
-        elif self.value(table, "absolute", _flag, "streams", i) is not True:
+            levels = self.value(table, lights[0], checks.list_of(checks.positive), "streams", i)
+        elif self.value(table, "absolute", checks.flag, "streams", i) is not True:
             raise ValueError(f"{self.where('streams', i, 'absolute')}: absolute can only be true; or give a ppp")
-        name = self.value(table, "name", _text, "streams", i) if "name" in table else None
+        name = self.value(table, "name", checks.text, "streams", i) if "name" in table else None
         if name is not None and len(bits) * len(levels) > 1:
             raise ValueError(f"{self.where('streams', i, 'name')}: one name for {len(bits) * len(levels)} streams")
         return [
@@ -283,7 +284,7 @@ class _Reader:
     def sensor(self, table: dict[str, Any], i: int) -> str:
         from qsim import devices
 
-        sensor: str = self.value(table, "sensor", _text, "streams", i, plain=False)
+        sensor: str = self.value(table, "sensor", checks.text, "streams", i, plain=False)
         where = self.where("streams", i, "sensor")
         if sensor.endswith(".toml"):
             sensor = str((self.path.parent / sensor).resolve())
@@ -340,96 +341,11 @@ def _suggest(word: str, known: Any) -> str:
     return f"; did you mean '{close[0]}'?" if close else ""
 
 
-def _text(value: Any) -> str:
-    if not isinstance(value, str) or not value:
-        raise ValueError(f"expected a text in quotes, got {value!r}")
-    return value
-
-
-def _flag(value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise ValueError(f"expected true or false, got {value!r}")
-    return value
-
-
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"expected a number, got {value!r}")
-    return float(value)
-
-
-def _positive(value: Any) -> float:
-    number = _number(value)
-    if not 0 < number < float("inf"):
-        raise ValueError(f"expected a number above 0, got {value!r}")
-    return number
-
-
-def _whole(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 100_000:
-        raise ValueError(f"expected a whole number from 1 to 100000, got {value!r}")
-    return value
-
-
-def _seed(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**31:
-        raise ValueError(f"expected a whole number from 0 to 2^31 - 1, got {value!r}")
-    return value
-
-
-def _bits(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 16:
-        raise ValueError(f"expected 1 to 16 bits per code, got {value!r}")
-    return value
-
-
-def _frame_rate(value: Any) -> float:
-    number = _positive(value)
-    if not 1 <= number <= 1e8:
-        raise ValueError(f"expected frames per second from 1 to 1e8, got {value!r}; 0.5 ms per frame is 2000.0")
-    return number
-
-
-def _shutter(value: Any) -> float:
-    number = _number(value)
-    if not 0 <= number <= 1:
-        raise ValueError(f"expected the open share of a frame, 0 to 1, got {value!r}; half of the frame is 0.5")
-    return number
-
-
-def _psnr(value: Any) -> float:
-    number = _number(value)
-    if not 10 <= number <= 80:
-        raise ValueError(f"expected the wanted error in dB, 10 to 80, got {value!r}; 40.0 is 1 % of the peak")
-    return number
-
-
-def _split(value: Any) -> str:
-    if value not in SPLITS:
-        raise ValueError(f"expected one of {', '.join(SPLITS)}, got {value!r}")
-    return str(value)
-
-
-def _list(check: Callable[[Any], Any]) -> Callable[[Any], list[Any]]:
-    """A check of one value or of a list of them, without repetitions."""
-
-    def checked(value: Any) -> list[Any]:
-        values = [check(item) for item in value] if isinstance(value, list) else [check(value)]
-        if not values:
-            raise ValueError("expected at least one value, got an empty list")
-        for n, item in enumerate(values):
-            if item in values[:n]:
-                raise ValueError(f"{item!r} is listed twice")
-        return values
-
-    return checked
-
-
 _SETTINGS: dict[str, Callable[[Any], Any]] = {
-    "frames": _whole,
-    "height": _whole,
-    "width": _whole,
-    "frame_rate": _frame_rate,
-    "shutter": _shutter,
-    "psnr": _psnr,
+    "frames": checks.whole,
+    "height": checks.whole,
+    "width": checks.whole,
+    "frame_rate": checks.frame_rate,
+    "shutter": checks.shutter,
+    "psnr": checks.psnr,
 }

@@ -13,11 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from qsim import formats, planes, video
+from qsim import export, formats, planes, video
 from qsim.cli import main
 from qsim.clip import RELATIVE, Clip, ClipWriter
+from qsim.export import Export
 from qsim.footage import Hints, from_linear, numbered, to_linear
-from qsim.formats import Capture, Export
+from qsim.formats import Capture
 from qsim.stream import Stream
 
 CAPTURE = Capture(frame_rate=1000.0)
@@ -111,7 +112,7 @@ def test_codes_through_our_stream_and_every_export(tmp_path: Path, bits: int, wi
     )
     exports = [Export("png"), Export("zarr")] + ([Export("cube")] if bits == 1 else [])
     for wanted in exports:
-        path = formats.export(stream, tmp_path / wanted.kind, wanted)
+        path = export.export(stream, tmp_path / wanted.kind, wanted)
         layout = {"png": "png", "zarr": "zarr", "cube": "cube"}[wanted.kind]
         np.testing.assert_array_equal(everything(path, layout=layout, bits=bits, width=width), codes)
         side = path / "meta.json" if path.is_dir() else path.with_name(path.name + ".json")
@@ -365,10 +366,10 @@ def test_lossless_video_is_bit_exact_and_ordinary_video_is_not(tmp_path: Path):
     codes = np.random.default_rng(0).integers(0, 8, (6, 34, 46)).astype(np.uint8)
     np.save(tmp_path / "c.npy", codes)
     stream = formats.to_stream(formats.read(tmp_path / "c.npy", Hints("codes", bits=3)), tmp_path / "s", CAPTURE)
-    exact = formats.export(stream, tmp_path / "exact.mp4", Export("mp4"))
+    exact = export.export(stream, tmp_path / "exact.mp4", Export("mp4"))
     found = everything(exact, transfer="linear") * 255
     np.testing.assert_array_equal(np.rint(found), video.stretch(codes, 3))
-    lossy = formats.export(stream, tmp_path / "lossy.mp4", Export("mp4", lossless=False))
+    lossy = export.export(stream, tmp_path / "lossy.mp4", Export("mp4", lossless=False))
     difference = np.rint(everything(lossy, transfer="linear") * 255) - video.stretch(codes, 3)
     assert np.abs(difference).max() > 8
     assert json.loads((tmp_path / "exact.mp4.json").read_text())["frame_rate"] == 1000.0
@@ -378,12 +379,12 @@ def test_odd_sizes_of_video(tmp_path: Path):
     pytest.importorskip("av")
     frames = np.random.default_rng(0).random((3, 17, 23)).astype(np.float16).astype(np.float32)
     clip = clip_of(tmp_path / "c", frames)
-    path = formats.export(clip, tmp_path / "c.mp4", Export("mp4", white=1.0))
+    path = export.export(clip, tmp_path / "c.mp4", Export("mp4", white=1.0))
     np.testing.assert_array_equal(
         np.rint(everything(path, transfer="linear") * 255), from_linear(frames, "gamma 2.2", 255)
     )
     with pytest.raises(ValueError, match=r"lossy H\.264 needs even sizes"):
-        formats.export(clip, tmp_path / "l.mp4", Export("mp4", lossless=False))
+        export.export(clip, tmp_path / "l.mp4", Export("mp4", lossless=False))
     assert not (tmp_path / "l.mp4").exists()
 
 
@@ -392,7 +393,7 @@ def test_a_folder_of_videos_becomes_clips(tmp_path: Path):
     frames = np.random.default_rng(0).random((2, 16, 24))
     clip = clip_of(tmp_path / "c", frames)
     for name in ("test_00000.mp4", "occ/a.mp4"):
-        formats.export(clip, tmp_path / "in" / name, Export("mp4", white=1.0))
+        export.export(clip, tmp_path / "in" / name, Export("mp4", white=1.0))
     options = ["--frame-rate", "2000", "--transfer", "gamma 2.2", "--split", "test"]
     assert main(["convert", str(tmp_path / "in"), str(tmp_path / "out"), *options]) == 0
     found = Clip.open(tmp_path / "out" / "occ_a")
@@ -407,12 +408,12 @@ def test_light_out_as_exr_png_and_zarr(tmp_path: Path):
 
     frames = np.random.default_rng(0).random((3, 9, 7)).astype(np.float16).astype(np.float32)
     clip = clip_of(tmp_path / "c", frames)
-    folder = formats.export(clip, tmp_path / "exr", Export("exr"))
+    folder = export.export(clip, tmp_path / "exr", Export("exr"))
     np.testing.assert_array_equal(exr.read(folder / "000002.exr")["Y"], frames[2])
-    folder = formats.export(clip, tmp_path / "png", Export("png", transfer="srgb", white=1.0))
+    folder = export.export(clip, tmp_path / "png", Export("png", transfer="srgb", white=1.0))
     np.testing.assert_allclose(everything(folder, transfer="srgb"), frames, atol=0.005)
     zarr = pytest.importorskip("zarr")
-    folder = formats.export(clip, tmp_path / "c.zarr", Export("zarr"))
+    folder = export.export(clip, tmp_path / "c.zarr", Export("zarr"))
     np.testing.assert_array_equal(zarr.open_group(str(folder), mode="r")["frames"][...], frames)
 
 
@@ -497,7 +498,7 @@ def test_wrong_kinds_are_refused_with_advice(tmp_path: Path):
     clip = formats.to_clip(light, tmp_path / "c", CAPTURE)
     for source, kind, message in [(clip, "cube", "a clip holds light"), (stream, "exr", "EXR holds light")]:
         with pytest.raises(ValueError, match=message):
-            formats.export(source, tmp_path / "out", Export(kind))
+            export.export(source, tmp_path / "out", Export(kind))
         assert not (tmp_path / "out").exists()
     with pytest.raises(FileExistsError, match="--force"):
         formats.to_stream(codes, tmp_path / "s", CAPTURE)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qsim import formats
+from qsim import export
 from qsim.clip import RELATIVE, Clip, ClipWriter
 
 FRAMES, HEIGHT, WIDTH = 32, 512, 1024
@@ -39,7 +39,7 @@ def rate(draw: Callable[[np.random.Generator], object], seconds: float) -> float
 def test_random_crops_are_quick(tmp_path: Path):
     av = pytest.importorskip("av")
     clip = textured_clip(tmp_path / "clip")
-    video = formats.export(clip, tmp_path / "clip.mp4", formats.Export("mp4", lossless=False))
+    video = export.export(clip, tmp_path / "clip.mp4", export.Export("mp4", lossless=False))
 
     def place(rng: np.random.Generator) -> tuple[int, int, int]:
         return (int(rng.integers(FRAMES - WINDOW)), int(rng.integers(HEIGHT - CROP)), int(rng.integers(WIDTH - CROP)))

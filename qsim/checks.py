@@ -1,0 +1,93 @@
+"""Checks of single values in a recipe: the value in its type, or a `ValueError` that says what was expected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+SPLITS = ("train", "val", "test")
+
+
+def text(value: Any) -> str:
+    if not isinstance(value, str) or not value:
+        raise ValueError(f"expected a text in quotes, got {value!r}")
+    return value
+
+
+def flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f"expected true or false, got {value!r}")
+    return value
+
+
+def real(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"expected a number, got {value!r}")
+    return float(value)
+
+
+def positive(value: Any) -> float:
+    number = real(value)
+    if not 0 < number < float("inf"):
+        raise ValueError(f"expected a number above 0, got {value!r}")
+    return number
+
+
+def whole(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 100_000:
+        raise ValueError(f"expected a whole number from 1 to 100000, got {value!r}")
+    return value
+
+
+def seed(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**31:
+        raise ValueError(f"expected a whole number from 0 to 2^31 - 1, got {value!r}")
+    return value
+
+
+def bits(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 16:
+        raise ValueError(f"expected 1 to 16 bits per code, got {value!r}")
+    return value
+
+
+def frame_rate(value: Any) -> float:
+    number = positive(value)
+    if not 1 <= number <= 1e8:
+        raise ValueError(f"expected frames per second from 1 to 1e8, got {value!r}; 0.5 ms per frame is 2000.0")
+    return number
+
+
+def shutter(value: Any) -> float:
+    number = real(value)
+    if not 0 <= number <= 1:
+        raise ValueError(f"expected the open share of a frame, 0 to 1, got {value!r}; half of the frame is 0.5")
+    return number
+
+
+def psnr(value: Any) -> float:
+    number = real(value)
+    if not 10 <= number <= 80:
+        raise ValueError(f"expected the wanted error in dB, 10 to 80, got {value!r}; 40.0 is 1 % of the peak")
+    return number
+
+
+def split(value: Any) -> str:
+    if value not in SPLITS:
+        raise ValueError(f"expected one of {', '.join(SPLITS)}, got {value!r}")
+    return str(value)
+
+
+def list_of(check: Callable[[Any], Any]) -> Callable[[Any], list[Any]]:
+    """A check of one value or of a list of them, without repetitions."""
+
+    def checked(value: Any) -> list[Any]:
+        values = [check(item) for item in value] if isinstance(value, list) else [check(value)]
+        if not values:
+            raise ValueError("expected at least one value, got an empty list")
+        for n, item in enumerate(values):
+            if item in values[:n]:
+                raise ValueError(f"{item!r} is listed twice")
+        return values
+
+    return checked
