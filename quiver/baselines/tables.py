@@ -17,6 +17,7 @@ from numpy import ndarray as Array
 from qsim.sensor import Sensor
 
 POINTS = 4096  # of a table; linear interpolation then errs by less than 1e-6 of the full scale
+TOGETHER = 1 << 22  # probabilities held at a time
 FLAT = 1e-7  # a response this close to its top (relative to the full scale) has ended
 
 
@@ -47,12 +48,19 @@ def brightest(sensor: Sensor, exposure: float) -> float:
     return float(photons[np.argmax(ended)])
 
 
+def pieces(photons: Array, values: int) -> list[Array]:
+    """Photons in pieces whose distributions, of this many values each, fit into memory together."""
+    return np.array_split(photons, -(-len(photons) * values // TOGETHER))
+
+
 def response_table(sensor: Sensor, exposure: float, points: int = POINTS) -> ResponseTable:
     """Tabulate a sensor's response from darkness to the end of its rise.
 
     Where the response falls again (a paralyzable counter) the table holds its rising branch only.
     """
     photons = np.linspace(0, np.sqrt(brightest(sensor, exposure)), points) ** 2
-    mean, variance = sensor.mean(photons, exposure), sensor.variance(photons, exposure)
+    parts = pieces(photons, sensor.levels)
+    mean = np.concatenate([sensor.mean(part, exposure) for part in parts])
+    variance = np.concatenate([sensor.variance(part, exposure) for part in parts])
     rising = np.concatenate([[True], mean[1:] > np.maximum.accumulate(mean)[:-1]])
     return ResponseTable(photons[rising], mean[rising], variance[rising], sensor.levels - 1)

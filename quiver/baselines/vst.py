@@ -21,7 +21,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.sensor import Sensor
-from quiver.baselines.tables import response_table
+from quiver.baselines.tables import pieces, response_table
 
 Kind = Literal["table", "binomial", "poisson"]
 
@@ -93,8 +93,10 @@ def stabiliser(sensor: Sensor, exposure: float, samples: int, kind: Kind = "tabl
         case _:
             raise ValueError(f"stabiliser is table, binomial or poisson, got {kind!r}")
     photons = np.linspace(0, np.sqrt(table.cap(samples)), POINTS) ** 2
-    sums = sum_pmf(np.exp(sensor.log_pmf(photons, exposure)), samples)
-    lattice = np.interp(np.arange(sums.shape[1]) / samples, mean_code, stabilised)
-    expected = np.maximum.accumulate(sums @ lattice)
+    lattice = np.interp(np.arange(samples * top + 1) / samples, mean_code, stabilised)
+    expected = np.concatenate(
+        [sum_pmf(np.exp(sensor.log_pmf(part, exposure)), samples) @ lattice for part in pieces(photons, len(lattice))]
+    )
+    expected = np.maximum.accumulate(expected)
     rising = np.concatenate([[True], np.diff(expected) > 0])
     return Stabiliser(samples, mean_code, stabilised, photons[rising], expected[rising])
