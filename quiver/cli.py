@@ -200,21 +200,22 @@ def _run_restore(args: argparse.Namespace) -> int:
     from quiver.data import bar, output
     from quiver.restore import restore_to_file, restorer
 
-    if args.output.suffix != ".npy":
-        raise ValueError(f"{args.output}: restored video is written as .npy")
-    for path in (args.output, args.output.with_suffix(".json")):
+    target: Path = args.output if args.output.suffix else args.output.with_suffix(".npy")
+    if target.suffix != ".npy":
+        raise ValueError(f"{target}: restored video is written as .npy")
+    for path in (target, target.with_suffix(".json")):
         if path.exists() and not args.force:
             raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
     codes = _source(args)
     method = restorer(args.method, _options(args))
-    args.output.parent.mkdir(parents=True, exist_ok=True)
+    target.parent.mkdir(parents=True, exist_ok=True)
     with bar(method.name) as progress:
-        meta = restore_to_file(codes, method, args.output, progress)
+        meta = restore_to_file(codes, method, target, progress)
     length, height, width = codes.shape
     output(
         args,
-        {"restored": str(args.output)} | meta,
-        f"{args.output}: {length} frames of {height} x {width} by {method.name}, "
+        {"restored": str(target)} | meta,
+        f"{target}: {length} frames of {height} x {width} by {method.name}, "
         f"{meta['seconds_per_frame']:.3g} s per frame; photons, white = {codes.white:.4g}",
     )
     return 0
