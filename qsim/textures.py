@@ -7,6 +7,7 @@ is ever downloaded.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +147,32 @@ def speckles(rng: np.random.Generator, count: int = 1500, size: int = 512, large
         at = np.ix_(iy % size, ix % size)
         picture[at] += cover * (tone - picture[at])
     return picture
+
+
+def lines_of_text(
+    lines: Sequence[str], width: int = 1024, height: int = 512, ink: float = 0.05, paper: float = 0.8
+) -> Picture:
+    """A printed page: every line fills the width, so longer lines are smaller; an empty line is half the page high.
+
+    The font is the bold DejaVu Sans inside matplotlib.
+    """
+    import matplotlib as mpl
+    from PIL import Image, ImageDraw, ImageFont
+
+    font = str(Path(mpl.get_data_path()) / "fonts" / "ttf" / "DejaVuSans-Bold.ttf")
+    page = Image.new("L", (width, height), 0)
+    draw = ImageDraw.Draw(page)
+    top, margin = 0.04 * height, 0.05 * width
+    for line in lines:
+        if not line:
+            top += height / 2
+            continue
+        wide = ImageFont.truetype(font, 100).getlength(line) / 100
+        size = (width - 2 * margin) / wide
+        draw.text((margin, top), line, fill=255, font=ImageFont.truetype(font, size))
+        top += 1.15 * size
+    cover = np.asarray(page, np.float32) / 255
+    return (paper + (ink - paper) * cover).astype(np.float32)
 
 
 def _to_edge(phase: NDArray[np.floating]) -> NDArray[np.floating]:

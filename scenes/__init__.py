@@ -10,13 +10,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 from qsim.scene import Scene
-from scenes import fan, tumble
+from scenes import drums, fan, fence, gears, pellets, text, tumble, wires
 
 Family = Callable[..., Scene]
 
 FAMILIES: dict[str, Family] = {
+    "drums": drums.scene,
     "fan": fan.scene,
+    "fence": fence.scene,
+    "gears": gears.scene,
+    "pellets": pellets.scene,
+    "text": text.scene,
     "tumble": tumble.scene,
+    "wires": wires.scene,
 }
 
 

@@ -10,23 +10,22 @@ from qsim.rotation import exponential, pose_matrix
 from qsim.scene import Body, Conductor, Constant, Diffuse, Mesh, RoughPlastic, Scene, Texture
 from qsim.shapes import ball, cylinder, merged, moved, wire
 from scenes import stage
+from scenes.stage import any_angle, between, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     """About 5 to 9 turns per second at speed 1."""
     rng = np.random.default_rng([seed, 1])
-    radius = float(rng.uniform(0.36, 0.43))
-    place = Still(
-        (float(rng.uniform(-0.06, 0.06)), float(rng.uniform(-0.03, 0.03)), 0.45), stage.upright(rng.uniform(-0.5, 0.5))
-    )
-    rate = speed * float(rng.uniform(30, 55)) * stage.pick(rng, (-1.0, 1.0))
-    spin = place @ Spin((0, 0, 1), rate, phase=float(rng.uniform(0, 6.28)))
+    radius = between(rng, 0.36, 0.43)
+    place = Still((between(rng, -0.06, 0.06), between(rng, -0.03, 0.03), 0.45), stage.upright(rng.uniform(-0.5, 0.5)))
+    rate = speed * between(rng, 30, 55) * sign(rng)
+    spin = place @ Spin((0, 0, 1), rate, phase=any_angle(rng))
     blades = rotor(
         blades=int(rng.integers(3, 7)),
         radius=radius,
-        pitch=float(rng.uniform(0.3, 0.7)),
-        width=float(rng.uniform(0.6, 1.0)),
-        sweep=float(rng.uniform(-0.2, 0.5)),
+        pitch=between(rng, 0.3, 0.7),
+        width=between(rng, 0.6, 1.0),
+        sweep=between(rng, -0.2, 0.5),
     )
     facing = pose_matrix(exponential((np.pi / 2, 0, 0)))
     behind = pose_matrix(facing[:3, :3], (0, 0, -0.17))
@@ -40,8 +39,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     ]
     if rng.random() < 0.5:
         bodies.append(Body("guard", guard(1.08 * radius, int(rng.integers(3, 6))), Conductor(roughness=0.3), place))
-    lights = (Constant(float(rng.uniform(0.3, 0.7))), stage.lamp(rng, (0, 0, 0.3)))
-    view = stage.camera((float(rng.uniform(-0.3, 0.3)), float(rng.uniform(-0.2, 0.25)), 2.6), (0, 0, 0.3), 0.45)
+    lights = (Constant(between(rng, 0.3, 0.7)), stage.lamp(rng, (0, 0, 0.3)))
+    view = stage.camera((between(rng, -0.3, 0.3), between(rng, -0.2, 0.25), 2.6), (0, 0, 0.3), 0.45)
     return Scene("fan", seed, view, lights, tuple(bodies), speed)
 
 

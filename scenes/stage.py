@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from qsim import textures
 from qsim.motion import Motion
 from qsim.rotation import UP, exponential, pose_matrix, unit, vector
-from qsim.scene import AreaLamp, Body, Camera, Diffuse, Material, RoughPlastic, SunSky, Texture
+from qsim.scene import AreaLamp, Body, Camera, Diffuse, EnvironmentImage, Material, RoughPlastic, SunSky, Texture
 from qsim.shapes import moved, sheet
 from qsim.textures import Picture
 
@@ -37,6 +37,21 @@ def camera(origin: ArrayLike, target: ArrayLike, view: float = 0.5, motion: Moti
         target=vector(target),
         motion=motion,
     )
+
+
+def between(rng: np.random.Generator, low: float, high: float) -> float:
+    """A number from low to high, all equally likely."""
+    return float(rng.uniform(low, high))
+
+
+def any_angle(rng: np.random.Generator) -> float:
+    """An angle from 0 to a whole turn [rad]."""
+    return between(rng, 0.0, 2 * np.pi)
+
+
+def sign(rng: np.random.Generator) -> float:
+    """-1 or 1."""
+    return float(rng.choice((-1.0, 1.0)))
 
 
 def pick(rng: np.random.Generator, options: Sequence[T]) -> T:
@@ -98,16 +113,16 @@ def floor(material: Material, size: float = 6.0, y: float = 0.0, z: float = 0.0)
 def paint(rng: np.random.Generator, picture: Picture, repeat: tuple[float, float] = (1.0, 1.0)) -> Material:
     """Matt or slightly glossy, by chance."""
     texture = Texture(picture, repeat)
-    return Diffuse(texture) if rng.random() < 0.5 else RoughPlastic(texture, roughness=float(rng.uniform(0.15, 0.4)))
+    return Diffuse(texture) if rng.random() < 0.5 else RoughPlastic(texture, roughness=between(rng, 0.15, 0.4))
 
 
 def sun(rng: np.random.Generator, low: float = 0.5, high: float = 1.1, strength: float = 6.0) -> SunSky:
     """Sun and sky from in front, left or right of the camera (which looks to -z)."""
     return SunSky(
-        elevation=float(rng.uniform(low, high)),
-        azimuth=float(rng.uniform(-1.0, 1.0)),
-        sun_irradiance=strength * float(rng.uniform(0.7, 1.3)),
-        sky_irradiance=strength * float(rng.uniform(0.2, 0.5)),
+        elevation=between(rng, low, high),
+        azimuth=between(rng, -1.0, 1.0),
+        sun_irradiance=strength * between(rng, 0.7, 1.3),
+        sky_irradiance=strength * between(rng, 0.2, 0.5),
     )
 
 
@@ -115,7 +130,7 @@ def lamp(rng: np.random.Generator, target: ArrayLike, distance: float = 2.5, pow
     """A soft lamp above and beside the camera that shines on `target`."""
     side = pick(rng, (-1.0, 1.0)) * rng.uniform(0.4, 0.9)
     away = unit((side, rng.uniform(0.5, 0.9), rng.uniform(0.7, 1.0)))
-    size = float(rng.uniform(0.5, 1.0))
+    size = between(rng, 0.5, 1.0)
     return AreaLamp(
         origin=vector(np.asarray(target) + distance * away),
         target=vector(target),
@@ -123,6 +138,22 @@ def lamp(rng: np.random.Generator, target: ArrayLike, distance: float = 2.5, pow
         height=size,
         radiance=power / size**2,
     )
+
+
+def studio(rng: np.random.Generator, strength: float = 0.6, boxes: int = 5) -> EnvironmentImage:
+    """A photographer's studio: soft boxes around, grey walls, a dark floor; its mean radiance is `strength`."""
+    height, width = 64, 128
+    up = (0.5 - (np.arange(height)[:, None] + 0.5) / height) * np.pi  # elevation [rad]
+    azimuth = ((np.arange(width)[None, :] + 0.5) / width - 0.5) * 2 * np.pi
+    room = 0.25 + 0.15 * np.sin(up) + 0.05 * np.cos(azimuth) + 0.1 * (up > 0.9)
+    for i in range(boxes):
+        at = (between(rng, 0.1, 1.0), between(rng, -1.6, 1.6) if i < 3 else any_angle(rng) - np.pi)
+        size = (between(rng, 0.12, 0.35), between(rng, 0.12, 0.5))
+        aside = np.abs(np.angle(np.exp(1j * (azimuth - at[1]))))
+        cover = np.clip((size[0] - np.abs(up - at[0])) / 0.06, 0, 1) * np.clip((size[1] - aside) / 0.06, 0, 1)
+        room = np.maximum(room, cover * between(rng, 2.0, 5.0))
+    mean = float(np.average(room, weights=np.broadcast_to(np.cos(up), room.shape)))
+    return EnvironmentImage(room / mean, scale=strength)
 
 
 def upright(yaw: float) -> tuple[float, float, float]:

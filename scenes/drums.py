@@ -1,0 +1,56 @@
+"""Periodic texture: striped and chequered drums turn before a lattice; every period looks like the last one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from qsim import textures
+from qsim.motion import Oscillation, Spin, Still
+from qsim.rotation import vector
+from qsim.scene import Body, Diffuse, Scene, Texture
+from qsim.shapes import ball, cylinder
+from qsim.textures import Picture
+from scenes import stage
+from scenes.stage import any_angle, between, pick, sign
+
+
+def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
+    """Four or five drums, 2 to 5 turns per second at speed 1; the lattice behind slides."""
+    rng = np.random.default_rng([seed, 8])
+    slide = speed * between(rng, 6, 10)
+    back = stage.wall(Diffuse(Texture(pattern(rng), (6.0, 3.0))), 1.6, 0.8)
+    bodies = [
+        Body(
+            "lattice",
+            back.mesh,
+            back.material,
+            Oscillation((0.03, 0.01, 0), slide, any_angle(rng), (0, 0, -0.25)),
+        )
+    ]
+    xs = np.linspace(-0.3, 0.3, int(rng.integers(4, 6))) + rng.uniform(-0.02, 0.02)
+    for i, x in enumerate(xs):
+        radius = between(rng, 0.045, 0.07)
+        solid = (
+            cylinder(radius, between(rng, 0.15, 0.26), 64, pick(rng, (1.0, 1.0, 0.6)))
+            if rng.random() < 0.75
+            else ball(1.2 * radius, 64)
+        )
+        place = Still((float(x), between(rng, -0.03, 0.03), between(rng, -0.06, 0.06)), vector(rng.normal(0, 0.35, 3)))
+        rate = speed * between(rng, 20, 45) * sign(rng)
+        repeat = (float(rng.integers(1, 3)), float(rng.integers(1, 3)))
+        bodies.append(Body(f"drum {i}", solid, stage.paint(rng, pattern(rng), repeat), place @ Spin((0, 1, 0), rate)))
+    view = stage.camera((between(rng, -0.1, 0.1), between(rng, 0.0, 0.15), 0.7), (0, 0, 0), 0.5)
+    return Scene("drums", seed, view, (stage.studio(rng), stage.lamp(rng, (0, 0, 0), 0.9, 1.5)), tuple(bodies), speed)
+
+
+def pattern(rng: np.random.Generator) -> Picture:
+    """Stripes, checks or dots, never anything random within."""
+    low, high = between(rng, 0.03, 0.2), between(rng, 0.55, 0.85)
+    kind = int(rng.integers(4))
+    if kind == 0:
+        return textures.stripes(int(rng.integers(8, 20)), low, high, duty=between(rng, 0.3, 0.7))
+    if kind == 1:
+        return textures.checker(2 * int(rng.integers(3, 8)), 2 * int(rng.integers(3, 8)), low, high)
+    if kind == 2:
+        return textures.dots(int(rng.integers(6, 14)), low, high)
+    return np.ascontiguousarray(textures.stripes(int(rng.integers(6, 16)), low, high).T)

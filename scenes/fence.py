@@ -1,0 +1,48 @@
+"""Occlusion: things pass behind a fence whose slats themselves move, and behind one another."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from qsim.motion import Spin, Translation
+from qsim.rotation import exponential, pose_matrix, vector
+from qsim.scene import Body, Diffuse, Mesh, Scene
+from qsim.shapes import blob, box, merged, moved
+from scenes import stage
+from scenes.stage import any_angle, between, sign
+
+
+def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
+    """A sliding fence before three layers of bodies that cross in both directions at 1 to 4 m/s at speed 1."""
+    rng = np.random.default_rng([seed, 5])
+    bodies = [stage.wall(Diffuse(stage.backdrop(rng)), 1.8, 0.9, z=-0.45)]
+    for i in range(int(rng.integers(5, 8))):
+        z = between(rng, -0.3, -0.05)
+        velocity = np.array([sign(rng) * rng.uniform(1.5, 3.5), rng.normal(0, 0.4), 0.0]) * speed
+        middle = np.array([rng.uniform(-0.34, 0.34) * (0.4 if i < 3 else 1.0), rng.uniform(-0.12, 0.12), z])
+        motion = Translation(vector(velocity), vector(middle - velocity * stage.CLIP / 2))
+        turn = Spin(stage.direction(rng), speed * between(rng, 5, 25), any_angle(rng))
+        size = between(rng, 0.04, 0.07)
+        solid = blob(rng, size, 0.2) if rng.random() < 0.5 else box(1.5 * size, 1.5 * size, 1.5 * size, 2 * size)
+        bodies.append(Body(f"passer {i}", solid, stage.paint(rng, stage.surface(rng)), motion @ turn))
+    slide = speed * between(rng, 0.8, 2.0) * sign(rng)
+    slats = Body(
+        "fence",
+        fence(rng),
+        stage.paint(rng, stage.surface(rng, 0.15, 0.8)),
+        Translation((slide, 0.0, 0.0), (-slide * stage.CLIP / 2, 0, 0)),
+    )
+    view = stage.camera((0.0, between(rng, -0.05, 0.1), 0.7), (0, 0, 0), 0.5)
+    return Scene("fence", seed, view, (stage.sun(rng, 0.6, 1.0),), (*bodies, slats), speed)
+
+
+def fence(rng: np.random.Generator) -> Mesh:
+    """Slats side by side with gaps, leaning by a random angle, with two rails."""
+    pitch, share = between(rng, 0.05, 0.1), between(rng, 0.3, 0.5)
+    lean = float(rng.choice([0.0, 0.0, 0.3, -0.5]))
+    slats = [
+        moved(box(pitch * share, 0.7, 0.008, 0.1), pose_matrix(exponential((0, 0, lean)), (x, 0, 0.05)))
+        for x in np.arange(-0.8, 0.8, pitch)
+    ]
+    rails = [moved(box(2.0, 0.014, 0.008, 0.1), pose_matrix(None, (0, y, 0.042))) for y in (-0.11, 0.11)]
+    return merged([*slats, *rails])

@@ -1,0 +1,72 @@
+"""Text on a moving plate: a printed sign slides, swings and turns; letters of relief stand on it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from qsim import textures
+from qsim.motion import Motion, Oscillation, Pendulum, Still, Translation
+from qsim.parts import letters
+from qsim.rotation import pose_matrix, vector
+from qsim.scene import Body, Diffuse, RoughPlastic, Scene, Texture
+from qsim.shapes import box, moved, sheet
+from scenes import stage
+from scenes.stage import any_angle, between, pick
+
+WORDS = (
+    "QUANTA",
+    "PHOTON",
+    "2000 FPS",
+    "SENSOR",
+    "SHUTTER",
+    "MOTION",
+    "POISSON",
+    "3 BITS",
+    "SINGLE",
+    "LUMEN",
+    "NOISE",
+    "KELVIN",
+)
+
+
+def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
+    """One plate across the middle, 1 to 3 m/s at speed 1."""
+    rng = np.random.default_rng([seed, 7])
+    place = Still(
+        (0.0, between(rng, -0.015, 0.015), 0.0),
+        (float(rng.normal(0, 0.15)), float(rng.normal(0, 0.25)), float(rng.normal(0, 0.08))),
+    )
+    motion: Motion = carrier(rng, speed) @ place
+    width, height = 0.40, 0.2
+    dark = rng.random() < 0.5
+    print_ = textures.lines_of_text(random_lines(rng), 1024, 512, *((0.8, 0.04) if dark else (0.06, 0.8)))
+    back = moved(box(width, height, 0.006, 0.1), pose_matrix(None, (0, 0, -0.004)))
+    bodies = [
+        stage.wall(Diffuse(stage.backdrop(rng)), 1.4, 0.7, z=-0.15),
+        Body("plate", back, RoughPlastic(0.4, 0.2), motion),
+        Body("print", sheet(width, height), RoughPlastic(Texture(print_), 0.3), motion),
+    ]
+    word = letters(pick(rng, WORDS), 0.05, 0.012)
+    word = moved(word, pose_matrix(np.eye(3) * min(1.0, 0.34 / float(np.ptp(word.vertices[:, 0]))), (0, 0.055, 0.006)))
+    bodies.append(Body("letters", word, RoughPlastic(0.75 if dark else 0.05, 0.2), motion))
+    view = stage.camera((between(rng, -0.12, 0.12), between(rng, -0.06, 0.1), 0.6), (0, 0, 0), 0.45)
+    return Scene("text", seed, view, (stage.studio(rng), stage.lamp(rng, (0, 0, 0), 0.9, 1.5)), tuple(bodies), speed)
+
+
+def carrier(rng: np.random.Generator, speed: float) -> Motion:
+    """How the plate moves: slides, swings or shakes."""
+    kind = int(rng.integers(3))
+    if kind == 0:
+        angle, rate = any_angle(rng), between(rng, 1.2, 2.5) * speed
+        velocity = np.array([rate * np.cos(angle), 0.6 * rate * np.sin(angle), 0.3 * rng.normal() * speed])
+        return Translation(vector(velocity), vector(-velocity * stage.CLIP / 2))
+    if kind == 1:
+        return Pendulum((0.0, 0.35, 0.0), (0, 0, 1), 0.25, speed * between(rng, 3, 5), any_angle(rng))
+    amplitude = (between(rng, 0.02, 0.05), between(rng, 0.005, 0.02), 0.0)
+    return Oscillation(amplitude, speed * between(rng, 8, 14), any_angle(rng))
+
+
+def random_lines(rng: np.random.Generator) -> list[str]:
+    """A few lines as on an eye chart: a heading's space is left free, letters get smaller downwards."""
+    alphabet = list("ABCDEFGHJKLMNPQRSTUVWXYZ23456789")
+    return ["", *("".join(rng.choice(alphabet, n)) for n in (9, 13, 18, 26))]
