@@ -8,7 +8,7 @@ decide (about 40 in a million) is flagged by the kernel and drawn by the referen
 are the reference's on every kind of machine; tails, where a second word is drawn, come out right for the same reason.
 
 Where no short form exists (codes above 8 bits, paralyzable pixels, very long sums) or a block is tiny, the reference
-itself draws. Peak memory: the output and one frame.
+itself draws. Peak memory: the output and one frame, or a million pixels where frames are smaller.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ SMALLEST = 1 << 14  # pixels; below, compiling costs more than it brings
 _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # of Philox4x32; see keys.py
 _KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 _INFINITY = 0x7F800000  # float32; larger bit patterns are NaN or negative
+_CHUNK = 1 << 20  # pixels of small frames that share a launch
 _CERTAIN = 80.0  # arrivals that are sure to bring 15: P(N < 15) = 1e-19
 _CONSTANT_PLANS = 32  # sensors of a process that get kernels of their own
 
@@ -163,29 +164,37 @@ def _frames(
 ) -> Iterator[tuple[int, Array, Array]]:
     """For each frame t: t, what the kernel wrote [H, lanes of a row], indices of the doubtful lanes.
 
-    Rows are padded to whole groups of `blocks` Philox blocks of the full frame.
+    Rows are padded to whole groups of `blocks` Philox blocks of the full frame. Small frames share a launch.
     """
     frames, height, width = stack.shape
     left = origin[1] & 3
     padded = -(-(left + width) // (4 * blocks)) * 4 * blocks
+    lanes = height * padded // 2  # of a frame
+    together = min(frames, max(1, _CHUNK // (2 * lanes)))
     direct = padded == width and stack.dtype == np.float32 and stack.flags.c_contiguous
-    light = np.zeros((0 if direct else height, padded), np.float32)
+    light = np.zeros((0 if direct else together, height, padded), np.float32)
+    fixed = _fixed_scalars(key, origin, height, padded // 2)
 
-    def launch(t: int) -> list[Any]:
+    def launch(t: int) -> tuple[int, int, list[Any]]:
+        n = min(together, frames - t)
         if not direct:
             with np.errstate(over="ignore"):  # beyond float32 the reference decides
-                light[:, left : left + width] = stack[t]
-        frame = (stack[t] if direct else light).reshape(-1).view(np.uint64)
-        return _launch(chosen, frame, padded // 2, key, (key.frame + t, origin[0], origin[1] >> 2), bits)
+                light[:n, :, left : left + width] = stack[t : t + n]
+        pairs = (stack[t : t + n] if direct else light[:n]).reshape(-1).view(np.uint64)
+        return t, n, _launch(chosen, pairs, key.frame + t, fixed, bits)
 
-    # While the host finishes a frame the next kernel runs, unless both need the buffer
-    running: list[Any] = []
-    for t in range(frames + 1):
-        done = [out.numpy() for out in running] if not direct else []
-        started = launch(t) if t < frames else []
+    # While the host finishes some frames the kernel of the next ones runs, unless both need the buffer
+    running: tuple[int, int, list[Any]] | None = None
+    for t in (*range(0, frames, together), frames):
+        done = [out.numpy() for out in running[2]] if running and not direct else []
+        started = launch(t) if t < frames else None
         if running:
-            pairs, flags = done or [out.numpy() for out in running]
-            yield t - 1, pairs.reshape(height, -1), _set(flags)
+            first, n, arrays = running
+            pairs, flags = done or [out.numpy() for out in arrays]
+            doubtful = _set(flags)
+            for i in range(n):
+                here = doubtful[(doubtful >= i * lanes) & (doubtful < (i + 1) * lanes)] - i * lanes
+                yield first + i, pairs[i * lanes : (i + 1) * lanes].reshape(height, -1), here
         running = started
 
 
@@ -201,19 +210,26 @@ def _set(flags: Array) -> Array:
 # ---- What a kernel computes
 
 
-def _launch(plan: Plan, light: Array, lanes: int, key: Key, place: tuple[int, int, int], bits: int | None) -> list[Any]:
-    """Start one frame: pairs of float32 photons as uint64 [n] -> what each lane writes, and 1 where it is doubtful.
+def _fixed_scalars(key: Key, origin: tuple[int, int], height: int, lanes: int) -> list[Any]:
+    """What every launch of a clip shares: first row and block, the generator's key, rows of `lanes` lanes."""
+    import drjit as dr
 
-    `lanes` are in a row, `place` = (frame, first row, first block). Without `bits` a lane writes a byte per code, the
-    first one lowest; with `bits` the codes follow each other bit by bit, the first one highest.
+    jit = _backend()
+    numbers = (origin[0], origin[1] >> 2, key.philox_key >> 32, key.philox_key, lanes, height)
+    integers = [dr.opaque(jit.UInt32, number & 0xFFFFFFFF) for number in numbers]
+    return [*integers, *(dr.opaque(jit.Float64, 1 / number) for number in (lanes, height))]
+
+
+def _launch(plan: Plan, light: Array, frame: int, fixed: list[Any], bits: int | None) -> list[Any]:
+    """Start a kernel: pairs of float32 photons as uint64 [n] -> what each lane writes, and 1 where it is doubtful.
+
+    Without `bits` a lane writes a byte per code, the first one lowest; with `bits` the codes follow each other bit by
+    bit, the first one highest.
     """
     import drjit as dr
 
     jit = _backend()
-    numbers = (place[0] * plan.planes, place[1], place[2], key.philox_key >> 32, key.philox_key, lanes)
-    scalars = [dr.opaque(jit.UInt32, number & 0xFFFFFFFF) for number in numbers]
-    out, flags = _kernel(plan, bits)(jit.UInt64(light), dr.opaque(jit.Float64, 1 / lanes), *scalars)
-    return [out, flags]
+    return list(_kernel(plan, bits)(jit.UInt64(light), dr.opaque(jit.UInt32, frame), *fixed))
 
 
 @lru_cache(maxsize=64)
@@ -223,17 +239,20 @@ def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
 
     jit = _backend()
 
-    def draw(pair: Any, inverse: Any, *scalars: Any) -> tuple[Any, Any]:
-        frame, row, block, high, low, lanes = scalars
-        # Rows by a product in float64, exact to 2^32 lanes: no division, and one kernel for every width
+    def draw(pair: Any, frame: Any, *fixed: Any) -> tuple[Any, Any]:
+        row, block, high, low, lanes, height, inverse_lanes, inverse_height = fixed
+        # Quotients by products in float64, exact below 2^32: no division, and one kernel for every size
         lane = dr.arange(jit.UInt32, dr.width(pair))
-        y = jit.UInt32((jit.Float64(lane) + 0.5) * inverse)
+        y = jit.UInt32((jit.Float64(lane) + 0.5) * inverse_lanes)
         x = lane - y * lanes
+        t = jit.UInt32((jit.Float64(y) + 0.5) * inverse_height)
+        y = y - t * height
+        first_plane = (frame + t) * plan.planes
         photons = [dr.reinterpret_array(jit.Float, jit.UInt32(half)) for half in (pair, pair >> 32)]
 
         def words(plane: Any) -> list[Any]:
             """Two neighbouring lanes share a block of four words."""
-            w = _philox(x // 2 + block, y + row, frame + plane, high, low)
+            w = _philox(x // 2 + block, y + row, first_plane + plane, high, low)
             right = (x & 1) == 1
             return [dr.select(right, w[2], w[0]), dr.select(right, w[3], w[1])]
 

@@ -250,11 +250,12 @@ def test_single_pixels_are_those_of_the_frame(name):
 
 
 @needs_engine
-def test_memory_is_the_output_and_one_frame():
+def test_memory_is_the_output_and_one_frame(monkeypatch):
     """40 frames in float64: beyond the codes NumPy may hold one frame's worth (float32 light and what it becomes)."""
     sensor = SENSORS["3 bits, gain 1"]
     photons = np.full((40, 256, 255), 2.0)
     frame = photons[0].nbytes
+    monkeypatch.setattr(kernels, "_CHUNK", 1)  # as for frames of a million pixels
     for draw in (kernels.sample, kernels.sample_packed):
         draw(sensor, photons[:2], EXPOSURE, key=KEY)
         tracemalloc.start()
