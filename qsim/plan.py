@@ -1,7 +1,7 @@
 """What a recipe will cost: one tiny job of each kind is rendered here, and the whole is multiplied out.
 
-A kind is a family with its render settings. Of each, the first job's scene is loaded, its budget chosen, and a few
-frames are rendered, sensed and stored in a temporary folder. Scenes of one family differ, so expect 30 % or so.
+A kind is a family with its render settings. Of each, a job's scene is loaded, its budget chosen, and a few frames are
+rendered, sensed and stored in a temporary folder. Scenes of one family differ, and so will the truth: by 30 % or so.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ import itertools
 import resource
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from qsim import jobs, stream
 from qsim.clip import Clip
 from qsim.recipe import Job, Recipe
+from qsim.workers import Limits
 
 START = 3.0  # s, a fresh worker process with its renderer; measured on two cores, shared by Limits.jobs jobs
 
@@ -54,7 +54,8 @@ class Plan:
 
     @property
     def hours(self) -> float:
-        return sum(cost.hours for cost in self.costs) + START / 8 * sum(cost.clips for cost in self.costs) / 3600
+        starts = sum(cost.clips for cost in self.costs) / Limits().jobs
+        return sum(cost.hours for cost in self.costs) + START * starts / 3600
 
     @property
     def gigabytes(self) -> float:
@@ -108,16 +109,14 @@ def plan(recipe: Recipe, *, frames: int = 3, progress: stream.Progress | None = 
     return Plan(tuple(costs), f"{chosen.backend}, {chosen.variant}", peak)
 
 
-def _measure(members: list[Job], path: Path, frames: int) -> Cost:
-    job = members[0]
+def _measure(members: list[Job], folder: Path, frames: int) -> Cost:
+    """The second rendering counts: kernels are then compiled and cached, as they are for nearly all jobs."""
+    _first_frames(members[0], folder / "warm", 1)
+    job = members[len(members) // 2]
     settings = job.settings
-    moments: list[float] = []
     started = time.perf_counter()
-    scene = jobs.load_scene(job)
-    budget = jobs.choose_budget(job, scene)
-    clip = _render(replace(job, settings=replace(settings, frames=min(frames, settings.frames))), scene, budget, path,
-                   lambda done, total: moments.append(time.perf_counter()))  # fmt: skip
-    # The first frame carries loading and compiling; the others are what each further frame costs.
+    clip, moments = _first_frames(job, folder / "measured", min(frames, settings.frames))
+    # The first frame carries scene, budget and loading; the others are what each further frame costs.
     later = [after - before for before, after in itertools.pairwise(moments)]
     per_frame = sum(later) / len(later) if later else moments[0] - started
     setup = moments[0] - started - (per_frame if later else 0.0)
@@ -135,20 +134,24 @@ def _measure(members: list[Job], path: Path, frames: int) -> Cost:
     )
 
 
-def _render(job: Job, scene: Any, budget: Any, path: Path, progress: Callable[[int, int], None]) -> Clip:
+def _first_frames(job: Job, path: Path, frames: int) -> tuple[Clip, list[float]]:
+    """The first frames of a job's clip, and when each was done."""
     from qsim import render
 
     settings = job.settings
-    return render.render_clip(
+    moments: list[float] = []
+    scene = jobs.load_scene(job)
+    clip = render.render_clip(
         scene,
         path,
-        frames=settings.frames,
+        frames=frames,
         frame_rate=settings.frame_rate,
         shutter=settings.shutter,
         seed=jobs.render_seed(job),
-        budget=budget,
-        progress=progress,
+        budget=jobs.choose_budget(job, scene),
+        progress=lambda done, total: moments.append(time.perf_counter()),
     )
+    return clip, moments
 
 
 def _sense(job: Job, clip: Clip) -> tuple[float, float]:

@@ -48,7 +48,8 @@ def test_a_killed_generation_resumes_to_the_same_bytes(tmp_path: Path):
     killed = generate(recipe, tmp_path / "killed", "--workers", "2")
     end = time.monotonic() + 300
     while not list((tmp_path / "killed").glob("work/*.part/journal.jsonl")):
-        assert time.monotonic() < end
+        assert time.monotonic() < end, "no frame was ever finished"
+        assert killed.poll() is None, "it came to its end before it could be killed"
         time.sleep(0.01)
     os.killpg(killed.pid, signal.SIGKILL)
     killed.wait()

@@ -1,0 +1,70 @@
+"""Plans: the arithmetic, and the forecast against a real run."""
+
+from pathlib import Path
+
+import pytest
+
+from qsim import dataset, plan, recipe
+from qsim.cli import main
+from qsim.plan import START, Cost, Plan
+from qsim.workers import Limits
+
+RECIPE = """[recipe]
+name = "tiny"
+frames = 12
+height = 32
+width = 48
+frame_rate = 2000.0
+psnr = 30.0
+
+[[scenes]]
+family = "fan"
+seeds = [0, 1, 2]
+
+[[streams]]
+sensor = "quiver-physical"
+bits = 3
+ppp = 3.25
+"""
+
+
+def test_the_arithmetic_of_a_forecast():
+    """10 clips of 30 frames: 10 * 6 s + 300 * (1.5 + 0.3) s = 600 s, and a tenth of a fresh process per clip or so."""
+    cost = Cost("fan", (512, 1024), 10, 300, setup=6.0, per_frame=1.5, sensing=0.3, frame_bytes=4e6)
+    assert cost.hours == pytest.approx(600 / 3600)
+    assert cost.gigabytes == pytest.approx(1.2)
+    whole = Plan((cost, cost), "llvm", 0.5)
+    assert whole.hours == pytest.approx((1200 + 20 * START / Limits().jobs) / 3600)
+    assert whole.gigabytes == pytest.approx(2.4)
+    assert f"10 machines like this: {whole.hours / 10:.3g} hours each" in "\n".join(whole.lines(10))
+    assert "GPU" in whole.lines(1)[-1]
+    assert whole.to_dict()["kinds"][0]["frames"] == 300
+
+
+def test_plans_without_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = tmp_path / "r.toml"
+    path.write_text(RECIPE)
+    for options, message in [(["--machines", "0"], "--machines: expected"), (["--frames", "1"], "at least 2 frames")]:
+        assert main(["plan", str(path), *options]) == 2
+        assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_forecast_against_a_real_run(tmp_path: Path):
+    """Wall time of the jobs themselves; a machine that is busy with other things makes both sides wrong, hence 60 %."""
+    wanted = recipe.parse(RECIPE)
+    forecast = plan.plan(wanted)
+    seconds = 0.0
+
+    def add(result: dataset.Result) -> None:
+        nonlocal seconds
+        seconds += result.clip_seconds + result.stream_seconds
+
+    dataset.generate(wanted, tmp_path / "d", dataset.Options(workers=0), on_result=add)
+    predicted = sum(cost.hours for cost in forecast.costs) * 3600
+    print(f"predicted {predicted:.1f} s, took {seconds:.1f} s")
+    assert 0.6 < seconds / predicted < 1.6
+    stored = sum(
+        file.stat().st_size for file in (tmp_path / "d" / "clips").rglob("*") if file.suffix in (".exr", ".npy")
+    )
+    assert stored == pytest.approx(forecast.gigabytes * 1e9, rel=0.3)
