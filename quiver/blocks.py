@@ -311,6 +311,26 @@ class Refinement(nn.Module):
         return self.hidden(g), self.next_picture(picture)
 
 
+class Baseline(nn.Module):
+    """Not part of the published design: a first picture from the window of pre-denoised frames, for quick learning.
+
+    A learnt mean over time plus a few convolutions over the stacked frames; before training it is a Gaussian mean.
+    """
+
+    SIGMA = 1.5  # frames
+
+    def __init__(self, image: int, width: int) -> None:
+        super().__init__()
+        weights = [math.exp(-0.5 * ((t - RADIUS) / self.SIGMA) ** 2) for t in range(WINDOW)]
+        self.weights = nn.Parameter(torch.tensor([weight / sum(weights) for weight in weights]))
+        self.layers = nn.Sequential(*_gelu_chain((WINDOW * image, width, width, width, image)))
+
+    def forward(self, window: Sequence[Tensor]) -> Tensor:
+        """Eleven frames [N, f2, h, w] -> [N, f2, h, w]."""
+        mean = sum((w * frame for w, frame in zip(self.weights, window, strict=True)), torch.zeros_like(window[0]))
+        return mean + self.layers(join(*window))
+
+
 def _gelu_chain(widths: Sequence[int]) -> list[nn.Module]:
     """conv3, GELU, conv3, GELU, ..., conv3 through the given widths."""
     layers: list[nn.Module] = []

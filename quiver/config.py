@@ -20,7 +20,7 @@ class Config:
     attention_width: int | None = None  # channels of the temporal attention; None = 44C as published
     attention_temperature: float | None = None  # start of a learnt factor on the logits; None = none, as published
     fold: int = 1  # side of the blocks of pixels that become channels before everything else (1 = none)
-    baseline: bool = False  # add a learnt mean over time of the pre-denoised frames to the output
+    baseline: int = 0  # width of a shallow network over the window whose picture is added to the output; 0 = none
     lecun: bool = False  # start from normal weights of variance 1/fan-in (LeCun, as the paper says) and zero biases
     pre_denoiser: bool = True  # ablation: False feeds the noisy frames to both streams and to the flow
     flow: bool = True  # ablation: False aligns by the learnt offsets alone
@@ -75,7 +75,7 @@ PRESETS: dict[str, Config] = {
         attention_width=64,
         attention_temperature=8.0,
         fold=2,
-        baseline=True,
+        baseline=32,
         lecun=True,
     ),
 }

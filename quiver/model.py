@@ -7,7 +7,6 @@ With the presets `quiver` and `quiver-s` this is the published network to the la
 (tests/quiver/test_golden.py); what else can be set, and the preset `nano`, is in config.py.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -20,6 +19,7 @@ from quiver.blocks import (
     RADIUS,
     WINDOW,
     Alignment,
+    Baseline,
     Extractor,
     FlowNetwork,
     GatedFusion,
@@ -32,7 +32,6 @@ from quiver.blocks import (
 )
 from quiver.config import ABLATIONS, PRESETS, Config
 
-BASELINE_SIGMA = 1.5  # frames, width of the learnt mean before training
 CHUNK_PIXELS = 2**16  # without gradients, frames are taken together up to this many pixels
 
 Pair = tuple[Tensor, Tensor]  # of the previous and the current frame
@@ -73,9 +72,11 @@ class QUIVER(nn.Module):
         )
         self.refine4 = Refinement(image, c)
         self.refine = Refinement(image, c)
+        self.baseline = Baseline(image, config.baseline) if config.baseline else None
         if config.lecun and not self.alignment.weight.is_meta:  # nothing to draw without memory
             start_from_lecun(self)
-        self.baseline = start_from_baseline(self) if config.baseline else None
+        if config.baseline:
+            start_from_baseline(self)
 
     @property
     def multiple(self) -> int:
@@ -140,10 +141,8 @@ class QUIVER(nn.Module):
         return entry.new_zeros(entry.shape[0], 2 * self.config.channels, *entry.shape[2:])
 
     def base(self, denoised: Sequence[Tensor]) -> Tensor | None:
-        """Learnt mean over time of eleven pre-denoised frames [B, f2, h, w]; None where the network has none."""
-        if self.baseline is None:
-            return None
-        return sum((w * frame for w, frame in zip(self.baseline, denoised, strict=True)), torch.zeros_like(denoised[0]))
+        """The baseline picture of eleven pre-denoised frames [B, f2, h, w]; None where the network has none."""
+        return None if self.baseline is None else self.baseline(denoised)
 
     # The network
 
@@ -292,25 +291,25 @@ def start_from_lecun(network: QUIVER) -> None:
     nn.init.zeros_(last.weight)
 
 
-def start_from_baseline(network: QUIVER) -> nn.Parameter:
-    """Weights over the window such that the untrained network returns about the mean of the middle frames.
+def start_from_baseline(network: QUIVER) -> None:
+    """Let the untrained network return about the mean of the middle frames.
 
-    The last layers of the pre-denoiser and of the picture branches are shrunk, pictures handed on start at zero.
+    The last layers of the pre-denoiser, of the picture branches and of the baseline are shrunk; pictures handed on to
+    the next scale start at zero.
     """
-    last = [refinement.picture[-1] for refinement in (network.refine4, network.refine)]
+    assert network.baseline is not None
+    last = [network.refine4.picture[-1], network.refine.picture[-1], network.baseline.layers[-1]]
     if network.denoiser is not None:
         last.append(network.denoiser.leave)
     with torch.no_grad():
         for layer in last:
             assert isinstance(layer, nn.Conv2d)
             assert layer.bias is not None
-            layer.weight.mul_(0.1)
+            layer.weight.mul_(0.03)
             layer.bias.zero_()
         for refinement in (network.refine4, network.refine):
             for tensor in refinement.next_picture.parameters():
                 tensor.zero_()
-    weights = [math.exp(-0.5 * ((t - RADIUS) / BASELINE_SIGMA) ** 2) for t in range(WINDOW)]
-    return nn.Parameter(torch.tensor([weight / sum(weights) for weight in weights]))
 
 
 def _flat(stack: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ SMALL = Config(
     flow_kernel=3,
     cell_blocks=2,
 )
-FOLDED = replace(SMALL, fold=2, baseline=True, attention_width=16, attention_temperature=4.0, flow_levels=3)
+FOLDED = replace(SMALL, fold=2, baseline=4, attention_width=16, attention_temperature=4.0, flow_levels=3)
 BOTH = pytest.mark.parametrize("config", [SMALL, FOLDED], ids=["published-design", "folded"])
 
 
@@ -123,7 +123,7 @@ def test_an_untrained_nano_returns_about_the_mean_of_the_middle_frames():
     network, x = build("nano"), draw(1, 11, 1, 32, 32, dtype=torch.float32)
     with torch.no_grad():
         out = network(x).scale1[:, 0]
-    weights = network.baseline.detach()
+    weights = network.baseline.weights.detach()
     assert float(weights.sum()) == pytest.approx(1)
     mean = torch.einsum("btchw,t->bchw", x, weights)
     assert float((out - mean).square().mean()) < 0.04 * float(x.var())

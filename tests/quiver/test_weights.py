@@ -135,7 +135,7 @@ def test_a_checkpoint_that_is_a_list_is_refused(tmp_path: Path):
     "build",
     [
         lambda: QUIVER(TINY),
-        lambda: QUIVER(replace(TINY, fold=2, baseline=True, attention_temperature=8.0, flow=False)),
+        lambda: QUIVER(replace(TINY, fold=2, baseline=4, attention_temperature=8.0, flow=False)),
         lambda: UNet(UNetConfig(4)),
     ],
     ids=["quiver", "extended", "unet"],
