@@ -172,3 +172,16 @@ def test_a_scene_file_beside_the_recipe(tmp_path: Path):
 @pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "scenes").glob("*.toml")), ids=lambda p: p.stem)
 def test_the_recipes_of_the_library_are_valid(path: Path):
     assert recipe.load(path).jobs
+
+
+def test_the_large_recipe_is_what_it_says():
+    """280 clips of 114 scenes, 249 and 31, 512 x 1024, 2000 fps, shutter 0; no scene or test family shared."""
+    jobs = recipe.load(Path(__file__).parents[2] / "scenes" / "i2_2000fps.toml").jobs
+    assert len(jobs) == 280
+    assert len({job.scene for job in jobs}) == 114
+    count = {split: sum(job.split == split for job in jobs) for split in recipe.SPLITS}
+    assert count == {"train": 249, "val": 0, "test": 31}
+    render = {(s.height, s.width, s.frame_rate, s.shutter) for s in (job.settings for job in jobs)}
+    assert render == {(512, 1024, 2000.0, 0.0)}
+    families = {split: {job.family for job in jobs if job.split == split} for split in ("train", "test")}
+    assert families["train"].isdisjoint(families["test"])
