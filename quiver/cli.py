@@ -114,6 +114,7 @@ def _run_train(args: argparse.Namespace) -> int:
     from quiver.data import output
     from quiver.model import build
     from quiver.restore import pick_device
+    from quiver.run import draw_curve
     from quiver.train import Diverged, train
 
     settings = _settings(args)
@@ -134,6 +135,7 @@ def _run_train(args: argparse.Namespace) -> int:
         print(f"quiver: {error}", file=sys.stderr)
         return 1
     if leads:
+        draw_curve(folder)
         output(args, *_summary(folder, state))
     if interrupted:
         print("quiver: interrupted; the same command goes on where it stopped", file=sys.stderr)
@@ -228,9 +230,11 @@ def _source(args: argparse.Namespace) -> Any:
     light = Light(args.sensor or "quiver-physical", args.ppp, args.bits)
     path: Path = args.source
     if path.is_dir():
-        clip = open_clips(path)[0]
-        if len(open_clips(path)) > 1 or not (path / "clip.json").exists():
-            raise ValueError(f"{path}: is a data set; name one of its clips, as in {clip.path}")
+        clips = open_clips(path)
+        if not (path / "clip.json").exists():
+            one = f", as in {clips[0].path}" if clips else "; none is finished yet"
+            raise ValueError(f"{path}: is a data set; name one of its clips{one}")
+        clip = clips[0]
         if args.ppp is None and args.stream is None and len(clip.streams) != 1:
             there = ", ".join(clip.streams) or "none"
             raise ValueError(f"{path}: choose one of its streams with --stream ({there}), or sense it now with --ppp")

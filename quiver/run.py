@@ -1,6 +1,7 @@
 """A training run as a folder: its settings, its state, its files.
 
-    settings.json  checkpoint.pt  best.safetensors  last.safetensors  history.json  failed.pt (only after NaN)
+    settings.json  checkpoint.pt  best.safetensors  last.safetensors  history.json  curve.png
+    failed.pt (only after NaN)  events.out.tfevents...
 
 Every file is whole or absent. A folder accepts the settings it was made with and no others, so that a run that is
 started again goes on where it stopped and never mixes two experiments.
@@ -173,3 +174,27 @@ class Run:
     def save_history(self, state: State) -> None:
         """The curve so far, one entry per validation."""
         write_json(self.folder / "history.json", {"settings": self.settings.to_dict(), "history": state.history})
+
+
+def draw_curve(folder: Path) -> Path | None:
+    """curve.png of a run from its history.json: validation PSNR and loss over minutes; None before any validation."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    if not (folder / "history.json").exists():
+        return None
+    history = read_json(folder / "history.json")["history"]
+    minutes = [entry["elapsed"] / 60 for entry in history]
+    canvas = FigureCanvasAgg(Figure(figsize=(6, 3.5), layout="constrained"))
+    axes = canvas.figure.subplots()
+    axes.plot(minutes, [entry["psnr_matched"] for entry in history], "o-", label="PSNR after the best factor")
+    axes.plot(minutes, [entry["psnr"] for entry in history], ".--", label="PSNR raw")
+    axes.set_xlabel("minutes")
+    axes.set_ylabel("validation PSNR [dB]")
+    losses = axes.twinx()
+    losses.plot(minutes, [entry["loss"] for entry in history], ":", color="grey", label="training loss")
+    losses.set_ylabel("training loss of one batch")
+    axes.legend(fontsize="small", loc="lower right")
+    with replacing(folder / "curve.png") as file:
+        canvas.figure.savefig(file, format="png", dpi=120)
+    return folder / "curve.png"

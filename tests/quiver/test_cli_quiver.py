@@ -50,6 +50,7 @@ def test_the_whole_chain(capsys, tiny_dataset, clip, tmp_path):
     code, out, _ = run(capsys, *train_words(tiny_dataset, run_folder), "--json")
     found = json.loads(out)
     assert (code, found["steps"]) == (0, 2)
+    assert (run_folder / "curve.png").read_bytes().startswith(b"\x89PNG")
     code, again, _ = run(capsys, *train_words(tiny_dataset, run_folder), "--json")
     assert json.loads(again)["last_validation"] == found["last_validation"]
 
