@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -270,3 +273,37 @@ def test_cuda_is_asked_for_by_name(tmp_path: Path):
     save(network, network.config, tmp_path / "w.safetensors")
     with pytest.raises(ValueError, match="--device cuda: torch finds no CUDA"):
         restorer(str(tmp_path / "w.safetensors"), Options(device="cuda"))
+
+
+MEMORY_PROGRAM = """
+import numpy as np
+from quiver.bench import peak_memory, reset_peak
+from quiver.data import Light, array_codes
+from quiver.model import build
+from quiver.restore import Options, wrap_network
+sensor = Light().device(5e-4)
+codes = array_codes(np.random.default_rng(0).integers(0, 8, (1, 320, 320), dtype=np.uint8), sensor, 5e-4)
+method = wrap_network(build("nano"), "nano", "", Options(memory={memory}, mode="{mode}"))
+before = reset_peak()
+method.restore(codes)
+print(peak_memory() - before)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["exact", "windows"])
+def test_the_memory_bound_holds(mode):
+    """80 MB for a frame that takes more in one piece; peak of resident pages, in a process of its own."""
+    tiled, whole = (
+        int(
+            subprocess.run(
+                [sys.executable, "-c", MEMORY_PROGRAM.format(memory=memory, mode=mode)],
+                capture_output=True,
+                text=True,
+                check=True,
+                env=os.environ | {"OMP_NUM_THREADS": "1"},
+            ).stdout
+        )
+        for memory in (80_000_000, 1_000_000_000)
+    )
+    assert tiled < 1.1 * 80_000_000 < whole
