@@ -18,6 +18,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from functools import cache, lru_cache
+from math import exp
 from typing import Any
 
 import numpy as np
@@ -125,7 +126,7 @@ def steps(sensor: Sensor, photons: Array, exposure: float) -> Array:
 
     jit = _backend()
     real = jit.Float64 if chosen.double else jit.Float
-    efficiency, dark, _, *scalars = _scalars(chosen)
+    efficiency, dark, _, *scalars = [real(number) for number in _numbers(chosen)]
     mean = dr.fma(real(jit.Float(np.asarray(photons, np.float32))), efficiency, dark)
     values, unit = _steps(chosen.steps, mean, scalars)
     columns = [(value / unit).numpy().astype(float) for value in values]
@@ -229,7 +230,7 @@ def _launch(plan: Plan, light: Array, frame: int, fixed: list[Any], bits: int | 
     import drjit as dr
 
     jit = _backend()
-    return list(_kernel(plan, bits)(jit.UInt64(light), dr.opaque(jit.UInt32, frame), *fixed))
+    return list(_kernel(plan, bits)(jit.UInt64(light), dr.opaque(jit.UInt32, frame), _arguments(plan), *fixed))
 
 
 @lru_cache(maxsize=64)
@@ -238,8 +239,9 @@ def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
     import drjit as dr
 
     jit = _backend()
+    real = jit.Float64 if plan.double else jit.Float
 
-    def draw(pair: Any, frame: Any, *fixed: Any) -> tuple[Any, Any]:
+    def draw(pair: Any, frame: Any, arguments: list[Any], *fixed: Any) -> tuple[Any, Any]:
         row, block, high, low, lanes, height, inverse_lanes, inverse_height = fixed
         # Quotients by products in float64, exact below 2^32: no division, and one kernel for every size
         lane = dr.arange(jit.UInt32, dr.width(pair))
@@ -256,7 +258,7 @@ def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
             right = (x & 1) == 1
             return [dr.select(right, w[2], w[0]), dr.select(right, w[3], w[1])]
 
-        codes, doubt = _count(plan, photons, words)
+        codes, doubt = _count(plan, photons, words, arguments or [real(number) for number in _numbers(plan)])
         if bits is None:
             out = codes[0] | (codes[1] << 8)
         else:
@@ -280,13 +282,15 @@ def _philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
     return [c0, c1, c2, c3]
 
 
-def _count(plan: Plan, photons: list[Any], words: Callable[[Any], list[Any]]) -> tuple[list[Any], Any]:
+def _count(
+    plan: Plan, photons: list[Any], words: Callable[[Any], list[Any]], scalars: list[Any]
+) -> tuple[list[Any], Any]:
     """Codes of the pixels of a lane, and whether one of them is doubtful."""
     import drjit as dr
 
     jit = _backend()
     real = jit.Float64 if plan.double else jit.Float
-    efficiency, dark, margin, *scalars = _scalars(plan)
+    efficiency, dark, margin, *scalars = scalars
     doubt: Any = jit.Bool(False)
     for theta in photons:  # negative, infinite and NaN by their bits: the reference says what is wrong
         pattern: Any = dr.reinterpret_array(jit.UInt32, theta)
@@ -372,29 +376,29 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
     return result, unit
 
 
+def _numbers(plan: Plan) -> list[float]:
+    """The numbers of a plan, in the order in which `_count` and `_steps` take them."""
+    values = [plan.efficiency, plan.dark, plan.margin]
+    steps = plan.steps
+    if isinstance(steps, Live):
+        return [*values, *steps.shares]
+    values += [steps.highest, steps.shift, 1 / steps.scale, exp(-steps.shift), *steps.full]
+    for band, floor in zip(steps.band, steps.floor, strict=True):
+        values += [*band, floor] if floor else [*band]
+    return [float(value) for value in values]
+
+
 @lru_cache(maxsize=64)
-def _scalars(plan: Plan) -> list[Any]:
-    """The plan's numbers: constants of a kernel of its own for the first sensors of a process, arguments of a shared
-    (about 20 % slower) kernel for the rest, so that a training that varies its sensors does not compile for ever."""
+def _arguments(plan: Plan) -> list[Any]:
+    """Nothing for the first sensors of a process, whose numbers are constants of kernels of their own; for the rest the
+    numbers, as arguments of a shared (about 20 % slower) kernel: a training that varies its sensors compiles once.
+    """
     import drjit as dr
 
-    jit = _backend()
-    real = jit.Float64 if plan.double else jit.Float
-    values = [plan.efficiency, plan.dark, plan.margin]
-    if isinstance(plan.steps, Live):
-        values += plan.steps.shares
-    else:
-        values += [
-            plan.steps.highest,
-            plan.steps.shift,
-            1 / plan.steps.scale,
-            np.exp(-plan.steps.shift),
-            *plan.steps.full,
-        ]
-        for band, floor in zip(plan.steps.band, plan.steps.floor, strict=True):
-            values += [*band, floor] if floor else [*band]
-    constant = _scalars.cache_info().misses <= _CONSTANT_PLANS
-    return [real(float(value)) if constant else dr.opaque(real, float(value)) for value in values]
+    if _arguments.cache_info().misses <= _CONSTANT_PLANS:
+        return []
+    real = _backend().Float64 if plan.double else _backend().Float
+    return [dr.opaque(real, number) for number in _numbers(plan)]
 
 
 # ---- Which Dr.Jit

@@ -196,12 +196,12 @@ def test_frames_can_be_drawn_in_any_order(draw):
 def test_sensors_share_kernels_after_the_first_few(monkeypatch):
     """Numbers as arguments of a common kernel instead of constants: the same codes."""
     monkeypatch.setattr(kernels, "_CONSTANT_PLANS", 0)
-    kernels._scalars.cache_clear()
+    kernels._arguments.cache_clear()
     for name in ("published gain", "full well", "dead time", "seven planes"):
         sensor = SENSORS[name]
         photons = light(sensor, (2, 20, 30))
         np.testing.assert_array_equal(fast(sensor, photons), reference(sensor, photons))
-    kernels._scalars.cache_clear()
+    kernels._arguments.cache_clear()
 
 
 @needs_engine
