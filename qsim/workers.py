@@ -79,7 +79,12 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs, folder, make, memory, os.getpid()), daemon=True)
-        self.process.start()
+        # The child inherits the mask: Ctrl-C in a terminal reaches all of its processes, and is the parent's business.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self.process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
         self.job: Job | None = None
         self.jobs = 0
@@ -119,7 +124,6 @@ class _Worker:
 
 def _work(pipe: Connection, folder: Path, make: Make, memory: float, parent: int) -> None:
     """A worker process: jobs in, results out, until the pipe closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
     threading.Thread(target=_watch, args=(parent, memory), daemon=True).start()
     with contextlib.suppress(EOFError):
         while True:

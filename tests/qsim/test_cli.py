@@ -244,12 +244,12 @@ def test_ctrl_c_says_how_to_go_on(tmp_path: Path):
     tests = Path(__file__).parents[1]
     env = os.environ | {"PYTHONPATH": f"{tests.parent}{os.pathsep}{tests}"}
     line = [sys.executable, "-c", code, "generate", str(recipe_path), "-o", str(tmp_path / "d"), "--workers", "2"]
-    first = subprocess.Popen(line, env=env, stderr=subprocess.PIPE, text=True)
+    first = subprocess.Popen(line, env=env, stderr=subprocess.PIPE, text=True, start_new_session=True)
     end = time.monotonic() + 60
     while not list((tmp_path / "d" / "logs").glob("*.log")):
         assert time.monotonic() < end
         time.sleep(0.01)
-    first.send_signal(signal.SIGINT)
+    os.killpg(first.pid, signal.SIGINT)  # as a terminal does: to the workers too
     _, err = first.communicate(timeout=60)
     assert first.returncode == 130
     assert "interrupted; the same command goes on where it stopped" in err

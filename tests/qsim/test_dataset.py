@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 from fakes import RECIPE, die_on_tumble, fail_on_tumble, hoard_on_tumble, make, make_slowly, tree
 
-from qsim import clip, files, jobs, recipe
+from qsim import files, jobs, recipe, writer
 from qsim.dataset import Dataset, Options, Summary, generate
 from qsim.jobs import Make
 from qsim.workers import Limits
@@ -177,18 +177,18 @@ class _Limited:
 
 
 def test_a_full_disk_everywhere(tmp_path: Path, undisturbed: dict[str, bytes], monkeypatch: pytest.MonkeyPatch):
-    """Space for 0, 1/16, ... of what a run writes: one clear error, nothing accepted, and resuming gives the same."""
+    """Space for 0, 1/10, ... of what a run writes: one clear error, nothing accepted, and resuming gives the same."""
     measure = FullDisk(1 << 30)
     with monkeypatch.context() as patch:
-        for module in (files, jobs, clip):
+        for module in (files, jobs, writer):
             patch.setattr(module, "open", measure.open, raising=False)
         generate(SMALL, tmp_path / "whole", HERE, make=make)
     needed = (1 << 30) - measure.space
-    for step in range(16):
+    for step in range(10):
         folder = tmp_path / f"d{step}"
-        disk = FullDisk(needed * step // 16)
+        disk = FullDisk(needed * step // 10)
         with monkeypatch.context() as patch:
-            for module in (files, jobs, clip):
+            for module in (files, jobs, writer):
                 patch.setattr(module, "open", disk.open, raising=False)
             with pytest.raises(OSError, match=r"No space left on device.*make space and run the same command again"):
                 generate(SMALL, folder, HERE, make=make)
