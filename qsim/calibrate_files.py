@@ -35,15 +35,7 @@ def read_stack(path: Path, *, bits: int, exposure: float, photons: float | None,
     `width` says that an `.npy` is a photon cube of packed planes. `ValueError` or `FileNotFoundError` naming the file.
     """
     if path.suffix == ".npy" and width is None:
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file")
-        try:
-            array = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, EOFError) as error:
-            raise ValueError(f"{path}: not readable as an array ({error})") from None
-        array = array[None] if array.ndim == 2 else array
-        if array.ndim != 3 or array.size == 0:
-            raise ValueError(f"{path}: expected frames [T, H, W], found shape {list(array.shape)}")
+        array = read_counts(path)
         blocks = _array_blocks(array)
     else:
         footage = formats.read(path, Hints(bits=bits, width=width))
@@ -51,6 +43,20 @@ def read_stack(path: Path, *, bits: int, exposure: float, photons: float | None,
             raise ValueError(f"{path}: holds {footage.source}, not codes of {bits} bits")
         blocks = (block for _, block in formats.blocks(footage))
     return measure(blocks, bits=bits, exposure=exposure, photons=photons, name=str(path))
+
+
+def read_counts(path: Path) -> Array:
+    """Frames [T, H, W] of an `.npy`, mapped; `ValueError` or `FileNotFoundError` naming the file."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        array: Array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"{path}: not readable as an array ({error})") from None
+    array = array[None] if array.ndim == 2 else array
+    if array.ndim != 3 or array.size == 0:
+        raise ValueError(f"{path}: expected frames [T, H, W], found shape {list(array.shape)}")
+    return array
 
 
 def _array_blocks(array: Array) -> Iterator[Array]:

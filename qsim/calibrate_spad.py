@@ -48,7 +48,7 @@ def calibrate_spad(
     warnings: list[str] = []
     values: dict[str, Value] = {}
     maps: dict[str, Array] = {}
-    fano = _dead_time(flats, bits, paralyzable) if bits > 1 and flats and dead_time else None
+    fano = fitted_dead_time(flats, bits, paralyzable) if bits > 1 and flats and dead_time else None
     ratio = 0.0 if fano is None else fano.value
     response = Response(bits, ratio, paralyzable)
     if darks:
@@ -155,7 +155,9 @@ def _distribution(rates: Array) -> dict[str, Value]:
     reach = Z95 * sqrt(n) / 2
     low, high = (int(np.clip(round(n / 2 + sign * reach), 0, n - 1)) for sign in (-1, 1))
     median = float(np.median(ordered))
-    found = {"dark_count_rate_median": Value(median, ordered[low], ordered[high], "1/s", "order statistics")}
+    found = {
+        "dark_count_rate_median": Value(median, float(ordered[low]), float(ordered[high]), "1/s", "order statistics")
+    }
     if median > 0:
         hot = float(np.mean(ordered > HOT * median))
         centre = (hot + Z95**2 / (2 * n)) / (1 + Z95**2 / n)
@@ -234,14 +236,14 @@ def _saturation(flats: Sequence[Stack]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class _Ratio:
+class Ratio:
     """Dead time in exposures, and its variance."""
 
     value: float
     variance: float
 
 
-def _dead_time(flats: Sequence[Stack], bits: int, paralyzable: bool) -> _Ratio | None:
+def fitted_dead_time(flats: Sequence[Stack], bits: int, paralyzable: bool) -> Ratio | None:
     """tau/T from the time variance of every flat against its mean: weighted least squares on exact moments."""
     from scipy.optimize import minimize_scalar
 
@@ -267,19 +269,26 @@ def _dead_time(flats: Sequence[Stack], bits: int, paralyzable: bool) -> _Ratio |
             strict=True,
         )
     ]
-    return _Ratio(ratio, 1 / max(float(np.dot(slope, slope)), 1e-300))
+    return Ratio(ratio, 1 / max(float(np.dot(slope, slope)), 1e-300))
 
 
 def _fano_residuals(flats: Sequence[Stack], bits: int, ratio: float, paralyzable: bool) -> list[float]:
-    """(observed variance - that of a dead-time pixel of the same mean) / sigma, per flat."""
+    """(observed variance - that of a dead-time pixel of the same mean) / sigma, per flat.
+
+    Sigma comes from the model's moments: those of the data would count the pattern of the pixels as noise.
+    """
     residuals = []
+    codes = np.arange(1 << bits, dtype=float)
+    sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
     for flat in flats:
+        arrivals, expected, slope = matched_variance(flat.mean, bits, ratio, paralyzable)
+        pmf = np.exp(sensor.log_pmf(np.array(arrivals), 1.0))
+        centred = codes - pmf @ codes
+        third, fourth = float(pmf @ centred**3), float(pmf @ centred**4)
+        v = max(expected, 1e-12)
         n = flat.pixels * (flat.frames - 1)
-        _, expected, slope = matched_variance(flat.mean, bits, ratio, paralyzable)
-        third, fourth = flat.central_moment(3), flat.central_moment(4)
-        v = flat.variance
         spread = max(fourth - v**2 + slope**2 * v - 2 * slope * third, 1e-12) / n
-        residuals.append((v - expected) / sqrt(spread))
+        residuals.append((flat.variance - expected) / sqrt(spread))
     return residuals
 
 
@@ -316,7 +325,7 @@ def _afterpulsing(stacks: Sequence[Stack], bits: int) -> dict[str, Value]:
     """
     estimates, variances = [], []
     for stack in stacks:
-        if stack.frames < 3 or not stack.variance > 0:
+        if not (stack.variance > 0 and isfinite(stack.lag_covariance)):
             continue
         correlation = stack.lag_covariance / stack.variance
         room = 1 - stack.mean * (1 - correlation) if bits == 1 else 1.0

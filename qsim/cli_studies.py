@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -87,13 +88,20 @@ def add_calibrate(sub: Any) -> None:
     parser = command(
         sub, "calibrate", _run_calibrate, "Dark and flat frames -> a sensor file, each number with its 95 % interval.",
         "qsim calibrate --bits 8 --dark d1.npy 1e-3 --dark d2.npy 0.1 --flat f.npy 1e-3 --flat g.npy 1e-3 -o my.toml\n"
-        "qsim calibrate --model spad --bits 1 --dark dark.npy 1e-5 --flat flat.npy 1e-5 0.8 -o spad.toml",
+        "qsim calibrate --model spad --bits 1 --dark dark.npy 1e-5 --flat flat.npy 1e-5 0.8 -o spad.toml\n"
+        "qsim calibrate --bits 8 --static counts.npy 6.33e-6 -o counter.toml",
     )  # fmt: skip
     for option, names, what in (
         ("--dark", ("FILE", "SECONDS"), "frames without light, and their exposure"),
         ("--flat", ("FILE", "SECONDS"), "evenly lit frames, their exposure, and the photons per pixel if known"),
     ):
         parser.add_argument(option, metavar=names, help=what, action="append", nargs="+", default=[])
+    parser.add_argument(
+        "--static",
+        nargs=2,
+        metavar=("FILE", "SECONDS"),
+        help="counts of a static scene instead: dead time from Fano factors",
+    )
     parser.add_argument("--bits", type=int, required=True, help="of a code; 1 for binary planes")
     parser.add_argument("--model", choices=("qis", "spad"), default="qis", help="default qis")
     parser.add_argument("--paralyzable", action="store_true", help="spad: every arrival restarts the dead time")
@@ -114,7 +122,9 @@ def _run_calibrate(args: argparse.Namespace) -> int:
         raise FileExistsError(f"{args.output}: exists; name another with -o, or use --force to replace it")
     darks = [_stack(words, args, dark=True) for words in args.dark]
     flats = [_stack(words, args, dark=False) for words in args.flat]
-    if args.model == "qis":
+    if args.static:
+        found = _static(args)
+    elif args.model == "qis":
         found = calibrate_qis(darks, flats, bits=args.bits)
     else:
         found = calibrate_spad(
@@ -132,6 +142,23 @@ def _run_calibrate(args: argparse.Namespace) -> int:
     return 0
 
 
+def _static(args: argparse.Namespace) -> Any:
+    from qsim.calibrate_files import read_counts
+    from qsim.calibrate_static import calibrate_static
+
+    if args.dark or args.flat:
+        raise ValueError("--static stands alone: a static scene takes the place of dark and flat frames")
+    counts = read_counts(Path(args.static[0]))
+    return calibrate_static(counts, bits=args.bits, exposure=_number(args.static[1]), paralyzable=args.paralyzable)
+
+
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise ValueError(f"{word!r} is no number; give seconds, as in 1e-3") from None
+
+
 def _stack(words: list[str], args: argparse.Namespace, *, dark: bool) -> Any:
     from qsim.calibrate_files import read_stack
 
@@ -140,10 +167,7 @@ def _stack(words: list[str], args: argparse.Namespace, *, dark: bool) -> Any:
         raise ValueError(
             f"{kind} {' '.join(words)}: give a file and its exposure in seconds, as in {kind} frames.npy 1e-3"
         )
-    try:
-        numbers = [float(word) for word in words[1:]]
-    except ValueError:
-        raise ValueError(f"{kind} {' '.join(words)}: {words[1:]} are no numbers; give seconds, as in 1e-3") from None
+    numbers = [_number(word) for word in words[1:]]
     photons = 0.0 if dark else numbers[1] if len(numbers) > 1 else None
     return read_stack(Path(words[0]), bits=args.bits, exposure=numbers[0], photons=photons, width=args.width)
 
@@ -169,14 +193,17 @@ def integers(text: str) -> list[int]:
 
 def add_validate(sub: Any) -> None:
     parser = command(
-        sub, "validate", _run_validate, "Measure the sensor engines here: speed against error, statistics, hard cases.",
-        "qsim validate sensor\nqsim validate sensor --json -o out/sensor.png",
+        sub, "validate", _run_validate, "Measure sensor engines or the renderer here: speed against error, hard cases.",
+        "qsim validate sensor --json -o out/sensor.png\nqsim validate render -o out/render.png",
     )  # fmt: skip
-    parser.add_argument("what", choices=["sensor"], help="what to validate")
+    parser.add_argument("what", choices=["sensor", "render"], help="what to validate")
     parser.add_argument("-o", "--output", type=Path, help="figure of speed against error (.png, .svg or .pdf)")
     parser.add_argument("--pixels", type=int, default=1 << 20, help="pixels of a draw (default 1048576)")
     parser.add_argument("--seed", type=int, default=0, help="of the draws (default 0)")
     parser.add_argument("--require-speed", action="store_true", help="a speed below its target is a failure too")
+    parser.add_argument("--scenes", nargs="+", metavar="FAMILY", help="render: families (default: four)")
+    parser.add_argument("--height", type=int, default=128, help="render: pixels (default 128)")
+    parser.add_argument("--width", type=int, default=256, help="render: pixels (default 256)")
     parser.add_argument("--force", action="store_true", help="replace an existing figure")
 
 
@@ -187,8 +214,23 @@ def _run_validate(args: argparse.Namespace) -> int:
         validate.check_figure(args.output)
         if args.output.exists() and not args.force:
             raise FileExistsError(f"{args.output}: exists; name another with -o, or use --force to replace it")
+    if args.what == "render":
+        return _validate_render(args)
     report = validate.run(args.pixels, args.seed, require_speed=args.require_speed)
     if args.output is not None:
         validate.figure(report, args.output)
     output(args, report.to_dict(), validate.table(report))
+    return 0 if report.ok else 1
+
+
+def _validate_render(args: argparse.Namespace) -> int:
+    import scenes
+    from qsim import validate_render
+
+    families = args.scenes or [name for name in scenes.FAMILIES if name not in validate_render.TUNED][:4]
+    chosen = [scenes.load(name, seed=args.seed + 3).resized(args.height, args.width) for name in families]
+    report = validate_render.run(chosen, progress=lambda text: print(text, file=sys.stderr))
+    if args.output is not None:
+        validate_render.figure(report, args.output)
+    output(args, report.to_dict(), validate_render.table(report))
     return 0 if report.ok else 1

@@ -117,6 +117,17 @@ def measure(
     return Stack(frames, float(exposure), photons, histogram, first=first, last=previous, **sums)
 
 
+def from_ones(ones: Array, *, frames: int, exposure: float, photons: float | None) -> Stack:
+    """The stack of 1-bit planes of which only the number of ones per pixel, [H, W], was kept; no time correlation."""
+    ones = np.asarray(ones)
+    if ones.ndim != 2 or ones.size == 0 or (ones < 0).any() or (ones > frames).any():
+        raise ValueError(f"ones per pixel are [H, W] numbers 0..{frames}, got shape {list(ones.shape)}")
+    total = ones.astype(np.float64)
+    histogram = np.array([total.size * frames - total.sum(), total.sum()]).astype(np.int64)
+    unknown = np.full(total.shape, np.nan)
+    return Stack(frames, float(exposure), photons, histogram, total, total, unknown, unknown, unknown)
+
+
 def _as_codes(block: Array, bits: int, name: str, frame: int) -> Array:
     """A block as integers [t, H, W]."""
     block = np.asarray(block)

@@ -1,6 +1,7 @@
 """Calibration: intervals hold the truth as often as promised, wrong models are noticed, hard data are refused."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +12,11 @@ from qsim import devices
 from qsim.calibrate import Calibration, calibrate_qis
 from qsim.calibrate_files import read_stack, sensor_of, write
 from qsim.calibrate_spad import calibrate_spad, matched_variance
+from qsim.calibrate_static import calibrate_static
 from qsim.spad import CountingSPAD
-from qsim.stacks import measure
+from qsim.stacks import from_ones, measure
+
+DATA = Path(__file__).parents[1] / "data"
 
 COUNTER = SPADCase(bits=5, photons=(2.0, 6.0, 14.0))
 QIS_CASES = {
@@ -206,6 +210,47 @@ def test_calibration_without_frames_is_refused():
         calibrate_spad([], [], bits=1)
     with pytest.raises(ValueError, match="no flat frames"):
         calibrate_qis([stack(noise())], [], bits=3)
+
+
+# Real detectors
+
+
+def test_real_photons_fano_one_at_low_flux_and_a_dead_time_near_four_nanoseconds():
+    """Five scans of a hazelnut, 6.33 us per pixel. Known: effective dead time 4.0 +- 0.3 ns."""
+    counts = np.load(DATA / "hazelnut_gates6.npz")["gates"].astype(np.int64).sum(axis=1)
+    edges = (1, 5, 10, 20, 30, 40, 60, 100, 130)
+    found = calibrate_static(counts, bits=8, exposure=6.33e-6, edges=edges)
+    dead = found.values["dead_time"]
+    assert dead.low < 4.0e-9 < dead.high
+    assert dead.high - dead.low < 2e-9
+    dim = found.values["fano_at_2.19"]
+    assert dim.low < 1.0 < dim.high
+    bright = found.values["fano_at_111"]
+    assert bright.high < 0.9
+    assert found.p_value > 1e-3
+
+
+def test_real_dark_counts():
+    """50 x 50 SPADs, 7650 planes of 10.3 us: median 127 counts/s, 1.0 % of the pixels above ten medians."""
+    path = Path(__file__).parents[3] / "shared" / "data" / "spad512_darkcounts_YX.npy"
+    if not path.exists():
+        pytest.skip(f"{path.name} is not part of this repository")
+    ones = np.rint(-np.expm1(-np.load(path)) * 7650)
+    found = calibrate_spad([from_ones(ones, frames=7650, exposure=10.3e-6, photons=0.0)], [], bits=1)
+    median = found.values["dark_count_rate_median"]
+    assert median.low < median.value
+    assert median.value == pytest.approx(127, abs=1)
+    assert found.values["hot_pixels"].value == pytest.approx(0.010, abs=0.002)
+
+
+def test_static_scene_without_dead_time_finds_none():
+    rng = np.random.default_rng(0)
+    light = np.geomspace(1, 120, 60)[:, None] * np.ones((1, 60))
+    found = calibrate_static(rng.poisson(light, (6, 60, 60)), bits=8, exposure=1e-5)
+    dead = found.values["dead_time"]
+    assert dead.low == 0.0 or dead.low < 3e-9
+    with pytest.raises(ValueError, match="at least 2 frames"):
+        calibrate_static(rng.poisson(light, (1, 60, 60)), bits=8, exposure=1e-5)
 
 
 # Files
