@@ -94,7 +94,7 @@ class Renderer:
         self._mi = mi
         self._key = Key(seed=seed, clip=hash_name(f"{scene.name}/{scene.seed}"), stage=RENDER_STAGE)
         self._stage = Stage(mi, scene)
-        self._integrators: dict[int, Any] = {}
+        self._integrators: dict[int | None, Any] = {}
         self._samplers: dict[int, Any] = {}
         self._numbers = self._shape_table()
 
@@ -210,10 +210,15 @@ class Renderer:
         corner = mi.Point2f(mi.Float((pixel - row * columns) * step + x0), mi.Float(row * step + y0))
         return sampler, corner + sampler.next_2d()
 
-    def _integrator(self, bounces: int) -> Any:
-        """A path tracer without Russian roulette, so that the same seed draws the same paths at every depth."""
+    def _integrator(self, bounces: int | None) -> Any:
+        """A path tracer without Russian roulette, so that the same seed draws the same paths at every depth.
+
+        None is Mitsuba's default: any depth, Russian roulette from the fifth bounce on.
+        """
         if bounces not in self._integrators:
-            plugin = {"type": "path", "max_depth": bounces + 1, "rr_depth": 1000}
+            plugin: dict[str, Any] = {"type": "path"}
+            if bounces is not None:
+                plugin |= {"max_depth": bounces + 1, "rr_depth": 1000}
             self._integrators[bounces] = self._mi.load_dict(plugin)
         return self._integrators[bounces]
 
@@ -243,8 +248,18 @@ class Renderer:
             self._samplers[samples] = sampler
         return self._samplers[samples]
 
-    def _film_pass(self, pose: Array, seed: int, samples: int, integrator: Any) -> Array:
-        """The scalar engine has no vector of rays: Mitsuba's own camera and film do the same."""
+    def obvious(self, t: int, samples: int) -> Array:
+        """The loop that everybody writes first, float64 [H, W]: only here to be compared with.
+
+        `mi.render` with Mitsuba's camera and film, its default integrator and its default sampler; box filter.
+        """
+        engines.activate(self.engine)
+        self._stage.place(self.time(t))
+        pose, seed = self.scene.camera.pose(self.time(t)), int(words(self.key(t), (1, 1))[0, 0])
+        return self._film_pass(pose, seed, samples, self._integrator(None), "independent")
+
+    def _film_pass(self, pose: Array, seed: int, samples: int, integrator: Any, sampler: str = "multijitter") -> Array:
+        """Mitsuba's own camera and film; the scalar engine, which has no vectors of rays, always renders so."""
         mi, camera = self._mi, self.scene.camera
         y, x, height, width = self.crop
         film: dict[str, Any] = {
@@ -253,12 +268,14 @@ class Renderer:
             "height": camera.height,
             "rfilter": {"type": "box"},
         }
+        if self.engine.backend != "scalar":
+            film["pixel_format"] = "luminance"
         film |= {"crop_offset_x": x, "crop_offset_y": y, "crop_width": width, "crop_height": height}
         view = pose @ np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's camera axes: left, up, forward
         sensor: dict[str, Any] = {"type": "perspective", "film": film, "near_clip": 1e-4, "far_clip": 1e5}
         sensor["to_world"] = mi.ScalarTransform4f(view.tolist())
         sensor |= {"fov_axis": "x", "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.focal_pixels)))}
-        sensor["sampler"] = {"type": "multijitter", "sample_count": samples}
+        sensor["sampler"] = {"type": sampler, "sample_count": samples}
         if camera.aperture_blur:
             sensor |= {"type": "thinlens", "aperture_radius": camera.pupil_radius, "focus_distance": camera.focus}
         image = mi.render(

@@ -1,0 +1,229 @@
+"""Rendering: time per frame against error, the obvious loop beside ours, on scenes that tuned nothing.
+
+    run() -> Report: one Row per scene, level [dB] and method; the error is that against a converged reference
+
+The obvious loop is `mi.render` per frame with the default integrator and the default `independent` sampler, a box
+filter, and the smallest power of two of samples that reaches the level. Ours is `Renderer.frame` without ground truth
+and with the budget that `budget.choose` gives for the level, error measurement included. Both start from a loaded scene
+and are timed alternately, so that a busy machine is fair to both. The reference's own variance is subtracted.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from io import BytesIO
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import budget, files
+from qsim.budget import Budget
+from qsim.render import Renderer
+from qsim.scene import Scene
+
+LEVELS = (30.0, 35.0, 40.0, 45.0)  # dB, peak = 99.9th percentile of the reference
+WANTED_RATIO, AT_LEVEL = 10.0, 40.0  # of the median scene
+MOST_SAMPLES = 2**15  # the obvious loop is timed up to here; beyond, time is proportional to samples and says so
+TUNED = ("fan", "tumble")  # families that were looked at while the budget was written
+FRAME = 3  # the instant that is rendered again and again
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scene at one level: both methods."""
+
+    scene: str
+    level: float  # dB asked for
+    obvious_samples: int
+    obvious_psnr: float  # dB reached
+    obvious_seconds: float  # per frame, median
+    extrapolated: bool  # obvious_seconds is proportional from fewer samples
+    samples: int
+    denoised: bool
+    bounces: int
+    psnr: float  # dB reached, ours
+    stated_psnr: float  # dB that our measured error states
+    seconds: float  # per frame, median
+
+    @property
+    def ratio(self) -> float:
+        """How many times faster ours is."""
+        return self.obvious_seconds / self.seconds
+
+
+@dataclass(frozen=True)
+class Report:
+    """All rows and what they were measured on."""
+
+    height: int
+    width: int
+    engine: str
+    rows: tuple[Row, ...]
+    choosing_seconds: dict[str, float]  # per scene, the pilots of all levels together; once per clip, not in `seconds`
+
+    @property
+    def median_ratio(self) -> float:
+        """Of the scenes at AT_LEVEL."""
+        return median(row.ratio for row in self.rows if row.level == AT_LEVEL)
+
+    @property
+    def ok(self) -> bool:
+        """At least WANTED_RATIO in the median scene at AT_LEVEL, and nowhere slower."""
+        return self.median_ratio >= WANTED_RATIO and all(row.ratio >= 1 for row in self.rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        rows = [asdict(row) | {"ratio": row.ratio} for row in self.rows]
+        return asdict(self) | {"rows": rows, "median_ratio": self.median_ratio, "ok": self.ok}
+
+
+def run(
+    scenes: Sequence[Scene],
+    *,
+    levels: Sequence[float] = LEVELS,
+    reference_samples: int = 2048,
+    rounds: int = 3,
+    progress: Callable[[str], None] | None = None,
+) -> Report:
+    """Measure every scene at every level; all scenes must have one size. Minutes for 128 x 256 pixels."""
+    if not scenes or AT_LEVEL not in levels:
+        raise ValueError(f"validate render: needs at least one scene, and {AT_LEVEL:g} among its levels")
+    rows: list[Row] = []
+    choosing: dict[str, float] = {}
+    for scene in scenes:
+        name = f"{scene.name}/{scene.seed}"
+        if progress is not None:
+            progress(f"{name}: reference")
+        renderer = Renderer(scene, budget=Budget(reference_samples, budget.DEEPEST), seed=1000)
+        halves = renderer.halves([renderer.time(FRAME)], renderer.budget, renderer.key(FRAME))
+        target = _Target(halves)
+        for level in levels:
+            if progress is not None:
+                progress(f"{name}: {level:g} dB")
+            started = time.perf_counter()
+            chosen = budget.choose(scene, psnr=level)
+            choosing[name] = choosing.get(name, 0.0) + time.perf_counter() - started
+            rows.append(_compare(scene, name, level, chosen, target, rounds))
+    camera = scenes[0].camera
+    return Report(camera.height, camera.width, renderer.engine.backend, tuple(rows), choosing)
+
+
+class _Target:
+    """A converged frame, its peak, and errors against it."""
+
+    def __init__(self, halves: Array) -> None:
+        self.image = halves.mean(axis=0)
+        self.variance = float(np.mean((halves[0] - halves[1]) ** 2)) / 4
+        self.peak = float(np.percentile(self.image, 99.9))
+
+    def psnr(self, image: Array) -> float:
+        """dB of an image that is independent of the reference."""
+        square = float(np.mean((image - self.image) ** 2)) - self.variance
+        return self.decibels(math.sqrt(max(square, self.variance / 100)))
+
+    def decibels(self, error: float) -> float:
+        return 20 * math.log10(self.peak / error) if error > 0 else math.inf
+
+
+def _compare(scene: Scene, name: str, level: float, chosen: Budget, target: _Target, rounds: int) -> Row:
+    ours, reached = _reaching(scene, chosen, level, target)
+    samples, obvious_psnr = _obvious_samples(ours, level, target)
+    timed = min(samples, MOST_SAMPLES)
+    obvious_seconds, seconds, stated = [], [], 0.0
+    for i in range(rounds + 1):  # the first round compiles and does not count
+        started = time.perf_counter()
+        _obvious(ours, FRAME + i, timed)
+        between = time.perf_counter()
+        stated = target.decibels(ours.frame(FRAME + i, with_truth=False).error)
+        obvious_seconds.append(between - started)
+        seconds.append(time.perf_counter() - between)
+    return Row(
+        name,
+        level,
+        samples,
+        obvious_psnr,
+        median(obvious_seconds[1:]) * samples / timed,
+        timed < samples,
+        ours.budget.samples,
+        ours.budget.denoise,
+        ours.budget.bounces,
+        reached,
+        stated,
+        median(seconds[1:]),
+    )
+
+
+def _reaching(scene: Scene, chosen: Budget, level: float, target: _Target) -> tuple[Renderer, float]:
+    """Our renderer with the chosen budget, or with more samples until the level is reached in truth."""
+    while True:
+        renderer = Renderer(scene, budget=chosen)
+        reached = target.psnr(renderer.frame(FRAME, with_truth=False).radiance)
+        if reached >= level or chosen.samples >= budget.MOST_SAMPLES:
+            return renderer, reached
+        chosen = replace(chosen, samples=2 * budget.grid_samples(chosen.samples // 2 + 1))
+
+
+def _obvious_samples(renderer: Renderer, level: float, target: _Target) -> tuple[int, float]:
+    """The smallest power of two that reaches the level, and the PSNR there: MSE of independent samples is c / n."""
+    trial = 64
+    measured = target.psnr(_obvious(renderer, FRAME, trial))
+    samples = 2 ** max(0, math.ceil(math.log2(trial) + (level - measured) / (10 * math.log10(2))))
+    return samples, measured + 10 * math.log10(samples / trial)
+
+
+def _obvious(renderer: Renderer, t: int, samples: int) -> Array:
+    """Large counts in several calls, as memory demands."""
+    height, width = renderer.shape
+    calls = max(1, math.ceil(samples * height * width / 2**24))
+    each = samples // calls
+    return np.mean([renderer.obvious(t, each) for _ in range(calls)], axis=0)
+
+
+def table(report: Report) -> str:
+    """The rows as text, one line each, and the verdict."""
+    lines = [f"{report.height} x {report.width} pixels, engine {report.engine}; seconds per frame, radiance only"]
+    head = f"{'scene':14} {'level':>5} | {'obvious: samples':>16} {'dB':>5} {'s':>8}"
+    lines.append(f"{head} | {'ours: samples':>14} {'dB':>5} {'s':>7} | faster")
+    for row in report.rows:
+        ours = f"{row.samples}{' denoised' if row.denoised else ''}"
+        lines.append(
+            f"{row.scene:14} {row.level:5g} | {row.obvious_samples:16d} {row.obvious_psnr:5.1f} "
+            f"{row.obvious_seconds:7.3f}{'*' if row.extrapolated else ' '} | {ours:>14} {row.psnr:5.1f} "
+            f"{row.seconds:7.3f} | {row.ratio:5.1f}"
+        )
+    if any(row.extrapolated for row in report.rows):
+        lines.append(f"* proportional to the time of {MOST_SAMPLES} samples")
+    choosing = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in report.choosing_seconds.items())
+    lines.append(f"choosing the budgets, once per clip (all levels): {choosing}")
+    verdict = "reached" if report.ok else "NOT reached"
+    lines.append(
+        f"median at {AT_LEVEL:g} dB: {report.median_ratio:.1f} times faster; "
+        f"wanted {WANTED_RATIO:g}, and nowhere slower: {verdict}"
+    )
+    return "\n".join(lines)
+
+
+def figure(report: Report, path: Path) -> None:
+    """Seconds per frame against the PSNR reached, one panel per scene (.png, .svg or .pdf)."""
+    from matplotlib.figure import Figure
+
+    names = list(dict.fromkeys(row.scene for row in report.rows))
+    drawn = Figure(figsize=(3.2 * len(names), 3.4), layout="constrained")
+    for name, axes in zip(names, np.ravel(drawn.subplots(1, len(names), sharey=True)), strict=True):
+        rows = [row for row in report.rows if row.scene == name]
+        axes.plot([r.obvious_seconds for r in rows], [r.obvious_psnr for r in rows], "o-", label="obvious loop")
+        axes.plot([r.seconds for r in rows], [r.psnr for r in rows], "s-", label="qsim")
+        axes.set(xscale="log", xlabel="seconds per frame", title=name)
+        axes.grid(alpha=0.3)
+    drawn.axes[0].set_ylabel("PSNR of the radiance [dB]")
+    drawn.axes[0].legend(frameon=False)
+    buffer = BytesIO()
+    drawn.savefig(buffer, format=path.suffix.lstrip(".").lower(), dpi=150)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files.write_bytes(path, buffer.getvalue())
