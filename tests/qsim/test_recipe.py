@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from qsim import recipe
+from qsim import jobs, recipe
 from qsim.recipe import Recipe, parse
 
 HEAD = """[recipe]
@@ -176,12 +176,26 @@ def test_the_recipes_of_the_library_are_valid(path: Path):
 
 def test_the_large_recipe_is_what_it_says():
     """280 clips of 114 scenes, 249 and 31, 512 x 1024, 2000 fps, shutter 0; no scene or test family shared."""
-    jobs = recipe.load(Path(__file__).parents[2] / "scenes" / "i2_2000fps.toml").jobs
-    assert len(jobs) == 280
-    assert len({job.scene for job in jobs}) == 114
-    count = {split: sum(job.split == split for job in jobs) for split in recipe.SPLITS}
+    wanted = recipe.load(Path(__file__).parents[2] / "scenes" / "i2_2000fps.toml").jobs
+    assert len(wanted) == 280
+    assert len({job.scene for job in wanted}) == 114
+    count = {split: sum(job.split == split for job in wanted) for split in recipe.SPLITS}
     assert count == {"train": 249, "val": 0, "test": 31}
-    render = {(s.height, s.width, s.frame_rate, s.shutter) for s in (job.settings for job in jobs)}
+    render = {(s.height, s.width, s.frame_rate, s.shutter) for s in (job.settings for job in wanted)}
     assert render == {(512, 1024, 2000.0, 0.0)}
-    families = {split: {job.family for job in jobs if job.split == split} for split in ("train", "test")}
+    families = {split: {job.family for job in wanted if job.split == split} for split in ("train", "test")}
     assert families["train"].isdisjoint(families["test"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "scenes").glob("*.toml")), ids=lambda p: p.stem)
+def test_no_texture_of_a_test_scene_is_in_training(path: Path):
+    """By content, not by name: the SHA-256 of every picture in every scene."""
+    found: dict[str, set[str]] = {split: set() for split in recipe.SPLITS}
+    scenes = {job.scene: job for job in recipe.load(path).jobs}
+    for job in scenes.values():
+        assets = jobs.assets(jobs.load_scene(job).to_dict())
+        found[job.split] |= {asset for asset in assets if asset.startswith("texture ")}
+    assert found["train"]
+    assert found["test"]
+    assert found["test"].isdisjoint(found["train"] | found["val"])
