@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from qsim.motion import Motion, Still
+from qsim.motion import Motion, Still, check_numbers
 from qsim.rotation import Array
 
 
@@ -23,6 +23,11 @@ class Ripple:
     frequency: float  # Hz
     slant: float = 0.0  # rad/m along y: crests lean
     phase: float = 0.0  # rad
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+        if not self.wavelength > 0:
+            raise ValueError(f"Ripple.wavelength: a positive length [m] is needed, got {self.wavelength!r}")
 
     def angle(self, places: Array, t: float) -> Array:
         """Phase [rad] at the places [V, 3] at time `t` [s]."""
@@ -37,6 +42,12 @@ class Flag(Motion):
     rest: Array  # m, vertices [V, 3] of the sheet at rest
     ripples: tuple[Ripple, ...]
     carrier: Motion = field(default_factory=Still)  # of the pole
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.rest) != 2 or np.shape(self.rest)[1] != 3 or not self.width > 0:
+            raise ValueError(
+                f"Flag.rest: vertices [V, 3] from the pole at x = 0 to x > 0 are needed, got {np.shape(self.rest)}"
+            )
 
     @property
     def width(self) -> float:

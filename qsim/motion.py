@@ -9,7 +9,8 @@ exact motion between them. Nothing here is random. What deforms is in `cloth.py`
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,7 +34,13 @@ GRAVITY: Vector = (0.0, -9.80665, 0.0)  # m s^-2, standard acceleration (CGPM 19
 
 
 class Motion(ABC):
-    """A rigid motion: `pose(t)` and `velocity(t)` are all that a renderer needs."""
+    """A rigid motion: `pose(t)` and `velocity(t)` are all that a renderer needs.
+
+    `ValueError` for parameters that are not finite, vectors without three components, and axes of length zero.
+    """
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
 
     @abstractmethod
     def pose(self, t: float) -> Array:
@@ -96,9 +103,6 @@ class Spin(Motion):
     phase: float = 0.0  # rad, angle at t = 0
     center: Vector = ORIGIN  # m
 
-    def __post_init__(self) -> None:
-        unit(self.axis)
-
     def pose(self, t: float) -> Array:
         return about(rotation_matrix(self.axis, self.phase + self.rate * t), self.center)
 
@@ -117,9 +121,6 @@ class Ballistic(Motion):
     phase: float = 0.0  # rad
     gravity: Vector = GRAVITY  # m/s^2
 
-    def __post_init__(self) -> None:
-        unit(self.axis)
-
     def pose(self, t: float) -> Array:
         place = np.asarray(self.position) + np.asarray(self.speed) * t + np.asarray(self.gravity) * (t * t / 2)
         return pose_matrix(rotation_matrix(self.axis, self.phase + self.rate * t), place)
@@ -137,9 +138,6 @@ class Pendulum(Motion):
     amplitude: float  # rad
     frequency: float  # Hz
     phase: float = 0.0  # rad
-
-    def __post_init__(self) -> None:
-        unit(self.axis)
 
     def pose(self, t: float) -> Array:
         angle = self.amplitude * np.sin(2 * np.pi * self.frequency * t + self.phase)
@@ -177,6 +175,9 @@ class Wave:
     amplitude: Vector
     frequency: float  # Hz
     phase: float = 0.0  # rad
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
 
 
 @dataclass(frozen=True)
@@ -218,8 +219,10 @@ class Keyframes(Motion):
                 f"Keyframes needs two or more times and as many positions (and turns, or none), "
                 f"got {n} times, {len(self.positions)} positions, {len(self.turns)} turns"
             )
-        if (np.diff(self.times) <= 0).any():
-            raise ValueError(f"Keyframes.times must increase, got {self.times}")
+        if not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
+            raise ValueError(f"Keyframes.times must be finite and increase, got {self.times}")
+        for place in (*self.positions, *self.turns):
+            vector(place)
 
     def pose(self, t: float) -> Array:
         i, s, length = self._locate(t)
@@ -278,6 +281,21 @@ class Composition(Motion):
         inner_linear, inner_angular = self.inner.velocity(t)
         arm = turn @ self.inner.pose(t)[:3, 3]
         return linear + np.cross(angular, arm) + turn @ inner_linear, angular + turn @ inner_angular
+
+
+def check_numbers(record: Any) -> None:
+    """`ValueError` naming the first number or vector of a record that cannot be; axes must have a direction."""
+    for field in fields(record):
+        value = getattr(record, field.name)
+        try:
+            if field.name == "axis":
+                unit(value)
+            elif field.type == "Vector":
+                vector(value)
+            elif field.type == "float" and not np.isfinite(value):
+                raise ValueError(f"expected a finite number, got {value!r}")
+        except ValueError as error:
+            raise ValueError(f"{type(record).__name__}.{field.name}: {error}") from None
 
 
 # Shared arithmetic -------------------------------------------------------------------------------------------------

@@ -180,19 +180,28 @@ def filled(loops: Sequence[Array]) -> tuple[Array, NDArray[np.int64]]:
 
 
 def wire(path: ArrayLike, radius: float, sides: int = 8, closed: bool = False) -> Mesh:
-    """A tube of `radius` along a path [N, 3]; frames are carried along without twist (parallel transport)."""
+    """A tube of `radius` along a path [N, 3]: open ends, or closed from the last point to the first.
+
+    Frames are carried along without twist (parallel transport); what a closed path turns them by is spread over it.
+    """
     points = np.asarray(path, np.float64)
     tangent = np.gradient(np.concatenate([points[-1:], points, points[:1]]), axis=0)[1:-1] if closed else None
     tangent = np.gradient(points, axis=0) if tangent is None else tangent
     tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
     side = np.cross(tangent[0], np.eye(3)[int(np.argmin(np.abs(tangent[0])))])
+    sides_along = []
+    for along in [*tangent, tangent[0]]:
+        side = side - along * (side @ along)
+        side = side / np.linalg.norm(side)
+        sides_along.append(side)
+    first, last = sides_along[0], sides_along[-1]
+    gained = float(np.arctan2(np.cross(first, last) @ tangent[0], first @ last)) if closed else 0.0
     rings = []
     around = np.linspace(0, 2 * np.pi, sides + 1)
-    for place, along in zip(points, tangent, strict=True):
-        side = side - along * (side @ along)
-        side /= np.linalg.norm(side)
-        across = np.cross(along, side)
-        rings.append(place + radius * (np.cos(around)[:, None] * side + np.sin(around)[:, None] * across))
+    for i, (place, along) in enumerate(zip(points, tangent, strict=True)):
+        angle = (around - gained * i / len(points))[:, None]
+        across = np.cross(along, sides_along[i])
+        rings.append(place + radius * (np.cos(angle) * sides_along[i] + np.sin(angle) * across))
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     if closed:
         rings, length = [*rings, rings[0]], np.append(length, length[-1] + np.linalg.norm(points[0] - points[-1]))
