@@ -8,7 +8,7 @@ decide (about 40 in a million) is flagged by the kernel and drawn by the referen
 are the reference's on every kind of machine; tails, where a second word is drawn, come out right for the same reason.
 
 Where no short form exists (codes above 8 bits, paralyzable pixels, very long sums) or a block is tiny, the reference
-itself draws. Peak memory: the output and one frame, or a million pixels where frames are smaller.
+itself draws. Peak memory: the output and one frame, or two million pixels where frames are smaller.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SMALLEST = 1 << 14  # pixels; below, compiling costs more than it brings
 _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # of Philox4x32; see keys.py
 _KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 _INFINITY = 0x7F800000  # float32; larger bit patterns are NaN or negative
-_CHUNK = 1 << 20  # pixels of small frames that share a launch
+_CHUNK = 1 << 21  # pixels of small frames that share a launch
 _CERTAIN = 80.0  # arrivals that are sure to bring 15: P(N < 15) = 1e-19
 _CONSTANT_PLANS = 32  # sensors of a process that get kernels of their own
 
@@ -101,9 +101,12 @@ def sample_packed(
     doubtful = []
     for t, pairs, lanes in _frames(chosen, stack, key, origin, blocks=2, bits=bits):
         eights = _join(_join(pairs, 2 * bits), 4 * bits)
-        size = eights.dtype.itemsize
-        whole = eights.byteswap().view(np.uint8).reshape(height, -1, size)[..., size - bits :]
-        packed[t] = whole.reshape(height, -1)[:, :row]
+        if bits == 1:
+            packed[t] = eights[:, :row]
+        else:
+            size = eights.dtype.itemsize
+            whole = eights.byteswap().view(np.uint8).reshape(height, -1, size)[..., size - bits :]
+            packed[t] = whole.reshape(height, -1)[:, :row]
         octets = np.unique(lanes // 4)
         doubtful.append(np.stack([np.full(octets.size, t), *np.divmod(octets, eights.shape[1])]))
     if width * bits % 8:
@@ -135,8 +138,12 @@ def steps(sensor: Sensor, photons: Array, exposure: float) -> Array:
 
 def _join(numbers: Array, bits: int) -> Array:
     """Neighbours side by side: [H, 2 n] numbers of `bits` bits -> [H, n] of twice as many, the first one highest."""
-    dtype = np.min_scalar_type(2 ** (2 * bits) - 1)
-    return numbers[:, ::2].astype(dtype) << dtype.type(bits) | numbers[:, 1::2].astype(dtype)
+    width, wide = 8 * numbers.itemsize, np.dtype(f"u{2 * numbers.itemsize}") if numbers.itemsize < 8 else None
+    if wide is None:
+        return numbers[:, ::2] << np.uint64(bits) | numbers[:, 1::2]
+    both = numbers.view(wide)  # little-endian: the first one is in the low half
+    low = wide.type(2 ** (2 * bits) - 1)
+    return (both << wide.type(bits) | both >> wide.type(width)) & low
 
 
 def _write_octets(
@@ -245,9 +252,9 @@ def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
         row, block, high, low, lanes, height, inverse_lanes, inverse_height = fixed
         # Quotients by products in float64, exact below 2^32: no division, and one kernel for every size
         lane = dr.arange(jit.UInt32, dr.width(pair))
-        y = jit.UInt32((jit.Float64(lane) + 0.5) * inverse_lanes)
+        y = jit.UInt32(dr.fma(jit.Float64(lane), inverse_lanes, inverse_lanes / 2))
         x = lane - y * lanes
-        t = jit.UInt32((jit.Float64(y) + 0.5) * inverse_height)
+        t = jit.UInt32(dr.fma(jit.Float64(y), inverse_height, inverse_height / 2))
         y = y - t * height
         first_plane = (frame + t) * plan.planes
         photons = [dr.reinterpret_array(jit.Float, jit.UInt32(half)) for half in (pair, pair >> 32)]

@@ -84,7 +84,7 @@ def plan(sensor: Sensor, exposure: float) -> Plan | None:
 
 def _margin(terms: int) -> float:
     """Several times the largest float32 error of a step: rounding of u, exp and lambda, and of each term."""
-    return 2e-6 + 1.2e-7 * terms
+    return 4e-7 + 1.2e-7 * terms
 
 
 def electrons(sensor: QIS) -> Electrons | None:
