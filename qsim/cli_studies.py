@@ -86,7 +86,7 @@ def _run_tradeoff(args: argparse.Namespace) -> int:
 
 def add_calibrate(sub: Any) -> None:
     parser = command(
-        sub, "calibrate", _run_calibrate, "Dark and flat frames -> a sensor file, each number with its 95 % interval.",
+        sub, "calibrate", _run_calibrate, "Dark and flat frames -> a sensor file, numbers with confidence intervals.",
         "qsim calibrate --bits 8 --dark d1.npy 1e-3 --dark d2.npy 0.1 --flat f.npy 1e-3 --flat g.npy 1e-3 -o my.toml\n"
         "qsim calibrate --model spad --bits 1 --dark dark.npy 1e-5 --flat flat.npy 1e-5 0.8 -o spad.toml\n"
         "qsim calibrate --bits 8 --static counts.npy 6.33e-6 -o counter.toml",

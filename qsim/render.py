@@ -317,11 +317,17 @@ class Renderer:
         found = self._stage.loaded.ray_intersect_preliminary(ray, coherent=True)
         shape = dr.reinterpret_array(mi.UInt32, found.shape)
         instance: Any = dr.reinterpret_array(mi.UInt32, found.instance)
-        index = np.array(dr.select(instance > 0, instance, shape))
+        index = np.array(dr.select(found.is_valid(), dr.select(instance > 0, instance, shape), 0))
         number = self._numbers[np.minimum(index, len(self._numbers) - 1)]
-        distance = np.where(number >= 0, np.array(found.t, np.float64), np.inf)
-        weights = np.array(found.prim_uv, np.float64)
-        return Hits(distance, number, np.array(found.prim_index, np.int64), weights.reshape(2, -1).T)
+        distance = np.where(number >= 0, np.array(dr.select(found.is_valid(), found.t, dr.inf), np.float64), np.inf)
+        # Where nothing was hit, Dr.Jit leaves whatever the memory held.
+        weights = np.array(dr.select(found.is_valid(), found.prim_uv, 0), np.float64)
+        return Hits(
+            distance,
+            number,
+            np.array(dr.select(found.is_valid(), found.prim_index, 0), np.int64),
+            weights.reshape(2, -1).T,
+        )
 
     def _cast_one_by_one(self, origin: Array, unit: Array) -> Hits:
         mi = self._mi
