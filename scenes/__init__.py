@@ -10,16 +10,41 @@ from collections.abc import Callable
 from pathlib import Path
 
 from qsim.scene import Scene
-from scenes import drums, fan, fence, gears, pellets, text, tumble, wires
+from scenes import (
+    crowd,
+    drums,
+    fan,
+    fence,
+    flag,
+    gears,
+    glass,
+    glossy,
+    lamp,
+    pellets,
+    plain,
+    room,
+    shadow,
+    text,
+    tumble,
+    wires,
+)
 
 Family = Callable[..., Scene]
 
 FAMILIES: dict[str, Family] = {
+    "crowd": crowd.scene,
     "drums": drums.scene,
     "fan": fan.scene,
     "fence": fence.scene,
+    "flag": flag.scene,
     "gears": gears.scene,
+    "glass": glass.scene,
+    "glossy": glossy.scene,
+    "lamp": lamp.scene,
     "pellets": pellets.scene,
+    "plain": plain.scene,
+    "room": room.scene,
+    "shadow": shadow.scene,
     "text": text.scene,
     "tumble": tumble.scene,
     "wires": wires.scene,

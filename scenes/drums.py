@@ -15,9 +15,9 @@ from scenes.stage import any_angle, between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Four or five drums, 2 to 5 turns per second at speed 1; the lattice behind slides."""
+    """Four or five drums, 6 to 11 turns per second at speed 1; the lattice behind slides."""
     rng = np.random.default_rng([seed, 8])
-    slide = speed * between(rng, 6, 10)
+    slide = speed * between(rng, 10, 14)
     back = stage.wall(Diffuse(Texture(pattern(rng), (6.0, 3.0))), 1.6, 0.8)
     bodies = [
         Body(
@@ -36,7 +36,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
             else ball(1.2 * radius, 64)
         )
         place = Still((float(x), between(rng, -0.03, 0.03), between(rng, -0.06, 0.06)), vector(rng.normal(0, 0.35, 3)))
-        rate = speed * between(rng, 20, 45) * sign(rng)
+        rate = speed * between(rng, 38, 70) * sign(rng)
         repeat = (float(rng.integers(1, 3)), float(rng.integers(1, 3)))
         bodies.append(Body(f"drum {i}", solid, stage.paint(rng, pattern(rng), repeat), place @ Spin((0, 1, 0), rate)))
     view = stage.camera((between(rng, -0.1, 0.1), between(rng, 0.0, 0.15), 0.7), (0, 0, 0), 0.5)

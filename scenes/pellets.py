@@ -31,7 +31,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         size = between(rng, 0.0015, 0.0045)
         solid = ball(size, 24) if rng.random() < 0.5 else polyhedron(rng, 1.2 * size, 8, 2 * size)
         bodies.append(Body(f"pellet {i}", solid, coat(rng), motion))
-    view = stage.camera((0, 0, 0.65), (0, 0, 0), 0.5)
+    view = stage.camera((between(rng, -0.1, 0.1), between(rng, -0.05, 0.1), 0.65), (0, 0, 0), 0.5)
     return Scene("pellets", seed, view, (stage.studio(rng), stage.lamp(rng, (0, 0, 0), 0.8, 1.0)), tuple(bodies), speed)
 
 
