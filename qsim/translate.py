@@ -2,8 +2,10 @@
 
     Scene -> mi.Scene (loaded once) + `place(t)`, which moves bodies, lamps and points to their poses at time t
 
-How a body moves decides how it is held: at rest, its mesh lies in world coordinates; rigid, it is an instance whose
-`to_world` changes (the acceleration structure of its mesh stays); deforming or glowing, its vertices are rewritten.
+How a body moves decides how it is held: at rest, its mesh lies in world coordinates; rigid and large, it is an instance
+whose `to_world` changes (the acceleration structure of its mesh stays); small, deforming or glowing, its vertices are
+rewritten. Mitsuba traces the code of every instance into the kernel of every pass: 87 small bodies took 13 s a frame as
+instances, 0.7 s rewritten.
 `mi` is the Mitsuba module, handed in by render.py, which alone imports it.
 """
 
@@ -19,6 +21,7 @@ from qsim import scene as records
 from qsim.scene import Body, Scene
 from qsim.sky import environment_map, sky_map, sun_direction, sun_radiance
 
+LARGE = 20_000  # triangles from which a rigid body becomes an instance
 SUN_DISTANCE = 1000.0  # in units of the scene's reach from the camera: parallax of the sun under 1 mrad
 
 
@@ -100,7 +103,9 @@ def lamp_pose(lamp: records.AreaLamp) -> Array:
 
 
 def _is_instance(body: Body) -> bool:
-    return body.motion is not None and not body.deforms and not isinstance(body.material, records.Glow)
+    """Whether a body is held as an instance of a mesh in its own coordinates."""
+    rigid = body.motion is not None and not body.deforms
+    return rigid and len(body.mesh.faces) >= LARGE and not isinstance(body.material, records.Glow)
 
 
 def _scene_dict(mi: Any, scene: Scene) -> dict[str, Any]:
