@@ -6,12 +6,15 @@ Motion is measured by projecting points of the bodies: nothing is rendered.
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import scenes
+from qsim.jobs import assets
 from qsim.motion import Translation
+from qsim.recipe import load as load_recipe
 from qsim.scene import AreaLamp, Body, Camera, Constant, EnvironmentImage, PointLight, Scene
 from qsim.shapes import sheet
 from scenes.stage import FRAME_RATE, HEIGHT, WIDTH
@@ -174,3 +177,15 @@ def test_loading_by_name_and_by_file(tmp_path):
     own.write_text("x = 1\n")
     with pytest.raises(ValueError, match=r"needs a function scene\(seed=0"):
         scenes.load(own)
+
+
+@pytest.mark.parametrize("name", ["demo", "starter"])
+def test_recipes_keep_the_textures_of_the_test_split_out_of_training(name):
+    recipe = load_recipe(Path(scenes.__file__).parent / f"{name}.toml")
+    assert all(recipe.splits.values()), "every split has a clip"
+    seen: dict[str, set[str]] = {"train": set(), "val": set(), "test": set()}
+    for job in recipe.jobs:
+        described = scenes.load(job.family, job.scene_seed, job.speed).to_dict()
+        seen[job.split] |= {asset for asset in assets(described) if asset.startswith("texture ")}
+    assert seen["test"]
+    assert not seen["test"] & (seen["train"] | seen["val"])
