@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 import scenes
+from qsim.budget import Budget
 from qsim.jobs import assets
 from qsim.motion import Translation
 from qsim.recipe import load as load_recipe
+from qsim.render import Renderer
 from qsim.scene import AreaLamp, Body, Camera, Constant, EnvironmentImage, PointLight, Scene
 from qsim.shapes import sheet
 from scenes.stage import FRAME_RATE, HEIGHT, WIDTH
@@ -189,3 +191,12 @@ def test_recipes_keep_the_textures_of_the_test_split_out_of_training(name):
         seen[job.split] |= {asset for asset in assets(described) if asset.startswith("texture ")}
     assert seen["test"]
     assert not seen["test"] & (seen["train"] | seen["val"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", scenes.FAMILIES)
+def test_a_family_renders_light_everywhere_and_true_motion(family):
+    frame = Renderer(built(family, 0).resized(32, 64), frame_rate=FRAME_RATE, budget=Budget(samples=16)).frame(8)
+    assert frame.radiance.min() > 0
+    assert frame.radiance.max() > 1.5 * frame.radiance.min()
+    assert np.nanmax(np.hypot(*frame.flow)) * HEIGHT / 32 > 0.7
