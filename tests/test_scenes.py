@@ -181,6 +181,7 @@ def test_loading_by_name_and_by_file(tmp_path):
         scenes.load(own)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["demo", "starter"])
 def test_recipes_keep_the_textures_of_the_test_split_out_of_training(name):
     recipe = load_recipe(Path(scenes.__file__).parent / f"{name}.toml")
