@@ -312,7 +312,7 @@ def _add_plan(sub: Any) -> None:
     )  # fmt: skip
     parser.add_argument("recipe", type=Path, help="a .toml file")
     parser.add_argument("--machines", type=int, default=10, help="to spread the work over (default 10)")
-    parser.add_argument("--frames", type=int, default=3, help="frames rendered per kind (default 3)")
+    parser.add_argument("--frames", type=int, default=5, help="frames rendered per kind (default 5)")
 
 
 def _run_plan(args: argparse.Namespace) -> int:

@@ -89,7 +89,7 @@ class Plan:
         ]
 
 
-def plan(recipe: Recipe, *, frames: int = 3, progress: stream.Progress | None = None) -> Plan:
+def plan(recipe: Recipe, *, frames: int = 5, progress: stream.Progress | None = None) -> Plan:
     """Measure one job of each kind with so many frames (at least 2: the first one compiles)."""
     from qsim import engine
 
@@ -111,7 +111,7 @@ def plan(recipe: Recipe, *, frames: int = 3, progress: stream.Progress | None = 
 
 def _measure(members: list[Job], folder: Path, frames: int) -> Cost:
     """The second rendering counts: kernels are then compiled and cached, as they are for nearly all jobs."""
-    _first_frames(members[0], folder / "warm", 1)
+    _first_frames(members[0], folder / "warm", min(2, members[0].settings.frames))
     job = members[len(members) // 2]
     settings = job.settings
     started = time.perf_counter()

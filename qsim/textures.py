@@ -152,7 +152,7 @@ def speckles(rng: np.random.Generator, count: int = 1500, size: int = 512, large
 def lines_of_text(
     lines: Sequence[str], width: int = 1024, height: int = 512, ink: float = 0.05, paper: float = 0.8
 ) -> Picture:
-    """A printed page: every line fills the width, so longer lines are smaller; an empty line is half the page high.
+    """A printed page: every line fills the width, so longer lines are smaller; an empty line is 0.4 pages high.
 
     The font is the bold DejaVu Sans inside matplotlib.
     """
@@ -165,7 +165,7 @@ def lines_of_text(
     top, margin = 0.04 * height, 0.05 * width
     for line in lines:
         if not line:
-            top += height / 2
+            top += 0.4 * height
             continue
         wide = ImageFont.truetype(font, 100).getlength(line) / 100
         size = (width - 2 * margin) / wide

@@ -11,20 +11,20 @@ from qsim.scene import Body, Diffuse, Scene, Texture
 from qsim.shapes import ball, cylinder
 from qsim.textures import Picture
 from scenes import stage
-from scenes.stage import any_angle, between, pick, sign
+from scenes.stage import between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Four or five drums, 6 to 11 turns per second at speed 1; the lattice behind slides."""
+    """Four or five drums, 6 to 11 turns per second at speed 1; the lattice behind slides to and fro."""
     rng = np.random.default_rng([seed, 8])
     slide = speed * between(rng, 10, 14)
-    back = stage.wall(Diffuse(Texture(pattern(rng), (6.0, 3.0))), 1.6, 0.8)
+    back = stage.wall(Diffuse(Texture(pattern(rng), (6.0, 3.0))), 1.8, 0.9)
     bodies = [
         Body(
             "lattice",
             back.mesh,
             back.material,
-            Oscillation((0.03, 0.01, 0), slide, any_angle(rng), (0, 0, -0.25)),
+            Oscillation((0.06 * sign(rng), 0.02, 0), slide, between(rng, -1.2, 0.2), (0, 0, -0.25)),
         )
     ]
     xs = np.linspace(-0.3, 0.3, int(rng.integers(4, 6))) + rng.uniform(-0.02, 0.02)

@@ -32,8 +32,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     cap = moved(ball(0.12 * radius, 40), pose_matrix(None, (0, 0, 0.05)))
     hub = merged([moved(cylinder(0.19 * radius, 0.1, 40), facing), cap])
     bodies = [
-        stage.wall(Diffuse(stage.backdrop(rng)), 4.4, 2.2, z=-0.25),
-        Body("blades", blades, stage.paint(rng, stage.surface(rng, 0.12, 0.85)), spin),
+        stage.wall(Diffuse(stage.backdrop(rng, 0.06, 0.45)), 4.4, 2.2, z=-0.25),
+        Body("blades", blades, stage.paint(rng, stage.surface(rng, 0.15, 0.9)), spin),
         Body("hub", hub, RoughPlastic(Texture(stage.surface(rng, 0.1, 0.6)), 0.2), spin),
         Body("motor", moved(cylinder(0.24 * radius, 0.2, 40), behind), Conductor(roughness=0.35), place),
     ]

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from qsim import textures
 from qsim.motion import Spin, Translation
 from qsim.rotation import exponential, pose_matrix, vector
-from qsim.scene import Body, Diffuse, Mesh, Scene
+from qsim.scene import Body, Diffuse, Mesh, Scene, Texture
 from qsim.shapes import blob, box, merged, moved
 from scenes import stage
 from scenes.stage import any_angle, between, sign
@@ -15,7 +16,7 @@ from scenes.stage import any_angle, between, sign
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     """A sliding fence before three layers of bodies that cross in both directions at 1 to 4 m/s at speed 1."""
     rng = np.random.default_rng([seed, 5])
-    bodies = [stage.wall(Diffuse(stage.backdrop(rng)), 1.8, 0.9, z=-0.45)]
+    bodies = [stage.wall(Diffuse(stage.backdrop(rng, 0.06, 0.45)), 1.8, 0.9, z=-0.45)]
     for i in range(int(rng.integers(5, 8))):
         z = between(rng, -0.3, -0.05)
         velocity = np.array([sign(rng) * rng.uniform(1.5, 3.5), rng.normal(0, 0.4), 0.0]) * speed
@@ -26,10 +27,11 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         solid = blob(rng, size, 0.2) if rng.random() < 0.5 else box(1.5 * size, 1.5 * size, 1.5 * size, 2 * size)
         bodies.append(Body(f"passer {i}", solid, stage.paint(rng, stage.surface(rng)), motion @ turn))
     slide = speed * between(rng, 0.8, 2.0) * sign(rng)
+    wood = textures.levels(textures.rings(rng, between(rng, 8, 20)), between(rng, 0.3, 0.5), between(rng, 0.6, 0.9))
     slats = Body(
         "fence",
         fence(rng),
-        stage.paint(rng, stage.surface(rng, 0.15, 0.8)),
+        Diffuse(Texture(wood)),
         Translation((slide, 0.0, 0.0), (-slide * stage.CLIP / 2, 0, 0)),
     )
     view = stage.camera((0.0, between(rng, -0.05, 0.1), 0.7), (0, 0, 0), 0.5)
@@ -38,11 +40,11 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 def fence(rng: np.random.Generator) -> Mesh:
     """Slats side by side with gaps, leaning by a random angle, with two rails."""
-    pitch, share = between(rng, 0.05, 0.1), between(rng, 0.3, 0.5)
+    pitch, share = between(rng, 0.05, 0.1), between(rng, 0.25, 0.42)
     lean = float(rng.choice([0.0, 0.0, 0.3, -0.5]))
     slats = [
-        moved(box(pitch * share, 0.7, 0.008, 0.1), pose_matrix(exponential((0, 0, lean)), (x, 0, 0.05)))
+        moved(box(pitch * share, 0.7, 0.008, 0.7), pose_matrix(exponential((0, 0, lean)), (x, 0, 0.05)))
         for x in np.arange(-0.8, 0.8, pitch)
     ]
-    rails = [moved(box(2.0, 0.014, 0.008, 0.1), pose_matrix(None, (0, y, 0.042))) for y in (-0.11, 0.11)]
+    rails = [moved(box(2.0, 0.014, 0.008, 0.7), pose_matrix(None, (0, y, 0.042))) for y in (-0.11, 0.11)]
     return merged([*slats, *rails])

@@ -14,7 +14,7 @@ TABLE = -0.09  # m
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Things on a table, half of them turning, and two that fly through at 1.5 to 3.5 m/s at speed 1."""
+    """Things on a table, half of them turning, and two that fly through at 2 to 4 m/s at speed 1."""
     rng = np.random.default_rng([seed, 12])
     bodies = [
         stage.floor(Diffuse(stage.backdrop(rng, 0.1, 0.7)), 1.8, y=TABLE, z=-0.3),
@@ -25,10 +25,10 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     for i, x in enumerate(xs):
         solid = tumble.shape(rng)
         place = Still((float(x), TABLE - float(solid.vertices[:, 1].min()), between(rng, -0.2, 0.1)))
-        turn: Motion = Spin((0, 1, 0), speed * between(rng, 25, 60) * sign(rng), any_angle(rng))
+        turn: Motion = Spin((0, 1, 0), speed * between(rng, 40, 80) * sign(rng), any_angle(rng))
         bodies.append(Body(f"thing {i}", solid, finish(rng), place @ turn if i % 2 else place))
     for i in range(2):
-        velocity = speed * np.array([sign(rng) * rng.uniform(1.5, 3.5), rng.normal(0, 0.5), 0.0])
+        velocity = speed * np.array([sign(rng) * rng.uniform(2.0, 4.0), rng.normal(0, 0.5), 0.0])
         middle = np.array([rng.uniform(-0.12, 0.12), rng.uniform(0.02, 0.09), rng.uniform(-0.1, 0.1)])
         flight = Translation(vector(velocity), vector(middle - velocity * stage.CLIP / 2))
         turn = Spin(stage.direction(rng), speed * between(rng, 15, 40), any_angle(rng))

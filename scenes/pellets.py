@@ -13,9 +13,9 @@ from scenes.stage import any_angle, between, pick
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Forty to seventy pellets of 3 to 9 mm in two or three jets, 2 to 5 m/s at speed 1."""
+    """Forty to seventy pellets of 4 to 12 mm in two or three jets, 2 to 5 m/s at speed 1."""
     rng = np.random.default_rng([seed, 4])
-    bodies = [stage.wall(Diffuse(stage.backdrop(rng)), 1.2, 0.6, z=-0.12)]
+    bodies = [stage.wall(Diffuse(stage.backdrop(rng, 0.15, 0.45)), 1.2, 0.6, z=-0.12)]
     jets = [(any_angle(rng), between(rng, 2.0, 4.2)) for _ in range(int(rng.integers(2, 4)))]
     for i in range(int(rng.integers(40, 70))):
         angle, fast = pick(rng, jets)
@@ -28,7 +28,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
             stage.direction(rng),
             speed * rng.uniform(0, 120),
         )
-        size = between(rng, 0.0015, 0.0045)
+        size = between(rng, 0.002, 0.006)
         solid = ball(size, 24) if rng.random() < 0.5 else polyhedron(rng, 1.2 * size, 8, 2 * size)
         bodies.append(Body(f"pellet {i}", solid, coat(rng), motion))
     view = stage.camera((between(rng, -0.1, 0.1), between(rng, -0.05, 0.1), 0.65), (0, 0, 0), 0.5)
@@ -39,4 +39,4 @@ def coat(rng: np.random.Generator) -> Material:
     """Steel, white or dark."""
     if rng.random() < 0.3:
         return Conductor(roughness=0.2)
-    return RoughPlastic(float(pick(rng, (0.03, 0.08, 0.6, 0.85))), 0.2)
+    return RoughPlastic(float(pick(rng, (0.03, 0.05, 0.8, 0.9))), 0.2)

@@ -15,7 +15,7 @@ WIDTH, HEIGHT, DEPTH = 4.0, 2.6, 5.0  # m
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Seeds take turns: a pan of 4 to 9 rad/s, a shake of two degrees at 15 to 30 Hz, a flight at 9 to 18 m/s."""
+    """Seeds take turns: a pan of 4 to 9 rad/s, a shake of two degrees at 18 to 32 Hz, a flight at 9 to 18 m/s."""
     rng = np.random.default_rng([seed, 13])
     bodies = [*walls(rng), *furniture(rng)]
     origin = np.array([between(rng, -0.3, 0.3), between(rng, 1.2, 1.6), 2.2])
@@ -34,7 +34,7 @@ def pan(rng: np.random.Generator, speed: float) -> Motion:
 def shake(rng: np.random.Generator, speed: float) -> Motion:
     """A hand that trembles: three waves about all axes and one that shifts."""
     turns = tuple(
-        Wave(vector(rng.normal(0, (0.03, 0.03, 0.015))), speed * between(rng, 15, 30), any_angle(rng)) for _ in range(3)
+        Wave(vector(rng.normal(0, (0.04, 0.04, 0.02))), speed * between(rng, 18, 32), any_angle(rng)) for _ in range(3)
     )
     return Shake(turns, (Wave(vector(rng.normal(0, 0.01, 3)), speed * between(rng, 8, 15), any_angle(rng)),))
 

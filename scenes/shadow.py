@@ -38,7 +38,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     middle = np.array([rng.uniform(-0.1, 0.1), rng.uniform(-0.06, 0.06), 0.08])
     flight = Translation(vector(velocity), vector(middle - velocity * stage.CLIP / 2))
     turn = Spin(stage.direction(rng), speed * between(rng, 15, 40), any_angle(rng))
-    flyer = polyhedron(rng, between(rng, 0.012, 0.02), 8, 0.03)
+    flyer = polyhedron(rng, between(rng, 0.018, 0.03), 8, 0.04)
     bodies.append(Body("flyer", flyer, stage.paint(rng, stage.surface(rng)), flight @ turn))
     view = stage.camera((between(rng, -0.08, 0.08), between(rng, -0.08, 0.02), 0.65), (0, 0, 0), 0.5)
     return Scene("shadow", seed, view, (sun,), tuple(bodies), speed)

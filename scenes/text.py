@@ -67,6 +67,6 @@ def carrier(rng: np.random.Generator, speed: float) -> Motion:
 
 
 def random_lines(rng: np.random.Generator) -> list[str]:
-    """A few lines as on an eye chart: a heading's space is left free, letters get smaller downwards."""
+    """Three lines as on an eye chart: a heading's space is left free, letters get smaller downwards."""
     alphabet = list("ABCDEFGHJKLMNPQRSTUVWXYZ23456789")
-    return ["", *("".join(rng.choice(alphabet, n)) for n in (9, 13, 18, 26))]
+    return ["", *("".join(rng.choice(alphabet, n)) for n in (11, 16, 24))]
