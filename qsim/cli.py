@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from qsim import __version__
-from qsim.cli_studies import add_calibrate, add_report, add_tradeoff, add_validate
+from qsim.cli_look import add_preview, add_report
+from qsim.cli_studies import add_calibrate, add_tradeoff, add_validate
 from qsim.console import Parser, bar, command, output, run
 from qsim.convert import add_convert
 
@@ -28,6 +29,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _add_plan,
         _add_check,
         add_convert,
+        add_preview,
         add_report,
         add_tradeoff,
         add_calibrate,

@@ -1,4 +1,4 @@
-"""Commands that look and study: `report`, `tradeoff`, `calibrate`, `validate`; pairs `add_X`, `_run_X` as in cli.py."""
+"""Commands that study: `tradeoff`, `calibrate`, `validate`; pairs `add_X`, `_run_X` as in cli.py."""
 
 from __future__ import annotations
 
@@ -9,35 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import files
-from qsim.console import bar, command, output
-
-# report
-
-
-def add_report(sub: Any) -> None:
-    parser = command(
-        sub, "report", _run_report, "Draw one self-contained page of clips, data sets, runs, restored video, scores.",
-        "qsim report out/fan -o out/fan.html\nqsim report out/demo -o out/demo/index.html --title 'My run'",
-    )  # fmt: skip
-    parser.add_argument("path", type=Path, help="clip, data set, or any folder with such things in it")
-    parser.add_argument("-o", "--output", type=Path, required=True, help=".html file to write")
-    parser.add_argument("--title", help="of the page")
-    parser.add_argument("--note", action="append", default=[], help="a line for the top of the page; may be repeated")
-    parser.add_argument("--force", action="store_true", help="replace an existing page")
-
-
-def _run_report(args: argparse.Namespace) -> int:
-    from qsim import report
-
-    if args.output.exists() and not args.force:
-        raise FileExistsError(f"{args.output}: exists; name another with -o, or use --force to replace it")
-    page = report.build(args.path, title=args.title, notes=args.note).encode()
-    args.output.parent.mkdir(parents=True, exist_ok=True)
-    files.write_bytes(args.output, page)
-    found = {"page": str(args.output), "bytes": len(page)}
-    output(args, found, f"{args.output}: {len(page) / 1e6:.1f} MB, loads nothing from elsewhere; open it in a browser")
-    return 0
-
+from qsim.console import bar, command, output, refuse_existing
 
 # tradeoff
 
@@ -221,8 +193,7 @@ def _run_calibrate(args: argparse.Namespace) -> int:
 
     if args.output.suffix != ".toml":
         raise ValueError(f"{args.output}: the sensor file is a .toml, as in -o my_sensor.toml")
-    if args.output.exists() and not args.force:
-        raise FileExistsError(f"{args.output}: exists; name another with -o, or use --force to replace it")
+    refuse_existing(args.output, args.force)
     darks = [_stack(words, args, dark=True) for words in args.dark]
     flats = [_stack(words, args, dark=False) for words in args.flat]
     if args.static:
@@ -342,8 +313,7 @@ def _run_validate(args: argparse.Namespace) -> int:
 
     if args.output is not None:
         validate.check_figure(args.output)
-        if args.output.exists() and not args.force:
-            raise FileExistsError(f"{args.output}: exists; name another with -o, or use --force to replace it")
+        refuse_existing(args.output, args.force)
     if args.what == "render":
         return _validate_render(args)
     report = validate.run(args.pixels, args.seed, require_speed=args.require_speed)

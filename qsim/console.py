@@ -14,6 +14,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 from qsim import stream
@@ -97,6 +98,14 @@ def output(args: argparse.Namespace, found: dict[str, Any], text: str | Sequence
         print(json.dumps(found, sort_keys=True))
     else:
         print(text if isinstance(text, str) else "\n".join(text))
+
+
+def refuse_existing(path: Path, force: bool) -> None:
+    """`FileExistsError` with the cure if a file that is to be written is there already and `force` is not set."""
+    if path.is_dir():
+        raise FileExistsError(f"{path}: is a folder; name a file with -o")
+    if path.exists() and not force:
+        raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
 
 
 @contextlib.contextmanager

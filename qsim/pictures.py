@@ -11,6 +11,13 @@ from numpy.typing import NDArray
 GAMMA = 2.2  # the one tone curve of every picture
 
 
+def peak(stack: NDArray[np.floating]) -> float:
+    """The white of a clip's pictures: the 99.9th percentile of its finite values (1 for a black clip)."""
+    finite = stack[np.isfinite(stack)]
+    value = float(np.percentile(finite, 99.9)) if finite.size else 0.0
+    return value if value > 0 else 1.0
+
+
 def tone(linear: NDArray[np.floating], peak: float) -> NDArray[np.uint8]:
     """Linear light -> 8-bit grey: 255 (v / peak)^(1/2.2), clipped to 0 ... peak and rounded; NaN is shown black."""
     if not peak > 0:
@@ -56,12 +63,38 @@ def flow_legend(size: int = 96) -> NDArray[np.uint8]:
     return wheel
 
 
-def depth_levels(depth: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Depth as grey: near is bright; 1/depth between its 1st and 99th percentile; nothing hit is black."""
-    with np.errstate(divide="ignore"):
-        nearness = np.where(np.isfinite(depth) & (depth > 0), 1.0 / depth, np.nan)
-    if not np.isfinite(nearness).any():
-        return np.zeros(depth.shape, np.uint8)
-    low, high = np.nanpercentile(nearness, [1, 99])
-    grey = 40 + 215 * (nearness - low) / max(high - low, 1e-12)
-    return np.where(np.isfinite(nearness), np.clip(np.nan_to_num(grey), 0, 255), 0).astype(np.uint8)
+# Far to near, of rising lightness so that the order survives in grey: (share, red, green, blue).
+_DEPTH_RAMP = np.array(
+    [(0.0, 24, 22, 66), (0.25, 74, 40, 130), (0.5, 182, 54, 121), (0.75, 246, 122, 88), (1.0, 252, 246, 190)]
+)
+
+
+def depth_range(depth: NDArray[np.floating]) -> tuple[float, float]:
+    """(near, far) [m]: the 1st and 99th percentile of what was hit; (1, 1) where nothing was."""
+    hit = depth[np.isfinite(depth) & (depth > 0)]
+    if hit.size == 0:
+        return 1.0, 1.0
+    near, far = np.percentile(hit, [1, 99])
+    return float(near), float(far)
+
+
+def depth_colours(depth: NDArray[np.floating], near: float, far: float) -> NDArray[np.uint8]:
+    """Depth [..., H, W] in metres as colour [..., H, W, 3]: near is light yellow, far is dark blue, even in 1/depth.
+
+    Nothing hit (infinite, zero, NaN) is black.
+    """
+    if not 0 < near <= far < np.inf:
+        raise ValueError(f"depth_colours: expected 0 < near <= far in metres, got {near!r} and {far!r}")
+    hit = np.isfinite(depth) & (depth > 0)
+    nearness = 1.0 / np.where(hit, depth, far)
+    low, high = 1.0 / far, 1.0 / near
+    share = np.clip((nearness - low) / (high - low) if high > low else np.ones_like(nearness), 0.0, 1.0)
+    rgb = np.stack([np.interp(share, _DEPTH_RAMP[:, 0], _DEPTH_RAMP[:, i]) for i in (1, 2, 3)], axis=-1)
+    rgb[~hit] = 0
+    return np.rint(rgb).astype(np.uint8)
+
+
+def depth_legend(height: int = 12, width: int = 96) -> NDArray[np.uint8]:
+    """The bar of `depth_colours` [height, width, 3]: the near end is left, the far end right, even in 1/depth."""
+    nearness = np.linspace(1.0, 0.5, width)
+    return np.tile(depth_colours(1.0 / nearness, 1.0, 2.0), (height, 1, 1))

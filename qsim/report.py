@@ -77,12 +77,6 @@ def _fit(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return frames[:, ::step, ::step]
 
 
-def peak(stack: NDArray[np.floating]) -> float:
-    """The white of a clip's pictures: its 99.9th percentile (1 for a black clip)."""
-    value = float(np.percentile(stack, 99.9))
-    return value if value > 0 else 1.0
-
-
 def truth_stack(clip: Clip, frames: range) -> NDArray[np.float32]:
     """Sharp radiance [T, H, W] of these frames."""
     return np.stack([clip.sharp(t) for t in frames])
@@ -100,7 +94,7 @@ def stream_panels(stream: Stream, frames: range) -> list[page.Panel]:
     shown = codes[frames.start - first : frames.stop - first]
     return [
         page.Panel(f"codes, {bits} bit ({stream.name})", _fit(pictures.code_levels(shown, bits))),
-        page.Panel(f"plain average of {AVERAGE} frames", _fit(pictures.tone(averages, peak(averages)))),
+        page.Panel(f"plain average of {AVERAGE} frames", _fit(pictures.tone(averages, pictures.peak(averages)))),
     ]
 
 
@@ -108,7 +102,7 @@ def clip_section(clip: Clip) -> str:
     """Truth, streams and flow of a clip, its light, its motion, and what was modelled."""
     frames = chosen_frames(len(clip))
     truth = truth_stack(clip, frames)
-    white = peak(truth)
+    white = pictures.peak(truth)
     panels = [page.Panel("truth", _fit(pictures.tone(truth, white)))]
     for name in clip.streams:
         stream = clip.stream(name)
@@ -172,10 +166,10 @@ def restored_section(path: Path) -> str:
     shown = np.asarray(restored[: len(frames)])
     clip, stream = _source(meta)
     panels: list[page.Panel] = []
-    white = peak(shown)
+    white = pictures.peak(shown)
     if clip is not None and stream is not None and len(clip) >= len(frames):
         photons = np.stack([clip_photons(clip, t, stream.photons_factor, sharp=True) for t in frames])
-        white = peak(photons)
+        white = pictures.peak(photons)
         panels = [page.Panel("truth", _fit(pictures.tone(photons, white))), *stream_panels(stream, frames)]
     panels.append(page.Panel(f"restored by {meta['method']}", _fit(pictures.tone(shown, white))))
     line = (

@@ -133,7 +133,7 @@ def to_luminance(values: Array, transfer: str, top: float, colour: bool) -> Arra
 
 
 def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossless: bool) -> None:
-    """8-bit grey frames [H, W] as H.264: bit-exact grey (`qp 0`), or FFmpeg's ordinary lossy settings, in yuv420p."""
+    """8-bit grey frames [H, W] (lossy: colour [H, W, 3] too) as H.264: bit-exact grey (`qp 0`), or FFmpeg's yuv420p."""
     import av
 
     with files.replacing(path) as file, av.open(file, "w", format="mp4") as container:
@@ -143,13 +143,13 @@ def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossl
                 stream = container.add_stream(
                     "libx264", rate=round(frame_rate), options={"qp": "0"} if lossless else {}
                 )
-                stream.height, stream.width = image.shape
+                stream.height, stream.width = image.shape[:2]
                 stream.codec_context.pix_fmt = "gray" if lossless else "yuv420p"
                 if not lossless and (image.shape[0] % 2 or image.shape[1] % 2):
                     raise ValueError(
-                        f"{path}: lossy H.264 needs even sizes, the frames are {image.shape}; use --lossless"
+                        f"{path}: lossy H.264 needs even sizes, the frames are {image.shape[:2]}; use --lossless"
                     )
-            picture = av.VideoFrame.from_ndarray(image, format="gray")
+            picture = av.VideoFrame.from_ndarray(image, format="gray" if image.ndim == 2 else "rgb24")
             if lossless:  # say that 0 ... 255 are meant, or decoders stretch 16 ... 235
                 picture.color_range = stream.codec_context.color_range = _FULL_RANGE
             for packet in stream.encode(picture):
