@@ -305,14 +305,15 @@ def _run_evaluate(args: argparse.Namespace) -> int:
 def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
     from quiver.data import output
     from quiver.evaluate import json_safe
-    from quiver.static import evaluate_static, markdown, read_counts
+    from quiver.static import FORMAT, evaluate_static, markdown, read_counts
 
     if not args.static.is_file():
         raise FileNotFoundError(f"{args.static}: no such file")
     counts = read_counts(args.static)
     bits = (args.bits or (3,))[0]
     scores = evaluate_static(counts, methods, frames=args.frames, bits=bits, splits=args.splits, seed=args.seed)
-    found = {"counts": str(args.static), "frames": args.frames, "bits": bits, "scores": [asdict(s) for s in scores]}
+    found = {"format": FORMAT, "counts": str(args.static), "frames": args.frames, "bits": bits}
+    found["scores"] = [asdict(score) for score in scores]
     output(args, json_safe(found), markdown(counts, scores, args.frames, bits))
     return 1 if any(score.failure for score in scores) else 0
 

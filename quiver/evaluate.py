@@ -37,6 +37,7 @@ from quiver.data import (
 from quiver.restore import Restorer
 
 FORMAT = "quiver-evaluation-1"
+PLAN_FORMAT = "quiver-plan-1"
 PUBLISHED_EDGE = 5  # frames at each end that the published evaluation leaves out
 
 Progress = Callable[[str, int, int], None]  # (what is restored, rows done, rows in all)
@@ -190,7 +191,7 @@ def in_memory(codes: Codes) -> Codes:
 def begin(plan: Plan, out: Path) -> list[Row]:
     """Make the folder of an evaluation, or take the finished rows of an interrupted one."""
     path = out / "plan.json"
-    wanted = {"format": FORMAT} | plan.to_dict()
+    wanted = {"format": PLAN_FORMAT} | plan.to_dict()
     if not path.exists():
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise FileExistsError(f"{out} exists and is no evaluation; choose another -o")

@@ -21,6 +21,8 @@ from quiver import metrics
 from quiver.data import array_codes, ideal_counter
 from quiver.restore import Restorer
 
+FORMAT = "quiver-static-1"  # of the JSON that `quiver evaluate --static` prints
+
 
 @dataclass(frozen=True)
 class Counts:
