@@ -9,10 +9,8 @@ not ship are run with random weights: their cost is real, their PSNR is left out
 
 from __future__ import annotations
 
-import contextlib
 import math
 import multiprocessing
-import resource
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -25,6 +23,7 @@ from numpy import ndarray as Array
 from quiver import metrics
 from quiver.baselines import METHODS
 from quiver.data import Codes, Key, Light, array_codes, draw_codes, replacing
+from quiver.memory import peak_memory, reset_peak
 from quiver.restore import Options, Restorer, network_restorer, pick_device, restorer, weights_path, wrap_network
 
 EXPOSURE = 5e-4  # s
@@ -131,22 +130,6 @@ def measure(case: Case, setting: Setting) -> Cost:
         gmac_per_frame=multiply_accumulates(method, codes, first) / 1e9 if method.learned else math.nan,
         psnr_matched=score.psnr_matched if trained else math.nan,
     )
-
-
-def reset_peak() -> int:
-    """Forget the peak so far; resident memory of this process now, bytes. (Linux; elsewhere the old peak stays.)"""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
-    return peak_memory()
-
-
-def peak_memory() -> int:
-    """Largest resident memory of this process since `reset_peak`, bytes."""
-    try:
-        status = Path("/proc/self/status").read_text()
-    except OSError:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    return int(status.split("VmHWM:")[1].split()[0]) * 1024
 
 
 def multiply_accumulates(method: Restorer, codes: Codes, first: int) -> float:

@@ -29,7 +29,7 @@ from quiver.options import (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; returns the exit code."""
-    from quiver.data import Parser, run
+    from quiver.data import Parser, add_completion, run
 
     parser = Parser(
         prog="quiver", description="Restore blur-free video from few-bit quanta streams; train and compare."
@@ -37,6 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
     for add in (_add_train, _add_restore, _add_evaluate, _add_ablate, _add_bench, _add_convert_weights):
         add(sub)
+    add_completion(sub, parser)
     with _handling(signal.default_int_handler, signal.SIGTERM):  # termination cleans up like Ctrl-C
         return run(parser, argv)
 
@@ -53,10 +54,12 @@ def _handling(handler: Callable[[int, Any], Any], *numbers: signal.Signals) -> I
             signal.signal(number, old)
 
 
-def _command(sub: Any, name: str, action: Any, what: str, example: str) -> argparse.ArgumentParser:
-    from quiver.data import command
+def _command(
+    sub: Any, name: str, action: Any, what: str, example: str, *, goes_on: bool = False
+) -> argparse.ArgumentParser:
+    from quiver.data import GOES_ON, STARTS_AGAIN, command
 
-    return command(sub, name, action, what, example)
+    return command(sub, name, action, what, example, GOES_ON if goes_on else STARTS_AGAIN)
 
 
 # Shared by the commands
@@ -85,6 +88,7 @@ def _add_train(sub: Any) -> None:
         "quiver train out/starter -o out/nano --minutes 20\n"
         "quiver train out/starter -o out/unet --preset unet --protocol control --minutes 20\n"
         "torchrun --nproc-per-node 4 -m quiver train out/starter -o out/s --preset quiver-s --protocol published",
+        goes_on=True,
     )  # fmt: skip
     parser.add_argument("data", help="data set folder")
     parser.add_argument("-o", "--output", required=True, help="folder of the run")
@@ -129,7 +133,7 @@ def _run_train(args: argparse.Namespace) -> int:
                 settings,
                 device=pick_device(args.device),
                 should_stop=lambda: bool(interrupted),
-                progress=not args.json,
+                progress=not (args.json or args.quiet),
             )
     except Diverged as error:
         print(f"quiver: {error}", file=sys.stderr)
@@ -180,6 +184,7 @@ def _add_restore(sub: Any) -> None:
         "quiver restore out/fan/streams/quiver-physical_3bit_3.25ppp.npy -o out/fan.npy --method out/nano\n"
         "quiver restore out/fan --ppp 3.25 -o out/fan.npy --method moment\n"
         "quiver restore cube.npy --width 320 --planes 7 --sensor spad-320x240 --frame-rate 1428 -o out/cube.npy",
+        goes_on=True,
     )  # fmt: skip
     parser.add_argument("source", type=Path, help="stream (.npy with its .json), clip folder, or bare .npy array")
     parser.add_argument("-o", "--output", type=Path, required=True, help=".npy to write; a .json appears beside it")
@@ -257,11 +262,13 @@ def _add_evaluate(sub: Any) -> None:
         sub, "evaluate", _run_evaluate, "Compare methods on held-out clips, or on real photons of a static object.",
         "quiver evaluate out/starter -o out/table --methods naive,moment,out/nano,out/unet --ppp 3.25,9.75,26\n"
         "quiver evaluate out/starter/clips/fan_0003 -o out/fan_table --methods moment,nano --split all\n"
-        "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,nano",
+        "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,nano", goes_on=True,
     )  # fmt: skip
     parser.add_argument("source", nargs="?", help="data set or clip folder")
     parser.add_argument("-o", "--output", type=Path, help="folder for evaluation.md, .json, .png (needed for clips)")
-    parser.add_argument("--methods", type=words, default="naive,moment", help="with commas; window as in moment:3")
+    parser.add_argument(
+        "--methods", type=words, default="naive,moment", help="with commas; window as in moment:3; all = all"
+    )
     parser.add_argument("--split", default="test", choices=("train", "val", "test", "all"), help="default test")
     parser.add_argument("--stream", help="score this stored stream of every clip instead of sensing now")
     add_light(parser, several=True)
@@ -277,9 +284,10 @@ def _add_evaluate(sub: Any) -> None:
 
 
 def _run_evaluate(args: argparse.Namespace) -> int:
-    from quiver.restore import restorer
+    from quiver.restore import method_names, restorer
 
-    methods = [restorer(name, _options(args)) for name in args.methods]
+    names = [name for word in args.methods for name in (method_names() if word == "all" else (word,))]
+    methods = [restorer(name, _options(args)) for name in dict.fromkeys(names)]
     if args.static is not None:
         return _run_static(args, methods)
     if args.source is None or args.output is None:
@@ -324,7 +332,7 @@ def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
 def _add_ablate(sub: Any) -> None:
     parser = _command(
         sub, "ablate", _run_ablate, "Train the network without some of its parts, six ways, and compare them.",
-        "quiver ablate out/starter -o out/ablation --minutes 20",
+        "quiver ablate out/starter -o out/ablation --minutes 20", goes_on=True,
     )  # fmt: skip
     parser.add_argument("data", help="data set folder")
     parser.add_argument("-o", "--output", required=True, help="folder of the six runs and their table")
@@ -350,7 +358,7 @@ def _run_ablate(args: argparse.Namespace) -> int:
     args.precision = precision
     plan = Plan(args.data, args.split, settings.lights, settings.seed)
     with _signals() as interrupted:
-        options, show = _options(args), not args.json
+        options, show = _options(args), not (args.json or args.quiet)
         found = run_ablation(settings, plan, options, should_stop=lambda: bool(interrupted), progress=show)
     if found is None:
         print("quiver: interrupted; the same command goes on where it stopped", file=sys.stderr)

@@ -17,7 +17,8 @@ from numpy import ndarray as Array
 
 from qsim import devices, keys
 from qsim.clip import Clip
-from qsim.console import Parser, bar, command, output, run, suggest
+from qsim.completion import add_completion
+from qsim.console import GOES_ON, STARTS_AGAIN, Parser, bar, command, output, run, suggest
 from qsim.dataset import Dataset
 from qsim.files import read_json, replacing, write_bytes, write_json
 from qsim.keys import Key, hash_name

@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import ndarray as Array
 
-from quiver import metrics
+from quiver import breakdown, metrics
 from quiver.data import (
     Clip,
     Codes,
@@ -34,6 +35,7 @@ from quiver.data import (
     windows_sensed,
     write_json,
 )
+from quiver.memory import peak_memory, reset_peak
 from quiver.restore import Restorer
 
 FORMAT = "quiver-evaluation-1"
@@ -70,7 +72,10 @@ class Row:
     scene: str
     score: metrics.Score | None = None
     seconds_per_frame: float = math.nan
+    peak_bytes: int | None = None  # of memory while restoring, beyond what was in use before
     truth_psnr: float | None = None  # dB; what a perfect restorer would score against this truth
+    motion_pixels: tuple[int, ...] = ()  # per bin of breakdown.EDGES; empty where the clip has no flow
+    motion_squares: tuple[float, ...] = ()  # squared error summed over them, matched, in units of white
     failure: str | None = None
 
     @property
@@ -89,6 +94,7 @@ class Row:
             numbers: dict[str, Any] = {name: math.nan if v is None else v for name, v in score.items()}
             score = metrics.Score(**numbers)
         seconds = values.pop("seconds_per_frame")
+        values |= {name: tuple(values[name]) for name in ("motion_pixels", "motion_squares")}
         return cls(score=score, seconds_per_frame=math.nan if seconds is None else seconds, **values)
 
 
@@ -125,13 +131,15 @@ def truth_psnr(clip: Clip, factor: float, white: float) -> float | None:
     return metrics.truth_psnr(rms * photons_per_radiance * factor / white)
 
 
-def restore_clip(method: Restorer, clip: Clip, light: Light, plan: Plan, codes: Codes, factor: float) -> Row:
-    """Restore and score one clip; a failure of the method becomes the row's reason."""
+def restore_clip(
+    method: Restorer, clip: Clip, light: Light, plan: Plan, codes: Codes, factor: float, out: Path | None = None
+) -> Row:
+    """Restore and score one clip, and keep a crop of its middle frame under OUT; a failure becomes the row's reason."""
     row = Row(method.name, method.description, plan.stream or light.label, clip.name, scene_of(clip))
     frames = scored_frames(len(clip), plan.published)
     target = truth(clip, factor, frames.start, frames.stop) / codes.white
     windows = list(windows_sensed(clip, light, plan.seed, frames)) if plan.published else []
-    started = time.perf_counter()
+    before, started = reset_peak(), time.perf_counter()
     try:
         if plan.published:
             pieces = [method.restore(window, PUBLISHED_EDGE, PUBLISHED_EDGE + 1) for window in windows]
@@ -139,10 +147,34 @@ def restore_clip(method: Restorer, clip: Clip, light: Light, plan: Plan, codes: 
         else:
             restored = method.restore(codes)
         seconds = (time.perf_counter() - started) / len(frames)
+        peak = peak_memory() - before
         score = metrics.score(restored / np.float32(codes.white), target, per_frame_scale=plan.published)
     except Exception as error:  # whatever a method dies of is its result
         return replace(row, failure=f"{type(error).__name__}: {' '.join(str(error).split())}")
-    return replace(row, score=score, seconds_per_frame=seconds, truth_psnr=truth_psnr(clip, factor, codes.white))
+    matched = restored * np.float32(score.scale / codes.white)
+    speed = breakdown.speeds(clip, frames)
+    pixels, squares = ((), ()) if speed is None else breakdown.by_motion(matched, target, speed)
+    if out is not None:
+        keep_crops(out, row, clip, codes, frames, {row.method: matched, "truth": target})
+    return replace(
+        row,
+        score=score,
+        seconds_per_frame=seconds,
+        peak_bytes=peak,
+        truth_psnr=truth_psnr(clip, factor, codes.white),
+        motion_pixels=pixels,
+        motion_squares=squares,
+    )
+
+
+def keep_crops(out: Path, row: Row, clip: Clip, codes: Codes, frames: range, stacks: dict[str, Array]) -> None:
+    """The part of the middle frame where most moves, from each [T, H, W] stack and from the codes, under OUT/crops."""
+    middle = len(frames) // 2
+    part = breakdown.place(clip, frames[middle])
+    pictures = {name: stack[middle][part] for name, stack in stacks.items()}
+    pictures["codes"] = codes.read(frames[middle], frames[middle] + 1)[0][part] / (codes.sensor.levels - 1)
+    for name, picture in pictures.items():
+        breakdown.save_crop(breakdown.crop_file(out, row.light, row.clip, name), picture)
 
 
 def evaluate(
@@ -174,7 +206,7 @@ def evaluate(
                     progress(f"{method.name}, {clip.name}, {label}", len(rows), total)
                 if key not in known:
                     codes = codes or in_memory(drawn)
-                    known[key] = restore_clip(method, clip, light, plan, codes, factor)
+                    known[key] = restore_clip(method, clip, light, plan, codes, factor, out)
                     if out is not None:
                         append(out / "rows.jsonl", known[key])
                 rows.append(known[key])

@@ -102,10 +102,19 @@ def restorer(name: str, options: Options | None = None) -> Restorer:
     return Restorer(name, frames, look_ahead(frames), False, method.description, fill)
 
 
+def shipped_names() -> list[str]:
+    """Networks whose weights come with the package."""
+    return sorted(file.stem for file in PRETRAINED.glob("*.safetensors"))
+
+
+def method_names() -> list[str]:
+    """Every method that needs no training: the classical ones and the shipped networks."""
+    return [*METHODS, *shipped_names()]
+
+
 def weights_path(name: str) -> Path:
     """The weights file meant by the name of a shipped preset, a file or a training folder."""
-    path = Path(name)
-    shipped = sorted(file.stem for file in PRETRAINED.glob("*.safetensors"))
+    path, shipped = Path(name), shipped_names()
     if name in shipped:
         return PRETRAINED / f"{name}.safetensors"
     if path.suffix == ".safetensors":
@@ -117,7 +126,7 @@ def weights_path(name: str) -> Path:
     if (path / "settings.json").is_file():
         raise FileNotFoundError(f"{path}: a training run without best.safetensors; has it validated yet?")
     raise ValueError(
-        f"no method {name!r}{suggest(name, [*METHODS, *shipped])}; known are {', '.join([*METHODS, *shipped])}, a "
+        f"no method {name!r}{suggest(name, method_names())}; known are {', '.join(method_names())}, a "
         ".safetensors file, and a folder of `quiver train`"
     )
 

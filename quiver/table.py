@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from quiver import breakdown
 from quiver.data import replacing, write_bytes, write_json
 from quiver.evaluate import FORMAT, Plan, Row, json_safe
 from quiver.metrics import Interval, over_scenes
@@ -25,6 +26,7 @@ COLUMNS = (
     "SSIM matched",
     "factor",
     "s/frame",
+    "memory",
     "truth's own PSNR",
 )
 SCORES = ("psnr", "psnr_matched", "ssim", "ssim_matched")
@@ -40,7 +42,9 @@ class Line:
     psnr_matched_per_frame: float  # dB, mean over all frames of all clips alike
     scale: float  # best factor, mean over clips
     scale_spread: float  # standard deviation over clips, or over windows where every window has its own
+    psnr_by_motion: list[float]  # dB, matched, all pixels of a bin of breakdown.EDGES pooled; NaN = no pixel
     seconds_per_frame: float
+    peak_bytes: int | None  # of memory, largest over clips
     truth_psnr: float | None  # dB, mean over clips
     failures: tuple[str, ...]  # clip: reason
 
@@ -63,6 +67,7 @@ def _line(method: str, light: str, rows: Sequence[Row]) -> Line:
     spread = math.sqrt(mean([(s - mean(scales)) ** 2 for s in scales])) if good else math.nan
     within = mean([score.scale_spread for _, score in good])
     frames = sum(score.frames for _, score in good)
+    moved = [row for row, _ in good if row.motion_pixels]
     truths = [row.truth_psnr for row, _ in good if row.truth_psnr is not None]
     return Line(
         method=method,
@@ -71,7 +76,9 @@ def _line(method: str, light: str, rows: Sequence[Row]) -> Line:
         psnr_matched_per_frame=sum(s.psnr_matched * s.frames for _, s in good) / frames if frames else math.nan,
         scale=mean(scales),
         scale_spread=within if within > 0 else spread,
+        psnr_by_motion=breakdown.pooled([row.motion_pixels for row in moved], [row.motion_squares for row in moved]),
         seconds_per_frame=mean([row.seconds_per_frame for row, _ in good]),
+        peak_bytes=max((row.peak_bytes for row, _ in good if row.peak_bytes is not None), default=None),
         truth_psnr=mean(truths) if truths else None,
         failures=tuple(f"{row.clip}: {row.failure}" for row in rows if row.failure is not None),
     )
@@ -108,22 +115,38 @@ def markdown(plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row]) -> st
         method = by_name[line.method]
         cells = [line.method, f"{method.window} ({method.look_ahead})", line.light]
         if line.scores["psnr"].scenes == 0:
-            cells += [f"failed: {line.failures[0]}", *[""] * 7]
+            cells += [f"failed: {line.failures[0]}", *[""] * 8]
         else:
             scores = [_interval(line.scores[name], 2 if "psnr" in name else 3) for name in SCORES]
             cells += [*scores[:2], _number(line.psnr_matched_per_frame, 2), *scores[2:]]
             cells += [f"{line.scale:.3f} (spread {line.scale_spread:.3f})", f"{line.seconds_per_frame:.3g}"]
+            cells += ["-" if line.peak_bytes is None else f"{line.peak_bytes / 1e6:.0f} MB"]
             cells += ["not measured" if line.truth_psnr is None else f"{line.truth_psnr:.1f}"]
         text.append("| " + " | ".join(cells) + " |")
-    text += ["", f"Not built yet (learned methods of the paper): {', '.join(PAPER_METHODS)}.", ""]
+    text += ["| " + " | ".join([name, "", "", "not built yet", *[""] * 8]) + " |" for name in PAPER_METHODS]
+    text += ["", "Memory: the most that restoring one clip took beyond what was in use before.", ""]
     failures = [f"- {line.method}, {line.light}, {reason}" for line in lines for reason in line.failures]
     text += ["## Failures", "", *failures, ""] if failures else []
-    return "\n".join([*text, *_per_scene(rows)]) + "\n"
+    return "\n".join([*text, *_by_motion(lines), *_per_scene(rows)]) + "\n"
 
 
 def _seen_by(plan: Plan) -> str:
     sensors = dict.fromkeys(light.sensor for light in plan.lights)
     return f"Stream {plan.stream}" if plan.stream is not None else f"Sensor {', '.join(sensors)}"
+
+
+def _by_motion(lines: Sequence[Line]) -> list[str]:
+    """PSNR against motion; nothing where no clip has flow."""
+    moving = [line for line in lines if not all(math.isnan(psnr) for psnr in line.psnr_by_motion)]
+    if not moving:
+        return []
+    text = ["## By motion: matched PSNR in dB of all pixels that move so many px/frame", ""]
+    text += ["| method | light | " + " | ".join(breakdown.bin_names()) + " |"]
+    text += ["|---" * (len(breakdown.EDGES) + 1) + "|"]
+    for line in moving:
+        cells = [_number(psnr, 2) for psnr in line.psnr_by_motion]
+        text.append(f"| {line.method} | {line.light} | " + " | ".join(cells) + " |")
+    return [*text, ""]
 
 
 def _per_scene(rows: Sequence[Row]) -> list[str]:
@@ -182,7 +205,11 @@ def figure(rows: Sequence[Row], path: Path) -> None:
 
 
 def write(out: Path, plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row]) -> None:
-    """evaluation.json, evaluation.md and evaluation.png in the folder of an evaluation."""
+    """evaluation.json, .md, .png and a sheet of crops per light level, crops_LIGHT.png, in an evaluation's folder."""
+    one_per_scene = list({row.scene: row.clip for row in reversed(rows)}.values())[::-1]
+    for light in dict.fromkeys(row.light for row in rows):
+        target = out / f"crops_{light.replace(', ', '_').replace(' ', '')}.png"
+        breakdown.sheet(out, light, one_per_scene, [method.name for method in methods], target)
     write_bytes(out / "evaluation.md", markdown(plan, methods, rows).encode())
     figure(rows, out / "evaluation.png")
     write_json(out / "evaluation.json", as_dict(plan, methods, rows))

@@ -42,6 +42,7 @@ def write_clip(
     sharp: bool = False,
     error: float | None = 0.01,
     radiance: Array | None = None,
+    flow: Array | None = None,
     **meta: object,
 ) -> Clip:
     stack = sliding_pattern(frames, height, width, seed) if radiance is None else radiance
@@ -55,7 +56,8 @@ def write_clip(
     }
     with ClipWriter(path, described | meta) as writer:
         for t, frame in enumerate(stack):
-            writer.add(t, frame, sharp=frame * 1.1 if sharp else None, error=error)
+            truth = None if flow is None else {"flow": flow, "flow_back": -flow, "valid": np.ones(frame.shape, bool)}
+            writer.add(t, frame, sharp=frame * 1.1 if sharp else None, truth=truth, error=error)
     return Clip.open(path)
 
 

@@ -1,6 +1,6 @@
 """Classical restorers, one file per method, one signature.
 
-    restore(codes [T, H, W], sensor, exposure, *, window=...) -> restored photons [T, H, W], float32
+    restore(codes [T, H, W], sensor, exposure, *, window=..., photons_per_unit=1) -> restored [T, H, W], float32
 
 Any number of frames and any size; a clip is continued by reflection at both ends. METHODS is the whole list: import
 the module of a method for its other settings.
@@ -23,7 +23,7 @@ class Method:
     """A restorer and what a table says about it."""
 
     name: str
-    restore: Callable[..., Array]  # restore(codes, sensor, exposure, *, window=...) -> photons
+    restore: Callable[..., Array]  # restore(codes, sensor, exposure, *, window=..., photons_per_unit=1) -> [T, H, W]
     window: int  # frames used for one restored frame, when not told otherwise
     description: str
 

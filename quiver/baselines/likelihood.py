@@ -17,13 +17,13 @@ from numpy import ndarray as Array
 
 from qsim.sensor import Sensor
 from quiver.baselines.tables import response_table
-from quiver.baselines.windows import check_codes, check_window, window_frames
+from quiver.baselines.windows import check_codes, check_window, in_units, window_frames
 
 CHUNK = 1 << 22  # entries of the histograms solved at a time
 
 
-def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11) -> Array:
-    """Codes [T, H, W] -> restored photons [T, H, W], float32, from `window` frames around each.
+def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11, photons_per_unit: float = 1.0) -> Array:
+    """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
 
     Quick up to about 4 bits; with more, nearly every pixel has an outcome of its own. Raises ValueError for codes the
     sensor cannot produce and for an empty window.
@@ -43,7 +43,7 @@ def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11) 
         known = np.insert(known, place, distinct[new])
         answers = np.insert(answers, place, solve(seen[:, example[new]], sensor, exposure, cap))
         restored[frame] = answers[np.searchsorted(known, distinct)][where].reshape(codes.shape[1:])
-    return restored
+    return in_units(restored, photons_per_unit)
 
 
 def outcome_names(levels: int, window: int) -> Array:

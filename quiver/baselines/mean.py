@@ -14,7 +14,7 @@ from numpy import ndarray as Array
 
 from qsim.qis import QIS
 from qsim.sensor import Sensor
-from quiver.baselines.windows import check_codes, check_window, restore_by_sum
+from quiver.baselines.windows import check_codes, check_window, in_units, restore_by_sum
 
 
 def dark_codes(sensor: Sensor, exposure: float) -> float:
@@ -24,14 +24,14 @@ def dark_codes(sensor: Sensor, exposure: float) -> float:
     return slope * sensor.dark_rate * exposure / sensor.efficiency + offset
 
 
-def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11) -> Array:
-    """Codes [T, H, W] -> restored photons [T, H, W], float32, from `window` frames around each.
+def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11, photons_per_unit: float = 1.0) -> Array:
+    """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
 
-    Raises ValueError for codes the sensor cannot produce and for an empty window.
+    Raises ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
     """
     check_codes(codes, sensor)
     check_window(window)
     top = sensor.levels - 1
     mean_code = np.arange(window * top + 1) / window
     photons = np.maximum(0, mean_code - dark_codes(sensor, exposure)) * (sensor.white(exposure) / top)
-    return restore_by_sum(codes, window, photons)
+    return in_units(restore_by_sum(codes, window, photons), photons_per_unit)

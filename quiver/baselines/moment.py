@@ -14,16 +14,18 @@ from numpy import ndarray as Array
 
 from qsim.sensor import Sensor
 from quiver.baselines.tables import response_table
-from quiver.baselines.windows import check_codes, check_window, restore_by_sum
+from quiver.baselines.windows import check_codes, check_window, in_units, restore_by_sum
 
 
-def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11) -> Array:
-    """Codes [T, H, W] -> restored photons [T, H, W], float32, from `window` frames around each.
+def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11, photons_per_unit: float = 1.0) -> Array:
+    """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
 
-    Raises ValueError for codes the sensor cannot produce and for an empty window.
+    Raises ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
     """
     check_codes(codes, sensor)
     check_window(window)
     top = sensor.levels - 1
     mean_code = np.arange(window * top + 1) / window
-    return restore_by_sum(codes, window, response_table(sensor, exposure).invert(mean_code, window))
+    return in_units(
+        restore_by_sum(codes, window, response_table(sensor, exposure).invert(mean_code, window)), photons_per_unit
+    )

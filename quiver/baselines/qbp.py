@@ -26,7 +26,7 @@ from torch import Tensor
 from qsim.sensor import Sensor
 from quiver.baselines import align
 from quiver.baselines.tables import ResponseTable, response_table
-from quiver.baselines.windows import check_codes, check_window, window_frames
+from quiver.baselines.windows import check_codes, check_window, in_units, window_frames
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,17 @@ AS_PUBLISHED = Settings(prefilter=1, wiener=8.0, wiener_variance="patch", refine
 
 
 def restore(
-    codes: Array, sensor: Sensor, exposure: float, *, window: int = 11, settings: Settings = CALIBRATED
+    codes: Array,
+    sensor: Sensor,
+    exposure: float,
+    *,
+    window: int = 11,
+    photons_per_unit: float = 1.0,
+    settings: Settings = CALIBRATED,
 ) -> Array:
-    """Codes [T, H, W] -> restored photons [T, H, W], float32, from `window` frames around each.
+    """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
 
-    Raises ValueError for codes the sensor cannot produce, and for a window that is not a whole number of blocks.
+    Raises ValueError for codes the sensor cannot produce, an impossible unit, and a window that blocks do not divide.
     """
     check_codes(codes, sensor)
     table = response_table(sensor, exposure)
@@ -63,7 +69,7 @@ def restore(
     for frame in range(len(codes)):
         merged = merge(codes, frame, table, window, settings)
         restored[frame] = table.invert(merged, window)
-    return restored
+    return in_units(restored, photons_per_unit)
 
 
 def merge(codes: Array, frame: int, table: ResponseTable, window: int, settings: Settings = CALIBRATED) -> Array:

@@ -16,7 +16,7 @@ from qsim.sensor import Sensor
 from quiver.baselines import bm3d, qbp
 from quiver.baselines.tables import response_table
 from quiver.baselines.vst import stabiliser
-from quiver.baselines.windows import check_codes, check_window
+from quiver.baselines.windows import check_codes, check_window, in_units
 
 EXCESS = 1.0  # best of 0.8, 1, 1.25, 1.5, 2 on the clips on which qbp.py was calibrated
 
@@ -27,12 +27,13 @@ def restore(
     exposure: float,
     *,
     window: int = 11,
+    photons_per_unit: float = 1.0,
     settings: qbp.Settings = qbp.CALIBRATED,
     excess: float = EXCESS,
 ) -> Array:
-    """Codes [T, H, W] -> restored photons [T, H, W], float32, from `window` frames around each.
+    """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
 
-    Raises ValueError for codes the sensor cannot produce, and for a window that is not a whole number of blocks.
+    Raises ValueError for codes the sensor cannot produce, an impossible unit, and a window that blocks do not divide.
     """
     check_codes(codes, sensor)
     check_window(window)
@@ -42,4 +43,4 @@ def restore(
         stable = transform.forward(qbp.merge(codes, frame, table, window, settings))
         clean = bm3d.denoise(stable, excess * transform.deviation, peak=transform.peak)
         restored[frame] = transform.inverse(clean)
-    return restored
+    return in_units(restored, photons_per_unit)

@@ -16,13 +16,21 @@ from numpy import ndarray as Array
 from qsim.sensor import Sensor
 from quiver.baselines import bm3d
 from quiver.baselines.vst import Kind, stabiliser
-from quiver.baselines.windows import check_codes, check_window, window_sums
+from quiver.baselines.windows import check_codes, check_window, in_units, window_sums
 
 
-def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 3, kind: Kind = "table") -> Array:
-    """Codes [T, H, W] -> restored photons [T, H, W], float32, from `window` frames around each.
+def restore(
+    codes: Array,
+    sensor: Sensor,
+    exposure: float,
+    *,
+    window: int = 3,
+    photons_per_unit: float = 1.0,
+    kind: Kind = "table",
+) -> Array:
+    """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
 
-    Raises ValueError for codes the sensor cannot produce and for an empty window.
+    Raises ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
     """
     check_codes(codes, sensor)
     check_window(window)
@@ -33,4 +41,4 @@ def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 3, k
     for frame, total in enumerate(window_sums(codes, window, top)):
         clean = bm3d.denoise(table[total], transform.deviation, peak=transform.peak)
         restored[frame] = transform.inverse(clean)
-    return restored
+    return in_units(restored, photons_per_unit)

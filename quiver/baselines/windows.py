@@ -77,3 +77,10 @@ def restore_by_sum(codes: Array, window: int, table: Array) -> Array:
     for frame, total in enumerate(window_sums(codes, window, (len(table) - 1) // window)):
         np.take(entries, total, out=restored[frame], mode="clip")  # clip never happens, but is the unbuffered mode
     return restored
+
+
+def in_units(photons: Array, photons_per_unit: float) -> Array:
+    """Restored photons, float32, in a unit of so many photons. Raise ValueError unless that is finite and above 0."""
+    if not 0 < photons_per_unit < np.inf:
+        raise ValueError(f"photons_per_unit must be a finite number above 0, got {photons_per_unit!r}")
+    return photons if photons_per_unit == 1 else photons / np.float32(photons_per_unit)

@@ -169,3 +169,15 @@ def test_wrong_codes_and_windows_are_named():
         mean.restore(codes.astype(float), sensor, EXPOSURE)
     with pytest.raises(ValueError, match="window is a number of frames, got 0"):
         moment.restore(codes[:1], sensor, EXPOSURE, window=0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_unit_of_the_result(method):
+    codes = flat(SENSORS["qis-3"], 3.25, 3, (17, 19))
+    run = METHODS[method].restore
+    photons = run(codes, SENSORS["qis-3"], EXPOSURE, window=3)
+    lux = run(codes, SENSORS["qis-3"], EXPOSURE, window=3, photons_per_unit=2.47)
+    assert lux.dtype == np.float32
+    assert np.allclose(lux, photons / 2.47, rtol=1e-6)
+    with pytest.raises(ValueError, match="photons_per_unit must be a finite number above 0, got 0"):
+        run(codes, SENSORS["qis-3"], EXPOSURE, window=3, photons_per_unit=0)

@@ -277,7 +277,7 @@ def test_cuda_is_asked_for_by_name(tmp_path: Path):
 
 MEMORY_PROGRAM = """
 import numpy as np
-from quiver.bench import peak_memory, reset_peak
+from quiver.memory import peak_memory, reset_peak
 from quiver.data import Light, array_codes
 from quiver.model import build
 from quiver.restore import Options, wrap_network
