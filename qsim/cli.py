@@ -9,10 +9,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from qsim import __version__
+from qsim import __version__, checks
 from qsim.cli_look import add_preview, add_report
 from qsim.cli_studies import add_calibrate, add_tradeoff, add_validate
-from qsim.console import Parser, bar, command, output, run
+from qsim.completion import add_completion
+from qsim.console import GOES_ON, Parser, bar, checked, command, output, run
 from qsim.convert import add_convert
 
 
@@ -36,6 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         add_validate,
     ):
         add(sub)
+    add_completion(sub, parser)
     return run(parser, argv)
 
 
@@ -78,19 +80,22 @@ def _device_text(device: dict[str, Any]) -> str:
 def _add_render(sub: Any) -> None:
     parser = command(
         sub, "render", _run_render, "Render a scene into a clip: radiance, sharp frames, flow, depth, body ids.",
-        "qsim render fan -o out/fan --frames 21 --height 128 --width 128",
+        "qsim render fan -o out/fan --frames 21 --height 128 --width 128", GOES_ON,
     )  # fmt: skip
     parser.add_argument("scene", help="a family of scenes/, or a .py file with scene(seed, speed=...)")
     parser.add_argument("-o", "--output", type=Path, required=True, help="clip folder to make")
-    parser.add_argument("--seed", type=int, default=0, help="of the scene and its samples (default 0)")
-    parser.add_argument("--speed", type=float, default=1.0, help="factor on all motions (default 1)")
-    parser.add_argument("--frames", type=int, default=21, help="default 21")
-    parser.add_argument("--height", type=int, default=128, help="pixels (default 128)")
-    parser.add_argument("--width", type=int, default=128, help="pixels (default 128)")
-    parser.add_argument("--frame-rate", type=float, default=2000.0, help="frames per second (default 2000)")
-    parser.add_argument("--shutter", type=float, default=0.0, help="open share of a frame, 0..1 (default 0: sharp)")
-    parser.add_argument("--psnr", type=float, default=40.0, help="wanted error of the radiance, dB (default 40)")
-    parser.add_argument("--ppp", type=float, help="brightest light level that will be sensed, photons per pixel")
+    whole = checked(checks.whole)
+    parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the scene and its samples (default 0)")
+    parser.add_argument("--speed", type=checked(checks.positive), default=1.0, help="factor on all motions (default 1)")
+    parser.add_argument("--frames", type=whole, default=21, help="default 21")
+    parser.add_argument("--height", type=whole, default=128, help="pixels (default 128)")
+    parser.add_argument("--width", type=whole, default=128, help="pixels (default 128)")
+    rate, shutter, psnr = (checked(check) for check in (checks.frame_rate, checks.shutter, checks.psnr))
+    parser.add_argument("--frame-rate", type=rate, default=2000.0, help="frames per second (default 2000)")
+    parser.add_argument("--shutter", type=shutter, default=0.0, help="open share of a frame, 0..1 (default 0: sharp)")
+    parser.add_argument("--psnr", type=psnr, default=40.0, help="wanted error of the radiance, dB (default 40)")
+    light = checked(checks.positive)
+    parser.add_argument("--ppp", type=light, help="brightest light level that will be sensed, photons per pixel")
     parser.add_argument("--force", action="store_true", help="replace an existing clip")
 
 
@@ -100,9 +105,6 @@ def _run_render(args: argparse.Namespace) -> int:
 
     if args.output.exists() and not args.force:
         raise FileExistsError(f"{args.output}: exists; name another with -o, or use --force to replace it")
-    for name in ("frames", "height", "width"):
-        if getattr(args, name) < 1:
-            raise ValueError(f"--{name}: expected a whole number of at least 1, got {getattr(args, name)}")
     scene = scenes.load(args.scene, seed=args.seed, speed=args.speed).resized(args.height, args.width)
     with bar(args.output.name) as progress:
         chosen = budget.choose(
@@ -143,15 +145,16 @@ def _add_sense(sub: Any) -> None:
         "qsim sense out/fan --bits 3 --ppp 3.25\n"
         "qsim sense out/starter --sensor spad-320x240 --bits 1 --ppp 0.5,3.25,26\n"
         "qsim sense out/starter --name quiver-physical_3bit_3.25ppp --replay fan_0003:7",
+        "the same command goes on with the streams that are missing",
     )  # fmt: skip
     parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="clips or data sets")
     parser.add_argument(
         "--sensor", default="quiver-physical", help="a name of `qsim doctor --devices`, or a .toml file"
     )
-    parser.add_argument("--bits", type=int, help="bits per code (default: the sensor's own)")
+    parser.add_argument("--bits", type=checked(checks.bits), help="bits per code (default: the sensor's own)")
     parser.add_argument("--ppp", type=_numbers, help="photons per pixel and code over the whole clip; several: 3.25,26")
     parser.add_argument("--lux", type=_numbers, help="faceplate lux at 555 nm instead of --ppp")
-    parser.add_argument("--seed", type=int, default=0, help="of the noise (default 0)")
+    parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the noise (default 0)")
     parser.add_argument("-o", "--name", help="name of the stream (default: made from sensor, bits and light)")
     parser.add_argument("--group", action="store_true", help="codes sum 2^bits - 1 clip frames as binary planes")
     parser.add_argument("--diffraction", action="store_true", help="blur by the lens's Airy pattern")
@@ -251,13 +254,14 @@ def _add_generate(sub: Any) -> None:
     parser = command(
         sub, "generate", _run_generate, "Make a data set from a recipe; whatever is done already is kept.",
         "qsim generate scenes/starter.toml -o out/starter --workers 2\n"
-        "qsim generate scenes/i2_2000fps.toml -o /data/i2 --shard 7/100",
+        "qsim generate scenes/i2_2000fps.toml -o /data/i2 --shard 7/100", GOES_ON,
     )  # fmt: skip
     parser.add_argument("recipe", type=Path, help="a .toml file; its format is described in qsim/recipe.py")
     parser.add_argument("-o", "--output", type=Path, help="data set folder (default out/NAME of the recipe)")
     parser.add_argument("--workers", type=int, default=1, help="processes, each with its own renderer (default 1)")
     parser.add_argument("--shard", type=_part, metavar="I/N", help="only the I-th of N parts, as in 7/100")
-    parser.add_argument("--memory", type=float, default=4.0, help="GiB per process before it gives up (default 4)")
+    memory = checked(checks.positive)
+    parser.add_argument("--memory", type=memory, default=4.0, help="GiB per process before it gives up (default 4)")
     parser.add_argument("--retry", action="store_true", help="try failed jobs again")
     parser.add_argument("--repair", action="store_true", help="check all files and make the damaged ones again")
     parser.add_argument("--wait", action="store_true", help="wait while another generator is at work in the folder")

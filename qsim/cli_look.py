@@ -125,6 +125,8 @@ def add_report(sub: Any) -> None:
 def _run_report(args: argparse.Namespace) -> int:
     from qsim import report
 
+    if args.output.suffix not in (".html", ".htm"):
+        raise ValueError(f"{args.output}: a page is a .html file, as in -o {args.output.stem}.html")
     refuse_existing(args.output, args.force)
     page = report.build(args.path, title=args.title, notes=args.note).encode()
     args.output.parent.mkdir(parents=True, exist_ok=True)

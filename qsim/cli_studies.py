@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from qsim import files
-from qsim.console import bar, command, output, refuse_existing
+from qsim import checks, files
+from qsim.console import bar, checked, command, note, output, refuse_existing
 
 # tradeoff
 
@@ -177,7 +176,7 @@ def add_calibrate(sub: Any) -> None:
         metavar=("FILE", "SECONDS"),
         help="counts of a static scene instead: dead time from Fano factors",
     )
-    parser.add_argument("--bits", type=int, required=True, help="of a code; 1 for binary planes")
+    parser.add_argument("--bits", type=checked(checks.bits), required=True, help="of a code; 1 for binary planes")
     parser.add_argument("--model", choices=("qis", "spad"), default="qis", help="default qis")
     parser.add_argument("--paralyzable", action="store_true", help="spad: every arrival restarts the dead time")
     parser.add_argument("--ignore-dead-time", action="store_true", help="spad: take the counts as Poisson")
@@ -300,11 +299,12 @@ def add_validate(sub: Any) -> None:
     parser.add_argument("what", choices=["sensor", "render"], help="what to validate")
     parser.add_argument("-o", "--output", type=Path, help="figure of speed against error (.png, .svg or .pdf)")
     parser.add_argument("--pixels", type=int, default=1 << 20, help="pixels of a draw (default 1048576)")
-    parser.add_argument("--seed", type=int, default=0, help="of the draws (default 0)")
+    parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the draws (default 0)")
     parser.add_argument("--require-speed", action="store_true", help="a speed below its target is a failure too")
     parser.add_argument("--scenes", nargs="+", metavar="FAMILY", help="render: families (default: four)")
-    parser.add_argument("--height", type=int, default=128, help="render: pixels (default 128)")
-    parser.add_argument("--width", type=int, default=256, help="render: pixels (default 256)")
+    whole = checked(checks.whole)
+    parser.add_argument("--height", type=whole, default=128, help="render: pixels (default 128)")
+    parser.add_argument("--width", type=whole, default=256, help="render: pixels (default 256)")
     parser.add_argument("--force", action="store_true", help="replace an existing figure")
 
 
@@ -329,7 +329,7 @@ def _validate_render(args: argparse.Namespace) -> int:
 
     families = args.scenes or [name for name in scenes.FAMILIES if name not in validate_render.TUNED][:4]
     chosen = [scenes.load(name, seed=args.seed + 3).resized(args.height, args.width) for name in families]
-    report = validate_render.run(chosen, progress=lambda text: print(text, file=sys.stderr))
+    report = validate_render.run(chosen, progress=note)
     if args.output is not None:
         validate_render.figure(report, args.output)
     output(args, report.to_dict(), validate_render.table(report))

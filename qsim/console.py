@@ -1,7 +1,7 @@
 """What every command shares: a parser that suggests, a bar that waits two seconds, and errors of one line.
 
 Exit codes: 0 well, 1 done but something is wrong with what was found (a damaged file, a failed job), 2 the user's
-mistake, 130 interrupted. `QSIM_DEBUG=1` shows the traceback of a mistake.
+mistake, 130 interrupted. `--verbose` or `QSIM_DEBUG=1` shows the traceback of a mistake.
 """
 
 from __future__ import annotations
@@ -9,15 +9,51 @@ from __future__ import annotations
 import argparse
 import contextlib
 import difflib
+import errno
 import json
 import os
 import re
 import sys
+import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NoReturn
 
 from qsim import stream
+
+GOES_ON = "the same command goes on where it stopped"
+STARTS_AGAIN = "nothing half-written is left; run the same command again"
+FULL = (errno.ENOSPC, errno.EDQUOT)  # of an OSError
+_MAKE_SPACE = "nothing half-written is left; make space and run the same command again"
+
+# Options as other programs call them -> ours, suggested where a command has ours.
+_ALSO_CALLED = {
+    "--fps": "--frame-rate",
+    "--framerate": "--frame-rate",
+    "--resolution": "--height",
+    "--overwrite": "--force",
+    "--yes": "--force",
+    "--jobs": "--workers",
+    "--processes": "--workers",
+    "--gpu": "--device",
+    "--cuda": "--device",
+    "--epochs": "--steps",
+    "--lr": "--learning-rate",
+    "--photons": "--ppp",
+    "--light": "--ppp",
+    "--model": "--method",
+    "--weights": "--method",
+    "--debug": "--verbose",
+    "--silent": "--quiet",
+}
+
+# Packages that are extras of this one: module -> extra.
+_EXTRAS = {"av": "video", "zarr": "formats", "h5py": "formats", "distributed": "cluster", "pyoidn": "denoise"}
+_EXTRAS |= dict.fromkeys(("torch", "safetensors", "tensorboard"), "train")
+
+_quiet: ContextVar[bool] = ContextVar("quiet", default=False)  # of the command that runs now
 
 
 class Parser(argparse.ArgumentParser):
@@ -28,20 +64,34 @@ class Parser(argparse.ArgumentParser):
         super().__init__(prog=prog, description=description, epilog=epilog, formatter_class=style, allow_abbrev=False)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        found, extra = super().parse_known_args(args, namespace)
+        words = list(sys.argv[1:] if args is None else args)
+        self._refuse_unknown(words)  # before argparse complains of what is missing because a name is misspelt
+        found, extra = super().parse_known_args(words, namespace)
         if extra:
-            word = extra[0].split("=")[0]
-            known = [option for action in self._actions for option in action.option_strings]
-            what = "unknown option" if word.startswith("-") else "unexpected argument"
-            self.error(f"{what} {word}{suggest(word, known)}")
+            self.error(f"unexpected argument {extra[0]}")
         return found, extra
 
+    def _refuse_unknown(self, words: list[str]) -> None:
+        known = self._option_string_actions
+        for word in words:
+            if word == "--" or (self._subparsers is not None and not word.startswith("-")):
+                return  # values from here on, or the words of a command
+            option = word.split("=")[0]
+            short = re.match(r"-[A-Za-z]", word)
+            if (short and word[:2] not in known) or (word.startswith("--") and option not in known):
+                meant = _ALSO_CALLED.get(option, "")
+                self.error(f"unknown option {option}{suggest(meant if meant in known else option, list(known))}")
+
     def error(self, message: str) -> NoReturn:
-        choice = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message)
+        choice = re.search(r"invalid choice: '?([^']*?)'? \(choose from (.*)\)", message)
+        number = re.match(r"argument (.*): invalid (int|float) value: (.*)", message)
         if choice:
             known = [word.strip(" '") for word in choice[2].split(",")]
             what = "command" if "COMMAND" in message else message.split(":")[0]
             message = f"unknown {what} '{choice[1]}'{suggest(choice[1], known)}; there are: {', '.join(known)}"
+        elif number:
+            kind = "a whole number, as in 3" if number[2] == "int" else "a number, as in 3.25 or 20e-6"
+            message = f"argument {number[1]}: expected {kind}, got {number[3]}"
         print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
         raise SystemExit(2)
 
@@ -53,14 +103,22 @@ def suggest(word: str, known: Sequence[str]) -> str:
 
 
 def command(
-    sub: Any, name: str, run: Callable[[argparse.Namespace], int], what: str, example: str
+    sub: Any,
+    name: str,
+    run: Callable[[argparse.Namespace], int],
+    what: str,
+    example: str,
+    after_interrupt: str = STARTS_AGAIN,
 ) -> argparse.ArgumentParser:
-    """A command's parser with its example and --json; `run(args)` does it and returns the exit code."""
+    """A command's parser with its example and what all have; `run(args)` does it and returns the exit code."""
     parser: argparse.ArgumentParser = sub.add_parser(
         name, help=what, description=what, epilog="example:\n" + "".join(f"  {line}\n" for line in example.split("\n"))
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, for programs")
-    parser.set_defaults(run=run)
+    loudness = parser.add_mutually_exclusive_group()
+    loudness.add_argument("-q", "--quiet", action="store_true", help="no progress and no warnings, only the result")
+    loudness.add_argument("-v", "--verbose", action="store_true", help="time and memory; the traceback of a mistake")
+    parser.set_defaults(run=run, after_interrupt=after_interrupt)
     return parser
 
 
@@ -70,25 +128,65 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
         args = parser.parse_args(argv)
     except SystemExit as stop:
         return int(stop.code or 0)
+    token = _quiet.set(args.quiet)
+    started = time.perf_counter()
     try:
-        return int(args.run(args))
-    except (ValueError, OSError) as error:
+        with _warnings_as_lines(parser.prog):
+            return int(args.run(args))
+    except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
         if isinstance(error, BrokenPipeError):  # the reader of our output has gone, as in `| head`
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
-        if os.environ.get("QSIM_DEBUG"):
+        unknown_module = isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in _EXTRAS
+        if os.environ.get("QSIM_DEBUG") or args.verbose or unknown_module:
             raise
         print(f"{parser.prog}: {one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"\n{parser.prog}: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        print(f"\n{parser.prog}: interrupted; {args.after_interrupt}", file=sys.stderr)
         return 130
+    finally:
+        _quiet.reset(token)
+        if args.verbose:
+            print(f"{parser.prog}: {time.perf_counter() - started:.1f} s, {_peak_memory()}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def _warnings_as_lines(prog: str) -> Iterator[None]:
+    """Warnings become one line each on stderr, without the place in our source; none with --quiet."""
+
+    def show(message: Warning | str, *_: object, **__: object) -> None:
+        note(f"{prog}: warning: {' '.join(str(message).split())}")
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
+def _peak_memory() -> str:
+    import resource
+
+    scale = 2**30 if sys.platform == "darwin" else 2**20  # bytes there, KiB elsewhere
+    return f"at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale:.2f} GiB of memory"
+
+
+def note(text: str) -> None:
+    """A line for people on stderr, unless the command runs with --quiet."""
+    if not _quiet.get():
+        print(text, file=sys.stderr)
 
 
 def one_line(error: BaseException) -> str:
     """The message of an error in one line; an `OSError` of the system names its file and the reason."""
     if isinstance(error, OSError) and error.strerror and error.filename:
-        return f"{error.filename}: {error.strerror}"
+        return f"{error.filename}: {error.strerror}" + (f"; {_MAKE_SPACE}" if error.errno in FULL else "")
+    if isinstance(error, OSError) and error.errno in FULL and error.strerror:
+        return f"{error.strerror}; {_MAKE_SPACE}"
+    if isinstance(error, ModuleNotFoundError):
+        package = (error.name or "").split(".")[0]
+        return f"needs the package {package}, which is not installed: pip install 'qsim[{_EXTRAS[package]}]'"
+    if isinstance(error, MemoryError):
+        return f"not enough memory ({' '.join(str(error).split()) or 'no more to have'}); try fewer or smaller frames"
     return " ".join(str(error).split()) or type(error).__name__
 
 
@@ -98,6 +196,22 @@ def output(args: argparse.Namespace, found: dict[str, Any], text: str | Sequence
         print(json.dumps(found, sort_keys=True))
     else:
         print(text if isinstance(text, str) else "\n".join(text))
+
+
+def checked(check: Callable[[Any], Any]) -> Callable[[str], Any]:
+    """An argparse type from a check of recipe values (checks.py), so that files and options obey the same rules."""
+
+    def parse(text: str) -> Any:
+        value: int | float | str = text
+        for kind in (float, int):  # the last that fits
+            with contextlib.suppress(ValueError):
+                value = kind(text)
+        try:
+            return check(value)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return parse
 
 
 def refuse_existing(path: Path, force: bool) -> None:
@@ -114,7 +228,10 @@ def bar(label: str, unit: str = "frame") -> Iterator[stream.Progress]:
     from tqdm import tqdm
 
     interval = 0.2 if sys.stderr.isatty() else 10.0
-    with tqdm(desc=label, unit=unit, delay=2, mininterval=interval, dynamic_ncols=True, file=sys.stderr) as shown:
+    silent = _quiet.get()
+    with tqdm(
+        desc=label, unit=unit, delay=2, mininterval=interval, dynamic_ncols=True, file=sys.stderr, disable=silent
+    ) as shown:
 
         def update(done: int, total: int) -> None:
             shown.total = total

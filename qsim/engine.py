@@ -107,7 +107,7 @@ def activate(engine: Engine) -> None:
 
 def report() -> dict[str, Any]:
     """Everything `qsim doctor` says about rendering: the choice, every probe, versions, cache file."""
-    engine = _choose(os.environ.get("QSIM_ENGINE") or None)
+    engine = choose()
     probes = [asdict(probe) for probe in _cached_probes()]
     software = {"mitsuba": version("mitsuba"), "drjit": version("drjit")}
     return asdict(engine) | {"probes": probes, "software": software, "cache": str(_cache_file())}

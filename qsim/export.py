@@ -45,8 +45,12 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
     part = path.with_name(path.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
-    EXPORTS[wanted.kind](source, part, wanted, meta)
-    files.write_json(part / "meta.json", meta)
+    try:
+        EXPORTS[wanted.kind](source, part, wanted, meta)
+        files.write_json(part / "meta.json", meta)
+    except BaseException:
+        shutil.rmtree(part)
+        raise
     if path.exists():
         files.remove_folder(path)
     part.rename(path)

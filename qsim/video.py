@@ -299,7 +299,7 @@ def _checked_light(path: Path, values: Array, first: int) -> Array:
     if not good.all():
         t, y, x = (int(i) for i in np.argwhere(~good)[0])
         place = f"(t, y, x) = ({first + t}, {y}, {x})"
-        raise ValueError(f"{path}: value {values[t, y, x]!r} at {place} is no light: expected finite numbers from 0 up")
+        raise ValueError(f"{path}: value {values[t, y, x]} at {place} is no light: expected finite numbers from 0 up")
     return np.asarray(values)
 
 

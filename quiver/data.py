@@ -29,12 +29,15 @@ from qsim.stream import Sensing, Stream, prepare
 from quiver.code_table import TABLE_BITS, CodeTable
 
 __all__ = [
+    "GOES_ON",
+    "STARTS_AGAIN",
     "Clip",
     "Codes",
     "Key",
     "Light",
     "Parser",
     "Sensor",
+    "add_completion",
     "array_codes",
     "bar",
     "clip_photons",

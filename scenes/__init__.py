@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib.util
 from collections.abc import Callable
 from pathlib import Path
@@ -59,8 +60,13 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
     if str(name) in FAMILIES:
         return FAMILIES[str(name)](seed, speed=speed)
     if str(name).endswith(".py"):
-        return _from_file(Path(name))(seed, speed=speed)
-    raise ValueError(f"no scene family {str(name)!r}; there are {', '.join(FAMILIES)}, or give a .py file")
+        found = _from_file(Path(name))(seed, speed=speed)
+        if not isinstance(found, Scene):
+            raise ValueError(f"{name}: scene() returned a {type(found).__name__}; it must return a qsim.scene.Scene")
+        return found
+    close = difflib.get_close_matches(str(name), FAMILIES, n=1)
+    meant = f"; did you mean {close[0]!r}?" if close else ""
+    raise ValueError(f"no scene family {str(name)!r}{meant}; there are {', '.join(FAMILIES)}, or give a .py file")
 
 
 def _from_file(path: Path) -> Family:
@@ -70,7 +76,10 @@ def _from_file(path: Path) -> Family:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except SyntaxError as error:
+        raise ValueError(f"{path}:{error.lineno}: not valid Python: {error.msg}") from None
     if not callable(getattr(module, "scene", None)):
         raise ValueError(f"{path}: a scene file needs a function scene(seed=0, *, speed=1.0)")
     family: Family = module.scene
