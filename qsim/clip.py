@@ -64,6 +64,15 @@ class Clip:
     def __len__(self) -> int:
         return int(self.meta["shape"][0])
 
+    def __repr__(self) -> str:
+        frames, height, width = self.shape
+        unit = "(relative)" if self.meta["radiance_unit"] == RELATIVE else "W/m2/sr"
+        streams = ", ".join(self.streams) or "none"
+        return (
+            f"<Clip {self.name}: {frames} frames of {height} x {width} px at {self.frame_rate:g} fps, exposure "
+            f"{self.exposure * 1e6:.4g} us, mean radiance {self.mean_radiance:.4g} {unit}, streams: {streams}>"
+        )
+
     @property
     def name(self) -> str:
         return str(self.meta.get("name", self.path.name))

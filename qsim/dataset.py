@@ -54,6 +54,14 @@ class Dataset:
                 raise ValueError(f"{manifest}: key '{key}' is missing; the file is damaged, run `qsim generate` again")
         return Dataset(path, meta)
 
+    def __repr__(self) -> str:
+        splits = ", ".join(f"{len(self.names(split))} {split}" for split in SPLITS)
+        recipe = self.recipe.get("recipe", {})
+        size = " x ".join(str(recipe.get(key, "?")) for key in ("frames", "height", "width"))
+        rate = recipe.get("frame_rate", "?")
+        missing = f", {len(self.missing)} not made yet" if self.missing else ""
+        return f"<Dataset {self.name}: clips {splits}{missing}; {size} frames, rows, columns at {rate} fps>"
+
     @property
     def name(self) -> str:
         return str(self.meta["name"])

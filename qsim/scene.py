@@ -360,6 +360,15 @@ class Scene:
         for body in self.bodies:
             _check_motion(self.name, body)
 
+    def __repr__(self) -> str:
+        camera = self.camera
+        lights = ", ".join(type(light).__name__ for light in self.lights) or "glowing bodies only"
+        return (
+            f"<Scene {self.name}, seed {self.seed}, speed {self.speed:g}: {len(self.bodies)} bodies, light: {lights}; "
+            f"camera {camera.height} x {camera.width} px of {camera.pixel_pitch * 1e6:g} um, "
+            f"{camera.focal_length * 1e3:.3g} mm f/{camera.f_number:g}>"
+        )
+
     def emits(self) -> bool:
         """Whether anything gives light."""
         return any(_strength(light) > 0 for light in self.lights) or any(

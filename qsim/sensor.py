@@ -32,6 +32,17 @@ from qsim.keys import Key, uniform, uniform_pair, words
 
 _CHUNK = 1 << 18  # probabilities in one block of a draw (2 MiB)
 ENGINES = ("auto", "reference", "fast")
+_UNITS = {
+    "quantum_efficiency": "e-/photon",
+    "dark_current": "e-/s",
+    "read_noise": "e- rms",
+    "gain": "codes/e-",
+    "offset": "codes",
+    "full_well": "e-",
+    "pde": "avalanches/photon",
+    "dark_count_rate": "1/s",
+    "dead_time": "s",
+}
 
 
 class Sensor(ABC):
@@ -65,6 +76,15 @@ class Sensor(ABC):
     @abstractmethod
     def _slope(self, arrivals: Array, exposure: float) -> Array:
         """dF/darrivals: Poisson means [p] -> [p, levels]."""
+
+    def __str__(self) -> str:
+        """Parameters with their units; `repr` is the code that makes this sensor."""
+        values = [f"{name} {value} {_UNITS.get(name, '')}".rstrip() for name, value in vars(self).items()]
+        return f"{type(self).__name__} ({self.code_model}): " + ", ".join(values)
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        """What a notebook shows."""
+        printer.text(str(self))
 
     @property
     def levels(self) -> int:

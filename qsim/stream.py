@@ -56,6 +56,15 @@ class Stream:
     def __len__(self) -> int:
         return int(self.meta["shape"][0])
 
+    def __repr__(self) -> str:
+        frames, height, width = self.shape
+        ppp = self.meta.get("ppp")
+        light = "" if ppp is None else f", {ppp:.4g} photons/pixel"
+        return (
+            f"<Stream {self.name}: {frames} codes of {self.bits} bit, {height} x {width} px, at "
+            f"{float(self.meta['frame_rate']):g}/s, exposure {self.exposure * 1e6:.4g} us{light}>"
+        )
+
     @property
     def name(self) -> str:
         return self.path.name.removesuffix(".npy")

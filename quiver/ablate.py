@@ -13,7 +13,7 @@ import torch
 
 from quiver.evaluate import Plan, Row, evaluate
 from quiver.model import ABLATIONS, PRESETS, QUIVER, ablated, parameter_count
-from quiver.restore import Options, Restorer, pick_device, restorer
+from quiver.restoring import Options, Restorer, pick_device, restorer
 from quiver.run import Settings
 from quiver.train import train
 

@@ -24,7 +24,7 @@ from quiver import metrics
 from quiver.baselines import METHODS
 from quiver.data import Codes, Key, Light, array_codes, draw_codes, replacing
 from quiver.memory import peak_memory, reset_peak
-from quiver.restore import Options, Restorer, network_restorer, pick_device, restorer, weights_path, wrap_network
+from quiver.restoring import Options, Restorer, network_restorer, pick_device, restorer, weights_path, wrap_network
 
 EXPOSURE = 5e-4  # s
 PRESETS = ("nano", "quiver-s", "quiver", "unet")

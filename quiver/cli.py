@@ -66,7 +66,7 @@ def _command(
 
 
 def _options(args: argparse.Namespace) -> Any:
-    from quiver.restore import Options
+    from quiver.restoring import Options
 
     return Options(args.memory, args.mode, args.device, args.precision)
 
@@ -117,7 +117,7 @@ def _run_train(args: argparse.Namespace) -> int:
 
     from quiver.data import output
     from quiver.model import build
-    from quiver.restore import pick_device
+    from quiver.restoring import pick_device
     from quiver.run import draw_curve
     from quiver.train import Diverged, train
 
@@ -205,7 +205,7 @@ def _add_restore(sub: Any) -> None:
 
 def _run_restore(args: argparse.Namespace) -> int:
     from quiver.data import bar, output
-    from quiver.restore import restore_to_file, restorer
+    from quiver.restoring import restore_to_file, restorer
 
     target: Path = args.output if args.output.suffix else args.output.with_suffix(".npy")
     if target.suffix != ".npy":
@@ -284,7 +284,7 @@ def _add_evaluate(sub: Any) -> None:
 
 
 def _run_evaluate(args: argparse.Namespace) -> int:
-    from quiver.restore import method_names, restorer
+    from quiver.restoring import method_names, restorer
 
     names = [name for word in args.methods for name in (method_names() if word == "all" else (word,))]
     methods = [restorer(name, _options(args)) for name in dict.fromkeys(names)]

@@ -37,6 +37,7 @@ __all__ = [
     "Light",
     "Parser",
     "Sensor",
+    "Stream",
     "add_completion",
     "array_codes",
     "bar",

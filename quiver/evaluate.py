@@ -36,7 +36,7 @@ from quiver.data import (
     write_json,
 )
 from quiver.memory import peak_memory, reset_peak
-from quiver.restore import Restorer
+from quiver.restoring import Restorer
 
 FORMAT = "quiver-evaluation-1"
 PLAN_FORMAT = "quiver-plan-1"

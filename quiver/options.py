@@ -9,7 +9,7 @@ import argparse
 
 NETWORKS = ("nano", "quiver-s", "quiver", "unet")  # see model.py
 PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see run.py
-MODES = ("exact", "streaming", "windows")  # see restore.py
+MODES = ("exact", "streaming", "windows")  # see restoring.py
 
 
 def numbers(text: str) -> tuple[float, ...]:

@@ -19,7 +19,7 @@ from numpy import ndarray as Array
 
 from quiver import metrics
 from quiver.data import array_codes, ideal_counter
-from quiver.restore import Restorer
+from quiver.restoring import Restorer
 
 FORMAT = "quiver-static-1"  # of the JSON that `quiver evaluate --static` prints
 

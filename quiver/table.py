@@ -12,7 +12,7 @@ from quiver import breakdown
 from quiver.data import replacing, write_bytes, write_json
 from quiver.evaluate import FORMAT, Plan, Row, json_safe
 from quiver.metrics import Interval, over_scenes
-from quiver.restore import Restorer
+from quiver.restoring import Restorer
 
 PAPER_METHODS = ("Student-Teacher", "RVRT", "EMVD", "FloRNN", "MemDeblur", "Spk2ImgNet", "bit2bit")
 COLUMNS = (

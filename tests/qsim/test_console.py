@@ -54,7 +54,7 @@ def test_every_option_is_in_every_script(capsys, program):
     cli = {"qsim": qsim.cli.main, "quiver": quiver.cli.main}[program]
     scripts = {shell: completion(capsys, program, shell) for shell in ("bash", "zsh", "fish")}
     cli(["--help"])
-    commands = re.findall(r"^    ([a-z-]+)  +\S", capsys.readouterr().out, re.MULTILINE)
+    commands = re.findall(r"^    ([a-z-]+)(?:  +\S|$)", capsys.readouterr().out, re.MULTILINE)
     assert len(commands) >= 7
     for command in commands:
         cli([command, "--help"])

@@ -10,7 +10,7 @@ from clips import ClipMaker
 
 from quiver import breakdown, metrics, table
 from quiver.evaluate import Plan, evaluate
-from quiver.restore import restorer
+from quiver.restoring import restorer
 
 
 def test_every_pixel_counts_in_one_bin():

@@ -15,7 +15,7 @@ from numpy import ndarray as Array
 from quiver import table
 from quiver.data import Codes, Light, array_codes, ideal_counter, open_clips, sensed, truth
 from quiver.evaluate import Plan, Row, append, begin, evaluate, finished, scored_frames, truth_psnr
-from quiver.restore import Restorer, restorer
+from quiver.restoring import Restorer, restorer
 from quiver.static import Counts, evaluate_static, markdown, mean_square, read_counts, reference
 
 HAZELNUT = Path(__file__).parents[1] / "data" / "hazelnut_gates6.npz"

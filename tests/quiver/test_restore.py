@@ -16,11 +16,11 @@ from numpy import ndarray as Array
 from torch import Tensor, nn
 
 from qsim.qis import QIS
-from quiver import restore as restoring
+from quiver import restoring
 from quiver.baselines import METHODS
 from quiver.data import Codes, array_codes
 from quiver.model import Output, build
-from quiver.restore import (
+from quiver.restoring import (
     Options,
     Restorer,
     bytes_per_pixel,
@@ -280,7 +280,7 @@ import numpy as np
 from quiver.memory import peak_memory, reset_peak
 from quiver.data import Light, array_codes
 from quiver.model import build
-from quiver.restore import Options, wrap_network
+from quiver.restoring import Options, wrap_network
 sensor = Light().device(5e-4)
 codes = array_codes(np.random.default_rng(0).integers(0, 8, (1, 320, 320), dtype=np.uint8), sensor, 5e-4)
 method = wrap_network(build("nano"), "nano", "", Options(memory={memory}, mode="{mode}"))

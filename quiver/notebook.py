@@ -1,0 +1,59 @@
+"""Restoring in one line, for notebooks: a stream, a clip, a path or an array of codes in, photons out."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray as Array
+
+from quiver.data import Clip, Codes, Light, Sensor, Stream, array_codes, open_stream, sensed, stream_codes
+from quiver.restoring import Options, restorer
+
+Source = Stream | Clip | str | os.PathLike[str] | Array
+
+
+def restore(
+    source: Source,
+    method: str = "moment",
+    *,
+    sensor: Sensor | None = None,
+    exposure: float | None = None,
+    ppp: float | None = None,
+    device: str = "auto",
+    mode: str = "exact",
+) -> Array:
+    """Restored video, float32 [T, H, W], in photons per pixel and exposure (expected, before quantum efficiency).
+
+    `source` is a `Stream`; a `Clip` (its only stream; with `ppp` it is sensed now by the default sensor); the path of
+    either; or integer codes [T, H, W], for which `sensor` and `exposure` [s] must be given. `method` is a classical
+    method (naive, moment, likelihood, transform-denoise, qbp, qbp-bm3d), shipped weights, a .safetensors file or a
+    folder of `quiver train`. `ValueError` or `FileNotFoundError` where these do not fit together.
+
+        video = quiver.restore("out/fan", "moment")
+    """
+    codes = _codes(source, sensor, exposure, ppp)
+    return restorer(method, Options(device=device, mode=mode)).restore(codes)
+
+
+def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: float | None) -> Codes:
+    if isinstance(source, np.ndarray):
+        if sensor is None or exposure is None:
+            raise ValueError("codes in an array do not say what made them; give sensor= and exposure= in seconds")
+        return array_codes(source, sensor, exposure)
+    if sensor is not None or exposure is not None:
+        raise ValueError("sensor= and exposure= are for arrays; a clip and a stream know theirs")
+    if isinstance(source, str | os.PathLike):
+        path = Path(source)
+        source = Clip.open(path) if path.is_dir() or not path.exists() else open_stream(path)
+    if isinstance(source, Stream):
+        return stream_codes(source)
+    if ppp is not None:
+        return sensed(source, Light("quiver-physical", ppp, 3))[0]
+    if len(source.streams) != 1:
+        there = ", ".join(source.streams) or "none"
+        raise ValueError(
+            f"{source.path}: give one of its streams ({there}) as clip.stream(NAME), or ppp= to sense it now"
+        )
+    return stream_codes(source.stream(source.streams[0]))
