@@ -33,6 +33,20 @@ def positive(value: Any) -> float:
     return number
 
 
+def light(value: Any) -> float:
+    number = positive(value)
+    if not 1e-6 <= number < 1e6:
+        raise ValueError(f"expected a light level from 1e-6 to 1e6 photons per pixel (or lux), got {value!r}")
+    return number
+
+
+def speed(value: Any) -> float:
+    number = positive(value)
+    if not 1e-3 <= number <= 1e3:
+        raise ValueError(f"expected a factor on all motions from 0.001 to 1000, got {value!r}")
+    return number
+
+
 def whole(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 100_000:
         raise ValueError(f"expected a whole number from 1 to 100000, got {value!r}")

@@ -172,7 +172,7 @@ def run_job(job: Job, folder: Path, make: Make = render_job) -> Result:
 
 def _do(job: Job, folder: Path, make: Make) -> Result:
     """Clip, streams, record: each whole before the next begins."""
-    started = time.monotonic()
+    started, worked = time.monotonic(), time.process_time()
     files.sweep(folder / "clips" / job.name)
     for place in (folder / "jobs", folder / "failed", folder / "clips"):
         files.sweep(place, f"{job.name}*")
@@ -189,7 +189,8 @@ def _do(job: Job, folder: Path, make: Make) -> Result:
     (folder / "failed" / f"{job.name}.json").unlink(missing_ok=True)
     seconds = (rendered - started, time.monotonic() - rendered)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    spent = f"clip {seconds[0]:.2f} s, streams {seconds[1]:.2f} s, peak {peak >> 20} MiB"
+    spent = f"clip {seconds[0]:.2f} s, streams {seconds[1]:.2f} s, "
+    spent += f"processor {time.process_time() - worked:.2f} s, peak {peak >> 20} MiB"
     _log(folder, job.name, f"done on {platform.node()}, process {os.getpid()}: {spent}")
     return Result(job.name, "done", "", seconds[0], seconds[1], peak)
 

@@ -2,17 +2,18 @@
 
 A kind is a family with its render settings. Of each, a job's scene is loaded, its budget chosen, and a few frames are
 rendered, sensed and stored in a temporary folder. Scenes of one family differ, and so will the truth: by 30 % or so.
+Both clocks are read: wall time is what to wait for on a machine as busy as it is now, processor time is what the work
+needs, and what a real run can fairly be compared with (every job's log says both).
 """
 
 from __future__ import annotations
 
-import itertools
 import resource
 import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from qsim import jobs, stream
 from qsim.clip import Clip
@@ -20,6 +21,20 @@ from qsim.recipe import Job, Recipe
 from qsim.workers import Limits
 
 START = 3.0  # s, a fresh worker process with its renderer; measured on two cores, shared by Limits.jobs jobs
+
+
+class Seconds(NamedTuple):
+    """The same work on two clocks."""
+
+    wall: float
+    processor: float  # of all threads
+
+    @staticmethod
+    def now() -> Seconds:
+        return Seconds(time.perf_counter(), time.process_time())
+
+    def since(self, before: Seconds) -> Seconds:
+        return Seconds(self.wall - before.wall, self.processor - before.processor)
 
 
 @dataclass(frozen=True)
@@ -30,14 +45,23 @@ class Cost:
     size: tuple[int, int]  # height, width
     clips: int
     frames: int  # of all clips together
-    setup: float  # s per clip: scene, budget, first frame's compilation
-    per_frame: float  # s, rendering and storing
-    sensing: float  # s per frame, all streams
+    setup: Seconds  # per clip: scene, budget, first frame's compilation
+    per_frame: Seconds  # rendering and storing
+    sensing: Seconds  # per frame, all streams
     frame_bytes: float  # of radiance, truth and streams
 
     @property
+    def seconds(self) -> Seconds:
+        """Of all clips together."""
+        wall, processor = (
+            self.clips * setup + self.frames * (per_frame + sensing)
+            for setup, per_frame, sensing in zip(self.setup, self.per_frame, self.sensing, strict=True)
+        )
+        return Seconds(wall, processor)
+
+    @property
     def hours(self) -> float:
-        return (self.clips * self.setup + self.frames * (self.per_frame + self.sensing)) / 3600
+        return self.seconds.wall / 3600
 
     @property
     def gigabytes(self) -> float:
@@ -53,9 +77,17 @@ class Plan:
     peak_memory: float  # GiB of one worker
 
     @property
+    def starts(self) -> float:
+        """Seconds that starting worker processes takes, on either clock."""
+        return START * sum(cost.clips for cost in self.costs) / Limits().jobs
+
+    @property
     def hours(self) -> float:
-        starts = sum(cost.clips for cost in self.costs) / Limits().jobs
-        return sum(cost.hours for cost in self.costs) + START * starts / 3600
+        return (sum(cost.seconds.wall for cost in self.costs) + self.starts) / 3600
+
+    @property
+    def processor_hours(self) -> float:
+        return (sum(cost.seconds.processor for cost in self.costs) + self.starts) / 3600
 
     @property
     def gigabytes(self) -> float:
@@ -63,9 +95,14 @@ class Plan:
 
     def to_dict(self) -> dict[str, Any]:
         """For --json."""
-        rows = [{**vars(cost), "hours": cost.hours, "gigabytes": cost.gigabytes} for cost in self.costs]
-        totals = {"hours": self.hours, "gigabytes": self.gigabytes, "peak_memory_gib": self.peak_memory}
-        return totals | {"engine": self.engine, "kinds": rows}
+        rows = []
+        for cost in self.costs:
+            clocks = ("setup", "per_frame", "sensing")
+            row = {key: value for key, value in vars(cost).items() if key not in clocks}
+            row |= {f"{key}_seconds": getattr(cost, key)._asdict() for key in clocks}
+            rows.append(row | {"hours": cost.hours, "gigabytes": cost.gigabytes})
+        totals = {"hours": self.hours, "processor_hours": self.processor_hours, "gigabytes": self.gigabytes}
+        return totals | {"peak_memory_gib": self.peak_memory, "engine": self.engine, "kinds": rows}
 
     def lines(self, machines: int) -> list[str]:
         """The forecast as text."""
@@ -73,15 +110,16 @@ class Plan:
             f"{'family':12} {'size':>11} {'clips':>6} {'frames':>7} {'s/clip':>7} {'s/frame':>8} {'hours':>8} {'GB':>8}"
         )
         rows = [
-            f"{c.family:12} {c.size[0]:>5} x{c.size[1]:>4} {c.clips:6} {c.frames:7} {c.setup:7.2f} "
-            f"{c.per_frame + c.sensing:8.3f} {c.hours:8.3f} {c.gigabytes:8.3f}"
+            f"{c.family:12} {c.size[0]:>5} x{c.size[1]:>4} {c.clips:6} {c.frames:7} {c.setup.wall:7.2f} "
+            f"{c.per_frame.wall + c.sensing.wall:8.3f} {c.hours:8.3f} {c.gigabytes:8.3f}"
             for c in self.costs
         ]
         day = max(1, -(-self.hours // 24))
         return [
             head,
             *rows,
-            f"in all: {self.hours:.3g} hours on this machine ({self.engine}, one worker), {self.gigabytes:.3g} GB, "
+            f"in all: {self.hours:.3g} hours on this machine ({self.engine}, one worker; "
+            f"{self.processor_hours:.3g} hours of processor time), {self.gigabytes:.3g} GB, "
             f"{self.peak_memory:.2g} GiB of memory per worker",
             f"{machines} machines like this: {self.hours / machines:.3g} hours each, by --shard or --cluster",
             f"within a day: {day:.0f} machines like this, or one that is {max(1.0, self.hours / 24):.2g} times as fast"
@@ -114,12 +152,15 @@ def _measure(members: list[Job], folder: Path, frames: int) -> Cost:
     _first_frames(members[0], folder / "warm", min(2, members[0].settings.frames))
     job = members[len(members) // 2]
     settings = job.settings
-    started = time.perf_counter()
+    started = Seconds.now()
     clip, moments = _first_frames(job, folder / "measured", min(frames, settings.frames))
     # The first frame carries scene, budget and loading; the others are what each further frame costs.
-    later = [after - before for before, after in itertools.pairwise(moments)]
-    per_frame = sum(later) / len(later) if later else moments[0] - started
-    setup = moments[0] - started - (per_frame if later else 0.0)
+    first, more = moments[0].since(started), moments[-1].since(moments[0])
+    if len(moments) > 1:
+        per_frame = Seconds(*(seconds / (len(moments) - 1) for seconds in more))
+        setup = Seconds(*(max(0.0, seconds) for seconds in first.since(per_frame)))
+    else:
+        per_frame, setup = first, Seconds(0.0, 0.0)
     sensing, codes = _sense(job, clip)
     stored = sum(file.stat().st_size for file in clip.path.rglob("*.exr")) / len(clip)
     return Cost(
@@ -127,19 +168,19 @@ def _measure(members: list[Job], folder: Path, frames: int) -> Cost:
         size=(settings.height, settings.width),
         clips=len(members),
         frames=len(members) * settings.frames,
-        setup=max(setup, 0.0),
+        setup=setup,
         per_frame=per_frame,
         sensing=sensing,
         frame_bytes=stored + codes,
     )
 
 
-def _first_frames(job: Job, path: Path, frames: int) -> tuple[Clip, list[float]]:
+def _first_frames(job: Job, path: Path, frames: int) -> tuple[Clip, list[Seconds]]:
     """The first frames of a job's clip, and when each was done."""
     from qsim import render
 
     settings = job.settings
-    moments: list[float] = []
+    moments: list[Seconds] = []
     scene = jobs.load_scene(job)
     clip = render.render_clip(
         scene,
@@ -149,18 +190,19 @@ def _first_frames(job: Job, path: Path, frames: int) -> tuple[Clip, list[float]]
         shutter=settings.shutter,
         seed=jobs.render_seed(job),
         budget=jobs.choose_budget(job, scene),
-        progress=lambda done, total: moments.append(time.perf_counter()),
+        progress=lambda done, total: moments.append(Seconds.now()),
     )
     return clip, moments
 
 
-def _sense(job: Job, clip: Clip) -> tuple[float, float]:
+def _sense(job: Job, clip: Clip) -> tuple[Seconds, float]:
     """Seconds and bytes per frame of all streams together; the second drawing counts, the first one compiles."""
-    seconds = size = 0.0
+    wall = processor = size = 0.0
     for sensing in job.streams:
         stream.sense(clip, sensing)
-        started = time.perf_counter()
+        started = Seconds.now()
         drawn, _ = stream.sense(clip, sensing, force=True)
-        seconds += time.perf_counter() - started
+        spent = Seconds.now().since(started)
+        wall, processor = wall + spent.wall, processor + spent.processor
         size += drawn.path.stat().st_size
-    return seconds / len(clip), size / len(clip)
+    return Seconds(wall / len(clip), processor / len(clip)), size / len(clip)

@@ -41,6 +41,7 @@ from typing import Any
 
 from qsim import checks
 from qsim.files import to_json
+from qsim.footage import MAX_PIXELS
 from qsim.stream import Sensing, check_name
 
 SPLITS = checks.SPLITS
@@ -72,9 +73,14 @@ class Job:
     streams: tuple[Sensing, ...]
 
     @property
+    def stem(self) -> str:
+        """The family's name without folder and ending."""
+        return Path(self.family).stem
+
+    @property
     def scene(self) -> str:
         """What splits are made by: family and seed."""
-        return f"{Path(self.family).stem}:{self.scene_seed}"
+        return f"{self.stem}:{self.scene_seed}"
 
     @property
     def digest(self) -> str:
@@ -116,28 +122,9 @@ def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         found = re.search(r"at line (\d+)", str(error))
-        line = f":{found[1]}" if found else ""
-        raise ValueError(f"{path}{line}: not valid TOML: {error}") from None
+        line = found[1] if found else len(text.splitlines())  # else the parser says "at end of document"
+        raise ValueError(f"{path}:{line}: not valid TOML: {error}") from None
     return _Reader(text, path).recipe(content)
-
-
-def check_splits(jobs: tuple[Job, ...]) -> None:
-    """`ValueError` if a scene is in two splits, or a family of the test split in another one."""
-    split_of: dict[str, Job] = {}
-    for job in jobs:
-        other = split_of.setdefault(job.scene, job)
-        if other.split != job.split:
-            raise ValueError(
-                f"scene {job.scene} is in the splits '{other.split}' and '{job.split}'; splits are by scene, "
-                "whatever the speed: give one of them other seeds"
-            )
-    tested = {Path(job.family).stem for job in jobs if job.split == "test"}
-    for job in jobs:
-        if job.split != "test" and Path(job.family).stem in tested:
-            raise ValueError(
-                f"family {Path(job.family).stem} is in the splits '{job.split}' and 'test'; the test split holds "
-                "families that training never sees: move its scenes"
-            )
 
 
 class _Reader:
@@ -159,29 +146,45 @@ class _Reader:
         name = self.value(head, "name", checks.text, "recipe", 0)
         seed = self.value(head, "seed", checks.seed, "recipe", 0) if "seed" in head else 0
         defaults = {key: self.value(head, key, check, "recipe", 0) for key, check in _SETTINGS.items() if key in head}
-        streams = [s for i, table in self.tables(content, "streams") for s in self.streams(table, i, seed)]
-        names = [s.stream_name for s in streams]
-        for i, stream in enumerate(names):
-            if stream in names[:i]:
-                raise ValueError(f"{self.path}: two [[streams]] are called '{stream}'; give one of them a name")
-        jobs = []
+        streams: list[Sensing] = []
+        for i, table in self.tables(content, "streams"):
+            streams += self.streams(table, i, seed, {stream.stream_name for stream in streams})
+        jobs: list[Job] = []
+        sections: list[int] = []  # of the jobs
         for i, table in self.tables(content, "scenes"):
             jobs += self.jobs(table, i, defaults, seed, tuple(streams))
+            sections += [i] * (len(jobs) - len(sections))
         if not jobs:
             raise ValueError(f"{self.path}: no [[scenes]], nothing to render")
-        self.check_jobs(jobs)
+        self.check_jobs(jobs, sections)
         return Recipe(name, tuple(jobs), content)
 
-    def check_jobs(self, jobs: list[Job]) -> None:
+    def check_jobs(self, jobs: list[Job], sections: list[int]) -> None:
+        """No clip twice, no scene in two splits, no family of the test split in another one, frames for every sum."""
         seen: set[str] = set()
-        for job in jobs:
+        split_of: dict[str, str] = {}
+        tested = {job.stem for job in jobs if job.split == "test"}
+        for job, i in zip(jobs, sections, strict=True):
+            where = self.where("scenes", i)
             if job.name in seen:
-                raise ValueError(f"{self.path}: the clip {job.name} is asked for twice; give one of them other seeds")
+                raise ValueError(f"{where}: the clip {job.name} is asked for twice; give one of them other seeds")
             seen.add(job.name)
-        try:
-            check_splits(tuple(jobs))
-        except ValueError as error:
-            raise ValueError(f"{self.path}: {error}") from None
+            if split_of.setdefault(job.scene, job.split) != job.split:
+                raise ValueError(
+                    f"{where}: scene {job.scene} is in the splits '{split_of[job.scene]}' and '{job.split}'; splits "
+                    "are by scene, whatever the speed: give one of them other seeds"
+                )
+            if job.split != "test" and job.stem in tested:
+                raise ValueError(
+                    f"{where}: family {job.stem} is in the splits '{job.split}' and 'test'; the test split holds "
+                    "families that training never sees: move its scenes"
+                )
+            for sensing in job.streams:
+                if sensing.group and job.settings.frames < 2 ** (sensing.bits or 1) - 1:
+                    raise ValueError(
+                        f"{where}: {job.settings.frames} frames are too few for {sensing.stream_name}, whose codes "
+                        f"sum {2 ** (sensing.bits or 1) - 1} of them"
+                    )
 
     def jobs(
         self, table: dict[str, Any], i: int, defaults: dict[str, Any], seed: int, streams: tuple[Sensing, ...]
@@ -193,10 +196,15 @@ class _Reader:
             raise ValueError(f"{self.where('scenes', i)}: key 'family' is missing in [[scenes]]")
         family = self.family(table, i)
         seeds = self.seeds(table, i)
-        speeds = self.value(table, "speed", checks.list_of(checks.positive), "scenes", i) if "speed" in table else [1.0]
+        speeds = self.value(table, "speed", checks.list_of(checks.speed), "scenes", i) if "speed" in table else [1.0]
         split = self.value(table, "split", checks.split, "scenes", i) if "split" in table else "train"
         own = {key: self.value(table, key, check, "scenes", i) for key, check in _SETTINGS.items() if key in table}
         settings = Settings(**(defaults | own))
+        if settings.height * settings.width > MAX_PIXELS:
+            raise ValueError(
+                f"{self.where('scenes', i)}: frames of {settings.height} x {settings.width} pixels; at most "
+                f"{MAX_PIXELS} pixels are rendered"
+            )
         stem = Path(family).stem
         return [
             Job(
@@ -240,7 +248,7 @@ class _Reader:
         count = self.value(table, "count", checks.whole, "scenes", i) if "count" in table else 1
         return list(range(first, first + count))
 
-    def streams(self, table: dict[str, Any], i: int, seed: int) -> list[Sensing]:
+    def streams(self, table: dict[str, Any], i: int, seed: int, taken: set[str]) -> list[Sensing]:
         keys = ("sensor", "bits", "ppp", "lux", "absolute", "seed", "name", "group", "diffraction")
         self.known(table, keys, "[[streams]]", "streams", i)
         if "sensor" not in table:
@@ -252,21 +260,21 @@ class _Reader:
                 f"{self.where('streams', i)}: give one light level, ppp = ..., lux = ... or absolute = true; "
                 f"{given} given"
             )
-        sensor = self.sensor(table, i)
         bits = self.value(table, "bits", checks.list_of(checks.bits), "streams", i) if "bits" in table else [None]
         group, diffraction = (
             key in table and self.value(table, key, checks.flag, "streams", i) for key in ("group", "diffraction")
         )
+        sensor = self.sensor(table, i, bits, group)
         own = self.value(table, "seed", checks.seed, "streams", i) if "seed" in table else seed
         levels: list[float | None] = [None]
         if lights != ["absolute"]:
-            levels = self.value(table, lights[0], checks.list_of(checks.positive), "streams", i)
+            levels = self.value(table, lights[0], checks.list_of(checks.light), "streams", i)
         elif self.value(table, "absolute", checks.flag, "streams", i) is not True:
             raise ValueError(f"{self.where('streams', i, 'absolute')}: absolute can only be true; or give a ppp")
         name = self.value(table, "name", checks.text, "streams", i) if "name" in table else None
         if name is not None and len(bits) * len(levels) > 1:
             raise ValueError(f"{self.where('streams', i, 'name')}: one name for {len(bits) * len(levels)} streams")
-        return [
+        found = [
             Sensing(
                 sensor,
                 bits=b,
@@ -280,25 +288,37 @@ class _Reader:
             for b in bits
             for level in levels
         ]
+        names = [stream.stream_name for stream in found]
+        for n, stream in enumerate(names):
+            if stream in taken or stream in names[:n]:
+                raise ValueError(
+                    f"{self.where('streams', i)}: two [[streams]] are called '{stream}'; give one of them a name"
+                )
+        return found
 
-    def sensor(self, table: dict[str, Any], i: int) -> str:
+    def sensor(self, table: dict[str, Any], i: int, bits: list[int | None], group: bool) -> str:
+        """The sensor's name or file, if it exists with all these bits, and its planes can be summed where asked."""
         from qsim import devices
+        from qsim.spad import BinarySPAD
 
         sensor: str = self.value(table, "sensor", checks.text, "streams", i, plain=False)
         where = self.where("streams", i, "sensor")
         if sensor.endswith(".toml"):
             sensor = str((self.path.parent / sensor).resolve())
-        bits = table.get("bits")
-        try:
-            devices.load(sensor, ppp=3.25, bits=bits if isinstance(bits, int) else None, exposure=5e-4)
-        except (ValueError, OSError) as error:
-            raise ValueError(f"{where}: {error}") from None
+        for depth in bits:
+            try:
+                found = devices.load(sensor, ppp=3.25, bits=depth, exposure=5e-4)
+            except (ValueError, OSError) as error:
+                raise ValueError(f"{where}: {error}") from None
+            if group and not (depth and isinstance(found, BinarySPAD)):
+                what = f"this is a {type(found).__name__}" if depth else "the bits of a code are needed, as in bits = 3"
+                raise ValueError(f"{self.where('streams', i, 'group')}: group sums planes of a clocked SPAD; {what}")
         return sensor
 
     def tables(self, content: dict[str, Any], key: str) -> list[tuple[int, dict[str, Any]]]:
         tables = content.get(key, [])
         if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
-            raise ValueError(f"{self.path}: '{key}' must be sections, each beginning with [[{key}]]")
+            raise ValueError(f"{self.where(key, 0)}: '{key}' must be sections, each beginning with [[{key}]]")
         return list(enumerate(tables))
 
     def known(self, table: dict[str, Any], keys: tuple[str, ...], where: str, section: str | None, i: int) -> None:
@@ -333,7 +353,15 @@ class _Reader:
             elif inside and key is not None and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*[=.]", line):
                 number = n
                 break
-        return f"{self.path}:{number}" if number else str(self.path)
+        return f"{self.path}:{number or self.mention(section, key)}"
+
+    def mention(self, section: str | None, key: str | None) -> int:
+        """The first line that says `key =`, or else the section, for tables written in line or with dots."""
+        for word in (key, section):
+            for n, line in enumerate(self.lines, 1):
+                if word and re.search(rf"(?<![\w-]){re.escape(word)}[\"']?\s*[=.]", line):
+                    return n
+        return 1
 
 
 def _suggest(word: str, known: Any) -> str:

@@ -216,7 +216,8 @@ class Sensing:
         )
         bits = "" if self.bits is None else f"_{self.bits}bit"
         seed = f"_seed{self.seed}" if self.seed else ""
-        return check_name(f"{Path(self.sensor).stem}{bits}_{light}{seed}")
+        sensor = Path(self.sensor).name.removesuffix(".toml")
+        return check_name(f"{sensor}{bits}_{light}{seed}")
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pytest
 
 from qsim import dataset, plan, recipe
 from qsim.cli import main
-from qsim.plan import START, Cost, Plan
+from qsim.plan import START, Cost, Plan, Seconds
 from qsim.workers import Limits
 
 RECIPE = """[recipe]
@@ -31,15 +31,19 @@ ppp = 3.25
 
 def test_the_arithmetic_of_a_forecast():
     """10 clips of 30 frames: 10 * 6 s + 300 * (1.5 + 0.3) s = 600 s, and a tenth of a fresh process per clip or so."""
-    cost = Cost("fan", (512, 1024), 10, 300, setup=6.0, per_frame=1.5, sensing=0.3, frame_bytes=4e6)
+    seconds = {"setup": Seconds(6.0, 11.0), "per_frame": Seconds(1.5, 2.9), "sensing": Seconds(0.3, 0.4)}
+    cost = Cost("fan", (512, 1024), 10, 300, **seconds, frame_bytes=4e6)
     assert cost.hours == pytest.approx(600 / 3600)
+    assert cost.seconds.processor == pytest.approx(10 * 11 + 300 * (2.9 + 0.4))
     assert cost.gigabytes == pytest.approx(1.2)
     whole = Plan((cost, cost), "llvm", 0.5)
     assert whole.hours == pytest.approx((1200 + 20 * START / Limits().jobs) / 3600)
+    assert whole.processor_hours == pytest.approx((2 * 1100 + 20 * START / Limits().jobs) / 3600)
     assert whole.gigabytes == pytest.approx(2.4)
     assert f"10 machines like this: {whole.hours / 10:.3g} hours each" in "\n".join(whole.lines(10))
     assert "GPU" in whole.lines(1)[-1]
-    assert whole.to_dict()["kinds"][0]["frames"] == 300
+    kind = whole.to_dict()["kinds"][0]
+    assert (kind["frames"], kind["per_frame_seconds"]) == (300, {"wall": 1.5, "processor": 2.9})
 
 
 def test_plans_without_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -51,13 +55,11 @@ def test_plans_without_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.slow
-def test_a_forecast_against_a_real_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_forecast_against_a_real_run(tmp_path: Path):
     """In processor time on both sides, which other work on the machine changes little; 30 % is what a plan promises."""
     wanted = recipe.parse(RECIPE)
-    with monkeypatch.context() as patch:
-        patch.setattr(time, "perf_counter", time.process_time)
-        forecast = plan.plan(wanted)
-    predicted = sum(cost.hours for cost in forecast.costs) * 3600
+    forecast = plan.plan(wanted)
+    predicted = sum(cost.seconds.processor for cost in forecast.costs)
     started = time.process_time()
     dataset.generate(wanted, tmp_path / "d", dataset.Options(workers=0))
     seconds = time.process_time() - started

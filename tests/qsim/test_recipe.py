@@ -69,6 +69,7 @@ def test_a_digest_changes_with_everything_that_decides_the_files():
     assert digests(base.replace('name = "tiny"\n', 'name = "tiny"\nseed = 1\n')).isdisjoint(digests(base))
 
 
+AGAIN = "[[scenes]]\nfamily = "
 MISTAKES = [
     # (text in the good recipe, its replacement, line, what the message says)
     ("frames = 3", "frame = 3", 3, r"unknown key 'frame' in \[recipe\]; did you mean 'frames'\?"),
@@ -98,6 +99,19 @@ MISTAKES = [
     ("ppp = [0.5, 3.25]", "ppp = 1.0\nlux = 1.0", 20, r"give one light level, .* ppp and lux given"),
     ("ppp = [0.5, 3.25]", "absolute = false", 23, r"absolute can only be true"),
     ("ppp = [0.5, 3.25]", 'ppp = [1, 2]\nname = "x"', 24, r"one name for 4 streams"),
+    ("ppp = [0.5, 3.25]", "ppp = 1e9", 23, r"light level from 1e-6 to 1e6 photons per pixel .*, got 1000000000"),
+    ("ppp = [0.5, 3.25]", "lux = 0.3e7", 23, r"lux: expected a light level"),
+    ("speed = [1.0, 2.5]", "speed = 1e9", 11, r"factor on all motions from 0\.001 to 1000"),
+    ("seeds = [0, 2]", "seeds = [0, 2]\nheight = 90000\nwidth = 90000", 8, r"90000 x 90000 pixels; at most 67108864"),
+    ("ppp = [0.5, 3.25]", "ppp = 1\ngroup = true", 24, r"group sums planes of a clocked SPAD; this is a QIS"),
+    ('"quiver-physical"\nbits = [1, 3]', '"spad512s"\ngroup = true', 22, r"the bits of a code are needed"),
+    ('"quiver-physical"', '"spad512s"\ngroup = true', 8, r"3 frames are too few for spad512s_3bit_0\.5ppp, .* sum 7"),
+    ('split = "test"', f'split = "test"\n{AGAIN}"fan"', 18, r"the clip fan_0000 is asked for twice"),
+    ('split = "test"', f'split = "test"\n{AGAIN}"tumble"', 18, r"family tumble is in the splits 'train' and"),
+    ('split = "test"', f'split = "val"\n{AGAIN}"tumble"\nfirst = 5\nspeed = 2', 18, r"splits 'val' and 'train'"),
+    ("ppp = [0.5, 3.25]", f"ppp = 3.25\n{STREAMS}", 25, r"two \[\[streams"),
+    ("frames = 4", "frames = 4\nframes = 5", 19, r"not valid TOML"),
+    ("bits = [1, 3]\nppp = [0.5, 3.25]\n", "bits = 3\nbits = 3", 23, r"not valid TOML"),
     ("[[streams]]", "[[stream]]", 20, r"unknown key 'stream' in the recipe; did you mean 'streams'\?"),
     ("[[streams]]", "[[streams]", 20, r"not valid TOML"),
 ]  # fmt: skip
@@ -118,6 +132,9 @@ def test_each_mistake_is_named_with_file_and_line(tmp_path: Path, old: str, new:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ('scenes = [{family = "fan", seds = [2]}]\n' + HEAD, r"recipe\.toml:1: unknown key 'seds'"),
+        ("recipe.name = 'a'\nrecipe.heigt = 3", r"recipe\.toml:2: unknown key 'heigt'"),
+        (HEAD + "[scenes.a]\nfamily = 'fan'\n", r"recipe\.toml:7: 'scenes' must be sections"),
         ("", r"section \[recipe\] is missing"),
         ("recipe = 3", r"section \[recipe\] is missing"),
         (HEAD, r"no \[\[scenes\]\], nothing to render"),
@@ -131,6 +148,11 @@ def test_each_mistake_is_named_with_file_and_line(tmp_path: Path, old: str, new:
 def test_recipes_without_sense(text: str, message: str):
     with pytest.raises(ValueError, match=message):
         parse(text)
+
+
+def test_a_sensor_whose_name_holds_a_dot_keeps_it():
+    stream = '[[streams]]\nsensor = "cmos-5.1e"\nbits = 3\nppp = 3.25\n'
+    assert parse(HEAD + SCENES + stream).jobs[0].streams[0].stream_name == "cmos-5.1e_3bit_3.25ppp"
 
 
 def test_splits_are_by_scene_whatever_the_speed():
@@ -189,13 +211,12 @@ def test_the_large_recipe_is_what_it_says():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "scenes").glob("*.toml")), ids=lambda p: p.stem)
-def test_no_texture_of_a_test_scene_is_in_training(path: Path):
-    """By content, not by name: the SHA-256 of every picture in every scene."""
+def test_no_mesh_or_texture_of_a_test_scene_is_in_training(path: Path):
+    """By content, not by name: the SHA-256 of every picture and of all vertices in every scene."""
     found: dict[str, set[str]] = {split: set() for split in recipe.SPLITS}
     scenes = {job.scene: job for job in recipe.load(path).jobs}
     for job in scenes.values():
-        assets = jobs.assets(jobs.load_scene(job).to_dict())
-        found[job.split] |= {asset for asset in assets if asset.startswith("texture ")}
-    assert found["train"]
-    assert found["test"]
+        found[job.split] |= set(jobs.assets(jobs.load_scene(job).to_dict()))
+    for split in ("train", "test"):
+        assert {asset.split()[0] for asset in found[split]} == {"mesh", "texture"}
     assert found["test"].isdisjoint(found["train"] | found["val"])
