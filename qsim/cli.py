@@ -287,10 +287,11 @@ def _run_generate(args: argparse.Namespace) -> int:
     lines = [f"{folder}: {summary.done} of {summary.jobs} clips done, {summary.made} made now"]
     lines += [f"repaired {problem}" for problem in summary.repaired]
     lines += [f"FAILED {name}: {why}" for name, why in sorted(summary.failed.items())]
+    lines += [f"SHARED {problem}" for problem in summary.shared]
     if summary.failed:
         lines.append("run again with --retry after mending the cause")
     output(args, {"dataset": str(folder)} | dataclasses.asdict(summary), lines)
-    return 0 if summary.done == summary.jobs else 1
+    return 0 if summary.done == summary.jobs and not summary.shared else 1
 
 
 def _cluster(args: argparse.Namespace) -> Any:

@@ -95,9 +95,9 @@ class Dataset:
         return problems + self.shared_between_splits()
 
     def shared_between_splits(self) -> list[str]:
-        """Scenes and textures of the test split that another split has too, in words; empty if the split is honest.
+        """Scenes, meshes and textures of the test split that another split has too, in words; empty if it is honest.
 
-        Meshes are not counted: every family may use a sphere.
+        By content: a mesh is its vertices, a texture its pixels or its file.
         """
         elsewhere: dict[str, str] = {}
         for name in self.names("train") + self.names("val"):
@@ -111,11 +111,10 @@ class Dataset:
 
 
 def _seen_in(path: Path) -> list[str]:
-    """Scene and textures of a clip; nothing if it cannot be read."""
+    """Scene, meshes and textures of a clip; nothing if it cannot be read."""
     try:
         meta = Clip.open(path).meta
-        scene = f"scene {meta['scene']['family']}:{meta['scene']['seed']}"
-        return [scene, *(asset for asset in meta.get("assets", []) if asset.startswith("texture "))]
+        return [f"scene {meta['scene']['family']}:{meta['scene']['seed']}", *meta.get("assets", [])]
     except (ValueError, OSError, KeyError):
         return []
 
@@ -160,6 +159,7 @@ class Summary:
     made: int  # finished now
     failed: dict[str, str]  # name -> why, now or before
     repaired: tuple[str, ...]  # problems that led to jobs done again
+    shared: tuple[str, ...] = ()  # what training sees of the test split, in words
 
 
 def generate(
@@ -198,12 +198,13 @@ def generate(
                         on_result(result)
             write_manifest(recipe, folder)
             done = sum(record_path(folder, job.name).is_file() for job in jobs)
+            shared = tuple(Dataset.open(folder).shared_between_splits())
     except OSError as error:
         if error.errno not in FULL:
             raise
         message = f"{folder}: {error.strerror}; nothing is lost: make space and run the same command again"
         raise OSError(message) from None
-    return Summary(len(jobs), done, made, failed, repaired)
+    return Summary(len(jobs), done, made, failed, repaired, shared)
 
 
 def shard(jobs: tuple[Job, ...], part: tuple[int, int] | None) -> list[Job]:

@@ -39,10 +39,13 @@ def sync_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A binary file that appears under `path` when the block ends well, and not at all otherwise."""
+    """A binary file that appears under `path` when the block ends well, and not at all otherwise.
+
+    An `OSError` of the system (a full disk) names the file.
+    """
     temporary = path.with_name(f"{path.name}.tmp-{os.getpid()}")
     try:
-        with open(temporary, "wb") as file:
+        with _naming(path), open(temporary, "wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -51,6 +54,25 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         temporary.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+def append_line(path: Path, line: bytes) -> None:
+    """Add a line to a journal, synced; a killed writer leaves at most a last line cut short."""
+    with _naming(path), open(path, "ab") as journal:
+        journal.write(line + b"\n")
+        journal.flush()
+        os.fsync(journal.fileno())
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Writes that fail do not say where: add the file to their `OSError`."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
 
 
 def sweep(folder: Path, pattern: str = "*") -> None:

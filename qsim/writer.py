@@ -119,10 +119,7 @@ class ClipWriter:
             photons = optics.expected_photons(stored, self._camera, self.meta["exposure"], origin=origin)
             entry["mean_photons"] = float(photons.mean())
         self._frames[t] = entry
-        with open(self.part / "journal.jsonl", "ab") as journal:
-            journal.write(json.dumps(entry, sort_keys=True).encode() + b"\n")
-            journal.flush()
-            os.fsync(journal.fileno())
+        files.append_line(self.part / "journal.jsonl", json.dumps(entry, sort_keys=True).encode())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 from fakes import RECIPE, die_on_tumble, fail_on_tumble, hoard_on_tumble, make, make_slowly, tree
 
-from qsim import files, jobs, recipe, writer
+from qsim import files, jobs, recipe
 from qsim.dataset import Dataset, Options, Summary, generate
 from qsim.jobs import Make
 from qsim.workers import Limits
@@ -180,7 +180,7 @@ def test_a_full_disk_everywhere(tmp_path: Path, undisturbed: dict[str, bytes], m
     """Space for 0, 1/10, ... of what a run writes: one clear error, nothing accepted, and resuming gives the same."""
     measure = FullDisk(1 << 30)
     with monkeypatch.context() as patch:
-        for module in (files, jobs, writer):
+        for module in (files, jobs):
             patch.setattr(module, "open", measure.open, raising=False)
         generate(SMALL, tmp_path / "whole", HERE, make=make)
     needed = (1 << 30) - measure.space
@@ -188,7 +188,7 @@ def test_a_full_disk_everywhere(tmp_path: Path, undisturbed: dict[str, bytes], m
         folder = tmp_path / f"d{step}"
         disk = FullDisk(needed * step // 10)
         with monkeypatch.context() as patch:
-            for module in (files, jobs, writer):
+            for module in (files, jobs):
                 patch.setattr(module, "open", disk.open, raising=False)
             with pytest.raises(OSError, match=r"No space left on device.*make space and run the same command again"):
                 generate(SMALL, folder, HERE, make=make)
@@ -196,6 +196,71 @@ def test_a_full_disk_everywhere(tmp_path: Path, undisturbed: dict[str, bytes], m
             assert all(clip.verify() == [] for clip in Dataset.open(folder).clips())
         assert generate(SMALL, folder, HERE, make=make).done == 3
         assert tree(folder) == undisturbed
+        shutil.rmtree(folder)
+
+
+class FullAt:
+    """From the n-th operation that needs space on, every such operation fails: open, write, sync, rename, mkdir."""
+
+    def __init__(self, left: int, patch: pytest.MonkeyPatch) -> None:
+        self.left = left
+        for module in (files, jobs):
+            patch.setattr(module, "open", self.open, raising=False)
+        for name in ("fsync", "replace", "mkdir"):
+            patch.setattr(os, name, self.guarded(getattr(os, name)))
+
+    def guarded(self, action: Callable[..., Any]) -> Callable[..., Any]:
+        def act(*args: Any, **kwargs: Any) -> Any:
+            self.left -= 1
+            if self.left < 0:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return action(*args, **kwargs)
+
+        return act
+
+    def open(self, path: Any, mode: str = "r", *args: Any, **kwargs: Any) -> Any:
+        if "r" in mode:
+            return builtins.open(path, mode, *args, **kwargs)
+        file = self.guarded(builtins.open)(path, mode, *args, **kwargs)
+        return _Guarded(file, self.guarded(file.write))
+
+
+class _Guarded:
+    def __init__(self, file: Any, write: Callable[..., Any]) -> None:
+        self.file, self.write = file, write
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.file, name)
+
+    def __enter__(self) -> "_Guarded":
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.file.close()
+
+
+@pytest.mark.parametrize("stride", [23, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_disk_that_is_full_from_any_operation_on(
+    tmp_path: Path, undisturbed: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, stride: int
+):
+    """Every place in a run where the system may say ENOSPC, one after the other (in the quick tests: one in 23)."""
+    plenty = 1 << 30
+    with monkeypatch.context() as patch:
+        measure = FullAt(plenty, patch)
+        generate(SMALL, tmp_path / "whole", HERE, make=make)
+        needed = plenty - measure.left
+    assert needed > 200
+    for left in range(0, needed, stride):
+        folder = tmp_path / f"d{left}"
+        with monkeypatch.context() as patch:
+            FullAt(left, patch)
+            with pytest.raises(OSError, match=r"No space left on device.*make space and run the same command again"):
+                generate(SMALL, folder, HERE, make=make)
+        if (folder / "dataset.json").is_file():
+            for clip in Dataset.open(folder).clips():
+                assert clip.verify() == []
+        assert generate(SMALL, folder, HERE, make=make).done == 3, left
+        assert tree(folder) == undisturbed, left
         shutil.rmtree(folder)
 
 
@@ -350,14 +415,16 @@ def test_other_format_versions(tmp_path: Path, version: int, advice: str):
             action()
 
 
-def test_a_texture_of_the_test_split_in_training_is_reported(tmp_path: Path):
+@pytest.mark.parametrize("asset", ["texture abc", "mesh abc"])
+def test_what_training_sees_of_the_test_split_is_reported(tmp_path: Path, asset: str):
     generate(SMALL, tmp_path / "d", HERE, make=make)
-    for name, assets in [("fan_0001", ["texture abc", "mesh m"]), ("tumble_0004", ["mesh m", "texture abc"])]:
+    for name, assets in [("fan_0001", [asset, "mesh m"]), ("tumble_0004", ["mesh n", asset])]:
         path = tmp_path / "d" / "clips" / name / "clip.json"
         path.write_text(json.dumps(json.loads(path.read_text()) | {"assets": assets}))
-    shared = Dataset.open(tmp_path / "d").shared_between_splits()
+    shared = generate(SMALL, tmp_path / "d", HERE, make=make).shared
     assert len(shared) == 1
-    assert "its texture abc is also in fan_0001" in shared[0]
+    assert f"its {asset} is also in fan_0001, which is not a test clip" in shared[0]
+    assert shared[0] in Dataset.open(tmp_path / "d").verify()
 
 
 def test_assets_of_a_scene():
