@@ -8,9 +8,10 @@ from __future__ import annotations
 import base64
 import html
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +59,8 @@ def strip(frames: NDArray[np.uint8]) -> str:
     return picture_uri(tall, quality=None if frames.shape[2] <= 256 else 88)
 
 
-def player(panels: Sequence[Panel], *, milliseconds: int = 120) -> str:
-    """Panels that play together, a scrubber, and a slider that reveals one panel over another."""
+def player(panels: Sequence[Panel], *, left: int = -1, milliseconds: int = 120) -> str:
+    """Panels that play together, a scrubber, and a slider that reveals panel `left` over the first one."""
     count = len(panels[0].frames)
     for panel in panels:
         if len(panel.frames) != count:
@@ -74,13 +75,14 @@ def player(panels: Sequence[Panel], *, milliseconds: int = 120) -> str:
         f'<input class="frame" type="range" min="0" max="{count - 1}" value="0" aria-label="frame">'
         "<output></output></div>"
     )
+    comparison = _comparison(panels, left % len(panels)) if len(panels) > 1 else ""
     return (
         f'<div class="player" tabindex="0" data-frames="{count}" data-milliseconds="{milliseconds}">'
-        f'<div class="panels">{figures}</div>{controls}{_comparison(panels) if len(panels) > 1 else ""}</div>'
+        f'<div class="panels">{figures}</div>{controls}{comparison}</div>'
     )
 
 
-def _comparison(panels: Sequence[Panel]) -> str:
+def _comparison(panels: Sequence[Panel], left: int) -> str:
     def choice(chosen: int, side: str) -> str:
         options = "".join(
             f'<option value="{i}"{" selected" if i == chosen else ""}>{html.escape(p.caption)}</option>'
@@ -92,7 +94,7 @@ def _comparison(panels: Sequence[Panel]) -> str:
         '<details><summary>compare two</summary><div class="compare"><div style="position:relative">'
         '<canvas class="under"></canvas><canvas class="over"></canvas></div>'
         '<input class="reveal" type="range" min="0" max="100" value="50" aria-label="share of the left picture">'
-        f'<div class="controls">{choice(len(panels) - 1, "left")}{choice(0, "right")}</div></div></details>'
+        f'<div class="controls">{choice(left, "left")}{choice(0, "right")}</div></div></details>'
     )
 
 
@@ -140,6 +142,36 @@ def figure(png: bytes, caption: str) -> str:
     uri = "data:image/png;base64," + base64.b64encode(png).decode()
     words = html.escape(caption)
     return f'<figure><img src="{uri}" alt="{words}"><figcaption>{words}</figcaption></figure>'
+
+
+def axes(x_label: str, y_label: str) -> tuple[Any, Callable[[], bytes]]:
+    """One small set of axes, and a function that gives its picture as PNG bytes."""
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(6.4, 3.0), dpi=110, layout="constrained")
+    own = drawing.subplots()
+    own.set_xlabel(x_label)
+    own.set_ylabel(y_label)
+    own.grid(alpha=0.3)
+
+    def save() -> bytes:
+        buffer = io.BytesIO()
+        drawing.savefig(buffer, format="png")
+        return buffer.getvalue()
+
+    return own, save
+
+
+def picture(pixels: NDArray[np.uint8], caption: str) -> str:
+    """A small picture with its caption, in its own size."""
+    words = html.escape(caption)
+    image = f'<img src="{picture_uri(pixels)}" alt="{words}">'
+    return f'<figure class="small">{image}<figcaption>{words}</figcaption></figure>'
+
+
+def grid(figures: Sequence[str]) -> str:
+    """Figures side by side where there is room."""
+    return f'<div class="figures">{"".join(figures)}</div>' if figures else ""
 
 
 def section(title: str, *parts: str) -> str:

@@ -79,7 +79,9 @@ class Sensor(ABC):
 
     def __str__(self) -> str:
         """Parameters with their units; `repr` is the code that makes this sensor."""
-        values = [f"{name} {value} {_UNITS.get(name, '')}".rstrip() for name, value in vars(self).items()]
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        shown = {name: f"{value:.6g}" if isinstance(value, float) else str(value) for name, value in given.items()}
+        values = [f"{name} {text} {_UNITS.get(name, '')}".rstrip() for name, text in shown.items()]
         return f"{type(self).__name__} ({self.code_model}): " + ", ".join(values)
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:

@@ -71,7 +71,7 @@ def test_the_repr_of_a_scene_names_camera_and_light():
             QIS(0.8, 1.6, 0.2, 3),
             "QIS (multibit): quantum_efficiency 0.8 e-/photon, dark_current 1.6 e-/s, read_noise 0.2",
         ),
-        (BinarySPAD(0.4, 20.0), "BinarySPAD (binary_sum): pde 0.4 avalanches/photon, dark_count_rate 20.0 1/s, bits 1"),
+        (BinarySPAD(0.4, 20.0), "BinarySPAD (binary_sum): pde 0.4 avalanches/photon, dark_count_rate 20 1/s, bits 1"),
         (CountingSPAD(0.4, 20.0, 3e-8, 8), "dead_time 3e-08 s, bits 8"),
     ],
 )

@@ -7,10 +7,12 @@ import subprocess
 
 import numpy as np
 import pytest
+from clips import write_clip, write_dataset
 
-from qsim import report
+from qsim import report, report_clip
 from qsim.cli import main
 from qsim.clip import RELATIVE, Clip, ClipWriter
+from qsim.optics import clip_photons
 
 
 def make_clip(path, frames: int = 5, size: tuple[int, int] = (24, 33)) -> Clip:
@@ -66,7 +68,7 @@ def test_page_shows_everything_and_loads_nothing(folder):
 def test_average_is_the_mean_of_the_codes_around(folder):
     stream = Clip.open(folder / "square").stream(Clip.open(folder / "square").streams[0])
     codes = stream.codes(0, 5)
-    shown = report.stream_panels(stream, range(5))[1].frames
+    shown = report_clip.stream_panels(stream, range(5))[1].frames
     mean = codes.mean(axis=0) / 7  # five frames: every window of eleven holds all of them
     assert np.array_equal(shown[0], shown[4])
     brightest = np.unravel_index(np.argmax(mean), mean.shape)
@@ -98,16 +100,162 @@ def test_nothing_to_show_is_said(tmp_path, capsys, what):
     assert not (tmp_path / "x.html").exists()
 
 
+def test_clip_section_says_light_motion_model_and_error(tmp_path):
+    """Numbers of the page are those of the clip: photons, factor, lux, motion, findings, error of every frame."""
+    clip = write_clip(
+        tmp_path / "lit", frames=4, height=20, width=24,
+        render={"findings": [{"effect": "bounces", "chosen": "2", "size": "later ones <1 %"}]},
+    )  # fmt: skip
+    assert main(["sense", str(clip.path), "--ppp", "3.25", "--bits", "3"]) == 0
+    stream = clip.stream(clip.streams[0])
+    page = report.build(clip.path)
+    assert f"{clip.mean_photons:.4g} photons per pixel and exposure as it is" in page
+    assert f"3.25 photons per pixel (the clip&#x27;s light × {stream.photons_factor:.4g}), as much as 1.313 lx" in page
+    assert "2.6 e⁻ per pixel; 3 bit, QIS (multibit): quantum_efficiency 0.8 e-/photon" in page
+    assert "<td>bounces</td><td>2</td><td>later ones &lt;1 %</td>" in page
+    assert "Monte-Carlo error of a frame: 0.01 rms in the unit of the radiance, worst 0.01" in page
+    for words in ("light of the truth", "drawn, and expected from the light", "measured in every frame"):
+        assert words in page, words
+
+
+def test_motion_is_that_of_the_pixels_that_move(folder):
+    """The square moves 1 px, all else stands; half of the pixels unknown changes nothing."""
+    assert report_clip.motion(Clip.open(folder / "square"), range(5)) == (1.0, 1.0)
+    page = report.build(folder / "square")
+    assert (
+        "what moves (0.05 px/frame or more) moves 1 px/frame on average; 99.9 % of all pixels at most 1 px/frame"
+        in page
+    )
+    assert "rim = 1 px/frame" in page
+
+
+def test_expected_histogram_is_the_mean_of_the_exact_distribution(tmp_path):
+    """Even light: the expected shares are the sensor's pmf, and the drawn ones lie around them."""
+    clip = write_clip(tmp_path / "even", radiance=np.full((4, 40, 50), 1.0))
+    assert main(["sense", str(clip.path), "--ppp", "3.25", "--bits", "3", "-o", "mine"]) == 0
+    stream = clip.stream("mine")
+    expected = report_clip._expected(clip, stream, 4)
+    light = np.stack([clip_photons(clip, t, stream.photons_factor) for t in range(4)])
+    exact = stream.sensor.pmf(light, stream.exposure).mean(axis=(0, 1, 2))
+    np.testing.assert_allclose(expected, exact, atol=2e-3)  # every n-th pixel of light that falls off as cos^4
+    assert expected.sum() == pytest.approx(1)
+
+
+def test_a_data_set_is_a_table_and_a_clip_of_each_split(tmp_path):
+    data = write_dataset(tmp_path / "tiny", {"train": 2, "val": 1, "test": 1})
+    page = report.build(data)
+    assert page.count('class="player"') == 3
+    assert re.findall(r"<h2>(.*?)</h2>", page) == ["Data set tiny", "Clip test_0", "Clip train_0", "Clip val_0"]
+    assert "4 clips; motion in the middle frame" in page
+
+
+def test_studies_costs_and_validations_have_their_sections(tmp_path):
+    rows = [{"model": "planes", "bits": 3, "psnr_db": 21.25}, {"model": "multibit", "bits": 3, "psnr_db": None}]
+    study = {"clip": "fan", "ppp": 0.65, "rows": rows, "structure_function": [0.0, 1.0]}
+    sweep = {"cells": [{"speed": 2.0, "best_bits": 3}], "studies": [study]}
+    figure = {"figure": 1, "rows": [{"clip": "fan", "panels": [{"label": "CMOS 60 fps", "psnr_db": 18.9}]}]}
+    cost = {"method": "nano", "seconds_per_frame": 0.25, "psnr_matched": None, "failure": None}
+    checked = {"model": "QIS", "engine": "fast", "megapixels_per_second": 99.5, "times_numpy": 25.0, "cdf_error": 1e-7}
+    checked |= dict.fromkeys(("p_value", "z_mean", "z_variance", "mismatches_per_million"))
+    sensor = {"ok": False, "pixels": 9, "rows": [checked], "cases": [{"name": "ties", "found": "right", "ok": False}]}
+    frame = {"scene": "drums", "level": 40.0, "psnr": 40.5, "stated_psnr": 40.25, "samples": 16, "bounces": 4}
+    frame |= {"seconds": 0.5, "obvious_seconds": 6.0, "obvious_psnr": 40.0, "ratio": 12.0}
+    render = {"ok": True, "median_ratio": 12.0, "height": 8, "width": 10, "engine": "llvm", "rows": [frame]}
+    files = {"s/tradeoff": study, "w/tradeoff": sweep, "f/figure1": figure, "sensor": sensor, "render": render}
+    for name, content in (files | {"b/bench": {"setting": {"height": 64}, "costs": [cost]}}).items():
+        path = tmp_path / f"{name}.json"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps(content))
+    page = report.build(tmp_path)
+    for words in ("Study: s", "Study: w", "Study: f", "Cost of a frame: b", "21.25", "CMOS 60 fps", "best bits"):
+        assert words in page, words
+    assert "sensors, 9 pixels a draw: something is OUTSIDE its bounds" in page
+    assert "rendering, frames of 8 × 10, llvm: everything is within its bounds" in page
+    assert "<td>ties</td><td>right</td><td>wrong</td>" in page
+
+
+DRIVE = """<script>
+const found = {errors: []};
+window.addEventListener("error", event => found.errors.push(event.message));
+console.error = (...words) => found.errors.push(words.join(" "));
+window.addEventListener("load", () => setTimeout(() => {
+  try {
+    const player = document.querySelector(".player"), canvas = player.querySelector("canvas");
+    const slider = player.querySelector("input.frame"), label = player.querySelector("output");
+    const look = c => Array.from(c.getContext("2d").getImageData(0, 0, c.width, c.height).data).join();
+    const first = look(canvas);
+    found.size = [canvas.width, canvas.height];
+    slider.value = 3; slider.dispatchEvent(new Event("input", {bubbles: true}));
+    found.label = label.textContent;
+    found.moved = look(canvas) !== first;
+    player.dispatchEvent(new KeyboardEvent("keydown", {key: "Home", bubbles: true}));
+    found.home = label.textContent + (look(canvas) === first);
+    player.dispatchEvent(new KeyboardEvent("keydown", {key: "ArrowLeft", bubbles: true}));
+    found.last = label.textContent;
+    player.querySelector("button.play").click();
+    found.playing = player.querySelector("button.play").textContent;
+    player.querySelector("button.play").click();
+    player.querySelector("details").open = true;
+    const reveal = player.querySelector("input.reveal"), over = player.querySelector("canvas.over");
+    reveal.value = 25; reveal.dispatchEvent(new Event("input", {bubbles: true}));
+    found.clip = over.style.clipPath;
+    found.under = look(player.querySelector("canvas.under")) !== look(over);
+    found.wide = document.documentElement.scrollWidth <= window.innerWidth;
+    found.dark = getComputedStyle(document.body).backgroundColor;
+  } catch (error) { found.errors.push(String(error)); }
+  document.title = JSON.stringify(found);
+}, 500));
+</script>"""
+
+
+def chromium(*words: object, profile: object) -> str:
+    """Standard output of a headless Chromium."""
+    options = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-sync"
+    command = [
+        "chromium",
+        *options.split(),
+        f"--user-data-dir={profile}",
+        "--virtual-time-budget=5000",
+        *map(str, words),
+    ]
+    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=240).stdout
+
+
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium to look at the page with")
-def test_page_draws_in_a_real_browser(folder, tmp_path):
-    """The screenshot is not blank, and dark and bright parts of the strip are both there."""
+@pytest.mark.parametrize("dark", [False, True])
+def test_page_works_in_a_real_browser(folder, tmp_path, dark):
+    """At a phone's width: the scrubber moves frames, keys step, the slider reveals, nothing complains or sticks out."""
+    import html
+
+    page = tmp_path / "page.html"
+    page.write_text(report.build(folder).replace("<head>", "<head>" + DRIVE, 1))
+    words = ["--window-size=500,900", "--dump-dom", page.as_uri()]
+    dom = chromium(*(["--blink-settings=preferredColorScheme=0"] if dark else []), *words, profile=tmp_path / "p")
+    found = json.loads(html.unescape(re.search(r"<title>(\{.*?)</title>", dom)[1]))
+    assert found.pop("errors") == []
+    background = found.pop("dark")
+    assert (background == "rgb(21, 23, 26)") is dark
+    assert found == {
+        "size": [33, 24],
+        "label": "frame 4 / 5",
+        "moved": True,
+        "home": "frame 1 / 5true",
+        "last": "frame 5 / 5",
+        "playing": "pause",
+        "clip": "inset(0px 75% 0px 0px)",
+        "under": True,
+        "wide": True,
+    }
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium to look at the page with")
+def test_a_screenshot_is_not_blank(folder, tmp_path):
+    """Dark and bright parts of the pictures are both there."""
     from PIL import Image
 
     page, picture = tmp_path / "page.html", tmp_path / "page.png"
     page.write_text(report.build(folder))
-    options = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-sync"
-    command = ["chromium", *options.split(), f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=3000"]
-    subprocess.run([*command, f"--screenshot={picture}", page.as_uri()], check=True, capture_output=True, timeout=120)
+    chromium(f"--screenshot={picture}", page.as_uri(), profile=tmp_path / "profile")
     pixels = np.asarray(Image.open(picture).convert("L"))
     assert (pixels < 60).mean() > 0.005
     assert (pixels > 200).mean() > 0.2
