@@ -1,14 +1,14 @@
 # make demo    scenes -> few-bit frames -> restored video, as one page: out/demo/index.html
 # make test    the quick tests (about five minutes); make test-slow: the long ones
-# make lint    style and types
+# make lint    style and types; make docs: the pages of docs/ into out/site
 
 PYTHON ?= python3
 BIN := .venv/bin
-EXTRAS := train,cluster,denoise,video,formats,dev
+EXTRAS := train,cluster,denoise,video,formats,docs,dev
 # One thread per test process: two processes share two cores.
 TEST_ENV := OMP_NUM_THREADS=1 PYTHONWARNINGS=error::SyntaxWarning
 
-.PHONY: setup demo test test-slow lint clean
+.PHONY: setup demo test test-slow lint docs clean
 
 setup: .venv/.ready
 
@@ -33,6 +33,9 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: setup
+	$(BIN)/mkdocs build --strict --quiet
 
 clean:
 	rm -rf out .venv build *.egg-info
