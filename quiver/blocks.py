@@ -311,10 +311,34 @@ class Refinement(nn.Module):
         return self.hidden(g), self.next_picture(picture)
 
 
+class Hourglass(nn.Module):
+    """Convolutions at full, half and quarter scale, each joined to the next finer one (Ronneberger et al. 2015)."""
+
+    def __init__(self, inputs: int, width: int, outputs: int) -> None:
+        super().__init__()
+        w = width
+        self.down1 = nn.Sequential(*_gelu_chain((inputs, w, w)), nn.GELU())
+        self.down2 = nn.Sequential(*_gelu_chain((w, 2 * w, 2 * w)), nn.GELU())
+        self.bottom = nn.Sequential(*_gelu_chain((2 * w, 2 * w, 2 * w)), nn.GELU())
+        self.up2 = nn.ConvTranspose2d(2 * w, 2 * w, 2, stride=2)
+        self.merge2 = nn.Sequential(*_gelu_chain((4 * w, 2 * w, 2 * w)), nn.GELU())
+        self.up1 = nn.ConvTranspose2d(2 * w, w, 2, stride=2)
+        self.merge1 = nn.Sequential(*_gelu_chain((2 * w, w, w)), nn.GELU())
+        self.leave = conv(w, outputs, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[N, inputs, h, w] -> [N, outputs, h, w], h and w multiples of 4."""
+        full = self.down1(x)
+        half = self.down2(F.avg_pool2d(full, 2))
+        quarter = self.bottom(F.avg_pool2d(half, 2))
+        half = self.merge2(join(self.up2(quarter), half))
+        return self.leave(self.merge1(join(self.up1(half), full)))
+
+
 class Baseline(nn.Module):
     """Not part of the published design: a first picture from the window of pre-denoised frames, for quick learning.
 
-    A learnt mean over time plus a few convolutions over the stacked frames; before training it is a Gaussian mean.
+    A learnt mean over time plus an hourglass over the stacked frames; before training it is about a Gaussian mean.
     """
 
     SIGMA = 1.5  # frames
@@ -323,12 +347,12 @@ class Baseline(nn.Module):
         super().__init__()
         weights = [math.exp(-0.5 * ((t - RADIUS) / self.SIGMA) ** 2) for t in range(WINDOW)]
         self.weights = nn.Parameter(torch.tensor([weight / sum(weights) for weight in weights]))
-        self.layers = nn.Sequential(*_gelu_chain((WINDOW * image, width, width, width, image)))
+        self.correction = Hourglass(WINDOW * image, width, image)
 
     def forward(self, window: Sequence[Tensor]) -> Tensor:
         """Eleven frames [N, f2, h, w] -> [N, f2, h, w]."""
         mean = sum((w * frame for w, frame in zip(self.weights, window, strict=True)), torch.zeros_like(window[0]))
-        return mean + self.layers(join(*window))
+        return mean + self.correction(join(*window))
 
 
 def _gelu_chain(widths: Sequence[int]) -> list[nn.Module]:

@@ -102,7 +102,7 @@ def _add_train(sub: Any) -> None:
     parser.add_argument("--batch", type=count, help="windows per step and process")
     parser.add_argument("--learning-rate", type=positive, help="of Adam")
     parser.add_argument("--schedule", choices=("cosine", "plateau"), help="of the learning rate")
-    parser.add_argument("--loss", choices=("published", "paper", "l1"))
+    parser.add_argument("--loss", choices=("published", "paper", "l1", "scales-l1"))
     parser.add_argument("--validate-every", type=count, help="steps")
     parser.add_argument("--validation-split", choices=("train", "val", "test"), help="default val")
     parser.add_argument("--workers", type=nonnegative, help="processes that draw samples (default 0: this one)")

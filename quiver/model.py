@@ -298,7 +298,7 @@ def start_from_baseline(network: QUIVER) -> None:
     the next scale start at zero.
     """
     assert network.baseline is not None
-    last = [network.refine4.picture[-1], network.refine.picture[-1], network.baseline.layers[-1]]
+    last = [network.refine4.picture[-1], network.refine.picture[-1], network.baseline.correction.leave]
     if network.denoiser is not None:
         last.append(network.denoiser.leave)
     with torch.no_grad():
