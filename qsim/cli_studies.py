@@ -293,10 +293,10 @@ def _doublings(low: float, high: float) -> int:
 
 def add_validate(sub: Any) -> None:
     parser = command(
-        sub, "validate", _run_validate, "Measure sensor engines or the renderer here: speed against error, hard cases.",
-        "qsim validate sensor --json -o out/sensor.png\nqsim validate render -o out/render.png",
+        sub, "validate", _run_validate, "Measure sensor engines, the renderer or reading here: speed against error.",
+        "qsim validate sensor --json -o out/sensor.png\nqsim validate render -o out/render.png\nqsim validate reading",
     )  # fmt: skip
-    parser.add_argument("what", choices=["sensor", "render"], help="what to validate")
+    parser.add_argument("what", choices=["sensor", "render", "reading"], help="what to validate")
     parser.add_argument("-o", "--output", type=Path, help="figure of speed against error (.png, .svg or .pdf)")
     parser.add_argument("--pixels", type=int, default=1 << 20, help="pixels of a draw (default 1048576)")
     parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the draws (default 0)")
@@ -311,6 +311,8 @@ def add_validate(sub: Any) -> None:
 def _run_validate(args: argparse.Namespace) -> int:
     from qsim import validate
 
+    if args.what == "reading":
+        return _validate_reading(args)
     if args.output is not None:
         validate.check_figure(args.output)
         refuse_existing(args.output, args.force)
@@ -320,6 +322,16 @@ def _run_validate(args: argparse.Namespace) -> int:
     if args.output is not None:
         validate.figure(report, args.output)
     output(args, report.to_dict(), validate.table(report))
+    return 0 if report.ok else 1
+
+
+def _validate_reading(args: argparse.Namespace) -> int:
+    from qsim import validate_reading
+
+    if args.output is not None:
+        raise ValueError("validate reading: prints numbers and draws no figure; leave out --output")
+    report = validate_reading.run(seed=args.seed)
+    output(args, report.to_dict(), report.lines())
     return 0 if report.ok else 1
 
 

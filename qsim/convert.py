@@ -94,13 +94,11 @@ def _import(args: argparse.Namespace) -> list[Path]:
     hints = Hints(args.layout, args.height, args.width, args.bits, args.transfer, args.channel, args.flip, args.columns,
                   args.stretched)  # fmt: skip
     capture = formats.Capture(args.frame_rate, args.exposure, args.sensor, args.ppp, args.split)
-    pairs = [(args.input, args.output)]
-    if args.input.is_dir() and args.layout in (None, "video"):
-        videos = sorted(file for file in args.input.rglob("*") if file.suffix.lower() in formats.VIDEOS)
-        pairs = [(file, args.output / check_name(_flat_name(file, args.input))) for file in videos] or pairs
+    found = formats.recordings(args.input, args.layout)
+    pairs = [(source, args.output / check_name(_flat_name(source, args.input))) for source in found]
     made = []
     with bar("converting") as progress:
-        for source, target in pairs:
+        for source, target in pairs or [(args.input, args.output)]:
             footage = formats.read(source, hints)
             make = formats.to_clip if footage.is_light else formats.to_stream
             made.append(make(footage, target, capture, force=args.force, progress=progress).path)
@@ -108,5 +106,6 @@ def _import(args: argparse.Namespace) -> list[Path]:
 
 
 def _flat_name(file: Path, folder: Path) -> str:
-    """`scene/clip.mp4` below `folder` as `scene_clip`."""
-    return "_".join(file.relative_to(folder).with_suffix("").parts).replace(" ", "_")
+    """`scene/clip.mp4` (or the folder `scene/clip`) below `folder` as `scene_clip`."""
+    inside = file.relative_to(folder)
+    return "_".join((inside if file.is_dir() else inside.with_suffix("")).parts).replace(" ", "_")

@@ -66,6 +66,10 @@ def _cube(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any
 
 
 def _mp4(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+    if isinstance(source, Stream) and source.bits > 8:
+        raise ValueError(
+            f"{source.path}: a video holds 8 bits per pixel, this stream has {source.bits}; use png or zarr"
+        )
     video.write_video(path, _grey(source, wanted, meta), wanted.playback, lossless=wanted.lossless)
 
 

@@ -38,6 +38,7 @@ LAYOUTS: dict[str, Reader] = {  # the names of --layout
     "spike": planes.read_spike,
 }
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv")
+PICTURES = {".png": "png", ".tif": "tiff", ".tiff": "tiff"}
 _SMALL = 8_388_608  # bytes that three raw layouts share
 
 
@@ -58,6 +59,24 @@ def detect(path: Path) -> str:
     if suffix == ".bin":
         return _detect_raw(path)
     raise ValueError(f"{path}: unknown kind of file; say which with --layout: {', '.join(LAYOUTS)}")
+
+
+def recordings(folder: Path, layout: str | None) -> list[Path]:
+    """What a folder of many recordings holds: videos anywhere below it (I2-2000FPS), or folders of pictures (X4K).
+
+    Empty if `folder` is a file, or one recording itself.
+    """
+    if not folder.is_dir() or layout not in (None, "video", "png", "tiff"):
+        return []
+    if layout in (None, "video"):
+        videos = sorted(file for file in folder.rglob("*") if file.suffix.lower() in VIDEOS)
+        if videos or layout == "video":
+            return videos
+    if any(item.is_file() for item in folder.iterdir()):
+        return []
+    kinds = (layout,) if layout else ("png", "tiff")
+    places = {file.parent for file in folder.rglob("*") if PICTURES.get(file.suffix.lower()) in kinds}
+    return sorted(place for place in places if not any(place.glob("*.npy")))
 
 
 def read(path: Path, hints: Hints | None = None) -> Footage:
@@ -192,6 +211,8 @@ def _sensor(footage: Footage, capture: Capture, devices: Any) -> Any:
 def _detect_folder(path: Path) -> str:
     if (path / "transforms.json").is_file():
         return "visionsim"
+    if (path / "transforms.db").is_file():
+        raise ValueError(f"{path}: describes its frames in transforms.db; let visionsim write a transforms.json")
     if any((path / name).is_file() for name in ("zarr.json", ".zgroup", ".zarray")):
         return "zarr"
     if (path / "info.json").is_file() or any(path.glob("part_*.mat")):

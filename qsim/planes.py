@@ -163,7 +163,9 @@ def read_zarr(path: Path, hints: Hints) -> Footage:
             raise ValueError(f"{path}: expected unsigned codes, found {array.dtype}")
         if array.nchunks_initialized < array.nchunks:
             stored = f"{array.nchunks_initialized} of {array.nchunks} chunks are there"
-            raise ValueError(f"{path}: {stored}; the recording is incomplete")
+            raise ValueError(
+                f"{path}: {stored}; the recording is incomplete (or its dark chunks were left out: write them too)"
+            )
         if np.prod(array.chunks, dtype=float) > 1 << 31:
             raise ValueError(f"{path}: chunks of {array.chunks} pixels are too large to read")
     bits = hints.bits or 1

@@ -184,7 +184,10 @@ def write_zarr(folder: Path, blocks: Iterator[Array], shape: tuple[int, int, int
     start = 0
     for block in blocks:
         if array is None:
-            array = group.create_array("frames", shape=shape, chunks=(per_chunk, *shape[1:]), dtype=block.dtype)
+            chunks = (per_chunk, *shape[1:])
+            array = group.create_array(
+                "frames", shape=shape, chunks=chunks, dtype=block.dtype, config={"write_empty_chunks": True}
+            )  # dark chunks too: a reader cannot tell one that was left out from one that was lost
         array[start : start + len(block)] = block
         start += len(block)
 

@@ -67,6 +67,14 @@ def make_slowly(job: Job, path: Path) -> Clip:
     return make(job, path)
 
 
+def make_once_allowed(job: Job, path: Path) -> Clip:
+    """The same clip, but not before a file `go` is in the data set's folder."""
+    end = time.monotonic() + 120
+    while not (path.parents[1] / "go").exists() and time.monotonic() < end:
+        time.sleep(0.02)
+    return make(job, path)
+
+
 def fail_on_tumble(job: Job, path: Path) -> Clip:
     """Fails as a bad scene would."""
     if job.family == "tumble":

@@ -242,8 +242,10 @@ def test_generate_reports_failures_and_resumes(
 
 def test_ctrl_c_says_how_to_go_on(tmp_path: Path):
     """In a process of its own: SIGINT in the middle, exit code 130, one line; the same command finishes."""
-    code = "import sys, fakes; from qsim import dataset, cli; g = dataset.generate;"
-    code += "dataset.generate = lambda *args, run: g(*args, make=fakes.make_slowly);"
+    # A shell's background job ignores SIGINT, and its children with it: begin as a terminal's job does.
+    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
+    code += "import sys, fakes; from qsim import dataset, cli; g = dataset.generate;"
+    code += "dataset.generate = lambda *args, run: g(*args, make=fakes.make_once_allowed);"
     code += "sys.exit(cli.main(sys.argv[1:]))"
     recipe_path = tmp_path / "r.toml"
     recipe_path.write_text(fakes.RECIPE)
@@ -260,6 +262,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path: Path):
     assert first.returncode == 130
     assert "interrupted; the same command goes on where it stopped" in err
     assert "Traceback" not in err
+    (tmp_path / "d" / "go").touch()
     subprocess.run(line, env=env, check=True, capture_output=True)
     assert dataset.Dataset.open(tmp_path / "d").verify() == []
 

@@ -125,6 +125,71 @@ def test_codes_through_our_stream_and_every_export(tmp_path: Path, bits: int, wi
         )
 
 
+SIZES = st.tuples(st.integers(1, 5), st.integers(1, 9), st.integers(1, 70))
+
+
+@settings(max_examples=30, deadline=None)
+@given(shape=SIZES, bits=st.integers(1, 16), seed=st.integers(0, 99))
+def test_codes_of_any_size_and_depth_come_back(
+    tmp_path_factory: pytest.TempPathFactory, shape: tuple[int, int, int], bits: int, seed: int
+):
+    """Stream -> PNG, zarr (and cube, MATLAB's parts) -> the same codes, whatever the size."""
+    folder = tmp_path_factory.mktemp("any")
+    values = np.random.default_rng(seed).integers(0, 2**bits, shape).astype(np.uint8 if bits <= 8 else np.uint16)
+    np.save(folder / "codes.npy", values)
+    stream = formats.to_stream(formats.read(folder / "codes.npy", Hints("codes", bits=bits)), folder / "s", CAPTURE)
+    np.testing.assert_array_equal(stream.codes(), values)
+    assert (stream.meta["bit_order"], stream.meta["orientation"], stream.meta["width"]) == ("msb", "upright", shape[2])
+    for kind in ("png", "zarr", "cube") if bits == 1 else ("png", "zarr"):
+        path = export.export(stream, folder / kind, Export(kind))
+        np.testing.assert_array_equal(everything(path, layout=kind, bits=bits, width=shape[2]), values)
+    if bits <= 8:
+        from scipy.io import savemat
+
+        cut = seed % shape[0]  # parts of unequal length, or one part alone
+        for k, part in enumerate([values[:cut], values[cut:]] if cut else [values], 1):
+            (folder / "mat").mkdir(exist_ok=True)
+            savemat(folder / "mat" / f"part_{k}.mat", {"OUTPUT": part.transpose(1, 2, 0)})
+        np.testing.assert_array_equal(everything(folder / "mat", bits=bits), values)
+    shutil.rmtree(folder)
+
+
+@settings(max_examples=15, deadline=None)
+@given(shape=SIZES, seed=st.integers(0, 99))
+def test_light_of_any_size_comes_back(tmp_path_factory: pytest.TempPathFactory, shape: tuple[int, int, int], seed: int):
+    """Clip -> EXR and zarr exactly, lossless mp4 and PNG to half a step of 8 bits."""
+    from qsim import exr
+
+    pytest.importorskip("av")
+    zarr = pytest.importorskip("zarr")
+    folder = tmp_path_factory.mktemp("light")
+    light = np.random.default_rng(seed).random(shape).astype(np.float16).astype(np.float32)
+    clip = clip_of(folder / "c", light)
+    path = export.export(clip, folder / "exr", Export("exr"))
+    np.testing.assert_array_equal(np.stack([exr.read(path / f"{t:06d}.exr")["Y"] for t in range(shape[0])]), light)
+    path = export.export(clip, folder / "z", Export("zarr"))
+    np.testing.assert_array_equal(zarr.open_group(str(path), mode="r")["frames"][...], light)
+    for kind in ("mp4", "png"):
+        path = export.export(clip, folder / f"c.{kind}", Export(kind, transfer="linear", white=1.0))
+        np.testing.assert_allclose(everything(path, transfer="linear"), light, atol=0.5 / 255 + 1e-6)
+    shutil.rmtree(folder)
+
+
+@settings(max_examples=30, deadline=None)
+@given(shape=SIZES, channels=st.integers(1, 3), seed=st.integers(0, 99))
+def test_visionsim_folders_of_any_size(
+    tmp_path_factory: pytest.TempPathFactory, shape: tuple[int, int, int], channels: int, seed: int
+):
+    folder = tmp_path_factory.mktemp("vs")
+    expected = random_planes(*shape, channels, seed=seed)
+    np.save(folder / "frames.npy", np.packbits(expected, axis=2))
+    info = {"w": shape[2], "h": shape[1], "c": channels, "bitpack": True, "bitpack_dim": 2}
+    (folder / "transforms.json").write_text(json.dumps(info))
+    for channel in range(channels):
+        np.testing.assert_array_equal(everything(folder, channel=channel), expected[..., channel])
+    shutil.rmtree(folder)
+
+
 @pytest.mark.parametrize("kind", ["half", "full", "spad512s", "spad512s with footer"])
 @pytest.mark.parametrize("frames", [1, 3])
 def test_raw_camera_files(tmp_path: Path, kind: str, frames: int):
@@ -403,6 +468,26 @@ def test_a_folder_of_videos_becomes_clips(tmp_path: Path):
     assert Clip.open(tmp_path / "out" / "test_00000").frame_rate == 2000.0
 
 
+def test_a_tree_of_picture_folders_becomes_clips(tmp_path: Path):
+    """As X4K1000FPS's test set has it: test/Type1/TEST01/0000.png ..."""
+    images = np.random.default_rng(0).integers(0, 255, (3, 9, 7)).astype(np.uint8)
+    for n, name in enumerate(["Type1/TEST01_000_f0433", "Type1/TEST02", "Type2/v1.0"]):
+        (tmp_path / "in" / name).mkdir(parents=True)
+        video.write_png(tmp_path / "in" / name, iter(images[: n + 1]))
+    (tmp_path / "in" / "scene").mkdir()  # planes with their pictures beside them are another kind
+    np.save(tmp_path / "in" / "scene" / "0.npy", np.zeros((2, 3, 4), np.uint8))
+    video.write_png(tmp_path / "in" / "scene", iter(images))
+    options = ["--frame-rate", "1000", "--transfer", "srgb", "--split", "test"]
+    assert main(["convert", str(tmp_path / "in"), str(tmp_path / "out"), *options]) == 0
+    found = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert found == ["Type1_TEST01_000_f0433", "Type1_TEST02", "Type2_v1.0"]
+    clip = Clip.open(tmp_path / "out" / "Type2_v1.0")
+    assert clip.shape == (3, 9, 7)
+    np.testing.assert_allclose(clip.radiance(2), to_linear(images[2], "srgb", 255), rtol=2**-10)
+    assert main(["convert", str(tmp_path / "in" / "Type2" / "v1.0"), str(tmp_path / "one"), *options]) == 0
+    assert Clip.open(tmp_path / "one").shape == (3, 9, 7)
+
+
 def test_light_out_as_exr_png_and_zarr(tmp_path: Path):
     from qsim import exr
 
@@ -475,6 +560,10 @@ def test_detection_by_name_signature_and_type(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match="no such file"):
         formats.read(tmp_path / "none.npy")
     (tmp_path / "empty").mkdir()
+    (tmp_path / "visionsim").mkdir()
+    (tmp_path / "visionsim" / "transforms.db").touch()
+    with pytest.raises(ValueError, match=r"let visionsim write a transforms\.json"):
+        formats.read(tmp_path / "visionsim")
     with pytest.raises(ValueError, match="a folder of no known kind"):
         formats.read(tmp_path / "empty")
 
@@ -496,7 +585,13 @@ def test_wrong_kinds_are_refused_with_advice(tmp_path: Path):
         formats.to_stream(light, tmp_path / "s", CAPTURE)
     stream = formats.to_stream(codes, tmp_path / "s", CAPTURE)
     clip = formats.to_clip(light, tmp_path / "c", CAPTURE)
-    for source, kind, message in [(clip, "cube", "a clip holds light"), (stream, "exr", "EXR holds light")]:
+    np.save(tmp_path / "deep.npy", np.full((2, 3, 4), 1000, np.uint16))
+    deep = formats.to_stream(formats.read(tmp_path / "deep.npy", Hints("codes", bits=10)), tmp_path / "d", CAPTURE)
+    for source, kind, message in [
+        (clip, "cube", "a clip holds light"),
+        (stream, "exr", "EXR holds light"),
+        (deep, "mp4", "a video holds 8 bits per pixel, this stream has 10"),
+    ]:
         with pytest.raises(ValueError, match=message):
             export.export(source, tmp_path / "out", Export(kind))
         assert not (tmp_path / "out").exists()
