@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 GAMMA = 2.2  # the one tone curve of every picture
+AVERAGE = 11  # frames of a plain average, the window of QUIVER
 
 
 def peak(stack: NDArray[np.floating]) -> float:

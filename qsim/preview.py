@@ -25,7 +25,6 @@ from qsim.stream import Progress
 
 Picture = NDArray[np.uint8]  # [H, W, 3]
 
-AVERAGE = 11  # frames of the plain average, the window of QUIVER
 SAMPLES = 16  # frames that decide the scales of a clip
 KINDS = ("sharp", "radiance", "codes", "average", "flow", "depth")  # that --what knows
 CURVE = f"(value / white)^(1/{pictures.GAMMA:g})"
@@ -151,7 +150,7 @@ def _light_view(kind: str, title: str, unit: str, length: int, read: Callable[[i
 
 def _code_views(name: str, bits: int, length: int, read: Callable[[int, int], NDArray[Any]]) -> dict[str, View]:
     top = 2**bits - 1
-    reach = AVERAGE // 2
+    reach = pictures.AVERAGE // 2
 
     def average(t: int) -> NDArray[np.float64]:
         mean: NDArray[np.float64] = read(max(t - reach, 0), min(t + reach + 1, length)).mean(axis=0) / top
@@ -162,7 +161,7 @@ def _code_views(name: str, bits: int, length: int, read: Callable[[int, int], ND
 
     white = pictures.peak(np.stack([average(t) for t in _samples(length)]))
     shown = f"codes of {name}: 0 black, {top} white, no curve"
-    mean = f"plain average of {AVERAGE} frames: white = {white * top:.4g} codes, curve {CURVE}"
+    mean = f"plain average of {pictures.AVERAGE} frames: white = {white * top:.4g} codes, curve {CURVE}"
     return {
         "codes": View("codes", shown, code, None, {"bits": bits}),
         "average": View("average", mean, lambda t: _grey(pictures.tone(average(t), white)), None, {"white": white}),

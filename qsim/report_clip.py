@@ -15,7 +15,6 @@ from qsim.stream import electrons_per_photon
 
 FRAMES = 48  # of a player
 WIDTH = 512  # columns of a panel; wider pictures are shown smaller by a whole factor
-AVERAGE = 11  # frames of the plain average, the window of QUIVER
 MOVING = 0.05  # px/frame from which a pixel counts as moving
 _PIXELS = 4096  # of a frame, at most, for the expected histogram of codes
 
@@ -38,7 +37,7 @@ def truth_stack(clip: Clip, frames: range) -> NDArray[np.float32]:
 
 def stream_panels(stream: Stream, frames: range) -> list[page.Panel]:
     """Codes as they are, and the plain average of up to 11 frames around each."""
-    reach = AVERAGE // 2
+    reach = pictures.AVERAGE // 2
     first, last = max(frames.start - reach, 0), min(frames.stop + reach, len(stream))
     codes = stream.codes(first, last)
     bits = int(stream.meta["bits"])
@@ -46,9 +45,10 @@ def stream_panels(stream: Stream, frames: range) -> list[page.Panel]:
         [codes[max(t - reach - first, 0) : t + reach + 1 - first].mean(axis=0) / (2**bits - 1) for t in frames]
     )
     shown = codes[frames.start - first : frames.stop - first]
+    shown_average = pictures.tone(averages, pictures.peak(averages))
     return [
         page.Panel(f"codes, {bits} bit ({stream.name})", fit(pictures.code_levels(shown, bits))),
-        page.Panel(f"plain average of {AVERAGE} frames", fit(pictures.tone(averages, pictures.peak(averages)))),
+        page.Panel(f"plain average of {pictures.AVERAGE} frames", fit(shown_average)),
     ]
 
 
