@@ -21,15 +21,15 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import __version__, codes, files, optics
+from qsim.drawing import Draw, plane_of, prepare
+from qsim.footage import reading
 
 if TYPE_CHECKING:
     from qsim.clip import Clip
-    from qsim.keys import Key
     from qsim.sensor import Sensor
 
 FORMAT_VERSION = 1
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-_BLOCK_PIXELS = 1 << 22  # photons held in memory at a time while sensing: 32 MiB of float64
 
 Progress = Callable[[int, int], None]  # (frames done, frames in all)
 
@@ -51,6 +51,10 @@ class Stream:
         for key in ("shape", "bits", "width", "sensor", "ppp_factor", "exposure", "frame_rate"):
             if key not in meta:
                 raise ValueError(f"{json_path}: key '{key}' is missing; the file is damaged, sense again with --force")
+        for key, good in _GOOD.items():
+            if not good(meta[key]):
+                found = f"{key} = {meta[key]!r}"[:80]
+                raise ValueError(f"{json_path}: {found} cannot be; the file is damaged, sense again with --force")
         return Stream(json_path.with_suffix(".npy") if json_path.suffix == ".json" else json_path, meta)
 
     def __len__(self) -> int:
@@ -93,7 +97,7 @@ class Stream:
     def sensor(self) -> Sensor:
         from qsim import devices
 
-        return devices.from_dict(self.meta["sensor"])
+        return devices.from_dict(self.meta["sensor"], where=f"{self.path.with_suffix('.json')}: sensor")
 
     @cached_property
     def packed(self) -> Array:
@@ -102,10 +106,8 @@ class Stream:
         expected = (frames, height, codes.packed_width(width, self.bits))
         if not self.path.is_file():
             raise FileNotFoundError(f"{self.path}: no such file, though its json is there; sense again with --force")
-        try:
+        with reading(self.path, ".npy; sense again with --force"):
             array = np.load(self.path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, EOFError) as error:
-            raise ValueError(f"{self.path}: not readable as .npy ({error}); sense again with --force") from None
         if array.shape != expected or array.dtype != np.uint8:
             raise ValueError(
                 f"{self.path}: expected uint8 {list(expected)}, found {array.dtype} {list(array.shape)}; "
@@ -138,6 +140,21 @@ class Stream:
         return []
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < float("inf")
+
+
+_GOOD: dict[str, Callable[[Any], bool]] = {  # what a stream's json may say
+    "shape": lambda n: isinstance(n, list) and len(n) == 3 and all(type(i) is int and 0 < i < 2**40 for i in n),
+    "bits": lambda n: type(n) is int and 1 <= n <= 16,
+    "width": lambda n: type(n) is int,
+    "sensor": lambda described: isinstance(described, dict),
+    "ppp_factor": lambda factor: factor is None or _is_number(factor),
+    "exposure": _is_number,
+    "frame_rate": _is_number,
+}
+
+
 def check_crop(crop: optics.Crop, height: int, width: int, where: str) -> optics.Crop:
     """The crop (y, x, h, w) if it lies inside the frame, else `ValueError`."""
     y, x, h, w = crop
@@ -158,21 +175,37 @@ def write_stream(clip: Clip, name: str, codes_iter: Iterable[Array], sensor: Sen
 
     `meta` must hold shape (T, H, W), ppp_factor, exposure and frame_rate. `ValueError` if there are not T frames.
     """
+    shape = tuple(meta["shape"][1:])
+
+    def packed() -> Iterator[Array]:
+        done = 0
+        for block in codes_iter:
+            block = block if block.ndim == 3 else block[None]
+            if block.shape[1:] != shape:
+                raise ValueError(f"{clip.path}, {name}: frame {done} is {block.shape[1:]}, expected {shape}")
+            yield codes.pack(block, sensor.bits)
+            done += len(block)
+
+    return write_packed(clip, name, packed(), sensor, meta)
+
+
+def write_packed(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
+    """As `write_stream` for blocks that are packed already: uint8 [t, H, ceil(W bits / 8)]."""
     frames, height, width = meta["shape"]
     bits = sensor.bits
+    row = codes.packed_width(width, bits)
     folder = clip.path / "streams"
     folder.mkdir(exist_ok=True)
     json_path, path = folder / f"{check_name(name)}.json", folder / f"{name}.npy"
     json_path.unlink(missing_ok=True)  # from here on the old stream, if any, is not accepted any more
     done = 0
     with files.replacing(path) as file:
-        header = {"descr": "|u1", "fortran_order": False, "shape": (frames, height, codes.packed_width(width, bits))}
+        header = {"descr": "|u1", "fortran_order": False, "shape": (frames, height, row)}
         np.lib.format.write_array_header_1_0(file, header)
-        for block in codes_iter:
-            block = block if block.ndim == 3 else block[None]
-            if block.shape[1:] != (height, width):
-                raise ValueError(f"{path}: frame {done} is {block.shape[1:]}, expected {(height, width)}")
-            file.write(codes.pack(block, bits).tobytes())
+        for block in blocks:
+            if block.shape[1:] != (height, row) or block.dtype != np.uint8:
+                raise ValueError(f"{path}: packed frame {done} is {block.dtype} {block.shape[1:]}, not {(height, row)}")
+            file.write(np.ascontiguousarray(block).data)
             done += len(block)
         if done != frames:
             raise ValueError(f"{path}: got {done} frames, expected {frames}")
@@ -205,6 +238,8 @@ class Sensing:
     name: str | None = None  # of the stream; made from the rest if None
     group: bool = False  # a code sums 2^bits - 1 binary planes, each its own clip frame
     diffraction: bool = False  # blur by the lens's Airy pattern
+    defects: str | None = None  # .toml with a table [defects]; None: that of the sensor's file, if it has one
+    slices: int = 1  # clip frames in one exposure of a counting SPAD: light that changes inside it
 
     @property
     def stream_name(self) -> str:
@@ -218,50 +253,6 @@ class Sensing:
         seed = f"_seed{self.seed}" if self.seed else ""
         sensor = Path(self.sensor).name.removesuffix(".toml")
         return check_name(f"{sensor}{bits}_{light}{seed}")
-
-
-@dataclass(frozen=True)
-class Draw:
-    """A `Sensing` applied to one clip: everything that decides its codes."""
-
-    sensor: Sensor
-    plane: Sensor  # draws one clip frame; the same as `sensor` unless planes are summed
-    level: optics.LightLevel  # per clip frame
-    key: Key
-    planes: int  # clip frames per code
-    diffraction: bool
-
-    def frames(self, clip: Clip, start: int, stop: int) -> Array:
-        """Codes of stream frames start ... stop - 1, [stop - start, H, W]."""
-        first, last = start * self.planes, stop * self.planes
-        photons = np.stack(
-            [optics.clip_photons(clip, t, self.level.factor, diffraction=self.diffraction) for t in range(first, last)]
-        )
-        drawn = self.plane.sample(photons, clip.exposure, key=self.key.at(first))
-        if self.planes == 1:
-            return drawn
-        return drawn.reshape(-1, self.planes, *drawn.shape[1:]).sum(axis=1).astype(codes.code_dtype(self.sensor.bits))
-
-
-def prepare(clip: Clip, sensing: Sensing) -> Draw:
-    """The sensor, light factor and key for one clip; `ValueError` if they do not fit it."""
-    from qsim import devices, keys
-
-    planes = 1
-    if sensing.group:
-        if sensing.bits is None:
-            raise ValueError(f"{clip.name}: summing planes needs the bits of a code, as in --bits 3")
-        planes = 2**sensing.bits - 1
-        if len(clip) < planes:
-            raise ValueError(f"{clip.name}: {len(clip)} frames are too few for one code of {planes} planes")
-    target = None if sensing.ppp is None else sensing.ppp / planes
-    level = optics.light_level(clip, ppp=target, lux=sensing.lux)
-    sensor = devices.load(sensing.sensor, ppp=level.ppp * planes, bits=sensing.bits, exposure=clip.exposure * planes)
-    plane = sensor
-    if planes > 1:
-        plane = _single_plane(sensor, sensing.sensor)
-    key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
-    return Draw(sensor, plane, level, key, planes, sensing.diffraction)
 
 
 def describe(clip: Clip, sensing: Sensing, draw: Draw) -> dict[str, Any]:
@@ -285,7 +276,7 @@ def describe(clip: Clip, sensing: Sensing, draw: Draw) -> dict[str, Any]:
         "frame_rate": clip.frame_rate / draw.planes,
         "exposure": clip.exposure * draw.planes,
         "planes_per_code": draw.planes,
-    }
+    } | ({} if draw.flaws is None else {"defects": draw.flaws.to_dict()})
 
 
 def sense(clip: Clip, sensing: Sensing, *, force: bool = False, progress: Progress | None = None) -> tuple[Stream, str]:
@@ -296,54 +287,48 @@ def sense(clip: Clip, sensing: Sensing, *, force: bool = False, progress: Progre
     draw = prepare(clip, sensing)
     meta = describe(clip, sensing, draw)
     line = draw.level.line(clip, draw.planes * electrons_per_photon(draw.sensor))
+    missed = draw.missed(clip)
+    if missed is not None:
+        from qsim.events import TOLERANCE
+
+        draw = dataclasses.replace(draw, followed=missed if missed.largest > TOLERANCE else None)
+        meta["drawn_by"] = "events" if draw.followed else "closed form"
+        meta["dead_time_effects"] = dataclasses.asdict(missed)
+        line += f"; {missed}: {'photon by photon' if draw.followed else 'below ' + str(TOLERANCE) + ', closed form'}"
     json_path = clip.path / "streams" / f"{sensing.stream_name}.json"
     if json_path.is_file() and not force:
         old = Stream.open(json_path)
         if (
             all(old.meta.get(key) == value for key, value in meta.items())
+            and old.meta.get("defects") == meta.get("defects")
             and old.meta["sensor"] == draw.sensor.to_dict()
         ):
             return old, line
         raise FileExistsError(f"{json_path}: exists with other settings; name this stream with --name, or use --force")
-    stream = write_stream(clip, sensing.stream_name, _blocks(clip, draw, meta["shape"][0], progress), draw.sensor, meta)
-    return stream, line
+    blocks = draw.packed(clip, meta["shape"][0], progress)
+    return write_packed(clip, sensing.stream_name, blocks, draw.sensor, meta), line
 
 
 def replay(clip: Clip, stream: Stream, frame: int) -> tuple[Array, Array]:
     """One frame drawn again from the stream's json alone, and the stored one: both codes [H, W]."""
     if not 0 <= frame < len(stream):
         raise ValueError(f"{stream.path}: frame {frame} asked for, the stream has frames 0..{len(stream) - 1}")
+    from qsim import events, flaws
     from qsim.keys import Key
 
     meta = stream.meta
     planes = int(meta.get("planes_per_code", 1))
-    plane = stream.sensor if planes == 1 else _single_plane(stream.sensor, stream.name)
+    plane = plane_of(stream.sensor, planes)
     level = optics.LightLevel(stream.photons_factor, meta["ppp"] / planes, meta["mean_photons_before"] / planes, None)
     key = Key(seed=meta["seed"], clip=meta["clip_key"])
-    draw = Draw(stream.sensor, plane, level, key, planes, bool(meta.get("diffraction", False)))
+    where = f"{stream.path.with_suffix('.json')}: defects"
+    found = flaws.from_dict(meta["defects"], where) if "defects" in meta else None
+    followed = events.Effects(**meta["dead_time_effects"]) if meta.get("drawn_by") == "events" else None
+    draw = Draw(stream.sensor, plane, level, key, planes, bool(meta.get("diffraction", False)), found, followed)
     return draw.frames(clip, frame, frame + 1)[0], stream.codes(frame, frame + 1)[0]
-
-
-def _single_plane(sensor: Sensor, name: str) -> Sensor:
-    """The sensor of one binary plane of a sum of planes; `ValueError` if it does not sum planes."""
-    from qsim.spad import BinarySPAD
-
-    if not isinstance(sensor, BinarySPAD):
-        raise ValueError(f"{name}: only a clocked SPAD (BinarySPAD) sums planes, this is a {type(sensor).__name__}")
-    return dataclasses.replace(sensor, bits=1)
 
 
 def electrons_per_photon(sensor: Sensor) -> float:
     """Quantum or photon-detection efficiency of a sensor, for the line of light."""
     described = sensor.to_dict()
     return float(described.get("quantum_efficiency", described.get("pde", 1.0)))
-
-
-def _blocks(clip: Clip, draw: Draw, frames: int, progress: Progress | None) -> Iterator[Array]:
-    per_code = clip.shape[1] * clip.shape[2] * draw.planes
-    step = max(1, _BLOCK_PIXELS // per_code)
-    for start in range(0, frames, step):
-        stop = min(start + step, frames)
-        yield draw.frames(clip, start, stop)
-        if progress is not None:
-            progress(stop, frames)

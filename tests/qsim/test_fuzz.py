@@ -19,10 +19,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fakes import RECIPE
 
-from qsim import exr, formats, planes, video
+from qsim import exr, formats, planes, recipe, video
 from qsim.clip import RELATIVE, Clip, ClipWriter
 from qsim.footage import Hints
+from qsim.stream import Stream
 
 MEMORY = 400 << 20  # bytes that a reader of these tiny files may take at most
 T, H, W = 4, 6, 16
@@ -90,6 +92,30 @@ def make_zarr(folder: Path) -> None:
     video.write_zarr(folder, iter([some_planes()]), (T, H, W), {"fps": 1000})
 
 
+def make_raw(encode: Callable[[np.ndarray], bytes], height: int) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        (folder / "a.bin").write_bytes(encode(np.resize(some_planes(), (2, height, 512))))
+
+    return write
+
+
+def make_stream(folder: Path) -> None:
+    np.save(folder / "codes.npy", some_planes() * 5)
+    footage = formats.read(folder / "codes.npy", Hints("codes", bits=3))
+    formats.to_stream(footage, folder / "s", formats.Capture(1000.0))
+    (folder / "codes.npy").unlink()
+
+
+def read_stream(folder: Path) -> None:
+    stream = Stream.open(folder / "s.json")
+    assert stream.codes(0, min(len(stream), 9)).max() < 2**stream.bits
+    assert stream.sensor.levels == 2**stream.bits
+
+
+def make_recipe(folder: Path) -> None:
+    (folder / "r.toml").write_text(RECIPE)
+
+
 def make_clip(folder: Path) -> None:
     meta = {"shape": [T, H, W], "frame_rate": 9.0, "exposure": 0.1, "radiance_unit": RELATIVE, "camera": None}
     with ClipWriter(folder / "clip", meta) as writer:
@@ -131,7 +157,12 @@ FORMATS: dict[str, tuple[Callable[[Path], None], Callable[[Path], None]]] = {
     "mat 7.3": (make_mat73, reader(Hints())),
     "visionsim": (make_visionsim, reader(Hints())),
     "zarr": (make_zarr, reader(Hints())),
+    "swissspad2 half": (make_raw(planes.encode_half, 256), reader(Hints("swissspad2-half"), "a.bin")),
+    "swissspad2 full": (make_raw(planes.encode_full, 512), reader(Hints("swissspad2-full"), "a.bin")),
+    "spad512s": (make_raw(planes.encode_spad512s, 512), reader(Hints("spad512s"), "a.bin")),
     "clip": (make_clip, read_clip),
+    "stream": (make_stream, read_stream),
+    "recipe": (make_recipe, lambda folder: recipe.load(folder / "r.toml")),
 }
 
 
