@@ -128,7 +128,8 @@ def _run_report(args: argparse.Namespace) -> int:
     if args.output.suffix not in (".html", ".htm"):
         raise ValueError(f"{args.output}: a page is a .html file, as in -o {args.output.stem}.html")
     refuse_existing(args.output, args.force)
-    page = report.build(args.path, title=args.title, notes=args.note).encode()
+    with bar("drawing", "thing") as progress:
+        page = report.build(args.path, title=args.title, notes=args.note, progress=progress).encode()
     args.output.parent.mkdir(parents=True, exist_ok=True)
     files.write_bytes(args.output, page)
     found = {"page": str(args.output), "bytes": len(page)}

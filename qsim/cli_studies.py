@@ -318,7 +318,8 @@ def _run_validate(args: argparse.Namespace) -> int:
         refuse_existing(args.output, args.force)
     if args.what == "render":
         return _validate_render(args)
-    report = validate.run(args.pixels, args.seed, require_speed=args.require_speed)
+    with bar("measuring", "model") as progress:
+        report = validate.run(args.pixels, args.seed, require_speed=args.require_speed, progress=progress)
     if args.output is not None:
         validate.figure(report, args.output)
     output(args, report.to_dict(), validate.table(report))

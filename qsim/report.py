@@ -20,17 +20,37 @@ from qsim import files, page, pictures, report_tables
 from qsim.clip import Clip, Stream
 from qsim.dataset import Dataset
 from qsim.optics import clip_photons
-from qsim.recipe import SPLITS
 from qsim.report_clip import chosen_frames, clip_section, fit, flow_panel, legend, motion, stream_panels
+from qsim.stream import Progress
 
 INSIDE_CLIPS = {"streams", "truth", "radiance", "sharp", "jobs", "failed", "logs", "locks", "work"}
 
 
-def build(path: Path, *, title: str | None = None, notes: list[str] | None = None) -> str:
-    """The page for `path` as HTML text, with `notes` on top. `ValueError` if nothing under it is ours."""
+def build(
+    path: Path, *, title: str | None = None, notes: list[str] | None = None, progress: Progress | None = None
+) -> str:
+    """The page for `path` as HTML text, with `notes` on top. `ValueError` if nothing under it is ours.
+
+    `progress` is told how many of the things there are were drawn; a clip of a data set is one of them.
+    """
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
-    drawn = [_DRAW[kind](found) for kind in _DRAW for found in _known_files(path) if _kind(found) == kind]
+    kinds = {file: _kind(file) for file in _known_files(path)}
+    found = [(kind, file) for kind in _DRAW for file in kinds if kinds[file] == kind]
+    total = sum(_steps(kind, file) for kind, file in found)
+    done = 0
+    drawn = []
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    for kind, file in found:
+        drawn.append(dataset_section(file, step) if kind == "dataset" else _DRAW[kind](file))
+        if kind != "dataset":
+            step()
     if not drawn:
         raise ValueError(f"{path}: nothing to report; expected a clip, a data set, a restored video or an evaluation")
     words = [page.section("About this page", page.bullets(notes))] if notes else []
@@ -75,8 +95,13 @@ _KEYS = (
 )
 
 
-def dataset_section(path: Path) -> str:
-    """A table of the clips of a data set, and the first clip of each split in pictures."""
+def _steps(kind: str, file: Path) -> int:
+    """Things to draw for one file: the clips of a data set, otherwise one."""
+    return len(Dataset.open(file.parent).names()) if kind == "dataset" else 1
+
+
+def dataset_section(path: Path, step: Callable[[], None] = lambda: None) -> str:
+    """A table of the clips of a data set, `step` after each, and the first clip of each split in pictures."""
     data = Dataset.open(path.parent)
     rows = []
     for name in data.names():
@@ -87,6 +112,7 @@ def dataset_section(path: Path) -> str:
         size = f"{frames} × {height} × {width}"
         rows.append([name, split, size, clip.mean_radiance, clip.meta.get("mean_photons"), mean, largest,
                      clip.meta.get("psnr_of_truth")])  # fmt: skip
+        step()
     headers = [
         "clip", "split", "frames × rows × columns", "mean radiance", "photons per pixel",
         "motion of what moves [px/frame]", "largest", "truth's own PSNR [dB]",
@@ -94,7 +120,7 @@ def dataset_section(path: Path) -> str:
     missing = f"; not made yet: {', '.join(data.missing)}" if data.missing else ""
     caption = f"{len(rows)} clips{missing}; motion in the middle frame, of pixels that move 0.05 px or more"
     overview = page.section(f"Data set {data.name}", page.table(page.Table(caption, headers, rows)))
-    shown = [clip for split in ("test", "train", "val") if split in SPLITS for clip in data.clips(split)[:1]]
+    shown = [clip for split in ("test", "train", "val") for clip in data.clips(split)[:1]]
     return overview + "".join(clip_section(clip) for clip in shown)
 
 

@@ -29,6 +29,7 @@ from qsim.keys import Key
 from qsim.qis import QIS
 from qsim.sensor import Sensor
 from qsim.spad import BinarySPAD, CountingSPAD
+from qsim.stream import Progress
 
 EXPOSURE = 5e-4  # s, 2000 frames per second
 FALSE_ALARM = 1e-6  # of all statistical checks of one report together
@@ -84,15 +85,19 @@ class Report:
         return asdict(self) | {"ok": self.ok}
 
 
-def run(pixels: int = 1 << 20, seed: int = 0, *, require_speed: bool = False) -> Report:
+def run(
+    pixels: int = 1 << 20, seed: int = 0, *, require_speed: bool = False, progress: Progress | None = None
+) -> Report:
     """Measure everything on frames of 512 columns with about `pixels` pixels; seconds to a minute."""
     if pixels < 1 << 16:
         raise ValueError(f"pixels: a chi-square and a timing need at least 65536, got {pixels}")
     shape = (pixels // 512, 512)
     checks = 3 * 2 * len(MODELS)
     rows = []
-    for name, (sensor, photons, target) in MODELS.items():
+    for n, (name, (sensor, photons, target)) in enumerate(MODELS.items(), 1):
         rows += _measure(name, sensor, photons, target, shape, seed, checks, require_speed)
+        if progress is not None:
+            progress(n, len(MODELS) + 1)
     rows += _packed(shape, seed, require_speed)
     settings = {"seed": seed, "exposure": EXPOSURE, "fast_engine": kernels.available(), "rounds": _ROUNDS}
     return Report(

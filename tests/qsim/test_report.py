@@ -143,7 +143,9 @@ def test_expected_histogram_is_the_mean_of_the_exact_distribution(tmp_path):
 
 def test_a_data_set_is_a_table_and_a_clip_of_each_split(tmp_path):
     data = write_dataset(tmp_path / "tiny", {"train": 2, "val": 1, "test": 1})
-    page = report.build(data)
+    told: list[tuple[int, int]] = []
+    page = report.build(data, progress=lambda done, total: told.append((done, total)))
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert page.count('class="player"') == 3
     assert re.findall(r"<h2>(.*?)</h2>", page) == ["Data set tiny", "Clip test_0", "Clip train_0", "Clip val_0"]
     assert "4 clips; motion in the middle frame" in page
