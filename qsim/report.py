@@ -160,9 +160,9 @@ def _source(meta: dict[str, Any]) -> tuple[Clip | None, Stream | None]:
 
 
 _DRAW: dict[str, Callable[[Path], str]] = {
+    "restored": restored_section,  # moving pictures first
     "evaluation": report_tables.evaluation_section,
     "static": report_tables.static_section,
-    "restored": restored_section,
     "training": report_tables.training_section,
     "study": report_tables.study_section,
     "bench": report_tables.bench_section,
