@@ -113,10 +113,10 @@ def _show(args: argparse.Namespace, source: Any, views: list[Any], frames: range
 def add_report(sub: Any) -> None:
     parser = command(
         sub, "report", _run_report, "Draw one self-contained page of clips, data sets, runs, restored video, scores.",
-        "qsim report out/fan -o out/fan.html\nqsim report out/demo -o out/demo/index.html --title 'My run'",
+        "qsim report out/fan\nqsim report out/demo -o out/demo/index.html --title 'My run'",
     )  # fmt: skip
     parser.add_argument("path", type=Path, help="clip, data set, or any folder with such things in it")
-    parser.add_argument("-o", "--output", type=Path, required=True, help=".html file to write")
+    parser.add_argument("-o", "--output", type=Path, help=".html file to write (default: NAME.html here)")
     parser.add_argument("--title", help="of the page")
     parser.add_argument("--note", action="append", default=[], help="a line for the top of the page; may be repeated")
     parser.add_argument("--force", action="store_true", help="replace an existing page")
@@ -125,13 +125,14 @@ def add_report(sub: Any) -> None:
 def _run_report(args: argparse.Namespace) -> int:
     from qsim import report
 
-    if args.output.suffix not in (".html", ".htm"):
-        raise ValueError(f"{args.output}: a page is a .html file, as in -o {args.output.stem}.html")
-    refuse_existing(args.output, args.force)
+    target: Path = args.output or Path(f"{args.path.resolve().stem or 'report'}.html")
+    if target.suffix not in (".html", ".htm"):
+        raise ValueError(f"{target}: a page is a .html file, as in -o {target.stem}.html")
+    refuse_existing(target, args.force)
     with bar("drawing", "thing") as progress:
         page = report.build(args.path, title=args.title, notes=args.note, progress=progress).encode()
-    args.output.parent.mkdir(parents=True, exist_ok=True)
-    files.write_bytes(args.output, page)
-    found = {"page": str(args.output), "bytes": len(page)}
-    output(args, found, f"{args.output}: {len(page) / 1e6:.1f} MB, loads nothing from elsewhere; open it in a browser")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    files.write_bytes(target, page)
+    found = {"page": str(target), "bytes": len(page)}
+    output(args, found, f"{target}: {len(page) / 1e6:.1f} MB, loads nothing from elsewhere; open it in a browser")
     return 0

@@ -29,11 +29,12 @@ from quiver.options import (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; returns the exit code."""
-    from quiver.data import Parser, add_completion, run
+    from quiver.data import Parser, __version__, add_completion, run
 
     parser = Parser(
         prog="quiver", description="Restore blur-free video from few-bit quanta streams; train and compare."
     )
+    parser.add_argument("--version", action="version", version=f"quiver {__version__}")
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
     for add in (_add_train, _add_restore, _add_evaluate, _add_ablate, _add_bench, _add_convert_weights):
         add(sub)

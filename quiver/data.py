@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import devices, keys
+from qsim import __version__, devices, keys
 from qsim.clip import Clip
 from qsim.completion import add_completion
 from qsim.console import GOES_ON, STARTS_AGAIN, Parser, bar, command, output, run, suggest
@@ -38,6 +38,7 @@ __all__ = [
     "Parser",
     "Sensor",
     "Stream",
+    "__version__",
     "add_completion",
     "array_codes",
     "bar",

@@ -1,6 +1,7 @@
 """What all commands share: completion that knows every option, quiet and loud, warnings in one line, Ctrl-C."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -47,10 +48,36 @@ def test_bash_completes_commands_options_choices_and_files(capsys, tmp_path):
 
 
 @pytest.mark.parametrize("program", ["qsim", "quiver"])
+def test_every_help_has_an_example_that_is_understood(capsys, monkeypatch, program):
+    """And --json, --quiet, --verbose; the programs say their version."""
+    import shlex
+
+    import quiver.data
+
+    module, home = {"qsim": (qsim.cli, qsim.cli), "quiver": (quiver.cli, quiver.data)}[program]
+    assert module.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"{program} {qsim.__version__}\n"
+    module.main(["--help"])
+    commands = re.findall(r"^    ([a-z-]+)(?:  +\S|$)", capsys.readouterr().out, re.MULTILINE)
+    for command in commands:
+        module.main([command, "--help"])
+        text = capsys.readouterr().out
+        assert all(option in text for option in ("--json", "--quiet", "--verbose"))
+        examples = text.split("example:\n")[1].strip().split("\n")
+        for line in examples:
+            words = shlex.split(line.strip())
+            words = words[: next((i for i, word in enumerate(words) if word in (">", ">>")), len(words))]
+            assert words[0] in (program, "torchrun")
+            if words[0] == program:
+                assert words[1] == command
+                with monkeypatch.context() as patch:
+                    patch.setattr(home, "run", lambda parser, argv: parser.parse_args(argv))
+                    assert module.main(words[1:]) is not None
+
+
+@pytest.mark.parametrize("program", ["qsim", "quiver"])
 def test_every_option_is_in_every_script(capsys, program):
     """The options that the helps show, read from the helps."""
-    import re
-
     cli = {"qsim": qsim.cli.main, "quiver": quiver.cli.main}[program]
     scripts = {shell: completion(capsys, program, shell) for shell in ("bash", "zsh", "fish")}
     cli(["--help"])
