@@ -35,7 +35,8 @@ SMALLEST = 1 << 14  # pixels; below, compiling costs more than it brings
 _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # of Philox4x32; see keys.py
 _KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 _INFINITY = 0x7F800000  # float32; larger bit patterns are NaN or negative
-_CHUNK = 1 << 21  # pixels of small frames that share a launch
+_CHUNK = 1 << 19  # pixels of small frames that share a launch
+_LARGEST = 1 << 19  # pixels of a launch, at most 2^22; larger frames take several
 _CERTAIN = 80.0  # arrivals that are sure to bring 15: P(N < 15) = 1e-19
 _CONSTANT_PLANS = 32  # sensors of a process that get kernels of their own
 
@@ -62,15 +63,15 @@ def sample(
     left, width = origin[1] & 3, stack.shape[2]
     codes = np.empty(stack.shape, sensor.dtype)
     doubtful = []
-    for t, pairs, lanes in _frames(chosen, stack, key, origin, blocks=1):
-        padded = 2 * pairs.shape[1]
+    for t, top, pairs, lanes in _frames(chosen, stack, key, origin, blocks=1):
+        padded, rows = 2 * pairs.shape[1], slice(top, top + len(pairs))
         if padded == width:
-            codes[t].view(np.uint16)[...] = pairs
+            codes[t, rows].view(np.uint16)[...] = pairs
         else:
-            codes[t] = pairs.astype(np.uint16).view(np.uint8)[:, left : left + width]
+            codes[t, rows] = pairs.astype(np.uint16).view(np.uint8)[:, left : left + width]
         y, x = np.divmod(np.repeat(2 * lanes, 2) + np.tile([0, 1], lanes.size), padded)
         inside = (x >= left) & (x < left + width)
-        doubtful.append(np.stack([np.full(inside.sum(), t), y[inside], x[inside] - left]))
+        doubtful.append(np.stack([np.full(inside.sum(), t), y[inside] + top, x[inside] - left]))
     at = np.concatenate(doubtful, axis=1)
     if at.size:
         codes[tuple(at)] = draw_at(sensor, stack, exposure, key, origin, at)
@@ -95,20 +96,15 @@ def sample_packed(
     chosen = plan(sensor, exposure) if direct else None
     if chosen is None:
         return pack(sensor.sample(photons, exposure, key=key, origin=origin), sensor.bits)
-    frames, height, width = stack.shape
-    bits, row = sensor.bits, packed_width(width, sensor.bits)
-    packed = np.empty((frames, height, row), np.uint8)
+    width, bits = stack.shape[2], sensor.bits
+    row = packed_width(width, bits)
+    packed = np.empty((*stack.shape[:2], row), np.uint8)
     doubtful = []
-    for t, pairs, lanes in _frames(chosen, stack, key, origin, blocks=2, bits=bits):
-        eights = _join(_join(pairs, 2 * bits), 4 * bits)
-        if bits == 1:
-            packed[t] = eights[:, :row]
-        else:
-            size = eights.dtype.itemsize
-            whole = eights.byteswap().view(np.uint8).reshape(height, -1, size)[..., size - bits :]
-            packed[t] = whole.reshape(height, -1)[:, :row]
+    for t, top, pairs, lanes in _frames(chosen, stack, key, origin, blocks=2, bits=bits):
+        packed[t, top : top + len(pairs)] = _octets(pairs, bits)[:, :row]
         octets = np.unique(lanes // 4)
-        doubtful.append(np.stack([np.full(octets.size, t), *np.divmod(octets, eights.shape[1])]))
+        y, x = np.divmod(octets, pairs.shape[1] // 4)
+        doubtful.append(np.stack([np.full(octets.size, t), y + top, x]))
     if width * bits % 8:
         packed[..., -1] &= 0xFF << (8 * row - width * bits) & 0xFF
     at = np.concatenate(doubtful, axis=1)
@@ -134,6 +130,17 @@ def steps(sensor: Sensor, photons: Array, exposure: float) -> Array:
     values, unit = _steps(chosen.steps, mean, scalars)
     columns = [(value / unit).numpy().astype(float) for value in values]
     return np.stack(np.broadcast_arrays(*columns, photons)[:-1], axis=1)
+
+
+def _octets(pairs: Array, bits: int) -> Array:
+    """Rows of bytes of rows of pairs of codes: [H, 4 n] numbers of 2 `bits` each -> bytes [H, n bits]."""
+    if bits == 1:
+        # Four bytes of two bits: the product brings them side by side into the highest byte, and no other bits there
+        return (pairs.view(np.uint32) * np.uint32(0x40100401)) >> np.uint32(24)
+    eights = _join(_join(pairs, 2 * bits), 4 * bits)
+    size = eights.dtype.itemsize
+    whole = eights.byteswap().view(np.uint8).reshape(*eights.shape, size)[..., size - bits :]
+    return whole.reshape(len(eights), -1)
 
 
 def _join(numbers: Array, bits: int) -> Array:
@@ -169,40 +176,44 @@ def _write_octets(
 
 def _frames(
     chosen: Plan, stack: Array, key: Key, origin: tuple[int, int], blocks: int, bits: int | None = None
-) -> Iterator[tuple[int, Array, Array]]:
-    """For each frame t: t, what the kernel wrote [H, lanes of a row], indices of the doubtful lanes.
+) -> Iterator[tuple[int, int, Array, Array]]:
+    """Parts of frames: frame, first row, what the kernel wrote [rows, lanes of a row], indices of its doubtful lanes.
 
-    Rows are padded to whole groups of `blocks` Philox blocks of the full frame. Small frames share a launch.
+    Rows are padded to whole groups of `blocks` Philox blocks of the full frame. Small frames share a launch, large ones
+    take several.
     """
     frames, height, width = stack.shape
     left = origin[1] & 3
     padded = -(-(left + width) // (4 * blocks)) * 4 * blocks
-    lanes = height * padded // 2  # of a frame
-    together = min(frames, max(1, _CHUNK // (2 * lanes)))
+    rows = min(height, max(1, _LARGEST // padded))  # of a launch
+    together = min(frames, max(1, _CHUNK // (height * padded))) if rows == height else 1
     direct = padded == width and stack.dtype == np.float32 and stack.flags.c_contiguous
-    light = np.zeros((0 if direct else together, height, padded), np.float32)
-    fixed = _fixed_scalars(key, origin, height, padded // 2)
+    light = np.zeros((0 if direct else together, rows, padded), np.float32)
+    fixed = _fixed_scalars(key, origin, padded // 2)
 
-    def launch(t: int) -> tuple[int, int, list[Any]]:
-        n = min(together, frames - t)
+    def launch(t: int, top: int) -> tuple[int, int, int, list[Any]]:
+        n, h = min(together, frames - t), min(rows, height - top)
+        part = stack[t : t + n, top : top + h]
         if not direct:
             with np.errstate(over="ignore"):  # beyond float32 the reference decides
-                light[:n, :, left : left + width] = stack[t : t + n]
-        pairs = (stack[t : t + n] if direct else light[:n]).reshape(-1).view(np.uint64)
-        return t, n, _launch(chosen, pairs, key.frame + t, fixed, bits)
+                light[:n, :h, left : left + width] = part
+            part = light[:n, :h]
+        pairs = np.ascontiguousarray(part).reshape(-1).view(np.uint64)
+        return t, top, n, _launch(chosen, pairs, (key.frame + t, origin[0] + top, h), fixed, bits)
 
     # While the host finishes some frames the kernel of the next ones runs, unless both need the buffer
-    running: tuple[int, int, list[Any]] | None = None
-    for t in (*range(0, frames, together), frames):
-        done = [out.numpy() for out in running[2]] if running and not direct else []
-        started = launch(t) if t < frames else None
+    running: tuple[int, int, int, list[Any]] | None = None
+    places = [(t, top) for t in range(0, frames, together) for top in range(0, height, rows)]
+    for place in (*places, None):
+        done = [out.numpy() for out in running[3]] if running and not direct else []
+        started = launch(*place) if place else None
         if running:
-            first, n, arrays = running
+            first, top, n, arrays = running
             pairs, flags = done or [out.numpy() for out in arrays]
-            doubtful = _set(flags)
+            doubtful, lanes = _set(flags), pairs.size // n
             for i in range(n):
                 here = doubtful[(doubtful >= i * lanes) & (doubtful < (i + 1) * lanes)] - i * lanes
-                yield first + i, pairs[i * lanes : (i + 1) * lanes].reshape(height, -1), here
+                yield first + i, top, pairs[i * lanes : (i + 1) * lanes].reshape(-1, padded // 2), here
         running = started
 
 
@@ -218,26 +229,30 @@ def _set(flags: Array) -> Array:
 # ---- What a kernel computes
 
 
-def _fixed_scalars(key: Key, origin: tuple[int, int], height: int, lanes: int) -> list[Any]:
-    """What every launch of a clip shares: first row and block, the generator's key, rows of `lanes` lanes."""
+def _fixed_scalars(key: Key, origin: tuple[int, int], lanes: int) -> list[Any]:
+    """What every launch of a clip shares: first block, the generator's key, rows of `lanes` lanes."""
     import drjit as dr
 
     jit = _backend()
-    numbers = (origin[0], origin[1] >> 2, key.philox_key >> 32, key.philox_key, lanes, height)
+    numbers = (origin[1] >> 2, key.philox_key >> 32, key.philox_key, lanes)
     integers = [dr.opaque(jit.UInt32, number & 0xFFFFFFFF) for number in numbers]
-    return [*integers, *(dr.opaque(jit.Float64, 1 / number) for number in (lanes, height))]
+    return [*integers, dr.opaque(jit.Float, 1 / lanes)]
 
 
-def _launch(plan: Plan, light: Array, frame: int, fixed: list[Any], bits: int | None) -> list[Any]:
+def _launch(plan: Plan, light: Array, place: tuple[int, int, int], fixed: list[Any], bits: int | None) -> list[Any]:
     """Start a kernel: pairs of float32 photons as uint64 [n] -> what each lane writes, and 1 where it is doubtful.
 
-    Without `bits` a lane writes a byte per code, the first one lowest; with `bits` the codes follow each other bit by
-    bit, the first one highest.
+    `place` = number of the first frame, its first row, rows of a frame. Without `bits` a lane writes a byte per code,
+    the first one lowest; with `bits` the codes follow each other bit by bit, the first one highest.
     """
     import drjit as dr
 
     jit = _backend()
-    return list(_kernel(plan, bits)(jit.UInt64(light), dr.opaque(jit.UInt32, frame), _arguments(plan), *fixed))
+    frame, row, height = place
+    numbers = [dr.opaque(jit.UInt32, frame), dr.opaque(jit.UInt32, row), dr.opaque(jit.UInt32, height)]
+    return list(
+        _kernel(plan, bits)(jit.UInt64(light), *numbers, dr.opaque(jit.Float, 1 / height), _arguments(plan), *fixed)
+    )
 
 
 @lru_cache(maxsize=64)
@@ -248,14 +263,12 @@ def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
     jit = _backend()
     real = jit.Float64 if plan.double else jit.Float
 
-    def draw(pair: Any, frame: Any, arguments: list[Any], *fixed: Any) -> tuple[Any, Any]:
-        row, block, high, low, lanes, height, inverse_lanes, inverse_height = fixed
-        # Quotients by products in float64, exact below 2^32: no division, and one kernel for every size
-        lane = dr.arange(jit.UInt32, dr.width(pair))
-        y = jit.UInt32(dr.fma(jit.Float64(lane), inverse_lanes, inverse_lanes / 2))
-        x = lane - y * lanes
-        t = jit.UInt32(dr.fma(jit.Float64(y), inverse_height, inverse_height / 2))
-        y = y - t * height
+    def draw(
+        pair: Any, frame: Any, row: Any, height: Any, inverse_height: Any, arguments: list[Any], *fixed: Any
+    ) -> tuple[Any, Any]:
+        block, high, low, lanes, inverse_lanes = fixed
+        y, x = _divmod(dr.arange(jit.UInt32, dr.width(pair)), lanes, inverse_lanes)
+        t, y = _divmod(y, height, inverse_height)
         first_plane = (frame + t) * plan.planes
         photons = [dr.reinterpret_array(jit.Float, jit.UInt32(half)) for half in (pair, pair >> 32)]
 
@@ -274,6 +287,18 @@ def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
         return out, jit.UInt8(dr.select(doubt, jit.UInt32(1), jit.UInt32(0)))
 
     return dr.freeze(draw, warn_after=1000)
+
+
+def _divmod(number: Any, divisor: Any, inverse: Any) -> tuple[Any, Any]:
+    """Quotient and remainder of integers below 2^22, without a division: a float32 product misses by 1 at most."""
+    import drjit as dr
+
+    quotient = type(number)(type(inverse)(number) * inverse)
+    rest = number - quotient * divisor
+    below = rest >= 0x80000000
+    quotient, rest = dr.select(below, quotient - 1, quotient), dr.select(below, rest + divisor, rest)
+    above = rest >= divisor
+    return dr.select(above, quotient + 1, quotient), dr.select(above, rest - divisor, rest)
 
 
 def _philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
@@ -322,12 +347,19 @@ def _count(
         for count, word, step in zip(counts, words(plane), nothing, strict=True):
             code, distance = _search([step], uniform32(word))
             sums.append(count + code)
-            near = dr.minimum(near, distance)
+            near = _smaller(near, distance)
         return (plane + 1, near, *sums)
 
     state = (jit.UInt32(0), real(1), *(jit.UInt32(0) for _ in photons))
     _, near, *codes = dr.while_loop(state, lambda plane, *_: plane < plan.planes, add_plane)
     return codes, doubt | ~(near >= margin)
+
+
+def _smaller(a: Any, b: Any) -> Any:
+    """The smaller one, in one instruction: `drjit.minimum` minds NaN and signed zeros, which do not come here."""
+    import drjit as dr
+
+    return dr.select(a < b, a, b)
 
 
 def _search(steps: list[Any], u: Any) -> tuple[Any, Any]:
@@ -338,12 +370,12 @@ def _search(steps: list[Any], u: Any) -> tuple[Any, Any]:
     import drjit as dr
 
     count = _backend().UInt32
-    code, near = count(0), dr.inf
+    code, near = count(0), type(u)(dr.inf)
     while steps:
         half = len(steps) // 2
         distance = u - steps[half]
         passed = distance >= 0
-        near = dr.minimum(near, dr.abs(distance))
+        near = _smaller(near, dr.abs(distance))
         code += dr.select(passed, count(half + 1), count(0))
         steps = [dr.select(passed, steps[half + 1 + i], steps[i]) for i in range(half)]
     return code, near
@@ -357,7 +389,7 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
     if isinstance(steps, Live):
         result = []
         for k in range(len(steps.shares)):
-            live = dr.minimum(mean * scalars[k], _CERTAIN)
+            live = _smaller(mean * scalars[k], real(_CERTAIN))
             total = real(1)
             for n in range(k, 0, -1):
                 total = dr.fma(total, live * (1 / n), 1)
@@ -366,7 +398,7 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
     n = len(steps.full)
     highest, shift, scale, seed = scalars[:4]
     full, bands = scalars[4 : 4 + n], iter(scalars[4 + n :])
-    mean = dr.minimum(mean, highest)
+    mean = _smaller(mean, highest)
     unit, grow = dr.exp(mean - shift), mean * scale
     terms = [seed]
     for _ in range(1, n):

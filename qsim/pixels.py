@@ -33,12 +33,13 @@ def draw_at(sensor: Sensor, photons: Array, exposure: float, key: Key, origin: t
 
 
 def _draw(sensor: Sensor, light: Array, exposure: float, key: Key, place: tuple[Array, Array, Array]) -> Array:
-    first, second = (_words(key, place, redraw) for redraw in (0, 1))
+    first = _words(key, place, 0)
     cdf, u = sensor.cdf(light, exposure)[..., :-1], uniform(first)[:, None]
     drawn = np.count_nonzero(u >= cdf, axis=-1)
     tail = (np.abs(u - cdf) <= 2.0**-32).any(axis=-1)
     if tail.any():
-        drawn[tail] = sensor.codes_at(first[tail], second[tail], light[tail], exposure)
+        x, y, frame = (np.broadcast_to(axis, tail.shape)[tail] for axis in place)
+        drawn[tail] = sensor.codes_at(first[tail], _words(key, (x, y, frame), 1), light[tail], exposure)
     return drawn
 
 

@@ -193,6 +193,31 @@ def test_frames_can_be_drawn_in_any_order(draw):
 
 
 @needs_engine
+@pytest.mark.parametrize("largest", [1, 40, 100])
+def test_large_frames_are_drawn_in_strips(largest, monkeypatch):
+    """Launches of a row or a few each, with a last one that is shorter: the same codes, packed or not."""
+    sensor = SENSORS["low gain"]
+    photons = light(sensor, (2, 11, 20))
+    monkeypatch.setattr(kernels, "_LARGEST", largest)
+    expected = reference(sensor, photons, origin=(3, 8))
+    np.testing.assert_array_equal(fast(sensor, photons, origin=(3, 8)), expected)
+    packed = kernels.sample_packed(sensor, photons, EXPOSURE, key=KEY, origin=(3, 8), smallest=1)
+    np.testing.assert_array_equal(packed, pack(expected, sensor.bits))
+
+
+@needs_engine
+@pytest.mark.parametrize("divisor", [1, 2, 3, 7, 255, 256, 1000, 2047, 2**21 + 1])
+def test_quotients_without_division_are_exact(divisor):
+    jit = kernels._backend()
+    rng = np.random.default_rng(divisor)
+    edges = np.arange(0, 2**22, divisor)[:3000]
+    numbers = np.concatenate([rng.integers(0, 2**22, 4000), edges, np.maximum(edges, 1) - 1, [2**22 - 1]])
+    found = kernels._divmod(jit.UInt32(numbers.astype(np.uint32)), jit.UInt32(divisor), jit.Float(1 / divisor))
+    for ours, exact in zip(found, np.divmod(numbers, divisor), strict=True):
+        np.testing.assert_array_equal(ours.numpy(), exact)
+
+
+@needs_engine
 def test_sensors_share_kernels_after_the_first_few(monkeypatch):
     """Numbers as arguments of a common kernel instead of constants: the same codes."""
     monkeypatch.setattr(kernels, "_CONSTANT_PLANS", 0)
