@@ -159,6 +159,15 @@ def _add_sense(sub: Any) -> None:
     parser.add_argument("--group", action="store_true", help="codes sum 2^bits - 1 clip frames as binary planes")
     parser.add_argument("--diffraction", action="store_true", help="blur by the lens's Airy pattern")
     parser.add_argument(
+        "--defects",
+        metavar="FILE.toml",
+        help="table [defects]: hot and dead pixels, PRNU, offsets, measured maps, afterpulses, crosstalk, dead time "
+        "that is carried over (default: that of the sensor's own .toml file)",
+    )
+    parser.add_argument(
+        "--slices", type=int, default=1, help="counting SPAD: clip frames in one exposure, whose light may change"
+    )
+    parser.add_argument(
         "--replay", metavar="CLIP:FRAME", help="draw one frame again and compare it with the stored one"
     )
     parser.add_argument("--force", action="store_true", help="replace a stream of the same name")
@@ -174,7 +183,7 @@ def _run_sense(args: argparse.Namespace) -> int:
         raise ValueError(f"--name {args.name}: one name for {len(levels)} light levels; leave it out")
     wanted = [
         stream.Sensing(args.sensor, args.bits, seed=args.seed, name=args.name, group=args.group,
-                       diffraction=args.diffraction, **level)
+                       diffraction=args.diffraction, defects=args.defects, slices=args.slices, **level)
         for level in levels
     ]  # fmt: skip
     clips = [clip for path in args.paths for clip in _clips(path)]

@@ -156,6 +156,33 @@ def sample(
     below, columns right that `photons` and `maps` have beyond the wanted crop (they are cut off in the end): crosstalk
     needs 1 wherever the crop does not end at the sensor's edge. `origin` is that of `photons`, margin included.
     """
+    if afterpulse and key.frame:
+        raise ValueError(f"afterpulse has a memory: sample the clip from frame 0, not from frame {key.frame}")
+    codes, _ = sample_after(
+        None, sensor, photons, exposure, key=key, maps=maps, disturbances=(afterpulse, crosstalk), origin=origin,
+        engine=engine,
+    )  # fmt: skip
+    top, left, bottom, right = margin
+    return codes[:, top : codes.shape[1] - bottom, left : codes.shape[2] - right]
+
+
+def sample_after(
+    before: Array | None,
+    sensor: Sensor,
+    photons: Array,
+    exposure: float,
+    *,
+    key: Key,
+    maps: Maps = PERFECT,
+    disturbances: tuple[float, float] = (0.0, 0.0),
+    origin: tuple[int, int] = (0, 0),
+    engine: str = "auto",
+) -> tuple[Array, Array | None]:
+    """As `sample` with `disturbances` = (afterpulse, crosstalk), for a clip that comes in blocks of frames.
+
+    `before` is what the block before this one gave as its second result, None at the clip's first frame.
+    """
+    afterpulse, crosstalk = disturbances
     for name, value in (("afterpulse", afterpulse), ("crosstalk", crosstalk)):
         if not 0 <= value < 1:
             raise ValueError(f"{name} is a probability below 1, got {value!r}")
@@ -166,15 +193,21 @@ def sample(
         raise ValueError("afterpulse: defined per binary plane; for counting pixels use events.sample, a QIS has none")
     if crosstalk and isinstance(sensor, QIS):
         raise ValueError("crosstalk: a QIS has no avalanches; blur the light instead")
-    if afterpulse and key.frame:
-        raise ValueError(f"afterpulse has a memory: sample the clip from frame 0, not from frame {key.frame}")
     if isinstance(sensor, BinarySPAD) and sensor.bits > 1 and (afterpulse or crosstalk):
-        codes = _sum_of_planes(sensor, stack, exposure, key, maps, (afterpulse, crosstalk), origin, engine)
-    else:
-        codes = _draw(sensor, stack, exposure, key, maps, origin, engine)
-        codes = _disturb(codes, sensor.levels - 1, key, maps, (afterpulse, crosstalk), origin)
-    top, left, bottom, right = margin
-    return codes[:, top : stack.shape[1] - bottom, left : stack.shape[2] - right]
+        return _sum_of_planes(before, sensor, stack, exposure, key, maps, disturbances, origin, engine)
+    codes = _draw(sensor, stack, exposure, key, maps, origin, engine)
+    return _disturb(before, codes, sensor.levels - 1, key, maps, disturbances, origin)
+
+
+def lit(sensor: Sensor, photons: Array, exposure: float, maps: Maps) -> tuple[Sensor, Array]:
+    """A sensor and light [..., H, W] that together have the efficiency and dark rate of every pixel of the maps.
+
+    Dark events become the light that would cause them, so that the sensor's own cdf serves every pixel.
+    """
+    light = photons if maps.gain is None else photons * maps.gain
+    if maps.dark is None:
+        return sensor, light
+    return _without_dark(sensor), light + maps.dark * (sensor.dark_rate * exposure / sensor.efficiency)
 
 
 def _draw(
@@ -187,11 +220,7 @@ def _draw(
     engine: str,
 ) -> Array:
     """Codes [T, H, W] of pixels that differ from each other."""
-    light = photons if maps.gain is None else photons * maps.gain
-    if maps.dark is not None:
-        # Dark events as the light that would cause them, so that the sensor's own cdf serves every pixel
-        light = light + maps.dark * (sensor.dark_rate * exposure / sensor.efficiency)
-        sensor = _without_dark(sensor)
+    sensor, light = lit(sensor, photons, exposure, maps)
     if maps.offset is None and maps.read_noise is None:
         codes = sensor.sample(light, exposure, key=key, origin=origin, engine=engine)
     elif isinstance(sensor, QIS):
@@ -232,6 +261,7 @@ def _read_out(sensor: QIS, photons: Array, exposure: float, key: Key, maps: Maps
 
 
 def _sum_of_planes(
+    before: Array | None,
     sensor: BinarySPAD,
     photons: Array,
     exposure: float,
@@ -240,31 +270,35 @@ def _sum_of_planes(
     disturbances: tuple[float, float],
     origin: tuple[int, int],
     engine: str,
-) -> Array:
+) -> tuple[Array, Array | None]:
     """A code as its M planes one after the other, as BinarySPAD draws them, each disturbed by the one before."""
     m, plane = sensor.planes, replace(sensor, bits=1)
     codes = np.zeros(photons.shape, sensor.dtype)
-    before: Array | None = None
     for p in range(len(photons) * m):
         at = key.at(key.frame * m + p)
         fired = _draw(plane, photons[p // m][None] / m, exposure / m, at, maps, origin, engine)
         fired, before = _plane_after(fired[0], before, at, maps, disturbances[0], origin)
         codes[p // m] += _crosstalk(fired, 1, at, maps, disturbances[1], origin)
-    return codes
+    return codes, before
 
 
 def _disturb(
-    codes: Array, top: int, key: Key, maps: Maps, disturbances: tuple[float, float], origin: tuple[int, int]
-) -> Array:
+    before: Array | None,
+    codes: Array,
+    top: int,
+    key: Key,
+    maps: Maps,
+    disturbances: tuple[float, float],
+    origin: tuple[int, int],
+) -> tuple[Array, Array | None]:
     if not any(disturbances):
-        return codes
+        return codes, None
     result = np.empty_like(codes)
-    before: Array | None = None
     for t, frame in enumerate(codes):
         at = key.at(key.frame + t)
         fired, before = _plane_after(frame, before, at, maps, disturbances[0], origin)
         result[t] = _crosstalk(fired, top, at, maps, disturbances[1], origin)
-    return result
+    return result, before
 
 
 def _plane_after(

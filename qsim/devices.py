@@ -15,6 +15,8 @@ photons" means that light has to be given as photons that this sensor detects. A
     bits = 3
     [sources]                    # optional: one sentence per field
     read_noise = "photon transfer of 2026-05-03, 25 C"
+    [defects]                    # optional: hot and dead pixels, PRNU, afterpulses, crosstalk ...: see flaws.py
+    prnu = 0.01
 """
 
 from __future__ import annotations
@@ -222,7 +224,7 @@ def load(name: str | Path, *, ppp: float | None = None, bits: int | None = None,
 
 
 def from_toml(path: str | Path) -> Sensor:
-    """The sensor of a TOML file with a table [sensor] and, optionally, [sources]; strict."""
+    """The sensor of a TOML file with a table [sensor] and, optionally, [sources] and [defects] (flaws.py); strict."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such sensor file")
@@ -231,8 +233,8 @@ def from_toml(path: str | Path) -> Sensor:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: not a TOML file: {error}") from None
     for key in tables:
-        if key not in ("sensor", "sources"):
-            raise ValueError(f"{path}: unknown table [{key}]{_hint(key, ('sensor', 'sources'))}")
+        if key not in ("sensor", "sources", "defects"):  # [defects] is read by flaws.py
+            raise ValueError(f"{path}: unknown table [{key}]{_hint(key, ('sensor', 'sources', 'defects'))}")
     if not isinstance(tables.get("sensor"), dict):
         raise ValueError(f"{path}: a table [sensor] with model, bits and the model's fields is missing")
     sensor = from_dict(tables["sensor"], where=f"{path}: [sensor]")

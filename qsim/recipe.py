@@ -87,6 +87,10 @@ class Job:
         """SHA-256 of everything that decides the job's files."""
         described = dataclasses.asdict(self) | {"family": Path(self.family).stem}
         described["streams"] = [stream | {"sensor": Path(stream["sensor"]).name} for stream in described["streams"]]
+        for stream in described["streams"]:  # what is off stays out, so that data sets of earlier versions go on
+            for key, off in (("defects", None), ("slices", 1)):
+                if stream[key] == off:
+                    del stream[key]
         return hashlib.sha256(to_json(described)).hexdigest()
 
 

@@ -27,6 +27,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import estimate
+from qsim.codes import pack
 from qsim.estimate import Estimate, Response
 from qsim.keys import Key, uniform, uniform_pair, words
 
@@ -190,11 +191,7 @@ class Sensor(ABC):
         `engine`: "reference" is NumPy in float64; "fast" is compiled (kernels.py) and differs from it in at most 5
         pixels per million; "auto" takes the fast one where it can run.
         """
-        photons = np.asarray(photons)
-        if photons.ndim not in (2, 3):
-            raise ValueError(f"photons have the shape [H, W] or [T, H, W], got {list(photons.shape)}")
-        if engine not in ENGINES:
-            raise ValueError(f"engine is one of {', '.join(ENGINES)}, got {engine!r}")
+        photons = _checked(photons, engine)
         if engine != "reference" and _fast_engine():
             from qsim import kernels
 
@@ -205,6 +202,20 @@ class Sensor(ABC):
         for t, frame in enumerate(photons):
             codes[t] = self._draw(frame, exposure, key.at(key.frame + t), origin)
         return codes
+
+    def sample_packed(
+        self, photons: Array, exposure: float, *, key: Key, origin: tuple[int, int] = (0, 0), engine: str = "auto"
+    ) -> Array:
+        """The codes of `sample`, packed row by row: uint8 [..., H, ceil(W bits / 8)] as `codes.pack` makes them.
+
+        The compiled engine joins the bits itself, without a byte per code in between.
+        """
+        photons = _checked(photons, engine)
+        if engine != "reference" and _fast_engine():
+            from qsim import kernels
+
+            return kernels.sample_packed(self, photons, exposure, key=key, origin=origin)
+        return pack(self.sample(photons, exposure, key=key, origin=origin, engine="reference"), self.bits)
 
     def _draw(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
         """The reference draw of one frame [H, W], some rows at a time."""
@@ -233,6 +244,16 @@ class Sensor(ABC):
     def to_dict(self) -> dict[str, Any]:
         """The record as written into files: {"model": name of the class, field: value, ...}."""
         return {"model": type(self).__name__, **asdict(self)}  # type: ignore[call-overload]
+
+
+def _checked(photons: Array, engine: str) -> Array:
+    """Photons as an array of frames; `ValueError` for another shape or an unknown engine."""
+    photons = np.asarray(photons)
+    if photons.ndim not in (2, 3):
+        raise ValueError(f"photons have the shape [H, W] or [T, H, W], got {list(photons.shape)}")
+    if engine not in ENGINES:
+        raise ValueError(f"engine is one of {', '.join(ENGINES)}, got {engine!r}")
+    return photons
 
 
 @cache
