@@ -266,10 +266,8 @@ def _left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, 
     circle = camera.focal_length**2 / camera.f_number / abs(focus - camera.focal_length)
     blur = float(np.max(circle * np.abs(depths - focus) / depths, initial=0.0)) / camera.pixel_pitch
     how = "thin lens" if camera.aperture_blur else "left out, pinhole"
-    airy = optics.airy_diameter(camera)
-    nyquist = float(optics.mtf(np.array([0.5]), camera)[0])
     return (
         Finding("depth of field", how, f"largest blur circle {blur:.2g} px at f/{camera.f_number:g}"),
-        Finding("diffraction", "left out here", f"Airy disk {airy:.2g} px wide, MTF {nyquist:.2f} at Nyquist"),
+        Finding("diffraction", "left out here", optics.diffraction_line(camera)),
         Finding("lens aberrations, polarisation, spectra", "not modelled", "size unknown"),
     )

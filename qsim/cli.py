@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -59,9 +61,10 @@ def _run_doctor(args: argparse.Namespace) -> int:
         listing = devices.listing()
         output(args, {"devices": listing}, [_device_text(device) for device in listing])
         return 0
-    from qsim import engine
+    from qsim import engine, optics
+    from qsim.scene import Camera
 
-    report = engine.report()
+    report = engine.report() | {"lens": optics.diffraction_line(Camera(8e-3, 2.8, 1.1e-6, 512, 1024))}
     width = max(len(key) for key in report)
     output(args, report, [f"{key:{width}}  {value}" for key, value in report.items()])
     return 0
@@ -80,10 +83,16 @@ def _device_text(device: dict[str, Any]) -> str:
 def _add_render(sub: Any) -> None:
     parser = command(
         sub, "render", _run_render, "Render a scene into a clip: radiance, sharp frames, flow, depth, body ids.",
-        "qsim render fan -o out/fan --frames 21 --height 128 --width 128", GOES_ON,
+        "qsim render fan -o out/fan --frames 21 --height 128 --width 128\n"
+        "qsim render fan --explain", GOES_ON,
     )  # fmt: skip
-    parser.add_argument("scene", help="a family of scenes/, or a .py file with scene(seed, speed=...)")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="clip folder to make")
+    parser.add_argument(
+        "scene", help="a family of scenes/, a .py file with scene(seed, speed=...), Mitsuba .xml, a folder of assets"
+    )
+    parser.add_argument("-o", "--output", type=Path, help="clip folder to make (may be left out with --explain)")
+    parser.add_argument(
+        "--explain", action="store_true", help="say what is modelled, what is left out and how large it would have been"
+    )
     whole = checked(checks.whole)
     parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the scene and its samples (default 0)")
     parser.add_argument("--speed", type=checked(checks.positive), default=1.0, help="factor on all motions (default 1)")
@@ -96,17 +105,25 @@ def _add_render(sub: Any) -> None:
     parser.add_argument("--psnr", type=psnr, default=40.0, help="wanted error of the radiance, dB (default 40)")
     light = checked(checks.positive)
     parser.add_argument("--ppp", type=light, help="brightest light level that will be sensed, photons per pixel")
+    parser.add_argument(
+        "--engine", choices=("cuda", "llvm", "scalar"), help="insist on one (default: QSIM_ENGINE, else the fastest)"
+    )
     parser.add_argument("--force", action="store_true", help="replace an existing clip")
 
 
 def _run_render(args: argparse.Namespace) -> int:
     import scenes
-    from qsim import budget, render
+    from qsim import budget, engine, optics, render
 
-    if args.output.exists() and not args.force:
+    if args.output is None and not args.explain:
+        raise ValueError("the following arguments are required: -o/--output; only --explain does without")
+    if args.output is not None and args.output.exists() and not args.force:
         raise FileExistsError(f"{args.output}: exists; name another with -o, or use --force to replace it")
+    if args.engine is not None:
+        os.environ["QSIM_ENGINE"] = args.engine
+        engine.choose()
     scene = scenes.load(args.scene, seed=args.seed, speed=args.speed).resized(args.height, args.width)
-    with bar(args.output.name) as progress:
+    with bar(args.output.name if args.output else "pilot") as progress:
         chosen = budget.choose(
             scene,
             frame_rate=args.frame_rate,
@@ -116,6 +133,9 @@ def _run_render(args: argparse.Namespace) -> int:
             ppp=args.ppp,
             seed=args.seed,
         )
+        if args.output is None:
+            output(args, {"render": dataclasses.asdict(chosen)}, budget.explain(chosen))
+            return 0
         clip = render.render_clip(
             scene,
             args.output,
@@ -131,7 +151,11 @@ def _run_render(args: argparse.Namespace) -> int:
     text = f"{clip.path}: {len(clip)} frames of {args.height} x {args.width}"
     text += f", mean radiance {clip.mean_radiance:.4g} W/m2/sr"
     text += f", {clip.mean_photons:.4g} photons per pixel" + (f", error {psnr:.1f} dB" if psnr else "")
-    text += "\n" + budget.explain(chosen)
+    if "fireflies_per_frame" in clip.meta:
+        fireflies, pixels = sum(clip.meta["fireflies_per_frame"]), math.prod(clip.shape)
+        how = "counted before denoising" if chosen.denoise else "counted and left in"
+        text += f"\nfireflies: {fireflies} of {pixels} pixels, {how}"
+    text += "\n" + (budget.explain(chosen) if args.explain else optics.diffraction_line(scene.camera))
     output(args, {"clip": str(clip.path)} | {k: v for k, v in clip.meta.items() if k != "checksums"}, text)
     return 0
 

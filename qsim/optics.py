@@ -78,6 +78,11 @@ def off_axis_cosines(height: int, width: int, centre_y: float, centre_x: float, 
     return cosines
 
 
+def lux_to_irradiance(lux: float) -> float:
+    """Irradiance [W m^-2] of `lux` of 555 nm light: for lights that are known by their illuminance."""
+    return lux / LUMINOUS_EFFICACY
+
+
 def photons_per_lux(camera: Camera, exposure: float) -> float:
     """Photons per pixel and exposure for one lux of 555 nm light on the faceplate: 2.47 for 1.1 um and 0.5 ms."""
     area = camera.fill_factor * camera.pixel_pitch**2
@@ -173,6 +178,13 @@ def mtf(frequency: Array, camera: Camera) -> Array:
     nu = np.minimum(np.abs(frequency) * camera.wavelength * camera.f_number / camera.pixel_pitch, 1.0)
     contrast: Array = 2 / np.pi * (np.arccos(nu) - nu * np.sqrt(1 - nu * nu))
     return contrast
+
+
+def diffraction_line(camera: Camera) -> str:
+    """`Airy disk 3.4 px wide, MTF 0.19 at Nyquist (f/2.8, 550 nm, 1.1 um)`: what the lens could at best resolve."""
+    nyquist = float(mtf(np.array([0.5]), camera)[0])
+    where = f"f/{camera.f_number:g}, {1e9 * camera.wavelength:g} nm, {1e6 * camera.pixel_pitch:g} um"
+    return f"Airy disk {airy_diameter(camera):.2g} px wide, MTF {nyquist:.2f} at Nyquist ({where})"
 
 
 def airy_kernel(camera: Camera) -> Array:

@@ -11,7 +11,7 @@
     seed = 0                   # of the samples and of the noise
 
     [[scenes]]                 # one clip per family, seed and speed
-    family = "fan"             # a family of scenes/, or a .py file beside the recipe
+    family = "fan"             # a family of scenes/; or beside the recipe a .py or .xml file, or a folder ("./things")
     seeds = [0, 1, 2]          # or: count = 3 (seeds first ... first + count - 1; first = 0)
     speed = [1.0, 2.0]         # factor on all motions, a number or a list; default 1
     split = "train"            # train, val or test
@@ -227,8 +227,10 @@ class _Reader:
 
     def family(self, table: dict[str, Any], i: int) -> str:
         family: str = self.value(table, "family", checks.text, "scenes", i)
-        if family.endswith(".py"):
-            file = (self.path.parent / family).resolve()
+        file = (self.path.parent / family).resolve()
+        if "/" in family and file.is_dir():
+            return str(file)
+        if family.endswith((".py", ".xml")):
             if not file.is_file():
                 raise ValueError(f"{self.where('scenes', i, 'family')}: no such scene file {file}")
             return str(file)

@@ -12,20 +12,21 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim import engine as engines
-from qsim import truth
+from qsim import mitsuba_file, truth
 from qsim.budget import Budget, grid_samples
 from qsim.clip import PHYSICAL, Clip, ClipWriter
 from qsim.denoise import denoised, denoised_error
 from qsim.keys import Key, hash_name, words
-from qsim.scene import Scene, describe
+from qsim.scene import Camera, Motion, Scene, describe
 from qsim.translate import Stage
 from qsim.truth import Hits
 
@@ -397,10 +398,18 @@ def render_clip(
         for t in range(frames):
             if not writer.has(t):
                 frame = renderer.frame(t)
-                writer.add(t, frame.radiance, frame.sharp, frame.truth, frame.error)
+                writer.add(t, frame.radiance, frame.sharp, frame.truth, frame.error, frame.fireflies)
             if progress is not None:
                 progress(t + 1, frames)
     return Clip.open(path)
+
+
+def read_mitsuba(path: Path, motions: Mapping[str, Motion], camera: Camera | None = None) -> Scene:
+    """What `Scene.from_mitsuba` does, here because here is where Mitsuba is."""
+    engines.select()
+    import mitsuba as mi
+
+    return mitsuba_file.read(mi, path, motions, camera)
 
 
 def _checked_crop(scene: Scene, crop: Crop | None) -> Crop:

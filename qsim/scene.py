@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -245,6 +246,26 @@ class Body:
 
 
 @dataclass(frozen=True, eq=False)
+class MitsubaFile:
+    """An XML scene that Mitsuba reads itself: shapes, materials and lights, radiance taken as W m^-2 sr^-1."""
+
+    path: str
+    sha256: str  # of the file; meshes and pictures that it names are not counted
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A shape of a Mitsuba file; the motion carries it from where the file puts it, in the world's axes."""
+
+    name: str
+    motion: Motion | None = None
+
+    def pose(self, t: float) -> np.ndarray:
+        """Matrix that takes the shape from its place in the file to its place at time t [s], float64 [4, 4]."""
+        return np.eye(4) if self.motion is None else np.asarray(self.motion.pose(t), np.float64)
+
+
+@dataclass(frozen=True, eq=False)
 class Camera:
     """Lens, pixel, film and place: all that stands between the scene and the photodiode."""
 
@@ -343,6 +364,8 @@ class Scene:
     lights: tuple[Light, ...]
     bodies: tuple[Body, ...]
     speed: float = 1.0  # the factor that the family applied to its motions
+    file: MitsubaFile | None = None  # instead of lights and bodies of our own; see `from_mitsuba`
+    parts: tuple[Part, ...] = ()  # the file's shapes, in its order
 
     def __post_init__(self) -> None:
         environments = [light for light in self.lights if isinstance(light, ENVIRONMENTS)]
@@ -357,20 +380,43 @@ class Scene:
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"scene {self.name}: body names must differ, found {twice[0]!r} more than once")
-        for body in self.bodies:
+        if (self.file is None and self.parts) or (self.file is not None and (self.bodies or self.lights)):
+            raise ValueError(f"scene {self.name}: bodies and lights are either records or those of a Mitsuba file")
+        movable: tuple[Body | Part, ...] = (*self.bodies, *self.parts)
+        for body in movable:
             _check_motion(self.name, body)
 
     def __repr__(self) -> str:
         camera = self.camera
         lights = ", ".join(type(light).__name__ for light in self.lights) or "glowing bodies only"
+        lights = f"of {self.file.path}" if self.file is not None else lights
+        things = len(self.bodies) + len(self.parts)
         return (
-            f"<Scene {self.name}, seed {self.seed}, speed {self.speed:g}: {len(self.bodies)} bodies, light: {lights}; "
+            f"<Scene {self.name}, seed {self.seed}, speed {self.speed:g}: {things} bodies, "
+            f"light: {lights}; "
             f"camera {camera.height} x {camera.width} px of {camera.pixel_pitch * 1e6:g} um, "
             f"{camera.focal_length * 1e3:.3g} mm f/{camera.f_number:g}>"
         )
 
+    @classmethod
+    def from_mitsuba(
+        cls, xml: str | Path, motions: Mapping[str, Motion] | None = None, *, camera: Camera | None = None
+    ) -> Scene:
+        """A scene of Mitsuba's XML whose shapes, named by their `id`, follow `motions`; one without a motion rests.
+
+        Without `camera` the file's first sensor is taken, a pinhole of its field of view and size behind an f/2.8 lens
+        on pixels of 1.1 um. The file's integrator and samples do not count. `FileNotFoundError` for a missing file;
+        `ValueError` for one that Mitsuba refuses, without light, with participating media, with a camera that is no
+        plain `perspective`, and for motions of unknown shapes or of shapes that cannot be moved rigidly.
+        """
+        from qsim.render import read_mitsuba
+
+        return read_mitsuba(Path(xml), motions or {}, camera)
+
     def emits(self) -> bool:
         """Whether anything gives light."""
+        if self.file is not None:
+            return True  # made sure of when the file was read
         return any(_strength(light) > 0 for light in self.lights) or any(
             isinstance(body.material, Glow) and body.material.radiance > 0 for body in self.bodies
         )
@@ -409,11 +455,14 @@ def describe(value: Any) -> Any:
     return f"{type(value).__module__}.{type(value).__qualname__}"
 
 
-def _check_motion(scene: str, body: Body) -> None:
+def _check_motion(scene: str, body: Body | Part) -> None:
     pose = body.pose(0.0)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise ValueError(f"scene {scene}, body {body.name}: motion.pose(0) must be a finite 4x4 matrix, got {pose!r}")
-    if body.deforms and body.vertices(0.0).shape != body.mesh.vertices.shape:
+    if isinstance(body, Part):
+        if isinstance(body.motion, Deformation):
+            raise ValueError(f"scene {scene}, shape {body.name}: shapes of a Mitsuba file move rigidly, none deforms")
+    elif body.deforms and body.vertices(0.0).shape != body.mesh.vertices.shape:
         expected, found = body.mesh.vertices.shape, body.vertices(0.0).shape
         raise ValueError(f"scene {scene}, body {body.name}: deform must keep the mesh's {expected}, got {found}")
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import mitsuba_file
 from qsim import scene as records
 from qsim.scene import Body, Scene
 from qsim.sky import environment_map, sky_map, sun_direction, sun_radiance
@@ -30,8 +31,11 @@ class Stage:
 
     def __init__(self, mi: Any, scene: Scene) -> None:
         self.mi, self.scene = mi, scene
-        self.loaded = mi.load_dict(_scene_dict(mi, scene))
+        self.loaded = (
+            mi.load_dict(_scene_dict(mi, scene)) if scene.file is None else mitsuba_file.load(mi, scene.file.path)
+        )
         self._parameters = mi.traverse(self.loaded)
+        self._rest = {part.name: self._rest_of(part) for part in scene.parts if part.motion is not None}
         self._placed: dict[str, bytes] = {}
         self._normals: dict[str, Array] = {}  # of deformed smooth bodies, set after Mitsuba has made its own
 
@@ -44,6 +48,9 @@ class Stage:
             motion = getattr(light, "motion", None)
             if motion is not None:
                 self._place_light(f"light{i}", light, motion.pose(t))
+        for part in self.scene.parts:
+            if part.motion is not None:
+                self._place_part(part.name, part.pose(t), self._rest[part.name])
         self._parameters.update()
         if self._normals:
             for key, normals in self._normals.items():
@@ -55,6 +62,7 @@ class Stage:
         """Shape id -> body number; lamps follow the bodies; the sun's disk is -1 (surroundings)."""
         numbers = {f"body{i}": i for i in range(len(self.scene.bodies))}
         numbers |= {f"light{i}": len(self.scene.bodies) + i for i in range(len(self.scene.lights))}
+        numbers |= {part.name: i for i, part in enumerate(self.scene.parts)}
         return numbers | {"sun": -1}
 
     def _place_body(self, name: str, body: Body, t: float) -> None:
@@ -74,6 +82,25 @@ class Stage:
         elif isinstance(light, records.PointLight):
             position = _to_world(pose, np.array([light.position]))[0]
             self._set(f"{name}.position", position, lambda: self.mi.Point3f(*(float(x) for x in position)))
+
+    def _rest_of(self, part: records.Part) -> tuple[Array, ...]:
+        """Where a shape of a file stands: its 4x4 placement, or its vertices [V, 3] and normals [V, 3] or [0, 3]."""
+        if f"{part.name}.to_world" in self._parameters:
+            return (np.array(self._parameters[f"{part.name}.to_world"].matrix, np.float64).reshape(4, 4),)
+        arrays = (f"{part.name}.vertex_positions", f"{part.name}.vertex_normals")
+        return tuple(
+            np.array(self._parameters[key], np.float64).reshape(-1, 3) if key in self._parameters else np.zeros((0, 3))
+            for key in arrays
+        )
+
+    def _place_part(self, name: str, pose: Array, rest: tuple[Array, ...]) -> None:
+        if len(rest) == 1:
+            placed = pose @ rest[0]
+            self._set(f"{name}.to_world", placed, lambda: self._transform(placed))
+            return
+        world = _to_world(pose, rest[0]).astype(np.float32)
+        if self._set(f"{name}.vertex_positions", world, lambda: world.ravel()) and len(rest[1]):
+            self._normals[f"{name}.vertex_normals"] = (rest[1] @ pose[:3, :3].T).astype(np.float32)
 
     def _set(self, key: str, value: Array, make: Any) -> bool:
         stamp = value.tobytes()

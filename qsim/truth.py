@@ -93,9 +93,7 @@ def _project(camera: Camera, points: Array, directions: Array, seen: Array, t: f
 
 
 def _pose(scene: Scene, number: int, t: float) -> Array:
-    if number < len(scene.bodies):
-        return scene.bodies[number].pose(t)
-    motion = getattr(scene.lights[number - len(scene.bodies)], "motion", None)
+    motion = getattr((*scene.bodies, *scene.lights, *scene.parts)[number], "motion", None)
     return np.eye(4) if motion is None else np.asarray(motion.pose(t), np.float64)
 
 

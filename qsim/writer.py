@@ -86,8 +86,11 @@ class ClipWriter:
         sharp: Array | None = None,
         truth: dict[str, Array] | None = None,
         error: float | None = None,
+        fireflies: int | None = None,
     ) -> None:
         """Store frame t: radiance [H, W], optionally the sharp instant, ground truth and the rms error of the radiance.
+
+        `fireflies` counts the pixels that the renderer does not trust; clip.json keeps it beside the error.
 
         `truth` may hold flow [2, H, W], flow_back [2, H, W], valid, depth, body_id [H, W]. `ValueError` for radiance
         that is negative or not finite, naming frame and pixel.
@@ -114,6 +117,8 @@ class ClipWriter:
         }
         if error is not None:
             entry["error"] = float(error)
+        if fireflies is not None:
+            entry["fireflies"] = int(fireflies)
         if self._camera is not None:
             origin = tuple(self.meta.get("origin", (0, 0)))
             photons = optics.expected_photons(stored, self._camera, self.meta["exposure"], origin=origin)
@@ -165,6 +170,8 @@ class ClipWriter:
         if all("error" in e for e in entries):
             meta["error_per_frame"] = [e["error"] for e in entries]
             meta["psnr_of_truth"] = self._psnr(meta["error_per_frame"])
+        if all("fireflies" in e for e in entries):
+            meta["fireflies_per_frame"] = [e["fireflies"] for e in entries]
         files.write_json(self.part / "clip.json", meta)
         for name in ("begun.json", "journal.jsonl", "lock"):
             (self.part / name).unlink(missing_ok=True)

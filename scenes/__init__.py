@@ -21,6 +21,7 @@ from scenes import (
     glass,
     glossy,
     lamp,
+    own,
     pellets,
     plain,
     room,
@@ -53,9 +54,11 @@ FAMILIES: dict[str, Family] = {
 
 
 def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
-    """The scene of a family by name, or of a Python file with a function `scene(seed, *, speed)`.
+    """The scene of a family by name, of a Python file with `scene(seed, *, speed)`, a folder of assets, or Mitsuba XML.
 
-    Raises ValueError for a name that is neither, FileNotFoundError for a missing file.
+    What a folder may hold is in `own.py`. An XML scene stands still and knows no seed: a Python file that calls
+    `Scene.from_mitsuba` moves its shapes. Raises ValueError for a name that is none of these, FileNotFoundError for a
+    missing file.
     """
     if str(name) in FAMILIES:
         return FAMILIES[str(name)](seed, speed=speed)
@@ -64,9 +67,15 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
         if not isinstance(found, Scene):
             raise ValueError(f"{name}: scene() returned a {type(found).__name__}; it must return a qsim.scene.Scene")
         return found
+    if str(name).endswith(".xml"):
+        return Scene.from_mitsuba(name)
+    if Path(name).is_dir():
+        return own.scene(seed, speed=speed, folder=name)
     close = difflib.get_close_matches(str(name), FAMILIES, n=1)
     meant = f"; did you mean {close[0]!r}?" if close else ""
-    raise ValueError(f"no scene family {str(name)!r}{meant}; there are {', '.join(FAMILIES)}, or give a .py file")
+    raise ValueError(
+        f"no scene family {str(name)!r}{meant}; there are {', '.join(FAMILIES)}, or give a .py or .xml file or a folder"
+    )
 
 
 def _from_file(path: Path) -> Family:

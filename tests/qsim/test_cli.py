@@ -91,6 +91,34 @@ def test_a_mistake_is_one_line_and_code_2(capsys: pytest.CaptureFixture[str], li
     assert not Path("/tmp/never").exists()
 
 
+def test_render_explains_and_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any):
+    """--explain without -o renders nothing; with it the clip is made too; the lens's limit is printed either way."""
+    monkeypatch.delenv("QSIM_ENGINE", raising=False)
+    small = ("--height", 8, "--width", 10, "--psnr", 20, "--frames", 1)
+    code, out, _ = run(capsys, "render", "plain", "--explain", *small)
+    assert code == 0
+    for word in (
+        "samples",
+        "bounces",
+        "motion blur",
+        "depth of field",
+        "Airy disk 3.4 px wide, MTF 0.19",
+        "not modelled",
+    ):
+        assert word in out
+    code, out, _ = run(capsys, "render", "plain", "-o", tmp_path / "clip", *small)
+    assert code == 0
+    assert "Airy disk 3.4 px wide, MTF 0.19 at Nyquist (f/2.8, 550 nm, 1.1 um)" in out
+    assert "fireflies: " in out
+    assert "bounces" not in out
+    code, _, err = run(capsys, "render", "plain", *small)
+    assert code == 2
+    assert "required: -o/--output; only --explain does without" in err
+    code, _, err = run(capsys, "render", "plain", "--explain", "--engine", "metal")
+    assert code == 2
+    assert "metal" in err
+
+
 def test_sense_prints_one_line_of_light(made: Path, capsys: pytest.CaptureFixture[str]):
     clip = made / "clips" / "fan_0001"
     code, out, _ = run(capsys, "sense", clip, "--bits", 2, "--ppp", 3.25)

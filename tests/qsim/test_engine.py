@@ -94,6 +94,37 @@ def test_without_a_usable_llvm_the_scalar_engine_says_what_to_install(monkeypatc
         engine._choose.__wrapped__("cuda")
 
 
+def test_a_gpu_without_optix_is_told_what_to_update(monkeypatch):
+    """What Dr.Jit says where the driver has no OptiX becomes one line with the cure; the LLVM engine goes on."""
+    said = "Traceback ...\nRuntimeError: jit_optix_api_init(): optixQueryFunctionTable() failed: OptiX not found"
+
+    def child(*args, **options):
+        return subprocess.CompletedProcess(args, 1, stdout="", stderr=said)
+
+    monkeypatch.setattr(engine.subprocess, "run", child)
+    probe = engine._run_probe(engine.VARIANTS["cuda"], None)
+    assert not probe.works
+    assert probe.detail.startswith("OptiX is missing or too old")
+    assert probe.detail.endswith("update the NVIDIA driver")
+    works = engine.Probe("llvm", "new.so", True, "LLVM 19")
+    monkeypatch.setattr(engine, "_probe_cuda", lambda: probe)
+    monkeypatch.setattr(engine, "llvm_candidates", lambda: ["new.so"])
+    monkeypatch.setattr(engine, "_probe", lambda *args: works)
+    assert engine._choose.__wrapped__(None).backend == "llvm"
+    with pytest.raises(ValueError, match=r"engine cuda does not work here \(CUDA: OptiX is missing.*NVIDIA GPU"):
+        engine._choose.__wrapped__("cuda")
+
+
+def test_a_working_gpu_is_taken_first_and_another_engine_can_be_asked_for(monkeypatch):
+    """The choice of a device, with probes that answer as on a GPU machine."""
+    cuda, llvm = engine.Probe("cuda", None, True, "CUDA with OptiX"), engine.Probe("llvm", "new.so", True, "LLVM 19")
+    monkeypatch.setattr(engine, "_probe_cuda", lambda: cuda)
+    monkeypatch.setattr(engine, "llvm_candidates", lambda: ["new.so"])
+    monkeypatch.setattr(engine, "_probe", lambda *args: llvm)
+    variants = {name: engine._choose.__wrapped__(name).variant for name in (None, *engine.BACKENDS)}
+    assert variants == {None: "cuda_ad_mono", "cuda": "cuda_ad_mono", "llvm": "llvm_ad_mono", "scalar": "scalar_rgb"}
+
+
 def test_an_unknown_engine_is_named(monkeypatch):
     monkeypatch.setenv("QSIM_ENGINE", "metal")
     with pytest.raises(ValueError, match="engine 'metal': expected one of cuda, llvm, scalar"):

@@ -21,6 +21,7 @@ from qsim.scene import (
     Body,
     Camera,
     Conductor,
+    Constant,
     Dielectric,
     Diffuse,
     EnvironmentImage,
@@ -80,6 +81,23 @@ def test_the_clear_sky_gives_the_ground_the_irradiances_of_its_record():
     sigma = frame.error / math.sqrt(frame.radiance.size)
     assert abs(frame.radiance.mean() - expected) < critical_z() * sigma + 2e-3 * expected  # the map's 1.4 degree cells
     assert sigma < 3e-3 * expected
+
+
+def test_a_wall_under_100_lux_gives_the_photons_worked_by_hand():
+    """units.md, section 4: 100 lx on a 50 % Lambertian wall, f/2, T 0.9, 1.1 um, 0.5 ms at 555 nm: 6.960548 photons.
+
+    An even sky of radiance E / pi gives a plane facing it the irradiance E.
+    """
+    from qsim.optics import expected_photons, lux_to_irradiance
+
+    camera = Camera(8e-3, 2.0, 1.1e-6, 5, 7, transmission=0.9, wavelength=555e-9, origin=(0, 0, 4))
+    sky = Constant(lux_to_irradiance(100.0) / math.pi)
+    made = scene(Body("wall", square(40), Diffuse(0.5)), light=sky, camera=camera)
+    frame = renderer(made, budget=Budget(512, 1)).frame(0)
+    photons = expected_photons(frame.radiance, camera, 5e-4)
+    error = expected_photons(np.full((1, 1), frame.error), camera, 5e-4).item() / math.sqrt(photons.size)
+    assert abs(photons.mean() - 6.960548) < critical_z() * error + 1e-4
+    assert error < 0.02
 
 
 def test_an_area_lamp_is_seen_with_its_radiance_from_the_front_only():
@@ -388,6 +406,19 @@ def test_a_mirror_that_faces_the_sun_reports_its_fireflies():
     frame = renderer(scene(rough, mirror, light=SunSky()), budget=Budget(8, 4)).frame(0)
     assert np.isfinite(frame.radiance).all()
     assert frame.fireflies > 0
+
+
+def test_a_clip_counts_its_fireflies(tmp_path):
+    """Frame by frame in clip.json, beside the measured errors and the choice."""
+    mirror = Body("mirror", square(4), Conductor(roughness=0.02), Still((0, -1, 1), (-math.pi / 2, 0, 0)))
+    rough = Body("wall", square(9, -1), RoughPlastic(0.5))
+    made = scene(rough, mirror, light=SunSky())
+    clip = render_clip(made, tmp_path / "mirror", frames=2, budget=Budget(8, 4))
+    counted = [renderer(made, budget=Budget(8, 4)).frame(t, with_truth=False).fireflies for t in range(2)]
+    assert clip.meta["fireflies_per_frame"] == counted
+    assert sum(counted) > 0
+    assert len(clip.meta["error_per_frame"]) == 2
+    assert clip.meta["render"]["bounces"] == 4
 
 
 def test_glass_renders_and_a_clear_pane_keeps_the_light_of_a_furnace():

@@ -1,0 +1,78 @@
+"""Your own things: a folder of meshes, pictures and environments becomes scenes, one per seed.
+
+    folder/**  *.obj *.ply *.stl *.off *.glb *.gltf   meshes, each thrown into the air, scaled to 3 to 6 cm
+               *.png *.jpg *.tif *.bmp ...            textures of the meshes, the floor and the wall
+               *.hdr *.exr                            surroundings, equirectangular, zenith on top; 1 is 1 W m^-2 sr^-1
+
+Whatever kind is missing is made here: solids, procedural textures, sun and sky.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from qsim.motion import Ballistic
+from qsim.rotation import vector
+from qsim.scene import Body, Diffuse, EnvironmentImage, Light, Material, Mesh, RoughPlastic, Scene, Texture
+from qsim.shapes import MESH_SUFFIXES, mesh_file
+from qsim.textures import PICTURE_SUFFIXES
+from scenes import stage, tumble
+from scenes.stage import any_angle, between, pick
+
+ENVIRONMENT_SUFFIXES = frozenset({".hdr", ".exr"})
+
+
+def scene(seed: int = 0, *, speed: float = 1.0, folder: str | Path) -> Scene:
+    """Four to seven bodies of the folder's meshes and textures in free flight, as in `tumble`.
+
+    `FileNotFoundError` if the folder holds nothing of use; a file that cannot be read is named by a `ValueError`.
+    """
+    meshes, pictures, environments = assets(folder)
+    rng = np.random.default_rng([seed, 17])
+    bodies = [
+        stage.floor(_material(rng, pictures), 2.4, y=-0.18, z=-0.2),
+        stage.wall(_material(rng, pictures), 2.4, 1.2, z=-0.6, y=0.35),
+    ]
+    for i, place in enumerate(tumble.spread(rng, int(rng.integers(4, 8)))):
+        velocity = rng.standard_normal(3) * (1.8, 1.4, 0.3) * speed
+        motion = Ballistic(
+            vector(place - velocity * stage.CLIP / 2),
+            vector(velocity),
+            axis=stage.direction(rng),
+            rate=speed * between(rng, 20, 50),
+            phase=any_angle(rng),
+        )
+        bodies.append(Body(f"body {i}", _mesh(rng, meshes), _material(rng, pictures), motion))
+    view = stage.camera((0.0, between(rng, 0.02, 0.14), 0.65), (0, 0, 0), 0.5)
+    return Scene(Path(folder).resolve().name, seed, view, (_light(rng, environments),), tuple(bodies), speed)
+
+
+def assets(folder: str | Path) -> tuple[list[Path], list[Path], list[Path]]:
+    """Meshes, pictures and environments in a folder and below, sorted by path."""
+    found = sorted(path for path in Path(folder).rglob("*") if path.is_file())
+    kinds = (MESH_SUFFIXES, PICTURE_SUFFIXES, ENVIRONMENT_SUFFIXES)
+    meshes, pictures, environments = ([p for p in found if p.suffix.lower() in kind] for kind in kinds)
+    if not (meshes or pictures or environments):
+        known = ", ".join(sorted(MESH_SUFFIXES | PICTURE_SUFFIXES | ENVIRONMENT_SUFFIXES))
+        raise FileNotFoundError(f"{folder}: no mesh, picture or environment in this folder ({known})")
+    return meshes, pictures, environments
+
+
+def _mesh(rng: np.random.Generator, meshes: list[Path]) -> Mesh:
+    return mesh_file(pick(rng, meshes), size=between(rng, 0.03, 0.06)) if meshes else tumble.shape(rng)
+
+
+def _material(rng: np.random.Generator, pictures: list[Path]) -> Material:
+    """Matt or slightly glossy; a picture is taken as it is, white at 0.9 of the light at most."""
+    if not pictures:
+        return stage.paint(rng, stage.surface(rng))
+    texture = Texture(0.9 * Texture(str(pick(rng, pictures))).pixels())
+    return Diffuse(texture) if rng.random() < 0.5 else RoughPlastic(texture, roughness=between(rng, 0.15, 0.4))
+
+
+def _light(rng: np.random.Generator, environments: list[Path]) -> Light:
+    if not environments:
+        return stage.sun(rng)
+    return EnvironmentImage(str(pick(rng, environments)), rotation=any_angle(rng))
