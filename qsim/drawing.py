@@ -138,8 +138,10 @@ class Draw:
         from qsim import flaws
         from qsim.spad import CountingSPAD
 
+        if not isinstance(self.plane, CountingSPAD):
+            return None
         memory = flaws.memory_of(self.flaws)
-        if not isinstance(self.plane, CountingSPAD) or (self.planes == 1 and not (memory.carry or memory.afterpulse)):
+        if self.planes == 1 and not (memory.carry or memory.afterpulse):
             return None
         flawed = flaws.of_sensor(self.flaws or flaws.Flaws(), self.plane, *clip.shape[1:])
         shape = (len(clip) // self.planes, *clip.shape[1:])
