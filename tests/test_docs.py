@@ -195,6 +195,14 @@ def test_a_page_runs_from_top_to_bottom(path, tmp_path):
     follow(path, tmp_path)
 
 
+@pytest.mark.parametrize("path", sorted((ROOT / "scenes").glob("*.toml")), ids=place)
+def test_every_recipe_of_the_library_is_read(path):
+    """Those that no page runs because they are too large included."""
+    from qsim import recipe
+
+    assert len(recipe.load(path).jobs) >= 4
+
+
 # Links, trees, the site
 
 
