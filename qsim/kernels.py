@@ -8,7 +8,7 @@ decide (about 40 in a million) is flagged by the kernel and drawn by the referen
 are the reference's on every kind of machine; tails, where a second word is drawn, come out right for the same reason.
 
 Where no short form exists (codes above 8 bits, paralyzable pixels, very long sums) or a block is tiny, the reference
-itself draws. Peak memory: the output and one frame, or two million pixels where frames are smaller.
+itself draws. Peak memory: the output and one frame, or half a million pixels where frames are smaller.
 """
 
 from __future__ import annotations

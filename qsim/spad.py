@@ -104,7 +104,10 @@ class BinarySPAD(Sensor):
         return codes
 
     def _draw(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
-        """Many planes of a few rows at a time: all planes of a code share their light."""
+        """Many planes of a few rows at a time: all planes of a code share their light.
+
+        Error: the rounding of one exponential, 1e-16 in the probability of each plane, at any number of bits.
+        """
         single, m = replace(self, bits=1), self.planes
         codes = np.zeros(photons.shape, self.dtype)
         rows = max(1, _BATCH // max(photons.shape[1], 1))
@@ -230,7 +233,10 @@ class CountingSPAD(Sensor):
         return self._draw_by_bisection(photons, exposure, key, origin)
 
     def _draw_by_bisection(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
-        """The smallest code k with u < F_k without looking at all 2^bits of them; u has 64 bits."""
+        """The smallest code k with u < F_k without looking at all 2^bits of them; u has 64 bits.
+
+        Error: that of the regularised gamma function, below 1e-11 in any probability (tested to 65 534 counts).
+        """
         from scipy.special import gammainc, gammaincc
 
         below, above = uniform_pair(*(words(key, photons.shape, origin, redraw) for redraw in (0, 1)))

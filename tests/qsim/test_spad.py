@@ -313,3 +313,21 @@ def test_settings_that_make_no_sense_are_named():
         CountingSPAD(0.5, 0.0, 1e-8, 3, 1)
     with pytest.raises(ValueError, match=r"^BinarySPAD.pde is a number, above 0 and at most 1; got 45$"):
         BinarySPAD(45, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("k", "live"), [(255, 240.0), (1023, 1050.0), (4095, 4000.0), (65_000, 65_200.0), (65_534, 64_800.0)]
+)
+def test_the_error_of_deep_counters_is_below_1e_11(k, live):
+    """P(N <= k) summed downwards from n = k with 40 digits: what the bisection of codes above 8 bits looks at."""
+    from scipy.special import gammainc, gammaincc
+
+    with mp.workdps(40):
+        mean = mp.mpf(live)
+        term = mp.exp(k * mp.log(mean) - mean - mp.loggamma(k + 1))
+        total, n = mp.mpf(0), k
+        while n >= 0 and term > 1e-25:
+            total, term, n = total + term, term * n / mean, n - 1
+        below, above = float(total), float(1 - total)
+    assert abs(gammaincc(k + 1, live) - below) < 1e-11
+    assert abs(gammainc(k + 1, live) - above) < 1e-11
