@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 DATA = ROOT / "tests" / "data"
 PPP, BITS = "3.25", "3"
 MINUTES = "2.5"  # of training
-METHODS = ("naive:1", "naive:11", "moment:3")
+METHODS = ("naive:1", "naive:11", "moment:3", "nano")  # nano = the weights that ship with the package
 
 
 def main(out: Path) -> int:
@@ -41,7 +41,7 @@ def main(out: Path) -> int:
 
 def steps(out: Path) -> None:
     """Render and sense, train, restore, score, draw."""
-    data, nano, light = out / "data", out / "nano", ["--ppp", PPP, "--bits", BITS]
+    data, trained, light = out / "data", out / "trained", ["--ppp", PPP, "--bits", BITS]
     run(
         "Rendering moving scenes at 2000 fps and sensing them",
         "qsim",
@@ -56,7 +56,7 @@ def steps(out: Path) -> None:
         "train",
         data,
         "-o",
-        nano,
+        trained,
         "--preset",
         "nano",
         "--minutes",
@@ -65,7 +65,8 @@ def steps(out: Path) -> None:
     )
     jobs = json.loads((data / "dataset.json").read_text())["jobs"]
     for name in [name for name, job in jobs.items() if job["split"] == "test"]:
-        restore(data / "clips" / name, out / f"{name}.npy", nano)
+        restore(data / "clips" / name, out / f"{name}_trained_here.npy", str(trained))
+        restore(data / "clips" / name, out / f"{name}_shipped.npy", "nano")
     ball = out / "ball"
     if not ball.exists():
         frames = np.load(DATA / "ball_12bit.npz")["frames"]
@@ -73,8 +74,8 @@ def steps(out: Path) -> None:
         camera = ["--frame-rate", "30000", "--exposure", "20e-6", "--transfer", "linear"]
         run("Real video at 30 000 fps becomes a clip", "qsim", "convert", out / "ball_12bit.npy", ball, *camera)
     run("... and goes through the sensor", "qsim", "sense", ball, *light)
-    restore(ball, out / "real_ball.npy", nano)
-    methods = ",".join([*METHODS, str(nano)])
+    restore(ball, out / "real_ball.npy", str(trained))
+    methods = ",".join([*METHODS, str(trained)])
     run("Scores on held-out scenes", "quiver", "evaluate", data, "-o", out / "scores", "--methods", methods, *light)
     real = out / "real_photons.json"
     if not real.exists():
@@ -94,7 +95,7 @@ def steps(out: Path) -> None:
     )
 
 
-def restore(source: Path, target: Path, method: Path) -> None:
+def restore(source: Path, target: Path, method: str) -> None:
     if not target.with_suffix(".json").exists():
         run(f"Restoring {source.name}", "quiver", "restore", source, "-o", target, "--method", method)
 

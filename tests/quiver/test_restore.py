@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from clips import ClipMaker
 from numpy import ndarray as Array
 from torch import Tensor, nn
 
 from qsim.qis import QIS
-from quiver import restoring
+from quiver import metrics, restoring
 from quiver.baselines import METHODS
-from quiver.data import Codes, array_codes
+from quiver.data import Codes, Light, array_codes, sensed, truth
 from quiver.model import Output, build
 from quiver.restoring import (
     Options,
@@ -182,6 +183,21 @@ def test_blocks_of_frames_do_not_show():
     blocks = restorer("moment", Options(memory=200 * 6 * 7 * 30))
     np.testing.assert_array_equal(blocks.restore(codes, progress=lambda done, total: calls.append(done)), whole)
     assert len(calls) > 3
+
+
+def test_the_shipped_weights_are_useful_at_once(make_clip: ClipMaker):
+    """A pattern that no training saw, 1.5 px/frame: measured 6.9 dB above the best window mean; 4 dB must be there."""
+    clip = make_clip(frames=15, height=64, width=72)
+    codes, factor = sensed(clip, Light())
+    target = truth(clip, factor, 0, len(clip)) / codes.white
+
+    def psnr(name: str) -> float:
+        return metrics.score(restorer(name).restore(codes) / codes.white, target).psnr_matched
+
+    assert psnr("nano") > max(psnr(f"moment:{window}") for window in (1, 3, 5, 7, 9, 11)) + 4
+    assert weights_path("nano").stat().st_size < 5e6
+    card = weights_path("nano").with_suffix(".md").read_text()
+    assert f"{sum(p.numel() for p in build('nano').parameters()):,} parameters" in card
 
 
 def test_weights_are_found_by_file_folder_and_name(tmp_path):
