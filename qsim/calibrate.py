@@ -86,8 +86,10 @@ class Transfer:
 def photon_transfer(darks: Sequence[Stack], flats: Sequence[Stack]) -> Transfer:
     """Weighted straight line of variance over mean: slope = gain, height at the darkest stack = read noise + ADC noise.
 
-    Mean and variance of one stack are correlated through the third moment; the weights are those of the residual
-    v - g m: (mu4 - v^2 + g^2 v - 2 g mu3) / n. The ADC adds 1/12 codes^2 (Janesick, Photon Transfer, SPIE 2007).
+    Mean and variance of one stack are correlated through the third moment: the residual v - g m of a stack has the
+    variance (mu4 - v^2 + g^2 v - 2 g mu3) / n. Means count from the darkest stack, whose own mean therefore enters all
+    the others, while its residual is that of v alone: generalised least squares with these covariances. The ADC adds
+    1/12 codes^2 (Janesick, Photon Transfer, SPIE 2007).
     """
     base = min(darks, key=lambda stack: stack.exposure)
     stacks = [base, *[s for s in darks if s is not base], *flats]
@@ -99,9 +101,13 @@ def photon_transfer(darks: Sequence[Stack], flats: Sequence[Stack]) -> Transfer:
     design = np.stack([np.ones_like(mean), mean], axis=1)
     gain = max(float((variance[-1] - variance[0]) / (mean[-1] or 1.0)), 1e-6)
     for _ in range(4):
-        spread = np.maximum(fourth - variance**2 + gain**2 * variance - 2 * gain * third, 1e-12) / n
-        covariance = np.linalg.inv(design.T @ (design / spread[:, None]))
-        height, slope = covariance @ (design.T @ (variance / spread))
+        spread = np.diag(np.maximum(fourth - variance**2 + gain**2 * variance - 2 * gain * third, 1e-12) / n)
+        spread[1:, 1:] += gain**2 * variance[0] / n[0]
+        spread[0, 0] = max(fourth[0] - variance[0] ** 2, 1e-12) / n[0]
+        spread[0, 1:] = spread[1:, 0] = gain * third[0] / n[0]
+        weighted = np.linalg.solve(spread, design)
+        covariance = np.linalg.inv(design.T @ weighted)
+        height, slope = covariance @ (weighted.T @ variance)
         gain = max(float(slope), 1e-9)
     # The dark mean grows with exposure: offset + gain D t
     dark_slope, dark_offset, slope_variance = _dark_line(darks)

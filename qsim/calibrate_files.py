@@ -82,8 +82,11 @@ def sensor_of(found: Calibration) -> Sensor:
 _FIELDS = {"quantum_efficiency": ("quantum_efficiency",), "pde": ("pde_fill",)}
 
 
-def to_toml(found: Calibration, title: str) -> str:
-    """The sensor as a device file, each number with its interval and method as its source."""
+def to_toml(found: Calibration, title: str, dark_map: str | None = None) -> str:
+    """The sensor as a device file, each number with its interval and method as its source.
+
+    The map of dark counts is offered in a comment: it fits frames that are no larger than it.
+    """
     lines = [f"# {title}", "[sensor]"]
     described = sensor_of(found).to_dict()
     lines += [f"{key} = {_toml(value)}" for key, value in described.items() if value is not None]
@@ -95,6 +98,8 @@ def to_toml(found: Calibration, title: str) -> str:
                 lines.append(f'{key} = "{v.value:.6g}, 95 % interval {v.low:.6g} to {v.high:.6g} {v.unit}; {v.method}"')
             elif key in _FIELDS:
                 lines.append(f'{key} = "1, not measured: give light in detected photons"')
+    if dark_map is not None:
+        lines += ["", "# [defects]  # uncomment to give every pixel its own dark counts", f'# dark_map = "{dark_map}"']
     return "\n".join(lines) + "\n"
 
 
@@ -138,11 +143,12 @@ def figure(found: Calibration) -> bytes:
 def write(found: Calibration, path: Path, title: str) -> list[Path]:
     """All files of a calibration; the sensor file comes last. Returns their paths."""
     written = [path.with_suffix(".json"), path.with_suffix(".png")]
+    dark_map = path.with_name(f"{path.stem}_dark.npy") if "dark_count_rate" in found.maps else None
     files.write_json(written[0], as_dict(found))
     files.write_bytes(written[1], figure(found))
-    if "dark_count_rate" in found.maps:
-        written.append(path.with_name(f"{path.stem}_dark.npy"))
-        with files.replacing(written[-1]) as file:
+    if dark_map is not None:
+        written.append(dark_map)
+        with files.replacing(dark_map) as file:
             np.save(file, found.maps["dark_count_rate"].astype(np.float32))
-    files.write_bytes(path, to_toml(found, title).encode())
+    files.write_bytes(path, to_toml(found, title, dark_map and dark_map.name).encode())
     return [*written, path]

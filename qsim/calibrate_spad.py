@@ -33,7 +33,7 @@ from qsim.spad import CountingSPAD
 from qsim.stacks import Stack
 
 HOT = 10.0  # times the median dark-count rate
-PERCENTILES = (1, 10, 25, 50, 75, 90, 99, 99.9)
+PERCENTILES = (1, 10, 25, 75, 90, 99, 99.9)  # of the DCR map, beside the median
 
 
 def calibrate_spad(
@@ -149,7 +149,7 @@ def _dark_rates(darks: Sequence[Stack], response: Response) -> tuple[Array, floa
 
 
 def _distribution(rates: Array) -> dict[str, Value]:
-    """Median of the DCR map (order statistics) and the share of hot pixels (Wilson's interval)."""
+    """Median and percentiles of the DCR map (order statistics), and the share of hot pixels (Wilson's interval)."""
     ordered = np.sort(rates.ravel())
     n = ordered.size
     reach = Z95 * sqrt(n) / 2
@@ -158,6 +158,15 @@ def _distribution(rates: Array) -> dict[str, Value]:
     found = {
         "dark_count_rate_median": Value(median, float(ordered[low]), float(ordered[high]), "1/s", "order statistics")
     }
+    for percent in PERCENTILES:
+        share = percent / 100
+        reach = Z95 * sqrt(n * share * (1 - share))
+        low, high = (int(np.clip(round(n * share + sign * reach), 0, n - 1)) for sign in (-1, 1))
+        value = float(np.percentile(ordered, percent))
+        name = f"dark_count_rate_p{percent:g}"
+        found[name] = Value(
+            value, min(float(ordered[low]), value), max(float(ordered[high]), value), "1/s", "order statistics"
+        )
     if median > 0:
         hot = float(np.mean(ordered > HOT * median))
         centre = (hot + Z95**2 / (2 * n)) / (1 + Z95**2 / n)

@@ -8,7 +8,7 @@ import pytest
 from stats import assert_share
 from synthetic import QISCase, SPADCase
 
-from qsim import devices
+from qsim import devices, flaws
 from qsim.calibrate import Calibration, calibrate_qis
 from qsim.calibrate_files import read_stack, sensor_of, write
 from qsim.calibrate_spad import calibrate_spad, matched_variance
@@ -240,6 +240,10 @@ def test_real_dark_counts():
     median = found.values["dark_count_rate_median"]
     assert median.low < median.value
     assert median.value == pytest.approx(127, abs=1)
+    for percent, known in ((1, 0.00039), (90, 0.00196), (99, 0.01343)):  # per frame, from the data's description
+        found_there = found.values[f"dark_count_rate_p{percent}"]
+        assert found_there.value * 10.3e-6 == pytest.approx(known, rel=0.02)
+        assert found_there.low <= found_there.value <= found_there.high
     assert found.values["hot_pixels"].value == pytest.approx(0.010, abs=0.002)
 
 
@@ -264,6 +268,9 @@ def test_files_of_a_calibration_load_as_a_device(tmp_path):
     loaded = devices.load(path)
     assert loaded == sensor_of(found)
     assert np.load(tmp_path / "mine_dark.npy").shape == (24, 24)
+    assert flaws.from_toml(path) is None
+    path.write_text(path.read_text().replace("# [defects]", "[defects]").replace("# dark_map", "dark_map"))
+    assert flaws.from_toml(path).maps == {"dark_map": str(tmp_path / "mine_dark.npy")}
 
 
 def test_frames_are_read_from_npy_and_from_a_photon_cube(tmp_path):
