@@ -150,5 +150,5 @@ def write(found: Calibration, path: Path, title: str) -> list[Path]:
         written.append(dark_map)
         with files.replacing(dark_map) as file:
             np.save(file, found.maps["dark_count_rate"].astype(np.float32))
-    files.write_bytes(path, to_toml(found, title, dark_map and dark_map.name).encode())
+    files.write_bytes(path, to_toml(found, title, dark_map.name if dark_map else None).encode())
     return [*written, path]
