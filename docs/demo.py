@@ -21,7 +21,7 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "tests" / "data"
 PPP, BITS = "3.25", "3"
-MINUTES = "2.5"  # of training
+MINUTES = "2"  # of training
 METHODS = ("naive:1", "naive:11", "moment:3", "nano")  # nano = the weights that ship with the package
 
 
