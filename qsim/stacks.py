@@ -33,10 +33,6 @@ class Stack:
         return self.total.size
 
     @property
-    def is_dark(self) -> bool:
-        return self.photons == 0
-
-    @property
     def mean(self) -> float:
         """Mean code over pixels and frames."""
         return float(self.total.sum()) / (self.pixels * self.frames)

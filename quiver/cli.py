@@ -285,10 +285,9 @@ def _add_evaluate(sub: Any) -> None:
 
 
 def _run_evaluate(args: argparse.Namespace) -> int:
-    from quiver.restoring import method_names, restorer
+    from quiver.restoring import restorers
 
-    names = [name for word in args.methods for name in (method_names() if word == "all" else (word,))]
-    methods = [restorer(name, _options(args)) for name in dict.fromkeys(names)]
+    methods = restorers(args.methods, _options(args))
     if args.static is not None:
         return _run_static(args, methods)
     if args.source is None or args.output is None:

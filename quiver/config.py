@@ -62,7 +62,7 @@ PRESETS: dict[str, Config] = {
     "quiver": Config(),
     "quiver-s": Config(channels=16),
     # Small in everything, on half of the pixels' side; an hourglass over the window learns in minutes, the recurrent
-    # part adds to its picture. 8 windows of 11 x 64 x 64 and back: 0.8 s on one thread, 0.12 s of it the hourglass.
+    # part adds to its picture. docs/results/starter.md has what it reaches.
     "nano": Config(
         channels=4,
         deformable_groups=1,

@@ -13,7 +13,7 @@ import hashlib
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -110,6 +110,25 @@ def shipped_names() -> list[str]:
 def method_names() -> list[str]:
     """Every method that needs no training: the classical ones and the shipped networks."""
     return [*METHODS, *shipped_names()]
+
+
+def restorers(names: Sequence[str], options: Options | None = None) -> list[Restorer]:
+    """Several methods for one table; `all` stands for every method that needs no training.
+
+    ValueError as for `restorer`, and where two of them would go by one name.
+    """
+    expanded = [one for name in names for one in (method_names() if name == "all" else (name,))]
+    found: dict[str, str] = {}
+    methods = []
+    for name in dict.fromkeys(expanded):
+        method = restorer(name, options)
+        if method.name in found:
+            raise ValueError(
+                f"methods {found[method.name]!r} and {name!r} are both called {method.name!r}; rename the folder of one"
+            )
+        found[method.name] = name
+        methods.append(method)
+    return methods
 
 
 def weights_path(name: str) -> Path:

@@ -167,8 +167,10 @@ class Run:
             ) from None
 
     def save_weights(self, name: str, model: nn.Module, state: State) -> None:
-        """NAME.safetensors with the settings in its notes."""
-        notes = {"step": str(state.step), "settings": json.dumps(self.settings.to_dict(), sort_keys=True)}
+        """NAME.safetensors with the settings in its notes; of folders only the name, because weights travel."""
+        settings = self.settings.to_dict()
+        settings |= {name: Path(settings[name]).name for name in ("data", "out")}
+        notes = {"step": str(state.step), "settings": json.dumps(settings, sort_keys=True)}
         weights.save(model, model.config, self.folder / f"{name}.safetensors", notes)  # type: ignore[arg-type]
 
     def save_history(self, state: State) -> None:

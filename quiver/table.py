@@ -29,6 +29,10 @@ COLUMNS = (
     "memory",
     "truth's own PSNR",
 )
+MEMORY = (
+    "Memory: the most that restoring one clip took beyond what the process held before; what an earlier method left "
+    "free is not counted, `quiver bench` measures each in a process of its own."
+)
 SCORES = ("psnr", "psnr_matched", "ssim", "ssim_matched")
 
 
@@ -124,7 +128,7 @@ def markdown(plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row]) -> st
             cells += ["not measured" if line.truth_psnr is None else f"{line.truth_psnr:.1f}"]
         text.append("| " + " | ".join(cells) + " |")
     text += ["| " + " | ".join([name, "", "", "not built yet", *[""] * 8]) + " |" for name in PAPER_METHODS]
-    text += ["", "Memory: the most that restoring one clip took beyond what was in use before.", ""]
+    text += ["", MEMORY, ""]
     failures = [f"- {line.method}, {line.light}, {reason}" for line in lines for reason in line.failures]
     text += ["## Failures", "", *failures, ""] if failures else []
     return "\n".join([*text, *_by_motion(lines), *_per_scene(rows)]) + "\n"

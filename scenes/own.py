@@ -13,8 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from qsim.motion import Ballistic
-from qsim.rotation import vector
 from qsim.scene import Body, Diffuse, EnvironmentImage, Light, Material, Mesh, RoughPlastic, Scene, Texture
 from qsim.shapes import MESH_SUFFIXES, mesh_file
 from qsim.textures import PICTURE_SUFFIXES
@@ -36,14 +34,7 @@ def scene(seed: int = 0, *, speed: float = 1.0, folder: str | Path) -> Scene:
         stage.wall(_material(rng, pictures), 2.4, 1.2, z=-0.6, y=0.35),
     ]
     for i, place in enumerate(tumble.spread(rng, int(rng.integers(4, 8)))):
-        velocity = rng.standard_normal(3) * (1.8, 1.4, 0.3) * speed
-        motion = Ballistic(
-            vector(place - velocity * stage.CLIP / 2),
-            vector(velocity),
-            axis=stage.direction(rng),
-            rate=speed * between(rng, 20, 50),
-            phase=any_angle(rng),
-        )
+        motion = tumble.thrown(rng, place, speed)
         bodies.append(Body(f"body {i}", _mesh(rng, meshes), _material(rng, pictures), motion))
     view = stage.camera((0.0, between(rng, 0.02, 0.14), 0.65), (0, 0, 0), 0.5)
     return Scene(Path(folder).resolve().name, seed, view, (_light(rng, environments),), tuple(bodies), speed)

@@ -26,9 +26,11 @@ from quiver.restoring import (
     Restorer,
     bytes_per_pixel,
     fill_network,
+    method_names,
     network_restorer,
     restore_to_file,
     restorer,
+    restorers,
     weights_path,
 )
 from quiver.tiles import plan_tiles, spans
@@ -183,6 +185,15 @@ def test_blocks_of_frames_do_not_show():
     blocks = restorer("moment", Options(memory=200 * 6 * 7 * 30))
     np.testing.assert_array_equal(blocks.restore(codes, progress=lambda done, total: calls.append(done)), whole)
     assert len(calls) > 3
+
+
+def test_methods_of_one_table_have_names_of_their_own(tmp_path):
+    names = [method.name for method in restorers(["all", "moment", "moment:3"])]
+    assert names == [*method_names(), "moment:3"]
+    network = UNet(UNetConfig(2))
+    save(network, network.config, tmp_path / "nano.safetensors")
+    with pytest.raises(ValueError, match=r"methods 'nano' and '.*' are both called 'nano'; rename the folder of one"):
+        restorers(["all", str(tmp_path / "nano.safetensors")])
 
 
 def test_the_shipped_weights_are_useful_at_once(make_clip: ClipMaker):
