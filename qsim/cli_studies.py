@@ -298,7 +298,7 @@ def add_validate(sub: Any) -> None:
     )  # fmt: skip
     parser.add_argument("what", choices=["sensor", "render", "reading"], help="what to validate")
     parser.add_argument("-o", "--output", type=Path, help="figure of speed against error (.png, .svg or .pdf)")
-    parser.add_argument("--pixels", type=int, default=1 << 20, help="pixels of a draw (default 1048576)")
+    parser.add_argument("--pixels", type=int, default=1 << 22, help="pixels of a draw (default 4194304)")
     parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the draws (default 0)")
     parser.add_argument("--require-speed", action="store_true", help="a speed below its target is a failure too")
     parser.add_argument("--scenes", nargs="+", metavar="FAMILY", help="render: families (default: four)")

@@ -18,7 +18,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from functools import cache, lru_cache
-from math import exp
+from math import exp, log
 from typing import Any
 
 import numpy as np
@@ -35,8 +35,7 @@ SMALLEST = 1 << 14  # pixels; below, compiling costs more than it brings
 _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # of Philox4x32; see keys.py
 _KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 _INFINITY = 0x7F800000  # float32; larger bit patterns are NaN or negative
-_CHUNK = 1 << 19  # pixels of small frames that share a launch
-_LARGEST = 1 << 19  # pixels of a launch, at most 2^22; larger frames take several
+_LARGEST = 1 << 22  # pixels of a launch: small frames share one, large frames take several
 _CERTAIN = 80.0  # arrivals that are sure to bring 15: P(N < 15) = 1e-19
 _CONSTANT_PLANS = 32  # sensors of a process that get kernels of their own
 
@@ -61,17 +60,16 @@ def sample(
     if chosen is None:
         return sensor.sample(photons, exposure, key=key, origin=origin, engine="reference")
     left, width = origin[1] & 3, stack.shape[2]
-    codes = np.empty(stack.shape, sensor.dtype)
+    codes = np.empty(stack.shape, np.uint8)
     doubtful = []
-    for t, top, pairs, lanes in _frames(chosen, stack, key, origin, blocks=1):
-        padded, rows = 2 * pairs.shape[1], slice(top, top + len(pairs))
-        if padded == width:
-            codes[t, rows].view(np.uint16)[...] = pairs
+    for frames, rows, pairs, at in _parts(chosen, stack, key, origin, blocks=1):
+        if 2 * pairs.shape[2] == width:
+            codes[frames, rows].view(np.uint16)[...] = pairs
         else:
-            codes[t, rows] = pairs.astype(np.uint16).view(np.uint8)[:, left : left + width]
-        y, x = np.divmod(np.repeat(2 * lanes, 2) + np.tile([0, 1], lanes.size), padded)
-        inside = (x >= left) & (x < left + width)
-        doubtful.append(np.stack([np.full(inside.sum(), t), y[inside] + top, x[inside] - left]))
+            codes[frames, rows] = pairs.astype(np.uint16).view(np.uint8)[..., left : left + width]
+        at = np.repeat(at, 2, axis=1)
+        at[2] = 2 * at[2] - left + np.tile([0, 1], at.shape[1] // 2)
+        doubtful.append(at[:, (at[2] >= 0) & (at[2] < width)])
     at = np.concatenate(doubtful, axis=1)
     if at.size:
         codes[tuple(at)] = draw_at(sensor, stack, exposure, key, origin, at)
@@ -100,11 +98,10 @@ def sample_packed(
     row = packed_width(width, bits)
     packed = np.empty((*stack.shape[:2], row), np.uint8)
     doubtful = []
-    for t, top, pairs, lanes in _frames(chosen, stack, key, origin, blocks=2, bits=bits):
-        packed[t, top : top + len(pairs)] = _octets(pairs, bits)[:, :row]
-        octets = np.unique(lanes // 4)
-        y, x = np.divmod(octets, pairs.shape[1] // 4)
-        doubtful.append(np.stack([np.full(octets.size, t), y + top, x]))
+    for frames, rows, pairs, at in _parts(chosen, stack, key, origin, blocks=2, bits=bits):
+        packed[frames, rows] = _octets(pairs, bits)[..., :row]
+        at[2] //= 4
+        doubtful.append(np.unique(at, axis=1))
     if width * bits % 8:
         packed[..., -1] &= 0xFF << (8 * row - width * bits) & 0xFF
     at = np.concatenate(doubtful, axis=1)
@@ -133,21 +130,21 @@ def steps(sensor: Sensor, photons: Array, exposure: float) -> Array:
 
 
 def _octets(pairs: Array, bits: int) -> Array:
-    """Rows of bytes of rows of pairs of codes: [H, 4 n] numbers of 2 `bits` each -> bytes [H, n bits]."""
+    """Rows of bytes of rows of pairs of codes: [..., 4 n] numbers of 2 `bits` each -> bytes [..., n bits]."""
     if bits == 1:
         # Four bytes of two bits: the product brings them side by side into the highest byte, and no other bits there
         return (pairs.view(np.uint32) * np.uint32(0x40100401)) >> np.uint32(24)
     eights = _join(_join(pairs, 2 * bits), 4 * bits)
     size = eights.dtype.itemsize
     whole = eights.byteswap().view(np.uint8).reshape(*eights.shape, size)[..., size - bits :]
-    return whole.reshape(len(eights), -1)
+    return whole.reshape(*eights.shape[:-1], -1)
 
 
 def _join(numbers: Array, bits: int) -> Array:
-    """Neighbours side by side: [H, 2 n] numbers of `bits` bits -> [H, n] of twice as many, the first one highest."""
+    """Neighbours side by side: [..., 2 n] numbers of `bits` bits -> [..., n] twice as wide, the first one highest."""
     width, wide = 8 * numbers.itemsize, np.dtype(f"u{2 * numbers.itemsize}") if numbers.itemsize < 8 else None
     if wide is None:
-        return numbers[:, ::2] << np.uint64(bits) | numbers[:, 1::2]
+        return numbers[..., ::2] << np.uint64(bits) | numbers[..., 1::2]
     both = numbers.view(wide)  # little-endian: the first one is in the low half
     low = wide.type(2 ** (2 * bits) - 1)
     return (both << wide.type(bits) | both >> wide.type(width)) & low
@@ -169,90 +166,102 @@ def _write_octets(
     inside = pixels[2] < width
     codes = np.zeros(pixels.shape[1], sensor.dtype)
     codes[inside] = draw_at(sensor, stack, exposure, key, origin, pixels[:, inside])
-    for (t, y, octet), written in zip(at.T, pack(codes.reshape(-1, 8), bits), strict=True):
-        end = min((octet + 1) * bits, packed.shape[2])
-        packed[t, y, octet * bits : end] = written[: end - octet * bits]
+    columns = bits * at[2][:, None] + np.arange(bits)
+    octet, byte = np.nonzero(columns < packed.shape[2])
+    packed[at[0][octet], at[1][octet], columns[octet, byte]] = pack(codes.reshape(-1, 8), bits)[octet, byte]
 
 
-def _frames(
+def _parts(
     chosen: Plan, stack: Array, key: Key, origin: tuple[int, int], blocks: int, bits: int | None = None
-) -> Iterator[tuple[int, int, Array, Array]]:
-    """Parts of frames: frame, first row, what the kernel wrote [rows, lanes of a row], indices of its doubtful lanes.
+) -> Iterator[tuple[slice, slice, Array, Array]]:
+    """Parts of a clip: frames, rows, what the kernel wrote [frames, rows, lanes], doubtful lanes [3, n] = (t, y, lane).
 
     Rows are padded to whole groups of `blocks` Philox blocks of the full frame. Small frames share a launch, large ones
     take several.
     """
     frames, height, width = stack.shape
     left = origin[1] & 3
-    padded = -(-(left + width) // (4 * blocks)) * 4 * blocks
-    rows = min(height, max(1, _LARGEST // padded))  # of a launch
-    together = min(frames, max(1, _CHUNK // (height * padded))) if rows == height else 1
-    direct = padded == width and stack.dtype == np.float32 and stack.flags.c_contiguous
-    light = np.zeros((0 if direct else together, rows, padded), np.float32)
-    fixed = _fixed_scalars(key, origin, padded // 2)
+    lanes = -(-(left + width) // (4 * blocks)) * 2 * blocks  # of a row
+    rows = min(height, max(1, _LARGEST // (2 * lanes)))  # of a launch
+    together = min(frames, max(1, _LARGEST // (2 * height * lanes))) if rows == height else 1
+    direct = 2 * lanes == width and stack.dtype == np.float32 and stack.flags.c_contiguous
+    light = np.zeros((0 if direct else together, rows, 2 * lanes), np.float32)
+    fixed = _fixed_scalars(key, origin)
 
-    def launch(t: int, top: int) -> tuple[int, int, int, list[Any]]:
-        n, h = min(together, frames - t), min(rows, height - top)
-        part = stack[t : t + n, top : top + h]
+    def launch(part: tuple[slice, slice]) -> list[Any]:
+        some = stack[part]
+        shape = (*some.shape[:2], lanes)
         if not direct:
             with np.errstate(over="ignore"):  # beyond float32 the reference decides
-                light[:n, :h, left : left + width] = part
-            part = light[:n, :h]
-        pairs = np.ascontiguousarray(part).reshape(-1).view(np.uint64)
-        return t, top, n, _launch(chosen, pairs, (key.frame + t, origin[0] + top, h), fixed, bits)
+                light[: shape[0], : shape[1], left : left + width] = some
+            some = light[: shape[0], : shape[1]]
+        pairs = np.ascontiguousarray(some).reshape(-1).view(np.uint64)
+        first = (key.frame + part[0].start, origin[0] + part[1].start)
+        return _launch(chosen, pairs, shape, first, fixed, bits)
 
     # While the host finishes some frames the kernel of the next ones runs, unless both need the buffer
-    running: tuple[int, int, int, list[Any]] | None = None
-    places = [(t, top) for t in range(0, frames, together) for top in range(0, height, rows)]
+    running: tuple[tuple[slice, slice], list[Any]] | None = None
+    times = [slice(t, min(t + together, frames)) for t in range(0, frames, together)]
+    places = [(t, slice(y, min(y + rows, height))) for t in times for y in range(0, height, rows)]
     for place in (*places, None):
-        done = [out.numpy() for out in running[3]] if running and not direct else []
-        started = launch(*place) if place else None
+        done = [out.numpy() for out in running[1]] if running and not direct else []
+        started = launch(place) if place else None
         if running:
-            first, top, n, arrays = running
-            pairs, flags = done or [out.numpy() for out in arrays]
-            doubtful, lanes = _set(flags), pairs.size // n
-            for i in range(n):
-                here = doubtful[(doubtful >= i * lanes) & (doubtful < (i + 1) * lanes)] - i * lanes
-                yield first + i, top, pairs[i * lanes : (i + 1) * lanes].reshape(-1, padded // 2), here
-        running = started
-
-
-def _set(flags: Array) -> Array:
-    """Indices of the few non-zero bytes among many, found in blocks of 512."""
-    whole = flags.size // 512 * 512
-    eights = flags[:whole].view(np.uint64).reshape(-1, 64)
-    blocks = np.flatnonzero(np.bitwise_or.reduce(eights, axis=1))
-    near = np.append(512 * blocks[:, None] + np.arange(512), np.arange(whole, flags.size))
-    return near[flags[near] != 0]
+            (t, y), arrays = running
+            written, flags = done or [out.numpy() for out in arrays]
+            shape = (t.stop - t.start, y.stop - y.start, lanes)
+            at = np.stack(np.unravel_index(np.flatnonzero(flags.view(bool)), shape))
+            at += np.array([[t.start], [y.start], [0]])
+            yield t, y, written.reshape(shape), at
+        running = (place, started) if place and started else None
 
 
 # ---- What a kernel computes
 
 
-def _fixed_scalars(key: Key, origin: tuple[int, int], lanes: int) -> list[Any]:
-    """What every launch of a clip shares: first block, the generator's key, rows of `lanes` lanes."""
+def _fixed_scalars(key: Key, origin: tuple[int, int]) -> list[Any]:
+    """What every launch of a clip shares: first block, the generator's key."""
     import drjit as dr
 
-    jit = _backend()
-    numbers = (origin[1] >> 2, key.philox_key >> 32, key.philox_key, lanes)
-    integers = [dr.opaque(jit.UInt32, number & 0xFFFFFFFF) for number in numbers]
-    return [*integers, dr.opaque(jit.Float, 1 / lanes)]
+    numbers = (origin[1] >> 2, key.philox_key >> 32, key.philox_key)
+    return [dr.opaque(_backend().UInt32, number & 0xFFFFFFFF) for number in numbers]
 
 
-def _launch(plan: Plan, light: Array, place: tuple[int, int, int], fixed: list[Any], bits: int | None) -> list[Any]:
+@lru_cache(maxsize=4)
+def _places(shape: tuple[int, int, int]) -> list[Any]:
+    """Where each lane of [frames, rows, lanes] is: t, y and x in the bits of one number, and how to take them apart.
+
+    Reading it is cheaper than the two divisions that would find it.
+    """
+    import drjit as dr
+
+    u32 = _backend().UInt32
+    t, y, x = np.ogrid[: shape[0], : shape[1], : shape[2]]
+    below_y = (shape[2] - 1).bit_length()
+    below_t = below_y + (shape[1] - 1).bit_length()
+    number = (t << below_t | y << below_y | x).astype(np.uint32)
+    masks = (1 << below_y) - 1, (1 << below_t) - 1
+    return [u32(number.reshape(-1)), *(dr.opaque(u32, n) for n in (below_y, below_t, *masks))]
+
+
+def _launch(
+    plan: Plan,
+    light: Array,
+    shape: tuple[int, int, int],
+    first: tuple[int, int],
+    fixed: list[Any],
+    bits: int | None,
+) -> list[Any]:
     """Start a kernel: pairs of float32 photons as uint64 [n] -> what each lane writes, and 1 where it is doubtful.
 
-    `place` = number of the first frame, its first row, rows of a frame. Without `bits` a lane writes a byte per code,
-    the first one lowest; with `bits` the codes follow each other bit by bit, the first one highest.
+    `shape` = frames, rows, lanes; `first` = frame and row. Without `bits` a lane writes a byte per code, the first one
+    lowest; with `bits` the codes follow each other bit by bit, the first one highest.
     """
     import drjit as dr
 
     jit = _backend()
-    frame, row, height = place
-    numbers = [dr.opaque(jit.UInt32, frame), dr.opaque(jit.UInt32, row), dr.opaque(jit.UInt32, height)]
-    return list(
-        _kernel(plan, bits)(jit.UInt64(light), *numbers, dr.opaque(jit.Float, 1 / height), _arguments(plan), *fixed)
-    )
+    numbers = [dr.opaque(jit.UInt32, number) for number in first]
+    return list(_kernel(plan, bits)(jit.UInt64(light), *numbers, _arguments(plan), _places(shape), *fixed))
 
 
 @lru_cache(maxsize=64)
@@ -264,11 +273,10 @@ def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
     real = jit.Float64 if plan.double else jit.Float
 
     def draw(
-        pair: Any, frame: Any, row: Any, height: Any, inverse_height: Any, arguments: list[Any], *fixed: Any
+        pair: Any, frame: Any, row: Any, arguments: list[Any], places: list[Any], block: Any, high: Any, low: Any
     ) -> tuple[Any, Any]:
-        block, high, low, lanes, inverse_lanes = fixed
-        y, x = _divmod(dr.arange(jit.UInt32, dr.width(pair)), lanes, inverse_lanes)
-        t, y = _divmod(y, height, inverse_height)
+        place, below_y, below_t, mask_x, mask_y = places
+        t, y, x = place >> below_t, (place & mask_y) >> below_y, place & mask_x
         first_plane = (frame + t) * plan.planes
         photons = [dr.reinterpret_array(jit.Float, jit.UInt32(half)) for half in (pair, pair >> 32)]
 
@@ -287,18 +295,6 @@ def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
         return out, jit.UInt8(dr.select(doubt, jit.UInt32(1), jit.UInt32(0)))
 
     return dr.freeze(draw, warn_after=1000)
-
-
-def _divmod(number: Any, divisor: Any, inverse: Any) -> tuple[Any, Any]:
-    """Quotient and remainder of integers below 2^22, without a division: a float32 product misses by 1 at most."""
-    import drjit as dr
-
-    quotient = type(number)(type(inverse)(number) * inverse)
-    rest = number - quotient * divisor
-    below = rest >= 0x80000000
-    quotient, rest = dr.select(below, quotient - 1, quotient), dr.select(below, rest + divisor, rest)
-    above = rest >= divisor
-    return dr.select(above, quotient + 1, quotient), dr.select(above, rest - divisor, rest)
 
 
 def _philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
@@ -393,7 +389,7 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
             total = real(1)
             for n in range(k, 0, -1):
                 total = dr.fma(total, live * (1 / n), 1)
-            result.append(total * dr.exp(-live))
+            result.append(total * _exp_below_zero(-live))
         return result + [real(2)] * (steps.levels - 1 - len(result)), real(1)  # no live time: never passed
     n = len(steps.full)
     highest, shift, scale, seed = scalars[:4]
@@ -413,6 +409,28 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
             step = dr.fma(terms[prefix + m], next(bands), step)
         result.append(dr.fma(unit, next(bands), step) if floor else step)
     return result, unit
+
+
+def _exp_below_zero(x: Any) -> Any:
+    """exp(x) of float32 -87 <= x <= 0 within 1.2e-7 of its value: `drjit.exp` also minds everything that is not there.
+
+    2^n exp(r) with |r| <= log(2)/2; adding 1.5 2^23 rounds n to its last bits, where the exponent takes it from. The
+    polynomial is that of Cephes (Moshier, expf).
+    """
+    import drjit as dr
+
+    real, bits = _backend().Float, _backend().UInt32
+    magic = real(1.5 * 2.0**23)
+    shifted = dr.fma(x, real(1 / log(2)), magic)
+    n = shifted - magic
+    r = dr.fma(n, real(-0.693359375), x)  # log(2) in two parts, the first one short
+    r = dr.fma(n, real(2.12194440e-4), r)
+    series = real(1.9875691500e-4)
+    for c in (1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1):
+        series = dr.fma(series, r, real(c))
+    value: Any = dr.reinterpret_array(bits, dr.fma(series, r * r, r) + 1)
+    exponent: Any = dr.reinterpret_array(bits, shifted)
+    return dr.reinterpret_array(real, value + (exponent << 23))
 
 
 def _numbers(plan: Plan) -> list[float]:
