@@ -66,11 +66,3 @@ class Flag(Motion):
         for ripple in self.ripples:
             moved[:, 2] += ripple.amplitude * self.rest[:, 0] / self.width * np.sin(ripple.angle(self.rest, t))
         return moved
-
-    def deform_velocity(self, t: float) -> Array:
-        """Velocities [m/s] of the vertices in body coordinates, [V, 3]."""
-        speed = np.zeros_like(self.rest, dtype=np.float64)
-        for ripple in self.ripples:
-            rate = -2 * np.pi * ripple.frequency * np.cos(ripple.angle(self.rest, t))
-            speed[:, 2] += ripple.amplitude * self.rest[:, 0] / self.width * rate
-        return speed

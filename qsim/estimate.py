@@ -44,10 +44,6 @@ class Response:
         """Photons whose expected stabilised code is this: exact for noiseless input, clamped to the table's ends."""
         return np.interp(stabilised, self.expected, self.photons)
 
-    def invert_mean(self, mean: Array) -> Array:
-        """Photons whose expected code is this, clamped to the table's ends."""
-        return np.interp(mean, self.mean, self.photons)
-
 
 @dataclass(frozen=True)
 class Estimate:

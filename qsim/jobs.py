@@ -49,9 +49,6 @@ class Result:
     name: str
     state: str  # "done", "failed", "full" (no space left) or "died" (the worker process did not survive it)
     message: str = ""
-    clip_seconds: float = 0.0  # wall time of rendering
-    stream_seconds: float = 0.0  # wall time of sensing
-    peak_memory: int = 0  # bytes, of the worker process so far
 
 
 def provenance(job: Job) -> dict[str, Any]:
@@ -192,7 +189,7 @@ def _do(job: Job, folder: Path, make: Make) -> Result:
     spent = f"clip {seconds[0]:.2f} s, streams {seconds[1]:.2f} s, "
     spent += f"processor {time.process_time() - worked:.2f} s, peak {peak >> 20} MiB"
     _log(folder, job.name, f"done on {platform.node()}, process {os.getpid()}: {spent}")
-    return Result(job.name, "done", "", seconds[0], seconds[1], peak)
+    return Result(job.name, "done")
 
 
 def mark_failed(folder: Path, job: Job, message: str) -> None:

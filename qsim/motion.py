@@ -50,12 +50,6 @@ class Motion(ABC):
     def velocity(self, t: float) -> tuple[Array, Array]:
         """(velocity of the body's origin [m/s], angular velocity [rad/s]), in the world's axes, at time `t` [s]."""
 
-    def point_velocity(self, points: ArrayLike, t: float) -> Array:
-        """Velocity [m/s] of body points [..., 3] (body's axes) at time `t`: v + w x (R p)."""
-        linear, angular = self.velocity(t)
-        turned = np.asarray(points, dtype=np.float64) @ self.pose(t)[:3, :3].T
-        return linear + np.cross(angular, turned)
-
     def __matmul__(self, inner: Motion) -> Composition:
         """`outer @ inner`: the inner motion happens in the frame which the outer one carries."""
         return Composition(self, inner)

@@ -78,11 +78,6 @@ def off_axis_cosines(height: int, width: int, centre_y: float, centre_x: float, 
     return cosines
 
 
-def lux_to_irradiance(lux: float) -> float:
-    """Irradiance [W m^-2] of `lux` of 555 nm light: for lights that are known by their illuminance."""
-    return lux / LUMINOUS_EFFICACY
-
-
 def photons_per_lux(camera: Camera, exposure: float) -> float:
     """Photons per pixel and exposure for one lux of 555 nm light on the faceplate: 2.47 for 1.1 um and 0.5 ms."""
     area = camera.fill_factor * camera.pixel_pitch**2

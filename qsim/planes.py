@@ -1,7 +1,7 @@
 """Files of photon counting cameras: binary planes and few-bit counts, in every layout of the field that we know.
 
 Each reader takes a path and the user's hints and returns a `Footage` of codes; bits come first or last in a byte,
-rows are padded or not, halves are upside down or not, as its docstring says. Writers are the exact inverses.
+rows are padded or not, halves are upside down or not, as its docstring says.
 """
 
 from __future__ import annotations
@@ -216,31 +216,6 @@ def read_visionsim(path: Path, hints: Hints) -> Footage:
 
     model = "binary_sum" if packed else "binary_sum_static"
     return Footage(shape, read, "visionsim", bits, model, {"bit_order": "msb"})
-
-
-def encode_half(planes: Array) -> bytes:
-    """Planes [T, 256, 512] as SwissSPAD2 half-array bytes."""
-    return np.packbits(planes.reshape(-1), bitorder="little").tobytes()
-
-
-def encode_full(planes: Array) -> bytes:
-    """Planes [T, 512, 512] as SwissSPAD2 full-array bytes."""
-    zones = np.empty((len(planes), 256, 4, 2, 128), np.uint8)
-    zones[:, :, :, 0] = planes[:, :256].reshape(-1, 256, 4, 128)
-    zones[:, :, :, 1] = planes[:, :255:-1].reshape(-1, 256, 4, 128)
-    return np.packbits(zones.reshape(-1), bitorder="little").tobytes()
-
-
-def encode_spad512s(planes: Array) -> bytes:
-    """Planes [T, 512, 512] as SPAD512S bytes, without footer."""
-    return np.packbits(planes.reshape(-1)).tobytes()
-
-
-def encode_spike(planes: Array) -> bytes:
-    """Planes [T, H, W] with H*W a multiple of 8 as spike-camera bytes."""
-    if planes.shape[1] * planes.shape[2] % 8:
-        raise ValueError(f"spike frames fill whole bytes, {planes.shape[1]} x {planes.shape[2]} pixels do not")
-    return np.packbits(planes[:, ::-1].reshape(-1), bitorder="little").tobytes()
 
 
 def roughness(planes: Array) -> float:

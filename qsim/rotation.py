@@ -67,11 +67,6 @@ def rotation_between(start: ArrayLike, end: ArrayLike) -> Array:
     return rotation_matrix(axis, float(np.arccos(cosine)))
 
 
-def euler(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Array:
-    """3x3 rotation by `x`, then `y`, then `z` [rad] about the fixed axes."""
-    return rotation_matrix((0, 0, 1), z) @ rotation_matrix((0, 1, 0), y) @ rotation_matrix((1, 0, 0), x)
-
-
 def exponential(turn: ArrayLike) -> Array:
     """3x3 rotation of a rotation vector [rad]; accurate down to angle 0."""
     k = cross_matrix(turn)

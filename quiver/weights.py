@@ -226,11 +226,6 @@ def load(path: Path) -> QUIVER | UNet:
     return network.requires_grad_(True).eval()
 
 
-def read_notes(path: Path) -> dict[str, str]:
-    """The metadata of a weights file: format, network, config and the notes of whoever wrote it."""
-    return _read_safetensors(path)[1]
-
-
 def _build(kind: str, values: dict[str, object]) -> QUIVER | UNet:
     if kind == "QUIVER":
         return QUIVER(Config.from_dict(values))

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import raw_planes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from qsim import export, formats, planes, video
+from qsim import export, formats, video
 from qsim.cli import main
 from qsim.clip import RELATIVE, Clip, ClipWriter
 from qsim.export import Export
@@ -54,11 +55,11 @@ def test_golden_photon_cube(tmp_path: Path):
 
 def test_golden_lsb_first_stream():
     assert list(np.packbits(one((1, 2, 10), (0, 0, 0), (0, 1, 9)).ravel(), bitorder="little")) == [1, 0, 8]
-    assert list(planes.encode_half(one((1, 256, 512), (0, 0, 0), (0, 0, 9)))[:2]) == [1, 2]
+    assert list(raw_planes.half(one((1, 256, 512), (0, 0, 0), (0, 0, 9)))[:2]) == [1, 2]
 
 
 def test_golden_spike():
-    assert list(planes.encode_spike(one((1, 2, 8), (0, 1, 0)))) == [1, 0]
+    assert list(raw_planes.spike(one((1, 2, 8), (0, 1, 0)))) == [1, 0]
 
 
 @pytest.mark.parametrize(
@@ -72,11 +73,11 @@ def test_golden_swissspad2_full(tmp_path: Path, y: int, x: int, byte: int, value
     (tmp_path / "a.bin").write_bytes(raw)
     expected = one((1, 512, 512), (0, y, x))
     np.testing.assert_array_equal(everything(tmp_path / "a.bin", layout="swissspad2-full"), expected)
-    assert planes.encode_full(expected) == bytes(raw)
+    assert raw_planes.full(expected) == bytes(raw)
 
 
 def test_golden_spad512s():
-    assert planes.encode_spad512s(one((1, 512, 512), (0, 0, 0)))[:2] == b"\x80\x00"
+    assert raw_planes.spad512s(one((1, 512, 512), (0, 0, 0)))[:2] == b"\x80\x00"
 
 
 # Round trips
@@ -195,7 +196,7 @@ def test_visionsim_folders_of_any_size(
 def test_raw_camera_files(tmp_path: Path, kind: str, frames: int):
     height = 256 if kind == "half" else 512
     expected = random_planes(frames, height, 512)
-    encode = {"half": planes.encode_half, "full": planes.encode_full}.get(kind, planes.encode_spad512s)
+    encode = {"half": raw_planes.half, "full": raw_planes.full}.get(kind, raw_planes.spad512s)
     layout = {"half": "swissspad2-half", "full": "swissspad2-full"}.get(kind, "spad512s")
     content = encode(expected) + (b"\0\0\0\0" if "footer" in kind else b"")
     (tmp_path / "a.bin").write_bytes(content)
@@ -211,7 +212,7 @@ def test_numbered_files_are_read_in_the_order_of_their_numbers(tmp_path: Path):
     for n in range(11):
         folder = tmp_path / "0" / str(n // 4)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"filename{n}.bin").write_bytes(planes.encode_half(expected[2 * n : 2 * n + 2]))
+        (folder / f"filename{n}.bin").write_bytes(raw_planes.half(expected[2 * n : 2 * n + 2]))
     footage = formats.read(tmp_path, Hints("swissspad2-half"))
     assert footage.shape == (22, 256, 512)
     np.testing.assert_array_equal(footage.read(0, 22), expected)
@@ -229,14 +230,14 @@ def test_spike_files(tmp_path_factory: pytest.TempPathFactory, height: int, widt
     folder = tmp_path_factory.getbasetemp()
     expected = random_planes(3, height, width, seed=seed)
     path = folder / "a.dat"
-    path.write_bytes(planes.encode_spike(expected))
+    path.write_bytes(raw_planes.spike(expected))
     np.testing.assert_array_equal(everything(path, height=height, width=width), expected)
     np.testing.assert_array_equal(everything(path, height=height, width=width, columns=width - 1), expected[..., :-1])
 
 
 def test_spike_size_from_the_side_file(tmp_path: Path):
     expected = random_planes(2, 6, 8)
-    (tmp_path / "a.dat").write_bytes(planes.encode_spike(expected))
+    (tmp_path / "a.dat").write_bytes(raw_planes.spike(expected))
     with pytest.raises(ValueError, match="does not hold its size"):
         formats.read(tmp_path / "a.dat")
     (tmp_path / "config.yaml").write_text("data:\n  spike_h: 6\n  spike_w: 8\n")
@@ -335,7 +336,7 @@ def test_gzipped_cubes(tmp_path: Path):
 
 def test_flips(tmp_path: Path):
     expected = random_planes(2, 512, 512)
-    (tmp_path / "acq_0.bin").write_bytes(planes.encode_spad512s(expected))
+    (tmp_path / "acq_0.bin").write_bytes(raw_planes.spad512s(expected))
     np.testing.assert_array_equal(everything(tmp_path / "acq_0.bin", flip="lr"), expected[..., ::-1])
     np.testing.assert_array_equal(everything(tmp_path / "acq_0.bin", flip="ud"), expected[:, ::-1])
 
@@ -525,14 +526,14 @@ def test_three_raw_layouts_of_one_size_are_not_guessed(tmp_path: Path):
     bright = 0.3 + 0.25 * np.sin(2 * np.pi * np.arange(512) / 32)
     waves = (np.random.default_rng(0).random((256, 512, 512), np.float32) < bright).astype(np.uint8)
     path = tmp_path / "capture.bin"
-    path.write_bytes(planes.encode_spad512s(waves))
+    path.write_bytes(raw_planes.spad512s(waves))
     assert path.stat().st_size == 8_388_608
     with pytest.raises(ValueError, match=r"8388608 bytes fit .*; choose one with --layout") as caught:
         formats.read(path)
     evidence = dict(re.findall(r"([\w-]+) \(roughness ([\d.]+)\)", str(caught.value)))
     assert sorted(evidence) == ["spad512s", "swissspad2-full", "swissspad2-half"]
     assert min(evidence, key=lambda name: float(evidence[name])) == "spad512s"
-    path.write_bytes(planes.encode_spad512s(waves) + b"\0\0\0\0")
+    path.write_bytes(raw_planes.spad512s(waves) + b"\0\0\0\0")
     assert formats.detect(path) == "spad512s"
     path.rename(tmp_path / "acq_000.bin")
     assert formats.detect(tmp_path / "acq_000.bin") == "spad512s"
@@ -622,7 +623,7 @@ def test_our_camera_files_are_read_alike_by_others(tmp_path: Path, full: bool):
     frames, height = (256, 512) if full else (512, 256)
     expected = random_planes(frames, height, 512)
     (tmp_path / "raw").mkdir()
-    encode = planes.encode_full if full else planes.encode_half
+    encode = raw_planes.full if full else raw_planes.half
     (tmp_path / "raw" / "filename0.bin").write_bytes(encode(expected))
     photoncube.PhotonCube.convert_to_npy(str(tmp_path / "raw"), str(tmp_path / "theirs.npy"), is_full_array=full)
     np.testing.assert_array_equal(everything(tmp_path / "theirs.npy", layout="cube"), expected)

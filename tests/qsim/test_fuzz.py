@@ -19,9 +19,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import raw_planes
 from fakes import RECIPE
 
-from qsim import exr, formats, planes, recipe, video
+from qsim import exr, formats, recipe, video
 from qsim.clip import RELATIVE, Clip, ClipWriter
 from qsim.footage import Hints
 from qsim.stream import Stream
@@ -49,7 +50,7 @@ def make_float(folder: Path) -> None:
 
 
 def make_spike(folder: Path) -> None:
-    (folder / "a.dat").write_bytes(planes.encode_spike(some_planes()))
+    (folder / "a.dat").write_bytes(raw_planes.spike(some_planes()))
     (folder / "config.yaml").write_text("spike_h: 6\nspike_w: 16\n")
 
 
@@ -157,9 +158,9 @@ FORMATS: dict[str, tuple[Callable[[Path], None], Callable[[Path], None]]] = {
     "mat 7.3": (make_mat73, reader(Hints())),
     "visionsim": (make_visionsim, reader(Hints())),
     "zarr": (make_zarr, reader(Hints())),
-    "swissspad2 half": (make_raw(planes.encode_half, 256), reader(Hints("swissspad2-half"), "a.bin")),
-    "swissspad2 full": (make_raw(planes.encode_full, 512), reader(Hints("swissspad2-full"), "a.bin")),
-    "spad512s": (make_raw(planes.encode_spad512s, 512), reader(Hints("spad512s"), "a.bin")),
+    "swissspad2 half": (make_raw(raw_planes.half, 256), reader(Hints("swissspad2-half"), "a.bin")),
+    "swissspad2 full": (make_raw(raw_planes.full, 512), reader(Hints("swissspad2-full"), "a.bin")),
+    "spad512s": (make_raw(raw_planes.spad512s, 512), reader(Hints("spad512s"), "a.bin")),
     "clip": (make_clip, read_clip),
     "stream": (make_stream, read_stream),
     "recipe": (make_recipe, lambda folder: recipe.load(folder / "r.toml")),

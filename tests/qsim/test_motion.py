@@ -20,7 +20,7 @@ from qsim.motion import (
     Translation,
     Wave,
 )
-from qsim.rotation import euler, exponential, left_jacobian, logarithm, rotation_between, rotation_matrix
+from qsim.rotation import exponential, left_jacobian, logarithm, rotation_between, rotation_matrix
 from qsim.shapes import sheet
 
 TURNING = Spin((1, 2, -1), 30.0, 0.4, center=(0.1, -0.2, 0.3))
@@ -74,7 +74,8 @@ def test_every_pose_is_rigid_and_its_points_move_as_stated(name):
         assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
         assert pose[3].tolist() == [0, 0, 0, 1]
         ends = [points @ motion.pose(t + d)[:3, :3].T + motion.pose(t + d)[:3, 3] for d in (-STEP, STEP)]
-        speed = motion.point_velocity(points, t)
+        linear, angular = motion.velocity(t)
+        speed = linear + np.cross(angular, points @ pose[:3, :3].T)  # v + w x (R p)
         np.testing.assert_allclose(speed, (ends[1] - ends[0]) / (2 * STEP), atol=5e-6 * (1 + np.abs(speed).max()))
 
 
@@ -131,13 +132,12 @@ def test_keyframes_turn_evenly_and_their_places_have_no_kink():
     np.testing.assert_allclose(KEYS.velocity(0.31)[1], KEYS.velocity(0.49)[1])
 
 
-def test_the_flag_is_held_at_its_pole_and_its_velocity_is_exact():
+def test_the_flag_is_held_at_its_pole_and_repeats():
     t = 0.123
     np.testing.assert_array_equal(FLAG.deform(t)[REST[:, 0] == 0], REST[REST[:, 0] == 0])
     np.testing.assert_array_equal(FLAG.deform(t)[:, :2], REST[:, :2])
     slope = (FLAG.deform(t + STEP) - FLAG.deform(t - STEP)) / (2 * STEP)
-    np.testing.assert_allclose(FLAG.deform_velocity(t), slope, atol=1e-6)
-    assert np.abs(FLAG.deform_velocity(t)).max() > 0.1
+    assert np.abs(slope).max() > 0.1  # m/s: it does move
     edge = FLAG.rest[:, 0] == FLAG.width
     assert np.abs(FLAG.deform(t)[edge, 2]).max() <= 0.05 + 0.02
     period = Flag(REST, FLAG.ripples[:1])
@@ -195,11 +195,11 @@ def test_left_jacobian_is_continuous_across_its_series():
     np.testing.assert_allclose(left_jacobian(turn) @ turn, turn)  # turning on about the same axis
 
 
-def test_rotations_between_directions_and_about_fixed_axes():
+def test_rotations_between_directions_and_of_bodies_at_rest():
     rng = np.random.default_rng(3)
     pairs = [*rng.normal(size=(5, 2, 3)), np.array([[0, 0, 2.0], [0, 0, -1.0]]), np.array([[1.0, 0, 0], [3.0, 0, 0]])]
     for start, end in pairs:
         turned = rotation_between(start, end) @ start / np.linalg.norm(start)
         np.testing.assert_allclose(turned, end / np.linalg.norm(end), atol=1e-12)
-    np.testing.assert_allclose(euler(x=np.pi / 2, y=np.pi / 2) @ (0, 1, 0), (1, 0, 0), atol=1e-15)
-    np.testing.assert_allclose(Still.turned(euler(0.3, 0.2, 0.1), (1, 2, 3)).pose(0.0)[:3, :3], euler(0.3, 0.2, 0.1))
+    turn = rotation_matrix((1.0, 2.0, -0.5), 0.6)
+    np.testing.assert_allclose(Still.turned(turn, (1, 2, 3)).pose(0.0)[:3, :3], turn, atol=1e-15)

@@ -88,10 +88,10 @@ def test_a_wall_under_100_lux_gives_the_photons_worked_by_hand():
 
     An even sky of radiance E / pi gives a plane facing it the irradiance E.
     """
-    from qsim.optics import expected_photons, lux_to_irradiance
+    from qsim.optics import LUMINOUS_EFFICACY, expected_photons
 
     camera = Camera(8e-3, 2.0, 1.1e-6, 5, 7, transmission=0.9, wavelength=555e-9, origin=(0, 0, 4))
-    sky = Constant(lux_to_irradiance(100.0) / math.pi)
+    sky = Constant(100.0 / LUMINOUS_EFFICACY / math.pi)
     made = scene(Body("wall", square(40), Diffuse(0.5)), light=sky, camera=camera)
     frame = renderer(made, budget=Budget(512, 1)).frame(0)
     photons = expected_photons(frame.radiance, camera, 5e-4)

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from qsim.parts import gear, glyph_outlines, letters, rotor, spring
-from qsim.rotation import euler, pose_matrix
+from qsim.rotation import pose_matrix, rotation_matrix
 from qsim.scene import Mesh
 from qsim.shapes import (
     ball,
@@ -94,7 +94,7 @@ def test_plates_have_no_net_area_and_look_outward(name):
     mesh = PLATES[name]
     np.testing.assert_allclose(area_vectors(mesh).sum(0), 0, atol=1e-12)  # the law of every closed surface
     assert volume(mesh) > 0
-    away = moved(mesh, pose_matrix(euler(0.3, 0.2, 0.1), (3, -2, 5)))
+    away = moved(mesh, pose_matrix(rotation_matrix((3, 2, 1), 0.4), (3, -2, 5)))
     assert volume(away) == pytest.approx(volume(mesh), rel=1e-8)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from clips import write_dataset
+from safetensors import safe_open
 from torch import Tensor, nn
 
 from quiver import train as training
@@ -20,7 +21,7 @@ from quiver.model import Output
 from quiver.run import PROTOCOLS, Run, Settings, State
 from quiver.train import Diverged, learning_rate, make_windows, note_plateau, time_is_up, train
 from quiver.unet import UNet, UNetConfig
-from quiver.weights import load, read_notes
+from quiver.weights import load
 
 ROOT = Path(__file__).parents[2]
 
@@ -115,8 +116,8 @@ def test_files_of_a_run(tiny_dataset, tmp_path):
     names = {path.name for path in (tmp_path / "r").iterdir()}
     assert {"settings.json", "checkpoint.pt", "best.safetensors", "last.safetensors", "history.json"} <= names
     assert any(name.startswith("events.out.tfevents") for name in names)
-    notes = read_notes(tmp_path / "r/best.safetensors")
-    assert json.loads(notes["settings"])["ppp"] == [3.25]
+    with safe_open(tmp_path / "r/best.safetensors", framework="pt") as file:
+        assert json.loads(file.metadata()["settings"])["ppp"] == [3.25]
     history = json.loads((tmp_path / "r/history.json").read_text())["history"]
     assert [entry["step"] for entry in history] == [4, 6]
 

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 
 from quiver.model import PRESETS, QUIVER, Config
 from quiver.unet import UNet, UNetConfig
-from quiver.weights import ALIAS, convert_weights, from_published, load, published_name, read_notes, save
+from quiver.weights import ALIAS, convert_weights, from_published, load, published_name, save
 
 TINY = Config(
     channels=2,
@@ -23,6 +23,11 @@ TINY = Config(
     cell_blocks=1,
     attention_width=4,
 )
+
+
+def notes(path: Path) -> dict[str, str]:
+    with safe_open(path, framework="pt") as file:
+        return file.metadata()
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +93,7 @@ def test_a_checkpoint_is_converted(tmp_path: Path, state, wrap, prefix):
     ours = load(target)
     assert ours.config == PRESETS["quiver-s"]
     assert torch.equal(ours.alignment.weight, state["pa_deform.weight"])
-    assert read_notes(target)["converted_from"] == "their.pth"
+    assert notes(target)["converted_from"] == "their.pth"
     with pytest.raises(FileExistsError, match=r"ours\.safetensors exists"):
         convert_weights(source, target)
 
@@ -147,7 +152,7 @@ def test_saved_networks_come_back_the_same(tmp_path: Path, build):
     back = load(path)
     assert type(back) is type(network)
     assert back.config == network.config
-    assert read_notes(path)["steps"] == "12"
+    assert notes(path)["steps"] == "12"
     for name, value in network.state_dict().items():
         assert torch.equal(back.state_dict()[name], value), name
     assert list(tmp_path.iterdir()) == [path]
