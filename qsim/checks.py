@@ -1,11 +1,18 @@
-"""Checks of single values in a recipe: the value in its type, or a `ValueError` that says what was expected."""
+"""Checks of what people write: a value in its type, or a `ValueError` that says what was expected or meant."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import difflib
+from collections.abc import Callable, Iterable
 from typing import Any
 
 SPLITS = ("train", "val", "test")
+
+
+def suggest(word: str, known: Iterable[str]) -> str:
+    """`; did you mean '...'?`, or nothing if no known word is close."""
+    close = difflib.get_close_matches(word, list(known), n=1)
+    return f"; did you mean '{close[0]}'?" if close else ""
 
 
 def text(value: Any) -> str:

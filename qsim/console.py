@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import difflib
-import errno
 import json
 import os
 import re
@@ -22,10 +20,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from qsim import stream
+from qsim.checks import suggest
+from qsim.files import FULL
 
 GOES_ON = "the same command goes on where it stopped"
 STARTS_AGAIN = "nothing half-written is left; run the same command again"
-FULL = (errno.ENOSPC, errno.EDQUOT)  # of an OSError
 _MAKE_SPACE = "nothing half-written is left; make space and run the same command again"
 
 # Options as other programs call them -> ours, suggested where a command has ours.
@@ -80,7 +79,7 @@ class Parser(argparse.ArgumentParser):
             short = re.match(r"-[A-Za-z]", word)
             if (short and word[:2] not in known) or (word.startswith("--") and option not in known):
                 meant = _ALSO_CALLED.get(option, "")
-                self.error(f"unknown option {option}{suggest(meant if meant in known else option, list(known))}")
+                self.error(f"unknown option {option}{suggest(meant if meant in known else option, known)}")
 
     def error(self, message: str) -> NoReturn:
         choice = re.search(r"invalid choice: '?([^']*?)'? \(choose from (.*)\)", message)
@@ -94,12 +93,6 @@ class Parser(argparse.ArgumentParser):
             message = f"argument {number[1]}: expected {kind}, got {number[3]}"
         print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
         raise SystemExit(2)
-
-
-def suggest(word: str, known: Sequence[str]) -> str:
-    """`; did you mean '...'?`, or nothing if no known word is close."""
-    close = difflib.get_close_matches(word, known, n=1)
-    return f"; did you mean '{close[0]}'?" if close else ""
 
 
 def command(

@@ -21,7 +21,7 @@ from typing import Any
 
 from qsim import __version__, files
 from qsim.clip import Clip
-from qsim.jobs import FULL, Make, Result, record_path, render_job
+from qsim.jobs import Make, Result, record_path, render_job
 from qsim.recipe import SPLITS, Job, Recipe
 from qsim.stream import Progress
 from qsim.workers import Limits, run_here, run_local
@@ -200,7 +200,7 @@ def generate(
             done = sum(record_path(folder, job.name).is_file() for job in jobs)
             shared = tuple(Dataset.open(folder).shared_between_splits())
     except OSError as error:
-        if error.errno not in FULL:
+        if error.errno not in files.FULL:
             raise
         message = f"{folder}: {error.strerror}; nothing is lost: make space and run the same command again"
         raise OSError(message) from None

@@ -21,7 +21,7 @@ from numpy import ndarray as Array
 from qsim.keys import Key, hash_name, uniform, uniform_pair, words
 from qsim.qis import QIS
 from qsim.sensor import Sensor, require_number
-from qsim.spad import BinarySPAD, CountingSPAD
+from qsim.spad import SPAD, BinarySPAD
 
 _DEVICE = hash_name("qsim fixed pattern")  # the "clip" of all device maps
 _AFTERPULSE, _CROSSTALK = 101, 102  # stages of a clip's key; crosstalk takes one per direction
@@ -235,7 +235,7 @@ def _draw(
 def _without_dark(sensor: Sensor) -> Sensor:
     if isinstance(sensor, QIS):
         return replace(sensor, dark_current=0.0)
-    if isinstance(sensor, BinarySPAD | CountingSPAD):
+    if isinstance(sensor, SPAD):
         return replace(sensor, dark_count_rate=0.0)
     raise ValueError(f"{type(sensor).__name__}: unknown to the dark map")
 
@@ -277,8 +277,8 @@ def _sum_of_planes(
     for p in range(len(photons) * m):
         at = key.at(key.frame * m + p)
         fired = _draw(plane, photons[p // m][None] / m, exposure / m, at, maps, origin, engine)
-        fired, before = _plane_after(fired[0], before, at, maps, disturbances[0], origin)
-        codes[p // m] += _crosstalk(fired, 1, at, maps, disturbances[1], origin)
+        fired, before = _disturb(before, fired, 1, at, maps, disturbances, origin)
+        codes[p // m] += fired[0]
     return codes, before
 
 
@@ -291,6 +291,7 @@ def _disturb(
     disturbances: tuple[float, float],
     origin: tuple[int, int],
 ) -> tuple[Array, Array | None]:
+    """Codes [T, H, W] up to `top`, each frame after the one before it; and the memory of the next."""
     if not any(disturbances):
         return codes, None
     result = np.empty_like(codes)

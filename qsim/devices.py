@@ -21,13 +21,13 @@ photons" means that light has to be given as photons that this sensor detects. A
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, fields
-from difflib import get_close_matches
 from pathlib import Path
 from types import MappingProxyType
 
+from qsim import files
+from qsim.checks import suggest
 from qsim.qis import QIS
 from qsim.sensor import Sensor
 from qsim.spad import BinarySPAD, CountingSPAD
@@ -216,7 +216,9 @@ def load(name: str | Path, *, ppp: float | None = None, bits: int | None = None,
         return device.make(ppp, device.bits if bits is None else bits, exposure)
     path = Path(name)
     if path.suffix != ".toml":
-        raise ValueError(f"unknown sensor {str(name)!r}{_hint(str(name), DEVICES)}; `qsim doctor --devices` lists all")
+        raise ValueError(
+            f"unknown sensor {str(name)!r}{suggest(str(name), DEVICES)}; `qsim doctor --devices` lists all"
+        )
     sensor = from_toml(path)
     if bits is not None and bits != sensor.bits:
         raise ValueError(f"{path}: the file says bits = {sensor.bits}, asked for {bits}; change one of them")
@@ -226,22 +228,17 @@ def load(name: str | Path, *, ppp: float | None = None, bits: int | None = None,
 def from_toml(path: str | Path) -> Sensor:
     """The sensor of a TOML file with a table [sensor] and, optionally, [sources] and [defects] (flaws.py); strict."""
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such sensor file")
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not a TOML file: {error}") from None
+    tables = files.read_toml(path, "sensor file")
     for key in tables:
         if key not in ("sensor", "sources", "defects"):  # [defects] is read by flaws.py
-            raise ValueError(f"{path}: unknown table [{key}]{_hint(key, ('sensor', 'sources', 'defects'))}")
+            raise ValueError(f"{path}: unknown table [{key}]{suggest(key, ('sensor', 'sources', 'defects'))}")
     if not isinstance(tables.get("sensor"), dict):
         raise ValueError(f"{path}: a table [sensor] with model, bits and the model's fields is missing")
     sensor = from_dict(tables["sensor"], where=f"{path}: [sensor]")
     known = [field.name for field in fields(sensor)]  # type: ignore[arg-type]  # every model is a dataclass
     for key in tables.get("sources", {}):
         if key not in known:
-            raise ValueError(f"{path}: unknown key {key!r} in [sources]{_hint(key, known)}")
+            raise ValueError(f"{path}: unknown key {key!r} in [sources]{suggest(key, known)}")
     return sensor
 
 
@@ -249,13 +246,13 @@ def from_dict(settings: Mapping[str, object], where: str = "sensor") -> Sensor:
     """The sensor that `Sensor.to_dict` described: {"model": "QIS", field: value, ...}; strict, `ValueError`."""
     name = settings.get("model")
     if not isinstance(name, str) or name not in MODELS:
-        raise ValueError(f"{where}: model is one of {', '.join(MODELS)}, got {name!r}{_hint(str(name), MODELS)}")
+        raise ValueError(f"{where}: model is one of {', '.join(MODELS)}, got {name!r}{suggest(str(name), MODELS)}")
     model = MODELS[name]
     wanted = {field.name: field for field in fields(model)}  # type: ignore[arg-type]  # every model is a dataclass
     values = {key: value for key, value in settings.items() if key != "model"}
     for key, value in values.items():
         if key not in wanted:
-            raise ValueError(f"{where}: unknown key {key!r} for {name}{_hint(key, wanted)}")
+            raise ValueError(f"{where}: unknown key {key!r} for {name}{suggest(key, wanted)}")
         values[key] = _typed(where, key, value, str(wanted[key].type))
     missing = [key for key, field in wanted.items() if key not in values and field.default is MISSING]
     if missing:
@@ -296,9 +293,3 @@ def _typed(where: str, key: str, value: object, annotation: str) -> object:
     if not good:
         raise ValueError(f"{where}: {key} is {kind}, got {value!r}")
     return float(value) if annotation.startswith("float") else value  # type: ignore[arg-type]
-
-
-def _hint(word: str, known: Mapping[str, object] | list[str] | tuple[str, ...]) -> str:
-    """ "; did you mean 'exposure'?" where something is near."""
-    near = get_close_matches(word, list(known), n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""

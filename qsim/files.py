@@ -9,15 +9,19 @@ Every file that `qsim` makes goes through here, which is also where tests inject
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import json
 import os
 import shutil
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
+
+FULL = (errno.ENOSPC, errno.EDQUOT)  # of an `OSError`: no space left
 
 
 def sha256(source: bytes | Path) -> str:
@@ -102,6 +106,16 @@ def to_json(value: Any) -> bytes:
 def write_json(path: Path, value: Any) -> str:
     """Write `value` atomically as JSON; returns the SHA-256 of the file."""
     return write_bytes(path, to_json(value))
+
+
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """A TOML file; `FileNotFoundError` that says `what` is missing, `ValueError` for another kind of file."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such {what}")
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not a TOML file: {error}") from None
 
 
 def read_json(path: Path) -> dict[str, Any]:

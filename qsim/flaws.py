@@ -26,10 +26,8 @@ by photon (events.py) where the largest of these effects passes events.TOLERANCE
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from difflib import get_close_matches
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -38,11 +36,12 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import defects, events, files
+from qsim.checks import suggest
 from qsim.defects import DarkSpread, Defects, Maps
 from qsim.keys import Key
 from qsim.qis import QIS
 from qsim.sensor import Sensor
-from qsim.spad import BinarySPAD, CountingSPAD
+from qsim.spad import SPAD, BinarySPAD, CountingSPAD
 
 _MAPS = {"gain_map": "prnu", "dark_map": "dark", "dead_map": "dead", "offset_map": "offset",
          "read_noise_map": "read_noise"}  # fmt: skip
@@ -84,12 +83,7 @@ class Flaws:
 def from_toml(path: str | Path) -> Flaws | None:
     """The table [defects] of a TOML file, None if there is none or all of it is off; strict, `ValueError`."""
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file of defects")
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8")).get("defects", {})
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not a TOML file: {error}") from None
+    table = files.read_toml(path, "file of defects").get("defects", {})
     if not isinstance(table, dict):
         raise ValueError(f"{path}: [defects] is a table, got {table!r}")
     found = {key: str((path.parent / table[key]).resolve()) for key in _MAPS if isinstance(table.get(key), str)}
@@ -101,9 +95,8 @@ def from_dict(table: Mapping[str, Any], where: str = "defects") -> Flaws:
     """Flaws of a table, or of what `to_dict` wrote, whose maps have to be unchanged; strict, `ValueError`."""
     for key in table:
         if key not in _KEYS:
-            near = get_close_matches(key, _KEYS, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else f"; known are {', '.join(_KEYS)}"
-            raise ValueError(f"{where}: unknown key {key!r}{hint}")
+            meant = suggest(key, _KEYS) or f"; known are {', '.join(_KEYS)}"
+            raise ValueError(f"{where}: unknown key {key!r}{meant}")
     for name, pattern in _MAPS.items():
         if name in table and pattern in table:
             raise ValueError(f"{where}: {pattern} and {name} say the same thing twice; leave one out")
@@ -229,7 +222,7 @@ def _check_model(flaws: Flaws, sensor: Sensor) -> None:
 def _with_dark(sensor: Sensor, rate: float) -> Sensor:
     if isinstance(sensor, QIS):
         return replace(sensor, dark_current=rate)
-    if isinstance(sensor, BinarySPAD | CountingSPAD):
+    if isinstance(sensor, SPAD):
         return replace(sensor, dark_count_rate=rate)
     raise ValueError(f"{type(sensor).__name__}: unknown to the dark map")
 

@@ -12,7 +12,6 @@ A job is done when its record is there. Everything before can be killed at any m
 from __future__ import annotations
 
 import datetime
-import errno
 import os
 import platform
 import resource
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 
 Make = Callable[[Job, Path], object]  # renders a job's clip to a path; tests hand in a quick one
 
-FULL = (errno.ENOSPC, errno.EDQUOT)
 _ASSETS = {  # record of scene.py -> its array or file, and what it is
     "Texture": ("image", "texture"),
     "NormalMap": ("image", "texture"),
@@ -151,7 +149,7 @@ def run_job(job: Job, folder: Path, make: Make = render_job) -> Result:
         try:
             return _do(job, folder, make)
         except Exception as error:
-            if isinstance(error, OSError) and error.errno in FULL:
+            if isinstance(error, OSError) and error.errno in files.FULL:
                 raise
             _log(folder, job.name, traceback.format_exc())
             message = " ".join(str(error).split()) or type(error).__name__
@@ -160,7 +158,7 @@ def run_job(job: Job, folder: Path, make: Make = render_job) -> Result:
             mark_failed(folder, job, message)
             return Result(job.name, "failed", message)
     except OSError as error:
-        if error.errno not in FULL:
+        if error.errno not in files.FULL:
             raise
         return Result(job.name, "full", f"{error.strerror} while making {job.name}")
     finally:

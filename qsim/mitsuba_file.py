@@ -8,7 +8,6 @@ Mitsuba keeps shapes, materials and lights; we need the names of the shapes, whi
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from qsim import files
+from qsim.checks import suggest
 from qsim.scene import Camera, MitsubaFile, Motion, Part, Scene, Vector
 
 F_NUMBER, PITCH = 2.8, 1.1e-6  # of the camera that is made from the file's, which has no pixels in metres
@@ -35,8 +35,7 @@ def read(mi: Any, path: Path, motions: Mapping[str, Motion], camera: Camera | No
     parameters = mi.traverse(loaded)
     for name in motions:
         if name not in names:
-            close = difflib.get_close_matches(name, names, n=1)
-            meant = f"; did you mean {close[0]!r}?" if close else f"; there are {', '.join(map(repr, names)) or 'none'}"
+            meant = suggest(name, names) or f"; there are {', '.join(map(repr, names)) or 'none'}"
             raise ValueError(f"{path}: no shape has the id {name!r}{meant}")
         if not any(f"{name}.{key}" in parameters for key in MOVABLE):
             raise ValueError(f"{path}: shape {name!r} has neither vertices nor a placement to move; use a mesh")

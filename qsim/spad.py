@@ -23,20 +23,11 @@ _UNDERFLOW = 1e-290  # below, sums in floating point may have lost terms
 
 
 @dataclass(frozen=True)
-class BinarySPAD(Sensor):
-    """A clocked pixel: one plane says whether anything arrived; a code is the sum of M = 2^bits - 1 planes.
-
-    **Planes are drawn one by one.** Frame f of a b-bit stream is the sum of the planes f M ... f M + M - 1, and plane p
-    is what a 1-bit sensor draws for frame p of the same key. So two bit depths of one plane rate use the same photons:
-    seven frames of the 1-bit stream add up to one frame of the 3-bit stream, at constant light and, with
-    `sample_planes`, when every plane sees its own instant of the motion.
-    """
+class SPAD(Sensor):
+    """What both pixels are: avalanches per photon, and in the dark."""
 
     pde: float  # avalanches per photon, 0 ... 1
     dark_count_rate: float  # 1/s
-    bits: int = 1  # 1 ... 16
-
-    code_model: ClassVar[str] = "binary_sum"
 
     def __post_init__(self) -> None:
         require_number(self, "pde", 0, 1, open_low=True)
@@ -51,14 +42,29 @@ class BinarySPAD(Sensor):
     def dark_rate(self) -> float:
         return self.dark_count_rate
 
+    def white(self, exposure: float) -> float:
+        """(2^bits - 1) / PDE: light that would fill the code if every plane could count, or nothing were dead."""
+        return (self.levels - 1) / self.pde
+
+
+@dataclass(frozen=True)
+class BinarySPAD(SPAD):
+    """A clocked pixel: one plane says whether anything arrived; a code is the sum of M = 2^bits - 1 planes.
+
+    **Planes are drawn one by one.** Frame f of a b-bit stream is the sum of the planes f M ... f M + M - 1, and plane p
+    is what a 1-bit sensor draws for frame p of the same key. So two bit depths of one plane rate use the same photons:
+    seven frames of the 1-bit stream add up to one frame of the 3-bit stream, at constant light and, with
+    `sample_planes`, when every plane sees its own instant of the motion.
+    """
+
+    bits: int = 1  # 1 ... 16
+
+    code_model: ClassVar[str] = "binary_sum"
+
     @property
     def planes(self) -> int:
         """Binary planes in one code, M = 2^bits - 1."""
         return self.levels - 1
-
-    def white(self, exposure: float) -> float:
-        """M / PDE: light that would bring one avalanche per plane if planes could count."""
-        return self.planes / self.pde
 
     def _cdf(self, arrivals: Array, exposure: float) -> Array:
         cdf = np.minimum(np.cumsum(np.exp(self._log_pmf(arrivals, exposure)), axis=1), 1.0)
@@ -139,7 +145,7 @@ def _log_binomials(n: int) -> Array:
 
 
 @dataclass(frozen=True)
-class CountingSPAD(Sensor):
+class CountingSPAD(SPAD):
     """A free-running counter, live at the start of the exposure; codes clip at 2^bits - 1.
 
     Non-paralyzable: after a count the pixel is dead for `dead_time`, and k counts fit if the k-th arrival of the live
@@ -147,8 +153,6 @@ class CountingSPAD(Sensor):
     Paralyzable: every arrival, counted or not, starts a new dead time; see `deadtime.py`.
     """
 
-    pde: float  # avalanches per photon, 0 ... 1
-    dark_count_rate: float  # 1/s
     dead_time: float  # s
     bits: int  # 1 ... 16
     paralyzable: bool = False
@@ -156,24 +160,10 @@ class CountingSPAD(Sensor):
     code_model: ClassVar[str] = "counting"
 
     def __post_init__(self) -> None:
-        require_number(self, "pde", 0, 1, open_low=True)
-        require_number(self, "dark_count_rate", 0)
+        super().__post_init__()
         require_number(self, "dead_time", 0)
-        require_bits(self)
         if not isinstance(self.paralyzable, bool):
             raise ValueError(f"CountingSPAD.paralyzable is true or false, got {self.paralyzable!r}")
-
-    @property
-    def efficiency(self) -> float:
-        return self.pde
-
-    @property
-    def dark_rate(self) -> float:
-        return self.dark_count_rate
-
-    def white(self, exposure: float) -> float:
-        """(2^bits - 1) / PDE: where the counter would be full if there were no dead time."""
-        return (self.levels - 1) / self.pde
 
     def brightest(self, exposure: float) -> float:
         """Paralyzable: E[N] = 1 - exp(-n a) + n (1 - a) exp(-n a) of n arrivals, a = dead time / exposure < 1, peaks at

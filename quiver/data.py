@@ -16,9 +16,10 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import __version__, devices, keys
+from qsim.checks import suggest
 from qsim.clip import Clip
 from qsim.completion import add_completion
-from qsim.console import GOES_ON, STARTS_AGAIN, Parser, bar, command, output, run, suggest
+from qsim.console import GOES_ON, STARTS_AGAIN, Parser, bar, command, output, run
 from qsim.dataset import Dataset
 from qsim.files import read_json, replacing, write_bytes, write_json
 from qsim.keys import Key, hash_name

@@ -14,7 +14,7 @@ from numpy import ndarray as Array
 
 from qsim.qis import QIS
 from qsim.sensor import Sensor
-from quiver.baselines.windows import check_codes, check_window, in_units, restore_by_sum
+from quiver.baselines.windows import restore_by_mean
 
 
 def dark_codes(sensor: Sensor, exposure: float) -> float:
@@ -29,9 +29,9 @@ def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11, 
 
     Raises ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
     """
-    check_codes(codes, sensor)
-    check_window(window)
-    top = sensor.levels - 1
-    mean_code = np.arange(window * top + 1) / window
-    photons = np.maximum(0, mean_code - dark_codes(sensor, exposure)) * (sensor.white(exposure) / top)
-    return in_units(restore_by_sum(codes, window, photons), photons_per_unit)
+    dark, step = dark_codes(sensor, exposure), sensor.white(exposure) / (sensor.levels - 1)
+
+    def photons_of(mean_code: Array) -> Array:
+        return np.maximum(0, mean_code - dark) * step
+
+    return restore_by_mean(codes, sensor, window, photons_of, photons_per_unit)

@@ -3,18 +3,16 @@
     photons = mu^-1(min(mean(codes), top - 1/(2 window)))
 
 Source: method of moments, textbook. Knows clipping, rounding, dark counts and dead time, because mu comes from the
-sensor's exact distribution; knows nothing about space or motion. A sum of codes has few values, so the whole method
-is one table and a running sum.
+sensor's exact distribution; knows nothing about space or motion.
 """
 
 from __future__ import annotations
 
-import numpy as np
 from numpy import ndarray as Array
 
 from qsim.sensor import Sensor
 from quiver.baselines.tables import response_table
-from quiver.baselines.windows import check_codes, check_window, in_units, restore_by_sum
+from quiver.baselines.windows import restore_by_mean
 
 
 def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11, photons_per_unit: float = 1.0) -> Array:
@@ -22,10 +20,5 @@ def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11, 
 
     Raises ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
     """
-    check_codes(codes, sensor)
-    check_window(window)
-    top = sensor.levels - 1
-    mean_code = np.arange(window * top + 1) / window
-    return in_units(
-        restore_by_sum(codes, window, response_table(sensor, exposure).invert(mean_code, window)), photons_per_unit
-    )
+    table = response_table(sensor, exposure)
+    return restore_by_mean(codes, sensor, window, lambda mean_code: table.invert(mean_code, window), photons_per_unit)

@@ -9,7 +9,7 @@ over for short clips.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy import ndarray as Array
@@ -70,13 +70,22 @@ def window_sums(codes: Array, window: int, top: int) -> Iterator[Array]:
         yield total
 
 
-def restore_by_sum(codes: Array, window: int, table: Array) -> Array:
-    """Restored frames [T, H, W], float32, where a frame depends on the sum of its window only: table [sums]."""
+def restore_by_mean(
+    codes: Array, sensor: Sensor, window: int, photons_of: Callable[[Array], Array], photons_per_unit: float
+) -> Array:
+    """Restored frames [T, H, W], float32, where a frame depends on the mean code of its window only.
+
+    A sum of codes has few values, so the whole method is one table, `photons_of` every possible mean code, and a
+    running sum. ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
+    """
+    check_codes(codes, sensor)
+    check_window(window)
+    top = sensor.levels - 1
+    table = photons_of(np.arange(window * top + 1) / window).astype(np.float32)
     restored = np.empty(codes.shape, np.float32)
-    entries = table.astype(np.float32)
-    for frame, total in enumerate(window_sums(codes, window, (len(table) - 1) // window)):
-        np.take(entries, total, out=restored[frame], mode="clip")  # clip never happens, but is the unbuffered mode
-    return restored
+    for frame, total in enumerate(window_sums(codes, window, top)):
+        np.take(table, total, out=restored[frame], mode="clip")  # clip never happens, but is the unbuffered mode
+    return in_units(restored, photons_per_unit)
 
 
 def in_units(photons: Array, photons_per_unit: float) -> Array:

@@ -1,0 +1,110 @@
+"""The text of a recipe: its sections, and the line in which a key stands, so that every mistake is named with both."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from qsim.checks import suggest
+
+_NEEDED = object()  # the default of a key that has none
+
+
+@dataclass(frozen=True)
+class Text:
+    """A TOML file as it was written."""
+
+    path: Path
+    text: str
+
+    @property
+    def lines(self) -> list[str]:
+        return self.text.splitlines()
+
+    def content(self) -> dict[str, Any]:
+        """What it says; `ValueError` as `FILE:LINE: ...` if it is no TOML."""
+        try:
+            return tomllib.loads(self.text)
+        except tomllib.TOMLDecodeError as error:
+            found = re.search(r"at line (\d+)", str(error))
+            line = found[1] if found else len(self.lines)  # else the parser says "at end of document"
+            raise ValueError(f"{self.path}:{line}: not valid TOML: {error}") from None
+
+    def where(self, section: str | None, i: int, key: str | None = None) -> str:
+        """`FILE:LINE` of a key in the i-th section of that name (of the section's head without a key)."""
+        number, inside, seen = 0, section is None, -1
+        for n, line in enumerate(self.lines, 1):
+            head = re.match(r"\s*\[\[?\s*([\w.-]+)\s*\]\]?", line)
+            if head:
+                seen += head[1] == section
+                inside = head[1] == (key if section is None else section) and (section is None or seen == i)
+                if inside:
+                    number = n
+                    if key is None or section is None:
+                        break
+            elif inside and key is not None and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*[=.]", line):
+                number = n
+                break
+        return f"{self.path}:{number or self._mention(section, key)}"
+
+    def _mention(self, section: str | None, key: str | None) -> int:
+        """The first line that says `key =`, or else the section, for tables written in line or with dots."""
+        for word in (key, section):
+            for n, line in enumerate(self.lines, 1):
+                if word and re.search(rf"(?<![\w-]){re.escape(word)}[\"']?\s*[=.]", line):
+                    return n
+        return 1
+
+
+@dataclass(frozen=True)
+class Section:
+    """A table of a recipe: the whole file (no name), [recipe], or the i-th of [[scenes]] or [[streams]]."""
+
+    text: Text
+    name: str | None
+    i: int
+    table: dict[str, Any]
+
+    @property
+    def title(self) -> str:
+        """As it is written."""
+        return {None: "the recipe", "recipe": "[recipe]"}.get(self.name, f"[[{self.name}]]")
+
+    def where(self, key: str | None = None) -> str:
+        """`FILE:LINE` of a key, or of the section's head."""
+        return self.text.where(self.name, self.i, key)
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.table
+
+    def check_keys(self, known: tuple[str, ...], needed: tuple[str, ...] = ()) -> None:
+        """`ValueError` for a key that is not known, and for one that is needed and not there."""
+        for key in self.table:
+            if key not in known:
+                raise ValueError(
+                    f"{self.where(key)}: unknown key '{key}' in {self.title}{suggest(key, known)}; "
+                    f"known are {', '.join(known)}"
+                )
+        for key in needed:
+            if key not in self.table:
+                raise ValueError(f"{self.where()}: key '{key}' is missing in {self.title}")
+
+    def value(self, key: str, check: Callable[[Any], Any], default: Any = _NEEDED) -> Any:
+        """A key's value as `check` returns it; `ValueError` with its line for one that `check` refuses."""
+        if key not in self.table and default is not _NEEDED:
+            return default
+        try:
+            return check(self.table[key])
+        except ValueError as error:
+            raise ValueError(f"{self.where(key)}: {key}: {error}") from None
+
+    def sections(self, key: str) -> list[Section]:
+        """The tables [[key]] of the file, in their order."""
+        tables = self.table.get(key, [])
+        if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+            raise ValueError(f"{self.text.where(key, 0)}: '{key}' must be sections, each beginning with [[{key}]]")
+        return [Section(self.text, key, i, table) for i, table in enumerate(tables)]
