@@ -384,8 +384,10 @@ def _run_check(args: argparse.Namespace) -> int:
 
     problems: list[str] = []
     for path in args.paths:
-        opened = Dataset.open(path) if (path / "dataset.json").is_file() else Clip.open(path)
-        problems += opened.verify()
+        made_of_clips = (path / "dataset.json").is_file()
+        opened = Dataset.open(path) if made_of_clips else Clip.open(path)
+        with bar(str(path), "clip" if made_of_clips else "file") as progress:
+            problems += opened.verify(progress)
     names = ", ".join(str(path) for path in args.paths)
     lines = problems or [f"{names}: every file is what was written"]
     output(args, {"paths": [str(path) for path in args.paths], "problems": problems}, lines)

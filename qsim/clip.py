@@ -22,7 +22,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import exr, files, optics
-from qsim.stream import Stream, check_crop, write_stream
+from qsim.stream import Progress, Stream, check_crop, write_stream
 from qsim.writer import FORMAT_VERSION, PHYSICAL, RELATIVE, TRUTH, ClipWriter, camera_of
 
 if TYPE_CHECKING:
@@ -163,20 +163,23 @@ class Clip:
             raise FileNotFoundError(f"{self.path}: no stream {name!r}; there are: {known}")
         return Stream.open(path)
 
-    def verify(self) -> list[str]:
-        """Problems of the folder in words, one per file; empty if every file is what was written."""
+    def verify(self, progress: Progress | None = None) -> list[str]:
+        """Problems of the folder in words, one per file; empty if every file is what was written.
+
+        `progress` hears (files checked, files in all), a stream counting as one.
+        """
         problems = []
-        for relative, expected in sorted(self.meta["checksums"].items()):
-            path = self.path / relative
-            if not path.is_file():
-                problems.append(f"{path}: missing")
-            elif files.sha256(path) != expected:
-                problems.append(f"{path}: contents changed (checksum differs)")
-        for path in sorted((self.path / "streams").glob("*.json")):
+        stored, streams = sorted(self.meta["checksums"].items()), sorted((self.path / "streams").glob("*.json"))
+        report, total = progress or (lambda done, total: None), len(stored) + len(streams)
+        for done, (relative, expected) in enumerate(stored, 1):
+            problems += files.differs(self.path / relative, expected)
+            report(done, total)
+        for done, path in enumerate(streams, len(stored) + 1):
             try:
                 problems += Stream.open(path).verify()
             except (ValueError, OSError) as error:
                 problems.append(str(error))
+            report(done, total)
         return problems
 
     def _half(self, folder: str, t: int, crop: optics.Crop | None) -> Array:

@@ -87,11 +87,17 @@ class Dataset:
         """Names of the clips that the recipe asks for and that are not finished."""
         return [name for name in self.meta["jobs"] if not record_path(self.path, name).is_file()]
 
-    def verify(self) -> list[str]:
-        """Problems of all files in words, one per file; clips not made yet are problems too."""
+    def verify(self, progress: Progress | None = None) -> list[str]:
+        """Problems of all files in words, one per file; clips not made yet are problems too.
+
+        `progress` hears (clips checked, clips in all).
+        """
         problems = [f"{self.path / 'clips' / name}: not made yet; run `qsim generate` again" for name in self.missing]
-        for name in self.names():
+        names = self.names()
+        for done, name in enumerate(names, 1):
             problems += verify_job(self.path, name)
+            if progress is not None:
+                progress(done, len(names))
         return problems + self.shared_between_splits()
 
     def shared_between_splits(self) -> list[str]:
@@ -126,15 +132,9 @@ def verify_job(folder: Path, name: str) -> list[str]:
         clip = Clip.open(folder / "clips" / name)
     except (ValueError, OSError) as error:
         return [str(error)]
-    problems = clip.verify()
-    if files.sha256(clip.path / "clip.json") != record.get("clip"):
-        problems.append(f"{clip.path / 'clip.json'}: contents changed (checksum differs)")
+    problems = clip.verify() + files.differs(clip.path / "clip.json", record.get("clip"))
     for stream, digest in record.get("streams", {}).items():
-        path = clip.path / "streams" / f"{stream}.json"
-        if not path.is_file():
-            problems.append(f"{path}: missing")
-        elif files.sha256(path) != digest:
-            problems.append(f"{path}: contents changed (checksum differs)")
+        problems += files.differs(clip.path / "streams" / f"{stream}.json", digest)
     return list(dict.fromkeys(problems))
 
 

@@ -108,6 +108,13 @@ def write_json(path: Path, value: Any) -> str:
     return write_bytes(path, to_json(value))
 
 
+def differs(path: Path, expected: str | None) -> list[str]:
+    """What is wrong with a file that had this SHA-256, in words; empty if nothing is."""
+    if not path.is_file():
+        return [f"{path}: missing"]
+    return [] if sha256(path) == expected else [f"{path}: contents changed (checksum differs)"]
+
+
 def read_toml(path: Path, what: str) -> dict[str, Any]:
     """A TOML file; `FileNotFoundError` that says `what` is missing, `ValueError` for another kind of file."""
     if not path.is_file():

@@ -89,6 +89,7 @@ def _kind(path: Path) -> str | None:
 _KEYS = (
     ("bench", {"setting", "costs"}),
     ("validation", {"rows", "ok"}),
+    ("reading", {"clip_processor", "mp4_processor"}),
     ("study", {"rows", "structure_function"}),
     ("study", {"cells", "studies"}),
     ("study", {"figure", "rows"}),
@@ -167,6 +168,7 @@ _DRAW: dict[str, Callable[[Path], str]] = {
     "study": report_tables.study_section,
     "bench": report_tables.bench_section,
     "validation": report_tables.validation_section,
+    "reading": report_tables.reading_section,
     "dataset": dataset_section,
     "clip": lambda path: clip_section(Clip.open(path.parent)),
 }

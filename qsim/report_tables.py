@@ -4,7 +4,7 @@
     evaluation.json  -> the table of methods; a measured static object likewise; speed against error
     tradeoff.json    -> bit depth against motion; figureN.json -> a figure of the paper; with the pictures beside them
     bench.json       -> what a restored frame costs
-    the JSON of `qsim validate` -> speed against error of sensors and rendering
+    the JSON of `qsim validate` -> speed against error of sensors and rendering; windows read per second
 
 Nothing is computed here that is not in the files.
 """
@@ -154,6 +154,20 @@ def validation_section(path: Path) -> str:
     cases = [[case["name"], case["found"], "right" if case["ok"] else "wrong"] for case in found.get("cases", [])]
     hard = page.table(page.Table("hard cases", ["case", "found", ""], cases)) if cases else ""
     return page.section("Validation", page.figure(save(), "speed against error"), table, hard)
+
+
+def reading_section(path: Path) -> str:
+    """Windows read per second, from a clip and from video, as `qsim validate reading --json` printed it."""
+    found = files.read_json(path)
+    window, clip = (" × ".join(map(str, found[key])) for key in ("window_shape", "clip_shape"))
+    verdict = "as quick as wanted" if found["ok"] else "NOT as quick as wanted"
+    what = (
+        f"windows of {window} in a clip of {clip}: {verdict} ({found['wanted']:g}/s, {found['wanted_ratio']:g} times)"
+    )
+    sides = (("clip folder", "clip"), ("mp4", "mp4"))
+    rows = [[name, found[side], found[f"{side}_processor"]] for name, side in sides]
+    table = page.table(page.Table(what, ["from", "windows per second", "per second of processor time"], rows))
+    return page.section("Reading", table)
 
 
 def _is_number(value: Any) -> bool:

@@ -133,11 +133,7 @@ class Stream:
 
     def verify(self) -> list[str]:
         """Problems of the stream's files in words; empty if they are what was written."""
-        if not self.path.is_file():
-            return [f"{self.path}: missing"]
-        if files.sha256(self.path) != self.meta.get("sha256"):
-            return [f"{self.path}: contents changed (checksum differs)"]
-        return []
+        return files.differs(self.path, self.meta.get("sha256"))
 
 
 def _is_number(value: Any) -> bool:

@@ -49,7 +49,8 @@ class Report:
 
     def to_dict(self) -> dict[str, Any]:
         """For --json."""
-        return asdict(self) | {"ratio": self.ratio, "wanted": WANTED, "wanted_ratio": RATIO, "ok": self.ok}
+        sizes = {"window_shape": [WINDOW, CROP, CROP], "clip_shape": [FRAMES, HEIGHT, WIDTH]}
+        return asdict(self) | sizes | {"ratio": self.ratio, "wanted": WANTED, "wanted_ratio": RATIO, "ok": self.ok}
 
     def lines(self) -> list[str]:
         """The report as text."""

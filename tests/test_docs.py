@@ -29,6 +29,7 @@ import pytest
 import qsim.cli
 import quiver.cli
 import quiver.data
+from qsim.validate_reading import Report
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [
@@ -253,6 +254,10 @@ def test_the_page_of_evidence_is_made_from_its_numbers():
     assert page == _evidence().page(numbers), "run `python docs/evidence.py --page-only`"
     numbers["sensor"]["ok"] = False
     assert "outside its bounds" in _evidence().page(numbers)
+    numbers["reading"] = Report(250.0, 20.0, 300.0, 9.0, 0.3).to_dict()
+    page = _evidence().page(numbers)
+    assert "| clip folder | 250.0 | 300.0 |" in page
+    assert "(100 windows/s, 5 times the mp4) is **not reached** in this run" in page
 
 
 def test_tests_named_as_evidence_exist():

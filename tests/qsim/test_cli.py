@@ -1,11 +1,13 @@
 """The command line: one line for a mistake, JSON for programs, nothing lost on Ctrl-C."""
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +15,11 @@ import fakes
 import numpy as np
 import pytest
 
-from qsim import dataset, recipe
+from qsim import cli, dataset, recipe
 from qsim.cli import main
 from qsim.clip import RELATIVE, Clip, ClipWriter
+from qsim.dataset import Dataset
+from qsim.stream import Progress
 
 COMMANDS = ("doctor", "render", "sense", "generate", "plan", "check", "convert")
 
@@ -243,6 +247,26 @@ def test_check_names_the_damage(tmp_path: Path, capsys: pytest.CaptureFixture[st
     code, out, _ = run(capsys, "check", folder, "--json")
     assert code == 1
     assert json.loads(out)["problems"] == [f"{frame}: contents changed (checksum differs)"]
+
+
+def test_check_shows_how_far_it_is(made: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    """A data set clip by clip, a clip file by file, its streams included, both to the end."""
+    shown: list[tuple[str, str, list[tuple[int, int]]]] = []
+
+    @contextlib.contextmanager
+    def recorded(label: str, unit: str) -> Iterator[Progress]:
+        shown.append((label, unit, []))
+        yield lambda done, total: shown[-1][2].append((done, total))
+
+    monkeypatch.setattr(cli, "bar", recorded)
+    clip = Dataset.open(made).clips()[0]
+    assert run(capsys, "check", made, clip.path)[0] == 0
+    files = len(clip.meta["checksums"]) + len(clip.streams)
+    assert files > 4
+    assert shown == [
+        (str(made), "clip", [(n, 3) for n in (1, 2, 3)]),
+        (str(clip.path), "file", [(n, files) for n in range(1, files + 1)]),
+    ]
 
 
 def test_generate_reports_failures_and_resumes(

@@ -13,6 +13,7 @@ from qsim import report, report_clip
 from qsim.cli import main
 from qsim.clip import RELATIVE, Clip, ClipWriter
 from qsim.optics import clip_photons
+from qsim.validate_reading import Report
 
 
 def make_clip(path, frames: int = 5, size: tuple[int, int] = (24, 33)) -> Clip:
@@ -163,7 +164,9 @@ def test_studies_costs_and_validations_have_their_sections(tmp_path):
     frame = {"scene": "drums", "level": 40.0, "psnr": 40.5, "stated_psnr": 40.25, "samples": 16, "bounces": 4}
     frame |= {"seconds": 0.5, "obvious_seconds": 6.0, "obvious_psnr": 40.0, "ratio": 12.0}
     render = {"ok": True, "median_ratio": 12.0, "height": 8, "width": 10, "engine": "llvm", "rows": [frame]}
+    reading = Report(clip=250.5, mp4=20.0, clip_processor=300.0, mp4_processor=9.0, difference=0.01).to_dict()
     files = {"s/tradeoff": study, "w/tradeoff": sweep, "f/figure1": figure, "sensor": sensor, "render": render}
+    files["reading"] = reading
     for name, content in (files | {"b/bench": {"setting": {"height": 64}, "costs": [cost]}}).items():
         path = tmp_path / f"{name}.json"
         path.parent.mkdir(exist_ok=True)
@@ -173,6 +176,8 @@ def test_studies_costs_and_validations_have_their_sections(tmp_path):
         assert words in page, words
     assert "sensors, 9 pixels a draw: something is OUTSIDE its bounds" in page
     assert "rendering, frames of 8 × 10, llvm: everything is within its bounds" in page
+    assert "windows of 11 × 128 × 128 in a clip of 65 × 512 × 1024: as quick as wanted (100/s, 5 times)" in page
+    assert "250.5" in page
     assert "<td>ties</td><td>right</td><td>wrong</td>" in page
 
 
