@@ -260,7 +260,7 @@ def _checked(photons: Array, engine: str) -> Array:
 def _fast_engine() -> bool:
     """Whether the compiled engine can run here; says so once if it cannot."""
     try:
-        from qsim.kernels import available
+        from qsim.lanes import available
     except ImportError:  # Dr.Jit is not installed
         usable = False
     else:

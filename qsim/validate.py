@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import kernels
+from qsim import kernels, lanes
 from qsim.devices import quiver_physical
 from qsim.hard_cases import Case, hard_cases
 from qsim.keys import Key
+from qsim.ladders import plan
 from qsim.qis import QIS
 from qsim.sensor import Sensor
 from qsim.spad import BinarySPAD, CountingSPAD
@@ -101,7 +102,7 @@ def run(
         if progress is not None:
             progress(n, len(MODELS) + 1)
     rows += _packed(shape, seed, require_speed)
-    settings = {"seed": seed, "exposure": EXPOSURE, "fast_engine": kernels.available(), "rounds": _ROUNDS}
+    settings = {"seed": seed, "exposure": EXPOSURE, "fast_engine": lanes.available(), "rounds": _ROUNDS}
     return Report(
         rows, hard_cases({name: model[0] for name, model in MODELS.items()}, EXPOSURE), int(np.prod(shape)), settings
     )
@@ -121,7 +122,7 @@ def _measure(
     light = np.full(shape, photons, np.float32)
     key = Key(seed, 1)
     engines = ["reference"]
-    if kernels.available() and kernels.plan(sensor, EXPOSURE) is not None:
+    if lanes.available() and plan(sensor, EXPOSURE) is not None:
         engines.append("fast")
     draws: dict[str, Callable[[], Array]] = {
         engine: partial(sensor.sample, light, EXPOSURE, key=key, engine=engine) for engine in engines
@@ -154,7 +155,7 @@ def _measure(
 
 def _packed(shape: tuple[int, ...], seed: int, require_speed: bool) -> list[Row]:
     """Packed binary planes against NumPy's `random < p` and packbits."""
-    if not kernels.available():
+    if not lanes.available():
         return []
     sensor, _, _ = MODELS["clocked SPAD, 1 bit"]
     light = np.full(shape, 0.7, np.float32)
@@ -235,7 +236,7 @@ def _cdf_error(sensor: Sensor, engine: str) -> float | None:
         return None
     found = sensor.cdf(photons, EXPOSURE)[:, :-1]
     if engine == "fast":
-        found = kernels.steps(sensor, photons, EXPOSURE)
+        found = lanes.steps(sensor, photons, EXPOSURE)
         if isinstance(sensor, BinarySPAD):  # the kernel compares plane by plane
             expected = np.exp(-sensor.arrivals(photons, EXPOSURE) / sensor.planes)[:, None]
         found, expected = np.minimum(found, 1), np.minimum(expected, 1)

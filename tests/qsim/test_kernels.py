@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from stats import assert_histogram
 
-from qsim import kernels
+from qsim import kernels, lanes
 from qsim.codes import pack
 from qsim.keys import Key, philox4x32
 from qsim.ladders import Electrons, electrons, plan
@@ -22,7 +22,7 @@ from qsim.spad import BinarySPAD, CountingSPAD
 
 KEY = Key(seed=3, clip=5, frame=7)
 EXPOSURE = 5e-4  # s
-needs_engine = pytest.mark.skipif(not kernels.available(), reason="no usable LLVM or CUDA on this machine")
+needs_engine = pytest.mark.skipif(not lanes.available(), reason="no usable LLVM or CUDA on this machine")
 
 SENSORS: dict[str, Sensor] = {
     "3 bits, gain 1": QIS(0.8, 1.6, 0.2, 3),
@@ -88,10 +88,10 @@ def test_sensors_without_short_sums_have_no_plan(name):
 
 @needs_engine
 def test_the_compiled_generator_gives_the_same_words():
-    jit = kernels._backend()
+    jit = lanes.backend()
     counters = np.random.default_rng(0).integers(0, 2**32, (3, 1000), dtype=np.uint32)
     key = KEY.philox_key
-    words = kernels._philox(*(jit.UInt32(c) for c in counters), jit.UInt32(key >> 32), jit.UInt32(key & 0xFFFFFFFF))
+    words = lanes._philox(*(jit.UInt32(c) for c in counters), jit.UInt32(key >> 32), jit.UInt32(key & 0xFFFFFFFF))
     expected = philox4x32(np.vstack([counters, np.zeros((1, 1000), np.uint32)]), key)
     np.testing.assert_array_equal(np.stack([w.numpy() for w in words]), expected)
 
@@ -209,11 +209,11 @@ def test_large_frames_are_drawn_in_strips(largest, monkeypatch):
 @needs_engine
 def test_the_short_exponential_is_exact_to_float32():
     """Within 2 units in the last place of float32 of exp, over all that a live time can be."""
-    jit = kernels._backend()
+    jit = lanes.backend()
     x = -np.concatenate([np.geomspace(1e-12, 87, 200_000), np.arange(0, 87, 1 / 64), [0, log(2) / 2]]).astype(
         np.float32
     )
-    found = kernels._exp_below_zero(jit.Float(x)).numpy()
+    found = lanes._exp_below_zero(jit.Float(x)).numpy()
     error = found / np.exp(x.astype(np.float64)) - 1
     assert np.abs(error).max() < 2.4e-7
     assert found[x == 0][0] == 1
@@ -222,13 +222,13 @@ def test_the_short_exponential_is_exact_to_float32():
 @needs_engine
 def test_sensors_share_kernels_after_the_first_few(monkeypatch):
     """Numbers as arguments of a common kernel instead of constants: the same codes."""
-    monkeypatch.setattr(kernels, "_CONSTANT_PLANS", 0)
-    kernels._arguments.cache_clear()
+    monkeypatch.setattr(lanes, "_CONSTANT_PLANS", 0)
+    lanes._arguments.cache_clear()
     for name in ("published gain", "full well", "dead time", "seven planes"):
         sensor = SENSORS[name]
         photons = light(sensor, (2, 20, 30))
         np.testing.assert_array_equal(fast(sensor, photons), reference(sensor, photons))
-    kernels._arguments.cache_clear()
+    lanes._arguments.cache_clear()
 
 
 @needs_engine
@@ -295,7 +295,7 @@ def test_memory_is_the_output_and_one_frame(monkeypatch):
 FORK = """
 import os, sys, warnings
 import numpy as np
-from qsim import kernels
+from qsim import kernels, lanes
 from qsim.keys import Key
 from qsim.qis import QIS
 sensor, photons = QIS(0.8, 1.6, 0.2, 3), np.full((1, 128, 128), 2.0, np.float32)
@@ -305,7 +305,7 @@ before = draw()
 warnings.simplefilter("ignore")  # Python warns of forks while other threads run
 child = os.fork()
 if child == 0:
-    os._exit(0 if (draw() == before).all() and not kernels.available() else 1)
+    os._exit(0 if (draw() == before).all() and not lanes.available() else 1)
 sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
 

@@ -358,10 +358,10 @@ def test_types_and_shapes_of_codes():
 
 
 def test_without_a_compiler_the_reference_serves_and_says_so_once(monkeypatch: pytest.MonkeyPatch):
-    kernels = ModuleType("qsim.kernels")
-    kernels.available = lambda: False
-    monkeypatch.setitem(sys.modules, "qsim.kernels", kernels)
-    monkeypatch.setattr("qsim.kernels", kernels, raising=False)
+    lanes = ModuleType("qsim.lanes")
+    lanes.available = lambda: False
+    monkeypatch.setitem(sys.modules, "qsim.lanes", lanes)
+    monkeypatch.setattr("qsim.lanes", lanes, raising=False)
     qsim.sensor._fast_engine.cache_clear()
     sensor, light = SENSORS[0], np.full((4, 5), 2.0)
     try:

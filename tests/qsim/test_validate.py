@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qsim import cli, kernels, validate
+from qsim import cli, lanes, validate
 from qsim.keys import Key
 from qsim.qis import QIS
 from qsim.spad import BinarySPAD
@@ -30,7 +30,7 @@ def test_the_report_holds_a_row_for_every_engine_and_is_well(report):
     engines = {(row.model, row.engine) for row in report.rows}
     assert ("QIS 3 bits, gain 1", "numpy") in engines
     assert ("clocked SPAD, 1 bit", "reference") in engines
-    assert (("QIS 3 bits, gain 1", "fast") in engines) == kernels.available()
+    assert (("QIS 3 bits, gain 1", "fast") in engines) == lanes.available()
     for row in report.rows:
         assert row.megapixels_per_second > 0
         if row.engine == "reference":
