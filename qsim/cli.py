@@ -305,18 +305,18 @@ def _add_generate(sub: Any) -> None:
 
 
 def _run_generate(args: argparse.Namespace) -> int:
-    from qsim import dataset, recipe, workers
+    from qsim import generation, recipe, workers
 
     wanted = recipe.load(args.recipe)
     folder = args.output or Path("out") / wanted.name
     if args.workers < 0:
         raise ValueError(f"--workers: expected 0 (in this process) or more, got {args.workers}")
-    options = dataset.Options(
+    options = generation.Options(
         args.workers, args.shard, args.retry, args.repair, args.wait, workers.Limits(memory=args.memory)
     )
-    chosen = dataset.shard(wanted.jobs, args.shard)
-    with bar(wanted.name) as progress, dataset.watching(folder, chosen, progress):
-        summary = dataset.generate(wanted, folder, options, run=_cluster(args))
+    chosen = generation.shard(wanted.jobs, args.shard)
+    with bar(wanted.name) as progress, generation.watching(folder, chosen, progress):
+        summary = generation.generate(wanted, folder, options, run=_cluster(args))
     lines = [f"{folder}: {summary.done} of {summary.jobs} clips done, {summary.made} made now"]
     lines += [f"repaired {problem}" for problem in summary.repaired]
     lines += [f"FAILED {name}: {why}" for name, why in sorted(summary.failed.items())]

@@ -4,32 +4,23 @@
     clips/NAME     clip folders with their streams                       (clip.py)
     jobs/NAME.json records with checksums; a clip counts from the moment its record is there (jobs.py)
 
-`generate` does what is missing: after a kill, in shards, on a cluster, or with nothing left to do. The finished folder
-has the same bytes in all these cases (logs/ apart), on machines of one kind.
+Here a data set is read and checked; generation.py makes it.
 """
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import os
-import threading
-from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qsim import __version__, files
+from qsim import files
 from qsim.clip import Clip
-from qsim.jobs import Make, Result, record_path, render_job
-from qsim.recipe import SPLITS, Job, Recipe
+from qsim.jobs import record_path
+from qsim.recipe import SPLITS
 from qsim.stream import Progress
-from qsim.workers import Limits, run_here, run_local
 
 FORMAT_VERSION = 1
-_FOLDERS = ("clips", "jobs", "failed", "logs", "locks", "work")
-
-Run = Callable[[list[Job], Path, Make], Generator[Result]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,218 +127,3 @@ def verify_job(folder: Path, name: str) -> list[str]:
     for stream, digest in record.get("streams", {}).items():
         problems += files.differs(clip.path / "streams" / f"{stream}.json", digest)
     return list(dict.fromkeys(problems))
-
-
-@dataclass(frozen=True)
-class Options:
-    """How to generate; nothing here changes a byte of the result."""
-
-    workers: int = 1  # processes; 0: in this one
-    shard: tuple[int, int] | None = None  # (i, n): the i-th of n parts, i = 1 ... n
-    retry: bool = False  # try failed jobs again
-    repair: bool = False  # check all files first and make damaged ones again
-    wait: bool = False  # wait for another generator on the folder instead of refusing
-    limits: Limits = field(default_factory=Limits)
-
-
-@dataclass(frozen=True)
-class Summary:
-    """What a generation did."""
-
-    jobs: int  # of this shard
-    done: int  # finished now or before
-    made: int  # finished now
-    failed: dict[str, str]  # name -> why, now or before
-    repaired: tuple[str, ...]  # problems that led to jobs done again
-    shared: tuple[str, ...] = ()  # what training sees of the test split, in words
-
-
-def generate(
-    recipe: Recipe,
-    path: str | os.PathLike[str],
-    options: Options | None = None,
-    *,
-    make: Make = render_job,
-    run: Run | None = None,
-    on_result: Callable[[Result], None] | None = None,
-) -> Summary:
-    """Make what is missing of a recipe's data set in folder `path`.
-
-    `run` does the jobs (default: local processes; cluster.py has another), `make` renders one clip. `ValueError` if
-    the folder belongs to another recipe or another generator is at work, `OSError` if the disk is full.
-    """
-    options = options or Options()
-    folder = Path(path).resolve()
-    jobs = shard(recipe.jobs, options.shard)
-    try:
-        with _locked(folder, options):
-            _begin(recipe, folder)
-            repaired = repair(folder, jobs) if options.repair else ()
-            failed = {} if options.retry else _failures(folder, jobs)
-            todo = [job for job in jobs if not record_path(folder, job.name).is_file() and job.name not in failed]
-            made = 0
-            with contextlib.closing((run or _runner(options))(todo, folder, make)) as results:
-                for result in results:
-                    if result.state == "full":
-                        raise OSError(errno.ENOSPC, result.message)
-                    if result.state == "done":
-                        made += 1
-                    else:
-                        failed[result.name] = result.message
-                    if on_result is not None:
-                        on_result(result)
-            write_manifest(recipe, folder)
-            done = sum(record_path(folder, job.name).is_file() for job in jobs)
-            shared = tuple(Dataset.open(folder).shared_between_splits())
-    except OSError as error:
-        if error.errno not in files.FULL:
-            raise
-        message = f"{folder}: {error.strerror}; nothing is lost: make space and run the same command again"
-        raise OSError(message) from None
-    return Summary(len(jobs), done, made, failed, repaired, shared)
-
-
-def shard(jobs: tuple[Job, ...], part: tuple[int, int] | None) -> list[Job]:
-    """Every n-th job from the i-th on, so that expensive families spread over the shards."""
-    if part is None:
-        return list(jobs)
-    i, n = part
-    if not 1 <= i <= n:
-        raise ValueError(f"shard {i}/{n}: expected i/n with 1 <= i <= n, as in --shard 7/100")
-    return list(jobs[i - 1 :: n])
-
-
-def repair(folder: Path, jobs: list[Job]) -> tuple[str, ...]:
-    """Check the finished jobs and take back those with damage, so that they are made again; returns the problems."""
-    found: list[str] = []
-    for job in jobs:
-        if not record_path(folder, job.name).is_file():
-            continue
-        problems = verify_job(folder, job.name)
-        if not problems:
-            continue
-        found += problems
-        record_path(folder, job.name).unlink()
-        clip = folder / "clips" / job.name
-        streams = clip / "streams"
-        if all(problem.startswith(str(streams)) for problem in problems):
-            for problem in problems:
-                damaged = Path(problem.split(": ")[0])
-                damaged.with_suffix(".json").unlink(missing_ok=True)
-                damaged.with_suffix(".npy").unlink(missing_ok=True)
-        elif clip.exists():
-            files.remove_folder(clip)
-    return tuple(found)
-
-
-def frames_done(folder: Path, jobs: list[Job]) -> int:
-    """Frames rendered so far, whoever renders them: finished clips and the journals of those at work."""
-    total = 0
-    for job in jobs:
-        if (folder / "clips" / job.name).is_dir():
-            total += job.settings.frames
-        else:
-            with contextlib.suppress(OSError):
-                total += (folder / "work" / f"{job.name}.part" / "journal.jsonl").read_bytes().count(b"\n")
-    return total
-
-
-def write_manifest(recipe: Recipe, folder: Path) -> None:
-    """dataset.json from the recipe and the records that are there now."""
-    lock = files.Lock(folder / "locks" / "manifest")
-    lock.acquire(wait=True)
-    with lock:
-        for leftover in folder.glob("dataset.json.tmp-*"):
-            leftover.unlink()
-        jobs = {}
-        for job in recipe.jobs:
-            entry: dict[str, Any] = {"split": job.split, "scene": job.scene, "digest": job.digest, "state": "missing"}
-            if record_path(folder, job.name).is_file():
-                entry |= {"state": "done", "record": files.sha256(record_path(folder, job.name))}
-            elif (folder / "failed" / f"{job.name}.json").is_file():
-                entry |= {"state": "failed", "error": files.read_json(folder / "failed" / f"{job.name}.json")["error"]}
-            jobs[job.name] = entry
-        manifest = {
-            "format_version": FORMAT_VERSION,
-            "name": recipe.name,
-            "recipe": recipe.source,
-            "splits": recipe.splits,
-            "jobs": jobs,
-            "complete": all(entry["state"] == "done" for entry in jobs.values()),
-            "software": {"qsim": __version__},
-        }
-        files.write_json(folder / "dataset.json", manifest)
-
-
-def _begin(recipe: Recipe, folder: Path) -> None:
-    for name in _FOLDERS:
-        (folder / name).mkdir(exist_ok=True)
-    if not (folder / "dataset.json").is_file():
-        write_manifest(recipe, folder)
-        return
-    old = Dataset.open(folder).meta["jobs"]
-    for job in recipe.jobs:
-        if job.name not in old:
-            raise ValueError(f"{folder}: was made from another recipe, without the clip {job.name}; use another folder")
-        if old[job.name]["digest"] != job.digest:
-            raise ValueError(f"{folder}: its clip {job.name} was asked for with other settings; use another folder")
-    extra = sorted(set(old) - {job.name for job in recipe.jobs})
-    if extra:
-        raise ValueError(f"{folder}: holds the clip {extra[0]}, which is not in this recipe; use another folder")
-
-
-@contextlib.contextmanager
-def _locked(folder: Path, options: Options) -> Iterator[None]:
-    """One generator per folder, or any number of different shards."""
-    if folder.exists() and not (folder / "locks").is_dir() and any(folder.iterdir()):
-        raise ValueError(f"{folder}: is not empty and not a data set; use another folder")
-    (folder / "locks").mkdir(parents=True, exist_ok=True)
-    locks = [files.Lock(folder / "locks" / "generate", shared=options.shard is not None)]
-    if options.shard is not None:
-        locks.append(files.Lock(folder / "locks" / "shard-{}-of-{}".format(*options.shard)))
-    try:
-        for lock in locks:
-            if not lock.acquire(wait=options.wait):
-                raise ValueError(f"{folder}: another generator is at work here; let it finish, or add --wait")
-        yield
-    finally:
-        for lock in locks:
-            lock.release()
-
-
-def _failures(folder: Path, jobs: list[Job]) -> dict[str, str]:
-    found = {}
-    for job in jobs:
-        path = folder / "failed" / f"{job.name}.json"
-        if path.is_file():
-            found[job.name] = str(files.read_json(path).get("error"))
-    return found
-
-
-def _runner(options: Options) -> Run:
-    if options.workers == 0:
-        return run_here
-
-    def run(jobs: list[Job], folder: Path, make: Make) -> Generator[Result]:
-        return run_local(jobs, folder, make, options.workers, options.limits)
-
-    return run
-
-
-@contextlib.contextmanager
-def watching(folder: Path, jobs: list[Job], report: Progress, every: float = 0.5) -> Iterator[None]:
-    """Report (frames done, frames in all), whatever process or machine does them, while the block runs."""
-    total = sum(job.settings.frames for job in jobs)
-    stop = threading.Event()
-
-    def watch() -> None:
-        while not stop.wait(every):
-            report(frames_done(folder, jobs), total)
-
-    thread = threading.Thread(target=watch, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()

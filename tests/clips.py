@@ -10,7 +10,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip import PHYSICAL, RELATIVE, Clip, ClipWriter
-from qsim.dataset import Options, generate
+from qsim.generation import Options, generate
 from qsim.recipe import Job, Recipe, Settings
 from qsim.scene import Camera
 

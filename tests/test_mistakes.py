@@ -22,7 +22,7 @@ from clips import write_clip
 
 import qsim.cli
 import quiver.cli
-from qsim import dataset, engine, files, recipe
+from qsim import engine, files, generation, recipe
 
 ROOT = Path(__file__).parents[1]
 
@@ -170,7 +170,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_clip(top / "lit", frames=3, height=8, width=10)
     write_clip(top / "video", frames=3, height=8, width=10, relative=True)
     write_clip(top / "black", frames=2, relative=True, radiance=np.zeros((2, 8, 10)))
-    dataset.generate(recipe.parse(fakes.RECIPE), top / "data", dataset.Options(workers=0), make=fakes.make)
+    generation.generate(recipe.parse(fakes.RECIPE), top / "data", generation.Options(workers=0), make=fakes.make)
     (top / "empty").mkdir()
     arrays = {
         "light": np.ones((3, 8, 10), np.float32),

@@ -13,7 +13,7 @@ from clips import write_clip
 
 import qsim
 import quiver
-from qsim import QIS, BinarySPAD, CountingSPAD, Dataset, Scene, Sensing, dataset, recipe, sense
+from qsim import QIS, BinarySPAD, CountingSPAD, Dataset, Scene, Sensing, generation, recipe, sense
 from qsim.scene import Camera, Constant
 
 ROOT = Path(__file__).parents[1]
@@ -52,7 +52,7 @@ def test_reprs_show_shapes_and_units(tmp_path):
 
 
 def test_the_repr_of_a_data_set_counts_its_clips(tmp_path):
-    dataset.generate(recipe.parse(fakes.RECIPE), tmp_path / "d", dataset.Options(workers=0), make=fakes.make)
+    generation.generate(recipe.parse(fakes.RECIPE), tmp_path / "d", generation.Options(workers=0), make=fakes.make)
     words = "<Dataset small: clips 2 train, 0 val, 1 test; 3 x 8 x 10 frames, rows, columns at 2000.0 fps>"
     assert repr(Dataset.open(tmp_path / "d")) == words
 

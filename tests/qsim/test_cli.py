@@ -15,7 +15,7 @@ import fakes
 import numpy as np
 import pytest
 
-from qsim import cli, dataset, recipe
+from qsim import cli, generation, recipe
 from qsim.cli import main
 from qsim.clip import RELATIVE, Clip, ClipWriter
 from qsim.dataset import Dataset
@@ -28,7 +28,7 @@ COMMANDS = ("doctor", "render", "sense", "generate", "plan", "check", "convert")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small data set, made by the quick renderer."""
     folder = tmp_path_factory.mktemp("cli") / "small"
-    dataset.generate(recipe.parse(fakes.RECIPE), folder, dataset.Options(workers=0), make=fakes.make)
+    generation.generate(recipe.parse(fakes.RECIPE), folder, generation.Options(workers=0), make=fakes.make)
     return folder
 
 
@@ -145,7 +145,7 @@ def test_sense_again_with_other_light_over_a_data_set(made: Path, capsys: pytest
         (name, ppp) for name in ("fan_0000", "fan_0001", "tumble_0004") for ppp in (0.5, 26.0)
     ]
     assert {path: path.read_bytes() for path in made.rglob("*.exr")} == before
-    assert dataset.Dataset.open(made).verify() == []
+    assert Dataset.open(made).verify() == []
 
 
 def test_sensing_is_idempotent_and_never_overwrites_silently(made: Path, capsys: pytest.CaptureFixture[str]):
@@ -240,7 +240,7 @@ def test_a_sum_of_planes_groups_clip_frames(tmp_path: Path, capsys: pytest.Captu
 
 def test_check_names_the_damage(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = tmp_path / "d"
-    dataset.generate(recipe.parse(fakes.RECIPE), folder, dataset.Options(workers=0), make=fakes.make)
+    generation.generate(recipe.parse(fakes.RECIPE), folder, generation.Options(workers=0), make=fakes.make)
     assert run(capsys, "check", folder)[:2] == (0, f"{folder}: every file is what was written\n")
     frame = folder / "clips" / "fan_0000" / "radiance" / "000001.exr"
     frame.write_bytes(frame.read_bytes()[:-1])
@@ -274,10 +274,10 @@ def test_generate_reports_failures_and_resumes(
 ):
     path = tmp_path / "r.toml"
     path.write_text(fakes.RECIPE)
-    generate = dataset.generate
+    generate = generation.generate
 
     def with_maker(maker: Any) -> None:
-        monkeypatch.setattr(dataset, "generate", lambda *args, run: generate(*args, make=maker))
+        monkeypatch.setattr(generation, "generate", lambda *args, run: generate(*args, make=maker))
 
     arguments = ["generate", path, "-o", tmp_path / "d", "--workers", 0]
     with_maker(fakes.fail_on_tumble)
@@ -296,8 +296,8 @@ def test_ctrl_c_says_how_to_go_on(tmp_path: Path):
     """In a process of its own: SIGINT in the middle, exit code 130, one line; the same command finishes."""
     # A shell's background job ignores SIGINT, and its children with it: begin as a terminal's job does.
     code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
-    code += "import sys, fakes; from qsim import dataset, cli; g = dataset.generate;"
-    code += "dataset.generate = lambda *args, run: g(*args, make=fakes.make_once_allowed);"
+    code += "import sys, fakes; from qsim import generation, cli; g = generation.generate;"
+    code += "generation.generate = lambda *args, run: g(*args, make=fakes.make_once_allowed);"
     code += "sys.exit(cli.main(sys.argv[1:]))"
     recipe_path = tmp_path / "r.toml"
     recipe_path.write_text(fakes.RECIPE)
@@ -316,7 +316,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path: Path):
     assert "Traceback" not in err
     (tmp_path / "d" / "go").touch()
     subprocess.run(line, env=env, check=True, capture_output=True)
-    assert dataset.Dataset.open(tmp_path / "d").verify() == []
+    assert Dataset.open(tmp_path / "d").verify() == []
 
 
 def test_debug_shows_the_traceback(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):

@@ -13,7 +13,7 @@ from fakes import RECIPE, fail_on_tumble, make, make_slowly, tree
 
 from qsim import recipe
 from qsim.cluster import Cluster
-from qsim.dataset import Options, generate
+from qsim.generation import Options, generate
 
 pytest.importorskip("distributed", reason="the extra [cluster] is not installed")
 TESTS = Path(__file__).parents[1]

@@ -21,7 +21,8 @@ import pytest
 from fakes import RECIPE, die_on_tumble, fail_on_tumble, hoard_on_tumble, make, make_slowly, tree
 
 from qsim import files, jobs, recipe
-from qsim.dataset import Dataset, Options, Summary, generate
+from qsim.dataset import Dataset
+from qsim.generation import Options, Summary, generate
 from qsim.jobs import Make
 from qsim.workers import Limits
 
@@ -125,7 +126,7 @@ def test_killed_at_random_moments_sixty_times(tmp_path: Path, undisturbed: dict[
 
 def test_a_killed_parent_leaves_no_workers_and_its_folder_resumes(tmp_path: Path, undisturbed: dict[str, bytes]):
     folder = tmp_path / "d"
-    code = "import sys; from fakes import *; from qsim import recipe; from qsim.dataset import *;"
+    code = "import sys; from fakes import *; from qsim import recipe; from qsim.generation import *;"
     code += "generate(recipe.parse(RECIPE), sys.argv[1], Options(workers=2), make=make_slowly)"
     env = os.environ | {"PYTHONPATH": PYTHONPATH}
     parent = subprocess.Popen([sys.executable, "-c", code, str(folder)], env=env)
@@ -378,7 +379,7 @@ def test_the_second_generator_waits_when_asked(tmp_path: Path, undisturbed: dict
     """Two at once: the first makes everything, the second finds it done."""
     folder = tmp_path / "d"
     children = []
-    code = "import sys; from fakes import *; from qsim import recipe; from qsim.dataset import *;"
+    code = "import sys; from fakes import *; from qsim import recipe; from qsim.generation import *;"
     code += "print(generate(recipe.parse(RECIPE), sys.argv[1], Options(workers=0, wait=True), make=make_slowly).made)"
     env = os.environ | {"PYTHONPATH": PYTHONPATH}
     for _ in range(2):

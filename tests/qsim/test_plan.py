@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from qsim import dataset, plan, recipe
+from qsim import generation, plan, recipe
 from qsim.cli import main
 from qsim.plan import START, Cost, Plan, Seconds
 from qsim.workers import Limits
@@ -61,7 +61,7 @@ def test_a_forecast_against_a_real_run(tmp_path: Path):
     forecast = plan.plan(wanted)
     predicted = sum(cost.seconds.processor for cost in forecast.costs)
     started = time.process_time()
-    dataset.generate(wanted, tmp_path / "d", dataset.Options(workers=0))
+    generation.generate(wanted, tmp_path / "d", generation.Options(workers=0))
     seconds = time.process_time() - started
     print(forecast.costs)
     print(f"predicted {predicted:.1f} s, took {seconds:.1f} s of processor time")
