@@ -1,28 +1,28 @@
-"""The command `quiver`: parse, call, print. Each command is a pair `_add_X` (options) and `_run_X` (what it does)."""
+"""The command `quiver`: parse, call, print. Each command is a pair `_add_X` (options) and `_run_X` (what it does);
+`train` and `ablate` are in cli_train.py.
+"""
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
-import shutil
 import signal
-import sys
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, fields
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from quiver.cli_train import add_ablate, add_train
 from quiver.options import (
-    NETWORKS,
-    PROTOCOLS,
     add_light,
     add_running,
+    command,
     count,
+    handling,
     height_width,
-    nonnegative,
     positive,
+    renew,
+    running_options,
     words,
 )
 
@@ -36,150 +36,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--version", action="version", version=f"quiver {__version__}")
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
-    for add in (_add_train, _add_restore, _add_evaluate, _add_ablate, _add_bench, _add_convert_weights):
+    for add in (add_train, _add_restore, _add_evaluate, add_ablate, _add_bench, _add_convert_weights):
         add(sub)
     add_completion(sub, parser)
-    with _handling(signal.default_int_handler, signal.SIGTERM):  # termination cleans up like Ctrl-C
+    with handling(signal.default_int_handler, signal.SIGTERM):  # termination cleans up like Ctrl-C
         return run(parser, argv)
-
-
-@contextlib.contextmanager
-def _handling(handler: Callable[[int, Any], Any], *numbers: signal.Signals) -> Iterator[None]:
-    """Signals go to `handler` inside the block (only the main thread may say so; elsewhere nothing changes)."""
-    main_thread = threading.current_thread() is threading.main_thread()
-    before = {number: signal.signal(number, handler) for number in numbers if main_thread}
-    try:
-        yield
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
-
-
-def _command(
-    sub: Any, name: str, action: Any, what: str, example: str, *, goes_on: bool = False
-) -> argparse.ArgumentParser:
-    from quiver.data import GOES_ON, STARTS_AGAIN, command
-
-    return command(sub, name, action, what, example, GOES_ON if goes_on else STARTS_AGAIN)
-
-
-# Shared by the commands
-
-
-def _options(args: argparse.Namespace) -> Any:
-    from quiver.restoring import Options
-
-    return Options(args.memory, args.mode, args.device, args.precision)
-
-
-def _renew(folder: Path, mark: str) -> None:
-    """Remove a folder of ours (it holds `mark`), to start anew."""
-    if (folder / mark).is_file():
-        shutil.rmtree(folder)
-    elif folder.exists():
-        raise FileExistsError(f"{folder} holds no {mark}; --force removes only what this command made")
-
-
-# train
-
-
-def _add_train(sub: Any) -> None:
-    parser = _command(
-        sub, "train", _run_train, "Train a network on the clips of a data set; the same command again goes on.",
-        "quiver train out/starter -o out/nano --minutes 20\n"
-        "quiver train out/starter -o out/unet --preset unet --protocol control --minutes 20\n"
-        "torchrun --nproc-per-node 4 -m quiver train out/starter -o out/s --preset quiver-s --protocol published",
-        goes_on=True,
-    )  # fmt: skip
-    parser.add_argument("data", help="data set folder")
-    parser.add_argument("-o", "--output", required=True, help="folder of the run")
-    parser.add_argument("--preset", default="nano", choices=NETWORKS, help="network (default nano)")
-    parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
-    parser.add_argument("--steps", type=count, help="optimiser steps")
-    parser.add_argument("--minutes", type=positive, help="wall-clock limit; the learning rate is planned for it")
-    add_light(parser, several=True)
-    parser.add_argument("--crop", type=count, help="px, side of the training windows")
-    parser.add_argument("--frames", type=count, help="of a training window (default 11, one restored frame; 16: six)")
-    parser.add_argument("--batch", type=count, help="windows per step and process")
-    parser.add_argument("--learning-rate", type=positive, help="of Adam")
-    parser.add_argument("--schedule", choices=("cosine", "plateau"), help="of the learning rate")
-    parser.add_argument("--loss", choices=("published", "paper", "l1", "scales-l1"))
-    parser.add_argument("--validate-every", type=count, help="steps")
-    parser.add_argument("--validation-split", choices=("train", "val", "test"), help="default val")
-    parser.add_argument("--workers", type=nonnegative, help="processes that draw samples (default 0: this one)")
-    parser.add_argument("--precision", choices=("auto", "float32", "bfloat16"), help="default auto: bfloat16 on CUDA")
-    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
-    parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
-    parser.add_argument("--force", action="store_true", help="start anew where a run is")
-
-
-def _run_train(args: argparse.Namespace) -> int:
-    import torch
-
-    from quiver.data import output
-    from quiver.model import build
-    from quiver.restoring import pick_device
-    from quiver.run import draw_curve
-    from quiver.train import Diverged, train
-
-    settings = _settings(args)
-    folder, leads = Path(settings.out), os.environ.get("RANK", "0") == "0"
-    if args.force and folder.exists() and leads:
-        _renew(folder, "settings.json")
-    torch.manual_seed(settings.seed)
-    try:
-        with _signals() as interrupted:
-            state = train(
-                build(args.preset),
-                settings,
-                device=pick_device(args.device),
-                should_stop=lambda: bool(interrupted),
-                progress=not (args.json or args.quiet),
-            )
-    except Diverged as error:
-        print(f"quiver: {error}", file=sys.stderr)
-        return 1
-    if leads:
-        draw_curve(folder)
-        output(args, *_summary(folder, state))
-    if interrupted:
-        print("quiver: interrupted; the same command goes on where it stopped", file=sys.stderr)
-        return 130
-    return 0
-
-
-def _settings(args: argparse.Namespace) -> Any:
-    """The protocol's settings, overridden by the options that were given."""
-    from quiver.run import PROTOCOLS, Settings
-
-    given = {field.name: getattr(args, field.name, None) for field in fields(Settings)}
-    given |= {"data": args.data, "out": args.output, "network": args.preset}
-    return Settings(**PROTOCOLS[args.protocol] | {name: value for name, value in given.items() if value is not None})
-
-
-@contextlib.contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Collects Ctrl-C and termination instead of dying of them: the loop ends after its step and saves its state."""
-    found: list[int] = []
-    with _handling(lambda number, _: found.append(number), signal.SIGINT, signal.SIGTERM):
-        yield found
-
-
-def _summary(folder: Path, state: Any) -> tuple[dict[str, Any], str]:
-    found = {"run": str(folder), "steps": state.step, "seconds": state.elapsed}
-    text = f"{folder}: {state.step} steps in {state.elapsed / 60:.1f} min"
-    if state.history:
-        weights = str(folder / "best.safetensors")
-        found |= {"best_psnr_matched": state.best, "weights": weights, "last_validation": state.history[-1]}
-        text += f", best validation PSNR {state.best:.2f} dB (after the best factor): {weights}"
-    return found, text
 
 
 # restore
 
 
 def _add_restore(sub: Any) -> None:
-    parser = _command(
+    parser = command(
         sub, "restore", _run_restore, "Restore a stream, a clip or a photon cube; no ground truth is needed.",
         "quiver restore out/starter/clips/fan_0003 -o out/fan.npy\n"
         "quiver restore out/fan/streams/quiver-physical_3bit_3.25ppp.npy -o out/fan.npy --method out/nano\n"
@@ -206,7 +74,8 @@ def _add_restore(sub: Any) -> None:
 
 def _run_restore(args: argparse.Namespace) -> int:
     from quiver.data import bar, output
-    from quiver.restoring import restore_to_file, restorer
+    from quiver.restored_file import restore_to_file
+    from quiver.restoring import restorer
 
     target: Path = args.output if args.output.suffix else args.output.with_suffix(".npy")
     if target.suffix != ".npy":
@@ -215,7 +84,7 @@ def _run_restore(args: argparse.Namespace) -> int:
         if path.exists() and not args.force:
             raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
     codes = _source(args)
-    method = restorer(args.method, _options(args))
+    method = restorer(args.method, running_options(args))
     target.parent.mkdir(parents=True, exist_ok=True)
     with bar(method.name) as progress:
         meta = restore_to_file(codes, method, target, progress)
@@ -259,7 +128,7 @@ def _source(args: argparse.Namespace) -> Any:
 
 
 def _add_evaluate(sub: Any) -> None:
-    parser = _command(
+    parser = command(
         sub, "evaluate", _run_evaluate, "Compare methods on held-out clips, or on real photons of a static object.",
         "quiver evaluate out/starter -o out/table --methods naive,moment,out/nano,out/unet --ppp 3.25,9.75,26\n"
         "quiver evaluate out/starter/clips/fan_0003 -o out/fan_table --methods moment,nano --split all\n"
@@ -287,7 +156,7 @@ def _add_evaluate(sub: Any) -> None:
 def _run_evaluate(args: argparse.Namespace) -> int:
     from quiver.restoring import restorers
 
-    methods = restorers(args.methods, _options(args))
+    methods = restorers(args.methods, running_options(args))
     if args.static is not None:
         return _run_static(args, methods)
     if args.source is None or args.output is None:
@@ -302,7 +171,7 @@ def _run_evaluate(args: argparse.Namespace) -> int:
         args.source, None if args.split == "all" else args.split, lights, args.seed, args.published, args.stream
     )
     if args.force and args.output.exists():
-        _renew(args.output, "plan.json")
+        renew(args.output, "plan.json")
     with bar("rows", "row") as progress:
         rows = evaluate(plan, methods, args.output, lambda what, done, total: progress(done, total))
     table.write(args.output, plan, methods, rows)
@@ -326,54 +195,11 @@ def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
     return 1 if any(score.failure for score in scores) else 0
 
 
-# ablate
-
-
-def _add_ablate(sub: Any) -> None:
-    parser = _command(
-        sub, "ablate", _run_ablate, "Train the network without some of its parts, six ways, and compare them.",
-        "quiver ablate out/starter -o out/ablation --minutes 20", goes_on=True,
-    )  # fmt: skip
-    parser.add_argument("data", help="data set folder")
-    parser.add_argument("-o", "--output", required=True, help="folder of the six runs and their table")
-    parser.add_argument("--preset", default="nano", choices=NETWORKS[:-1], help="network (default nano)")
-    parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
-    parser.add_argument("--steps", type=count, help="optimiser steps of each")
-    parser.add_argument("--minutes", type=positive, help="wall-clock limit of each")
-    parser.add_argument("--crop", type=count, help="px, side of the training windows")
-    parser.add_argument("--batch", type=count, help="windows per step and process")
-    parser.add_argument("--split", default="test", choices=("train", "val", "test"), help="to score on (default test)")
-    parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
-    add_running(parser)
-
-
-def _run_ablate(args: argparse.Namespace) -> int:
-    from quiver import table
-    from quiver.ablate import markdown, run_ablation
-    from quiver.data import output
-    from quiver.evaluate import Plan
-
-    args.precision, precision = None, args.precision  # of restoring; training keeps its own default
-    settings = _settings(args)
-    args.precision = precision
-    plan = Plan(args.data, args.split, settings.lights, settings.seed)
-    with _signals() as interrupted:
-        options, show = _options(args), not (args.json or args.quiet)
-        found = run_ablation(settings, plan, options, should_stop=lambda: bool(interrupted), progress=show)
-    if found is None:
-        print("quiver: interrupted; the same command goes on where it stopped", file=sys.stderr)
-        return 130
-    methods, rows = found
-    table.write(Path(args.output) / "table", plan, methods, rows)
-    output(args, table.as_dict(plan, methods, rows), markdown(args.preset, rows))
-    return 1 if any(row.failure for row in rows) else 0
-
-
 # bench
 
 
 def _add_bench(sub: Any) -> None:
-    parser = _command(
+    parser = command(
         sub, "bench", _run_bench, "Measure what a restored frame costs, beside its PSNR.",
         "quiver bench\n"
         "quiver bench --methods moment,nano,quiver-s --modes exact,streaming,windows --size 128x128 -o out/bench",
@@ -419,7 +245,7 @@ def _run_bench(args: argparse.Namespace) -> int:
 
 
 def _add_convert_weights(sub: Any) -> None:
-    parser = _command(
+    parser = command(
         sub, "convert-weights", _run_convert_weights, "Turn a checkpoint of the published network into ours.",
         "quiver convert-weights quiver.pth -o out/quiver.safetensors",
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Options that several commands share, and what their values mean.
+"""What the commands share: options and what their values mean, folders that start anew, signals.
 
 Every function from text to value raises `argparse.ArgumentTypeError`, which becomes one line that names the option.
 """
@@ -6,6 +6,13 @@ Every function from text to value raises `argparse.ArgumentTypeError`, which bec
 from __future__ import annotations
 
 import argparse
+import contextlib
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 NETWORKS = ("nano", "quiver-s", "quiver", "unet")  # see model.py
 PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see run.py
@@ -87,3 +94,39 @@ def add_running(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mode", default="exact", choices=MODES, help="how frames share work (default exact)")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
     parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"), help="default float32")
+
+
+def running_options(args: argparse.Namespace) -> Any:
+    """What `add_running` asked for, as `restoring.Options`."""
+    from quiver.restoring import Options
+
+    return Options(args.memory, args.mode, args.device, args.precision)
+
+
+def renew(folder: Path, mark: str) -> None:
+    """Remove a folder of ours (it holds `mark`), to start anew."""
+    if (folder / mark).is_file():
+        shutil.rmtree(folder)
+    elif folder.exists():
+        raise FileExistsError(f"{folder} holds no {mark}; --force removes only what this command made")
+
+
+def command(
+    sub: Any, name: str, action: Any, what: str, example: str, *, goes_on: bool = False
+) -> argparse.ArgumentParser:
+    """A command's parser, as `qsim.console.command` makes it."""
+    from quiver import data
+
+    return data.command(sub, name, action, what, example, data.GOES_ON if goes_on else data.STARTS_AGAIN)
+
+
+@contextlib.contextmanager
+def handling(handler: Callable[[int, Any], Any], *numbers: signal.Signals) -> Iterator[None]:
+    """Signals go to `handler` inside the block (only the main thread may say so; elsewhere nothing changes)."""
+    main_thread = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, handler) for number in numbers if main_thread}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)

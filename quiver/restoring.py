@@ -10,21 +10,19 @@ truth is needed. `restorer(NAME)` finds a classical method, shipped weights, a w
 from __future__ import annotations
 
 import hashlib
-import os
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy import ndarray as Array
 
 from quiver.baselines import METHODS
 from quiver.baselines.windows import look_ahead, reflect
-from quiver.data import Codes, read_json, suggest, write_json
+from quiver.data import Codes, suggest
 from quiver.tiles import plan_tiles
 
 if TYPE_CHECKING:
@@ -35,7 +33,6 @@ PRETRAINED = Path(__file__).parent / "pretrained"  # weights that ship with the 
 DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory beside the weights
 CLASSICAL_BYTES = 200  # per pixel and frame held at once, about, of the hungriest classical method
 BLOCK_PIXELS = 1 << 22  # codes read at a time: 4 MB
-BLOCK_FRAMES = 256  # restored between two notes of how far a file has come
 CONTEXT = 5  # frames that a network needs before and after the one it restores
 MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/reuse.py
 
@@ -279,77 +276,6 @@ def bytes_per_pixel(model: nn.Module, mode: str) -> int:
         return 4_000
     held = 2 if mode == "windows" else 1  # windows of eleven frames at once
     return int(held * (4000 + 1200 * model.config.channels) / model.config.fold**2)
-
-
-def restore_to_file(codes: Codes, method: Restorer, path: Path, progress: Progress | None = None) -> dict[str, Any]:
-    """Restore a stream into PATH.npy (float32 photons [T, H, W]) and PATH.json; both appear when whole, the json last.
-
-    Returns what the json says. Works on disk, BLOCK_FRAMES at a time, in PATH.npy.part: an interrupted restoration that
-    has finished a block goes on there. A failure leaves nothing behind.
-    """
-    meta = {
-        "format": "quiver-restored-1",
-        "method": method.name,
-        "description": method.description,
-        "unit": "photons",
-        "white": codes.white,
-        "shape": list(codes.shape),
-        "frame_rate": codes.frame_rate,
-        "exposure": codes.exposure,
-        "sensor": codes.sensor.to_dict(),
-        "source": codes.source,
-    }
-    part, journal = path.with_name(path.name + ".part"), path.with_name(path.name + ".part.json")
-    try:
-        seconds = _fill_file(codes, method, part, journal, meta, progress)
-    except BaseException as error:
-        if isinstance(error, Exception) or not journal.exists():
-            part.unlink(missing_ok=True)
-            journal.unlink(missing_ok=True)
-        raise
-    path.with_suffix(".json").unlink(missing_ok=True)
-    os.replace(part, path)
-    meta["seconds_per_frame"] = seconds / codes.shape[0]
-    write_json(path.with_suffix(".json"), meta)
-    journal.unlink(missing_ok=True)
-    return meta
-
-
-def _fill_file(
-    codes: Codes, method: Restorer, part: Path, journal: Path, meta: dict[str, Any], progress: Progress | None
-) -> float:
-    """Restore what is missing of PART, block by block, noting each in JOURNAL; the seconds it took, all in all."""
-    length = codes.shape[0]
-    done, seconds = _done(part, journal, meta)
-    out = np.lib.format.open_memmap(part, mode="r+" if done else "w+", dtype=np.float32, shape=codes.shape)
-    for first in range(done, length, BLOCK_FRAMES if method.seamless else length):
-        block = out[first : first + BLOCK_FRAMES if method.seamless else length]
-        block[:] = 0  # an interrupted block may have left something
-        started = time.perf_counter()
-        method.fill(codes, block, first, _shifted(progress, first, length, len(block)))
-        check_finite(block, method.name, first)
-        out.flush()
-        seconds += time.perf_counter() - started
-        write_json(journal, meta | {"done": first + len(block), "seconds": seconds})
-    with open(part, "rb") as file:
-        os.fsync(file.fileno())
-    return seconds
-
-
-def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float]:
-    """Frames that an interrupted restoration of the same thing has finished, and the seconds they took."""
-    if not (part.exists() and journal.exists()):
-        return 0, 0.0
-    found = read_json(journal)
-    done, seconds = int(found.pop("done", 0)), float(found.pop("seconds", 0.0))
-    return (done, seconds) if found == meta else (0, 0.0)
-
-
-def _shifted(progress: Progress | None, first: int, length: int, block: int) -> Progress | None:
-    """Progress of a block as progress of the whole, in frames."""
-    if progress is None:
-        return None
-    return lambda done, total: progress(first + done * block // total, length)
 
 
 def check_finite(restored: Array, name: str, first: int = 0) -> None:

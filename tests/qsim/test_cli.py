@@ -15,7 +15,7 @@ import fakes
 import numpy as np
 import pytest
 
-from qsim import cli, generation, recipe
+from qsim import cli_data, generation, recipe
 from qsim.cli import main
 from qsim.clip import RELATIVE, Clip, ClipWriter
 from qsim.dataset import Dataset
@@ -258,7 +258,7 @@ def test_check_shows_how_far_it_is(made: Path, capsys: pytest.CaptureFixture[str
         shown.append((label, unit, []))
         yield lambda done, total: shown[-1][2].append((done, total))
 
-    monkeypatch.setattr(cli, "bar", recorded)
+    monkeypatch.setattr(cli_data, "bar", recorded)
     clip = Dataset.open(made).clips()[0]
     assert run(capsys, "check", made, clip.path)[0] == 0
     files = len(clip.meta["checksums"]) + len(clip.streams)

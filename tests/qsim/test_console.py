@@ -16,6 +16,7 @@ import qsim.cli
 import quiver.cli
 from qsim import console
 from qsim.cli import main
+from qsim.clip import Clip
 
 ROOT = Path(__file__).parents[2]
 
@@ -106,7 +107,7 @@ def test_quiet_and_verbose_exclude_each_other(capsys):
 
 
 def test_warnings_are_one_line_and_quiet_has_none(tmp_path, monkeypatch, capsys):
-    def warned(path: Path) -> list[str]:
+    def warned(clip: Clip, progress: object) -> list[str]:
         warnings.simplefilter("always")
         warnings.warn("the light is\n  dim", RuntimeWarning, stacklevel=1)
         return []

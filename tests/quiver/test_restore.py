@@ -17,10 +17,11 @@ from numpy import ndarray as Array
 from torch import Tensor, nn
 
 from qsim.qis import QIS
-from quiver import metrics, restoring
+from quiver import metrics, restored_file
 from quiver.baselines import METHODS
 from quiver.data import Codes, Light, array_codes, sensed, truth
 from quiver.model import Output, build
+from quiver.restored_file import restore_to_file
 from quiver.restoring import (
     Options,
     Restorer,
@@ -28,7 +29,6 @@ from quiver.restoring import (
     fill_network,
     method_names,
     network_restorer,
-    restore_to_file,
     restorer,
     restorers,
     weights_path,
@@ -255,7 +255,7 @@ def test_a_failed_restoration_leaves_nothing(tmp_path):
 
 def test_an_interrupted_restoration_goes_on(tmp_path, monkeypatch):
     """Blocks of four frames, stopped in the third: the next call starts with frame 8 and ends with the same bytes."""
-    monkeypatch.setattr(restoring, "BLOCK_FRAMES", 4)
+    monkeypatch.setattr(restored_file, "BLOCK_FRAMES", 4)
     codes, moment, starts = random_codes(14, 5, 6), restorer("moment"), []
 
     def fill(codes: Codes, out: Array, first: int, progress: object) -> None:

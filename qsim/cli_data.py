@@ -1,0 +1,124 @@
+"""Commands of data sets: `generate`, `plan` and `check`; pairs as in cli.py."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from qsim import checks
+from qsim.console import GOES_ON, bar, checked, command, output
+
+# generate
+
+
+def add_generate(sub: Any) -> None:
+    parser = command(
+        sub, "generate", _run_generate, "Make a data set from a recipe; whatever is done already is kept.",
+        "qsim generate scenes/starter.toml -o out/starter --workers 2\n"
+        "qsim generate scenes/i2_2000fps.toml -o /data/i2 --shard 7/100", GOES_ON,
+    )  # fmt: skip
+    parser.add_argument("recipe", type=Path, help="a .toml file; its format is described in qsim/recipe.py")
+    parser.add_argument("-o", "--output", type=Path, help="data set folder (default out/NAME of the recipe)")
+    parser.add_argument("--workers", type=int, default=1, help="processes, each with its own renderer (default 1)")
+    parser.add_argument("--shard", type=_part, metavar="I/N", help="only the I-th of N parts, as in 7/100")
+    memory = checked(checks.positive)
+    parser.add_argument("--memory", type=memory, default=4.0, help="GiB per process before it gives up (default 4)")
+    parser.add_argument("--retry", action="store_true", help="try failed jobs again")
+    parser.add_argument("--repair", action="store_true", help="check all files and make the damaged ones again")
+    parser.add_argument("--wait", action="store_true", help="wait while another generator is at work in the folder")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask scheduler, as in tcp://10.0.0.1:8786")
+    parser.add_argument(
+        "--gpus", type=float, default=0, help="GPU resource that each job takes on the cluster (default 0)"
+    )
+
+
+def _run_generate(args: argparse.Namespace) -> int:
+    from qsim import generation, recipe, workers
+
+    wanted = recipe.load(args.recipe)
+    folder = args.output or Path("out") / wanted.name
+    if args.workers < 0:
+        raise ValueError(f"--workers: expected 0 (in this process) or more, got {args.workers}")
+    options = generation.Options(
+        args.workers, args.shard, args.retry, args.repair, args.wait, workers.Limits(memory=args.memory)
+    )
+    chosen = generation.shard(wanted.jobs, args.shard)
+    with bar(wanted.name) as progress, generation.watching(folder, chosen, progress):
+        summary = generation.generate(wanted, folder, options, run=_cluster(args))
+    lines = [f"{folder}: {summary.done} of {summary.jobs} clips done, {summary.made} made now"]
+    lines += [f"repaired {problem}" for problem in summary.repaired]
+    lines += [f"FAILED {name}: {why}" for name, why in sorted(summary.failed.items())]
+    lines += [f"SHARED {problem}" for problem in summary.shared]
+    if summary.failed:
+        lines.append("run again with --retry after mending the cause")
+    output(args, {"dataset": str(folder)} | dataclasses.asdict(summary), lines)
+    return 0 if summary.done == summary.jobs and not summary.shared else 1
+
+
+def _cluster(args: argparse.Namespace) -> Any:
+    if args.cluster is None:
+        return None
+    from qsim.cluster import Cluster
+
+    return Cluster(args.cluster, gpus=args.gpus)
+
+
+def _part(text: str) -> tuple[int, int]:
+    first, _, last = text.partition("/")
+    if not (first.isdigit() and last.isdigit() and 1 <= int(first) <= int(last)):
+        raise argparse.ArgumentTypeError(f"expected I/N with 1 <= I <= N, as in 7/100, got {text!r}")
+    return int(first), int(last)
+
+
+# plan
+
+
+def add_plan(sub: Any) -> None:
+    parser = command(
+        sub, "plan", _run_plan, "Render one tiny job of each kind and say what the whole recipe will cost.",
+        "qsim plan scenes/i2_2000fps.toml --machines 10",
+    )  # fmt: skip
+    parser.add_argument("recipe", type=Path, help="a .toml file")
+    parser.add_argument("--machines", type=int, default=10, help="to spread the work over (default 10)")
+    parser.add_argument("--frames", type=int, default=5, help="frames rendered per kind (default 5)")
+
+
+def _run_plan(args: argparse.Namespace) -> int:
+    from qsim import plan, recipe
+
+    if args.machines < 1:
+        raise ValueError(f"--machines: expected at least 1, got {args.machines}")
+    wanted = recipe.load(args.recipe)
+    with bar("planning", "kind") as progress:
+        found = plan.plan(wanted, frames=args.frames, progress=progress)
+    output(args, {"recipe": wanted.name} | found.to_dict(), found.lines(args.machines))
+    return 0
+
+
+# check
+
+
+def add_check(sub: Any) -> None:
+    parser = command(
+        sub, "check", _run_check, "Compare clips and data sets with their checksums; exit code 1 if a file is damaged.",
+        "qsim check out/starter out/fan",
+    )  # fmt: skip
+    parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="clips or data sets")
+
+
+def _run_check(args: argparse.Namespace) -> int:
+    from qsim.clip import Clip
+    from qsim.dataset import Dataset
+
+    problems: list[str] = []
+    for path in args.paths:
+        made_of_clips = (path / "dataset.json").is_file()
+        opened = Dataset.open(path) if made_of_clips else Clip.open(path)
+        with bar(str(path), "clip" if made_of_clips else "file") as progress:
+            problems += opened.verify(progress)
+    names = ", ".join(str(path) for path in args.paths)
+    lines = problems or [f"{names}: every file is what was written"]
+    output(args, {"paths": [str(path) for path in args.paths], "problems": problems}, lines)
+    return 1 if problems else 0
