@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import __version__, files, planes, video
+from qsim import __version__, arrays, files, planes, video
 from qsim.clip import RELATIVE, Clip, ClipWriter
 from qsim.footage import Footage, Hints, turned
 from qsim.stream import FORMAT_VERSION, Progress, Stream
 
 Reader = Callable[[Path, Hints], Footage]
 LAYOUTS: dict[str, Reader] = {  # the names of --layout
-    "cube": planes.read_cube,
-    "codes": planes.read_codes_npy,
+    "cube": arrays.read_cube,
+    "codes": arrays.read_codes_npy,
     "light": video.read_light_npy,
     "video": video.read_video,
     "png": video.read_png,
@@ -32,9 +32,9 @@ LAYOUTS: dict[str, Reader] = {  # the names of --layout
     "swissspad2-half": planes.read_swissspad2_half,
     "swissspad2-full": planes.read_swissspad2_full,
     "spad512s": planes.read_spad512s,
-    "visionsim": planes.read_visionsim,
-    "zarr": planes.read_zarr,
-    "mat": planes.read_mat,
+    "visionsim": arrays.read_visionsim,
+    "zarr": arrays.read_zarr,
+    "mat": arrays.read_mat,
     "spike": planes.read_spike,
 }
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv")
@@ -226,7 +226,7 @@ def _detect_folder(path: Path) -> str:
 
 
 def _detect_npy(path: Path) -> str:
-    array = planes.load_npy(path)
+    array = arrays.load_npy(path)
     if array.dtype == bool:
         return "codes"
     if array.dtype != np.uint8:

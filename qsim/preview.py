@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsim import codes, files, pictures
+from qsim.arrays import checked_codes, load_npy
 from qsim.clip import Clip, Stream
 from qsim.footage import check_shape
-from qsim.planes import checked_codes, load_npy
 from qsim.stream import Progress
 
 Picture = NDArray[np.uint8]  # [H, W, 3]

@@ -14,8 +14,8 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import codes, exr, files
+from qsim.arrays import checked_codes
 from qsim.footage import Footage, Hints, check_shape, from_linear, need_transfer, numbered, reading, to_linear
-from qsim.planes import checked_codes
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709
 _FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG
@@ -73,7 +73,7 @@ def read_video(path: Path, hints: Hints) -> Footage:
 
 def read_light_npy(path: Path, hints: Hints) -> Footage:
     """Numbers [T, H, W] as light: integers are coded by --transfer (full scale of their type), floats are linear."""
-    from qsim.planes import load_npy
+    from qsim.arrays import load_npy
 
     array = load_npy(path)
     shape = check_shape(path, array.shape)

@@ -1,7 +1,6 @@
 """Data sets: the same bytes whatever happens on the way, and nothing accepted that is not whole."""
 
 import builtins
-import contextlib
 import errno
 import functools
 import json
@@ -12,13 +11,13 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fakes import RECIPE, die_on_tumble, fail_on_tumble, hoard_on_tumble, make, make_slowly, tree
+from forks import forked
 
 from qsim import files, jobs, recipe
 from qsim.dataset import Dataset
@@ -81,15 +80,7 @@ def test_shards_in_any_order_give_the_same_bytes(tmp_path: Path, undisturbed: di
 
 def in_child(action: Callable[[], Any], seconds: float) -> bool:
     """Run `action` in a fork and kill it after so many seconds; True if it came to its end before."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # fork in a process with threads, from Python 3.12 on
-        child = os.fork()
-    if child == 0:
-        code = 1
-        with contextlib.suppress(BaseException):
-            action()
-            code = 0
-        os._exit(code)
+    child = forked(action)
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         found, status = os.waitpid(child, os.WNOHANG)

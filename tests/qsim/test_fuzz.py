@@ -4,7 +4,6 @@ Each format's files are made once and then mutated: bits flipped, bytes overwrit
 The reading happens in a fork, so that a crash of a C library or a swollen memory is seen.
 """
 
-import contextlib
 import gzip
 import json
 import os
@@ -12,7 +11,6 @@ import random
 import resource
 import shutil
 import struct
-import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +19,7 @@ import numpy as np
 import pytest
 import raw_planes
 from fakes import RECIPE
+from forks import forked
 
 from qsim import exr, formats, recipe, video
 from qsim.clip import RELATIVE, Clip, ClipWriter
@@ -227,17 +226,12 @@ def attack(name: str, folder: Path, rounds: int) -> str:
 
 def fuzz(name: str, folder: Path, rounds: int) -> None:
     report = folder / "report"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # fork in a process with threads, from Python 3.12 on
-        child = os.fork()
-    if child == 0:
-        code = 1
-        with contextlib.suppress(BaseException):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # decoders complain to stderr
-            report.write_text(attack(name, folder, rounds))
-            code = 0
-        os._exit(code)
-    _, status = os.waitpid(child, 0)
+
+    def work() -> None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # decoders complain to stderr
+        report.write_text(attack(name, folder, rounds))
+
+    _, status = os.waitpid(forked(work), 0)
     assert os.waitstatus_to_exitcode(status) == 0, f"the reader of {name} took the process down"
     assert report.read_text() == ""
 
