@@ -109,9 +109,13 @@ def photon_transfer(darks: Sequence[Stack], flats: Sequence[Stack]) -> Transfer:
         covariance = np.linalg.inv(design.T @ weighted)
         height, slope = covariance @ (weighted.T @ variance)
         gain = max(float(slope), 1e-9)
-    # The dark mean grows with exposure: offset + gain D t
-    dark_slope, dark_offset, slope_variance = _dark_line(darks)
+    # The dark mean grows with exposure: offset + gain D t. Its noise is also in the residuals that gave the gain
+    dark_slope, dark_offset, slope_variance, levers = _dark_line(stacks[: len(darks)])
     dark_current = dark_slope / gain
+    shared = np.diag((third - gain * variance) / n)
+    shared[1:, 0] = gain * variance[0] / n[0]
+    shared[0, 0] = third[0] / n[0]
+    slope_with_gain = float((covariance @ weighted.T)[1] @ shared[:, : len(darks)] @ levers)
     adc = 1 / 12
     dark_electrons = dark_current * base.exposure
     read_variance = (height - adc) / gain**2 - dark_electrons
@@ -122,23 +126,24 @@ def photon_transfer(darks: Sequence[Stack], flats: Sequence[Stack]) -> Transfer:
         dark_current,
         float(read_variance),
         float(covariance[1, 1]),
-        slope_variance / gain**2 + dark_current**2 * float(covariance[1, 1]) / gain**2,
+        (slope_variance + dark_current**2 * float(covariance[1, 1]) - 2 * dark_current * slope_with_gain) / gain**2,
         float(gradient @ covariance @ gradient) + base.exposure**2 * slope_variance / gain**2,
     )
 
 
-def _dark_line(darks: Sequence[Stack]) -> tuple[float, float, float]:
-    """Slope [codes/s], offset [codes] and the slope's variance of the dark mean against exposure."""
+def _dark_line(darks: Sequence[Stack]) -> tuple[float, float, float, Array]:
+    """Slope [codes/s], offset [codes], the slope's variance of the dark mean against exposure; the means' weights in it."""
     time = np.array([s.exposure for s in darks])
     mean = np.array([s.mean for s in darks])
     spread = np.array([s.central_moment(2) / (s.pixels * s.frames) for s in darks]) + 1e-18
     if len(set(time)) < 2:
-        return 0.0, float(np.average(mean, weights=1 / spread)), 0.0
+        return 0.0, float(np.average(mean, weights=1 / spread)), 0.0, np.zeros_like(time)
     weight = 1 / spread
     centre = np.average(time, weights=weight)
     lever = float(np.sum(weight * (time - centre) ** 2))
-    slope = float(np.sum(weight * (time - centre) * mean)) / lever
-    return slope, float(np.average(mean, weights=weight) - slope * centre), 1 / lever
+    levers = weight * (time - centre) / lever
+    slope = float(levers @ mean)
+    return slope, float(np.average(mean, weights=weight) - slope * centre), 1 / lever, levers
 
 
 def prnu(flats: Sequence[Stack], dark_mean: float) -> tuple[float, float]:
