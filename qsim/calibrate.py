@@ -132,7 +132,7 @@ def photon_transfer(darks: Sequence[Stack], flats: Sequence[Stack]) -> Transfer:
 
 
 def _dark_line(darks: Sequence[Stack]) -> tuple[float, float, float, Array]:
-    """Slope [codes/s], offset [codes], the slope's variance of the dark mean against exposure; the means' weights in it."""
+    """Dark mean over exposure: slope [codes/s], offset [codes], variance of the slope, weights of the means in it."""
     time = np.array([s.exposure for s in darks])
     mean = np.array([s.mean for s in darks])
     spread = np.array([s.central_moment(2) / (s.pixels * s.frames) for s in darks]) + 1e-18
