@@ -5,7 +5,6 @@ Nothing here executes pickled code: our files are safetensors, foreign checkpoin
 """
 
 import json
-import os
 import pickle
 import re
 import warnings
@@ -17,6 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_safetensors
 from torch import Tensor, nn
 
+from quiver.data import write_bytes
 from quiver.model import QUIVER, Config
 from quiver.unet import UNet, UNetConfig
 
@@ -190,7 +190,7 @@ def _read_foreign(path: Path) -> dict[str, Tensor]:
 
 
 def save(network: nn.Module, config: Config | UNetConfig, path: Path, notes: Mapping[str, str] | None = None) -> None:
-    """Write weights and configuration as safetensors, under a temporary name first; `notes` become metadata."""
+    """Write weights and configuration as safetensors, whole or not at all; `notes` become metadata."""
     if path.suffix != ".safetensors":
         raise ValueError(f"weights are written as .safetensors, got {path.name}")
     metadata = {
@@ -200,15 +200,7 @@ def save(network: nn.Module, config: Config | UNetConfig, path: Path, notes: Map
         "config": json.dumps(config.to_dict()),
     }
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(to_safetensors(tensors, metadata))
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes(path, to_safetensors(tensors, metadata))
 
 
 def load(path: Path) -> QUIVER | UNet:
