@@ -7,7 +7,7 @@ A pilot renders every n-th pixel in its true size at three times of the clip. Th
     target:  peak * 10^(-psnr / 20), peak = 99.9th percentile of the radiance
     sensor:  Monte-Carlo variance in electrons^2 at most 1 % of the shot variance: mean * sqrt(0.01 / (QE * PPP))
 
-and is shared: bounces and blur may each take 30 % of it (rms), the samples get the rest.
+and is shared: bounces and blur may each take 30 % of it (rms), the samples get all that those leave.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.denoise import DENOISE_COST, available, denoised, denoised_error
+from qsim.denoise import DENOISE_COST, available, denoised, mixture
 
 if TYPE_CHECKING:
     from qsim.render import Renderer
@@ -32,8 +32,9 @@ SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the bl
 SENSOR_SHARE = 0.01  # of the shot variance that Monte-Carlo noise may add
 DEPTHS = (2, 4, 6, 9, 12)  # bounces tried, against (each depth is a kernel to compile)
 DEEPEST = 16
-PILOTS = (8, 32, 128)  # samples of the pilots, raw and denoised: 2x2, 4x4 and 8x8 in each half
+PILOTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half; the denoiser is scored on one half
 MOST_SAMPLES = 16384
+MOST_DENOISED = 256  # samples up to which the error of denoised pictures is foretold
 SHARP_FROM = 0.05  # px of motion in the exposure from which a sharp instant is stored too
 
 
@@ -96,12 +97,13 @@ def choose(
     if not mean > 0:
         raise ValueError(f"scene {scene.name}: the pilot saw no light in frames {times}; is a lamp behind a wall?")
     allowed, limit = _allowed(peak, mean, psnr, ppp, quantum_efficiency)
-    bounces, about_bounces = _bounces(pilot, times, bright, SHARE * allowed)
+    bounces, dimmed, about_bounces = _bounces(pilot, times, bright, SHARE * allowed)
     truths = [pilot.truth(t) for t in times]
     contrast = peak - float(np.percentile(bright, 0.1))
-    sub_frames, travel, about_blur = _sub_frames(truths, shutter, SHARE * allowed / contrast if contrast > 0 else 1.0)
+    tolerance = SHARE * allowed / contrast if contrast > 0 else 1.0
+    sub_frames, travel, blurred, about_blur = _sub_frames(truths, shutter, tolerance)
     instants = sub_frames if shutter > 0 else 1
-    noise = allowed * math.sqrt(1 - 2 * SHARE**2)
+    noise = math.sqrt(allowed**2 - dimmed**2 - (min(blurred, tolerance) * contrast) ** 2)
     samples, about_samples = _samples(pilot, times, bounces, instants, noise, peak)
     fewer, about_denoiser = None, Finding("denoiser", "off", "not asked for")
     if denoise is not False:
@@ -120,12 +122,14 @@ def explain(budget: Budget) -> str:
 
 
 def grid_samples(samples: int) -> int:
-    """The next square of an even number: 4, 16, 36, 64, ...
+    """The next product of two even neighbours or of an even number with itself: 4, 8, 16, 24, 36, 48, 64, ...
 
-    Multijitter does best on square grids with even sides, which also share themselves evenly among two lights. Measured
-    under sun and sky, error * samples^0.7 is 0.012 to 0.015 at 4, 16, 36, 64, 100, 144, but 0.018 to 0.028 at 9 to 121.
+    Multijitter does best on grids with even sides, which also share themselves evenly among two lights. Measured under
+    sun and sky, error * samples^0.7 is the same within 4 % from each such count to the next, but half as much again at
+    9, 25, ... 121.
     """
-    return (2 * math.ceil(math.sqrt(samples) / 2)) ** 2
+    side = 2 * math.ceil(math.sqrt(samples) / 2)
+    return side * (side - 2) if side * (side - 2) >= samples else side**2
 
 
 def blur_error(travel: float, instants: int) -> float:
@@ -167,8 +171,11 @@ def _allowed(peak: float, mean: float, psnr: float, ppp: float | None, efficienc
     return allowed, Finding("error", f"rms {allowed:.3g} W/m2/sr", f"{text}; peak {peak:.3g}, mean {mean:.3g}")
 
 
-def _bounces(pilot: Renderer, times: list[int], full: Array, tolerance: float) -> tuple[int, Finding]:
-    """The smallest depth whose radiance differs from that of DEEPEST by an rms below the tolerance (same paths)."""
+def _bounces(pilot: Renderer, times: list[int], full: Array, tolerance: float) -> tuple[int, float, Finding]:
+    """The smallest depth whose radiance differs from that of DEEPEST by an rms below the tolerance (same paths).
+
+    And that rms, W m^-2 sr^-1.
+    """
     for bounces in DEPTHS:
         cut = np.stack([_mean(pilot, t, Budget(PILOTS[1], bounces)) for t in times])
         left_out = float(np.sqrt(np.mean((full - cut) ** 2)))
@@ -178,23 +185,24 @@ def _bounces(pilot: Renderer, times: list[int], full: Array, tolerance: float) -
         bounces, left_out, cut = DEEPEST, 0.0, full
     share = 100 * float((full - cut).mean() / full.mean())
     size = f"later bounces up to {DEEPEST} would add rms {left_out:.2g} ({share:.2g} % of the light)"
-    return bounces, Finding("bounces", f"{bounces}", size)
+    return bounces, left_out, Finding("bounces", f"{bounces}", size)
 
 
-def _sub_frames(truths: list[dict[str, Array]], shutter: float, tolerance: float) -> tuple[int, float, Finding]:
-    """Instants, largest travel in the exposure [px] and the finding; the tolerance is rms error / contrast."""
+def _sub_frames(truths: list[dict[str, Array]], shutter: float, tolerance: float) -> tuple[int, float, float, Finding]:
+    """Instants, largest travel in the exposure [px], rms error / contrast (at most the tolerance) and the finding."""
     speeds = np.concatenate([np.hypot(*truth["flow"]).ravel() for truth in truths])
     travel = float(np.percentile(speeds, 99.9)) * shutter
     moving = float(np.mean(speeds > 0.1))
     motion = f"motion up to {travel / shutter if shutter else np.percentile(speeds, 99.9):.2f} px/frame"
     if travel < 1e-3:
-        return 1, travel, Finding("motion blur", "none, one instant", motion + f", shutter {shutter:g}")
+        return 1, travel, 0.0, Finding("motion blur", "none, one instant", motion + f", shutter {shutter:g}")
     edge = tolerance / math.sqrt(moving) if moving > 0 else tolerance
     count = 1
     while blur_error(travel, count) > edge and count < 4096:
         count += 2  # odd: one instant lies at mid-exposure
     size = f"{motion}, {travel:.2f} px in the exposure; an edge errs by {100 * blur_error(travel, count):.2g} %"
-    return count, travel, Finding("motion blur", f"mean of {count} instants", size)
+    blurred = blur_error(travel, count) * math.sqrt(moving)
+    return count, travel, blurred, Finding("motion blur", f"mean of {count} instants", size)
 
 
 def _samples(
@@ -238,21 +246,35 @@ def _denoiser(
     window = pilot.window(crop)
     instants, key = [window.time(t)], window.key(t, PILOT_STAGE)
     albedo, normal = window.surfaces(instants, key)
-    before = error = math.inf
-    for samples in PILOTS:
-        if wanted is None and samples + DENOISE_COST >= raw:
+    counts: list[int] = []
+    errors: list[float] = []
+    for count in PILOTS:
+        if wanted is None and count // 2 + DENOISE_COST >= raw:
             break
-        halves = window.halves(instants, Budget(samples, bounces), key)
-        before, error = error, denoised_error(halves, denoised(halves[0], albedo, normal))
-        if error <= target:
-            if math.isfinite(before):  # between the last two trials error is a power of the samples
-                share = math.log(before / target) / math.log(before / error)
-                samples = math.ceil(samples * 0.25 ** (1 - share))
-            size = f"rms {min(target, error):.2g} in the middle of frame {t}"
-            return 2 * grid_samples(math.ceil(samples / 2)), Finding("denoiser", "on", size)
-    if wanted:
-        return PILOTS[-1], Finding("denoiser", "on", f"rms {error:.2g}, above the target")
-    return None, Finding("denoiser", "off", f"{raw:.0f} raw samples cost no more")
+        # What is scored is half of the samples, A mixed with D(A)
+        halves = window.halves(instants, Budget(count, bounces), key)
+        counts.append(count // 2)
+        errors.append(mixture(halves, denoised(halves[0], albedo, normal))[1])
+        if errors[-1] <= target:
+            break
+    samples = _needed(counts, errors, target)
+    if wanted is None and samples + DENOISE_COST >= raw:
+        return None, Finding("denoiser", "off", f"{raw:.0f} raw samples cost no more")
+    size = f"rms {target:.2g} in the middle of frame {t}"
+    if samples > MOST_DENOISED:
+        samples, size = MOST_DENOISED, f"rms {errors[-1]:.2g} with {counts[-1]} samples, above the target"
+    return 2 * grid_samples(math.ceil(samples / 2)), Finding("denoiser", "on", size)
+
+
+def _needed(counts: list[int], errors: list[float], target: float) -> float:
+    """Samples with which a falling error reaches the target: a power of them between the last two trials and beyond."""
+    if errors and errors[0] <= target:
+        return counts[0]
+    if len(errors) < 2 or errors[-1] >= errors[-2]:
+        return math.inf
+    share = math.log(errors[-2] / target) / math.log(errors[-2] / errors[-1])
+    needed = counts[-2] * (counts[-1] / counts[-2]) ** share
+    return needed if needed <= MOST_DENOISED else math.inf
 
 
 def _left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, ...]:

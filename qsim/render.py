@@ -24,7 +24,7 @@ from qsim import engine as engines
 from qsim import mitsuba_file, truth
 from qsim.budget import Budget, grid_samples
 from qsim.clip import PHYSICAL, Clip, ClipWriter
-from qsim.denoise import denoised, denoised_error
+from qsim.denoise import denoised, mixture, typical_part
 from qsim.keys import Key, hash_name, words
 from qsim.scene import Camera, Motion, Scene, describe
 from qsim.translate import Stage
@@ -152,8 +152,11 @@ class Renderer:
         radiance = halves.mean(axis=0)
         if self.budget.denoise:
             albedo, normal = self.surfaces(instants, key)
-            error = denoised_error(halves, denoised(halves[0], albedo, normal))
-            radiance = denoised(radiance, albedo, normal)
+            y, x = typical_part(halves)
+            share, half = mixture(halves[:, y, x], denoised(halves[0, y, x], albedo[y, x], normal[y, x]))
+            noise = float(np.sqrt(np.mean(difference[y, x] ** 2)))
+            error *= half / noise if noise > 0 else 1.0
+            radiance = share * denoised(radiance, albedo, normal) + (1 - share) * radiance
         return radiance.astype(np.float32), error, fireflies
 
     def surfaces(self, instants: list[float], key: Key) -> tuple[Array, Array]:
@@ -169,7 +172,7 @@ class Renderer:
             self._stage.place(instant)
             sampler, position = self._film_positions(int(seed), samples)
             ray = self._camera_ray(self.scene.camera.pose(instant), position, sampler)
-            found = self._stage.loaded.ray_intersect(ray)
+            found = self._stage.loaded.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
             bsdf = found.bsdf(ray)
             seen = found.is_valid()
             matt = seen & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
