@@ -64,10 +64,11 @@ class Budget:
                 raise ValueError(f"Budget.{name}: at least 1, got {getattr(self, name)!r}")
 
     def passes(self, instants: int, pixels: int, lanes: int) -> tuple[int, int]:
-        """(samples of one pass, passes per instant): an even number of passes, none above `lanes` samples in flight."""
+        """(samples of each half in one pass, passes per instant), no pass above `lanes` samples in flight if it can."""
         wanted = math.ceil(self.samples / instants / 2)
-        split = math.ceil(wanted * pixels / lanes)
-        return grid_samples(math.ceil(wanted / split)), 2 * split
+        split = math.ceil(2 * wanted * pixels / lanes)
+        samples = grid_samples(math.ceil(wanted / split))
+        return samples, math.ceil(wanted / samples)
 
 
 def choose(

@@ -8,9 +8,8 @@ whose noise is V = E (A - B)^2 / 2,
     E (D(A) - B)^2 = E (D(A) - truth)^2 + V,    E (D(A) - B)(A - B) = E (D(A) - truth)(A - truth) + V,
 
 so the errors of D(A), of A and what they share are known without the truth, and with them the mixture w D + (1 - w) raw
-that errs least. Its error at half of the samples is an upper estimate for all of them (by 1 to 2 dB). It is measured on
-the quarter of the frame whose noise is most like that of the whole, and in proportion to the noise, because a second
-pass of the denoiser over everything would cost as much as the picture itself.
+that errs least. Means are taken around each pixel: where texture or a mirror misleads the denoiser, raw samples speak.
+The error of the mixture at half of the samples is an upper estimate for all of them (by 1 to 2 dB).
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 DENOISE_COST = 15.0  # samples per pixel that the denoiser, its score, albedo and normals cost (10 to 23 on two cores)
-SMALLEST_PART = 64  # px, sides of a quarter that the error is measured on
+AROUND = 33  # px, side of the square around a pixel in which errors are compared
 
 
 def available() -> bool:
@@ -44,29 +43,19 @@ def denoised(noisy: Array, albedo: Array, normal: Array) -> Array:
     return np.maximum(cleaned[..., 0], 0)
 
 
-def typical_part(halves: Array) -> tuple[slice, slice]:
-    """Rows and columns of the quarter of [2, H, W] whose noise is most like the whole's; all of a small frame."""
-    height, width = halves.shape[1:]
-    if min(height, width) < 2 * SMALLEST_PART:
-        return slice(0, height), slice(0, width)
-    rows = [slice(0, height // 2), slice(height // 2, height)]
-    columns = [slice(0, width // 2), slice(width // 2, width)]
-    square = (halves[0] - halves[1]) ** 2
-    whole = square.mean()
-    return min(((y, x) for y in rows for x in columns), key=lambda part: float(abs(square[part].mean() - whole)))
-
-
-def mixture(halves: Array, cleaned: Array) -> tuple[float, float]:
-    """The share w of the denoised picture that errs least, and the rms error of w D(A) + (1 - w) A.
+def mixture(halves: Array, cleaned: Array) -> tuple[Array, float]:
+    """The share w [H, W] of D that errs least around each pixel, and the rms error of w D(A) + (1 - w) A.
 
     From halves [2, H, W] = A, B and `cleaned` = D(A). The estimates are differences and may come out negative for few
     pixels; the error is at least a tenth of B's noise, which keeps it from promising nothing.
     """
+    from scipy.ndimage import uniform_filter
+
     a, b = halves
-    raw = float(np.mean((a - b) ** 2)) / 2
-    clean = float(np.mean((cleaned - b) ** 2)) - raw
-    both = float(np.mean((cleaned - b) * (a - b))) - raw
-    apart = clean + raw - 2 * both  # E (D(A) - A)^2
-    share = min(max((raw - both) / apart, 0.0), 1.0) if apart > 0 else 1.0
-    square = share**2 * clean + 2 * share * (1 - share) * both + (1 - share) ** 2 * raw
-    return share, float(np.sqrt(max(square, 0.01 * raw)))
+    raw, clean, both, apart = (
+        uniform_filter(product, AROUND)
+        for product in ((a - b) ** 2 / 2, (cleaned - b) ** 2, (cleaned - b) * (a - b), (cleaned - a) ** 2)
+    )
+    share = np.clip((2 * raw - both) / np.maximum(apart, 1e-300), 0, 1)
+    square = share**2 * (clean - raw) + 2 * share * (1 - share) * (both - raw) + (1 - share) ** 2 * raw
+    return share, float(np.sqrt(max(square.mean(), 0.01 * raw.mean())))

@@ -3,8 +3,8 @@
     Scene + frame rate + shutter + budget -> Frame(radiance, sharp, flow, flow_back, valid, depth, body_id, error)
 
 Frame t is exposed around t / frame_rate: K instants, evenly spread over shutter / frame_rate seconds, are averaged
-(Mitsuba's wheels have no motion blur). Every pixel integrates its own area (box filter). Samples come in independent
-passes, half of them to A and half to B; radiance is their mean, its error the rms of (A - B) / 2. The sampler's seeds
+(Mitsuba's wheels have no motion blur). Every pixel integrates its own area (box filter). Samples come in two
+independent halves A and B; radiance is their mean, its error the rms of (A - B) / 2. The sampler's seeds
 are words of qsim.keys, so any frame can be rendered alone, in any order. With engine.py, the only importer of Mitsuba.
 """
 
@@ -24,7 +24,7 @@ from qsim import engine as engines
 from qsim import mitsuba_file, truth
 from qsim.budget import Budget, grid_samples
 from qsim.clip import PHYSICAL, Clip, ClipWriter
-from qsim.denoise import denoised, mixture, typical_part
+from qsim.denoise import denoised, mixture
 from qsim.keys import Key, hash_name, words
 from qsim.scene import Camera, Motion, Scene, describe
 from qsim.translate import Stage
@@ -129,15 +129,15 @@ class Renderer:
     def halves(self, instants: list[float], budget: Budget, key: Key) -> Array:
         """Two independent estimates A, B of the mean radiance over the instants [s], float64 [2, H, W]."""
         height, width = self.shape
-        per_pass, passes = budget.passes(len(instants), height * width, MAX_LANES)
-        seeds = words(key, (1, len(instants) * passes))[0].reshape(len(instants), passes)
+        samples, passes = budget.passes(len(instants), height * width, MAX_LANES)
+        seeds = words(key, (2, len(instants) * passes)).reshape(2, len(instants), passes)
         sums = np.zeros((2, height, width))
-        for instant, row in zip(instants, seeds, strict=True):
+        for i, instant in enumerate(instants):
             self._stage.place(instant)
             pose = self.scene.camera.pose(instant)
-            for i, seed in enumerate(row):
-                sums[i % 2] += self._pass(pose, int(seed), per_pass, budget.bounces)
-        return sums / (len(instants) * passes / 2)
+            for pair in seeds[:, i].T:
+                sums += self._pass(pose, pair, samples, budget.bounces)
+        return sums / (len(instants) * passes)
 
     def key(self, t: int, stage: int = RENDER_STAGE) -> Key:
         """The random key of frame t: another seed, scene or stage draws other samples."""
@@ -152,10 +152,7 @@ class Renderer:
         radiance = halves.mean(axis=0)
         if self.budget.denoise:
             albedo, normal = self.surfaces(instants, key)
-            y, x = typical_part(halves)
-            share, half = mixture(halves[:, y, x], denoised(halves[0, y, x], albedo[y, x], normal[y, x]))
-            noise = float(np.sqrt(np.mean(difference[y, x] ** 2)))
-            error *= half / noise if noise > 0 else 1.0
+            share, error = mixture(halves, denoised(halves[0], albedo, normal))
             radiance = share * denoised(radiance, albedo, normal) + (1 - share) * radiance
         return radiance.astype(np.float32), error, fireflies
 
@@ -184,34 +181,39 @@ class Renderer:
         albedo, *normals = sums / len(instants)
         return albedo, np.stack(normals, axis=-1)
 
-    def _pass(self, pose: Array, seed: int, samples: int, bounces: int) -> Array:
-        """One independent estimate of the radiance of every pixel, float64 [H, W]."""
+    def _pass(self, pose: Array, seeds: Array, samples: int, bounces: int) -> Array:
+        """Two independent estimates of the radiance of every pixel, float64 [2, H, W], `samples` per pixel each.
+
+        Both are one launch: what it costs to start one is that of several samples of a small frame.
+        """
         integrator = self._integrator(bounces)
         if self.engine.backend == "scalar":
-            return self._film_pass(pose, seed, samples, integrator)
+            return np.stack([self._film_pass(pose, int(seed), samples, integrator) for seed in seeds])
         import drjit as dr
 
-        sampler, position = self._film_positions(seed, samples)
+        sampler, position = self._film_positions(int(seeds[0]), samples, 2)
         ray = self._camera_ray(pose, position, sampler)
         radiance, _, _ = integrator.sample(self._stage.loaded, sampler, ray)
         mean = dr.block_sum(radiance[0], samples) / samples
-        return np.array(mean, np.float64).reshape(self.shape)
+        return np.array(mean, np.float64).reshape(2, *self.shape)
 
-    def _film_positions(self, seed: int, samples: int) -> tuple[Any, Any]:
+    def _film_positions(self, seed: int, samples: int, times: int = 1) -> tuple[Any, Any]:
         """A seeded sampler and film positions [px], uniform in each pixel, whose samples are neighbours in memory.
 
-        Size and place of the window are data, not code: a pilot and a whole frame share one compiled kernel.
+        The whole window comes `times` times over, each time with grids of its own. Size and place of the window are
+        data, not code: a pilot and a whole frame share one compiled kernel.
         """
         import drjit as dr
 
         mi, (height, width) = self._mi, self.shape
-        lanes = height * width * samples
+        lanes = times * height * width * samples
         sampler = self._sampler(samples)
         sampler.seed(seed, lanes)
-        columns, step, y0, x0 = (mi.UInt32([value]) for value in (width, self.thinned, *self.crop[:2]))
+        rows, columns, step, y0, x0 = (mi.UInt32([n]) for n in (height, width, self.thinned, *self.crop[:2]))
         pixel = dr.arange(mi.UInt32, lanes) // samples
-        row = pixel // columns
-        corner = mi.Point2f(mi.Float((pixel - row * columns) * step + x0), mi.Float(row * step + y0))
+        line = pixel // columns
+        row = line % rows
+        corner = mi.Point2f(mi.Float((pixel - line * columns) * step + x0), mi.Float(row * step + y0))
         return sampler, corner + sampler.next_2d()
 
     def _integrator(self, bounces: int | None) -> Any:
