@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from qsim.scene import Camera, Scene
 
 PILOT_PIXELS = 3000
-WINDOW = 192  # px, largest side of the window in which the denoiser is tried
+WINDOW = 192  # px, side of the window in which the denoiser is tried; frames of fewer pixels are tried whole
 PILOT_STAGE = 18  # of the random keys
 SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
 SENSOR_SHARE = 0.01  # of the shot variance that Monte-Carlo noise may add
@@ -242,7 +242,9 @@ def _denoiser(
     if pilot.engine.backend == "scalar" or not available():
         return None, Finding("denoiser", "off", "not installed" if not available() else "needs LLVM or CUDA")
     camera = pilot.scene.camera
-    height, width = min(camera.height, WINDOW), min(camera.width, WINDOW)
+    height, width = camera.height, camera.width
+    if height * width > WINDOW**2:
+        height, width = min(height, WINDOW), min(width, WINDOW)
     crop = ((camera.height - height) // 2, (camera.width - width) // 2, height, width)
     window = pilot.window(crop)
     instants, key = [window.time(t)], window.key(t, PILOT_STAGE)
@@ -258,13 +260,13 @@ def _denoiser(
         errors.append(mixture(halves, denoised(halves[0], albedo, normal))[1])
         if errors[-1] <= target:
             break
-    samples = _needed(counts, errors, target)
+    needed, size = _needed(counts, errors, target), f"rms {target:.2g} in the middle of frame {t}"
+    if needed > MOST_DENOISED and wanted:
+        needed, size = MOST_DENOISED, f"rms {errors[-1]:.2g} with {counts[-1]} samples, above the target"
+    samples = 2 * grid_samples(math.ceil(needed / 2)) if needed <= MOST_DENOISED else math.inf
     if wanted is None and samples + DENOISE_COST >= raw:
         return None, Finding("denoiser", "off", f"{raw:.0f} raw samples cost no more")
-    size = f"rms {target:.2g} in the middle of frame {t}"
-    if samples > MOST_DENOISED:
-        samples, size = MOST_DENOISED, f"rms {errors[-1]:.2g} with {counts[-1]} samples, above the target"
-    return 2 * grid_samples(math.ceil(samples / 2)), Finding("denoiser", "on", size)
+    return int(samples), Finding("denoiser", "on", size)
 
 
 def _needed(counts: list[int], errors: list[float], target: float) -> float:
