@@ -159,7 +159,7 @@ def test_ctrl_c_of_a_command_that_starts_again(tmp_path):
     import os
     import signal
 
-    clip = write_clip(tmp_path / "long", frames=400, height=64, width=64)
+    clip = write_clip(tmp_path / "long", frames=1200, height=64, width=64)
     target = tmp_path / "film.gif"
     command = [sys.executable, "-m", "qsim", "preview", str(clip.path), "-o", str(target)]
     child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
