@@ -43,7 +43,8 @@ SENSOR = """## Sensors
 
 RENDERING = """## Rendering
 
-Radiance is compared with a converged reference of the same scene, of families that the budget was not tuned on.
+Radiance is compared with a converged reference of the same scene. fan, tumble, gears and flag tuned the budget and are
+left out; crowd and drums were looked at while its last details were settled.
 **asked** is the wanted PSNR; **reached** what a frame has against the reference; **stated** what its own measured error
 says (of a denoised frame that of half its samples, 1 to 2 dB too much). **obvious** is the loop that one would write
 first, with as many samples (a power of two) as it needs for the same PSNR.
