@@ -46,7 +46,7 @@ RENDERING = """## Rendering
 Radiance is compared with a converged reference of the same scene. fan, tumble, gears and flag tuned the budget and are
 left out; crowd and drums were looked at while its last details were settled.
 **asked** is the wanted PSNR; **reached** what a frame has against the reference; **stated** what its own measured error
-says (of a denoised frame that of half its samples, 1 to 2 dB too much). **obvious** is the loop that one would write
+says (of a denoised frame that of half its samples). **obvious** is the loop that one would write
 first, with as many samples (a power of two) as it needs for the same PSNR.
 """
 
@@ -97,7 +97,7 @@ def page(found: dict[str, Any]) -> str:
     comment = "<!-- not run: several minutes; tests/test_docs.py compares the page with its numbers -->"
     where = (
         f"Measured with Python {machine['python']} on {machine['processor']}, {found['render']['engine']}, while "
-        f"{machine['load']:g} processes wanted to run: speeds suffer from that, errors do not.\n"
+        f"{machine['load']:g} processes wanted to run at the start: speeds suffer from others, errors do not.\n"
     )
     sections = {"sensor": sensor, "render": rendering, "reading": reading}
     shown = [section(found[what]) for what, section in sections.items() if what in found]

@@ -9,7 +9,8 @@ whose noise is V = E (A - B)^2 / 2,
 
 so the errors of D(A), of A and what they share are known without the truth, and with them the mixture w D + (1 - w) raw
 that errs least. Means are taken around each pixel: where texture or a mirror misleads the denoiser, raw samples speak.
-The error of the mixture at half of the samples is an upper estimate for all of them (by 1 to 2 dB).
+What is stated is the error of the mixture at half of the samples, as a rule more than that of all of them. The share is
+chosen from the same pixels, which makes it a little too small (docs/evidence.md has both errors, stated and reached).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from importlib.util import find_spec
 import numpy as np
 from numpy import ndarray as Array
 
-DENOISE_COST = 15.0  # samples per pixel that the denoiser, its score, albedo and normals cost (10 to 23 on two cores)
+DENOISE_COST = 15.0  # samples per pixel that the denoiser, its score, albedo and normals cost (about, on two cores)
 AROUND = 33  # px, side of the square around a pixel in which errors are compared
 
 

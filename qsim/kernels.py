@@ -8,8 +8,9 @@ decide (about 40 in a million) is flagged by the kernel and drawn by the referen
 are the reference's on every kind of machine; tails, where a second word is drawn, come out right for the same reason.
 
 Where no short form exists (codes above 8 bits, paralyzable pixels, very long sums) or a block is tiny, the reference
-itself draws. Peak memory: the output, one frame, and at most 40 MB of launches of four million pixels, which is where
-what it costs to start one has faded.
+itself draws. Peak memory: the output, one frame, and what launches hold. They have at most four million pixels, where
+the cost of starting one has faded, and hold, per pixel, 4 bytes of converted light, 2 of places for each of two shapes,
+and 2.5 that each of two launches writes: at most 55 MB.
 """
 
 from __future__ import annotations

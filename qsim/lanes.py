@@ -62,7 +62,7 @@ def fixed_scalars(key: Key, origin: tuple[int, int]) -> list[Any]:
     return [dr.opaque(backend().UInt32, number & 0xFFFFFFFF) for number in numbers]
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=2)  # of one clip: whole parts, and the last one
 def _places(shape: tuple[int, int, int]) -> list[Any]:
     """Where each lane of [frames, rows, lanes] is: t, y and x in the bits of one number, and how to take them apart.
 

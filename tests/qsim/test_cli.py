@@ -71,18 +71,18 @@ def test_every_help_has_an_example_and_json(capsys: pytest.CaptureFixture[str], 
         ("generate x --shard 3", "qsim generate: argument --shard: expected I/N"),
         ("generate x --shard 0/3", "qsim generate: argument --shard: expected I/N"),
         ("generate x --shard 4/3", "qsim generate: argument --shard: expected I/N"),
-        ("render nofamily -o /tmp/never", "qsim: no scene family 'nofamily'; there are "),
+        ("render nofamily -o never/made", "qsim: no scene family 'nofamily'; there are "),
         (
-            "render fan -o /tmp/never --height 0",
+            "render fan -o never/made --height 0",
             "qsim render: argument --height: expected a whole number from 1 to 100000, got 0",
         ),
         (
-            "render fan -o /tmp/never --frames 0",
+            "render fan -o never/made --frames 0",
             "qsim render: argument --frames: expected a whole number from 1 to 100000, got 0",
         ),
         ("check /none", "qsim: /none: no such clip"),
-        ("convert /none /tmp/never", "qsim: /none: files do not say how fast"),
-        ("convert /none /tmp/never --frame-rate 10", "qsim: /none: no such file"),
+        ("convert /none never/made", "qsim: /none: files do not say how fast"),
+        ("convert /none never/made --frame-rate 10", "qsim: /none: no such file"),
         ("plan /none.toml", "qsim: /none.toml: no such recipe"),
     ],
 )
@@ -92,7 +92,7 @@ def test_a_mistake_is_one_line_and_code_2(capsys: pytest.CaptureFixture[str], li
     assert out == ""
     assert err.startswith(message), err
     assert err.count("\n") == 1
-    assert not Path("/tmp/never").exists()
+    assert not Path("never/made").exists()
 
 
 def test_render_explains_and_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any):
