@@ -77,6 +77,7 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
             found = tradeoff_sweep.sweep(clips, args.ppp or [first.mean_photons], question, progress=progress)
             result, pictures = found.to_dict(), {"best.png": tradeoff_sweep.sweep_figure(found)}
             text = [line for row in found.studies for one in row for line in tradeoff_sweep.table(one)]
+            text.append(tradeoff_sweep.summary(found))
         else:
             one = study(first, replace(question, ppp=levels[0], speed=clips[0].step), progress=progress)
             result, pictures = tradeoff_sweep.study_dict(one), {"tradeoff.png": tradeoff_sweep.study_figure(one)}

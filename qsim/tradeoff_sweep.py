@@ -93,7 +93,22 @@ class Sweep:
                             "loss_of_prediction_db": float(self.loss[model][i, j]),
                         }
                     )
-        return {"cells": cells, "studies": [study_dict(s) for row in self.studies for s in row]}
+        studies = [study_dict(s) for row in self.studies for s in row]
+        return {"agreement": self.agreement, "cells": cells, "studies": studies}
+
+    @property
+    def agreement(self) -> dict[str, float]:
+        """Simulation against its exact expectation, in standard errors, and what the law's choices cost."""
+        sigmas = np.array([row.sigmas for line in self.studies for found in line for row in found.rows])
+        best = {m: np.array([[found.best(m).bits for found in line] for line in self.studies]) for m in MODELS}
+        return {
+            "simulated": sigmas.size,
+            "rms_sigmas": float(np.sqrt(np.mean(sigmas**2))),
+            "largest_sigmas": float(np.abs(sigmas).max()),
+            "cells": sum(bits.size for bits in best.values()),
+            "cells_with_another_depth": sum(int((best[m] != self.predicted[m]).sum()) for m in MODELS),
+            "largest_loss_db": max(float(self.loss[m].max()) for m in MODELS),
+        }
 
 
 def study_dict(found: Study) -> dict[str, Any]:
@@ -133,6 +148,16 @@ def sweep(clips: Sequence[Moving], ppps: Sequence[float], question: Question, *,
             ]
         )
     return Sweep(speeds, tuple(ppps), tuple(studies), predicted, loss)
+
+
+def summary(found: Sweep) -> str:
+    """One line: how well simulation, expectation and law agree."""
+    a = found.agreement
+    return (
+        f"{a['simulated']} simulated PSNRs against their exact expectations: {a['rms_sigmas']:.2f} standard errors "
+        f"rms, largest {a['largest_sigmas']:.1f}; the law names another depth in {a['cells_with_another_depth']} of "
+        f"{a['cells']} cells and gives away at most {a['largest_loss_db']:.1f} dB"
+    )
 
 
 def law(base: Study, clip: Clip, question: Question, model: str, speed: float, ppp: float) -> dict[int, float]:

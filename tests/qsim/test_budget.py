@@ -142,7 +142,10 @@ def test_the_best_mixture_is_known_without_the_truth(bias):
 
 
 def test_each_part_of_a_picture_is_mixed_by_its_own_errors():
-    """A filter that is right on the left and far off on the right: denoised there, raw here, away from the border."""
+    """A filter that is right on the left and far off on the right: denoised there, raw here, away from the border.
+
+    Over 33 x 33 pixels the noise and the product are known to 4 %, the right share (0.01) to far less.
+    """
     rng = np.random.default_rng(6)
     truth = np.ones((120, 300))
     cleaned = truth + np.where(np.arange(300) < 150, 0.0, 3.0)
