@@ -11,6 +11,7 @@ to one band around `Camera.wavelength`. Left out: polarisation, spectra, partici
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -236,12 +237,14 @@ class Body:
 
     def vertices(self, t: float) -> np.ndarray:
         """Vertices in body coordinates at time t [s], float64 [V, 3]; only deformations change them."""
-        if isinstance(self.motion, Deformation):
+        if self.deforms:
+            assert isinstance(self.motion, Deformation)
             return np.asarray(self.motion.deform(t), np.float64)
         return self.mesh.vertices
 
-    @property
+    @functools.cached_property
     def deforms(self) -> bool:
+        """Asked at every frame; telling a protocol costs as much as posing the body."""
         return isinstance(self.motion, Deformation)
 
 
