@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from quiver.ops import deform_conv2d, warp
+from quiver.sweep import aligned, velocities
 
 RADIUS = 5  # frames before and after the restored one
 WINDOW = 2 * RADIUS + 1
@@ -314,45 +315,62 @@ class Refinement(nn.Module):
 class Hourglass(nn.Module):
     """Convolutions at full, half and quarter scale, each joined to the next finer one (Ronneberger et al. 2015)."""
 
-    def __init__(self, inputs: int, width: int, outputs: int) -> None:
+    def __init__(self, inputs: int, width: int) -> None:
         super().__init__()
         w = width
-        self.down1 = nn.Sequential(*_gelu_chain((inputs, w, w)), nn.GELU())
-        self.down2 = nn.Sequential(*_gelu_chain((w, 2 * w, 2 * w)), nn.GELU())
-        self.bottom = nn.Sequential(*_gelu_chain((2 * w, 2 * w, 2 * w)), nn.GELU())
-        self.up2 = nn.ConvTranspose2d(2 * w, 2 * w, 2, stride=2)
-        self.merge2 = nn.Sequential(*_gelu_chain((4 * w, 2 * w, 2 * w)), nn.GELU())
+        self.down1 = nn.Sequential(*_relu_chain((inputs, w, w)))
+        self.down2 = nn.Sequential(*_relu_chain((w, 2 * w, 2 * w)))
+        self.bottom = nn.Sequential(*_relu_chain((2 * w, *[4 * w] * 5)))
+        self.up2 = nn.ConvTranspose2d(4 * w, 2 * w, 2, stride=2)
+        self.merge2 = nn.Sequential(*_relu_chain((4 * w, 2 * w, 2 * w)))
         self.up1 = nn.ConvTranspose2d(2 * w, w, 2, stride=2)
-        self.merge1 = nn.Sequential(*_gelu_chain((2 * w, w, w)), nn.GELU())
-        self.leave = conv(w, outputs, 3)
+        self.merge1 = nn.Sequential(*_relu_chain((2 * w, w, w)))
+        self.leave = conv(w, 1, 3)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[N, inputs, h, w] -> [N, outputs, h, w], h and w multiples of 4."""
+        """[N, inputs, H, W] -> [N, 1, H, W], H and W multiples of 4."""
         full = self.down1(x)
-        half = self.down2(F.avg_pool2d(full, 2))
-        quarter = self.bottom(F.avg_pool2d(half, 2))
+        half = self.down2(F.max_pool2d(full, 2))
+        quarter = self.bottom(F.max_pool2d(half, 2))
         half = self.merge2(join(self.up2(quarter), half))
         return self.leave(self.merge1(join(self.up1(half), full)))
 
 
 class Baseline(nn.Module):
-    """Not part of the published design: a first picture from the window of pre-denoised frames, for quick learning.
+    """Not part of the published design: a first picture straight from the window, for quick learning.
 
-    A learnt mean over time plus an hourglass over the stacked frames; before training it is about a Gaussian mean.
+    A learnt mean over time plus an hourglass over the stacked frames, at full size; before training it is about a
+    Gaussian mean. With `sweep` the frames are first drawn along the velocity that makes them agree (sweep.py, found at
+    half the size, up to `sweep` px/frame there), and the hourglass sees them both ways, beside the velocity and the
+    standard deviation that is left over time.
     """
 
     SIGMA = 1.5  # frames
 
-    def __init__(self, image: int, width: int) -> None:
+    def __init__(self, width: int, sweep: float = 0.0) -> None:
         super().__init__()
+        self.sweep = sweep
         weights = [math.exp(-0.5 * ((t - RADIUS) / self.SIGMA) ** 2) for t in range(WINDOW)]
         self.weights = nn.Parameter(torch.tensor([weight / sum(weights) for weight in weights]))
-        self.correction = Hourglass(WINDOW * image, width, image)
+        self.correction = Hourglass(2 * WINDOW + 3 if sweep else WINDOW, width)
 
     def forward(self, window: Sequence[Tensor]) -> Tensor:
-        """Eleven frames [N, f2, h, w] -> [N, f2, h, w]."""
-        mean = sum((w * frame for w, frame in zip(self.weights, window, strict=True)), torch.zeros_like(window[0]))
-        return mean + self.correction(join(*window))
+        """Eleven folded frames [N, f2, h, w] -> [N, f2, h, w]."""
+        fold = math.isqrt(window[0].shape[1])
+        frames = F.pixel_shuffle(torch.stack(list(window), dim=1), fold)[:, :, 0]  # [N, T, H, W]
+        drawn, stack = frames, [frames]
+        if self.sweep:
+            size = frames.shape[2:]
+            velocity, variance = velocities(F.avg_pool2d(frames, 2), self.sweep)
+            drawn = aligned(frames, 2 * resize(velocity, *size))
+            stack = [drawn, frames, resize(velocity, *size), resize(variance, *size).sqrt()]
+        mean = (drawn * self.weights.view(1, -1, 1, 1)).sum(1, keepdim=True)
+        return F.pixel_unshuffle(mean + self.correction(join(*stack)), fold)
+
+
+def _relu_chain(widths: Sequence[int]) -> list[nn.Module]:
+    """conv3, ReLU, ..., conv3, ReLU through the given widths."""
+    return [layer for inputs, outputs in pairwise(widths) for layer in (conv(inputs, outputs, 3), nn.ReLU())]
 
 
 def _gelu_chain(widths: Sequence[int]) -> list[nn.Module]:

@@ -21,6 +21,7 @@ class Config:
     attention_temperature: float | None = None  # start of a learnt factor on the logits; None = none, as published
     fold: int = 1  # side of the blocks of pixels that become channels before everything else (1 = none)
     baseline: int = 0  # width of an hourglass over the window whose picture is added to the output; 0 = none
+    sweep: float = 0.0  # px/frame at half the size: the baseline aligns by the best velocity up to this one; 0 = not
     lecun: bool = False  # start from normal weights of variance 1/fan-in (LeCun, as the paper says) and zero biases
     pre_denoiser: bool = True  # ablation: False feeds the noisy frames to both streams and to the flow
     flow: bool = True  # ablation: False aligns by the learnt offsets alone
@@ -61,8 +62,8 @@ class Config:
 PRESETS: dict[str, Config] = {
     "quiver": Config(),
     "quiver-s": Config(channels=16),
-    # Small in everything, on half of the pixels' side; an hourglass over the window learns in minutes, the recurrent
-    # part adds to its picture. docs/results/starter.md has what it reaches.
+    # Small in everything, on half of the pixels' side; an hourglass over the window, its frames aligned, learns in
+    # minutes, the recurrent part adds to its picture. docs/results/starter.md has what it reaches.
     "nano": Config(
         channels=4,
         deformable_groups=1,
@@ -77,6 +78,7 @@ PRESETS: dict[str, Config] = {
         attention_temperature=8.0,
         fold=2,
         baseline=32,
+        sweep=3.5,
         lecun=True,
     ),
 }

@@ -72,7 +72,7 @@ class QUIVER(nn.Module):
         )
         self.refine4 = Refinement(image, c)
         self.refine = Refinement(image, c)
-        self.baseline = Baseline(image, config.baseline) if config.baseline else None
+        self.baseline = Baseline(config.baseline, config.sweep if config.flow else 0.0) if config.baseline else None
         if config.lecun and not self.alignment.weight.is_meta:  # nothing to draw without memory
             start_from_lecun(self)
         if config.baseline:
@@ -140,25 +140,33 @@ class QUIVER(nn.Module):
         """The zero state [N, 2C, h/4, w/4] before the first frame."""
         return entry.new_zeros(entry.shape[0], 2 * self.config.channels, *entry.shape[2:])
 
-    def base(self, denoised: Sequence[Tensor]) -> Tensor | None:
-        """The baseline picture of eleven pre-denoised frames [B, f2, h, w]; None where the network has none."""
-        return None if self.baseline is None else self.baseline(denoised)
+    def base(self, frames: Sequence[Tensor]) -> Tensor | None:
+        """The baseline picture of eleven folded frames [B, f2, h, w]; None where the network has none."""
+        return None if self.baseline is None else self.baseline(frames)
 
     # The network
 
-    def forward(self, x: Tensor) -> Output:
-        """[B, T, 1, H, W] of codes/(2^b - 1), T >= 11, H and W multiples of `multiple`; ValueError otherwise."""
+    def forward(self, x: Tensor, baseline_only: bool = False) -> Output:
+        """[B, T, 1, H, W] of codes/(2^b - 1), T >= 11, H and W multiples of `multiple`; ValueError otherwise.
+
+        With `baseline_only` scale 1 is the baseline's picture, and all that comes after it is left out.
+        """
         check_input(x, self.multiple)
         frames = self.fold(x)
+        centres = range(RADIUS, x.shape[1] - RADIUS)
+        bases = [self.base(frames[:, t - RADIUS : t + RADIUS + 1].unbind(1)) for t in centres]
+        if baseline_only:
+            if self.baseline is None:
+                raise ValueError("this network has no baseline (Config.baseline = 0)")
+            return Output(None, self.unfold(torch.stack([base for base in bases if base is not None], 1)), None, None)
         denoised = _per_frame(self.denoise, frames)[0]
         flows = _per_frame(self.flows, denoised[:, 1:], denoised[:, :-1])
         r1, r2, entries = self._encode(frames, denoised, flows)
         r4 = self.recur(entries)
-        centres = range(RADIUS, x.shape[1] - RADIUS)
-        pictures = [self.restore(r4[t - RADIUS : t + RADIUS + 1], r1[t], r2[t]) for t in centres]
-        if self.config.baseline:
-            bases = [self.base(denoised[:, t - RADIUS : t + RADIUS + 1].unbind(1)) for t in centres]
-            pictures = [add_base(p, base) for p, base in zip(pictures, bases, strict=True)]
+        pictures = [
+            add_base(self.restore(r4[t - RADIUS : t + RADIUS + 1], r1[t], r2[t]), base)
+            for t, base in zip(centres, bases, strict=True)
+        ]
         scales: list[Tensor | None] = [self.unfold(torch.stack(p, dim=1)) for p in zip(*pictures, strict=True)]
         if not self.config.multi_scale:
             scales[1:] = (None, None)
@@ -280,8 +288,9 @@ def start_from_lecun(network: QUIVER) -> None:
 
     PyTorch's own start has a third of that variance: through the products of the gated fusion, little is left of it.
     """
+    own_start = set() if network.baseline is None else set(network.baseline.modules())  # PyTorch's: made of ReLU
     for module in network.modules():
-        if isinstance(module, nn.Conv2d | nn.Conv3d | nn.Linear):
+        if module not in own_start and isinstance(module, nn.Conv2d | nn.Conv3d | nn.Linear):
             nn.init.normal_(module.weight, std=module.weight[0].numel() ** -0.5)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
@@ -294,21 +303,18 @@ def start_from_lecun(network: QUIVER) -> None:
 def start_from_baseline(network: QUIVER) -> None:
     """Let the untrained network return about the mean of the middle frames.
 
-    The last layers of the pre-denoiser, of the picture branches and of the baseline are shrunk; pictures handed on to
-    the next scale start at zero.
+    The last layers of the pre-denoiser and of the baseline are shrunk. Those of the picture branches are zero, as are
+    the pictures handed on to the next scale: at the start the recurrent part adds nothing to the baseline.
     """
     assert network.baseline is not None
-    last = [network.refine4.picture[-1], network.refine.picture[-1], network.baseline.correction.leave]
-    if network.denoiser is not None:
-        last.append(network.denoiser.leave)
+    shrunk = [network.baseline.correction.leave, *([] if network.denoiser is None else [network.denoiser.leave])]
     with torch.no_grad():
-        for layer in last:
-            assert isinstance(layer, nn.Conv2d)
+        for layer in shrunk:
             assert layer.bias is not None
             layer.weight.mul_(0.03)
             layer.bias.zero_()
         for refinement in (network.refine4, network.refine):
-            for tensor in refinement.next_picture.parameters():
+            for tensor in (*refinement.picture[-1].parameters(), *refinement.next_picture.parameters()):
                 tensor.zero_()
 
 

@@ -275,7 +275,8 @@ def bytes_per_pixel(model: nn.Module, mode: str) -> int:
     if not isinstance(model, QUIVER):
         return 4_000
     held = 2 if mode == "windows" else 1  # windows of eleven frames at once
-    return int(held * (4000 + 1200 * model.config.channels) / model.config.fold**2)
+    baseline = 64 * model.config.baseline if model.config.baseline else 0  # at full size
+    return int(held * (4000 + 1200 * model.config.channels) / model.config.fold**2) + baseline
 
 
 def check_finite(restored: Array, name: str, first: int = 0) -> None:

@@ -46,7 +46,7 @@ class Features:
 def stream(network: "QUIVER", frames: Iterable[Tensor]) -> Iterator[Tensor]:
     """Frames [B, 1, H, W] one by one -> restored frames 5 .. T-6 [B, 1, H, W]; each seven frames late."""
     places: deque[Frame | None] = deque([None] * REACH, maxlen=NEIGHBOURS)  # frames around the encoded one
-    denoised: deque[Tensor] = deque(maxlen=WINDOW)
+    images: deque[Tensor] = deque(maxlen=WINDOW)
     r4: deque[Tensor] = deque(maxlen=WINDOW)
     finest: deque[tuple[Tensor, Tensor]] = deque(maxlen=RADIUS + 1)
     before: Features | None = None
@@ -61,9 +61,9 @@ def stream(network: "QUIVER", frames: Iterable[Tensor]) -> Iterator[Tensor]:
         before = features
         r4.append(network.cell.step(entry, state))
         finest.append((r1, r2))
-        denoised.append(current.denoised)
+        images.append(current.images[0])
         if len(r4) == WINDOW:
-            yield _picture(network, list(r4), finest[0], denoised)
+            yield _picture(network, list(r4), finest[0], images)
 
 
 def exact(network: "QUIVER", frames: Iterable[Tensor]) -> Iterator[Tensor]:
@@ -83,7 +83,7 @@ def exact(network: "QUIVER", frames: Iterable[Tensor]) -> Iterator[Tensor]:
             finest.append((r1, r2))
         if len(window) == WINDOW:
             start, end = _edges(network, window, inside)
-            yield _picture(network, network.recur([*start, *entries, *end]), finest[0], [f.denoised for f in window])
+            yield _picture(network, network.recur([*start, *entries, *end]), finest[0], [f.images[0] for f in window])
 
 
 def _prepare(network: "QUIVER", frames: Iterable[Tensor]) -> Iterator[Frame]:
@@ -135,8 +135,8 @@ def _edges(network: "QUIVER", window: Sequence[Frame], inside: Sequence[Features
     return entries[:3], entries[3:]
 
 
-def _picture(network: "QUIVER", r4: list[Tensor], finest: tuple[Tensor, Tensor], denoised: Sequence[Tensor]) -> Tensor:
+def _picture(network: "QUIVER", r4: list[Tensor], finest: tuple[Tensor, Tensor], frames: Sequence[Tensor]) -> Tensor:
     """The full-scale picture [B, 1, H, W] of the centre of eleven frames."""
     picture = network.restore(r4, *finest)[0]
-    base = network.base(denoised)
+    base = network.base(frames)
     return network.unfold(picture if base is None else picture + base)

@@ -51,6 +51,8 @@ class Settings:
     loss: str = "published"  # published, paper, l1 or scales-l1: see loss.py
     flips: bool = True  # the eight flips and quarter turns
     reverse: bool = True  # time reversal
+    drift: int = 0  # px/frame; half of the crops move through their clip, up to so fast
+    head_start: float = 0.0  # share of the run in which a baseline, if the network has one, is trained alone
     force_exposure: bool = False  # published: every window at the light level on its own
     validate_every: int = 300  # steps; a run without `steps` validates after every tenth of its time
     validation_split: str = "val"
@@ -85,7 +87,7 @@ class Settings:
 # Ours, and what the authors' program and the paper's text say (spec 5.2): bundles of defaults; options override.
 _PUBLISHED = {"schedule": "plateau", "warmup": 0, "crop": 128, "reverse": False}
 PROTOCOLS: dict[str, dict[str, Any]] = {
-    "quick": {"loss": "scales-l1", "learning_rate": 2e-3},
+    "quick": {"loss": "scales-l1", "learning_rate": 1e-3, "drift": 3, "head_start": 0.7},
     "control": {"loss": "l1"},
     "published": _PUBLISHED
     | {"sensor": "quiver-published", "force_exposure": True, "learning_rate": 1e-4, "steps": 48_000},

@@ -36,6 +36,7 @@ class WindowSettings:
     crop: int = 64  # px, side of the square; validation takes the centre
     flips: bool = True  # the eight flips and quarter turns
     reverse: bool = True  # half of the windows run backwards in time
+    drift: int = 0  # px/frame; in half of the windows the crop itself moves, up to so far along each side
     force_exposure: bool = False  # published: every window is brought to the light level on its own
     ceiling: float = 2.0  # targets end here, in units of white: 11 codes tell no light above from saturation
     seed: int = 0
@@ -53,8 +54,9 @@ class Place:
 
     clip: int
     start: int
-    y: int
+    y: int  # of the first frame taken
     x: int
+    drift: tuple[int, int]  # px/frame along y and x: whole pixels, so that nothing is interpolated
     light: int
     turn: int  # quarter turns 0..3, + 4 = mirrored first
     backwards: bool
@@ -92,23 +94,39 @@ class Windows(Dataset[dict[str, Any]]):
         clip = int(np.random.default_rng((settings.seed, epoch)).permutation(self.length)[index]) % len(self.clips)
         rng = np.random.default_rng((settings.seed, epoch, index))
         length, height, width = self.clips[clip].shape
+        start = int(rng.integers(length - settings.frames + 1))
+        drift = self._drift(clip, rng)
+        y, x = (
+            int(rng.integers(side - settings.crop - abs(way) + 1)) + max(0, -way)
+            for side, way in zip((height, width), (d * (settings.frames - 1) for d in drift), strict=True)
+        )
         return Place(
             clip=clip,
-            start=int(rng.integers(length - settings.frames + 1)),
-            y=int(rng.integers(height - settings.crop + 1)),
-            x=int(rng.integers(width - settings.crop + 1)),
+            start=start,
+            y=y,
+            x=x,
+            drift=drift,
             light=int(rng.integers(len(settings.lights))),
             turn=int(rng.integers(8)) if settings.flips else 0,
             backwards=bool(rng.integers(2)) if settings.reverse else False,
             key=Key(seed=settings.seed, clip=n, stage=TRAINING),
         )
 
+    def _drift(self, clip: int, rng: np.random.Generator) -> tuple[int, int]:
+        """How the crop moves, as far as the clip has room."""
+        settings = self.settings
+        if not settings.drift or rng.random() < 0.5:
+            return 0, 0
+        room = [(side - settings.crop) // max(1, settings.frames - 1) for side in self.clips[clip].shape[1:]]
+        dy, dx = (int(rng.integers(-most, most + 1)) for most in (min(settings.drift, r) for r in room))
+        return dy, dx
+
     def _middle(self, index: int) -> Place:
         settings, clip = self.settings, index % len(self.clips)
         length, height, width = self.clips[clip].shape
         start, y, x = (length - settings.frames) // 2, (height - settings.crop) // 2, (width - settings.crop) // 2
         key = Key(seed=settings.seed, clip=index, stage=VALIDATION)
-        return Place(clip, start, y, x, index // len(self.clips), 0, False, key)
+        return Place(clip, start, y, x, (0, 0), index // len(self.clips), 0, False, key)
 
     def __getitem__(self, n: int) -> dict[str, Any]:
         place = self.place(n)
@@ -136,13 +154,20 @@ class Windows(Dataset[dict[str, Any]]):
     def _photons(self, place: Place) -> tuple[Array, Array]:
         """Expected photons of the exposed and of the sharp window, [T, h, w], turned."""
         clip, side = self.clips[place.clip], self.settings.crop
-        times, crop = range(place.start, place.start + self.settings.frames), (place.y, place.x, side, side)
-        factor = self._factor(place.clip, place.light)
-        exposed = np.stack([clip_photons(clip, t, factor, crop) for t in times])
-        sharp = (
-            np.stack([clip_photons(clip, t, factor, crop, sharp=True) for t in times]) if has_sharp(clip) else exposed
-        )
-        return turned(exposed, place), turned(sharp, place)
+        (dy, dx), factor = place.drift, self._factor(place.clip, place.light)
+
+        def taken(sharp: bool) -> Array:
+            return np.stack(
+                [
+                    clip_photons(
+                        clip, place.start + i, factor, (place.y + dy * i, place.x + dx * i, side, side), sharp=sharp
+                    )
+                    for i in range(self.settings.frames)
+                ]
+            )
+
+        exposed = taken(sharp=False)
+        return turned(exposed, place), turned(taken(sharp=True) if has_sharp(clip) else exposed, place)
 
     def _factor(self, clip: int, light: int) -> float:
         if (clip, light) not in self._factors:

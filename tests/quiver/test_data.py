@@ -141,6 +141,27 @@ def test_turns_move_codes_and_target_together(make_clip: ClipMaker, turn: int, b
         np.testing.assert_array_equal(exposed, plain[::-1])
 
 
+def test_a_drifting_crop_is_the_clip_under_a_moving_window(make_clip: ClipMaker):
+    """Frame i is the clip's frame at (y, x) + i (dy, dx), never outside; half of the windows stay, all ways occur."""
+    clip = make_clip(height=48, width=40)
+    data = Windows([clip], WindowSettings(crop=16, flips=False, reverse=False, drift=2))
+    places = [data.place(n) for n in range(600)]
+    for place in places:
+        for start, way, side in zip((place.y, place.x), place.drift, (48, 40), strict=True):
+            assert 0 <= min(start, start + 10 * way) <= max(start, start + 10 * way) <= side - 16
+    drifts = [place.drift for place in places]
+    assert set(drifts) == {(dy, dx) for dy in range(-2, 3) for dx in range(-2, 3)}
+    still = 0.5 + 0.5 / 25
+    assert abs(np.mean([drift == (0, 0) for drift in drifts]) - still) < 5 * np.sqrt(still * (1 - still) / 600)
+    place = next(place for place in places if place.drift == (-2, 1))
+    factor = light_level(clip, ppp=3.25).factor
+    for i, frame in enumerate(data._photons(place)[0]):
+        crop = (place.y - 2 * i, place.x + i, 16, 16)
+        np.testing.assert_array_equal(frame, clip_photons(clip, place.start + i, factor, crop))
+    narrow = Windows([make_clip("narrow", height=16, width=27)], WindowSettings(crop=16, drift=9))
+    assert {narrow.place(n).drift for n in range(100)} == {(0, -1), (0, 0), (0, 1)}
+
+
 def test_epochs_and_samples_have_their_own_noise(make_clip: ClipMaker):
     data = windows(make_clip)
     assert len(data) == 6

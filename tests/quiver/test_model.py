@@ -23,7 +23,7 @@ SMALL = Config(
     flow_kernel=3,
     cell_blocks=2,
 )
-FOLDED = replace(SMALL, fold=2, baseline=4, attention_width=16, attention_temperature=4.0, flow_levels=3)
+FOLDED = replace(SMALL, fold=2, baseline=4, sweep=1.0, attention_width=16, attention_temperature=4.0, flow_levels=3)
 BOTH = pytest.mark.parametrize("config", [SMALL, FOLDED], ids=["published-design", "folded"])
 
 
@@ -118,9 +118,9 @@ def test_output_shapes_and_units(config):
 
 
 def test_an_untrained_nano_returns_about_the_mean_of_the_middle_frames():
-    """The random layers add less than a fifth of the noise of one frame (rms)."""
+    """Where nothing moves; the random layers add less than a fifth of the noise of one frame (rms)."""
     torch.manual_seed(0)
-    network, x = build("nano"), draw(1, 11, 1, 32, 32, dtype=torch.float32)
+    network, x = build("nano"), draw(1, 1, 1, 32, 32, dtype=torch.float32).repeat(1, 11, 1, 1, 1)
     with torch.no_grad():
         out = network(x).scale1[:, 0]
     weights = network.baseline.weights.detach()
@@ -146,17 +146,18 @@ def test_alignment_starts_from_the_flow_alone(kernel, lecun):
 
 
 def test_the_lecun_start_keeps_the_fused_features_alive():
-    """Spread over space: default weights leave a few thousandths, because two faded signals are multiplied."""
-    x, spread = draw(1, 11, 1, 32, 32, dtype=torch.float32), {}
+    """Spread over space, four starts together: default weights leave little, as two faded signals are multiplied."""
+    x, spread = draw(1, 11, 1, 32, 32, dtype=torch.float32), {False: 0.0, True: 0.0}
     for lecun in (False, True):
-        torch.manual_seed(0)
-        started = QUIVER(replace(FOLDED, lecun=lecun))
-        fused: list[Tensor] = []
-        started.fusions[0].register_forward_hook(lambda _m, _i, out, fused=fused: fused.append(out))
-        with torch.no_grad():
-            started(x)
-        spread[lecun] = float(fused[1].flatten(2).std(dim=2).mean())
-    assert spread[True] > 20 * spread[False], spread
+        for seed in range(4):
+            torch.manual_seed(seed)
+            started = QUIVER(replace(FOLDED, lecun=lecun))
+            fused: list[Tensor] = []
+            started.fusions[0].register_forward_hook(lambda _m, _i, out, fused=fused: fused.append(out))
+            with torch.no_grad():
+                started(x)
+            spread[lecun] += float(fused[1].flatten(2).std(dim=2).mean())
+    assert spread[True] > 10 * spread[False], spread
 
 
 # The same numbers by other roads

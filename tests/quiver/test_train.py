@@ -8,6 +8,7 @@ import os
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,8 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from quiver import train as training
-from quiver.model import Output
+from quiver.config import PRESETS
+from quiver.model import QUIVER, Output
 from quiver.run import PROTOCOLS, Run, Settings, State
 from quiver.train import Diverged, learning_rate, make_windows, note_plateau, time_is_up, train
 from quiver.unet import UNet, UNetConfig
@@ -296,3 +298,26 @@ def test_two_processes_train_as_one_with_twice_the_batch(tiny_dataset, tmp_path)
     together = load(tmp_path / "b/last.safetensors")
     for ours, theirs in zip(alone.state_dict().values(), together.state_dict().values(), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+def test_a_head_start_trains_the_baseline_alone(tiny_dataset, tmp_path):
+    """After the first half only the baseline has moved; the second half moves the rest, from its last layers on."""
+
+    def moved(steps: int, out: str) -> set[str]:
+        torch.manual_seed(0)
+        network = QUIVER(replace(PRESETS["nano"], baseline=4, attention_width=16))
+        before = {name: p.detach().clone() for name, p in network.named_parameters()}
+        state = State()
+
+        def half() -> bool:
+            state.step += 1
+            return state.step == steps
+
+        run = settings(tiny_dataset, tmp_path / out, steps=4, head_start=0.5, loss="scales-l1")
+        train(network, run, should_stop=half, progress=False)
+        return {name.split(".")[0] for name, p in network.named_parameters() if not torch.equal(p, before[name])}
+
+    assert moved(2, "half") == {"baseline"}
+    assert moved(4, "more") >= {"denoiser", "baseline", "flow", "cell", "attention", "refine"}
+    plain = train(small_network(), settings(tiny_dataset, tmp_path / "unet", head_start=0.5), progress=False)
+    assert plain.finished, "a network without a baseline is trained as always"

@@ -1,0 +1,109 @@
+"""The velocity sweep: known motion, the obvious loop's choice, rest where nothing is to be seen, hard sizes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from quiver import sweep
+from quiver.sweep import aligned, velocities
+
+
+def sliding(velocity: tuple[float, float], size: tuple[int, int] = (40, 48), frames: int = 11) -> torch.Tensor:
+    """[1, T, h, w]: a sum of waves of 6 to 30 px that moves by `velocity` (x, y) px per frame, values 0.1 to 0.9."""
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[: size[0], : size[1]]
+    angles, lengths, phases = rng.uniform(0, 2 * np.pi, 9), rng.uniform(6, 30, 9), rng.uniform(0, 2 * np.pi, 9)
+    pictures = []
+    for t in range(frames):
+        k = t - frames // 2
+        along = [np.cos(a) * (x - k * velocity[0]) + np.sin(a) * (y - k * velocity[1]) for a in angles]
+        waves = [np.sin(2 * np.pi * s / n + p) for s, n, p in zip(along, lengths, phases, strict=True)]
+        pictures.append(0.5 + 0.4 * np.mean(waves, axis=0))
+    return torch.tensor(np.stack(pictures)[None], dtype=torch.float32)
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 0.0), (1.0, 0.0), (-0.5, 2.0), (1.3, -0.8), (3.0, 2.5)])
+def test_known_motion_is_found(velocity):
+    """Away from the border, to the last step of refinement and what the preference for rest takes; frames agree."""
+    window = sliding(velocity)
+    found, cost = velocities(window, 3.5)
+    inner = (..., slice(14, -14), slice(14, -14))
+    error = (found - torch.tensor(velocity).view(1, 2, 1, 1))[inner]
+    assert error.abs().max() <= 1.5 * sweep.REFINED[-1]
+    before, after = (frames[inner].std(dim=1).mean() for frames in (window, aligned(window, found)))
+    assert cost[inner].max() < 0.02**2
+    if velocity != (0.0, 0.0):
+        assert after < 0.3 * before
+
+
+def test_the_grid_is_searched_as_the_obvious_loop_does():
+    """Pixel by pixel in NumPy, float64: weights, whole-pixel shifts, box means and the choice are the same."""
+    window = sliding((1.0, -0.5), (12, 14))[0].double().numpy()[1:10]
+    weights = np.exp(-0.5 * (np.arange(-4, 5) / sweep.SIGMA) ** 2)
+    weights /= weights.sum()
+    grid = [(vx, vy) for vy in np.arange(-2, 3) / 2 for vx in np.arange(-2, 3) / 2]
+    h, w = window.shape[1:]
+    costs = np.empty((len(grid), h // 2, w // 2))
+    for i, (vx, vy) in enumerate(grid):
+        moved = np.empty_like(window)
+        for t, k in enumerate(range(-4, 5)):
+            rows = np.clip(np.arange(h) + round(k * vy), 0, h - 1)
+            moved[t] = window[t][rows][:, np.clip(np.arange(w) + round(k * vx), 0, w - 1)]
+        variance = np.tensordot(weights, moved**2, 1) - np.tensordot(weights, moved, 1) ** 2
+        for r in range(h // 2):
+            for c in range(w // 2):
+                box = variance[max(0, 2 * r - 3) : 2 * r + 5, max(0, 2 * c - 3) : 2 * c + 5]
+                costs[i, r, c] = (box.mean() + sweep.FLOOR) * (1 + sweep.PREFERENCE * np.hypot(vx, vy))
+    frames = torch.tensor(window, dtype=torch.float32)[None]
+    found = sweep._coarse(frames, torch.tensor(weights, dtype=torch.float32), 1.0)[0, :, ::2, ::2].numpy()
+    chosen = [grid.index((float(x), float(y))) for x, y in found.reshape(2, -1).T]
+    paid = np.take_along_axis(costs.reshape(len(grid), -1), np.array([chosen]), 0)[0]
+    np.testing.assert_allclose(paid, costs.min(0).ravel(), rtol=1e-3, atol=1e-7)  # the best, or its equal in float32
+
+
+def test_noise_is_averaged_along_the_way():
+    """Photon noise on a moving pattern: drawn together, the mean over time is unbiased and far closer to the truth."""
+    clean = sliding((1.5, -1.0), (64, 64))
+    photons = torch.from_numpy(np.random.default_rng(1).poisson(6.0 * clean.numpy()).astype(np.float32)) / 6
+    velocity, _ = velocities(photons, 3.5)
+    inner = (..., slice(18, -18), slice(18, -18))
+    truth = clean[:, 5][inner]
+    plain, drawn = ((f.mean(1)[inner] - truth) for f in (photons, aligned(photons, velocity)))
+    noise = truth.mean() / 6 / 11  # variance of a mean of eleven Poisson counts / 6
+    assert plain.square().mean() > 1.3 * noise, "without motion compensation the pattern is smeared"
+    assert drawn.square().mean() < noise, "bilinear interpolation only lowers it"
+    assert abs(drawn.mean()) < 5 * (noise / drawn.numel()).sqrt()
+
+
+@pytest.mark.parametrize("shape", [(1, 11, 4, 4), (2, 3, 4, 8), (1, 1, 6, 5), (1, 11, 5, 33)])
+def test_hard_sizes_and_constant_frames_rest(shape):
+    velocity, cost = velocities(torch.full(shape, 0.3), 3.5)
+    assert velocity.shape == (shape[0], 2, *shape[2:])
+    assert cost.shape == (shape[0], 1, *shape[2:])
+    assert velocity.abs().max() == 0
+    assert cost.abs().max() < 2e-6
+    assert torch.equal(aligned(torch.rand(shape), velocity).isfinite(), torch.ones(shape, dtype=torch.bool))
+
+
+def test_mirrored_frames_move_mirrored():
+    window = sliding((1.0, 0.5))
+    found, _ = velocities(window, 2.0)
+    mirrored, _ = velocities(window.flip(3), 2.0)
+    backwards, _ = velocities(window.flip(1), 2.0)
+    inner = (..., slice(14, -14), slice(14, -14))
+    for other, sign in ((mirrored.flip(3), (-1, 1)), (backwards, (-1, -1))):
+        assert (other * torch.tensor(sign).view(1, 2, 1, 1) - found)[inner].abs().max() <= 2 * sweep.REFINED[-1]
+
+
+def test_aligning_passes_gradients_to_the_frames():
+    window = sliding((1.0, 0.0), (8, 10)).requires_grad_()
+    velocity, _ = velocities(window, 1.0)
+    assert not velocity.requires_grad
+    aligned(window, velocity).sum().backward()
+    assert window.grad is not None
+    assert window.grad.isfinite().all()
+    np.testing.assert_allclose(float(window.grad.sum()), window.numel(), rtol=1e-5)  # bilinear weights sum to one
+    assert F.mse_loss(aligned(window, torch.zeros(1, 2, 8, 10)), window) < 1e-12
