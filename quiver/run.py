@@ -87,7 +87,7 @@ class Settings:
 # Ours, and what the authors' program and the paper's text say (spec 5.2): bundles of defaults; options override.
 _PUBLISHED = {"schedule": "plateau", "warmup": 0, "crop": 128, "reverse": False}
 PROTOCOLS: dict[str, dict[str, Any]] = {
-    "quick": {"loss": "scales-l1", "learning_rate": 1e-3, "drift": 3, "head_start": 0.7},
+    "quick": {"loss": "scales-l1", "drift": 3, "head_start": 0.7},
     "control": {"loss": "l1"},
     "published": _PUBLISHED
     | {"sensor": "quiver-published", "force_exposure": True, "learning_rate": 1e-4, "steps": 48_000},

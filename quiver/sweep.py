@@ -2,11 +2,13 @@
 
     cost(v, p) = mean over p's surroundings of  sum_k w_k x_k(p + k v)^2 - (sum_k w_k x_k(p + k v))^2
 
-the weighted variance over time along a straight path, k = frames from the centre. All velocities of a grid are tried,
-as plane sweeps try depths (Collins, "A space-sweep approach to true multi-image matching", CVPR 1996); the best is
-refined in smaller steps and smoothed by a median. Nothing is learnt, nothing is differentiated: photon noise that hides
-a pixel from its neighbour in time is averaged over frames and a neighbourhood before anything is decided. What turns or
-accelerates moves straight on over the few frames that count; what is covered and uncovered is left to the network.
+the weighted variance over time along a straight path, k = frames from the centre, x = sqrt(code + OFFSET): without the
+root, whose photon noise is about the same everywhere, the least variance would be where there is least light. All
+velocities of a grid are tried, as plane sweeps try depths (Collins, "A space-sweep approach to true multi-image
+matching", CVPR 1996); the best is refined in smaller steps and smoothed by a median. Nothing is learnt, nothing is
+differentiated: photon noise that hides a pixel from its neighbour in time is averaged over frames and a neighbourhood
+before anything is decided. What turns or accelerates moves straight on over the few frames that count; what is covered
+and uncovered is left to the network.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from torch import Tensor
 
 from quiver.ops import warp
 
-OFFSET = 0.05  # a third of a code of 3 bits: sqrt(x + OFFSET) has about the same photon noise everywhere
+OFFSET = 0.05  # in units of full scale: about 3/8 of a 3-bit code (Anscombe 1948), too much for more bits
 SIGMA = 2.0  # frames, of the weights over time
 REACH = 4  # frames from the centre that count: beyond, weights are under 0.03
 STEP = 0.5  # px/frame, of the grid of velocities
@@ -33,7 +35,8 @@ FLOOR = 1e-6  # added to every variance, so that this holds for frames without n
 def velocities(window: Tensor, largest: float) -> tuple[Tensor, Tensor]:
     """Frames [N, T, h, w], T odd -> velocity [N, 2, h, w] (x, y; px/frame) in the middle, and its cost [N, 1, h, w].
 
-    `largest` bounds the tried components. Frame t shows at p + (t - T // 2) v what the middle one shows at p.
+    `largest` bounds the tried components; the cost is that before the last median. Frame t shows at p + (t - T // 2) v
+    what the middle one shows at p.
     """
     frames = (window.float().clamp(min=0) + OFFSET).sqrt()
     middle = frames.shape[1] // 2

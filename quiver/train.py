@@ -263,10 +263,9 @@ def train(
     """Train `model` in place until the end that the settings name, or until `should_stop`; returns the state reached.
 
     Goes on with the run in `settings.out` if there is one. Raises ValueError and OSError for settings and folders that
-    do not fit, `Diverged` for NaN or Inf.
+    do not fit, `Diverged` for NaN or Inf. From then on denormal numbers count as zero in this process.
     """
-    # Gradients through the tails of GELU are denormal numbers, which make a step twice as slow on a CPU
-    torch.set_flush_denormal(True)
+    torch.set_flush_denormal(True)  # gradients through the tails of GELU are such numbers: a step can be twice as slow
     with joined(device) as process, contextlib.ExitStack() as stack:
         windows, fixed = make_windows(settings, int(model.multiple))  # type: ignore[arg-type]
         run = Run(settings)

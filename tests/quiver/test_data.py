@@ -152,7 +152,7 @@ def test_a_drifting_crop_is_the_clip_under_a_moving_window(make_clip: ClipMaker)
     drifts = [place.drift for place in places]
     assert set(drifts) == {(dy, dx) for dy in range(-2, 3) for dx in range(-2, 3)}
     still = 0.5 + 0.5 / 25
-    assert abs(np.mean([drift == (0, 0) for drift in drifts]) - still) < 5 * np.sqrt(still * (1 - still) / 600)
+    assert_mean(np.array([drift == (0, 0) for drift in drifts]), still, still * (1 - still))
     place = next(place for place in places if place.drift == (-2, 1))
     factor = light_level(clip, ppp=3.25).factor
     for i, frame in enumerate(data._photons(place)[0]):

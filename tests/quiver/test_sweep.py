@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from stats import assert_mean
 
 from quiver import sweep
 from quiver.sweep import aligned, velocities
@@ -27,14 +28,13 @@ def sliding(velocity: tuple[float, float], size: tuple[int, int] = (40, 48), fra
 
 @pytest.mark.parametrize("velocity", [(0.0, 0.0), (1.0, 0.0), (-0.5, 2.0), (1.3, -0.8), (3.0, 2.5)])
 def test_known_motion_is_found(velocity):
-    """Away from the border, to the last step of refinement and what the preference for rest takes; frames agree."""
+    """Away from the border: the nearest multiple of the last step, or the one beside it. The frames then agree."""
     window = sliding(velocity)
-    found, cost = velocities(window, 3.5)
+    found, _ = velocities(window, 3.5)
     inner = (..., slice(14, -14), slice(14, -14))
     error = (found - torch.tensor(velocity).view(1, 2, 1, 1))[inner]
     assert error.abs().max() <= 1.5 * sweep.REFINED[-1]
     before, after = (frames[inner].std(dim=1).mean() for frames in (window, aligned(window, found)))
-    assert cost[inner].max() < 0.02**2
     if velocity != (0.0, 0.0):
         assert after < 0.3 * before
 
@@ -75,7 +75,7 @@ def test_noise_is_averaged_along_the_way():
     noise = truth.mean() / 6 / 11  # variance of a mean of eleven Poisson counts / 6
     assert plain.square().mean() > 1.3 * noise, "without motion compensation the pattern is smeared"
     assert drawn.square().mean() < noise, "bilinear interpolation only lowers it"
-    assert abs(drawn.mean()) < 5 * (noise / drawn.numel()).sqrt()
+    assert_mean(drawn.numpy().ravel(), 0.0, float(noise))
 
 
 @pytest.mark.parametrize("shape", [(1, 11, 4, 4), (2, 3, 4, 8), (1, 1, 6, 5), (1, 11, 5, 33)])
