@@ -6,6 +6,7 @@ import collections
 import contextlib
 import multiprocessing
 import multiprocessing.connection
+import multiprocessing.resource_tracker
 import os
 import resource
 import signal
@@ -80,6 +81,8 @@ class _Worker:
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs, folder, make, memory, os.getpid()), daemon=True)
         # The child inherits the mask: Ctrl-C in a terminal reaches all of its processes, and is the parent's business.
+        # The first start of a child starts the tracker too, which unblocks SIGINT again: have it running before.
+        multiprocessing.resource_tracker.ensure_running()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self.process.start()

@@ -309,7 +309,12 @@ def test_ctrl_c_says_how_to_go_on(tmp_path: Path):
     while not list((tmp_path / "d" / "logs").glob("*.log")):
         assert time.monotonic() < end
         time.sleep(0.01)
-    os.killpg(first.pid, signal.SIGINT)  # as a terminal does: to the workers too
+    # As a terminal does, to the workers too; to them first, so that the parent cannot hide that they noticed it.
+    children = Path(f"/proc/{first.pid}/task/{first.pid}/children").read_text().split()
+    for process in [int(child) for child in children]:
+        os.kill(process, signal.SIGINT)
+    time.sleep(0.5)
+    first.send_signal(signal.SIGINT)
     _, err = first.communicate(timeout=60)
     assert first.returncode == 130
     assert "interrupted; the same command goes on where it stopped" in err
