@@ -1,7 +1,8 @@
 """What a recipe will cost: one tiny job of each kind is rendered here, and the whole is multiplied out.
 
 A kind is a family with its render settings. Of each, a job's scene is loaded, its budget chosen, and a few frames are
-rendered, sensed and stored in a temporary folder. Scenes of one family differ, and so will the truth: by 30 % or so.
+rendered, sensed and stored in a temporary folder. Scenes of one family differ, some in samples per pixel by ten times:
+the budgets of a few more jobs are chosen too, and a frame of theirs is taken to cost as much more as its samples say.
 Both clocks are read: wall time is what to wait for on a machine as busy as it is now, processor time is what the work
 needs, and what a real run can fairly be compared with (every job's log says both).
 """
@@ -16,11 +17,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from qsim import jobs, stream
+from qsim.budget import Budget
 from qsim.clip import Clip
+from qsim.denoise import DENOISE_COST
 from qsim.recipe import Job, Recipe
 from qsim.workers import Limits
 
 START = 3.0  # s, a fresh worker process with its renderer; measured on two cores, shared by Limits.jobs jobs
+LOOKED_AT = 5  # jobs of a kind whose budgets are chosen, at most
 
 
 class Seconds(NamedTuple):
@@ -46,7 +50,8 @@ class Cost:
     clips: int
     frames: int  # of all clips together
     setup: Seconds  # per clip: scene, budget, first frame's compilation
-    per_frame: Seconds  # rendering and storing
+    samples: tuple[int, int]  # per pixel, the fewest and the most of the budgets that were looked at
+    per_frame: Seconds  # rendering and storing, the mean of those
     sensing: Seconds  # per frame, all streams
     frame_bytes: float  # of radiance, truth and streams
 
@@ -107,10 +112,12 @@ class Plan:
     def lines(self, machines: int) -> list[str]:
         """The forecast as text."""
         head = (
-            f"{'family':12} {'size':>11} {'clips':>6} {'frames':>7} {'s/clip':>7} {'s/frame':>8} {'hours':>8} {'GB':>8}"
+            f"{'family':12} {'size':>11} {'clips':>6} {'frames':>7} {'samples':>9} {'s/clip':>7} {'s/frame':>8} "
+            f"{'hours':>8} {'GB':>8}"
         )
         rows = [
-            f"{c.family:12} {c.size[0]:>5} x{c.size[1]:>4} {c.clips:6} {c.frames:7} {c.setup.wall:7.2f} "
+            f"{c.family:12} {c.size[0]:>5} x{c.size[1]:>4} {c.clips:6} {c.frames:7} "
+            f"{'-'.join(str(n) for n in sorted(set(c.samples))):>9} {c.setup.wall:7.2f} "
             f"{c.per_frame.wall + c.sensing.wall:8.3f} {c.hours:8.3f} {c.gigabytes:8.3f}"
             for c in self.costs
         ]
@@ -149,8 +156,10 @@ def plan(recipe: Recipe, *, frames: int = 5, progress: stream.Progress | None = 
 
 def _measure(members: list[Job], folder: Path, frames: int) -> Cost:
     """The second rendering counts: kernels are then compiled and cached, as they are for nearly all jobs."""
+    budgets = [jobs.choose_budget(job, jobs.load_scene(job)) for job in _spread(members)]
+    work = [_work(budget) for budget in budgets]
     _first_frames(members[0], folder / "warm", min(2, members[0].settings.frames))
-    job = members[len(members) // 2]
+    job = _spread(members)[len(budgets) // 2]
     settings = job.settings
     started = Seconds.now()
     clip, moments = _first_frames(job, folder / "measured", min(frames, settings.frames))
@@ -161,6 +170,7 @@ def _measure(members: list[Job], folder: Path, frames: int) -> Cost:
         setup = Seconds(*(max(0.0, seconds) for seconds in first.since(per_frame)))
     else:
         per_frame, setup = first, Seconds(0.0, 0.0)
+    dearer = sum(work) / len(work) / work[len(work) // 2]
     sensing, codes = _sense(job, clip)
     stored = sum(file.stat().st_size for file in clip.path.rglob("*.exr")) / len(clip)
     return Cost(
@@ -169,10 +179,22 @@ def _measure(members: list[Job], folder: Path, frames: int) -> Cost:
         clips=len(members),
         frames=len(members) * settings.frames,
         setup=setup,
-        per_frame=per_frame,
+        samples=(min(budget.samples for budget in budgets), max(budget.samples for budget in budgets)),
+        per_frame=Seconds(*(dearer * seconds for seconds in per_frame)),
         sensing=sensing,
         frame_bytes=stored + codes,
     )
+
+
+def _spread(members: list[Job]) -> list[Job]:
+    """At most LOOKED_AT of them, evenly spaced, from the first to the last."""
+    count = min(LOOKED_AT, len(members))
+    return [members[round(i * (len(members) - 1) / max(1, count - 1))] for i in range(count)]
+
+
+def _work(budget: Budget) -> float:
+    """What a frame costs, in samples per pixel: nearly everything else that a frame needs is small beside them."""
+    return budget.samples + (DENOISE_COST if budget.denoise else 0.0)
 
 
 def _first_frames(job: Job, path: Path, frames: int) -> tuple[Clip, list[Seconds]]:

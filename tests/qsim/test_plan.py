@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from qsim import generation, plan, recipe
+from qsim.budget import Budget
 from qsim.cli import main
 from qsim.plan import START, Cost, Plan, Seconds
 from qsim.workers import Limits
@@ -32,7 +33,7 @@ ppp = 3.25
 def test_the_arithmetic_of_a_forecast():
     """10 clips of 30 frames: 10 * 6 s + 300 * (1.5 + 0.3) s = 600 s, and a tenth of a fresh process per clip or so."""
     seconds = {"setup": Seconds(6.0, 11.0), "per_frame": Seconds(1.5, 2.9), "sensing": Seconds(0.3, 0.4)}
-    cost = Cost("fan", (512, 1024), 10, 300, **seconds, frame_bytes=4e6)
+    cost = Cost("fan", (512, 1024), 10, 300, samples=(8, 72), **seconds, frame_bytes=4e6)
     assert cost.hours == pytest.approx(600 / 3600)
     assert cost.seconds.processor == pytest.approx(10 * 11 + 300 * (2.9 + 0.4))
     assert cost.gigabytes == pytest.approx(1.2)
@@ -42,8 +43,47 @@ def test_the_arithmetic_of_a_forecast():
     assert whole.gigabytes == pytest.approx(2.4)
     assert f"10 machines like this: {whole.hours / 10:.3g} hours each" in "\n".join(whole.lines(10))
     assert "GPU" in whole.lines(1)[-1]
+    assert " 8-72 " in whole.lines(1)[1]
     kind = whole.to_dict()["kinds"][0]
     assert (kind["frames"], kind["per_frame_seconds"]) == (300, {"wall": 1.5, "processor": 2.9})
+
+
+def test_a_few_jobs_are_looked_at_from_first_to_last():
+    wanted = recipe.parse(RECIPE.replace("[0, 1, 2]", str(list(range(42)))))
+    seeds = [job.scene_seed for job in plan._spread(list(wanted.jobs))]
+    assert seeds == [0, 10, 20, 31, 41]
+    assert len(plan._spread(list(wanted.jobs)[:3])) == 3
+    assert plan._spread(list(wanted.jobs)[:1]) == list(wanted.jobs)[:1]
+
+
+def test_a_frame_costs_what_its_samples_cost(monkeypatch: pytest.MonkeyPatch):
+    """Three budgets of 10, 20 and 90 samples: a frame costs twice that of the middle one, which is timed."""
+    wanted = recipe.parse(RECIPE)
+    samples = {0: 10, 1: 20, 2: 90}
+    monkeypatch.setattr(plan.jobs, "load_scene", lambda job: job)
+    monkeypatch.setattr(plan.jobs, "choose_budget", lambda job, scene: Budget(samples[job.scene_seed]))
+    timed = []
+
+    def first_frames(job, path, frames):
+        timed.append(job.scene_seed)
+        started = Seconds.now()
+        return FakeClip(), [Seconds(started.wall + 2 + 3 * n, started.processor + 1 + n) for n in range(frames)]
+
+    monkeypatch.setattr(plan, "_first_frames", first_frames)
+    monkeypatch.setattr(plan, "_sense", lambda job, clip: (Seconds(0.0, 0.0), 0.0))
+    cost = plan._measure(list(wanted.jobs), Path(), 4)
+    assert timed[-1] == 1
+    assert cost.samples == (10, 90)
+    assert cost.per_frame == pytest.approx(Seconds(6.0, 2.0))
+
+
+class FakeClip:
+    """Of no frame that could be stored."""
+
+    path = Path("/nowhere")
+
+    def __len__(self) -> int:
+        return 1
 
 
 def test_plans_without_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
