@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from quiver.ops import deform_conv2d, warp
-from quiver.sweep import aligned, velocities
+from quiver.sweep import aligned, disagreement, paths
 
 RADIUS = 5  # frames before and after the restored one
 WINDOW = 2 * RADIUS + 1
@@ -340,8 +340,8 @@ class Baseline(nn.Module):
     """Not part of the published design: a first picture straight from the window, for quick learning.
 
     A learnt mean over time plus an hourglass over the stacked frames, at full size; before training it is about a
-    Gaussian mean. With `sweep` the frames are first drawn along the velocity that makes them agree (sweep.py, found at
-    half the size, up to `sweep` px/frame there), and the hourglass sees them both ways, beside the velocity and the
+    Gaussian mean. With `sweep` the frames are first drawn along the paths on which they agree (sweep.py, up to about
+    `sweep` px/frame), and the hourglass sees them both ways, beside the velocity as a share of `sweep` and the
     standard deviation that is left over time.
     """
 
@@ -360,10 +360,9 @@ class Baseline(nn.Module):
         frames = F.pixel_shuffle(torch.stack(list(window), dim=1), fold)[:, :, 0]  # [N, T, H, W]
         drawn, stack = frames, [frames]
         if self.sweep:
-            size = frames.shape[2:]
-            velocity, variance = velocities(F.avg_pool2d(frames, 2), self.sweep)
-            drawn = aligned(frames, 2 * resize(velocity, *size))
-            stack = [drawn, frames, resize(velocity, *size), resize(variance, *size).sqrt()]
+            velocity, acceleration = paths(frames, self.sweep)
+            drawn = aligned(frames, velocity, acceleration)
+            stack = [drawn, frames, velocity / self.sweep, disagreement(drawn).sqrt()]
         mean = (drawn * self.weights.view(1, -1, 1, 1)).sum(1, keepdim=True)
         return F.pixel_unshuffle(mean + self.correction(join(*stack)), fold)
 

@@ -21,7 +21,7 @@ class Config:
     attention_temperature: float | None = None  # start of a learnt factor on the logits; None = none, as published
     fold: int = 1  # side of the blocks of pixels that become channels before everything else (1 = none)
     baseline: int = 0  # width of an hourglass over the window whose picture is added to the output; 0 = none
-    sweep: float = 0.0  # px/frame at half the size: the baseline aligns by the best velocity up to this one; 0 = not
+    sweep: float = 0.0  # px/frame: the baseline aligns by the best velocity up to about this one; 0 = not
     lecun: bool = False  # start from normal weights of variance 1/fan-in (LeCun, as the paper says) and zero biases
     pre_denoiser: bool = True  # ablation: False feeds the noisy frames to both streams and to the flow
     flow: bool = True  # ablation: False aligns by the learnt offsets alone
@@ -78,7 +78,7 @@ PRESETS: dict[str, Config] = {
         attention_temperature=8.0,
         fold=2,
         baseline=32,
-        sweep=3.5,
+        sweep=7.0,
         lecun=True,
     ),
 }

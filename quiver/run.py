@@ -22,6 +22,7 @@ from torch import nn
 from quiver import weights
 from quiver.data import Light, read_json, replacing, write_json
 from quiver.loss import PRESETS as LOSSES
+from quiver.optimiser import OPTIMISERS, Kind, Optimiser
 
 SCHEDULES = ("cosine", "plateau")
 PRECISIONS = ("auto", "float32", "bfloat16")
@@ -42,6 +43,7 @@ class Settings:
     crop: int = 64  # px
     frames: int = 11  # of a training window; each one beyond eleven is one more restored frame for little more work
     batch: int = 8  # of each process
+    optimiser: Kind = "adam"  # or muon: see optimiser.py
     learning_rate: float = 1e-3
     betas: tuple[float, float] = (0.9, 0.99)  # of Adam
     schedule: str = "cosine"  # or plateau
@@ -70,7 +72,8 @@ class Settings:
                 raise ValueError(f"--{name.replace('_', '-')} must be above 0, got {value!r}")
         if self.frames < 11:
             raise ValueError(f"--frames must be at least 11, the window of the networks, got {self.frames}")
-        for name, known in (("schedule", SCHEDULES), ("precision", PRECISIONS), ("loss", tuple(LOSSES))):
+        known_names = {"schedule": SCHEDULES, "precision": PRECISIONS, "loss": tuple(LOSSES), "optimiser": OPTIMISERS}
+        for name, known in known_names.items():
             if getattr(self, name) not in known:
                 raise ValueError(f"no {name} is called {getattr(self, name)!r}; known are {', '.join(known)}")
 
@@ -87,7 +90,7 @@ class Settings:
 # Ours, and what the authors' program and the paper's text say (spec 5.2): bundles of defaults; options override.
 _PUBLISHED = {"schedule": "plateau", "warmup": 0, "crop": 128, "reverse": False}
 PROTOCOLS: dict[str, dict[str, Any]] = {
-    "quick": {"loss": "scales-l1", "drift": 3, "head_start": 0.7},
+    "quick": {"optimiser": "muon", "learning_rate": 6e-3, "loss": "scales-l1", "drift": 3, "head_start": 0.85},
     "control": {"loss": "l1"},
     "published": _PUBLISHED
     | {"sensor": "quiver-published", "force_exposure": True, "learning_rate": 1e-4, "steps": 48_000},
@@ -137,7 +140,7 @@ class Run:
                     "choose another -o, or start anew with --force"
                 )
 
-    def save(self, path: Path, model: nn.Module, optimiser: torch.optim.Optimizer, state: State, **extra: Any) -> None:
+    def save(self, path: Path, model: nn.Module, optimiser: Optimiser, state: State, **extra: Any) -> None:
         """The whole state of the run in one file."""
         content = {
             "model": model.state_dict(),
@@ -150,7 +153,7 @@ class Run:
         with replacing(path) as file:
             torch.save(content, file)
 
-    def load(self, model: nn.Module, optimiser: torch.optim.Optimizer, device: torch.device) -> State:
+    def load(self, model: nn.Module, optimiser: Optimiser, device: torch.device) -> State:
         """The newest state, put into model and optimiser; a fresh one if there is none, ValueError if it is damaged."""
         if not self.checkpoint.exists():
             return State()

@@ -1,14 +1,22 @@
-"""Where things move, found by trying: the velocity under which the frames of a window agree best.
+"""Where things move, found by trying and then by slope: the path along which the frames of a window agree best.
 
-    cost(v, p) = mean over p's surroundings of  sum_k w_k x_k(p + k v)^2 - (sum_k w_k x_k(p + k v))^2
+    path(k) = p + k v + k^2/2 a,   k = frames from the centre
+    cost(v, a, p) = mean over p's surroundings of  sum_k w_k x_k(path(k))^2 - (sum_k w_k x_k(path(k)))^2
 
-the weighted variance over time along a straight path, k = frames from the centre, x = sqrt(code + OFFSET): without the
-root, whose photon noise is about the same everywhere, the least variance would be where there is least light. All
-velocities of a grid are tried, as plane sweeps try depths (Collins, "A space-sweep approach to true multi-image
-matching", CVPR 1996); the best is refined in smaller steps and smoothed by a median. Nothing is learnt, nothing is
-differentiated: photon noise that hides a pixel from its neighbour in time is averaged over frames and a neighbourhood
-before anything is decided. What turns or accelerates moves straight on over the few frames that count; what is covered
-and uncovered is left to the network.
+the weighted variance over time, x = sqrt(code + OFFSET): without the root, whose photon noise is about the same
+everywhere, the least variance would be where there is least light. At half the size all velocities of a grid are tried,
+as plane sweeps try depths (Collins, "A space-sweep approach to true multi-image matching", CVPR 1996), and smoothed by
+a median. At full size follow, in turns, corrections by Lucas and Kanade's equations ("An iterative image registration
+technique", IJCAI 1981) for a velocity and an acceleration that all frames share:
+
+    dv = -(sum_k w_k k^2   <g g'>)^-1 <g sum_k w_k k   x_k(path(k))>,   g = gradient of the aligned mean
+    da = -(sum_k w_k q_k^2 <g g'>)^-1 <g sum_k w_k q_k x_k(path(k))>,   q_k = k^2/2 - sum_k w_k k^2/2, <> = mean over
+                                                                        p's surroundings
+
+and a look at what the neighbours found, which is taken over where it costs less (as in PatchMatch, Barnes et al., ACM
+TOG 28(3), 2009). Nothing is learnt, nothing is differentiated: photon noise that hides a pixel from its neighbour in
+time is averaged over frames and a neighbourhood before anything is decided. What is covered and uncovered is left to
+the network.
 """
 
 from __future__ import annotations
@@ -24,39 +32,53 @@ from quiver.ops import warp
 OFFSET = 0.05  # in units of full scale: about 3/8 of a 3-bit code (Anscombe 1948), too much for more bits
 SIGMA = 2.0  # frames, of the weights over time
 REACH = 4  # frames from the centre that count: beyond, weights are under 0.03
-STEP = 0.5  # px/frame, of the grid of velocities
-REFINED = (0.25, 0.125)  # px/frame, steps around the best
-SIDE = 7  # px, of the surroundings and of the median
+STEP = 0.5  # px/frame at half the size, of the grid of velocities
+SIDE = 7  # px at half the size, of the surroundings and of the median
 PREFERENCE = 0.02  # relative cost of 1 px/frame: where nothing tells velocities apart, things rest
+NEIGHBOURS = (8, 4)  # px, how far the neighbours are whose paths are tried, one turn after the other
+SMOOTH, EVEN = 3, 5  # px: of the mean before its gradient is taken, and of dv and da
+AROUND = (9, 15)  # px of <>, for velocity and acceleration
+MOST = (0.5, 0.2)  # px/frame, px/frame^2: of one correction
+DAMPING = (1e-4, 1e-3)  # added to <g g'>: gradients whose square is smaller are as good as none
 FLOOR = 1e-6  # added to every variance, so that this holds for frames without noise too
 
 
 @torch.no_grad()
-def velocities(window: Tensor, largest: float) -> tuple[Tensor, Tensor]:
-    """Frames [N, T, h, w], T odd -> velocity [N, 2, h, w] (x, y; px/frame) in the middle, and its cost [N, 1, h, w].
+def paths(window: Tensor, largest: float) -> tuple[Tensor, Tensor]:
+    """Frames [N, T, H, W], T odd -> velocity and acceleration [N, 2, H, W] (x, y; px/frame, px/frame^2) in the middle.
 
-    `largest` bounds the tried components; the cost is that before the last median. Frame t shows at p + (t - T // 2) v
-    what the middle one shows at p.
+    `largest` bounds the tried components. Frame k shows at p + k v + k^2/2 a what the middle one, k = 0, shows at p.
     """
-    frames = (window.float().clamp(min=0) + OFFSET).sqrt()
-    middle = frames.shape[1] // 2
+    middle = window.shape[1] // 2
     reach = min(REACH, middle)
-    frames = frames[:, middle - reach : middle + reach + 1]
-    times = torch.arange(-reach, reach + 1, device=frames.device)
-    weights = torch.exp(-0.5 * (times / SIGMA) ** 2)
-    weights = weights / weights.sum()
-    velocity = _coarse(frames, weights, largest)
-    for step in REFINED:
-        velocity, cost = _refined(frames, weights, velocity, step)
-        velocity = _median(velocity)
-    return velocity, cost
+    frames = window[:, middle - reach : middle + reach + 1].float().clamp(min=0)
+    half = F.avg_pool2d(frames, 2, ceil_mode=True, count_include_pad=False)
+    weights = time_weights(2 * reach + 1, frames.device)
+    velocity = 2 * _resize(_median(_coarse(_stable(half), weights, largest / 2)), frames.shape[2:])
+    frames = _stable(frames)
+    path = _corrected(frames, torch.cat([velocity, torch.zeros_like(velocity)], 1))
+    for distance in NEIGHBOURS:
+        path = _corrected(frames, _cheapest(frames, path, distance))
+    return path[:, :2], path[:, 2:]
 
 
-def aligned(window: Tensor, velocity: Tensor) -> Tensor:
+@torch.no_grad()
+def disagreement(drawn: Tensor) -> Tensor:
+    """Aligned frames [N, T, H, W] -> the cost that is left [N, 1, H, W], at full size."""
+    return _variance(_stable(drawn.float().clamp(min=0)))
+
+
+def time_weights(length: int, device: torch.device) -> Tensor:
+    """w_k of `length` frames, [T], of sum 1."""
+    weights = torch.exp(-0.5 * ((torch.arange(length, device=device) - length // 2) / SIGMA) ** 2)
+    return weights / weights.sum()
+
+
+def aligned(window: Tensor, velocity: Tensor, acceleration: Tensor) -> Tensor:
     """Frames [N, T, h, w] drawn to where the middle one shows the same: bilinear, clamped at the border."""
     count, length, height, width = window.shape
-    times = torch.arange(length, device=window.device, dtype=velocity.dtype) - length // 2
-    flow = times.view(1, -1, 1, 1, 1) * velocity[:, None]
+    k = (torch.arange(length, device=window.device, dtype=velocity.dtype) - length // 2).view(1, -1, 1, 1, 1)
+    flow = k * velocity[:, None] + k * k / 2 * acceleration[:, None]
     moved = warp(window.reshape(-1, 1, height, width), flow.reshape(-1, 2, height, width), "border")
     return moved.view(count, length, height, width)
 
@@ -87,24 +109,69 @@ def _coarse(frames: Tensor, weights: Tensor, largest: float) -> Tensor:
     return F.interpolate(grid[:, paid.argmin(0)].transpose(0, 1), size=(height, width), mode="nearest")
 
 
-def _refined(frames: Tensor, weights: Tensor, velocity: Tensor, step: float) -> tuple[Tensor, Tensor]:
-    """The best of a velocity and its eight neighbours at a distance of `step`, pixel by pixel, and its cost."""
-    weights = weights.view(1, -1, 1, 1)
-    best, lowest = velocity, None
-    for dx in (0.0, -step, step):
-        for dy in (0.0, -step, step):
-            tried = velocity + velocity.new_tensor([dx, dy]).view(1, 2, 1, 1)
-            moved = aligned(frames, tried)
-            mean = (moved * weights).sum(1, keepdim=True)
-            variance = (moved * moved * weights).sum(1, keepdim=True) - mean * mean
-            cost = F.avg_pool2d(variance, SIDE, 1, SIDE // 2, count_include_pad=False)
-            cost = cost.clamp(min=0).add(FLOOR) * (1 + PREFERENCE * tried.norm(dim=1, keepdim=True))
-            if lowest is None:
-                best, lowest = tried, cost
-            else:
-                best, lowest = torch.where(cost < lowest, tried, best), torch.minimum(cost, lowest)
-    assert lowest is not None
-    return best, lowest
+def _corrected(frames: Tensor, path: Tensor) -> Tensor:
+    """Velocity and acceleration [N, 4, H, W] after one step of Lucas and Kanade with all frames at once."""
+    weights = time_weights(frames.shape[1], frames.device)
+    k = torch.arange(len(weights), device=frames.device, dtype=frames.dtype) - len(weights) // 2
+    drawn = aligned(frames, path[:, :2], path[:, 2:])
+    mean = _mean_around(_over_time(drawn, weights), SMOOTH)
+    padded = F.pad(mean, (1, 1, 1, 1), mode="replicate")
+    gx, gy = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2, (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
+    steps = []
+    for moment, side, most, damping in zip((k, k * k / 2), AROUND, MOST, DAMPING, strict=True):
+        moment = moment - (weights * moment).sum()
+        slope = _over_time(drawn, weights * moment)
+        products = _mean_around(torch.cat([gx * gx, gx * gy, gy * gy, gx * slope, gy * slope], 1), side)
+        xx, xy, yy, bx, by = products.split(1, dim=1)
+        xx, yy = xx + damping, yy + damping
+        solved = torch.cat([xy * by - yy * bx, xy * bx - xx * by], 1) / (xx * yy - xy * xy)
+        step = solved / (weights * moment * moment).sum()
+        steps.append(step.nan_to_num().clamp(-most, most))  # NaN: of a single frame, which has no moments
+    return path + _mean_around(torch.cat(steps, 1), EVEN)
+
+
+def _cheapest(frames: Tensor, path: Tensor, distance: int) -> Tensor:
+    """Of each pixel's own path and those of its neighbours left, right, above and below the one that costs least."""
+
+    def cost(tried: Tensor) -> Tensor:
+        velocity = tried[:, :2]
+        paid = PREFERENCE / 2 * velocity.norm(dim=1, keepdim=True)
+        return (_variance(aligned(frames, velocity, tried[:, 2:])) + FLOOR) * (1 + paid)
+
+    best, lowest = path, cost(path)
+    height, width = path.shape[2:]
+    around = F.pad(path, (distance,) * 4, mode="replicate")
+    for dy, dx in ((0, distance), (0, -distance), (distance, 0), (-distance, 0)):
+        tried = around[:, :, distance + dy : distance + dy + height, distance + dx : distance + dx + width]
+        price = cost(tried)
+        best, lowest = torch.where(price < lowest, tried, best), torch.minimum(price, lowest)
+    return best
+
+
+def _variance(frames: Tensor) -> Tensor:
+    """Weighted variance over time of [N, T, H, W], averaged around each pixel: [N, 1, H, W]."""
+    weights = time_weights(frames.shape[1], frames.device)
+    mean = _over_time(frames, weights)
+    return _mean_around(_over_time(frames * frames, weights) - mean * mean, AROUND[0]).clamp(min=0)
+
+
+def _over_time(frames: Tensor, weights: Tensor) -> Tensor:
+    """Weighted sum over time, [N, 1, H, W]."""
+    return (frames * weights.view(1, -1, 1, 1)).sum(1, keepdim=True)
+
+
+def _stable(frames: Tensor) -> Tensor:
+    """Codes in units of full scale -> their roots, whose photon noise is about the same everywhere."""
+    return (frames + OFFSET).sqrt()
+
+
+def _resize(field: Tensor, size: torch.Size) -> Tensor:
+    return F.interpolate(field, size=size, mode="bilinear", align_corners=False)
+
+
+def _mean_around(image: Tensor, side: int) -> Tensor:
+    """Means over side x side pixels, of those that exist."""
+    return F.avg_pool2d(image, side, 1, side // 2, count_include_pad=False)
 
 
 def _median(field: Tensor) -> Tensor:

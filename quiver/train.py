@@ -1,6 +1,6 @@
 """One training loop for every learned method: the model is an argument.
 
-    windows (fresh noise) -> model -> loss -> Adam; now and then: validation, checkpoint, TensorBoard
+    windows (fresh noise) -> model -> loss -> Adam or Muon; now and then: validation, checkpoint, TensorBoard
 
 Sample numbers count on from step to step and from process to process, so a run that was killed and started again draws
 what it would have drawn, and ends with the weights of an uninterrupted one. NaN or Inf stop it with the step and the
@@ -29,6 +29,7 @@ from quiver.data import open_clips
 from quiver.loss import PRESETS as LOSSES
 from quiver.loss import training_loss
 from quiver.model import RADIUS, WINDOW
+from quiver.optimiser import Optimiser
 from quiver.run import Run, Settings, State
 from quiver.samples import Batches, Windows, WindowSettings
 
@@ -236,7 +237,7 @@ def record(run: Run, model: nn.Module, state: State, score: metrics.Score, loss:
 def fail(
     run: Run,
     model: nn.Module,
-    optimiser: torch.optim.Optimizer,
+    optimiser: Optimiser,
     state: State,
     batch: dict[str, Any],
     loss: float,
@@ -273,7 +274,7 @@ def train(
             run.open()
         process.wait()
         model.to(process.device).train()
-        optimiser = torch.optim.Adam(model.parameters(), lr=settings.learning_rate, betas=settings.betas, eps=1e-8)
+        optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)
         state = run.load(model, optimiser, process.device)
         parallel = (
             nn.parallel.DistributedDataParallel(model, find_unused_parameters=True) if process.world > 1 else model
@@ -289,18 +290,16 @@ def train(
         for batch in batches(windows, settings, state, process):
             # Forward, backward, step
             rate = learning_rate(settings, state)
-            for group in optimiser.param_groups:
-                group["lr"] = rate
             alone = has_baseline and share_used(settings, state) < settings.head_start
             with torch.autocast(process.device.type, torch.bfloat16, enabled=low):
                 output = parallel(batch["codes"].to(process.device), **({"baseline_only": True} if alone else {}))
             loss = training_loss(output, batch["target"].to(process.device), LOSSES[settings.loss], first=RADIUS)
-            optimiser.zero_grad(set_to_none=True)
+            model.zero_grad(set_to_none=True)
             loss.backward()
             norm, value = nn.utils.clip_grad_norm_(model.parameters(), settings.clip_norm).item(), loss.item()
             if process.any(not math.isfinite(value + norm)):
                 fail(run, model, optimiser, state, batch, value, norm, process.rank)
-            optimiser.step()
+            optimiser.step(rate)
             state.step, state.elapsed = state.step + 1, time.monotonic() - started
             if board is not None:
                 board.step(state, value, norm, rate)
