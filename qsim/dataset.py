@@ -1,6 +1,6 @@
 """Data sets: a folder of clips made from one recipe, whole, resumable, checkable.
 
-    dataset.json   recipe, splits by scene, state of every job; rewritten when a generation ends
+    dataset.json   recipe, splits by scene, state of every job, its own checksum; rewritten when a generation ends
     clips/NAME     clip folders with their streams                       (clip.py)
     jobs/NAME.json records with checksums; a clip counts from the moment its record is there (jobs.py)
 
@@ -23,6 +23,10 @@ from qsim.stream import Progress
 FORMAT_VERSION = 1
 
 
+class Damaged(ValueError):
+    """dataset.json is there but is not what was written; `qsim generate --repair` writes it again."""
+
+
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """A data set folder; only clips whose record is there are seen."""
@@ -35,14 +39,22 @@ class Dataset:
         """`FileNotFoundError` or `ValueError` if this is not a data set of our version."""
         path = Path(path)
         manifest = path / "dataset.json"
+        remedy = f"`qsim generate RECIPE -o {path} --repair` writes it again"
         if not manifest.is_file():
+            if (path / "jobs").is_dir():
+                raise FileNotFoundError(f"{manifest}: missing; {remedy}")
             what = "not a data set folder (it has no dataset.json)" if path.exists() else "no such data set"
             raise FileNotFoundError(f"{path}: {what}")
-        meta = files.read_json(manifest)
+        try:
+            meta = files.read_json(manifest)
+        except ValueError as error:
+            raise Damaged(f"{error}; {remedy}") from None
         files.check_version(manifest, meta.get("format_version"), FORMAT_VERSION)
+        if meta.get("checksum", checksum(meta)) != checksum(meta):
+            raise Damaged(f"{manifest}: contents changed (checksum differs); {remedy}")
         for key in ("name", "recipe", "jobs"):
             if key not in meta:
-                raise ValueError(f"{manifest}: key '{key}' is missing; the file is damaged, run `qsim generate` again")
+                raise Damaged(f"{manifest}: key '{key}' is missing; {remedy}")
         return Dataset(path, meta)
 
     def __repr__(self) -> str:
@@ -84,9 +96,13 @@ class Dataset:
         `progress` hears (clips checked, clips in all).
         """
         problems = [f"{self.path / 'clips' / name}: not made yet; run `qsim generate` again" for name in self.missing]
+        if "checksum" not in self.meta:
+            problems.append(
+                f"{self.path / 'dataset.json'}: holds no checksum; `qsim generate --repair` writes it again"
+            )
         names = self.names()
         for done, name in enumerate(names, 1):
-            problems += verify_job(self.path, name)
+            problems += verify_job(self.path, name, self.meta["jobs"][name])
             if progress is not None:
                 progress(done, len(names))
         return problems + self.shared_between_splits()
@@ -116,14 +132,31 @@ def _seen_in(path: Path) -> list[str]:
         return []
 
 
-def verify_job(folder: Path, name: str) -> list[str]:
-    """Problems of one finished job's files in words."""
+def checksum(meta: dict[str, Any]) -> str:
+    """SHA-256 of a manifest's content, without the checksum that it holds itself."""
+    return files.sha256(files.to_json({key: value for key, value in meta.items() if key != "checksum"}))
+
+
+def verify_job(folder: Path, name: str, expected: dict[str, Any]) -> list[str]:
+    """Problems of one finished job's files in words; `expected` is its entry in the manifest.
+
+    Each file vouches for the next: manifest, record, clip.json and the streams' json, frames and codes.
+    """
+    path = record_path(folder, name)
+    problems = files.differs(path, expected["record"]) if "record" in expected else []
+    about = folder / "clips" / name / "clip.json"
+    if not about.is_file():
+        return [*problems, f"{about}: missing"]
     try:
-        record = files.read_json(record_path(folder, name))
-        clip = Clip.open(folder / "clips" / name)
+        record = {} if problems else files.read_json(path)
+        clip = Clip.open(about.parent)
     except (ValueError, OSError) as error:
-        return [str(error)]
-    problems = clip.verify() + files.differs(clip.path / "clip.json", record.get("clip"))
+        return [*problems, str(error)]
+    if not problems and any(record.get(key) != expected[key] for key in ("digest", "split")):
+        problems = [f"{path}: is the record of another job"]
+    if problems:  # then nothing that it says can be used
+        return problems + clip.verify()
+    problems = clip.verify() + files.differs(about, record.get("clip"))
     for stream, digest in record.get("streams", {}).items():
         problems += files.differs(clip.path / "streams" / f"{stream}.json", digest)
     return list(dict.fromkeys(problems))

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from qsim import __version__, files
-from qsim.dataset import FORMAT_VERSION, Dataset, verify_job
-from qsim.jobs import Make, Result, record_path, render_job
+from qsim.dataset import FORMAT_VERSION, Damaged, Dataset, checksum, verify_job
+from qsim.jobs import Make, Result, make_record, record_path, render_job
 from qsim.recipe import Job, Recipe
 from qsim.stream import Progress
 from qsim.workers import Limits, run_here, run_local
@@ -70,8 +70,8 @@ def generate(
     jobs = shard(recipe.jobs, options.shard)
     try:
         with _locked(folder, options):
-            _begin(recipe, folder)
-            repaired = repair(folder, jobs) if options.repair else ()
+            repaired = _begin(recipe, folder, options.repair)
+            repaired += repair(folder, jobs) if options.repair else ()
             failed = {} if options.retry else _failures(folder, jobs)
             todo = [job for job in jobs if not record_path(folder, job.name).is_file() and job.name not in failed]
             made = 0
@@ -107,26 +107,46 @@ def shard(jobs: tuple[Job, ...], part: tuple[int, int] | None) -> list[Job]:
 
 
 def repair(folder: Path, jobs: list[Job]) -> tuple[str, ...]:
-    """Check the finished jobs and take back those with damage, so that they are made again; returns the problems."""
-    found: list[str] = []
+    """Check the finished jobs and take back those with damage, so that they are made again; returns the problems.
+
+    A damaged stream is drawn again, a damaged record written again, without rendering; anything else is rendered again.
+    What `qsim sense` added to a clip that goes, goes with it, and is named.
+    """
+    entries, found = Dataset.open(folder).meta["jobs"], []
     for job in jobs:
-        if not record_path(folder, job.name).is_file():
+        record, clip = record_path(folder, job.name), folder / "clips" / job.name
+        if not record.is_file():
             continue
-        problems = verify_job(folder, job.name)
+        expected = entries[job.name] | {"digest": job.digest, "split": job.split}
+        problems = verify_job(folder, job.name, expected)
         if not problems:
             continue
         found += problems
-        record_path(folder, job.name).unlink()
-        clip = folder / "clips" / job.name
-        streams = clip / "streams"
-        if all(problem.startswith(str(streams)) for problem in problems):
-            for problem in problems:
-                damaged = Path(problem.split(": ")[0])
-                damaged.with_suffix(".json").unlink(missing_ok=True)
-                damaged.with_suffix(".npy").unlink(missing_ok=True)
+        record.unlink()
+        damaged = {Path(problem.split(": ")[0]) for problem in problems}
+        streams, wanted = clip / "streams", {sensing.stream_name for sensing in job.streams}
+        if record in damaged:
+            light = damaged == {record} and _vouched_for(job, clip, expected.get("record"))
+        else:
+            light = all(path.parent == streams for path in damaged)
+        lost = damaged if light else set(streams.glob("*.json"))
+        added = sorted({path.stem for path in lost if path.parent == streams} - wanted)
+        found += [f"{streams / name}.npy: was added by `qsim sense` and is gone; sense it again" for name in added]
+        if light:
+            for path in damaged - {record}:
+                path.with_suffix(".json").unlink(missing_ok=True)
+                path.with_suffix(".npy").unlink(missing_ok=True)
         elif clip.exists():
             files.remove_folder(clip)
     return tuple(found)
+
+
+def _vouched_for(job: Job, clip: Path, digest: str | None) -> bool:
+    """Whether a clip would get the record that the manifest knows."""
+    try:
+        return files.sha256(files.to_json(make_record(job, clip))) == digest
+    except FileNotFoundError:
+        return False
 
 
 def frames_done(folder: Path, jobs: list[Job]) -> int:
@@ -165,16 +185,25 @@ def write_manifest(recipe: Recipe, folder: Path) -> None:
             "complete": all(entry["state"] == "done" for entry in jobs.values()),
             "software": {"qsim": __version__},
         }
-        files.write_json(folder / "dataset.json", manifest)
+        files.write_json(folder / "dataset.json", manifest | {"checksum": checksum(manifest)})
 
 
-def _begin(recipe: Recipe, folder: Path) -> None:
+def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
+    """Folders and manifest; what had to be repaired of the manifest. `ValueError` if it is another recipe's."""
     for name in _FOLDERS:
         (folder / name).mkdir(exist_ok=True)
     if not (folder / "dataset.json").is_file():
+        _check_records(recipe, folder)
         write_manifest(recipe, folder)
-        return
-    old = Dataset.open(folder).meta["jobs"]
+        return ()
+    try:
+        old = Dataset.open(folder).meta["jobs"]
+    except Damaged as error:
+        if not repair:
+            raise
+        _check_records(recipe, folder)
+        write_manifest(recipe, folder)
+        return (str(error),)
     for job in recipe.jobs:
         if job.name not in old:
             raise ValueError(f"{folder}: was made from another recipe, without the clip {job.name}; use another folder")
@@ -183,6 +212,18 @@ def _begin(recipe: Recipe, folder: Path) -> None:
     extra = sorted(set(old) - {job.name for job in recipe.jobs})
     if extra:
         raise ValueError(f"{folder}: holds the clip {extra[0]}, which is not in this recipe; use another folder")
+    return ()
+
+
+def _check_records(recipe: Recipe, folder: Path) -> None:
+    """Without a manifest the records say whose folder this is: `ValueError` if there are some and none is of ours."""
+    digests = {job.name: job.digest for job in recipe.jobs}
+    found = []
+    for path in sorted((folder / "jobs").glob("*.json")):
+        with contextlib.suppress(ValueError):
+            found.append(files.read_json(path).get("digest") == digests.get(path.stem))
+    if found and not any(found):
+        raise ValueError(f"{folder}: none of its {len(found)} finished clips is of this recipe; use another folder")
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ A job is done when its record is there. Everything before can be killed at any m
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import os
 import platform
@@ -69,7 +70,7 @@ def render_job(job: Job, path: Path) -> object:
         shutter=settings.shutter,
         seed=render_seed(job),
         budget=choose_budget(job, scene),
-        extra=provenance(job) | {"assets": assets(scene.to_dict())},
+        extra=provenance(job) | {"assets": sorted(assets(scene.to_dict()) + photographs(scene))},
     )
 
 
@@ -134,6 +135,26 @@ def assets(described: Any) -> list[str]:
     return sorted(found)
 
 
+def photographs(scene: Any) -> list[str]:
+    """`photograph NAME` for every photograph of textures.py in a scene: in whatever range, it is the same."""
+    from qsim.scene import Texture
+    from qsim.textures import photograph_in
+
+    found: set[str] = set()
+    waiting = [scene]
+    while waiting:
+        item = waiting.pop()
+        if isinstance(item, Texture):
+            found |= {f"photograph {name}" for name in [photograph_in(item.pixels())] if name is not None}
+        elif isinstance(item, list | tuple):
+            waiting += item
+        elif isinstance(item, dict):
+            waiting += item.values()
+        elif dataclasses.is_dataclass(item):
+            waiting += [getattr(item, part.name) for part in dataclasses.fields(item)]
+    return sorted(found)
+
+
 def record_path(folder: Path, name: str) -> Path:
     """The record whose presence means that the job is done."""
     return folder / "jobs" / f"{name}.json"
@@ -173,14 +194,10 @@ def _do(job: Job, folder: Path, make: Make) -> Result:
         files.sweep(place, f"{job.name}*")
     clip = _clip(job, folder, make)
     rendered = time.monotonic()
-    digests = {}
     for sensing in job.streams:
-        drawn, line = stream.sense(clip, sensing)
+        _, line = stream.sense(clip, sensing)
         _log(folder, job.name, line)
-        digests[drawn.name] = files.sha256(drawn.path.with_suffix(".json"))
-    record = {"name": job.name, "digest": job.digest, "split": job.split, "streams": digests}
-    record["clip"] = files.sha256(clip.path / "clip.json")
-    files.write_json(record_path(folder, job.name), record)
+    files.write_json(record_path(folder, job.name), make_record(job, clip.path))
     (folder / "failed" / f"{job.name}.json").unlink(missing_ok=True)
     seconds = (rendered - started, time.monotonic() - rendered)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
@@ -188,6 +205,15 @@ def _do(job: Job, folder: Path, make: Make) -> Result:
     spent += f"processor {time.process_time() - worked:.2f} s, peak {peak >> 20} MiB"
     _log(folder, job.name, f"done on {platform.node()}, process {os.getpid()}: {spent}")
     return Result(job.name, "done")
+
+
+def make_record(job: Job, clip: Path) -> dict[str, Any]:
+    """What vouches for a clip and the job's streams; `FileNotFoundError` if one is missing."""
+    streams = {
+        sensing.stream_name: files.sha256(clip / "streams" / f"{sensing.stream_name}.json") for sensing in job.streams
+    }
+    record = {"name": job.name, "digest": job.digest, "split": job.split, "streams": streams}
+    return record | {"clip": files.sha256(clip / "clip.json")}
 
 
 def mark_failed(folder: Path, job: Job, message: str) -> None:

@@ -30,13 +30,14 @@ no other split.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qsim import checks
+from qsim import checks, files
 from qsim.files import to_json
 from qsim.footage import MAX_PIXELS
 from qsim.recipe_text import Section, Text
@@ -89,7 +90,25 @@ class Job:
             for key, off in (("defects", None), ("slices", 1)):
                 if stream[key] == off:
                     del stream[key]
+        own = [path for path in (self.family, *(stream.sensor for stream in self.streams)) if Path(path).is_absolute()]
+        if own:  # by content: what a file says decides, not what it is called
+            described["own"] = [_contents(path) for path in own]
         return hashlib.sha256(to_json(described)).hexdigest()
+
+
+def _contents(path: str) -> str:
+    """SHA-256 of a scene or sensor file, or of all files in a folder with their names."""
+    root = Path(path)
+    parts = sorted(part for part in root.rglob("*") if part.is_file()) if root.is_dir() else [root]
+    state = tuple((str(part.relative_to(root)), part.stat().st_mtime_ns, part.stat().st_size) for part in parts)
+    return _read_contents(path, state)
+
+
+@functools.lru_cache(maxsize=64)
+def _read_contents(path: str, state: tuple[tuple[str, int, int], ...]) -> str:
+    """The same, read once as long as no file changes."""
+    listed = [(name, files.sha256(Path(path) / name)) for name, _, _ in state]
+    return files.sha256(to_json(listed))
 
 
 @dataclass(frozen=True)

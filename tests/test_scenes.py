@@ -7,16 +7,13 @@ family; other seeds and speeds are slow tests of the same laws.
 from __future__ import annotations
 
 import functools
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import scenes
 from qsim.budget import Budget
-from qsim.jobs import assets
 from qsim.motion import Translation
-from qsim.recipe import load as load_recipe
 from qsim.render import Renderer
 from qsim.scene import AreaLamp, Body, Camera, Constant, EnvironmentImage, PointLight, Scene, SunSky
 from qsim.shapes import sheet
@@ -219,19 +216,6 @@ def test_a_folder_of_meshes_textures_and_environments_becomes_scenes(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileNotFoundError, match="empty: no mesh, picture or environment in this folder"):
         scenes.load(tmp_path / "empty")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["demo", "starter"])
-def test_recipes_keep_the_textures_of_the_test_split_out_of_training(name):
-    recipe = load_recipe(Path(scenes.__file__).parent / f"{name}.toml")
-    assert all(recipe.splits.values()), "every split has a clip"
-    seen: dict[str, set[str]] = {"train": set(), "val": set(), "test": set()}
-    for job in recipe.jobs:
-        described = scenes.load(job.family, job.scene_seed, job.speed).to_dict()
-        seen[job.split] |= {asset for asset in assets(described) if asset.startswith("texture ")}
-    assert seen["test"]
-    assert not seen["test"] & (seen["train"] | seen["val"])
 
 
 @pytest.mark.slow

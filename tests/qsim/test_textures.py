@@ -118,3 +118,20 @@ def test_pictures_of_a_folder(tmp_path):
     assert [p.name for p in textures.pictures_in(tmp_path)] == ["a.JPG", "b.png"]
     with pytest.raises(FileNotFoundError, match="no image files"):
         textures.pictures_in(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("name", sorted(textures.PHOTOGRAPHS))
+def test_a_photograph_is_known_in_any_range_and_contrast(name: str):
+    for low, high in ((0.0, 1.0), (0.15, 0.45)):
+        picture = textures.photograph(name, low, high)
+        assert textures.photograph_in(picture) == name
+        assert textures.photograph_in(textures.levels(picture, 0.2, 0.6, contrast=2.0)) == name
+
+
+def test_what_is_drawn_is_no_photograph():
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        for picture in (textures.noise(rng), textures.bricks(rng), textures.cells(rng, 60), textures.checker(8, 8)):
+            assert textures.photograph_in(picture) is None
+    assert textures.photograph_in(np.full((512, 512), 0.5)) is None
+    assert textures.photograph_in(np.zeros((2, 2))) is None
