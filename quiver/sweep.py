@@ -102,7 +102,7 @@ def _coarse(frames: Tensor, weights: Tensor, largest: float) -> Tensor:
             total.add_(moved, alpha=float(weights[t]))
             squares.addcmul_(moved, moved, value=float(weights[t]))
         variance = squares.addcmul_(total, total, value=-1)
-        pooled.append(F.avg_pool2d(variance, SIDE + 1, 2, SIDE // 2, ceil_mode=True, count_include_pad=False))
+        pooled.append(_means(variance, SIDE + 1, 2, ceil_mode=True))
     one = (torch.arange(2 * n + 1, device=frames.device, dtype=frames.dtype) - n) * STEP
     grid = torch.stack([one.repeat(2 * n + 1), one.repeat_interleave(2 * n + 1)])  # x, y
     paid = torch.cat(pooled).clamp(min=0).add_(FLOOR) * (1 + PREFERENCE * grid.norm(dim=0))[:, None, None, None]
@@ -171,7 +171,14 @@ def _resize(field: Tensor, size: torch.Size) -> Tensor:
 
 def _mean_around(image: Tensor, side: int) -> Tensor:
     """Means over side x side pixels, of those that exist."""
-    return F.avg_pool2d(image, side, 1, side // 2, count_include_pad=False)
+    return _means(image, side, 1)
+
+
+def _means(image: Tensor, side: int, stride: int, ceil_mode: bool = False) -> Tensor:
+    """The same at every `stride`-th pixel: along rows, then along columns, which is side / 2 times less work."""
+    before, options = (side - 1) // 2, {"ceil_mode": ceil_mode, "count_include_pad": False}
+    along = F.avg_pool2d(image, (1, side), (1, stride), (0, before), **options)
+    return F.avg_pool2d(along, (side, 1), (stride, 1), (before, 0), **options)
 
 
 def _median(field: Tensor) -> Tensor:
