@@ -21,10 +21,10 @@ def add_generate(sub: Any) -> None:
     )  # fmt: skip
     parser.add_argument("recipe", type=Path, help="a .toml file; its format is described in qsim/recipe.py")
     parser.add_argument("-o", "--output", type=Path, help="data set folder (default out/NAME of the recipe)")
-    parser.add_argument("--workers", type=int, default=1, help="processes, each with its own renderer (default 1)")
+    parser.add_argument("--workers", type=int, help="processes, each with its own renderer (default 1)")
     parser.add_argument("--shard", type=_part, metavar="I/N", help="only the I-th of N parts, as in 7/100")
     memory = checked(checks.positive)
-    parser.add_argument("--memory", type=memory, default=4.0, help="GiB per process before it gives up (default 4)")
+    parser.add_argument("--memory", type=memory, help="GiB per process before it gives up (default 4)")
     parser.add_argument("--retry", action="store_true", help="try failed jobs again")
     parser.add_argument("--repair", action="store_true", help="check all files and make the damaged ones again")
     parser.add_argument("--wait", action="store_true", help="wait while another generator is at work in the folder")
@@ -35,15 +35,17 @@ def add_generate(sub: Any) -> None:
 
 
 def _run_generate(args: argparse.Namespace) -> int:
-    from qsim import generation, recipe, workers
+    from qsim import generation, recipe
+    from qsim.workers import Limits
 
     wanted = recipe.load(args.recipe)
     folder = args.output or Path("out") / wanted.name
-    if args.workers < 0:
-        raise ValueError(f"--workers: expected 0 (in this process) or more, got {args.workers}")
-    options = generation.Options(
-        args.workers, args.shard, args.retry, args.repair, args.wait, workers.Limits(memory=args.memory)
-    )
+    # None: not given, which --cluster must tell from given (`_cluster`).
+    count = generation.Options.workers if args.workers is None else args.workers
+    limits = Limits() if args.memory is None else Limits(memory=args.memory)
+    if count < 0:
+        raise ValueError(f"--workers: expected 0 (in this process) or more, got {count}")
+    options = generation.Options(count, args.shard, args.retry, args.repair, args.wait, limits)
     chosen = generation.shard(wanted.jobs, args.shard)
     with bar(wanted.name) as progress, generation.watching(folder, chosen, progress):
         summary = generation.generate(wanted, folder, options, run=_cluster(args))
@@ -58,8 +60,19 @@ def _run_generate(args: argparse.Namespace) -> int:
 
 
 def _cluster(args: argparse.Namespace) -> Any:
+    """The cluster asked for or None; `ValueError` if options for processes of this machine are given with it."""
+    if not 0 <= args.gpus < float("inf"):
+        raise ValueError(f"--gpus: expected 0 or more, got {args.gpus}")
     if args.cluster is None:
+        if args.gpus:
+            raise ValueError("--gpus: needs --cluster, whose workers say how many they have; leave it out here")
         return None
+    for option, given, instead in (("workers", args.workers, "nworkers"), ("memory", args.memory, "memory-limit")):
+        if given is not None:
+            raise ValueError(
+                f"--{option}: changes nothing with --cluster: number, memory and lifetime of its workers are set where "
+                f"they are started; leave it out and use `dask worker --{instead}` there"
+            )
     from qsim.cluster import Cluster
 
     return Cluster(args.cluster, gpus=args.gpus)
@@ -77,7 +90,7 @@ def _part(text: str) -> tuple[int, int]:
 
 def add_plan(sub: Any) -> None:
     parser = command(
-        sub, "plan", _run_plan, "Render one tiny job of each kind and say what the whole recipe will cost.",
+        sub, "plan", _run_plan, "Render one tiny job of each kind and say what the recipe will cost.",
         "qsim plan scenes/i2_2000fps.toml --machines 10",
     )  # fmt: skip
     parser.add_argument("recipe", type=Path, help="a .toml file")

@@ -1,8 +1,8 @@
 """The same jobs on a Dask cluster: a scheduler somewhere, workers that see the data set's folder.
 
     dask scheduler                                      # prints tcp://HOST:8786
-    dask worker tcp://HOST:8786 --nthreads 1            # on every machine, as many as it has room for
-    dask worker tcp://HOST:8786 --nthreads 1 --resources GPU=1
+    dask worker tcp://HOST:8786 --nthreads 1 LIMITS     # on every machine; LIMITS as below
+    dask worker tcp://HOST:8786 --nthreads 1 LIMITS --resources GPU=1
     qsim generate scenes/i2_2000fps.toml -o /shared/i2 --cluster tcp://HOST:8786
 
 On SLURM let dask-jobqueue start the workers and hand its address over:
@@ -13,18 +13,23 @@ On SLURM let dask-jobqueue start the workers and hand its address over:
 
 The folder must have the same path on all machines; a scene file or a sensor file likewise. A worker that dies gives its
 job back to the others, who go on with the frames it had finished. The files are those of a local run.
+
+Renderers grow, and `workers.Limits` is for local processes only, so a worker gets its LIMITS where it is started:
+`--memory-limit 4GiB --lifetime 1h --lifetime-stagger 10m --lifetime-restart`; docs/cluster.md says what they do.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
+from qsim import files
 from qsim.jobs import Make, Result, mark_failed, run_job
 from qsim.recipe import Job
 
-RETRIES = 3  # deaths of workers, before a job counts as failed
+RETRIES = 3  # of a job whose worker raised; deaths of workers are counted by the scheduler (its allowed-failures)
 
 
 class Cluster:
@@ -46,7 +51,7 @@ class Cluster:
         with client:
             # One future per job; pure=False because a job's result is files, not its return value.
             futures = {
-                client.submit(run_job, job, folder, make, key=f"{folder.name}-{job.name}", pure=False,
+                client.submit(run_job, job, folder, make, key=task_key(folder, job), pure=False,
                               retries=RETRIES, resources=resources): job
                 for job in jobs
             }  # fmt: skip
@@ -56,6 +61,16 @@ class Cluster:
                     future.release()
             finally:
                 client.cancel(list(futures))
+
+
+def task_key(folder: Path, job: Job) -> str:
+    """The name of a job at the scheduler: `FOLDER-JOB-HASH`.
+
+    Dask hands the result of a key that it knows to whoever asks for it, another client with another folder included.
+    The hash is of the whole resolved path and of all that decides the job's files.
+    """
+    whole = os.fsencode(folder.resolve()) + b"\0" + job.digest.encode()
+    return f"{folder.name}-{job.name}-{files.sha256(whole)[:32]}"
 
 
 def _result(future: Any, job: Job, folder: Path) -> Result:

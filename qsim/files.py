@@ -165,7 +165,8 @@ class Lock:
 
     def acquire(self, *, wait: bool = False, on_wait: Callable[[], None] | None = None) -> bool:
         """Take the lock. With `wait`, `on_wait` is called once before waiting for another holder."""
-        file = open(self.path, "ab")  # noqa: SIM115 (stays open as long as the lock is held)
+        # Open as long as the lock is held; for reading too, because NFS wants that for a shared lock.
+        file = open(self.path, "a+b")  # noqa: SIM115
         try:
             fcntl.flock(file, self.mode | fcntl.LOCK_NB)
         except BlockingIOError:

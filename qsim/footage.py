@@ -11,7 +11,7 @@ import contextlib
 import re
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ class Footage:
     source: str  # the format it came from
     bits: int | None = None  # of codes; None: light
     code_model: str = "binary_sum"
-    meta: dict[str, Any] = field(default_factory=dict)  # what else the file said
+    meta: dict[str, Any] = field(default_factory=dict)  # what else the file said, or its reader assumed
 
     @property
     def is_light(self) -> bool:
@@ -138,8 +138,13 @@ def need_transfer(path: Path, hints: Hints) -> str:
     return hints.transfer
 
 
+def stated(footage: Footage, bit_order: str, orientation: str) -> Footage:
+    """The footage with bit order and orientation in its `meta`; what its reader says of them itself is kept."""
+    return replace(footage, meta={"bit_order": bit_order, "orientation": orientation} | footage.meta)
+
+
 def turned(footage: Footage, hints: Hints) -> Footage:
-    """The footage with the user's flips and column cut applied."""
+    """The footage with the user's flips and column cut applied; its `orientation` says that it was flipped."""
     frames, height, width = footage.shape
     columns = hints.columns or width
     if not 0 < columns <= width:
@@ -155,4 +160,6 @@ def turned(footage: Footage, hints: Hints) -> Footage:
         return np.ascontiguousarray(footage.read(start, stop)[..., :columns][:, rows, across])
 
     meta = footage.meta | {"flip": hints.flip, "columns_kept": columns}
+    if hints.flip != "none":
+        meta["orientation"] = f"{footage.meta.get('orientation', 'unknown')}; then --flip {hints.flip}"
     return Footage((frames, height, columns), read, footage.source, footage.bits, footage.code_model, meta)

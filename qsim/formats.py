@@ -3,7 +3,9 @@
     photon cube .npy (.gz), codes and light .npy, mp4, PNG, TIFF, SwissSPAD2 and SPAD512S .bin, visionsim, zarr, .mat,
     spike .dat  ->  Footage  ->  a clip of relative radiance (light), or a stream NAME.npy + NAME.json (codes)
 
-What a file does not say (size, rate, transfer curve, which of two layouts) is asked for, never guessed.
+What a file does not say (size, rate, transfer curve, which of two layouts) is asked for, never guessed. Which bit of a
+byte is the first pixel, and which way is up, follows from the layout: what is assumed goes into the `source` of what is
+made.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from numpy import ndarray as Array
 
 from qsim import __version__, arrays, files, planes, video
 from qsim.clip import RELATIVE, Clip, ClipWriter
-from qsim.footage import Footage, Hints, turned
+from qsim.footage import Footage, Hints, stated, turned
 from qsim.stream import FORMAT_VERSION, Progress, Stream
 
 Reader = Callable[[Path, Hints], Footage]
@@ -36,6 +38,19 @@ LAYOUTS: dict[str, Reader] = {  # the names of --layout
     "zarr": arrays.read_zarr,
     "mat": arrays.read_mat,
     "spike": planes.read_spike,
+}
+_WHOLE = "none: whole bytes per pixel"
+# (bit order, orientation) of the layouts whose readers in arrays.py and video.py leave it out, and why it is assumed.
+ASSUMED: dict[str, tuple[str, str]] = {
+    "cube": ("msb", "upright"),  # np.packbits along rows, row 0 on top: so photoncube shows it
+    "codes": (_WHOLE, "upright"),  # row 0 on top, as whatever draws an array draws it
+    "light": (_WHOLE, "upright"),  # the same
+    "video": (_WHOLE, "upright"),  # decoders give the top row first; a telephone's rotation tag is not followed
+    "png": ("msb if 1-bit", "upright"),  # by the standard: leftmost pixel in the high bit, top row first
+    "tiff": ("msb if 1-bit", "upright"),  # tifffile undoes FillOrder; an Orientation tag is not followed
+    "visionsim": ("msb", "upright"),  # np.packbits along rows of pictures as rendered
+    "zarr": (_WHOLE, "upright"),  # quanta-spad-sim draws row 0 on top
+    "mat": (_WHOLE, "as stored"),  # OUTPUT's rows are the array's; which way the camera hung is not in a file
 }
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv")
 PICTURES = {".png": "png", ".tif": "tiff", ".tiff": "tiff"}
@@ -87,7 +102,10 @@ def read(path: Path, hints: Hints | None = None) -> Footage:
         raise ValueError(f"layout {layout!r}: known are {', '.join(LAYOUTS)}")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file")
-    return turned(LAYOUTS[layout](path, hints), hints)
+    footage = LAYOUTS[layout](path, hints)
+    if layout in ASSUMED:
+        footage = stated(footage, *ASSUMED[layout])
+    return turned(footage, hints)
 
 
 @dataclass(frozen=True)
@@ -172,7 +190,7 @@ def to_stream(
         "width": width,
         "bits": footage.bits,
         "bit_order": "msb",
-        "orientation": footage.meta.get("orientation", "upright"),
+        "orientation": footage.meta.get("orientation", "unknown"),  # never upright unless a reader says so
         "code_model": footage.code_model,
         "planes_per_code": 2**footage.bits - 1 if footage.code_model == "binary_sum" else 1,
         "frame_rate": capture.frame_rate,

@@ -1,7 +1,8 @@
 """Raw files of photon counting cameras: binary planes as streams of bits, in every layout of the field that we know.
 
 Each reader takes a path and the user's hints and returns a `Footage` of codes; bits come first or last in a byte,
-rows are in order or not, halves are upside down or not, as its docstring says. Files that say their shape: arrays.py.
+rows are in order or not, halves are upside down or not, as its docstring and its `meta` say: these files say nothing
+of it themselves. Files that say their shape: arrays.py.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ def read_swissspad2_half(path: Path, hints: Hints) -> Footage:
     def decode(raw: Array) -> Array:
         return np.unpackbits(raw, bitorder="little").reshape(-1, *HALF)
 
+    # Two independent readers (python-spad, quanta_SL) take bits and rows so; how the camera hung is not in a file.
     meta = {"bit_order": "lsb", "orientation": "as stored"}
     return _raw(files, counts, RAW_FRAME // 2, HALF, decode, "SwissSPAD2 half array", meta)
 
@@ -43,13 +45,16 @@ def read_swissspad2_full(path: Path, hints: Hints) -> Footage:
         bottom = zones[:, ::-1, :, 1].reshape(-1, *HALF)
         return np.concatenate([top, bottom], axis=1)
 
-    return _raw(files, counts, RAW_FRAME, FULL, decode, "SwissSPAD2 full array", {"bit_order": "lsb"})
+    # photoncube takes bits and halves so, each half from its outer row inwards; how the camera hung is not in a file.
+    meta = {"bit_order": "lsb", "orientation": "as stored, the bottom half turned: it is stored upside down"}
+    return _raw(files, counts, RAW_FRAME, FULL, decode, "SwissSPAD2 full array", meta)
 
 
 def read_spad512s(path: Path, hints: Hints) -> Footage:
     """SPAD512S: raw planes of 512 x 512, row by row, most significant bit first; some files end with 4 more bytes.
 
-    Public readers disagree about left and right: the file is read as it lies, `flip_lr` is stored as unknown.
+    Public readers disagree about left and right: the file is read as it lies, `orientation` says so, and `flip_lr` is
+    stored as unknown.
     """
     files = raw_files(path)
     counts = [check_size(file, file.stat().st_size, RAW_FRAME, "SPAD512S", footer=(0, 4)) for file in files]
@@ -57,7 +62,8 @@ def read_spad512s(path: Path, hints: Hints) -> Footage:
     def decode(raw: Array) -> Array:
         return np.unpackbits(raw).reshape(-1, *FULL)
 
-    meta = {"bit_order": "msb", "flip_lr": "unknown"}
+    # Both public readers take bits and rows so, one of them mirrored; nothing in a file tells which of them is right.
+    meta = {"bit_order": "msb", "orientation": "as stored, left and right are disputed", "flip_lr": "unknown"}
     return _raw(files, counts, RAW_FRAME, FULL, decode, "SPAD512S", meta)
 
 
@@ -79,6 +85,7 @@ def read_spike(path: Path, hints: Hints) -> Footage:
     def decode(raw: Array) -> Array:
         return np.unpackbits(raw, bitorder="little").reshape(-1, height, width)[:, ::-1]
 
+    # On published streams this bit order is the smoother one, and turned frames agree with their ground truth.
     meta = {"bit_order": "lsb", "orientation": "stored upside down, turned upright"}
     return _raw([path], [count], frame, (height, width), decode, "spike camera", meta)
 

@@ -19,6 +19,7 @@ from qsim.footage import Footage, Hints, check_shape, from_linear, need_transfer
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709
 _FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG
+EXACT = 2 | 0x2000 | 0x40000  # FFmpeg's BILINEAR, FULL_CHR_H_INT, ACCURATE_RND; else colours come a code dark
 BLOCK = 16  # frames read at a time
 
 
@@ -240,7 +241,10 @@ class _Decoder:
             for frame in container.decode(video=0):
                 if (frame.height, frame.width) != self.size:
                     raise ValueError(f"{self.path}: a frame of {frame.height} x {frame.width} among {self.size}")
-                yield frame.to_ndarray(format="gray" if frame.format.name.startswith("gray") else "rgb24")
+                if frame.format.name.startswith("gray"):
+                    yield frame.to_ndarray(format="gray")
+                else:
+                    yield frame.to_ndarray(format="rgb24", interpolation=EXACT)
 
 
 def _video_shape(path: Path) -> tuple[int, int, int]:

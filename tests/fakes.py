@@ -7,6 +7,8 @@ import os
 import signal
 import time
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -106,3 +108,17 @@ def tree(folder: Path) -> dict[str, bytes]:
         for path in sorted(folder.rglob("*"))
         if path.is_file() and path.relative_to(folder).parts[0] in kept
     }
+
+
+def make_with_pause(job: Job, path: Path) -> Clip:
+    """The same clip, but after each frame that it adds it waits for a file `go` in the data set's folder."""
+    add = ClipWriter.add
+
+    def add_and_wait(writer: ClipWriter, *args: Any, **kwargs: Any) -> None:
+        add(writer, *args, **kwargs)
+        end = time.monotonic() + 120
+        while not (path.parents[1] / "go").exists() and time.monotonic() < end:
+            time.sleep(0.02)
+
+    with mock.patch.object(ClipWriter, "add", add_and_wait):
+        return make(job, path)

@@ -22,7 +22,7 @@ from forks import forked
 
 from qsim import files, jobs, recipe, stream, textures
 from qsim.dataset import Dataset
-from qsim.generation import Options, Summary, generate
+from qsim.generation import Options, Summary, generate, watching
 from qsim.jobs import Make
 from qsim.scene import Body, Diffuse, Texture
 from qsim.workers import Limits
@@ -503,3 +503,29 @@ def test_a_photograph_in_another_range_is_the_same_photograph():
     assert first
     assert not first & second
     assert [jobs.photographs(scene) for scene in made] == [["photograph gravel"], ["photograph gravel"]]
+
+
+def test_progress_counts_the_frames_of_whoever_renders(tmp_path: Path):
+    """Finished clips whole, a clip at work by the lines of its journal, nothing for the others."""
+    jobs_wanted = list(SMALL.jobs)
+    total = sum(job.settings.frames for job in jobs_wanted)
+    first, second, _ = jobs_wanted
+    part = tmp_path / "work" / f"{second.name}.part"
+    heard: list[tuple[int, int]] = []
+
+    def until(count: int) -> None:
+        end = time.monotonic() + 30
+        while not heard or heard[-1] != (count, total):
+            assert time.monotonic() < end, heard
+            time.sleep(0.005)
+
+    with watching(tmp_path, jobs_wanted, lambda done, of: heard.append((done, of)), every=0.01):
+        until(0)
+        part.mkdir(parents=True)
+        for line in (1, 2):
+            with open(part / "journal.jsonl", "a", encoding="utf-8") as journal:
+                journal.write("{}\n")
+            until(line)
+        (tmp_path / "clips" / first.name).mkdir(parents=True)
+        until(2 + first.settings.frames)
+    assert heard == sorted(heard)

@@ -10,15 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 import raw_planes
+from fakes import RECIPE, make
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from qsim import export, formats, video
+from qsim import export, formats, generation, recipe, video
 from qsim.cli import main
 from qsim.clip import RELATIVE, Clip, ClipWriter
+from qsim.dataset import Dataset
 from qsim.export import Export
-from qsim.footage import Hints, from_linear, numbered, to_linear
+from qsim.footage import Footage, Hints, from_linear, numbered, to_linear
 from qsim.formats import Capture
 from qsim.stream import Stream
 
@@ -341,6 +343,111 @@ def test_flips(tmp_path: Path):
     np.testing.assert_array_equal(everything(tmp_path / "acq_0.bin", flip="ud"), expected[:, ::-1])
 
 
+# Which bit comes first, and which way is up
+
+
+@pytest.mark.parametrize(
+    ("layout", "size", "row"),
+    [("swissspad2-half", (256, 512), 0), ("swissspad2-full", (512, 512), 0), ("spad512s", (512, 512), 0),
+     ("spike", (6, 8), 5)],
+)  # fmt: skip
+def test_the_bit_order_of_raw_files_is_said_as_it_is_read(tmp_path: Path, layout: str, size: tuple[int, int], row: int):
+    """The first bit in the said order is the left pixel of the top row, or of the bottom row if it says upside down."""
+    raw = np.zeros(size[0] * size[1] // 8, np.uint8)
+    hints = Hints(layout, height=size[0], width=size[1])
+    raw.tofile(tmp_path / "a.raw")
+    said = formats.read(tmp_path / "a.raw", hints).meta
+    assert ("upside down, turned upright" in said["orientation"]) == (row > 0)
+    raw[0] = {"msb": 0x80, "lsb": 0x01}[said["bit_order"]]
+    raw.tofile(tmp_path / "a.raw")
+    np.testing.assert_array_equal(formats.read(tmp_path / "a.raw", hints).read(0, 1), one((1, *size), (0, row, 0)))
+
+
+def sample(folder: Path, layout: str) -> tuple[Path, Hints]:
+    """A small recording of each layout, and what has to be said to read it."""
+    planes_ = random_planes(2, 16, 16)
+    path = folder / "a.npy"
+    if layout == "cube":
+        np.save(path, np.packbits(planes_, axis=2))
+    elif layout in ("codes", "light"):
+        np.save(path, planes_.astype(bool if layout == "codes" else np.float32))
+    elif layout == "video":
+        pytest.importorskip("av")
+        path = folder / "a.mp4"
+        video.write_video(path, iter(255 * planes_), 30, lossless=True)
+    elif layout == "png":
+        path = folder
+        video.write_png(folder, iter(planes_.astype(bool)))
+    elif layout == "tiff":
+        path = folder / "a.tif"
+        pytest.importorskip("tifffile").imwrite(path, planes_[0].astype(bool))
+    elif layout == "visionsim":
+        path = folder
+        np.save(folder / "frames.npy", np.packbits(planes_[..., None], axis=2))
+        (folder / "transforms.json").write_text('{"w": 16, "h": 16, "c": 1, "bitpack": true, "bitpack_dim": 2}')
+    elif layout == "zarr":
+        pytest.importorskip("zarr")
+        path = folder / "a.zarr"
+        video.write_zarr(path, iter([planes_]), (2, 16, 16), {})
+    elif layout == "mat":
+        from scipy.io import savemat
+
+        path = folder / "a.mat"
+        savemat(path, {"OUTPUT": planes_.transpose(1, 2, 0)})
+    else:
+        path = folder / "a.bin"
+        path.write_bytes(bytes(64 if layout == "spike" else 32768))
+    return path, Hints(layout, height=16, width=16, transfer="linear")
+
+
+def promised() -> dict[str, tuple[str, str]]:
+    """(bit order, orientation) of every layout, in the words of the readers, from the table in docs/files.md."""
+    text = (Path(__file__).parents[2] / "docs" / "files.md").read_text(encoding="utf-8")
+    found = {}
+    for names, _, bits, rows in re.findall(r"^\| (`.*?) \| (.*?) \| ?(.*?) \| (.*?) \|$", text, re.MULTILINE):
+        order = "msb" if "highest" in bits else "lsb" if "lowest" in bits else "none"
+        for name in re.findall(r"`([\w-]+)`", names):
+            found[name] = order, rows.removesuffix(", rows padded").removesuffix(": `--flip lr`")
+    return found
+
+
+@pytest.mark.parametrize("layout", formats.LAYOUTS)
+def test_every_reader_says_bit_order_and_orientation(tmp_path: Path, layout: str):
+    """As promised in docs/files.md, in what is read and in what is made of it."""
+    (tmp_path / "in").mkdir()
+    footage = formats.read(*sample(tmp_path / "in", layout))
+    make = formats.to_clip if footage.is_light else formats.to_stream
+    made = make(footage, tmp_path / "made", CAPTURE)
+    order, rows = promised()[layout]
+    assert footage.meta["bit_order"].startswith(order)
+    assert footage.meta["orientation"].startswith(rows)
+    said = {key: footage.meta[key] for key in ("bit_order", "orientation")}
+    assert made.meta["source"] == made.meta["source"] | said
+    assert made.meta.get("orientation", said["orientation"]) == said["orientation"]
+    exported = export.export(made, tmp_path / "out", Export("png"))
+    assert json.loads((exported / "meta.json").read_text())["orientation"] == said["orientation"]
+
+
+def test_a_disputed_side_stays_disputed_and_a_flip_is_remembered(tmp_path: Path):
+    (tmp_path / "a.bin").write_bytes(bytes(32768))
+    disputed = "as stored, left and right are disputed"
+    for flip, said in [("none", disputed), ("lr", f"{disputed}; then --flip lr")]:
+        stream = formats.to_stream(
+            formats.read(tmp_path / "a.bin", Hints("spad512s", flip=flip)), tmp_path / flip, CAPTURE
+        )
+        assert (stream.meta["orientation"], stream.meta["source"]["flip_lr"]) == (said, "unknown")
+        cube = export.export(stream, tmp_path / f"{flip}_cube.npy", Export("cube"))
+        assert json.loads(cube.with_name(cube.name + ".json").read_text())["orientation"] == said
+    np.save(tmp_path / "light.npy", np.ones((2, 3, 4), np.float32))
+    clip = formats.to_clip(formats.read(tmp_path / "light.npy", Hints(flip="ud")), tmp_path / "clip", CAPTURE)
+    assert clip.meta["source"]["orientation"] == "upright; then --flip ud"
+
+
+def test_footage_whose_reader_says_nothing_is_not_called_upright(tmp_path: Path):
+    footage = Footage((1, 2, 8), lambda start, stop: random_planes(stop - start, 2, 8), "somewhere", 1)
+    assert formats.to_stream(footage, tmp_path / "s", CAPTURE).meta["orientation"] == "unknown"
+
+
 # Pictures and video
 
 
@@ -487,6 +594,138 @@ def test_a_tree_of_picture_folders_becomes_clips(tmp_path: Path):
     np.testing.assert_allclose(clip.radiance(2), to_linear(images[2], "srgb", 255), rtol=2**-10)
     assert main(["convert", str(tmp_path / "in" / "Type2" / "v1.0"), str(tmp_path / "one"), *options]) == 0
     assert Clip.open(tmp_path / "one").shape == (3, 9, 7)
+
+
+COLOURS = np.array([(200, 30, 40), (30, 180, 60), (40, 50, 220), (210, 200, 50), (60, 190, 200), (120, 120, 120)])
+MATRICES = {
+    "bt709": (1, 0.2126, 0.0722),
+    "bt601": (5, 0.299, 0.114),
+    "untagged": (None, 0.299, 0.114),
+}  # tag, red, blue
+
+
+def mosaics(colours: np.ndarray, side: int = 16) -> np.ndarray:
+    """Frames [T, H, W, 3] of squares: every frame begins with another colour."""
+    n = len(colours)
+    grid = (np.arange(n)[:, None, None] + 2 * np.arange(2)[:, None] + np.arange(3)) % n
+    return colours[grid].repeat(side, axis=1).repeat(side, axis=2)
+
+
+def to_ycbcr(rgb: np.ndarray, matrix: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Y, Cb, Cr of colours by the formulae of BT.601 and BT.709; Cb and Cr are 0 for grey."""
+    _, red, blue = MATRICES[matrix]
+    luma = rgb @ np.array([red, 1 - red - blue, blue])
+    return luma, (rgb[..., 2] - luma) / (2 * (1 - blue)), (rgb[..., 0] - luma) / (2 * (1 - red))
+
+
+def from_ycbcr(luma: np.ndarray, cb: np.ndarray, cr: np.ndarray, matrix: str) -> np.ndarray:
+    """The inverse of `to_ycbcr`."""
+    _, red, blue = MATRICES[matrix]
+    ends = luma + 2 * (1 - red) * cr, luma + 2 * (1 - blue) * cb
+    return np.stack([ends[0], (luma - red * ends[0] - blue * ends[1]) / (1 - red - blue), ends[1]], axis=-1)
+
+
+def write_colour_video(path: Path, rgb: np.ndarray, matrix: str, full_range: bool) -> None:
+    """H.264 in 4:2:0 without loss of its own; FFmpeg converts no colours here, it would share its mistakes."""
+    import av
+
+    tag = MATRICES[matrix][0]
+    luma_scale, chroma_scale, black = (1.0, 1.0, 0) if full_range else (219 / 255, 224 / 255, 16)
+    luma, *chroma = to_ycbcr(rgb, matrix)
+    layers = [luma * luma_scale + black] + [c[:, ::2, ::2] * chroma_scale + 128 for c in chroma]
+    flat = np.concatenate([np.rint(layer).astype(np.uint8).reshape(len(rgb), -1) for layer in layers], axis=1)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"qp": "0"})
+        stream.height, stream.width = rgb.shape[1:3]
+        stream.codec_context.pix_fmt = "yuv420p"
+        for image in flat.reshape(len(rgb), -1, rgb.shape[2]):
+            picture = av.VideoFrame.from_ndarray(image, format="yuv420p")
+            if tag is not None:
+                picture.colorspace = stream.codec_context.colorspace = tag
+            if tag is not None or full_range:
+                picture.color_range = stream.codec_context.color_range = 2 if full_range else 1
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+
+
+def luminance(rgb: np.ndarray, transfer: str) -> np.ndarray:
+    """Rec. 709 luminance of colours 0 ... 255, linearised before they are weighted, in double precision."""
+    coded = np.clip(np.asarray(rgb, float), 0, 255) / 255
+    srgb = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+    return (srgb if transfer == "srgb" else coded**2.2) @ np.array([0.2126, 0.7152, 0.0722])
+
+
+def decoded(rgb: np.ndarray, matrix: str, full_range: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the greatest [R, G, B] that a decoder may return for colours sent as 8-bit YCbCr.
+
+    Y, Cb and Cr are each rounded by half a code at most. FFmpeg's ordinary converter then cuts the fraction off every
+    term of R = Y + a Cr, B = Y + b Cb and G = Y - c Cb - d Cr: up to 2, 2 and 3 codes less, never more.
+    """
+    _, red, blue = MATRICES[matrix]
+    green = 1 - red - blue
+    luma, chroma = (0.5, 0.5) if full_range else (0.5 * 255 / 219, 0.5 * 255 / 224)
+    of_red, of_blue = 2 * (1 - red) * chroma, 2 * (1 - blue) * chroma
+    rounding = luma + np.array([of_red, (red * of_red + blue * of_blue) / green, of_blue])
+    return rgb - rounding - np.array([2, 3, 2]), rgb + rounding
+
+
+@pytest.mark.parametrize("transfer", ["srgb", "gamma 2.2"])
+@pytest.mark.parametrize("full_range", [False, True])
+@pytest.mark.parametrize("matrix", MATRICES)
+def test_colour_video_becomes_linear_luminance(tmp_path: Path, matrix: str, full_range: bool, transfer: str):
+    """As docs/files.md promises, for folders as I2-2000FPS and X4K1000FPS come: 8-bit colour H.264 in 4:2:0.
+
+    Squares of one colour, without a rim of 4 pixels: chroma has half the pixels, and interpolation takes up to two of
+    them from the next square. What is left differs from the known colour by the rounding of YCbCr (`decoded`), and by
+    that of half precision in the clip. Channels in another order, weights before the curve, and the other matrix must
+    lie outside, or the test could not tell them.
+    """
+    pytest.importorskip("av")
+    rgb = mosaics(COLOURS)
+    write_colour_video(tmp_path / "in" / "scene" / "clip.mp4", rgb, matrix, full_range)
+    options = ["--frame-rate", "2000", "--transfer", transfer, "--split", "train"]
+    assert main(["convert", str(tmp_path / "in"), str(tmp_path / "out"), *options]) == 0
+    clip = Clip.open(tmp_path / "out" / "scene_clip")
+    assert (clip.shape, clip.meta["split"], clip.meta["source"]["transfer"]) == (rgb.shape[:3], "train", transfer)
+    inside = np.abs(np.arange(rgb.shape[2]) % 16 - 7.5) < 4
+    kept = np.outer(inside[: rgb.shape[1]], inside)
+    found = np.stack([clip.radiance(t) for t in range(len(clip))])[:, kept]
+    colours = rgb[:, kept].astype(float)
+    low, high = (luminance(bound, transfer) for bound in decoded(colours, matrix, full_range))
+    low, high = low * (1 - 2**-11), high * (1 + 2**-11)
+    assert ((low <= found) & (found <= high)).all()
+    weighted_first = (colours @ np.array([0.2126, 0.7152, 0.0722]))[..., None].repeat(3, axis=-1)
+    other_matrix = from_ycbcr(*to_ycbcr(colours, matrix), "bt601" if matrix == "bt709" else "bt709")
+    for wrong in (colours[..., ::-1], weighted_first, other_matrix):
+        light = luminance(wrong, transfer)
+        assert ((light < low) | (light > high)).any()
+
+
+def test_a_data_set_becomes_videos(tmp_path: Path):
+    """`convert DATASET --to mp4`: a file per clip in the folder of its split, grey values rounded to half a code."""
+    av = pytest.importorskip("av")
+    generation.generate(recipe.parse(RECIPE), tmp_path / "small", generation.Options(workers=0), make=make)
+    command = ["convert", str(tmp_path / "small"), str(tmp_path / "out"), "--to", "mp4"]
+    assert main(command) == 0
+    clips = Dataset.open(tmp_path / "small").clips()
+    names = {f"{clip.meta['split']}/{clip.name}.mp4": clip for clip in clips}
+    assert sorted(names) == ["test/tumble_0004.mp4", "train/fan_0000.mp4", "train/fan_0001.mp4"]
+    made = [str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")]
+    assert sorted(made) == sorted([*names, *(f"{name}.json" for name in names)])
+    for name, clip in names.items():
+        meta = json.loads((tmp_path / "out" / f"{name}.json").read_text())
+        assert (meta["shape"], meta["frame_rate"], meta["split"]) == ([*clip.shape], 2000.0, clip.meta["split"])
+        assert (meta["orientation"], meta["transfer"], meta["lossless"]) == ("upright", "gamma 2.2", True)
+        radiance = np.stack([clip.radiance(t) for t in range(len(clip))]).astype(float)
+        assert meta["white"] == pytest.approx(np.percentile(radiance[:, ::2, ::2], 99.9), rel=1e-6)
+        exact = 255 * np.clip(radiance / meta["white"], 0, 1) ** (1 / 2.2)
+        with av.open(str(tmp_path / "out" / name)) as container:
+            grey = np.stack([frame.to_ndarray(format="gray") for frame in container.decode(video=0)])
+        assert grey.shape == clip.shape
+        assert np.abs(grey - exact).max() <= 0.5 + 1e-6
+    assert main(command) == 2, "what is there is not replaced without --force"
+    assert main([*command, "--force"]) == 0
 
 
 def test_light_out_as_exr_png_and_zarr(tmp_path: Path):
