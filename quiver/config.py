@@ -63,7 +63,7 @@ PRESETS: dict[str, Config] = {
     "quiver": Config(),
     "quiver-s": Config(channels=16),
     # Small in everything, on half of the pixels' side; an hourglass over the window, its frames aligned, learns in
-    # minutes, the recurrent part adds to its picture. docs/results/starter.md has what it reaches.
+    # minutes, the recurrent part can add to its picture. docs/results/starter.md has what it reaches.
     "nano": Config(
         channels=4,
         deformable_groups=1,

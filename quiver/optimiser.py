@@ -19,12 +19,18 @@ EDGES = ("leave",)  # names of last layers: Muon is for what lies between
 
 
 class Optimiser:
-    """One step for all weights of a network; make it when the weights are where they will stay."""
+    """One step for all weights of a network; make it when the weights are where they will stay.
+
+    `ValueError` if Muon is asked for and a kernel is not contiguous.
+    """
 
     def __init__(self, model: nn.Module, kind: Kind, rate: float, betas: tuple[float, float]) -> None:
         named = [(name, weight) for name, weight in model.named_parameters() if weight.requires_grad]
-        inner = [w for name, w in named if kind == "muon" and w.ndim >= 4 and not set(EDGES) & set(name.split("."))]
-        self.kernels = [weight for weight in inner if weight.is_contiguous()]  # others cannot be seen as matrices
+        inner = [(n, w) for n, w in named if kind == "muon" and w.ndim >= 4 and not set(EDGES) & set(n.split("."))]
+        for name, weight in inner:
+            if not weight.is_contiguous():
+                raise ValueError(f"{name}: Muon sees kernels as matrices in the same memory; make it contiguous first")
+        self.kernels = [weight for _, weight in inner]
         self.matrices = [nn.Parameter(weight.detach().flatten(1)) for weight in self.kernels]  # the same memory
         rest = [weight for _, weight in named if not any(weight is kernel for kernel in self.kernels)]
         self.parts: list[torch.optim.Optimizer] = [torch.optim.Adam(rest, lr=rate, betas=betas, eps=1e-8)]
