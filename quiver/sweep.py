@@ -27,8 +27,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from quiver.ops import warp
-
 OFFSET = 0.05  # in units of full scale: about 3/8 of a 3-bit code (Anscombe 1948), too much for more bits
 SIGMA = 2.0  # frames, of the weights over time
 REACH = 4  # frames from the centre that count: beyond, weights are under 0.03
@@ -77,9 +75,17 @@ def time_weights(length: int, device: torch.device) -> Tensor:
 def aligned(window: Tensor, velocity: Tensor, acceleration: Tensor) -> Tensor:
     """Frames [N, T, h, w] drawn to where the middle one shows the same: bilinear, clamped at the border."""
     count, length, height, width = window.shape
-    k = (torch.arange(length, device=window.device, dtype=velocity.dtype) - length // 2).view(1, -1, 1, 1, 1)
-    flow = k * velocity[:, None] + k * k / 2 * acceleration[:, None]
-    moved = warp(window.reshape(-1, 1, height, width), flow.reshape(-1, 2, height, width), "border")
+    with torch.autocast(window.device.type, enabled=False):
+        dtype = torch.promote_types(window.dtype, torch.float32)
+        frames, path = window.to(dtype), torch.cat([velocity, acceleration], 1).to(dtype)
+        # Positions in grid_sample's units, -1 to 1 between the outer edges, built in its order of axes
+        k = (torch.arange(length, device=window.device, dtype=path.dtype) - length // 2).view(1, -1, 1, 1, 1)
+        unit = 2 / path.new_tensor([width, height, width, height])
+        v, a = (path.permute(0, 2, 3, 1) * unit)[:, None].split(2, dim=-1)  # [N, 1, H, W, 2] each
+        y, x = ((2 * torch.arange(n, device=window.device, dtype=path.dtype) + 1) / n - 1 for n in (height, width))
+        grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).addcmul(k, v).addcmul_(k * k / 2, a)
+        flat = frames.reshape(-1, 1, height, width)
+        moved = F.grid_sample(flat, grid.flatten(0, 1), padding_mode="border", align_corners=False)
     return moved.view(count, length, height, width)
 
 
@@ -102,10 +108,10 @@ def _coarse(frames: Tensor, weights: Tensor, largest: float) -> Tensor:
             total.add_(moved, alpha=float(weights[t]))
             squares.addcmul_(moved, moved, value=float(weights[t]))
         variance = squares.addcmul_(total, total, value=-1)
-        pooled.append(_means(variance, SIDE + 1, 2, ceil_mode=True))
+        pooled.append(_means(variance, SIDE + 1, 2))
     one = (torch.arange(2 * n + 1, device=frames.device, dtype=frames.dtype) - n) * STEP
     grid = torch.stack([one.repeat(2 * n + 1), one.repeat_interleave(2 * n + 1)])  # x, y
-    paid = torch.cat(pooled).clamp(min=0).add_(FLOOR) * (1 + PREFERENCE * grid.norm(dim=0))[:, None, None, None]
+    paid = torch.cat(pooled).clamp(min=0).add_(FLOOR) * (1 + PREFERENCE * torch.hypot(*grid))[:, None, None, None]
     return F.interpolate(grid[:, paid.argmin(0)].transpose(0, 1), size=(height, width), mode="nearest")
 
 
@@ -135,7 +141,7 @@ def _cheapest(frames: Tensor, path: Tensor, distance: int) -> Tensor:
 
     def cost(tried: Tensor) -> Tensor:
         velocity = tried[:, :2]
-        paid = PREFERENCE / 2 * velocity.norm(dim=1, keepdim=True)
+        paid = PREFERENCE / 2 * torch.hypot(velocity[:, :1], velocity[:, 1:])  # a hundred times .norm's pace
         return (_variance(aligned(frames, velocity, tried[:, 2:])) + FLOOR) * (1 + paid)
 
     best, lowest = path, cost(path)
@@ -174,11 +180,32 @@ def _mean_around(image: Tensor, side: int) -> Tensor:
     return _means(image, side, 1)
 
 
-def _means(image: Tensor, side: int, stride: int, ceil_mode: bool = False) -> Tensor:
-    """The same at every `stride`-th pixel: along rows, then along columns, which is side / 2 times less work."""
-    before, options = (side - 1) // 2, {"ceil_mode": ceil_mode, "count_include_pad": False}
-    along = F.avg_pool2d(image, (1, side), (1, stride), (0, before), **options)
-    return F.avg_pool2d(along, (side, 1), (stride, 1), (before, 0), **options)
+def _means(image: Tensor, side: int, stride: int) -> Tensor:
+    """The same at every `stride`-th pixel."""
+    height, width = image.shape[2:]
+    before = (side - 1) // 2
+    sums = F.pad(image, (before, side - 1 - before, before, side - 1 - before))
+    for dim, length in ((3, width), (2, height)):
+        there = torch.ones(length, dtype=image.dtype, device=image.device)
+        counts = _sums(F.pad(there, (before, side - 1 - before)), side, 0)[::stride]
+        shape = [-1 if axis == dim else 1 for axis in range(4)]
+        sums = _sums(sums, side, dim)[(slice(None),) * dim + (slice(None, None, stride),)] / counts.view(shape)
+    return sums
+
+
+def _sums(values: Tensor, side: int, dim: int) -> Tensor:
+    """Sums of `side` neighbours: of 1, 2, 4, ... by doubling, and of what `side` is made of; no cancellation."""
+    length = values.shape[dim] - side + 1
+    total, taken, width = None, 0, 1
+    while True:
+        if side & width:
+            piece = values.narrow(dim, taken, length)
+            total, taken = piece if total is None else total + piece, taken + width
+        if 2 * width > side:
+            assert total is not None
+            return total
+        shorter = values.shape[dim] - width
+        values, width = values.narrow(dim, 0, shorter) + values.narrow(dim, width, shorter), 2 * width
 
 
 def _median(field: Tensor) -> Tensor:

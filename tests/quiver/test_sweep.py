@@ -124,3 +124,17 @@ def test_aligning_passes_gradients_to_the_frames():
     assert window.grad.isfinite().all()
     np.testing.assert_allclose(float(window.grad.sum()), window.numel(), rtol=1e-5)  # bilinear weights sum to one
     assert F.mse_loss(aligned(window, *torch.zeros(2, 1, 2, 8, 10)), window) < 1e-12
+
+
+@pytest.mark.parametrize(("side", "stride"), [(1, 1), (3, 1), (5, 1), (9, 1), (15, 1), (8, 2)])
+@pytest.mark.parametrize("size", [(1, 1), (2, 7), (31, 40)])
+def test_means_are_those_of_what_exists(side, stride, size):
+    image = torch.rand(2, 1, *size, dtype=torch.float64)
+    means = sweep._means(image, side, stride)
+    before = (side - 1) // 2
+    for i in range(means.shape[2]):
+        for j in range(means.shape[3]):
+            y, x = stride * i - before, stride * j - before
+            around = image[..., max(y, 0) : y + side, max(x, 0) : x + side]
+            assert torch.allclose(means[..., i, j], around.mean(dim=(2, 3)), rtol=1e-12)
+    assert means.shape[2:] == (-(-size[0] // stride), -(-size[1] // stride))
