@@ -1,6 +1,9 @@
 """The paper's ablation: the network without some of its parts, at similar capacity, as one command and one table.
 
 for each of six combinations of pre-denoiser, flow and multi-scale outputs: train, then score on held-out clips
+
+`nano` is taken without its hourglass, which makes a picture from aligned frames before any of these parts is asked and
+would hide what they do.
 """
 
 from __future__ import annotations
@@ -11,11 +14,20 @@ from pathlib import Path
 
 import torch
 
+from quiver.config import ABLATIONS, PRESETS, Config
 from quiver.evaluate import Plan, Row, evaluate
-from quiver.model import ABLATIONS, PRESETS, QUIVER, ablated, parameter_count
+from quiver.model import QUIVER, ablated, parameter_count
 from quiver.restoring import Options, Restorer, pick_device, restorer
 from quiver.run import Settings
 from quiver.train import train
+
+
+def networks(preset: str) -> dict[str, Config]:
+    """The six by name; ValueError if the preset has no ablation."""
+    if preset not in PRESETS:
+        raise ValueError(f"no ablation of {preset!r}; there is one of {', '.join(PRESETS)}")
+    whole = replace(PRESETS[preset], baseline=0, sweep=0.0)
+    return {name: ablated(whole, name) for name in ABLATIONS}
 
 
 def run_ablation(
@@ -30,12 +42,10 @@ def run_ablation(
 
     None if `should_stop` ended it; the same call goes on. ValueError if the preset has no ablation.
     """
-    if settings.network not in PRESETS:
-        raise ValueError(f"no ablation of {settings.network!r}; there is one of {', '.join(PRESETS)}")
     out = Path(settings.out)
-    for name in ABLATIONS:
+    for name, config in networks(settings.network).items():
         torch.manual_seed(settings.seed)
-        network = QUIVER(ablated(PRESETS[settings.network], name))
+        network = QUIVER(config)
         own = replace(settings, out=str(out / name), network=f"{settings.network} {name}")
         train(network, own, device=pick_device(options.device), should_stop=should_stop, progress=progress)
         if should_stop():
@@ -47,10 +57,10 @@ def run_ablation(
 def markdown(preset: str, rows: Sequence[Row]) -> str:
     """The paper's table: what is built in, parameters, PSNR after the best factor and SSIM."""
     text = ["| pre-denoiser | flow | multi-scale | parameters | PSNR matched | SSIM |", "|---|---|---|---|---|---|"]
-    for name, parts in ABLATIONS.items():
+    for name, config in networks(preset).items():
         scores = [row.score for row in rows if row.method == name and row.score is not None]
-        cells = ["yes" if part else "no" for part in parts]
-        cells.append(f"{parameter_count(ablated(PRESETS[preset], name)):,}")
+        cells = ["yes" if part else "no" for part in ABLATIONS[name]]
+        cells.append(f"{parameter_count(config):,}")
         if scores:
             cells += [f"{sum(s.psnr_matched for s in scores) / len(scores):.2f} dB"]
             cells += [f"{sum(s.ssim for s in scores) / len(scores):.3f}"]
