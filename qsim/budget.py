@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from qsim.scene import Camera, Scene
 
 PILOT_PIXELS = 3000
-WINDOW = 192  # px, side of the window in which the denoiser is tried; frames of fewer pixels are tried whole
+WINDOW = 96  # px, side of the windows in which the denoiser is tried, one in the middle of each quarter of the frame
 PILOT_STAGE = 18  # of the random keys
 SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
 SENSOR_SHARE = 0.01  # of the shot variance that Monte-Carlo noise may add
@@ -238,35 +238,43 @@ def _error(errors: list[float], samples: int) -> float:
 def _denoiser(
     pilot: Renderer, t: int, bounces: int, target: float, raw: float, wanted: bool | None
 ) -> tuple[int | None, Finding]:
-    """Samples per instant with which the denoised window has the error asked for, or None where raw ones cost less."""
+    """Samples per instant with which denoised windows have the error asked for, or None where raw ones cost less."""
     if pilot.engine.backend == "scalar" or not available():
         return None, Finding("denoiser", "off", "not installed" if not available() else "needs LLVM or CUDA")
-    camera = pilot.scene.camera
-    height, width = camera.height, camera.width
-    if height * width > WINDOW**2:
-        height, width = min(height, WINDOW), min(width, WINDOW)
-    crop = ((camera.height - height) // 2, (camera.width - width) // 2, height, width)
-    window = pilot.window(crop)
-    instants, key = [window.time(t)], window.key(t, PILOT_STAGE)
-    albedo, normal = window.surfaces(instants, key)
+    windows = [pilot.window(crop) for crop in _windows(pilot.scene.camera)]
+    instants, key = [pilot.time(t)], pilot.key(t, PILOT_STAGE)
+    surfaces = [window.surfaces(instants, key) for window in windows]
     counts: list[int] = []
     errors: list[float] = []
     for count in PILOTS:
         if wanted is None and count // 2 + DENOISE_COST >= raw:
             break
         # What is scored is half of the samples, A mixed with D(A)
-        halves = window.halves(instants, Budget(count, bounces), key)
+        squares = 0.0
+        for window, (albedo, normal) in zip(windows, surfaces, strict=True):
+            halves = window.halves(instants, Budget(count, bounces), key)
+            squares += mixture(halves, denoised(halves[0], albedo, normal))[1] ** 2
         counts.append(count // 2)
-        errors.append(mixture(halves, denoised(halves[0], albedo, normal))[1])
+        errors.append(math.sqrt(squares / len(windows)))
         if errors[-1] <= target:
             break
-    needed, size = _needed(counts, errors, target), f"rms {target:.2g} in the middle of frame {t}"
+    where = f"{'' if len(windows) == 1 else 'four windows of '}frame {t}"
+    needed, size = _needed(counts, errors, target), f"rms {target:.2g} in {where}"
     if needed > MOST_DENOISED and wanted:
         needed, size = MOST_DENOISED, f"rms {errors[-1]:.2g} with {counts[-1]} samples, above the target"
     samples = 2 * grid_samples(math.ceil(needed / 2)) if needed <= MOST_DENOISED else math.inf
     if wanted is None and samples + DENOISE_COST >= raw:
         return None, Finding("denoiser", "off", f"{raw:.0f} raw samples cost no more")
     return int(samples), Finding("denoiser", "on", size)
+
+
+def _windows(camera: Camera) -> list[tuple[int, int, int, int]]:
+    """Where the denoiser is tried, (y, x, height, width): all of a small frame, else four places that stand for it."""
+    height, width = camera.height, camera.width
+    if height * width <= 4 * WINDOW**2:
+        return [(0, 0, height, width)]
+    rows, columns = (max(1, min(side // 2, WINDOW)) for side in (height, width))
+    return [(height * i // 4 - rows // 2, width * j // 4 - columns // 2, rows, columns) for i in (1, 3) for j in (1, 3)]
 
 
 def _needed(counts: list[int], errors: list[float], target: float) -> float:
