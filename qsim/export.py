@@ -13,7 +13,7 @@ from numpy import ndarray as Array
 
 from qsim import __version__, files, video
 from qsim.clip import Clip
-from qsim.stream import Stream
+from qsim.stream import Stream, orientation
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
             "seed", "ppp_target", "ppp_factor", "width", "planes_per_code")  # fmt: skip
     found = {key: meta[key] for key in keys if key in meta}
     found |= {"format_version": 1, "bit_order": "msb", "software": {"qsim": __version__}}
-    found["orientation"] = _orientation(meta)
+    found["orientation"] = orientation(meta)
     if isinstance(source, Clip):
         found["transfer"] = "linear" if wanted.kind in ("exr", "zarr") else wanted.transfer
         if wanted.kind in ("mp4", "png"):
@@ -119,13 +119,6 @@ def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
     elif wanted.kind == "mp4":
         found["stretched"] = True
     return found | ({"lossless": wanted.lossless} if wanted.kind == "mp4" else {})
-
-
-def _orientation(meta: dict[str, Any]) -> str:
-    """Of a clip or stream: what its reader said of the file it was imported from; what we rendered is upright."""
-    origin = meta.get("source")
-    imported = origin.get("orientation", "upright") if isinstance(origin, dict) else "upright"
-    return str(meta.get("orientation", imported))
 
 
 def _grey(source: Clip | Stream, wanted: Export, meta: dict[str, Any]) -> Iterator[Array]:

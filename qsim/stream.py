@@ -166,6 +166,13 @@ def check_name(name: str) -> str:
     return name
 
 
+def orientation(meta: dict[str, Any]) -> str:
+    """Of a clip or stream: what its reader said of the file it was imported from; what we rendered is upright."""
+    origin = meta.get("source")
+    imported = origin.get("orientation", "upright") if isinstance(origin, dict) else "upright"
+    return str(meta.get("orientation", imported))
+
+
 def write_stream(clip: Clip, name: str, codes_iter: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
     """Store codes ([H, W] frames or [t, H, W] blocks, in order) as a stream of `clip`; the json comes last.
 
@@ -210,7 +217,7 @@ def write_packed(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor,
         "bits": bits,
         "width": width,
         "bit_order": "msb",
-        "orientation": "upright",
+        "orientation": orientation(clip.meta),
         "code_model": sensor.code_model,
         "sensor": sensor.to_dict(),
         "planes_per_code": 1,

@@ -342,7 +342,9 @@ class Baseline(nn.Module):
     A learnt mean over time plus an hourglass over the stacked frames, at full size; before training it is about a
     Gaussian mean. With `sweep` the frames are first drawn along the paths on which they agree (sweep.py, up to about
     `sweep` px/frame), and the hourglass sees them both ways, beside the velocity as a share of `sweep` and the
-    standard deviation that is left over time.
+    standard deviation that is left over time. When it is not being trained, its answers to the eight flips and quarter
+    turns of all this are averaged: what it learnt in minutes differs among them (Lim et al. 2017, "EDSR", call it
+    geometric self-ensemble).
     """
 
     SIGMA = 1.5  # frames
@@ -364,7 +366,35 @@ class Baseline(nn.Module):
             drawn = aligned(frames, velocity, acceleration)
             stack = [drawn, frames, velocity / self.sweep, disagreement(drawn).sqrt()]
         mean = (drawn * self.weights.view(1, -1, 1, 1)).sum(1, keepdim=True)
-        return F.pixel_unshuffle(mean + self.correction(join(*stack)), fold)
+        seen = join(*stack)
+        return F.pixel_unshuffle(mean + (self.correction(seen) if self.training else self._averaged(seen)), fold)
+
+    def _averaged(self, stack: Tensor) -> Tensor:
+        """The hourglass's mean answer to the eight flips and quarter turns of what it sees."""
+        x = 2 * WINDOW if self.sweep else None  # channel of the velocity's x; its y follows
+        total = stack.new_zeros(stack.shape[0], 1, *stack.shape[2:])
+        for turns in range(4):
+            for mirrored in (False, True):
+                answer = self.correction(join(_mirrored(stack, x) if mirrored else stack))
+                total += (answer.flip(3) if mirrored else answer).rot90(-turns, (2, 3))
+            stack = _turned(stack, x)
+        return total / 8
+
+
+def _mirrored(stack: Tensor, x: int | None) -> Tensor:
+    """[N, C, H, W] with left and right exchanged; channels x and x + 1 are components of a vector (None: no vector)."""
+    flipped = stack.flip(3)
+    if x is not None:
+        flipped[:, x] *= -1
+    return flipped
+
+
+def _turned(stack: Tensor, x: int | None) -> Tensor:
+    """The same after a quarter turn: what pointed to the right points up."""
+    turned = stack.rot90(1, (2, 3))
+    if x is None:
+        return turned
+    return torch.cat([turned[:, :x], turned[:, x + 1 : x + 2], -turned[:, x : x + 1], turned[:, x + 2 :]], dim=1)
 
 
 def _relu_chain(widths: Sequence[int]) -> list[nn.Module]:

@@ -13,7 +13,7 @@ from qsim.budget import Budget, blur_error, choose, explain, grid_samples
 from qsim.denoise import available, mixture
 from qsim.motion import Spin
 from qsim.render import Renderer
-from qsim.scene import Body, Diffuse, Glow, PointLight, Scene, SunSky
+from qsim.scene import Body, Diffuse, Glow, PointLight, Scene, SunSky, Texture
 
 
 def test_sample_counts_are_those_of_the_sampler(capfd):
@@ -170,6 +170,19 @@ def test_denoising_helps_where_it_says_so():
     assert distance < 0.7 * raw.error
     assert clean.error == pytest.approx(distance, rel=0.6)
     assert clean.error > 0.8 * distance  # measured with half of the samples: rather too much than too little
+
+
+@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
+def test_the_denoiser_is_tried_beside_the_middle_of_a_large_frame():
+    """A lamp fills the middle, which has no noise at all: the error asked for holds for the whole frame."""
+    camera = CAMERA.resized(256, 512)
+    lamp = Body("lamp", square(200 / camera.focal_pixels * 4), Glow(0.3))
+    leaves = Texture(np.random.default_rng(1).random((96, 96)), nearest=True)
+    made = scene(Body("wall", square(12, -1), Diffuse(leaves)), lamp, light=SunSky(), camera=camera)
+    chosen = choose(made, psnr=38, denoise=True)
+    frame = Renderer(made, budget=chosen).frame(3, with_truth=False)
+    peak = np.percentile(frame.radiance, 99.9)
+    assert -20 * math.log10(frame.error / peak) > 37
 
 
 def test_denoising_without_the_package_is_refused(monkeypatch):
