@@ -19,6 +19,8 @@ import re
 import subprocess
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from importlib.metadata import version
@@ -103,6 +105,25 @@ def activate(engine: Engine) -> None:
 
     if mi.variant() != engine.variant:
         mi.set_variant(engine.variant)
+
+
+@contextmanager
+def kernels_timed() -> Iterator[list[float]]:
+    """How long compiled kernels run inside the block, one number [s] for each; the list is filled at its end.
+
+    Empty for the scalar engine, which launches none.
+    """
+    import drjit as dr
+
+    seconds: list[float] = []
+    before = dr.flag(dr.JitFlag.KernelHistory)
+    dr.set_flag(dr.JitFlag.KernelHistory, True)
+    dr.kernel_history_clear()
+    try:
+        yield seconds
+    finally:
+        seconds += [launch["execution_time"] / 1e3 for launch in dr.kernel_history()]
+        dr.set_flag(dr.JitFlag.KernelHistory, before)
 
 
 def report() -> dict[str, Any]:

@@ -273,9 +273,10 @@ class Renderer:
             "width": camera.width,
             "height": camera.height,
             "rfilter": {"type": "box"},
+            # In Mitsuba's RGB variant a uniform spectrum is reddish (the white of sRGB is not that of equal energy);
+            # its luminance is 1.
+            "pixel_format": "luminance",
         }
-        if self.engine.backend != "scalar":
-            film["pixel_format"] = "luminance"
         film |= {"crop_offset_x": x, "crop_offset_y": y, "crop_width": width, "crop_height": height}
         view = pose @ np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's camera axes: left, up, forward
         sensor: dict[str, Any] = {"type": "perspective", "film": film, "near_clip": 1e-4, "far_clip": 1e5}

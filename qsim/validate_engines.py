@@ -2,6 +2,8 @@
 
     run(families) -> Report: one Row per engine and scene; CUDA beside LLVM beside scalar
 
+A frame is radiance and ground truth. What it takes beside the compiled kernels is our own overhead.
+
 Every engine renders the same scene with the same budget in a process of its own. Two engines that estimate one radiance
 differ in its mean over all pixels and frames by no more than their Monte-Carlo errors explain.
 """
@@ -35,6 +37,7 @@ class Row:
     engine: str
     scene: str
     seconds: float  # per frame, median
+    outside: float | None  # share of the seconds in which no compiled kernel runs; None: the engine has none
     mean: float  # radiance over all frames and pixels, W m^-2 sr^-1
     mean_error: float  # its standard error
 
@@ -99,26 +102,33 @@ def _measure(backend: str, family: str, height: int, width: int, seed: int) -> R
     from qsim.render import Renderer
 
     renderer = Renderer(scenes.load(family, seed=seed).resized(height, width), budget=BUDGET)
-    seconds, halves = [], []
+    seconds, outside, frames = [], [], []
     for t in range(FRAMES + 1):
-        started = time.perf_counter()
-        halves.append(renderer.halves(renderer.instants(t), BUDGET, renderer.key(t)))
-        seconds.append(time.perf_counter() - started)
-    both = np.stack(halves)
-    error = float(np.std(both[:, 0] - both[:, 1])) / 2 / math.sqrt(both[:, 0].size)
-    return Row(backend, family, median(seconds[1:]), float(both.mean()), error)
+        with engine.kernels_timed() as inside:
+            started = time.perf_counter()
+            frames.append(renderer.frame(t))
+            seconds.append(time.perf_counter() - started)
+        outside.append(1 - sum(inside) / seconds[-1])
+    radiance = np.stack([frame.radiance for frame in frames]).astype(np.float64)
+    error = math.sqrt(sum(frame.error**2 for frame in frames) / len(frames) / radiance.size)
+    share = None if backend == "scalar" else median(outside[1:])
+    return Row(backend, family, median(seconds[1:]), share, float(radiance.mean()), error)
 
 
 def table(report: Report) -> str:
     """The rows as text, and why engines are missing."""
-    lines = [f"{report.height} x {report.width} pixels, {report.samples} samples; seconds per frame, radiance only"]
-    lines.append(f"{'scene':10} {'engine':8} {'s/frame':>8} {'faster':>7} {'mean radiance':>22} {'off by':>14}")
+    lines = [f"{report.height} x {report.width} pixels, {report.samples} samples; seconds per frame with ground truth"]
+    head = f"{'scene':10} {'engine':8} {'s/frame':>8} {'faster':>7} {'outside kernels':>15}"
+    lines.append(f"{head} {'mean radiance':>22} {'off by':>14}")
     for row in report.rows:
         plain = report.reference(row)
         off = "" if row is plain else f"{row.deviation(plain):.1f} std. errors"
         mean = f"{row.mean:.5g} +- {row.mean_error:.1g}"
         ratio = plain.seconds / row.seconds
-        lines.append(f"{row.scene:10} {row.engine:8} {row.seconds:8.3f} {ratio:7.1f} {mean:>22} {off:>14}")
+        outside = "" if row.outside is None else f"{row.outside:.1%}"
+        lines.append(
+            f"{row.scene:10} {row.engine:8} {row.seconds:8.3f} {ratio:7.1f} {outside:>15} {mean:>22} {off:>14}"
+        )
     lines += [f"{backend}: {why}" for backend, why in report.missing.items()]
     lines.append(f"means agree within {DEVIATIONS:g} standard errors: {'yes' if report.ok else 'NO'}")
     return "\n".join(lines)

@@ -125,12 +125,23 @@ def test_pictures_on_surfaces_and_around_lie_as_documented():
     assert seen[26:].min() > 0.9  # right of -z lies +x: bright
 
 
-def test_scalar_and_vector_engines_agree():
+@pytest.mark.parametrize(
+    "light",
+    [
+        Constant(0.7),
+        Constant(1.7),
+        AreaLamp((1.0, 2.0, 4.0), (0.0, 0.0, 0.0), 1.0, 1.0, 5.0),
+        PointLight((1, 2, 4), 9.0),
+    ],
+    ids=["sky", "bright sky", "lamp", "point"],
+)
+def test_scalar_and_vector_engines_agree(light):
+    """Also where a radiance above 1 makes Mitsuba's RGB variant compute with a spectrum of equal energy."""
     from qsim import engine
 
     camera = Camera(2e-3, 2.8, 2e-4, 5, 7, origin=(0.5, 0.2, 4))
     body = Body("plate", square(1.5), Diffuse(0.6), Translation((100.0, 0, 0)))
-    made = scene(body, camera=camera)
+    made = scene(body, camera=camera, light=light)
     fast = renderer(made, budget=Budget(512, 2))
     slow = renderer(made, budget=Budget(512, 2), engine=engine._choose("scalar"))
     try:
