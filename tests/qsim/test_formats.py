@@ -441,7 +441,8 @@ def test_a_disputed_side_stays_disputed_and_a_flip_is_remembered(tmp_path: Path)
     np.save(tmp_path / "light.npy", np.ones((2, 3, 4), np.float32))
     clip = formats.to_clip(formats.read(tmp_path / "light.npy", Hints(flip="ud")), tmp_path / "clip", CAPTURE)
     assert clip.meta["source"]["orientation"] == "upright; then --flip ud"
-    assert sense(clip, Sensing("quiver-physical", ppp=3.25)).meta["orientation"] == "upright; then --flip ud"
+    sensed, _ = sense(clip, Sensing("quiver-physical", ppp=3.25))
+    assert sensed.meta["orientation"] == "upright; then --flip ud"
 
 
 def test_footage_whose_reader_says_nothing_is_not_called_upright(tmp_path: Path):
