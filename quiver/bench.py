@@ -219,9 +219,10 @@ def figure(costs: Sequence[Cost], path: Path) -> None:
     axes = canvas.figure.subplots()
     for c in costs:
         if c.failure is None and not math.isnan(c.psnr_matched):
-            axes.plot(c.seconds_per_frame, c.psnr_matched, "o")
-            axes.annotate(f"{c.method}, {c.mode}, {c.precision}", (c.seconds_per_frame, c.psnr_matched), fontsize=7)
+            axes.plot(c.seconds_per_frame, c.psnr_matched, "o", label=f"{c.method}, {c.mode}, {c.precision}")
     axes.set_xscale("log")
+    if axes.lines:
+        axes.legend(fontsize=7)
     axes.set_xlabel("seconds per frame")
     axes.set_ylabel("PSNR after the best factor [dB]")
     with replacing(path) as file:

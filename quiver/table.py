@@ -192,7 +192,7 @@ def figure(rows: Sequence[Row], path: Path) -> None:
     lines = [line for line in summarise(rows) if line.scores["psnr"].scenes]
     lights, methods = list(dict.fromkeys(x.light for x in lines)), list(dict.fromkeys(x.method for x in lines))
     canvas = FigureCanvasAgg(
-        Figure(figsize=(2 + 1.2 * max(3, len(lights) * len(methods) / 2), 4), layout="constrained")
+        Figure(figsize=(4 + 1.2 * max(3, len(lights) * len(methods) / 2), 4), layout="constrained")
     )
     axes = canvas.figure.subplots()
     width = 0.8 / max(1, len(methods))
@@ -200,10 +200,11 @@ def figure(rows: Sequence[Row], path: Path) -> None:
         own = {line.light: line.scores["psnr_matched"] for line in lines if line.method == method}
         places = [lights.index(light) + (i - (len(methods) - 1) / 2) * width for light in own]
         error = [0.0 if math.isnan(x.half_width) else x.half_width for x in own.values()]
-        axes.bar(places, [x.mean for x in own.values()], width, yerr=error, capsize=3, label=method)
+        look = {"color": f"C{i % 10}", "hatch": ("", "///", "...")[i // 10 % 3], "edgecolor": "white"}
+        axes.bar(places, [x.mean for x in own.values()], width, yerr=error, capsize=3, label=method, **look)
     axes.set_xticks(range(len(lights)), lights)
     axes.set_ylabel("PSNR after the best factor [dB]")
-    axes.legend(fontsize="small", ncols=2)
+    canvas.figure.legend(fontsize="small", loc="outside right upper")
     with replacing(path) as file:
         canvas.figure.savefig(file, format="png", dpi=120)
 
