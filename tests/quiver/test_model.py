@@ -140,7 +140,7 @@ def test_velocities_turn_with_their_frames(change):
 
 
 @pytest.mark.parametrize("largest", [0.0, 7.0])
-def test_a_trained_hourglass_answers_turned_windows_alike(largest):
+def test_an_hourglass_in_use_answers_turned_windows_alike(largest):
     """Its own answers differ, their mean over the eight symmetries does not; while training nothing is averaged."""
     torch.manual_seed(0)
     baseline = blocks.Baseline(4, largest).double().eval()
