@@ -292,62 +292,59 @@ class Renderer:
 
     def truth(self, t: int) -> dict[str, Array]:
         """Flow, validity, depth and body of frame t at mid-exposure, as in `Frame`."""
-        now, (height, width) = self.time(t), self.shape
-        rays = truth.pixel_rays(self.scene.camera, now, self.crop, self.thinned)
+        camera, now, after, shape = self.scene.camera, self.time(t), self.time(t + 1), self.shape
+        rays = truth.pixel_rays(camera, self.crop, self.thinned)
         self._stage.place(now)
-        hits = self._cast(rays[0], rays[1].reshape(-1, 3))
-        flow, inside, points = truth.flow_between(self.scene, rays, hits, now, self.time(t + 1))
+        hits = self._cast(camera.pose(now), rays)
+        flow, inside, then = truth.flow_between(self.scene, rays, hits, now, after)
         back, _, _ = truth.flow_between(self.scene, rays, hits, now, self.time(t - 1))
-        seen = hits.number >= 0
-        self._stage.place(self.time(t + 1))
-        eye = self.scene.camera.pose(self.time(t + 1))[:3, 3]
-        towards = np.where(seen[:, None], points - eye, points)
-        valid = inside & truth.visible(np.linalg.norm(towards, axis=1), seen, self._cast(eye, towards))
-        length = np.linalg.norm(rays[1].reshape(-1, 3), axis=1)
+        self._stage.place(after)
+        valid = inside & truth.visible(hits.distance, self._cast(camera.pose(after), then))
         return {
-            "flow": flow.reshape(2, height, width).astype(np.float32),
-            "flow_back": back.reshape(2, height, width).astype(np.float32),
-            "valid": valid.reshape(height, width),
-            "depth": (hits.distance / length).reshape(height, width).astype(np.float32),
-            "body_id": hits.number.reshape(height, width),
+            "flow": flow.reshape(2, *shape).astype(np.float32),
+            "flow_back": back.reshape(2, *shape).astype(np.float32),
+            "valid": valid.reshape(shape),
+            "depth": hits.distance.reshape(shape).astype(np.float32),
+            "body_id": hits.number.reshape(shape),
         }
 
-    def _cast(self, origin: Array, directions: Array) -> Hits:
-        """First hits along rays from one point; directions [N, 3] need no unit length."""
-        unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    def _cast(self, pose: Array, rays: Array) -> Hits:
+        """First hits along rays [3, N] of a camera with this pose."""
+        origin, directions = pose[:3, 3], pose[:3, :3] @ rays
         if self.engine.backend == "scalar":
-            return self._cast_one_by_one(origin, unit)
+            return self._cast_one_by_one(origin, directions)
         import drjit as dr
 
         mi = self._mi
-        ray = mi.Ray3f(mi.Point3f(*(float(x) for x in origin)), mi.Vector3f(unit.T.astype(np.float32)))
+        direction = mi.Vector3f(directions.astype(np.float32))
+        length = dr.norm(direction)
+        ray = mi.Ray3f(mi.Point3f(*(float(x) for x in origin)), direction / length)
         found = self._stage.loaded.ray_intersect_preliminary(ray, coherent=True)
         shape = dr.reinterpret_array(mi.UInt32, found.shape)
         instance: Any = dr.reinterpret_array(mi.UInt32, found.instance)
-        index = np.array(dr.select(found.is_valid(), dr.select(instance > 0, instance, shape), 0))
-        number = self._numbers[np.minimum(index, len(self._numbers) - 1)]
-        distance = np.where(number >= 0, np.array(dr.select(found.is_valid(), found.t, dr.inf), np.float64), np.inf)
+        hit = found.is_valid()
         # Where nothing was hit, Dr.Jit leaves whatever the memory held.
-        weights = np.array(dr.select(found.is_valid(), found.prim_uv, 0), np.float64)
-        return Hits(
-            distance,
-            number,
-            np.array(dr.select(found.is_valid(), found.prim_index, 0), np.int64),
-            weights.reshape(2, -1).T,
-        )
+        index = dr.select(hit, dr.select(instance > 0, instance, shape), 0)
+        distance = dr.select(hit, found.t / length, dr.inf)
+        triangle, weights = dr.select(hit, found.prim_index, 0), dr.select(hit, found.prim_uv, 0)
+        dr.eval(index, distance, triangle, weights)  # rays are cast once, not once for each answer
+        number = self._numbers[np.minimum(np.array(index), len(self._numbers) - 1)]
+        far = np.where(number >= 0, np.array(distance, np.float64), np.inf)
+        return Hits(far, number, np.array(triangle, np.int64), np.array(weights, np.float64).reshape(2, -1).T)
 
-    def _cast_one_by_one(self, origin: Array, unit: Array) -> Hits:
+    def _cast_one_by_one(self, origin: Array, directions: Array) -> Hits:
         mi = self._mi
         numbers = self._stage.shape_numbers()
-        distance, number = np.full(len(unit), np.inf), np.full(len(unit), -1, np.int32)
-        triangle, weights = np.zeros(len(unit), np.int64), np.zeros((len(unit), 2))
-        for i, direction in enumerate(unit):
-            ray = mi.Ray3f(origin.tolist(), direction.tolist())
+        lengths = np.linalg.norm(directions, axis=0)
+        distance, number = np.full(len(lengths), np.inf), np.full(len(lengths), -1, np.int32)
+        triangle, weights = np.zeros(len(lengths), np.int64), np.zeros((len(lengths), 2))
+        for i, (direction, length) in enumerate(zip(directions.T, lengths, strict=True)):
+            ray = mi.Ray3f(origin.tolist(), (direction / length).tolist())
             found = self._stage.loaded.ray_intersect_preliminary(ray)
             if found.is_valid():
                 number[i] = numbers.get((found.instance or found.shape).id(), -1)
                 triangle[i], weights[i] = found.prim_index, found.prim_uv
-                distance[i] = found.t if number[i] >= 0 else np.inf
+                distance[i] = found.t / length if number[i] >= 0 else np.inf
         return Hits(distance, number, triangle, weights)
 
     def _shape_table(self) -> Array:

@@ -5,6 +5,10 @@
 A hit belongs to a body; the body's poses (or its deformed triangle) carry it to any other time, the camera's pose of
 that time projects it. Nothing is estimated from images. Points of the surroundings lie infinitely far away and move
 with the camera's turn only. Through glass and in mirrors the surface itself is followed, not what is seen in it.
+
+Points are rays [3, N] in the camera's axes together with how many lengths of its ray each lies away. A rigid motion
+(R, T) makes of the ray r of a point, d lengths away, the ray R r + T / d, along which it again lies d lengths away:
+nearby points and those at infinity (d = inf) obey one rule, and what does not move keeps its ray to the last bit.
 """
 
 from __future__ import annotations
@@ -14,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.scene import Camera, Scene
+from qsim.scene import Body, Camera, Scene
 
 OCCLUSION_TOLERANCE = 1e-4  # relative distance by which a surface may lie before the point that it is itself
 
@@ -23,73 +27,73 @@ OCCLUSION_TOLERANCE = 1e-4  # relative distance by which a surface may lie befor
 class Hits:
     """First surfaces along rays, one entry per ray [N]."""
 
-    distance: Array  # float64, m along the unit ray; inf where nothing is
+    distance: Array  # float64, in lengths of the ray (z of the camera's axes where the ray's z is 1); inf: nothing hit
     number: Array  # int32, body number; lamps follow the bodies; -1 where nothing is
     triangle: Array  # int64, index into the mesh's faces
     weights: Array  # float64 [N, 2], barycentric weights of the triangle's second and third vertex
 
 
-def pixel_rays(camera: Camera, t: float, crop: tuple[int, int, int, int], thinned: int = 1) -> tuple[Array, Array]:
-    """Camera position [3] and world ray directions [h, w, 3] with unit z in camera axes, through pixel centres."""
-    pose = camera.pose(t)
+def pixel_rays(camera: Camera, crop: tuple[int, int, int, int], thinned: int = 1) -> Array:
+    """Rays [3, N] through the pixel centres of a window, row by row, in the camera's axes and with unit z."""
     y, x, height, width = crop
-    local = camera.directions()[y : y + height : thinned, x : x + width : thinned]
-    return pose[:3, 3], local @ pose[:3, :3].T
+    rays = camera.directions()[y : y + height : thinned, x : x + width : thinned]
+    return np.ascontiguousarray(rays.reshape(-1, 3).T)
 
 
-def carried(scene: Scene, points: Array, hits: Hits, t: float, later: float) -> tuple[Array, Array]:
-    """World points [N, 3] of the hits at time t and where their bodies carry them at time `later`.
+def flow_between(scene: Scene, rays: Array, hits: Hits, t: float, later: float) -> tuple[Array, Array, Array]:
+    """Flow [2, N] in pixels from time t to `later`, whether it ends inside the frame [N], and the rays then [3, N].
 
-    The first answer differs from `points` only for deforming bodies, whose points are rebuilt from their triangles so
-    that both times round alike.
-    """
-    now, then = points.copy(), points.copy()
-    for number in np.unique(hits.number[hits.number >= 0]):
-        chosen = hits.number == number
-        if number < len(scene.bodies) and scene.bodies[number].deforms:
-            body = scene.bodies[number]
-            corners, weights = body.mesh.faces[hits.triangle[chosen]], hits.weights[chosen]
-            now[chosen] = _transformed(body.pose(t), _interpolated(body.vertices(t)[corners], weights))
-            then[chosen] = _transformed(body.pose(later), _interpolated(body.vertices(later)[corners], weights))
-        else:
-            before, after = _pose(scene, number, t), _pose(scene, number, later)
-            if not np.array_equal(before, after):
-                then[chosen] = _transformed(after @ np.linalg.inv(before), points[chosen])
-    return now, then
-
-
-def flow_between(
-    scene: Scene, rays: tuple[Array, Array], hits: Hits, t: float, later: float
-) -> tuple[Array, Array, Array]:
-    """Flow [2, N] in pixels from time t to `later`, whether it ends inside the frame [N], and the points then [N, 3].
-
-    Where the point is behind the camera then, flow is 0 and not inside. For the surroundings, `points` are directions.
+    `rays` [3, N] are those of the hits at time t; a ray then is in the camera's axes of then, and its point lies
+    `hits.distance` of it away. Where a point is behind the camera then, flow is 0 and not inside.
     """
     camera = scene.camera
-    origin, directions = rays
-    directions = directions.reshape(-1, 3)
-    seen = hits.number >= 0
-    length = np.linalg.norm(directions, axis=1)
-    points = origin + directions * np.where(seen, hits.distance / length, 0.0)[:, None]
-    now, then = carried(scene, points, hits, t, later)
-    start, _ = _project(camera, now, directions, seen, t)
-    end, depth = _project(camera, then, directions, seen, later)
-    ahead = depth > 0
-    inside = ahead & (end[:, 0] >= 0) & (end[:, 0] <= camera.width) & (end[:, 1] >= 0) & (end[:, 1] <= camera.height)
-    flow = np.where(ahead[:, None], end - start, 0.0)
-    return flow.T, inside, np.where(seen[:, None], then, directions)
+    start, end = seen_again(scene, rays, hits, t, later)
+    ahead = end[2] > 0
+    place = end[:2] / np.where(ahead, end[2], 1.0)
+    inside = ahead
+    for along, size in zip(place, (camera.width, camera.height), strict=True):
+        inside = inside & (np.abs(along) <= size / 2 / camera.focal_pixels)
+    flow = np.where(ahead, place - start[:2] / start[2], 0.0) * camera.focal_pixels
+    return flow, inside, end
 
 
-def visible(distance: Array, seen: Array, hits: Hits) -> Array:
-    """Whether points at `distance` [N] (surroundings where not `seen`) are the first thing along rays cast to them."""
-    reach = np.where(seen, distance * (1 - OCCLUSION_TOLERANCE), np.inf)
-    return hits.distance >= reach
+def seen_again(scene: Scene, rays: Array, hits: Hits, t: float, later: float) -> tuple[Array, Array]:
+    """The rays [3, N] of the hits at time t and those of the same points at time `later`.
+
+    The first answer differs from `rays` only for deforming bodies, whose points are rebuilt from their triangles so
+    that both times round alike.
+    """
+    before, after = scene.camera.pose(t), scene.camera.pose(later)
+    inverse = 1 / hits.distance
+    start, end = rays, _moved(rays, inverse, before, np.eye(4), after)
+    for number in np.flatnonzero(np.bincount(hits.number + 1)[1:]):
+        body = scene.bodies[number] if number < len(scene.bodies) else None
+        if body is not None and body.deforms:
+            chosen = np.flatnonzero(hits.number == number)
+            start = start.copy() if start is rays else start
+            for ends, moment, view in ((start, t, before), (end, later, after)):
+                points = _points(body, hits, chosen, moment) - view[:3, 3]
+                ends[:, chosen] = view[:3, :3].T @ points.T * inverse[chosen]
+            continue
+        here, there = _pose(scene, number, t), _pose(scene, number, later)
+        if not np.array_equal(here, there):
+            chosen = np.flatnonzero(hits.number == number)
+            motion = there @ np.linalg.inv(here)
+            end[:, chosen] = _moved(rays[:, chosen], inverse[chosen], before, motion, after)
+    return start, end
 
 
-def _project(camera: Camera, points: Array, directions: Array, seen: Array, t: float) -> tuple[Array, Array]:
-    """Pixels [N, 2] and depth [N]; the surroundings are projected as points at infinity."""
-    origin = camera.pose(t)[:3, 3]
-    return camera.project(np.where(seen[:, None], points, origin + directions), t)
+def visible(distance: Array, hits: Hits) -> Array:
+    """Whether points at `distance` [N] are the first thing along the rays of `hits`; inf is the surroundings."""
+    return hits.distance >= distance * (1 - OCCLUSION_TOLERANCE)
+
+
+def _moved(rays: Array, inverse: Array, before: Array, motion: Array, after: Array) -> Array:
+    """Rays [3, N] of points at 1 / `inverse` [N], seen from `before`, once `motion` moved them, from `after`."""
+    if np.array_equal(motion @ before, after):
+        return rays.copy()
+    whole = np.linalg.inv(after) @ motion @ before
+    return whole[:3, :3] @ rays + whole[:3, 3:] * inverse
 
 
 def _pose(scene: Scene, number: int, t: float) -> Array:
@@ -97,11 +101,9 @@ def _pose(scene: Scene, number: int, t: float) -> Array:
     return np.eye(4) if motion is None else np.asarray(motion.pose(t), np.float64)
 
 
-def _transformed(pose: Array, points: Array) -> Array:
-    return points @ pose[:3, :3].T + pose[:3, 3]
-
-
-def _interpolated(corners: Array, weights: Array) -> Array:
-    """Points [N, 3] in triangles [N, 3, 3]."""
-    first = 1 - weights.sum(axis=1)
-    return np.einsum("nij,ni->nj", corners, np.column_stack([first, weights]))
+def _points(body: Body, hits: Hits, chosen: Array, t: float) -> Array:
+    """World points [n, 3] of the chosen hits at time t [s], rebuilt from their triangles."""
+    corners = body.vertices(t)[body.mesh.faces[hits.triangle[chosen]]]
+    weights = hits.weights[chosen]
+    pose, first = body.pose(t), 1 - weights.sum(axis=1)
+    return np.einsum("nij,ni->nj", corners, np.column_stack([first, weights])) @ pose[:3, :3].T + pose[:3, 3]
