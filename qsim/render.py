@@ -95,6 +95,7 @@ class Renderer:
         self._mi = mi
         self._key = Key(seed=seed, clip=hash_name(f"{scene.name}/{scene.seed}"), stage=RENDER_STAGE)
         self._stage = Stage(mi, scene)
+        self._obvious: Stage | None = None
         self._integrators: dict[int | None, Any] = {}
         self._samplers: dict[int, Any] = {}
         self._numbers = self._shape_table()
@@ -106,13 +107,13 @@ class Renderer:
     def frame(self, t: int, *, with_truth: bool = True) -> Frame:
         """Render frame t."""
         engines.activate(self.engine)
-        found = self.truth(t) if with_truth else {}
         instants = self.instants(t)
         radiance, error, fireflies = self._exposed(instants, self.key(t))
         sharp = None
         if self.shutter > 0 and self.budget.sharp:
             sharp = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))[0]
-        return Frame(radiance, error, fireflies, sharp, **found)
+        # Last, because it leaves the scene at t + 1, where the next frame wants it.
+        return Frame(radiance, error, fireflies, sharp, **(self.truth(t) if with_truth else {}))
 
     def window(self, crop: Crop) -> Renderer:
         """The same loaded scene seen through another crop, every pixel of it."""
@@ -188,7 +189,7 @@ class Renderer:
         """
         integrator = self._integrator(bounces)
         if self.engine.backend == "scalar":
-            return np.stack([self._film_pass(pose, int(seed), samples, integrator) for seed in seeds])
+            return np.stack([self._film_pass(self._stage, pose, int(seed), samples, integrator) for seed in seeds])
         import drjit as dr
 
         sampler, position = self._film_positions(int(seeds[0]), samples, 2)
@@ -209,7 +210,8 @@ class Renderer:
         lanes = times * height * width * samples
         sampler = self._sampler(samples)
         sampler.seed(seed, lanes)
-        rows, columns, step, y0, x0 = (mi.UInt32([n]) for n in (height, width, self.thinned, *self.crop[:2]))
+        numbers = (height, width, self.thinned, *self.crop[:2])
+        rows, columns, step, y0, x0 = (dr.opaque(mi.UInt32, n) for n in numbers)
         pixel = dr.arange(mi.UInt32, lanes) // samples
         line = pixel // columns
         row = line % rows
@@ -233,7 +235,7 @@ class Renderer:
         import drjit as dr
 
         mi, camera = self._mi, self.scene.camera
-        axes = [mi.Vector3f(*(mi.Float([float(x)]) for x in pose[:3, i])) for i in range(4)]
+        axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in pose[:3, i])) for i in range(4)]
         f = camera.focal_pixels
         across = (position.x - camera.width / 2) / f
         down = (position.y - camera.height / 2) / f
@@ -260,11 +262,15 @@ class Renderer:
         `mi.render` with Mitsuba's camera and film, its default integrator and its default sampler; box filter.
         """
         engines.activate(self.engine)
-        self._stage.place(self.time(t))
+        if self._obvious is None:
+            self._obvious = Stage(self._mi, self.scene, smooth_weight=1.0)
+        self._obvious.place(self.time(t))
         pose, seed = self.scene.camera.pose(self.time(t)), int(words(self.key(t), (1, 1))[0, 0])
-        return self._film_pass(pose, seed, samples, self._integrator(None), "independent")
+        return self._film_pass(self._obvious, pose, seed, samples, self._integrator(None), "independent")
 
-    def _film_pass(self, pose: Array, seed: int, samples: int, integrator: Any, sampler: str = "multijitter") -> Array:
+    def _film_pass(
+        self, stage: Stage, pose: Array, seed: int, samples: int, integrator: Any, sampler: str = "multijitter"
+    ) -> Array:
         """Mitsuba's own camera and film; the scalar engine, which has no vectors of rays, always renders so."""
         mi, camera = self._mi, self.scene.camera
         y, x, height, width = self.crop
@@ -285,9 +291,7 @@ class Renderer:
         sensor["sampler"] = {"type": sampler, "sample_count": samples}
         if camera.aperture_blur:
             sensor |= {"type": "thinlens", "aperture_radius": camera.pupil_radius, "focus_distance": camera.focus}
-        image = mi.render(
-            self._stage.loaded, sensor=mi.load_dict(sensor), integrator=integrator, seed=seed, spp=samples
-        )
+        image = mi.render(stage.loaded, sensor=mi.load_dict(sensor), integrator=integrator, seed=seed, spp=samples)
         return np.array(image, np.float64)[:: self.thinned, :: self.thinned, 0]
 
     def truth(self, t: int) -> dict[str, Array]:
@@ -318,7 +322,8 @@ class Renderer:
         mi = self._mi
         direction = mi.Vector3f(directions.astype(np.float32))
         length = dr.norm(direction)
-        ray = mi.Ray3f(mi.Point3f(*(float(x) for x in origin)), direction / length)
+        eye = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in origin))
+        ray = mi.Ray3f(eye, direction / length)
         found = self._stage.loaded.ray_intersect_preliminary(ray, coherent=True)
         shape = dr.reinterpret_array(mi.UInt32, found.shape)
         instance: Any = dr.reinterpret_array(mi.UInt32, found.instance)

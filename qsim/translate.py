@@ -23,21 +23,29 @@ from qsim.scene import Body, Scene
 from qsim.sky import environment_map, sky_map, sun_direction, sun_radiance
 
 LARGE = 20_000  # triangles from which a rigid body becomes an instance
+# How often smooth surroundings (constant, clear sky) are drawn as a bounce's emitter, against 1 for any other light.
+# Rays that a surface scatters find them anyway; drawing them takes samples from the sun or the lamp. Measured at equal
+# samples on fan, tumble and flag: 1.3 to 1.7 times less error than with a weight of 1, little more below 1/64.
+SMOOTH_WEIGHT = 1 / 1024
 SUN_DISTANCE = 1000.0  # in units of the scene's reach from the camera: parallax of the sun under 1 mrad
 
 
 class Stage:
     """A loaded scene that can be moved to any time; the only mutable thing of the renderer."""
 
-    def __init__(self, mi: Any, scene: Scene) -> None:
+    def __init__(self, mi: Any, scene: Scene, smooth_weight: float = SMOOTH_WEIGHT) -> None:
+        """`smooth_weight` is 1 in Mitsuba unless told otherwise."""
         self.mi, self.scene = mi, scene
         self.loaded = (
-            mi.load_dict(_scene_dict(mi, scene)) if scene.file is None else mitsuba_file.load(mi, scene.file.path)
+            mi.load_dict(_scene_dict(mi, scene, smooth_weight))
+            if scene.file is None
+            else mitsuba_file.load(mi, scene.file.path)
         )
         self._parameters = mi.traverse(self.loaded)
         self._rest = {part.name: self._rest_of(part) for part in scene.parts if part.motion is not None}
         self._placed: dict[str, bytes] = {}
-        self._normals: dict[str, Array] = {}  # of deformed smooth bodies, set after Mitsuba has made its own
+        self._normals: dict[str, Array] = {}  # of smooth bodies that moved, set after Mitsuba has made its own
+        self._rest_normals: dict[str, Array] = {}
 
     def place(self, t: float) -> None:
         """Move everything to time t [s]; what did not change since the last call is left alone."""
@@ -73,7 +81,15 @@ class Stage:
             world = _to_world(pose, body.vertices(t)).astype(np.float32)
             moved = self._set(f"{name}.vertex_positions", world, lambda: world.ravel())
             if moved and body.mesh.smooth:
-                self._normals[f"{name}.vertex_normals"] = vertex_normals(world, body.mesh.faces)
+                self._normals[f"{name}.vertex_normals"] = self._normals_of(name, body, pose, world)
+
+    def _normals_of(self, name: str, body: Body, pose: Array, world: Array) -> Array:
+        """Unit normals of a smooth body's vertices, float32 [V, 3]; those of a rigid one are made once and turned."""
+        if body.deforms:
+            return vertex_normals(world, body.mesh.faces)
+        if name not in self._rest_normals:
+            self._rest_normals[name] = vertex_normals(body.mesh.vertices, body.mesh.faces)
+        return (self._rest_normals[name] @ pose[:3, :3].T).astype(np.float32)
 
     def _place_light(self, name: str, light: records.Light, pose: Array) -> None:
         if isinstance(light, records.AreaLamp):
@@ -81,7 +97,7 @@ class Stage:
             self._set(f"{name}.to_world", placed, lambda: self._transform(placed))
         elif isinstance(light, records.PointLight):
             position = _to_world(pose, np.array([light.position]))[0]
-            self._set(f"{name}.position", position, lambda: self.mi.Point3f(*(float(x) for x in position)))
+            self._set(f"{name}.position", position, lambda: self._opaque(self.mi.Point3f(position.tolist())))
 
     def _rest_of(self, part: records.Part) -> tuple[Array, ...]:
         """Where a shape of a file stands: its 4x4 placement, or its vertices [V, 3] and normals [V, 3] or [0, 3]."""
@@ -112,7 +128,15 @@ class Stage:
 
     def _transform(self, matrix: Array) -> Any:
         kind = self.mi.ScalarTransform4f if self.mi.variant().startswith("scalar") else self.mi.Transform4f
-        return kind(matrix.tolist())
+        return self._opaque(kind(matrix.tolist()))
+
+    def _opaque(self, value: Any) -> Any:
+        """The value as data: were it code, Dr.Jit would compile every kernel anew for every place."""
+        if not self.mi.variant().startswith("scalar"):
+            import drjit as dr
+
+            dr.make_opaque(value)
+        return value
 
 
 def lamp_pose(lamp: records.AreaLamp) -> Array:
@@ -135,10 +159,10 @@ def _is_instance(body: Body) -> bool:
     return rigid and len(body.mesh.faces) >= LARGE and not isinstance(body.material, records.Glow)
 
 
-def _scene_dict(mi: Any, scene: Scene) -> dict[str, Any]:
+def _scene_dict(mi: Any, scene: Scene, smooth_weight: float) -> dict[str, Any]:
     parts: dict[str, Any] = {"type": "scene"}
     for i, light in enumerate(scene.lights):
-        parts |= _light(mi, scene, light, f"light{i}")
+        parts |= _light(mi, scene, light, f"light{i}", smooth_weight)
     for i, body in enumerate(scene.bodies):
         name = f"body{i}"
         if _is_instance(body):
@@ -195,12 +219,12 @@ def vertex_normals(vertices: Array, faces: Array) -> Array:
     return np.where(length > 0, summed / np.maximum(length, 1e-300), (0.0, 0.0, 1.0)).astype(np.float32)
 
 
-def _light(mi: Any, scene: Scene, light: records.Light, name: str) -> dict[str, Any]:
+def _light(mi: Any, scene: Scene, light: records.Light, name: str, smooth_weight: float) -> dict[str, Any]:
     match light:
         case records.Constant(radiance):
-            return {name: {"type": "constant", "radiance": _grey(mi, radiance)}}
+            return {name: {"type": "constant", "radiance": _grey(mi, radiance), "sampling_weight": smooth_weight}}
         case records.SunSky():
-            sky = {"type": "envmap", "bitmap": _rgb_bitmap(mi, sky_map(light))}
+            sky = {"type": "envmap", "bitmap": _rgb_bitmap(mi, sky_map(light)), "sampling_weight": smooth_weight}
             return {name: sky} | ({"sun": _sun(mi, scene, light)} if light.sun_irradiance > 0 else {})
         case records.EnvironmentImage(rotation=rotation):
             turn = mi.ScalarTransform4f().rotate([0, 1, 0], math.degrees(rotation))

@@ -66,7 +66,7 @@ def seen_again(scene: Scene, rays: Array, hits: Hits, t: float, later: float) ->
     before, after = scene.camera.pose(t), scene.camera.pose(later)
     inverse = 1 / hits.distance
     start, end = rays, _moved(rays, inverse, before, np.eye(4), after)
-    for number in np.flatnonzero(np.bincount(hits.number + 1)[1:]):
+    for number in np.flatnonzero(np.bincount(hits.number + 1)[1:]).tolist():
         body = scene.bodies[number] if number < len(scene.bodies) else None
         if body is not None and body.deforms:
             chosen = np.flatnonzero(hits.number == number)

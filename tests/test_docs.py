@@ -252,9 +252,9 @@ def test_the_page_of_evidence_is_made_from_its_numbers():
     numbers = json.loads((ROOT / "docs" / "evidence.json").read_text())
     page = (ROOT / "docs" / "evidence.md").read_text(encoding="utf-8")
     assert page == _evidence().page(numbers), "run `python docs/evidence.py --page-only`"
-    numbers["sensor"]["ok"] = False
+    numbers["sensor"]["report"]["ok"] = False
     assert "outside its bounds" in _evidence().page(numbers)
-    numbers["reading"] = Report(250.0, 20.0, 300.0, 9.0, 0.3).to_dict()
+    numbers["reading"]["report"] = Report(250.0, 20.0, 300.0, 9.0, 0.3).to_dict()
     page = _evidence().page(numbers)
     assert "| clip folder | 250.0 | 300.0 |" in page
     assert "(100 windows/s, 5 times the mp4) is **not reached** in this run" in page

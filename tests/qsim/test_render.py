@@ -7,6 +7,7 @@ critical z of tests/stats.py; deterministic light (one sample decides) is compar
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,6 +34,7 @@ from qsim.scene import (
     SunSky,
     Texture,
 )
+from qsim.translate import Stage
 
 # Radiometry
 
@@ -98,6 +100,19 @@ def test_a_wall_under_100_lux_gives_the_photons_worked_by_hand():
     error = expected_photons(np.full((1, 1), frame.error), camera, 5e-4).item() / math.sqrt(photons.size)
     assert abs(photons.mean() - 6.960548) < critical_z() * error + 1e-4
     assert error < 0.02
+
+
+@pytest.mark.parametrize("lights", [(SunSky(),), (Constant(0.3), AreaLamp((1, 1, 3), (0, 0, 0), 0.5, 0.5, 90.0))])
+def test_smooth_surroundings_are_rarely_drawn_which_changes_no_mean_and_lowers_the_noise(lights):
+    """Beside Mitsuba's own weights: as many samples, the same mean, at most four fifths of the error."""
+    things = Body("floor", square(4, -1), Diffuse(0.6)), Body("plate", square(0.7), RoughPlastic(0.4))
+    made = replace(scene(*things), lights=lights)
+    ours, plain = (renderer(made, budget=Budget(64, 3)) for _ in range(2))
+    plain._stage = Stage(plain._mi, plain.scene, smooth_weight=1.0)
+    a, b = (r.frame(0, with_truth=False) for r in (ours, plain))
+    spread = math.hypot(a.error, b.error) / math.sqrt(a.radiance.size)
+    assert abs(a.radiance.mean(dtype=float) - b.radiance.mean(dtype=float)) < critical_z(checks=2) * spread
+    assert a.error < 0.8 * b.error
 
 
 def test_an_area_lamp_is_seen_with_its_radiance_from_the_front_only():
@@ -319,6 +334,37 @@ def test_any_frame_alone_is_the_same_frame_and_seeds_differ():
     assert alone.radiance.tobytes() == in_order[2].radiance.tobytes()
     assert all((alone.truth[name] == in_order[2].truth[name]).all() for name in alone.truth)
     assert (renderer(made, seed=1).frame(2).radiance != alone.radiance).any()
+
+
+SHAKEN = Camera(focal_length=2e-3, f_number=2.8, pixel_pitch=5e-5, height=24, width=33, motion=Translation((1.0, 0, 0)))
+SWINGING = AreaLamp((1, 1, 3), (0, 0, 0), 0.5, 0.5, 9.0, Oscillation((0.3, 0, 0), 100.0))
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        plate(Translation((40.0, 0, 0))),
+        plate(Spin((0, 0, 1), 200.0), camera=SHAKEN),
+        plate(None, light=SWINGING),
+        plate(None, light=PointLight((0, 0, 3), 5.0, Translation((40.0, 0, 0)))),
+    ],
+    ids=["body", "camera", "lamp", "point"],
+)
+def test_what_moves_is_data_and_compiles_no_kernel_anew(made):
+    """A kernel per place of the camera or of a lamp costs half a second each, many times what a small frame takes."""
+    made = renderer(made)
+    if made.engine.backend == "scalar":
+        pytest.skip("the scalar engine compiles nothing")
+    import drjit as dr
+
+    seen = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        for t in range(4):
+            dr.kernel_history_clear()
+            made.frame(t)
+            seen.append({launch["hash"] for launch in dr.kernel_history() if "hash" in launch})
+    assert seen[0]
+    assert seen[2] | seen[3] <= seen[0] | seen[1]
 
 
 def test_the_measured_error_is_the_error():
