@@ -163,7 +163,7 @@ def rendering(report: dict[str, Any]) -> str:
     ]
     wanted = "reached" if report["ok"] else "**not reached**"
     size = (
-        f"Frames of {report['height']} × {report['width']}; the median scene at 40 dB is {report['median_ratio']:.1f} "
+        f"Frames of {report['height']} × {report['width']}; the median scene at 40 dB is {report['median_ratio']:.2f} "
         f"times faster; the wanted speed (10 times there, and nowhere slower) is {wanted} in this run."
     )
     picture = f"![Seconds per frame against PSNR]({FIGURE.relative_to(HERE).as_posix()})"

@@ -241,7 +241,7 @@ def figure(report: Report, path: Path) -> None:
     names = list(dict.fromkeys(row.scene for row in report.rows))
     across, down = min(4, len(names)), math.ceil(len(names) / 4)
     drawn = Figure(figsize=(3.2 * across, 3.4 * down), layout="constrained")
-    panels = np.ravel(drawn.subplots(down, across, sharey=True, squeeze=False))
+    panels = np.ravel(drawn.subplots(down, across, sharex=True, sharey=True, squeeze=False))
     for axes in panels[len(names) :]:
         axes.remove()
     for name, axes in zip(names, panels[: len(names)], strict=True):
@@ -249,6 +249,7 @@ def figure(report: Report, path: Path) -> None:
         axes.plot([r.obvious_seconds for r in rows], [r.obvious_psnr for r in rows], "o-", label="obvious loop")
         axes.plot([r.seconds for r in rows], [r.psnr for r in rows], "s-", label="qsim")
         axes.set(xscale="log", xlabel="seconds per frame", title=name)
+        axes.tick_params(labelbottom=True)  # of all: the last row may be shorter
         axes.grid(alpha=0.3)
     drawn.axes[0].set_ylabel("PSNR of the radiance [dB]")
     drawn.axes[0].legend(frameon=False)
