@@ -126,6 +126,14 @@ def kernels_timed() -> Iterator[list[float]]:
         dr.set_flag(dr.JitFlag.KernelHistory, before)
 
 
+def opaque(value: Any) -> Any:
+    """A Dr.Jit value as data: were it code, every kernel would be compiled anew whenever it changes."""
+    import drjit as dr
+
+    dr.make_opaque(value)
+    return value
+
+
 def report() -> dict[str, Any]:
     """Everything `qsim doctor` says about rendering: the choice, every probe, versions, cache file."""
     engine = choose()

@@ -19,6 +19,7 @@ from numpy import ndarray as Array
 
 from qsim import mitsuba_file
 from qsim import scene as records
+from qsim.engine import opaque
 from qsim.scene import Body, Scene
 from qsim.sky import environment_map, sky_map, sun_direction, sun_radiance
 
@@ -131,12 +132,7 @@ class Stage:
         return self._opaque(kind(matrix.tolist()))
 
     def _opaque(self, value: Any) -> Any:
-        """The value as data: were it code, Dr.Jit would compile every kernel anew for every place."""
-        if not self.mi.variant().startswith("scalar"):
-            import drjit as dr
-
-            dr.make_opaque(value)
-        return value
+        return value if self.mi.variant().startswith("scalar") else opaque(value)
 
 
 def lamp_pose(lamp: records.AreaLamp) -> Array:

@@ -216,8 +216,8 @@ def test_plateau_halves_at_the_ninth_validation_without_gain():
 
 
 def test_a_time_limit_ends_the_run(tiny_dataset, tmp_path):
-    state = train(small_network(), settings(tiny_dataset, tmp_path / "r", steps=None, minutes=0.01), progress=False)
-    assert state.elapsed < 10
+    state = train(small_network(), settings(tiny_dataset, tmp_path / "r", steps=None, minutes=0.1), progress=False)
+    assert state.elapsed < 30
     assert state.history[-1]["step"] == state.step
     assert 2 <= len(state.history) <= 12  # after every tenth of the time that a step ended in, and at the end
 
