@@ -10,6 +10,7 @@ import math
 import os
 import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from qsim.cli_data import add_check, add_generate, add_plan
 from qsim.cli_look import add_preview, add_report
 from qsim.cli_studies import add_calibrate, add_tradeoff, add_validate
 from qsim.completion import add_completion
-from qsim.console import GOES_ON, Parser, bar, checked, command, output, run
+from qsim.console import EXTRAS, GOES_ON, Parser, bar, checked, command, output, run
 from qsim.convert import add_convert
 
 
@@ -51,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _add_doctor(sub: Any) -> None:
     parser = command(
-        sub, "doctor", _run_doctor, "Say which renderer, compiler and packages were found, and what is missing.",
+        sub, "doctor", _run_doctor, "Say what this machine renders with, what was tried, and which extras are missing.",
         "qsim doctor\nqsim doctor --devices",
     )  # fmt: skip
     parser.add_argument("--devices", action="store_true", help="list the named sensors and the source of each number")
@@ -67,9 +68,17 @@ def _run_doctor(args: argparse.Namespace) -> int:
     from qsim import engine, optics
     from qsim.scene import Camera
 
-    report = engine.report() | {"lens": optics.diffraction_line(Camera(8e-3, 2.8, 1.1e-6, 512, 1024))}
+    extras = {extra: all(find_spec(m) for m in EXTRAS if EXTRAS[m] == extra) for extra in sorted(set(EXTRAS.values()))}
+    report = engine.report() | {"extras": extras, "lens": optics.diffraction_line(Camera(8e-3, 2.8, 1.1e-6, 512, 1024))}
     width = max(len(key) for key in report)
-    output(args, report, [f"{key:{width}}  {value}" for key, value in report.items()])
+    missing = ", ".join(f"{extra} (pip install 'qsim[{extra}]')" for extra, there in extras.items() if not there)
+    probes = [f"{p['library'] or p['backend']}: {p['detail']}" for p in report["probes"]]
+    words = report | {
+        "probes": ("\n" + " " * (width + 2)).join(probes),
+        "software": ", ".join(f"{name} {found}" for name, found in report["software"].items()),
+        "extras": ", ".join(extra for extra, there in extras.items() if there) + (missing and f"; missing: {missing}"),
+    }
+    output(args, report, [f"{key:{width}}  {value}" for key, value in words.items()])
     return 0
 
 
@@ -226,10 +235,13 @@ def _run_sense(args: argparse.Namespace) -> int:
                 def count(done: int, _: int, start: int = before) -> None:
                     progress(start + done, frames)
 
+                known = not args.force and sensing.stream_name in clip.streams
                 found, line = stream.sense(clip, sensing, force=args.force, progress=count)
                 before += len(clip)
-                made.append({"clip": str(clip.path), "stream": found.name, "light": line, **_light(found.meta)})
-    output(args, {"streams": made}, [m["light"] for m in made])
+                facts = {"clip": str(clip.path), "stream": found.name, "made": not known, "light": line}
+                made.append(facts | _light(found.meta))
+    lines = [f"{m['light']}; {'made' if m['made'] else 'there already'}: stream {m['stream']}" for m in made]
+    output(args, {"streams": made}, lines)
     return 0
 
 

@@ -49,8 +49,8 @@ _ALSO_CALLED = {
 }
 
 # Packages that are extras of this one: module -> extra.
-_EXTRAS = {"av": "video", "zarr": "formats", "h5py": "formats", "distributed": "cluster", "pyoidn": "denoise"}
-_EXTRAS |= dict.fromkeys(("torch", "safetensors", "tensorboard"), "train")
+EXTRAS = {"av": "video", "zarr": "formats", "h5py": "formats", "distributed": "cluster", "pyoidn": "denoise"}
+EXTRAS |= dict.fromkeys(("torch", "safetensors", "tensorboard"), "train")
 
 _quiet: ContextVar[bool] = ContextVar("quiet", default=False)  # of the command that runs now
 
@@ -130,7 +130,7 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
         if isinstance(error, BrokenPipeError):  # the reader of our output has gone, as in `| head`
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
-        unknown_module = isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in _EXTRAS
+        unknown_module = isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in EXTRAS
         if os.environ.get("QSIM_DEBUG") or args.verbose or unknown_module:
             raise
         print(f"{parser.prog}: {one_line(error)}", file=sys.stderr)
@@ -177,7 +177,7 @@ def one_line(error: BaseException) -> str:
         return f"{error.strerror}; {_MAKE_SPACE}"
     if isinstance(error, ModuleNotFoundError):
         package = (error.name or "").split(".")[0]
-        return f"needs the package {package}, which is not installed: pip install 'qsim[{_EXTRAS[package]}]'"
+        return f"needs the package {package}, which is not installed: pip install 'qsim[{EXTRAS[package]}]'"
     if isinstance(error, MemoryError):
         return f"not enough memory ({' '.join(str(error).split()) or 'no more to have'}); try fewer or smaller frames"
     return " ".join(str(error).split()) or type(error).__name__

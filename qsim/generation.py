@@ -27,6 +27,9 @@ _FOLDERS = ("clips", "jobs", "failed", "logs", "locks", "work")
 Run = Callable[[list[Job], Path, Make], Generator[Result]]
 
 
+_ELSEWHERE = "a worker says that it is done, but it is not here; does every worker have this folder at this path?"
+
+
 @dataclass(frozen=True)
 class Options:
     """How to generate; nothing here changes a byte of the result."""
@@ -74,18 +77,19 @@ def generate(
             repaired += repair(folder, jobs) if options.repair else ()
             failed = {} if options.retry else _failures(folder, jobs)
             todo = [job for job in jobs if not record_path(folder, job.name).is_file() and job.name not in failed]
-            made = 0
+            made: list[str] = []
             with contextlib.closing((run or _runner(options))(todo, folder, make)) as results:
                 for result in results:
                     if result.state == "full":
                         raise OSError(errno.ENOSPC, result.message)
                     if result.state == "done":
-                        made += 1
+                        made.append(result.name)
                     else:
                         failed[result.name] = result.message
                     if on_result is not None:
                         on_result(result)
             write_manifest(recipe, folder)
+            failed |= {name: _ELSEWHERE for name in made if not record_path(folder, name).is_file()}
             done = sum(record_path(folder, job.name).is_file() for job in jobs)
             shared = tuple(Dataset.open(folder).shared_between_splits())
     except OSError as error:
@@ -93,7 +97,8 @@ def generate(
             raise
         message = f"{folder}: {error.strerror}; nothing is lost: make space and run the same command again"
         raise OSError(message) from None
-    return Summary(len(jobs), done, made, failed, repaired, shared)
+    made = [name for name in made if name not in failed]
+    return Summary(len(jobs), done, len(made), failed, repaired, shared)
 
 
 def shard(jobs: tuple[Job, ...], part: tuple[int, int] | None) -> list[Job]:

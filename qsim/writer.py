@@ -40,7 +40,8 @@ class ClipWriter:
 
     `meta` is clip.json without what the writer measures (means, errors, checksums); it must hold shape, frame_rate,
     exposure and radiance_unit, and camera (a dict) unless the unit is relative. A writer with the same meta goes on
-    where an interrupted one stopped: `has(t)` tells. `FileExistsError` if the clip exists and `force` is not set.
+    where an interrupted one stopped: `has(t)` tells. `FileExistsError` if the clip exists and `force` is not set, or
+    if it is no clip; `ValueError` if PATH.part holds what no writer left there.
     """
 
     def __init__(self, path: str | os.PathLike[str], meta: dict[str, Any], *, force: bool = False) -> None:
@@ -49,6 +50,10 @@ class ClipWriter:
         check_name(self.path.name)
         if self.path.exists() and not force:
             raise FileExistsError(f"{self.path}: exists; name another with -o, or use --force to replace it")
+        if self.path.exists() and not (self.path / "clip.json").is_file():
+            raise FileExistsError(
+                f"{self.path}: exists and is no clip, which is all that --force replaces; use another -o"
+            )
         self.meta = json.loads(files.to_json({"format_version": FORMAT_VERSION, "name": self.path.name} | meta))
         _check_new(self.path, self.meta)
         self.part = self.path.with_name(self.path.name + ".part")
@@ -63,6 +68,10 @@ class ClipWriter:
             raise ValueError(f"{self.part}: another process is writing this clip; wait for it, or name another with -o")
         try:
             begun = self.part / "begun.json"
+            if not begun.is_file() and any(
+                not item.name.startswith(("lock", "begun.json")) for item in self.part.iterdir()
+            ):
+                raise ValueError(f"{self.part}: holds files of somebody else; move them away, or name another with -o")
             if not begun.is_file() or begun.read_bytes() != identity:
                 for item in self.part.iterdir():
                     if item.name != "lock":

@@ -118,6 +118,8 @@ def _source(args: argparse.Namespace) -> Any:
         return sensed(clip, Light(light.sensor, args.ppp, args.bits or 3), args.seed)[0]
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file or folder")
+    if path.suffix not in (".npy", ".json"):
+        raise ValueError(f"{path}: no stream, clip folder or .npy array; `qsim convert` makes a clip of other files")
     if path.with_suffix(".json").is_file() and args.width is None:
         return stream_codes(open_stream(path))
     bits = args.bits or (args.planes.bit_length() if args.planes else 3)

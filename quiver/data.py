@@ -209,7 +209,9 @@ def stream_codes(stream: Stream) -> Codes:
 
 
 def open_stream(path: Path) -> Stream:
-    """The stored stream whose .npy or .json this is."""
+    """The stored stream whose .npy or .json this is; `ValueError` if it is video that `quiver restore` wrote."""
+    if "seconds_per_frame" in read_json(path.with_suffix(".json")):
+        raise ValueError(f"{path}: is restored video; name the stream or the clip that it was made from")
     return Stream.open(path.with_suffix(".json"))
 
 
@@ -237,8 +239,8 @@ def cube_codes(
     """
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"{path}: not readable as an array ({error})") from None
+    except (ValueError, EOFError):
+        raise ValueError(f"{path}: not readable as an array of numbers; save the codes with np.save") from None
     if width is not None:
         array = _summed_planes(path, array, planes or 1, width)
     sensor = light.device(1 / frame_rate)

@@ -131,6 +131,8 @@ def test_sense_prints_one_line_of_light(made: Path, capsys: pytest.CaptureFixtur
     assert "W/m2/sr, 3.25 PPP (factor " in out
     assert "lx at 555 nm, 2.6 e-/pixel" in out
     assert out.count("\n") == 1
+    assert out.endswith("made: stream quiver-physical_2bit_3.25ppp\n")
+    assert "there already: stream quiver" in run(capsys, "sense", clip, "--bits", 2, "--ppp", 3.25)[1]
     stream = Clip.open(clip).stream("quiver-physical_2bit_3.25ppp")
     assert stream.codes().max() <= 3
     assert stream.meta["ppp_target"] == 3.25

@@ -185,6 +185,22 @@ def test_nothing_is_overwritten_without_force(tmp_path: Path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a"]
 
 
+def test_what_is_no_clip_is_never_replaced(tmp_path: Path):
+    """Not a folder, not a file, not somebody's folder that has the name of the unfinished one."""
+    (tmp_path / "thesis").mkdir()
+    for path in (tmp_path / "thesis" / "a.txt", tmp_path / "b", tmp_path / "c.part" / "notes.txt"):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("years of work")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    for name in ("thesis", "b"):
+        with pytest.raises(FileExistsError, match="exists and is no clip"):
+            ClipWriter(tmp_path / name, meta(), force=True)
+    with pytest.raises(ValueError, match=r"c\.part: holds files of somebody else"):
+        ClipWriter(tmp_path / "c", meta()).__enter__()
+    left = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and path.name != "lock"}
+    assert left == before
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -25,7 +25,7 @@ from qsim.dataset import Dataset
 from qsim.generation import Options, Summary, generate, watching
 from qsim.jobs import Make
 from qsim.scene import Body, Diffuse, Texture
-from qsim.workers import Limits
+from qsim.workers import Limits, run_here
 
 TESTS = Path(__file__).parents[1]
 PYTHONPATH = f"{TESTS.parent}{os.pathsep}{TESTS}"  # of child processes; the package first: tests/qsim is no package
@@ -284,6 +284,17 @@ def test_a_failing_job_is_listed_and_retried(tmp_path: Path, undisturbed: dict[s
     assert "ValueError" in (tmp_path / "d" / "logs" / "tumble_0004.log").read_text()
     assert generate(SMALL, tmp_path / "d", Options(workers=0, retry=True), make=make) == Summary(3, 3, 1, {}, ())
     assert tree(tmp_path / "d") == undisturbed
+
+
+def test_clips_that_were_made_somewhere_else_are_named(tmp_path: Path):
+    """Workers whose folder of that name is another one say "done" and mean it."""
+    generate(SMALL, tmp_path / "there", HERE, make=make)
+    summary = generate(
+        SMALL, tmp_path / "here", make=make, run=lambda todo, _, make: run_here(todo, tmp_path / "there", make)
+    )
+    assert (summary.made, summary.done) == (0, 0)
+    assert set(summary.failed) == {job.name for job in SMALL.jobs}
+    assert all("does every worker have this folder" in why for why in summary.failed.values())
 
 
 @pytest.mark.parametrize(

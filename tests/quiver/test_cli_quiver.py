@@ -175,6 +175,14 @@ def test_arrays_that_are_no_stream_are_refused(capsys, tmp_path, array, message)
     assert [path.name for path in tmp_path.iterdir()] == ["a.npy"]
 
 
+def test_restored_video_is_not_taken_for_a_stream(capsys, tmp_path):
+    np.save(tmp_path / "v.npy", np.ones((3, 4, 4), np.float32))
+    (tmp_path / "v.json").write_text('{"method": "moment", "seconds_per_frame": 0.1}')
+    said = mistake(capsys, "restore", tmp_path / "v.npy", "-o", tmp_path / "w.npy", "--method", "moment")
+    assert "v.npy: is restored video; name the stream" in said
+    assert not (tmp_path / "w.npy").exists()
+
+
 def test_unreadable_files_are_named(capsys, tmp_path):
     (tmp_path / "a.npy").write_text("not an array")
     words = ["--sensor", "quiver-paper", "--method", "moment"]
