@@ -15,6 +15,7 @@ import platform
 import subprocess
 import sys
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import scenes
@@ -26,7 +27,7 @@ FIGURE = HERE / "pictures" / "rendering.png"
 UNTUNED = [name for name in scenes.FAMILIES if name not in validate_render.TUNED]
 VALIDATIONS = {
     "sensor": [],
-    "render": ["--scenes", *UNTUNED, "--seed", "1", "-o", str(FIGURE)],
+    "render": ["--scenes", *UNTUNED, "--seed", "1", "-o", str(FIGURE), "--force"],
     "engines": ["--scenes", "fan", "flag", "--height", "512", "--width", "1024"],
     "reading": [],
 }
@@ -56,9 +57,10 @@ SENSOR = """## Sensors
 RENDERING = """## Rendering
 
 Radiance is compared with a converged reference of the same scene. fan, tumble, gears, flag, crowd, drums and text were
-looked at while the budget was written and are left out. The seed of all others is one that nothing was tried on.
+looked at while the budget was written and are left out. No constant was chosen on the others, nor on their
+seed, but one: the deepest bounce that is tried, after glass lacked light, which makes ours slower there.
 **asked** is the wanted PSNR; **reached** what a frame has against the reference; **stated** what its own measured error
-says (of a denoised frame that of half its samples). **obvious** is the loop that one would write
+says. **obvious** is the loop that one would write
 first, with as many samples (a power of two) as it needs for the same PSNR.
 """
 
@@ -141,7 +143,7 @@ def sensor(report: dict[str, Any]) -> str:
 
 def rendering(report: dict[str, Any]) -> str:
     header = ["scene", "asked [dB]", "reached [dB]", "stated [dB]", "samples", "denoised", "bounces", "s/frame",
-              "obvious s/frame", "times faster"]  # fmt: skip
+              "obvious s/frame", "obvious [dB]", "times faster"]  # fmt: skip
     rows = [
         [
             row["scene"],
@@ -153,14 +155,21 @@ def rendering(report: dict[str, Any]) -> str:
             str(row["bounces"]),
             f"{row['seconds']:.2f}",
             f"{row['obvious_seconds']:.2f}" + (" (extrapolated)" if row["extrapolated"] else ""),
+            f"{row['obvious_psnr']:.1f}",
             f"{row['ratio']:.1f}",
         ]
         for row in report["rows"]
     ]
+    at = [row for row in report["rows"] if row["level"] == validate_render.AT_LEVEL]
+    # The squared error of independent samples is c / n, so that a PSNR x dB lower takes 10^(-x / 10) of the time.
+    equal = median(row["ratio"] * 10 ** ((row["psnr"] - row["obvious_psnr"]) / 10) for row in at)
+    exact = median(row["ratio"] * 10 ** ((row["level"] - row["obvious_psnr"]) / 10) for row in at)
     wanted = "reached" if report["ok"] else "**not reached**"
     size = (
         f"Frames of {report['height']} × {report['width']}; the median scene at 40 dB is {report['median_ratio']:.3f} "
-        f"times faster; the wanted speed (10 times there, and nowhere slower) is {wanted} in this run."
+        f"times faster; the wanted speed (10 times there, and nowhere slower) is {wanted} in this run. The "
+        "loop takes powers of two of samples and overshoots (**obvious [dB]**): could it stop at the PSNR that ours "
+        f"reached, the median would be {equal:.1f}; could it stop at 40 dB exactly, with ours as it is, {exact:.1f}."
     )
     picture = f"![Seconds per frame against PSNR]({FIGURE.relative_to(HERE).as_posix()})"
     return "\n".join([RENDERING, _table(header, rows), "", size, "", picture, ""])

@@ -13,13 +13,14 @@ and is shared: bounces and blur may each take 30 % of it (rms), the samples get 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.denoise import DENOISE_COST, available, denoised, mixture
+from qsim.denoise import AROUND, DENOISE_COST, available, cleaned_mean
 
 if TYPE_CHECKING:
     from qsim.render import Renderer
@@ -30,11 +31,12 @@ WINDOW = 96  # px, side of the windows in which the denoiser is tried, one in th
 PILOT_STAGE = 18  # of the random keys
 SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
 SENSOR_SHARE = 0.01  # of the shot variance that Monte-Carlo noise may add
-DEPTHS = (2, 4, 6, 9, 12)  # bounces tried, against (each depth is a kernel to compile)
-DEEPEST = 16
-PILOTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half; the denoiser is scored on one half
+DEPTHS = (2, 4, 6, 9, 12, 16, 24)  # bounces tried, against (each depth is a kernel to compile)
+DEEPEST = 32
+PILOTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
 MOST_SAMPLES = 16384
 MOST_DENOISED = 256  # samples up to which the error of denoised pictures is foretold
+MOST_TRIED = 9  # instants up to which three times as many are tried against them
 SHARP_FROM = 0.05  # px of motion in the exposure from which a sharp instant is stored too
 
 
@@ -63,12 +65,9 @@ class Budget:
             if getattr(self, name) < 1:
                 raise ValueError(f"Budget.{name}: at least 1, got {getattr(self, name)!r}")
 
-    def passes(self, instants: int, pixels: int, lanes: int) -> tuple[int, int]:
-        """(samples of each half in one pass, passes per instant), no pass above `lanes` samples in flight if it can."""
-        wanted = math.ceil(self.samples / instants / 2)
-        split = math.ceil(2 * wanted * pixels / lanes)
-        samples = grid_samples(math.ceil(wanted / split))
-        return samples, math.ceil(wanted / samples)
+    def grid(self, instants: int) -> int:
+        """Samples per pixel of each half at each of these instants."""
+        return grid_samples(math.ceil(self.samples / instants / 2))
 
 
 def choose(
@@ -93,19 +92,24 @@ def choose(
         raise ValueError(f"psnr: 10 to 80 dB can be asked for, got {psnr!r}")
     pilot = _pilot(scene, frame_rate, seed)
     times = sorted({0, frames // 2, frames - 1})
-    bright = np.stack([_mean(pilot, t, Budget(PILOTS[1], DEEPEST)) for t in times])
-    peak, mean = float(np.percentile(bright, 99.9)), float(bright.mean())
-    if not mean > 0:
+    full = np.stack([_mean(pilot, t, Budget(PILOTS[1], DEEPEST)) for t in times])
+    if not full.mean() > 0:
         raise ValueError(f"scene {scene.name}: the pilot saw no light in frames {times}; is a lamp behind a wall?")
-    allowed, limit = _allowed(peak, mean, psnr, ppp, quantum_efficiency)
-    bounces, dimmed, about_bounces = _bounces(pilot, times, bright, SHARE * allowed)
+    # Noise lifts the percentile of few samples: the peak that counts is that of the pilot with the most.
+    rough, _ = _allowed(full, psnr, ppp, quantum_efficiency)
+    bounces, dimmed, about_bounces = _bounces(pilot, times, full, SHARE * rough)
+    halves = [np.stack([_halves(pilot, t, Budget(count, bounces)) for t in times], axis=1) for count in PILOTS]
+    bright = halves[-1].mean(axis=0)
+    allowed, limit = _allowed(bright, psnr, ppp, quantum_efficiency)
+    dimmed = min(dimmed, SHARE * allowed)
     truths = [pilot.truth(t) for t in times]
-    contrast = peak - float(np.percentile(bright, 0.1))
-    tolerance = SHARE * allowed / contrast if contrast > 0 else 1.0
-    sub_frames, travel, blurred, about_blur = _sub_frames(truths, shutter, tolerance)
+    contrast = float(np.percentile(bright, 99.9) - np.percentile(bright, 0.1))
+    sub_frames, travel, blurred, about_blur = _sub_frames(
+        truths, shutter, SHARE * allowed, contrast, lambda k: _changes(pilot, times, shutter, k, bounces)
+    )
     instants = sub_frames if shutter > 0 else 1
-    noise = math.sqrt(allowed**2 - dimmed**2 - (min(blurred, tolerance) * contrast) ** 2)
-    samples, about_samples = _samples(pilot, times, bounces, instants, noise, peak)
+    noise = math.sqrt(allowed**2 - dimmed**2 - min(blurred, SHARE * allowed) ** 2)
+    samples, about_samples = _samples(halves, instants, noise)
     fewer, about_denoiser = None, Finding("denoiser", "off", "not asked for")
     if denoise is not False:
         fewer, about_denoiser = _denoiser(pilot, times[len(times) // 2], bounces, noise, samples / instants, denoise)
@@ -113,7 +117,8 @@ def choose(
         samples = fewer * instants
         about_samples = Finding("samples", f"{samples} per pixel, denoised", f"without: {about_samples.chosen}")
     findings = (limit, about_samples, about_denoiser, about_bounces, about_blur, *_left_out(scene.camera, truths))
-    return Budget(samples, bounces, sub_frames, travel >= SHARP_FROM, fewer is not None, findings)
+    sharp = travel >= SHARP_FROM or instants > 1
+    return Budget(samples, bounces, sub_frames, sharp, fewer is not None, findings)
 
 
 def explain(budget: Budget) -> str:
@@ -123,14 +128,22 @@ def explain(budget: Budget) -> str:
 
 
 def grid_samples(samples: int) -> int:
-    """The next product of two even neighbours or of an even number with itself: 4, 8, 16, 24, 36, 48, 64, ...
+    """The next size of an even number of cells, nearly square: 4, 6, 8, 12, 16, 20, 24, 30, 36, 42, 48, 56, 64, ...
 
-    Multijitter does best on grids with even sides, which also share themselves evenly among two lights. Measured under
-    sun and sky, error * samples^0.7 is 0.012 to 0.015 at 4, 16, ... 144, but 0.018 to 0.028 at 9, 25, ... 121. The
-    errors at 8, 24, 48 and 80 lie between those of their neighbours (fan and tumble).
+    Multijitter does worse on squares of odd numbers: measured under sun and sky, error * samples^0.7 is 0.012 to 0.015
+    at 4, 16, ... 144, but 0.018 to 0.028 at 9, 25, ... 121. On all others it is alike: at 4, 6, 8, 12, 16, 20 and 24
+    samples it stays within 5 % of its mean (fan, tumble, gears, flag, crowd).
     """
-    side = 2 * math.ceil(math.sqrt(samples) / 2)
-    return side * (side - 2) if side * (side - 2) >= samples else side**2
+    size = max(4, samples)
+    while not _is_grid(size):
+        size += 1
+    return size
+
+
+def _is_grid(size: int) -> bool:
+    """Whether multijitter, whose grid is isqrt(size) high, holds just that many, evenly and nearly square."""
+    high = math.isqrt(size)
+    return size % 2 == 0 and size % high == 0 and size // high - high <= 2
 
 
 def blur_error(travel: float, instants: int) -> float:
@@ -160,8 +173,9 @@ def _mean(pilot: Renderer, t: int, budget: Budget) -> Array:
     return _halves(pilot, t, budget).mean(axis=0)
 
 
-def _allowed(peak: float, mean: float, psnr: float, ppp: float | None, efficiency: float) -> tuple[float, Finding]:
+def _allowed(image: Array, psnr: float, ppp: float | None, efficiency: float) -> tuple[float, Finding]:
     """The stricter of the two limits [W m^-2 sr^-1]."""
+    peak, mean = float(np.percentile(image, 99.9)), float(image.mean())
     target = peak * 10 ** (-psnr / 20)
     text = f"target {psnr:g} dB allows {target:.3g}"
     allowed = target
@@ -183,37 +197,72 @@ def _bounces(pilot: Renderer, times: list[int], full: Array, tolerance: float) -
         if left_out <= tolerance:
             break
     else:
-        bounces, left_out, cut = DEEPEST, 0.0, full
+        # What lies beyond is not known; it is less than what the last step added, which takes its place.
+        size = f"the last {DEEPEST - bounces} added rms {left_out:.2g}, more than allowed; deeper ones were not tried"
+        return DEEPEST, left_out, Finding("bounces", f"{DEEPEST}", size)
     share = 100 * float((full - cut).mean() / full.mean())
     size = f"later bounces up to {DEEPEST} would add rms {left_out:.2g} ({share:.2g} % of the light)"
     return bounces, left_out, Finding("bounces", f"{bounces}", size)
 
 
-def _sub_frames(truths: list[dict[str, Array]], shutter: float, tolerance: float) -> tuple[int, float, float, Finding]:
-    """Instants, largest travel in the exposure [px], rms error / contrast (at most the tolerance) and the finding."""
+def _sub_frames(
+    truths: list[dict[str, Array]], shutter: float, tolerance: float, contrast: float, changes: Callable[[int], float]
+) -> tuple[int, float, float, Finding]:
+    """Instants, largest travel in the exposure [px], rms error of the blur [W m^-2 sr^-1] and the finding.
+
+    First from the motion of what is seen; then, since shadows, lamps and reflections move on surfaces at rest, more
+    until `changes(K)`, the measured rms difference between the means of K and of 3 K instants, is below the tolerance.
+    """
     speeds = np.concatenate([np.hypot(*truth["flow"]).ravel() for truth in truths])
-    travel = float(np.percentile(speeds, 99.9)) * shutter
-    moving = float(np.mean(speeds > 0.1))
-    motion = f"motion up to {travel / shutter if shutter else np.percentile(speeds, 99.9):.2f} px/frame"
-    if travel < 1e-3:
-        return 1, travel, 0.0, Finding("motion blur", "none, one instant", motion + f", shutter {shutter:g}")
-    edge = tolerance / math.sqrt(moving) if moving > 0 else tolerance
+    fastest = float(np.percentile(speeds, 99.9))
+    travel, moving = fastest * shutter, float(np.mean(speeds > 0.1))
+    motion = f"motion up to {fastest:.2f} px/frame"
+    if shutter == 0:
+        return 1, 0.0, 0.0, Finding("motion blur", "none, one instant", f"{motion}, shutter 0")
+    edge = tolerance / max(contrast * math.sqrt(moving), 1e-300)
     count = 1
     while blur_error(travel, count) > edge and count < 4096:
         count += 2  # odd: one instant lies at mid-exposure
+    by_motion, found = count, math.nan
+    while count <= MOST_TRIED and (found := changes(count)) > tolerance:
+        count = 2 * count + 1
+    if count == 1:
+        return (
+            1,
+            travel,
+            found,
+            Finding("motion blur", "none, one instant", f"{motion}; more would change rms {found:.2g}"),
+        )
     size = f"{motion}, {travel:.2f} px in the exposure; an edge errs by {100 * blur_error(travel, count):.2g} %"
-    blurred = blur_error(travel, count) * math.sqrt(moving)
+    if count > by_motion:
+        size += f"; {by_motion} for what is seen moving, the rest for light and shadow that move on it"
+    blurred = blur_error(travel, count) * math.sqrt(moving) * contrast
     return count, travel, blurred, Finding("motion blur", f"mean of {count} instants", size)
 
 
-def _samples(
-    pilot: Renderer, times: list[int], bounces: int, instants: int, target: float, peak: float
-) -> tuple[int, Finding]:
-    """Samples per pixel and frame; the error between the pilots' counts is taken as a power of the samples."""
-    errors = []
-    for count in PILOTS:
-        halves = np.stack([_halves(pilot, t, Budget(count, bounces)) for t in times])
-        errors.append(float(np.sqrt(np.mean((halves[:, 0] - halves[:, 1]) ** 2))) / 2)
+def _changes(pilot: Renderer, times: list[int], shutter: float, count: int, bounces: int) -> float:
+    """The rms difference between the means of K and of 3 K instants of the exposures [W m^-2 sr^-1].
+
+    The K are among the 3 K, and all instants draw the same paths, so that what rests adds nothing. The square is the
+    product of the differences of two independent halves, which noise changes by nothing on average.
+    """
+    square = 0.0
+    for t in times:
+        offsets = ((np.arange(3 * count) + 0.5) / (3 * count) - 0.5) * shutter / pilot.frame_rate
+        key, budget = pilot.key(t, PILOT_STAGE), Budget(PILOTS[1], bounces)
+        halves = np.stack([pilot.halves([pilot.time(t) + float(offset)], budget, key) for offset in offsets])
+        a, b = halves[1::3].mean(axis=0) - halves.mean(axis=0)
+        square += float(np.mean(a * b)) / len(times)
+    return math.sqrt(max(square, 0.0))
+
+
+def _samples(pilots: list[Array], instants: int, target: float) -> tuple[int, Finding]:
+    """Samples per pixel and frame; the error between the pilots' counts is taken as a power of the samples.
+
+    `pilots` are halves [2, times, H, W] with PILOTS samples.
+    """
+    errors = [float(np.sqrt(np.mean((halves[0] - halves[1]) ** 2))) / 2 for halves in pilots]
+    peak = float(np.percentile(pilots[-1].mean(axis=0), 99.9))
     if min(errors) <= 0:
         return PILOTS[0] * instants, Finding("samples", f"{PILOTS[0] * instants} per pixel", "the pilot found no noise")
     each = 2 * grid_samples(PILOTS[0] // 2)
@@ -241,20 +290,21 @@ def _denoiser(
     """Samples per instant with which denoised windows have the error asked for, or None where raw ones cost less."""
     if pilot.engine.backend == "scalar" or not available():
         return None, Finding("denoiser", "off", "not installed" if not available() else "needs LLVM or CUDA")
+    height, width = pilot.scene.camera.height, pilot.scene.camera.width
+    if wanted is None and height * width < AROUND**2:
+        return None, Finding("denoiser", "off", f"its error is not known well in fewer than {AROUND**2} pixels")
     windows = [pilot.window(crop) for crop in _windows(pilot.scene.camera)]
     instants, key = [pilot.time(t)], pilot.key(t, PILOT_STAGE)
     surfaces = [window.surfaces(instants, key) for window in windows]
     counts: list[int] = []
     errors: list[float] = []
     for count in PILOTS:
-        if wanted is None and count // 2 + DENOISE_COST >= raw:
+        if wanted is None and count + DENOISE_COST >= raw:
             break
-        # What is scored is half of the samples, A mixed with D(A)
         squares = 0.0
         for window, (albedo, normal) in zip(windows, surfaces, strict=True):
-            halves = window.halves(instants, Budget(count, bounces), key)
-            squares += mixture(halves, denoised(halves[0], albedo, normal))[1] ** 2
-        counts.append(count // 2)
+            squares += cleaned_mean(window.halves(instants, Budget(count, bounces), key), albedo, normal)[1] ** 2
+        counts.append(count)
         errors.append(math.sqrt(squares / len(windows)))
         if errors[-1] <= target:
             break

@@ -11,6 +11,7 @@ are words of qsim.keys, so any frame can be rendered alone, in any order. With e
 from __future__ import annotations
 
 import copy
+import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -24,7 +25,7 @@ from qsim import engine as engines
 from qsim import mitsuba_file, truth
 from qsim.budget import Budget, grid_samples
 from qsim.clip import PHYSICAL, Clip, ClipWriter
-from qsim.denoise import denoised, mixture
+from qsim.denoise import cleaned_mean
 from qsim.keys import Key, hash_name, words
 from qsim.scene import Camera, Motion, Scene, describe
 from qsim.translate import Stage
@@ -35,7 +36,7 @@ Crop = tuple[int, int, int, int]  # y, x, height, width
 RENDER_STAGE = 16  # of the random keys: sampler seeds
 SHARP_STAGE = 17  # the sharp instant has seeds of its own
 SURFACE_SAMPLES = 16  # per pixel, for the denoiser's albedo and normals
-MAX_LANES = 2**23  # samples in flight; more are split into passes
+MAX_LANES = 2**23  # samples in flight, about; a frame that takes more is rendered in parts
 FIREFLY = 10.0  # a pixel counts as a firefly where halves differ by this many rms of the frame's difference
 
 
@@ -45,7 +46,7 @@ class Frame:
 
     radiance: Array  # float32 [H, W], W m^-2 sr^-1, mean over the exposure
     error: float  # rms Monte-Carlo error of `radiance`, W m^-2 sr^-1, measured
-    fireflies: int  # pixels whose halves differ by more than FIREFLY rms
+    fireflies: int  # pixels whose halves differ by more than FIREFLY rms, or are not finite (and made 0)
     sharp: Array | None = None  # float32 [H, W], the instant at mid-exposure, only for an open shutter
     flow: Array | None = None  # float32 [2, H, W], px, mid-exposure of t to that of t + 1
     flow_back: Array | None = None  # float32 [2, H, W], px, mid-exposure of t to that of t - 1
@@ -129,16 +130,30 @@ class Renderer:
 
     def halves(self, instants: list[float], budget: Budget, key: Key) -> Array:
         """Two independent estimates A, B of the mean radiance over the instants [s], float64 [2, H, W]."""
-        height, width = self.shape
-        samples, passes = budget.passes(len(instants), height * width, MAX_LANES)
-        seeds = words(key, (2, len(instants) * passes)).reshape(2, len(instants), passes)
-        sums = np.zeros((2, height, width))
+        samples = budget.grid(len(instants))
+        parts = self._parts(2 * samples)
+        seeds = words(key, (2, len(instants) * len(parts))).reshape(2, len(instants), len(parts))
+        sums = np.zeros((2, math.prod(self.shape)))
         for i, instant in enumerate(instants):
             self._stage.place(instant)
             pose = self.scene.camera.pose(instant)
-            for pair in seeds[:, i].T:
-                sums += self._pass(pose, pair, samples, budget.bounces)
-        return sums / (len(instants) * passes)
+            if self.engine.backend == "scalar":
+                integrator = self._integrator(budget.bounces)
+                images = [self._film_pass(self._stage, pose, int(s), samples, integrator) for s in seeds[:, i, 0]]
+                sums += np.reshape(images, sums.shape)
+                continue
+            for part, seed in zip(parts, seeds[0, i], strict=True):
+                sums[:, part.start : part.stop] += self._pass(pose, int(seed), samples, budget.bounces, part)
+        return sums.reshape(2, *self.shape) / len(instants)
+
+    def _parts(self, samples: int) -> list[range]:
+        """The window's pixels, row by row, in ranges of about MAX_LANES samples or less, `samples` to a pixel.
+
+        Pixels are shared among the passes, not samples: the error of a whole grid falls faster than that of its parts.
+        """
+        pixels = math.prod(self.shape)
+        count = min(pixels, math.ceil(pixels * samples / MAX_LANES))
+        return [range(pixels * i // count, pixels * (i + 1) // count) for i in range(count)]
 
     def key(self, t: int, stage: int = RENDER_STAGE) -> Key:
         """The random key of frame t: another seed, scene or stage draws other samples."""
@@ -147,14 +162,14 @@ class Renderer:
     def _exposed(self, instants: list[float], key: Key) -> tuple[Array, float, int]:
         """Mean radiance over the instants, its rms error and the number of fireflies."""
         halves = self.halves(instants, self.budget, key)
+        broken = ~np.isfinite(halves).all(axis=0)
+        halves[:, broken] = 0  # or the denoiser and every mean around would break too
         difference = (halves[0] - halves[1]) / 2
         error = float(np.sqrt(np.mean(difference**2)))
-        fireflies = int(np.count_nonzero(np.abs(difference) > FIREFLY * error)) if error > 0 else 0
+        fireflies = int(np.count_nonzero(broken | ((np.abs(difference) > FIREFLY * error) & (error > 0))))
         radiance = halves.mean(axis=0)
         if self.budget.denoise:
-            albedo, normal = self.surfaces(instants, key)
-            share, error = mixture(halves, denoised(halves[0], albedo, normal))
-            radiance = share * denoised(radiance, albedo, normal) + (1 - share) * radiance
+            radiance, error = cleaned_mean(halves, *self.surfaces(instants, key))
         return radiance.astype(np.float32), error, fireflies
 
     def surfaces(self, instants: list[float], key: Key) -> tuple[Array, Array]:
@@ -163,59 +178,59 @@ class Renderer:
             raise ValueError("the scalar engine cannot denoise; leave Budget.denoise off or install LLVM")
         import drjit as dr
 
-        mi, (height, width) = self._mi, self.shape
+        mi = self._mi
         samples = grid_samples(max(2, SURFACE_SAMPLES // len(instants)))
-        sums = np.zeros((4, height, width))
-        for instant, seed in zip(instants, words(key, (1, len(instants)), redraw=1)[0], strict=True):
+        parts = self._parts(samples)
+        seeds = words(key, (len(instants), len(parts)), redraw=1)
+        sums = np.zeros((4, math.prod(self.shape)))
+        for instant, row in zip(instants, seeds, strict=True):
             self._stage.place(instant)
-            sampler, position = self._film_positions(int(seed), samples)
-            ray = self._camera_ray(self.scene.camera.pose(instant), position, sampler)
-            found = self._stage.loaded.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
-            bsdf = found.bsdf(ray)
-            seen = found.is_valid()
-            matt = seen & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
-            albedo = dr.select(matt, bsdf.eval_diffuse_reflectance(found)[0], 1)
-            normal = dr.select(seen, found.sh_frame.n, 0)
-            means = [dr.block_sum(value, samples) / samples for value in (albedo, normal.x, normal.y, normal.z)]
-            dr.eval(*means)
-            sums += np.stack([np.array(mean, np.float64).reshape(height, width) for mean in means])
-        albedo, *normals = sums / len(instants)
+            for part, seed in zip(parts, row, strict=True):
+                sampler, position = self._film_positions(int(seed), samples, part)
+                ray = self._camera_ray(self.scene.camera.pose(instant), position, sampler)
+                found = self._stage.loaded.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
+                bsdf = found.bsdf(ray)
+                seen = found.is_valid()
+                matt = seen & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
+                albedo = dr.select(matt, bsdf.eval_diffuse_reflectance(found)[0], 1)
+                normal = dr.select(seen, found.sh_frame.n, 0)
+                values = (albedo, normal.x, normal.y, normal.z)
+                dr.eval(*values)  # together, or each sum would trace the rays again
+                means = [np.array(dr.block_sum(value, samples)) / samples for value in values]
+                sums[:, part.start : part.stop] += means
+        albedo, *normals = sums.reshape(4, *self.shape) / len(instants)
         return albedo, np.stack(normals, axis=-1)
 
-    def _pass(self, pose: Array, seeds: Array, samples: int, bounces: int) -> Array:
-        """Two independent estimates of the radiance of every pixel, float64 [2, H, W], `samples` per pixel each.
+    def _pass(self, pose: Array, seed: int, samples: int, bounces: int, part: range) -> Array:
+        """Two independent estimates of the radiance of these pixels, float64 [2, N], `samples` per pixel each.
 
         Both are one launch: what it costs to start one is that of several samples of a small frame.
         """
-        integrator = self._integrator(bounces)
-        if self.engine.backend == "scalar":
-            return np.stack([self._film_pass(self._stage, pose, int(seed), samples, integrator) for seed in seeds])
         import drjit as dr
 
-        sampler, position = self._film_positions(int(seeds[0]), samples, 2)
+        sampler, position = self._film_positions(seed, samples, part, 2)
         ray = self._camera_ray(pose, position, sampler)
-        radiance, _, _ = integrator.sample(self._stage.loaded, sampler, ray)
+        radiance, _, _ = self._integrator(bounces).sample(self._stage.loaded, sampler, ray)
         mean = dr.block_sum(radiance[0], samples) / samples
-        return np.array(mean, np.float64).reshape(2, *self.shape)
+        return np.array(mean, np.float64).reshape(2, len(part))
 
-    def _film_positions(self, seed: int, samples: int, times: int = 1) -> tuple[Any, Any]:
+    def _film_positions(self, seed: int, samples: int, part: range, times: int = 1) -> tuple[Any, Any]:
         """A seeded sampler and film positions [px], uniform in each pixel, whose samples are neighbours in memory.
 
-        The whole window comes `times` times over, each time with grids of its own. Size and place of the window are
-        data, not code: a pilot and a whole frame share one compiled kernel.
+        The pixels of `part` come `times` times over, each time with grids of their own. Size and place of the window
+        are data, not code: a pilot and a whole frame share one compiled kernel.
         """
         import drjit as dr
 
-        mi, (height, width) = self._mi, self.shape
-        lanes = times * height * width * samples
+        mi = self._mi
+        lanes = times * len(part) * samples
         sampler = self._sampler(samples)
         sampler.seed(seed, lanes)
-        numbers = (height, width, self.thinned, *self.crop[:2])
-        rows, columns, step, y0, x0 = (dr.opaque(mi.UInt32, n) for n in numbers)
-        pixel = dr.arange(mi.UInt32, lanes) // samples
-        line = pixel // columns
-        row = line % rows
-        corner = mi.Point2f(mi.Float((pixel - line * columns) * step + x0), mi.Float(row * step + y0))
+        numbers = (len(part), part.start, self.shape[1], self.thinned, *self.crop[:2])
+        count, first, columns, step, y0, x0 = (dr.opaque(mi.UInt32, n) for n in numbers)
+        pixel = dr.arange(mi.UInt32, lanes) // samples % count + first
+        row = pixel // columns
+        corner = mi.Point2f(mi.Float((pixel - row * columns) * step + x0), mi.Float(row * step + y0))
         return sampler, corner + sampler.next_2d()
 
     def _integrator(self, bounces: int | None) -> Any:
@@ -256,16 +271,17 @@ class Renderer:
             self._samplers[samples] = sampler
         return self._samplers[samples]
 
-    def obvious(self, t: int, samples: int) -> Array:
+    def obvious(self, t: int, samples: int, redraw: int = 0) -> Array:
         """The loop that everybody writes first, float64 [H, W]: only here to be compared with.
 
-        `mi.render` with Mitsuba's camera and film, its default integrator and its default sampler; box filter.
+        `mi.render` with Mitsuba's camera and film, its default integrator and its default sampler; box filter. Another
+        `redraw` draws other samples.
         """
         engines.activate(self.engine)
         if self._obvious is None:
             self._obvious = Stage(self._mi, self.scene, smooth_weight=1.0)
         self._obvious.place(self.time(t))
-        pose, seed = self.scene.camera.pose(self.time(t)), int(words(self.key(t), (1, 1))[0, 0])
+        pose, seed = self.scene.camera.pose(self.time(t)), int(words(self.key(t), (1, 1), redraw=redraw)[0, 0])
         return self._film_pass(self._obvious, pose, seed, samples, self._integrator(None), "independent")
 
     def _film_pass(

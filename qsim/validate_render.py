@@ -204,7 +204,7 @@ def _obvious(renderer: Renderer, t: int, samples: int) -> Array:
     height, width = renderer.shape
     calls = min(samples, 2 ** max(0, math.ceil(math.log2(samples * height * width / 2**24))))
     each = samples // calls
-    return np.mean([renderer.obvious(t, each) for _ in range(calls)], axis=0)
+    return np.mean([renderer.obvious(t, each, redraw) for redraw in range(calls)], axis=0)
 
 
 def table(report: Report) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from small_scenes import CAMERA, plate, renderer, scene, square
 from qsim import budget
 from qsim.budget import Budget, blur_error, choose, explain, grid_samples
 from qsim.denoise import available, mixture
-from qsim.motion import Spin
+from qsim.motion import Spin, Translation
 from qsim.render import Renderer
 from qsim.scene import Body, Diffuse, Glow, PointLight, Scene, SunSky, Texture
 
@@ -96,6 +97,37 @@ def test_an_open_shutter_gets_an_odd_number_of_instants():
     assert "mean of" in explain(chosen)
 
 
+def test_a_shadow_that_moves_on_a_wall_at_rest_is_blurred_too():
+    """Nothing that is seen moves; a slat beside the lamp throws a shadow that runs across the wall.
+
+    With the instants chosen, the mean over the exposure is that of many more to the error asked for; one instant is
+    not.
+    """
+    slat = Body("slat", square(0.15), Diffuse(0.5), Translation((100.0, 0.0, 0.0), (-0.5, 0.0, 2.0)))
+    made = scene(Body("wall", square(6, -1), Diffuse(0.7)), slat, light=PointLight((0.0, 0.0, 3.0), 40.0))
+    made = replace(made, camera=replace(CAMERA, origin=(0.0, 0.0, 1.5)))
+    chosen = choose(made, shutter=1.0, psnr=35, denoise=False)
+    assert chosen.sub_frames > 1
+    assert chosen.sharp
+    assert "light and shadow" in explain(chosen)
+    means = {}
+    for count in (1, chosen.sub_frames, 45):
+        one = renderer(made, shutter=1.0, budget=replace(chosen, samples=64 * count, sub_frames=count))
+        means[count] = one.frame(10, with_truth=False).radiance
+    allowed = np.percentile(means[45], 99.9) * 10 ** (-35 / 20)
+    far = {count: math.sqrt(np.mean((image - means[45]) ** 2)) for count, image in means.items()}
+    assert far[chosen.sub_frames] < allowed < far[1]
+
+
+def test_bounces_that_no_pilot_tried_are_not_called_nothing(monkeypatch):
+    full = np.full((1, 4, 4), 2.0)
+    monkeypatch.setattr(budget, "_mean", lambda pilot, t, cheap: full[0] - 0.1)
+    bounces, left_out, finding = budget._bounces(None, [0], full, 0.01)
+    assert bounces == budget.DEEPEST
+    assert left_out == pytest.approx(0.1)
+    assert "deeper ones were not tried" in finding.size
+
+
 def test_the_choice_is_a_function_of_the_question():
     made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
     assert choose(made, psnr=25) == choose(made, psnr=25)
@@ -118,46 +150,61 @@ def test_a_budget_of_nothing_is_refused():
         Budget(samples=0)
 
 
-def test_samples_in_flight_are_bounded():
-    of_each_half, passes = Budget(samples=4096).passes(1, 512 * 1024, 2**23)
-    assert 2 * of_each_half * 512 * 1024 <= 2**23
-    assert 2 * of_each_half * passes >= 4096
-    assert Budget(samples=72).passes(1, 128 * 256, 2**23) == (36, 1)
+def test_samples_are_shared_among_halves_and_instants():
+    assert Budget(samples=72).grid(1) == 36
+    assert Budget(samples=72).grid(9) == 4
+    assert Budget(samples=1).grid(5) == 4
 
 
 @pytest.mark.parametrize("bias", [0.0, 0.3, 2.0])
 def test_the_best_mixture_is_known_without_the_truth(bias):
     """A filter that adds a bias to the truth, raw noise of 0.5: A - B knows nothing of the bias, D(A) - B does.
 
-    The shares are as 1 / variance: w = 0.25 / (0.25 + bias^2), error^2 = w bias^2. Over 40 000 pixels the estimates of
-    the squares have sigmas of about 0.004 (0.01 at a bias of 2).
+    The shares are as 1 / variance, that of the mean of two halves 0.125: w = 0.125 / (0.125 + bias^2), and
+    error^2 = w bias^2. Over 40 000 pixels the estimate has a sigma of 0.001 or less (0.125 sqrt(2) / 200; with the bias
+    of 2, w is 0.03 and bias Z w as large), of which one is added.
     """
     rng = np.random.default_rng(3)
     truth = rng.random((200, 200))
     halves = truth + 0.5 * rng.standard_normal((2, 200, 200))
-    share, error = mixture(halves, truth + bias)
-    best = 0.25 / (0.25 + bias**2)
+    share, error = mixture(halves, np.stack([truth + bias] * 2))
+    best = 0.125 / (0.125 + bias**2)
     assert share.mean() == pytest.approx(best, abs=0.05)
-    assert error**2 == pytest.approx(max(best * bias**2, 0.0025), abs=0.02)
+    assert error**2 == pytest.approx(max(best * bias**2, 0.00125), abs=0.006)
+
+
+def test_halves_whose_noise_the_filter_keeps_are_known_for_it():
+    """A filter that keeps the share k of the noise, without bias: E (C - truth)^2 is k^2 of the raw one.
+
+    The best w is the whole (only C), its error k sqrt(V / 2); a naive half difference of D(A) and D(B) says the same
+    here, which the test above denies it. 160 000 pixels: sigma of the square below 0.4 %.
+    """
+    rng = np.random.default_rng(5)
+    noise = rng.standard_normal((2, 400, 400))
+    share, error = mixture(1 + noise, 1 + 0.6 * noise)
+    assert share.mean() > 0.9
+    assert error**2 == pytest.approx(0.36 / 2, rel=0.03)
 
 
 def test_each_part_of_a_picture_is_mixed_by_its_own_errors():
     """A filter that is right on the left and far off on the right: denoised there, raw here, away from the border.
 
-    Over 33 x 33 pixels the noise and the product are known to 4 %, the right share (0.01) to far less.
+    The left share is a ratio of two sums of 33 x 33 squares: 6 % of noise, 9 % at a border, which mirrors half of them,
+    and nothing above 1. The right one is 0.005, known far better.
     """
     rng = np.random.default_rng(6)
     truth = np.ones((120, 300))
     cleaned = truth + np.where(np.arange(300) < 150, 0.0, 3.0)
-    share, _ = mixture(truth + 0.3 * rng.standard_normal((2, 120, 300)), cleaned)
-    assert share[:, :120].min() > 0.8
+    share, _ = mixture(truth + 0.3 * rng.standard_normal((2, 120, 300)), np.stack([cleaned] * 2))
+    assert share[:, :120].min() > 0.6
+    assert share[:, :120].mean() > 0.95
     assert share[:, 180:].max() < 0.05
 
 
 def test_a_filter_that_does_nothing_is_not_trusted():
     halves = np.random.default_rng(4).standard_normal((2, 100, 100))
-    _, error = mixture(halves, halves[0])
-    assert error == pytest.approx(1.0, rel=0.05)
+    _, error = mixture(halves, halves)
+    assert error == pytest.approx(math.sqrt(0.5), rel=0.05)
 
 
 @pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
@@ -168,8 +215,7 @@ def test_denoising_helps_where_it_says_so():
     converged = renderer(made, seed=9, budget=Budget(512, 2)).frame(0, with_truth=False).radiance
     distance = math.sqrt(np.mean((clean.radiance - converged) ** 2))
     assert distance < 0.7 * raw.error
-    assert clean.error == pytest.approx(distance, rel=0.6)
-    assert clean.error > 0.8 * distance  # measured with half of the samples: rather too much than too little
+    assert clean.error == pytest.approx(distance, rel=0.2)
 
 
 @pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")

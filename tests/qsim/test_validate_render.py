@@ -30,6 +30,14 @@ def test_the_obvious_loop_sees_the_same_scene():
     assert theirs.mean() == pytest.approx(ours.radiance.mean(), rel=0.02)
 
 
+def test_calls_of_the_obvious_loop_draw_other_samples():
+    """A large frame is rendered in several calls, whose mean is that of all their samples."""
+    views = renderer(plate(None, light=SunSky()))
+    one, other = views.obvious(2, 4), views.obvious(2, 4, 1)
+    np.testing.assert_array_equal(one, views.obvious(2, 4))
+    assert (one != other).mean() > 0.5
+
+
 def test_the_variance_of_the_reference_is_not_held_against_an_image():
     rng = np.random.default_rng(1)
     truth = np.ones((300, 300))
