@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.metadata
 import json
@@ -68,14 +69,13 @@ class ClipWriter:
             raise ValueError(f"{self.part}: another process is writing this clip; wait for it, or name another with -o")
         try:
             begun = self.part / "begun.json"
-            if not begun.is_file() and any(
-                not item.name.startswith(("lock", "begun.json")) for item in self.part.iterdir()
-            ):
-                raise ValueError(f"{self.part}: holds files of somebody else; move them away, or name another with -o")
-            if not begun.is_file() or begun.read_bytes() != identity:
-                for item in self.part.iterdir():
-                    if item.name != "lock":
-                        shutil.rmtree(item) if item.is_dir() else item.unlink()
+            if not begun.is_file():
+                if not self._left_by_a_writer():
+                    message = f"{self.part}: holds files of somebody else; move them away, or name another with -o"
+                    raise ValueError(message)
+                files.write_bytes(begun, b"")  # before anything goes: a clearing cut short is still a writer's
+            if begun.read_bytes() != identity:
+                self._clear()
                 files.write_bytes(begun, identity)
             files.sweep(self.part)
             self._frames = _read_journal(self.part)
@@ -142,9 +142,22 @@ class ClipWriter:
             if kind is None:
                 self._finish()
             elif not self._frames:
+                self._clear()
                 shutil.rmtree(self.part)
         finally:
             self._lock.release()
+
+    def _left_by_a_writer(self) -> bool:
+        """Whether a .part without begun.json is a writer's: killed before it began, or between the last two steps."""
+        with contextlib.suppress(OSError, ValueError):
+            return bool(files.read_json(self.part / "clip.json").get("name") == self.path.name)
+        return all(item.name.startswith(("lock", "begun.json.tmp-")) for item in self.part.iterdir())
+
+    def _clear(self) -> None:
+        """Delete what a writer left; begun.json, which says that it was one, stays."""
+        for item in self.part.iterdir():
+            if item.name not in ("lock", "begun.json"):
+                shutil.rmtree(item) if item.is_dir() else item.unlink()
 
     def _encode(self, t: int, folder: str, image: Array, contents: dict[str, bytes]) -> tuple[Array, int]:
         _, height, width = self.meta["shape"]

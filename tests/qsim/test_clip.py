@@ -1,11 +1,17 @@
 """Clip folders: what is written is read, and nothing that is not whole is accepted."""
 
+import functools
+import itertools
 import json
+import os
+import signal
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from forks import forked
 
 from qsim import exr, files, optics
 from qsim.clip import PHYSICAL, RELATIVE, Clip, ClipWriter
@@ -148,6 +154,41 @@ def test_an_interrupted_writer_leaves_nothing_readable_and_goes_on(tmp_path: Pat
     assert (path / "clip.json").read_bytes() == (whole / "clip.json").read_bytes()
     assert not (tmp_path / "a.part").exists()
     assert sorted(p.name for p in path.iterdir()) == ["clip.json", "radiance"]
+
+
+@pytest.mark.parametrize("left", [None, {}, {"frame_rate": 1000.0}])
+def test_a_writer_killed_at_every_step_can_begin_again(tmp_path: Path, left: dict[str, Any] | None):
+    """Before each file it opens, removes or renames; in an empty folder, going on, and clearing what is of no use."""
+    code, steps = signal.SIGKILL, 0
+    while code == signal.SIGKILL:
+        path = tmp_path / str(steps) / "a"
+        path.parent.mkdir()
+        if left is not None:
+            interrupted(path, 0, **left)
+        steps += 1
+        code = -os.waitstatus_to_exitcode(os.waitpid(forked(functools.partial(killed_at, steps, path)), 0)[1])
+        if not path.exists():
+            write(path)
+        assert Clip.open(path).verify() == []
+        assert [item.name for item in path.parent.iterdir()] == ["a"]
+        assert sorted(item.name for item in path.iterdir()) == ["clip.json", "radiance", "sharp", "truth"]
+    assert code == 0
+    assert steps > 50
+
+
+def killed_at(step: int, path: Path) -> None:
+    """Write a clip, and die of SIGKILL before the so-many-th event of the file system."""
+    events = itertools.count(1)
+
+    def watch(event: str, arguments: tuple[Any, ...]) -> None:
+        ours = event in ("os.mkdir", "os.rename", "os.remove", "os.rmdir") or (
+            event == "open" and str(path) in str(arguments[0])
+        )
+        if ours and next(events) == step:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.addaudithook(watch)
+    write(path)
 
 
 def test_a_damaged_frame_of_an_interrupted_writer_is_done_again(tmp_path: Path):
