@@ -20,22 +20,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.denoise import AROUND, DENOISE_COST, available, cleaned_mean
-
 if TYPE_CHECKING:
-    from qsim.render import Renderer
     from qsim.scene import Camera, Scene
 
-PILOT_PIXELS = 3000
-WINDOW = 96  # px, side of the windows in which the denoiser is tried, one in the middle of each quarter of the frame
-PILOT_STAGE = 18  # of the random keys
 SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
 SENSOR_SHARE = 0.01  # of the shot variance that Monte-Carlo noise may add
 DEPTHS = (2, 4, 6, 9, 12, 16, 24)  # bounces tried, against (each depth is a kernel to compile)
 DEEPEST = 32
-PILOTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
+COUNTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
 MOST_SAMPLES = 16384
-MOST_DENOISED = 256  # samples up to which the error of denoised pictures is foretold
 MOST_TRIED = 9  # instants up to which three times as many are tried against them
 SHARP_FROM = 0.05  # px of motion in the exposure from which a sharp instant is stored too
 
@@ -90,29 +83,32 @@ def choose(
     """
     if not 10 <= psnr <= 80:
         raise ValueError(f"psnr: 10 to 80 dB can be asked for, got {psnr!r}")
-    pilot = _pilot(scene, frame_rate, seed)
-    times = sorted({0, frames // 2, frames - 1})
-    full = np.stack([_mean(pilot, t, Budget(PILOTS[1], DEEPEST)) for t in times])
+    from qsim.pilot import Pilot, denoised_samples  # which renders budgets
+
+    pilot = Pilot.of(scene, frame_rate, frames, seed)
+    full = pilot.mean(COUNTS[1], DEEPEST)
     if not full.mean() > 0:
-        raise ValueError(f"scene {scene.name}: the pilot saw no light in frames {times}; is a lamp behind a wall?")
+        raise ValueError(
+            f"scene {scene.name}: the pilot saw no light in frames {list(pilot.times)}; is a lamp behind a wall?"
+        )
     # Noise lifts the percentile of few samples: the peak that counts is that of the pilot with the most.
     rough, _ = _allowed(full, psnr, ppp, quantum_efficiency)
-    bounces, dimmed, about_bounces = _bounces(pilot, times, full, SHARE * rough)
-    halves = [np.stack([_halves(pilot, t, Budget(count, bounces)) for t in times], axis=1) for count in PILOTS]
+    bounces, dimmed, about_bounces = _bounces(lambda depth: pilot.mean(COUNTS[1], depth), full, SHARE * rough)
+    halves = [pilot.halves(count, bounces) for count in COUNTS]
     bright = halves[-1].mean(axis=0)
     allowed, limit = _allowed(bright, psnr, ppp, quantum_efficiency)
     dimmed = min(dimmed, SHARE * allowed)
-    truths = [pilot.truth(t) for t in times]
+    truths = pilot.truths()
     contrast = float(np.percentile(bright, 99.9) - np.percentile(bright, 0.1))
     sub_frames, travel, blurred, about_blur = _sub_frames(
-        truths, shutter, SHARE * allowed, contrast, lambda k: _changes(pilot, times, shutter, k, bounces)
+        truths, shutter, SHARE * allowed, contrast, lambda k: pilot.changes(shutter, k, bounces)
     )
     instants = sub_frames if shutter > 0 else 1
     noise = math.sqrt(allowed**2 - dimmed**2 - min(blurred, SHARE * allowed) ** 2)
     samples, about_samples = _samples(halves, instants, noise)
     fewer, about_denoiser = None, Finding("denoiser", "off", "not asked for")
     if denoise is not False:
-        fewer, about_denoiser = _denoiser(pilot, times[len(times) // 2], bounces, noise, samples / instants, denoise)
+        fewer, about_denoiser = denoised_samples(pilot, bounces, noise, samples / instants, denoise)
     if fewer is not None:
         samples = fewer * instants
         about_samples = Finding("samples", f"{samples} per pixel, denoised", f"without: {about_samples.chosen}")
@@ -156,23 +152,6 @@ def blur_error(travel: float, instants: int) -> float:
     return step**2 / (8 * travel) if 0 < step <= 1 else 1 / instants if step > 1 else 0.0
 
 
-def _pilot(scene: Scene, frame_rate: float, seed: int) -> Renderer:
-    """A renderer of every n-th pixel; render.py needs Budget, hence the late import."""
-    from qsim.render import Renderer
-
-    camera = scene.camera
-    thinned = max(1, math.isqrt(camera.height * camera.width // PILOT_PIXELS))
-    return Renderer(scene, frame_rate=frame_rate, seed=seed, budget=Budget(), thinned=thinned)
-
-
-def _halves(pilot: Renderer, t: int, budget: Budget) -> Array:
-    return pilot.halves([pilot.time(t)], budget, pilot.key(t, PILOT_STAGE))
-
-
-def _mean(pilot: Renderer, t: int, budget: Budget) -> Array:
-    return _halves(pilot, t, budget).mean(axis=0)
-
-
 def _allowed(image: Array, psnr: float, ppp: float | None, efficiency: float) -> tuple[float, Finding]:
     """The stricter of the two limits [W m^-2 sr^-1]."""
     peak, mean = float(np.percentile(image, 99.9)), float(image.mean())
@@ -186,13 +165,13 @@ def _allowed(image: Array, psnr: float, ppp: float | None, efficiency: float) ->
     return allowed, Finding("error", f"rms {allowed:.3g} W/m2/sr", f"{text}; peak {peak:.3g}, mean {mean:.3g}")
 
 
-def _bounces(pilot: Renderer, times: list[int], full: Array, tolerance: float) -> tuple[int, float, Finding]:
-    """The smallest depth whose radiance differs from that of DEEPEST by an rms below the tolerance (same paths).
+def _bounces(cut_at: Callable[[int], Array], full: Array, tolerance: float) -> tuple[int, float, Finding]:
+    """The smallest depth whose radiance differs from that of DEEPEST by an rms below the tolerance; and that rms.
 
-    And that rms, W m^-2 sr^-1.
+    `cut_at(depth)` and `full` are the pilot's radiance from the same paths, W m^-2 sr^-1.
     """
     for bounces in DEPTHS:
-        cut = np.stack([_mean(pilot, t, Budget(PILOTS[1], bounces)) for t in times])
+        cut = cut_at(bounces)
         left_out = float(np.sqrt(np.mean((full - cut) ** 2)))
         if left_out <= tolerance:
             break
@@ -227,12 +206,8 @@ def _sub_frames(
     while count <= MOST_TRIED and (found := changes(count)) > tolerance:
         count = 2 * count + 1
     if count == 1:
-        return (
-            1,
-            travel,
-            found,
-            Finding("motion blur", "none, one instant", f"{motion}; more would change rms {found:.2g}"),
-        )
+        size = f"{motion}; more would change rms {found:.2g}"
+        return 1, travel, found, Finding("motion blur", "none, one instant", size)
     size = f"{motion}, {travel:.2f} px in the exposure; an edge errs by {100 * blur_error(travel, count):.2g} %"
     if count > by_motion:
         size += f"; {by_motion} for what is seen moving, the rest for light and shadow that move on it"
@@ -240,32 +215,16 @@ def _sub_frames(
     return count, travel, blurred, Finding("motion blur", f"mean of {count} instants", size)
 
 
-def _changes(pilot: Renderer, times: list[int], shutter: float, count: int, bounces: int) -> float:
-    """The rms difference between the means of K and of 3 K instants of the exposures [W m^-2 sr^-1].
-
-    The K are among the 3 K, and all instants draw the same paths, so that what rests adds nothing. The square is the
-    product of the differences of two independent halves, which noise changes by nothing on average.
-    """
-    square = 0.0
-    for t in times:
-        offsets = ((np.arange(3 * count) + 0.5) / (3 * count) - 0.5) * shutter / pilot.frame_rate
-        key, budget = pilot.key(t, PILOT_STAGE), Budget(PILOTS[1], bounces)
-        halves = np.stack([pilot.halves([pilot.time(t) + float(offset)], budget, key) for offset in offsets])
-        a, b = halves[1::3].mean(axis=0) - halves.mean(axis=0)
-        square += float(np.mean(a * b)) / len(times)
-    return math.sqrt(max(square, 0.0))
-
-
 def _samples(pilots: list[Array], instants: int, target: float) -> tuple[int, Finding]:
     """Samples per pixel and frame; the error between the pilots' counts is taken as a power of the samples.
 
-    `pilots` are halves [2, times, H, W] with PILOTS samples.
+    `pilots` are halves [2, times, H, W] with COUNTS samples.
     """
     errors = [float(np.sqrt(np.mean((halves[0] - halves[1]) ** 2))) / 2 for halves in pilots]
     peak = float(np.percentile(pilots[-1].mean(axis=0), 99.9))
     if min(errors) <= 0:
-        return PILOTS[0] * instants, Finding("samples", f"{PILOTS[0] * instants} per pixel", "the pilot found no noise")
-    each = 2 * grid_samples(PILOTS[0] // 2)
+        return COUNTS[0] * instants, Finding("samples", f"{COUNTS[0] * instants} per pixel", "the pilot found no noise")
+    each = 2 * grid_samples(COUNTS[0] // 2)
     while _error(errors, each) > target * math.sqrt(instants) and each * instants < MOST_SAMPLES:
         each = 2 * grid_samples(each // 2 + 1)
     expected = _error(errors, each) / math.sqrt(instants)
@@ -277,65 +236,11 @@ def _samples(pilots: list[Array], instants: int, target: float) -> tuple[int, Fi
 
 def _error(errors: list[float], samples: int) -> float:
     """Error at a number of samples: a power law through the two nearest pilots, beyond them 0.5 to 0.75."""
-    i = 0 if samples <= PILOTS[1] else 1
-    power = math.log(errors[i] / errors[i + 1]) / math.log(PILOTS[i + 1] / PILOTS[i])
-    if samples > PILOTS[-1]:
+    i = 0 if samples <= COUNTS[1] else 1
+    power = math.log(errors[i] / errors[i + 1]) / math.log(COUNTS[i + 1] / COUNTS[i])
+    if samples > COUNTS[-1]:
         power = min(max(power, 0.5), 0.75)
-    return float(errors[i + 1] * (samples / PILOTS[i + 1]) ** -power)
-
-
-def _denoiser(
-    pilot: Renderer, t: int, bounces: int, target: float, raw: float, wanted: bool | None
-) -> tuple[int | None, Finding]:
-    """Samples per instant with which denoised windows have the error asked for, or None where raw ones cost less."""
-    if pilot.engine.backend == "scalar" or not available():
-        return None, Finding("denoiser", "off", "not installed" if not available() else "needs LLVM or CUDA")
-    height, width = pilot.scene.camera.height, pilot.scene.camera.width
-    if wanted is None and height * width < AROUND**2:
-        return None, Finding("denoiser", "off", f"its error is not known well in fewer than {AROUND**2} pixels")
-    windows = [pilot.window(crop) for crop in _windows(pilot.scene.camera)]
-    instants, key = [pilot.time(t)], pilot.key(t, PILOT_STAGE)
-    surfaces = [window.surfaces(instants, key) for window in windows]
-    counts: list[int] = []
-    errors: list[float] = []
-    for count in PILOTS:
-        if wanted is None and count + DENOISE_COST >= raw:
-            break
-        squares = 0.0
-        for window, (albedo, normal) in zip(windows, surfaces, strict=True):
-            squares += cleaned_mean(window.halves(instants, Budget(count, bounces), key), albedo, normal)[1] ** 2
-        counts.append(count)
-        errors.append(math.sqrt(squares / len(windows)))
-        if errors[-1] <= target:
-            break
-    where = f"{'' if len(windows) == 1 else 'four windows of '}frame {t}"
-    needed, size = _needed(counts, errors, target), f"rms {target:.2g} in {where}"
-    if needed > MOST_DENOISED and wanted:
-        needed, size = MOST_DENOISED, f"rms {errors[-1]:.2g} with {counts[-1]} samples, above the target"
-    samples = 2 * grid_samples(math.ceil(needed / 2)) if needed <= MOST_DENOISED else math.inf
-    if wanted is None and samples + DENOISE_COST >= raw:
-        return None, Finding("denoiser", "off", f"{raw:.0f} raw samples cost no more")
-    return int(samples), Finding("denoiser", "on", size)
-
-
-def _windows(camera: Camera) -> list[tuple[int, int, int, int]]:
-    """Where the denoiser is tried, (y, x, height, width): all of a small frame, else four places that stand for it."""
-    height, width = camera.height, camera.width
-    if height * width <= 4 * WINDOW**2:
-        return [(0, 0, height, width)]
-    rows, columns = (max(1, min(side // 2, WINDOW)) for side in (height, width))
-    return [(height * i // 4 - rows // 2, width * j // 4 - columns // 2, rows, columns) for i in (1, 3) for j in (1, 3)]
-
-
-def _needed(counts: list[int], errors: list[float], target: float) -> float:
-    """Samples with which a falling error reaches the target: a power of them between the last two trials and beyond."""
-    if errors and errors[0] <= target:
-        return counts[0]
-    if len(errors) < 2 or errors[-1] >= errors[-2]:
-        return math.inf
-    share = math.log(errors[-2] / target) / math.log(errors[-2] / errors[-1])
-    needed = counts[-2] * (counts[-1] / counts[-2]) ** share
-    return needed if needed <= MOST_DENOISED else math.inf
+    return float(errors[i + 1] * (samples / COUNTS[i + 1]) ** -power)
 
 
 def _left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, ...]:

@@ -119,10 +119,9 @@ def test_a_shadow_that_moves_on_a_wall_at_rest_is_blurred_too():
     assert far[chosen.sub_frames] < allowed < far[1]
 
 
-def test_bounces_that_no_pilot_tried_are_not_called_nothing(monkeypatch):
+def test_bounces_that_no_pilot_tried_are_not_called_nothing():
     full = np.full((1, 4, 4), 2.0)
-    monkeypatch.setattr(budget, "_mean", lambda pilot, t, cheap: full[0] - 0.1)
-    bounces, left_out, finding = budget._bounces(None, [0], full, 0.01)
+    bounces, left_out, finding = budget._bounces(lambda depth: full - 0.1, full, 0.01)
     assert bounces == budget.DEEPEST
     assert left_out == pytest.approx(0.1)
     assert "deeper ones were not tried" in finding.size
