@@ -1,5 +1,5 @@
 # make demo    scenes -> few-bit frames -> restored video, as one page: out/demo/index.html
-# make test    the quick tests (about five minutes); make test-slow: the long ones
+# make test    the quick tests (five to ten minutes); make test-slow: the long ones
 # make lint    style and types; make docs: the pages of docs/ into out/site
 
 PYTHON ?= python3

@@ -10,9 +10,9 @@ SPLITS = ("train", "val", "test")
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
-    """`; did you mean '...'?`, or nothing if no known word is close."""
+    """` (did you mean '...'?)`, or nothing if no known word is close."""
     close = difflib.get_close_matches(word, list(known), n=1)
-    return f"; did you mean '{close[0]}'?" if close else ""
+    return f" (did you mean '{close[0]}'?)" if close else ""
 
 
 def text(value: Any) -> str:

@@ -9,6 +9,7 @@ needs, and what a real run can fairly be compared with (every job's log says bot
 
 from __future__ import annotations
 
+import math
 import resource
 import tempfile
 import time
@@ -121,17 +122,22 @@ class Plan:
             f"{c.per_frame.wall + c.sensing.wall:8.3f} {c.hours:8.3f} {c.gigabytes:8.3f}"
             for c in self.costs
         ]
-        day = max(1, -(-self.hours // 24))
+        day, faster = max(1, math.ceil(self.hours / 24)), max(1.0, self.hours / 24)
         return [
             head,
             *rows,
             f"in all: {self.hours:.3g} hours on this machine ({self.engine}, one worker; "
             f"{self.processor_hours:.3g} hours of processor time), {self.gigabytes:.3g} GB, "
             f"{self.peak_memory:.2g} GiB of memory per worker",
-            f"{machines} machines like this: {self.hours / machines:.3g} hours each, by --shard or --cluster",
-            f"within a day: {day:.0f} machines like this, or one that is {max(1.0, self.hours / 24):.2g} times as fast"
+            f"{_machines(machines)} like this: {self.hours / machines:.3g} hours{' each' if machines > 1 else ''}"
+            + (", by --shard or --cluster" if machines > 1 else ""),
+            f"within a day: {_machines(day)} like this, or one that is {faster:.2g} times as fast"
             + ("" if "cuda" in self.engine else "; run this command on a machine with a GPU to have that measured"),
         ]
+
+
+def _machines(count: int) -> str:
+    return f"{count} machine{'' if count == 1 else 's'}"
 
 
 def plan(recipe: Recipe, *, frames: int = 5, progress: stream.Progress | None = None) -> Plan:

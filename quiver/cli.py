@@ -80,10 +80,10 @@ def _run_restore(args: argparse.Namespace) -> int:
     target: Path = args.output if args.output.suffix else args.output.with_suffix(".npy")
     if target.suffix != ".npy":
         raise ValueError(f"{target}: restored video is written as .npy")
+    codes = _source(args)
     for path in (target, target.with_suffix(".json")):
         if path.exists() and not args.force:
             raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
-    codes = _source(args)
     method = restorer(args.method, running_options(args))
     target.parent.mkdir(parents=True, exist_ok=True)
     with bar(method.name) as progress:

@@ -105,8 +105,9 @@ def markdown(plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row]) -> st
         "",
         f"{_seen_by(plan)}, noise seed {plan.seed}; "
         + ("published protocol: every window exposed, scaled and scored on its own" if plan.published else "all frames")
-        + "; mean ± half-width of the 95 % interval over scenes (clips of one scene averaged first). PSNR in dB, peak ="
-        " white; matched = after the best factor per "
+        + "; mean ± half-width of the 95 % interval over scenes (clips of one scene averaged first"
+        + ("; there is only one, hence no interval" if len({row.scene for row in rows}) == 1 else "")
+        + "). PSNR in dB, peak = white; matched = after the best factor per "
         + ("window" if plan.published else "clip")
         + "; by frames = its mean "
         "over all frames of all clips alike.",
@@ -127,8 +128,7 @@ def markdown(plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row]) -> st
             cells += ["-" if line.peak_bytes is None else f"{line.peak_bytes / 1e6:.0f} MB"]
             cells += ["not measured" if line.truth_psnr is None else f"{line.truth_psnr:.1f}"]
         text.append("| " + " | ".join(cells) + " |")
-    text += ["| " + " | ".join([name, "", "", "not built yet", *[""] * 8]) + " |" for name in PAPER_METHODS]
-    text += ["", MEMORY, ""]
+    text += ["", MEMORY, "", f"The paper also compares with {', '.join(PAPER_METHODS)}: not built yet.", ""]
     failures = [f"- {line.method}, {line.light}, {reason}" for line in lines for reason in line.failures]
     text += ["## Failures", "", *failures, ""] if failures else []
     return "\n".join([*text, *_by_motion(lines), *_per_scene(rows)]) + "\n"
@@ -199,7 +199,7 @@ def figure(rows: Sequence[Row], path: Path) -> None:
     for i, method in enumerate(methods):
         own = {line.light: line.scores["psnr_matched"] for line in lines if line.method == method}
         places = [lights.index(light) + (i - (len(methods) - 1) / 2) * width for light in own]
-        error = [0.0 if math.isnan(x.half_width) else x.half_width for x in own.values()]
+        error = [x.half_width for x in own.values()]  # NaN, of one scene, draws none
         look = {"color": f"C{i % 10}", "hatch": ("", "///", "...")[i // 10 % 3], "edgecolor": "white"}
         axes.bar(places, [x.mean for x in own.values()], width, yerr=error, capsize=3, label=method, **look)
     axes.set_xticks(range(len(lights)), lights)

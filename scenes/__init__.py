@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 
+from qsim.checks import suggest
 from qsim.scene import Scene
 from scenes import (
     crowd,
@@ -71,10 +71,9 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
         return Scene.from_mitsuba(name)
     if Path(name).is_dir():
         return own.scene(seed, speed=speed, folder=name)
-    close = difflib.get_close_matches(str(name), FAMILIES, n=1)
-    meant = f"; did you mean {close[0]!r}?" if close else ""
     raise ValueError(
-        f"no scene family {str(name)!r}{meant}; there are {', '.join(FAMILIES)}, or give a .py or .xml file or a folder"
+        f"no scene family {str(name)!r}{suggest(str(name), FAMILIES)}; there are {', '.join(FAMILIES)}, "
+        "or give a .py or .xml file or a folder"
     )
 
 

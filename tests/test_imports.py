@@ -55,7 +55,7 @@ def test_arrows_point_one_way(path):
     if name.startswith("scenes/") and name not in {"scenes/contact_sheet.py"}:
         own = {n for n in imports(path) if n.startswith("qsim.")}
         parts = {".".join(n.split(".")[:2]) for n in own}
-        describing = ("scene", "motion", "rotation", "cloth", "shapes", "parts", "textures")
+        describing = ("scene", "motion", "rotation", "cloth", "shapes", "parts", "textures", "checks")
         assert parts <= {f"qsim.{module}" for module in describing}
 
 

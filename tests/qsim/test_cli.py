@@ -57,10 +57,10 @@ def test_every_help_has_an_example_and_json(capsys: pytest.CaptureFixture[str], 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("rendr fan", "qsim: unknown command 'rendr'; did you mean 'render'?"),
+        ("rendr fan", "qsim: unknown command 'rendr' (did you mean 'render'?)"),
         ("", "qsim: the following arguments are required: COMMAND"),
-        ("sense x --sensr y", "qsim sense: unknown option --sensr; did you mean '--sensor'?"),
-        ("sense x --bit 3", "qsim sense: unknown option --bit; did you mean '--bits'?"),
+        ("sense x --sensr y", "qsim sense: unknown option --sensr (did you mean '--sensor'?)"),
+        ("sense x --bit 3", "qsim sense: unknown option --bit (did you mean '--bits'?)"),
         ("sense x --bits three", "qsim sense: argument --bits: expected 1 to 16 bits per code, got 'three'"),
         ("sense x --ppp 3,-1", "qsim sense: argument --ppp: expected numbers above 0"),
         ("sense x --ppp bright", "qsim sense: argument --ppp: expected numbers such as 3.25"),

@@ -155,7 +155,7 @@ def test_dead_pixels_of_counters_stay_dead_when_followed(tmp_path):
 @pytest.mark.parametrize(
     ("sensor", "table", "message"),
     [
-        (BINARY, "prnuu = 0.1", "unknown key 'prnuu'; did you mean 'prnu'?"),
+        (BINARY, "prnuu = 0.1", "unknown key 'prnuu' (did you mean 'prnu'?)"),
         (BINARY, "prnu = -1", "Defects.prnu is a number"),
         (BINARY, "crosstalk = 1.0", "crosstalk is a probability below 1, got 1.0"),
         (BINARY, 'dark_map = "none.npy"', "none.npy: no such file"),

@@ -103,7 +103,7 @@ MEDIUM = """<shape type="sphere" id="fog"><bsdf type="null"/>
 @pytest.mark.parametrize(
     ("parts", "motions", "message"),
     [
-        ((SENSOR, LIGHT, SHAPES), {"bal": Still()}, r"room.xml: no shape has the id 'bal'; did you mean 'ball'\?"),
+        ((SENSOR, LIGHT, SHAPES), {"bal": Still()}, r"room.xml: no shape has the id 'bal' \(did you mean 'ball'\?\)"),
         ((SENSOR, LIGHT, SHAPES), {"xyz": Still()}, r"no shape has the id 'xyz'; there are 'ball', 'box', 'shape 2'"),
         ((SENSOR, SHAPES), {}, "no emitter, every pixel would be black"),
         ((LIGHT, SHAPES), {}, "no sensor; give a camera of your own"),

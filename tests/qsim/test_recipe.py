@@ -72,7 +72,7 @@ def test_a_digest_changes_with_everything_that_decides_the_files():
 AGAIN = "[[scenes]]\nfamily = "
 MISTAKES = [
     # (text in the good recipe, its replacement, line, what the message says)
-    ("frames = 3", "frame = 3", 3, r"unknown key 'frame' in \[recipe\]; did you mean 'frames'\?"),
+    ("frames = 3", "frame = 3", 3, r"unknown key 'frame' in \[recipe\] \(did you mean 'frames'\?\)"),
     ("frame_rate = 2000.0\n", "", 1, r"key 'frame_rate' is missing in \[recipe\]"),
     ("frame_rate = 2000.0", "frame_rate = 0.0005", 6, r"frames per second .* 0\.5 ms per frame is 2000\.0"),
     ("frame_rate = 2000.0", 'frame_rate = "2000 fps"', 6, r"frame_rate: expected a number, got '2000 fps'"),
@@ -83,7 +83,7 @@ MISTAKES = [
     ("width = 10", "width = 10\nshutter = 50", 6, r"open share of a frame, 0 to 1, got 50"),
     ("width = 10", "width = 10\npsnr = 0.01", 6, r"wanted error in dB"),
     ('name = "tiny"', 'name = "../tiny"', 2, r"letters, digits"),
-    ('"fan"', '"fann"', 9, r"unknown family 'fann'; did you mean 'fan'\?"),
+    ('"fan"', '"fann"', 9, r"unknown family 'fann' \(did you mean 'fan'\?\)"),
     ("seeds = [0, 2]", "seeds = [0, 0]", 10, r"seeds: 0 is listed twice"),
     ("seeds = [0, 2]", "seeds = []", 10, r"expected at least one value"),
     ("seeds = [0, 2]", "seeds = [-1]", 10, r"whole number from 0"),
@@ -95,7 +95,7 @@ MISTAKES = [
     ('sensor = "quiver-physical"', 'sensor = "quiver-phisical"', 21, r"quiver-physical"),
     ("bits = [1, 3]", "bits = [1, 17]", 22, r"1 to 16 bits per code, got 17"),
     ("ppp = [0.5, 3.25]", "ppp = [0.5, -3.25]", 23, r"expected a number above 0, got -3\.25"),
-    ("ppp = [0.5, 3.25]", "pp = [0.5, 3.25]", 23, r"unknown key 'pp' in \[\[streams\]\]; did you mean 'ppp'\?"),
+    ("ppp = [0.5, 3.25]", "pp = [0.5, 3.25]", 23, r"unknown key 'pp' in \[\[streams\]\] \(did you mean 'ppp'\?\)"),
     ("ppp = [0.5, 3.25]", "ppp = 1.0\nlux = 1.0", 20, r"give one light level, .* ppp and lux given"),
     ("ppp = [0.5, 3.25]", "absolute = false", 23, r"absolute can only be true"),
     ("ppp = [0.5, 3.25]", 'ppp = [1, 2]\nname = "x"', 24, r"one name for 4 streams"),
@@ -112,7 +112,7 @@ MISTAKES = [
     ("ppp = [0.5, 3.25]", f"ppp = 3.25\n{STREAMS}", 25, r"two \[\[streams"),
     ("frames = 4", "frames = 4\nframes = 5", 19, r"not valid TOML"),
     ("bits = [1, 3]\nppp = [0.5, 3.25]\n", "bits = 3\nbits = 3", 23, r"not valid TOML"),
-    ("[[streams]]", "[[stream]]", 20, r"unknown key 'stream' in the recipe; did you mean 'streams'\?"),
+    ("[[streams]]", "[[stream]]", 20, r"unknown key 'stream' in the recipe \(did you mean 'streams'\?\)"),
     ("[[streams]]", "[[streams]", 20, r"not valid TOML"),
 ]  # fmt: skip
 

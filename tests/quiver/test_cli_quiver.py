@@ -130,7 +130,7 @@ def test_missing_things_are_named(capsys, tmp_path, tiny_dataset, clip):
     assert f"{gone}: no such file" in mistake(capsys, "restore", gone, "-o", tmp_path / "v.npy", "--method", "moment")
     assert f"{gone}: no such data set" in mistake(capsys, "evaluate", gone, "-o", tmp_path / "t")
     assert f"{gone}: no such data set" in mistake(capsys, "train", gone, "-o", tmp_path / "r", "--steps", 1)
-    assert "no method 'momnt'; did you mean 'moment'?" in mistake(
+    assert "no method 'momnt' (did you mean 'moment'?)" in mistake(
         capsys, "evaluate", tiny_dataset, "-o", gone, "--methods", "momnt"
     )
     assert "no such file" in mistake(capsys, "evaluate", "--static", gone)

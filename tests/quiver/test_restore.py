@@ -221,7 +221,7 @@ def test_weights_are_found_by_file_folder_and_name(tmp_path):
     assert "UNet, weights " in found.description
     with pytest.raises(FileNotFoundError, match="no such weights file"):
         restorer(str(tmp_path / "none.safetensors"))
-    with pytest.raises(ValueError, match=r"no method 'momnt'; did you mean 'moment'\?; known are naive, "):
+    with pytest.raises(ValueError, match=r"no method 'momnt' \(did you mean 'moment'\?\); known are naive, "):
         restorer("momnt")
     (tmp_path / "young").mkdir()
     (tmp_path / "young/settings.json").write_text("{}")
