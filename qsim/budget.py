@@ -108,9 +108,9 @@ def choose(
     samples, about_samples = _samples(halves, instants, noise)
     fewer, about_denoiser = None, Finding("denoiser", "off", "not asked for")
     if denoise is not False:
-        fewer, about_denoiser = denoised_samples(pilot, bounces, noise, samples / instants, denoise)
+        fewer, about_denoiser = denoised_samples(pilot, shutter, instants, bounces, noise, samples, denoise)
     if fewer is not None:
-        samples = fewer * instants
+        samples = fewer
         about_samples = Finding("samples", f"{samples} per pixel, denoised", f"without: {about_samples.chosen}")
     findings = (limit, about_samples, about_denoiser, about_bounces, about_blur, *_left_out(scene.camera, truths))
     sharp = travel >= SHARP_FROM or instants > 1

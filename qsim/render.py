@@ -125,8 +125,7 @@ class Renderer:
     def instants(self, t: int) -> list[float]:
         """The times [s] whose mean is the exposure of frame t."""
         count = self.budget.sub_frames if self.shutter > 0 else 1
-        offsets = (np.arange(count) + 0.5) / count - 0.5
-        return [self.time(t) + float(offset) * self.shutter / self.frame_rate for offset in offsets]
+        return instants(self.time(t), self.shutter / self.frame_rate, count)
 
     def halves(self, instants: list[float], budget: Budget, key: Key) -> Array:
         """Two independent estimates A, B of the mean radiance over the instants [s], float64 [2, H, W]."""
@@ -382,6 +381,11 @@ class Renderer:
         for index, shape in zip(indices, shapes, strict=True):
             table[index] = numbers.get(shape.id(), -1)
         return table
+
+
+def instants(middle: float, exposure: float, count: int) -> list[float]:
+    """The middles of `count` equal parts of an exposure [s]."""
+    return [middle + float(part) * exposure for part in (np.arange(count) + 0.5) / count - 0.5]
 
 
 def render_clip(
