@@ -29,8 +29,9 @@ DEPTHS = (2, 4, 6, 9, 12, 16, 24)  # bounces tried, against (each depth is a ker
 DEEPEST = 32
 COUNTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
 MOST_SAMPLES = 16384
-MOST_TRIED = 9  # instants up to which three times as many are tried against them
-SHARP_FROM = 0.05  # px of motion in the exposure from which a sharp instant is stored too
+PEAK_INSTANTS = 25  # whose mean tells how bright the exposure of a frame is
+MOST_INSTANTS = 3 + 6 * 85
+MOST_TRIED = 15  # instants up to which more are tried against them
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,10 @@ class Budget:
 
     samples: int = 32  # per pixel and frame, all instants and both halves together
     bounces: int = 6  # scatterings along a path
-    sub_frames: int = 9  # instants per exposure when the shutter is open
+    sub_frames: int = 9  # instants per exposure when the shutter is open; their error is measured if 3, 6, 9 ...
     sharp: bool = True  # also render the instant at mid-exposure when the shutter is open
     denoise: bool = False  # Open Image Denoise; its error is measured against raw halves
+    left_out: float = 0.0  # W m^-2 sr^-1, rms of later bounces by the pilot; part of the error that a frame states
     findings: tuple[Finding, ...] = field(default=())
 
     def __post_init__(self) -> None:
@@ -83,38 +85,38 @@ def choose(
     """
     if not 10 <= psnr <= 80:
         raise ValueError(f"psnr: 10 to 80 dB can be asked for, got {psnr!r}")
-    from qsim.pilot import Pilot, denoised_samples  # which renders budgets
+    from qsim.pilot import Pilot, denoised_samples, rests  # which renders budgets
 
-    pilot = Pilot.of(scene, frame_rate, frames, seed)
+    pilot = Pilot.of(scene, frame_rate, shutter, frames, seed)
     full = pilot.mean(COUNTS[1], DEEPEST)
     if not full.mean() > 0:
         raise ValueError(
             f"scene {scene.name}: the pilot saw no light in frames {list(pilot.times)}; is a lamp behind a wall?"
         )
-    # Noise lifts the percentile of few samples: the peak that counts is that of the pilot with the most.
-    rough, _ = _allowed(full, psnr, ppp, quantum_efficiency)
+    # Noise lifts the percentile of few samples: the peak that counts is that of the pilot with the most. Blur lowers it
+    # where what is bright is small: with an open shutter it is that of the blurred pilot.
+    blurs = shutter > 0 and not rests(scene)
+    exposed = np.stack([pilot.blurred(t, PEAK_INSTANTS, DEEPEST).mean(axis=0) for t in pilot.times]) if blurs else full
+    rough, _ = _allowed(exposed, psnr, ppp, quantum_efficiency)
     bounces, dimmed, about_bounces = _bounces(lambda depth: pilot.mean(COUNTS[1], depth), full, SHARE * rough)
     halves = [pilot.halves(count, bounces) for count in COUNTS]
     bright = halves[-1].mean(axis=0)
-    allowed, limit = _allowed(bright, psnr, ppp, quantum_efficiency)
-    dimmed = min(dimmed, SHARE * allowed)
-    truths = pilot.truths()
+    allowed, limit = _allowed(exposed if blurs else bright, psnr, ppp, quantum_efficiency)
     contrast = float(np.percentile(bright, 99.9) - np.percentile(bright, 0.1))
-    sub_frames, travel, blurred, about_blur = _sub_frames(
-        truths, shutter, SHARE * allowed, contrast, lambda k: pilot.changes(shutter, k, bounces)
-    )
-    instants = sub_frames if shutter > 0 else 1
-    noise = math.sqrt(allowed**2 - dimmed**2 - min(blurred, SHARE * allowed) ** 2)
+    instants, blurred, about_blur, share = 1, 0.0, _motion(pilot.travel, shutter), SHARE * allowed
+    if blurs:
+        instants, blurred, about_blur = _instants(pilot.travel, share, contrast, lambda k: pilot.changes(k, bounces))
+    noise = math.sqrt(allowed**2 - min(dimmed, share) ** 2 - min(blurred, share) ** 2)
     samples, about_samples = _samples(halves, instants, noise)
     fewer, about_denoiser = None, Finding("denoiser", "off", "not asked for")
     if denoise is not False:
-        fewer, about_denoiser = denoised_samples(pilot, shutter, instants, bounces, noise, samples, denoise)
+        fewer, about_denoiser = denoised_samples(pilot, instants, bounces, noise, samples, denoise)
     if fewer is not None:
         samples = fewer
         about_samples = Finding("samples", f"{samples} per pixel, denoised", f"without: {about_samples.chosen}")
-    findings = (limit, about_samples, about_denoiser, about_bounces, about_blur, *_left_out(scene.camera, truths))
-    sharp = travel >= SHARP_FROM or instants > 1
-    return Budget(samples, bounces, sub_frames, sharp, fewer is not None, findings)
+    lens = _left_out(scene.camera, pilot.truths())
+    findings = (limit, about_samples, about_denoiser, about_bounces, about_blur, *lens)
+    return Budget(samples, bounces, instants, instants > 1, fewer is not None, dimmed, findings)
 
 
 def explain(budget: Budget) -> str:
@@ -184,35 +186,52 @@ def _bounces(cut_at: Callable[[int], Array], full: Array, tolerance: float) -> t
     return bounces, left_out, Finding("bounces", f"{bounces}", size)
 
 
-def _sub_frames(
-    truths: list[dict[str, Array]], shutter: float, tolerance: float, contrast: float, changes: Callable[[int], float]
-) -> tuple[int, float, float, Finding]:
-    """Instants, largest travel in the exposure [px], rms error of the blur [W m^-2 sr^-1] and the finding.
+def _motion(travel: Array, shutter: float) -> Finding:
+    """What the pilot sees move [frames, H, W], px in the exposure, in words; nothing is blurred."""
+    fastest = float(np.percentile(travel, 99.9, axis=(1, 2)).max()) / (shutter or 1.0)
+    size = f"motion up to {fastest:.2f} px/frame in 99.9 % of the pilot's pixels, "
+    return Finding("motion blur", "none, one instant", size + ("nothing moves" if shutter else "shutter 0"))
 
-    First from the motion of what is seen; then, since shadows, lamps and reflections move on surfaces at rest, more
-    until `changes(K)`, the measured rms difference between the means of K and of 3 K instants, is below the tolerance.
+
+def _instants(
+    travel: Array, tolerance: float, contrast: float, changes: Callable[[int], float]
+) -> tuple[int, float, Finding]:
+    """Instants (3, 9, 15 ...), rms error of the blur that they leave [W m^-2 sr^-1] and the finding.
+
+    First from the travel of what is seen, px [frames, H, W], in the frame where most of it moves farthest; then, since
+    shadows, lamps and reflections move on surfaces at rest, more until `changes(K)`, the measured rms difference
+    between the means of K and of more instants, is below the tolerance.
     """
-    speeds = np.concatenate([np.hypot(*truth["flow"]).ravel() for truth in truths])
-    fastest = float(np.percentile(speeds, 99.9))
-    travel, moving = fastest * shutter, float(np.mean(speeds > 0.1))
-    motion = f"motion up to {fastest:.2f} px/frame"
-    if shutter == 0:
-        return 1, 0.0, 0.0, Finding("motion blur", "none, one instant", f"{motion}, shutter 0")
+    fastest = float(np.percentile(travel, 99.9, axis=(1, 2)).max())
+    moving = float((travel > 0.1).mean(axis=(1, 2)).max())
     edge = tolerance / max(contrast * math.sqrt(moving), 1e-300)
-    count = 1
-    while blur_error(travel, count) > edge and count < 4096:
-        count += 2  # odd: one instant lies at mid-exposure
-    by_motion, found = count, math.nan
-    while count <= MOST_TRIED and (found := changes(count)) > tolerance:
-        count = 2 * count + 1
-    if count == 1:
-        size = f"{motion}; more would change rms {found:.2g}"
-        return 1, travel, found, Finding("motion blur", "none, one instant", size)
-    size = f"{motion}, {travel:.2f} px in the exposure; an edge errs by {100 * blur_error(travel, count):.2g} %"
+    count = 3
+    while blur_error(fastest, count) > edge and count < MOST_INSTANTS:
+        count += 6  # 3, 9, 15 ...: one instant lies at mid-exposure, and every third shows what more would change
+    by_motion, tried = count, {}
+    while count <= MOST_TRIED:
+        tried[count] = changes(count)
+        if tried[count] <= tolerance:
+            break
+        count += 6
+    found, power = tried.get(count, 0.0), 1.0
+    if tried and count not in tried:  # beyond the last trial the difference falls as it did before, or as ghosts do
+        few, most = min(tried), max(tried)
+        if few < most:
+            power = min(max(math.log(tried[few] / tried[most]) / math.log(most / few), 0.5), 2.0)
+        wanted = min(most * (tried[most] / tolerance) ** (1 / power), MOST_INSTANTS)
+        count = max(count, 3 + 6 * math.ceil((wanted - 3) / 6))
+        found = tried[most] * (most / count) ** power
+    blurred = max(blur_error(fastest, count) * math.sqrt(moving) * contrast, found)
+    size = f"motion up to {fastest:.2f} px in the exposure in 99.9 % of the pilot's pixels"
+    size += f"; an edge so fast errs by {100 * blur_error(fastest, count):.2g} %"
     if count > by_motion:
         size += f"; {by_motion} for what is seen moving, the rest for light and shadow that move on it"
-    blurred = blur_error(travel, count) * math.sqrt(moving) * contrast
-    return count, travel, blurred, Finding("motion blur", f"mean of {count} instants", size)
+    if tried:
+        size += f"; more than {max(tried)} would change rms {tried[max(tried)]:.2g}"
+    if count >= MOST_INSTANTS:
+        size += f", the limit of {MOST_INSTANTS} instants is reached"
+    return count, blurred, Finding("motion blur", f"mean of {count} instants", size)
 
 
 def _samples(pilots: list[Array], instants: int, target: float) -> tuple[int, Finding]:
@@ -221,6 +240,9 @@ def _samples(pilots: list[Array], instants: int, target: float) -> tuple[int, Fi
     `pilots` are halves [2, times, H, W] with COUNTS samples.
     """
     errors = [float(np.sqrt(np.mean((halves[0] - halves[1]) ** 2))) / 2 for halves in pilots]
+    # Paths that are rare and bright are missed by small pilots: fewer samples err at least as 1 / sqrt(n) makes it.
+    for i in (1, 0):
+        errors[i] = max(errors[i], errors[i + 1] * math.sqrt(COUNTS[i + 1] / COUNTS[i]))
     peak = float(np.percentile(pilots[-1].mean(axis=0), 99.9))
     if min(errors) <= 0:
         return COUNTS[0] * instants, Finding("samples", f"{COUNTS[0] * instants} per pixel", "the pilot found no noise")

@@ -1,6 +1,8 @@
-"""What a pilot of a scene measures, for budget.py to decide on: every n-th pixel, in its true size, at a few times.
+"""What a pilot of a scene measures, for budget.py to decide on: every n-th pixel, in its true size.
 
-Noise is told from what noise is not by two independent halves. Equal frames draw equal paths, whatever the depth.
+Motion and bodies are looked at in every frame, by rays alone. Light is rendered in a few frames: the first, the middle
+and the last; those that show what these do not; with an open shutter, those in which things move fastest. Noise is told
+from what noise is not by two independent halves. Equal frames draw equal paths, whatever the depth.
 """
 
 from __future__ import annotations
@@ -13,10 +15,12 @@ from numpy import ndarray as Array
 
 from qsim.budget import COUNTS, Budget, Finding, grid_samples
 from qsim.denoise import AROUND, DENOISE_COST, available, cleaned_mean
+from qsim.motion import Still
 from qsim.render import Renderer, instants
-from qsim.scene import Camera, Scene
+from qsim.scene import Camera, Motion, Scene
 
 PIXELS = 3000
+MOST_MORE = 3  # frames beyond the first, the middle and the last for what these do not show, and for what moves
 WINDOW = 96  # px, side of the windows in which the denoiser is tried, one in the middle of each quarter of the frame
 STAGE = 18  # of the random keys
 MOST_DENOISED = 256  # samples per instant up to which the error of denoised pictures is foretold
@@ -24,17 +28,31 @@ MOST_DENOISED = 256  # samples per instant up to which the error of denoised pic
 
 @dataclass(frozen=True)
 class Pilot:
-    """A loaded scene seen in some of its pixels, and the frames at which it is looked at."""
+    """A loaded scene seen in some of its pixels, what moves there, and the frames in which light is looked at."""
 
     renderer: Renderer
-    times: tuple[int, ...]
+    shutter: float
+    travel: Array  # [frames, H, W], px in the exposure, in a whole frame time if the shutter is 0
+    middle: int  # frame
+    times: tuple[int, ...]  # frames
 
     @classmethod
-    def of(cls, scene: Scene, frame_rate: float, frames: int, seed: int) -> Pilot:
-        """About PIXELS pixels of the first, the middle and the last frame."""
+    def of(cls, scene: Scene, frame_rate: float, shutter: float, frames: int, seed: int) -> Pilot:
+        """About PIXELS pixels of a scene."""
         thinned = max(1, math.isqrt(scene.camera.height * scene.camera.width // PIXELS))
         renderer = Renderer(scene, frame_rate=frame_rate, seed=seed, budget=Budget(), thinned=thinned)
-        return cls(renderer, tuple(sorted({0, frames // 2, frames - 1})))
+        seen = [renderer.travel(t, (shutter or 1.0) / frame_rate) for t in range(frames)]
+        travel, bodies = (np.stack(each) for each in zip(*seen, strict=True))
+        times = {0, frames // 2, frames - 1}
+        for _ in range(MOST_MORE):
+            hidden = ~np.isin(bodies, np.unique(bodies[list(times)]))
+            if not hidden.any():
+                break
+            times.add(int(np.argmax(hidden.sum(axis=(1, 2)))))
+        if shutter > 0:
+            times.add(int(np.argmax(np.percentile(travel, 99.9, axis=(1, 2)))))
+            times |= _fastest(scene, [renderer.time(t) for t in range(frames)], times)
+        return cls(renderer, shutter, travel, frames // 2, tuple(sorted(times)))
 
     def halves(self, samples: int, bounces: int) -> Array:
         """Two independent estimates of the sharp radiance, float64 [2, times, H, W], W m^-2 sr^-1."""
@@ -48,36 +66,65 @@ class Pilot:
         """Flow, depth and the rest at each time."""
         return [self.renderer.truth(t) for t in self.times]
 
-    def changes(self, shutter: float, count: int, bounces: int) -> float:
-        """The rms difference between the means of K and of 3 K instants of the exposures [W m^-2 sr^-1].
+    def changes(self, count: int, bounces: int) -> float:
+        """The rms difference between the means of K and of 3 K or 5 K instants, the larger [W m^-2 sr^-1].
 
-        The K are among the 3 K, and all instants draw the same paths, so that what rests adds nothing. The square is
-        the product of the differences of two independent halves, which noise changes by nothing on average.
+        Two, because what returns after a third of a step looks like rest among 3 K. The K are among both, and all
+        instants draw the same paths, so that what rests adds nothing. The square is the product of the differences of
+        two independent halves, which noise changes by nothing on average.
         """
-        square, budget = 0.0, Budget(COUNTS[1], bounces)
+        squares = np.zeros(2)
         for t in self.times:
-            drawn = np.stack([self._drawn(t, instant, budget) for instant in self.exposed(t, shutter, 3 * count)])
-            a, b = drawn[1::3].mean(axis=0) - drawn.mean(axis=0)
-            square += float(np.mean(a * b)) / len(self.times)
-        return math.sqrt(max(square, 0.0))
+            few, *more = (self.blurred(t, count * times, bounces) for times in (1, 3, 5))
+            squares += [float(np.mean(np.prod(few - many, axis=0))) / len(self.times) for many in more]
+        return math.sqrt(max(*squares, 0.0))
 
-    def exposed(self, t: int, shutter: float, count: int) -> list[float]:
+    def blurred(self, t: int, count: int, bounces: int) -> Array:
+        """Two independent estimates of frame t's mean over so many instants, [2, H, W], with the same paths in each."""
+        budget = Budget(COUNTS[0], bounces)
+        return np.mean([self._drawn(t, instant, budget) for instant in self.exposed(t, count)], axis=0)
+
+    def exposed(self, t: int, count: int) -> list[float]:
         """So many instants of the exposure of frame t [s]."""
-        return instants(self.renderer.time(t), shutter / self.renderer.frame_rate, count)
+        return instants(self.renderer.time(t), self.shutter / self.renderer.frame_rate, count)
 
     def _drawn(self, t: int, instant: float, budget: Budget) -> Array:
         return self.renderer.halves([instant], budget, self.renderer.key(t, STAGE))
 
 
+def rests(scene: Scene) -> bool:
+    """Whether nothing in a scene moves, seen or not."""
+    return not _moving(scene) and not any(body.deforms for body in scene.bodies)
+
+
+def _moving(scene: Scene) -> list[Motion]:
+    things = (scene.camera, *scene.bodies, *scene.lights, *scene.parts)
+    motions = (getattr(thing, "motion", None) for thing in things)
+    return [motion for motion in motions if motion is not None and not isinstance(motion, Still)]
+
+
+def _fastest(scene: Scene, moments: list[float], known: set[int]) -> set[int]:
+    """Frames, at most MOST_MORE, in which things go that are slow in the known ones: below half of their fastest."""
+    speeds = np.array([[sum(map(np.linalg.norm, m.velocity(t))) for t in moments] for m in _moving(scene)])
+    found: set[int] = set()
+    while len(speeds) and len(found) < MOST_MORE:
+        slow = speeds[:, sorted(known | found)].max(axis=1) < 0.5 * speeds.max(axis=1)
+        if not slow.any():
+            break
+        speeds = speeds[slow]
+        found.add(int(np.argmax((speeds / speeds.max(axis=1, keepdims=True)).sum(axis=0))))
+    return found
+
+
 def denoised_samples(
-    pilot: Pilot, shutter: float, count: int, bounces: int, target: float, raw: int, wanted: bool | None
+    pilot: Pilot, count: int, bounces: int, target: float, raw: int, wanted: bool | None
 ) -> tuple[int | None, Finding]:
     """Samples of a frame with which denoised windows have the error asked for, or None where `raw` ones cost less.
 
     Windows of the clip's middle frame, every pixel of them, with `count` instants. `wanted` None means: where it costs
     less.
     """
-    renderer, t = pilot.renderer, pilot.times[len(pilot.times) // 2]
+    renderer, t = pilot.renderer, pilot.middle
     camera = renderer.scene.camera
     if renderer.engine.backend == "scalar" or not available():
         return None, Finding("denoiser", "off", "not installed" if not available() else "needs LLVM or CUDA")
@@ -88,7 +135,7 @@ def denoised_samples(
     if not tried:
         return None, cheap
     windows = [renderer.window(crop) for crop in _windows(camera)]
-    times, key = pilot.exposed(t, shutter, count), renderer.key(t, STAGE)
+    times, key = pilot.exposed(t, count), renderer.key(t, STAGE)
     surfaces = [window.surfaces(times, key) for window in windows]
     errors: list[float] = []
     for samples in tried:
@@ -131,4 +178,4 @@ def _needed(tried: list[int], errors: list[float], target: float) -> float:
         return math.inf
     before, last = tried[len(errors) - 2 : len(errors)]
     share = math.log(errors[-2] / target) / math.log(errors[-2] / errors[-1])
-    return before * math.exp(min(share * math.log(last / before), 100.0))  # a bias that samples do not help: no overflow
+    return before * math.exp(min(share * math.log(last / before), 100.0))  # where samples hardly help, no overflow
