@@ -59,8 +59,8 @@ RENDERING = """## Rendering
 Radiance is compared with a converged reference of the same scene. fan, tumble, gears, flag, crowd, drums and text were
 looked at while the budget was written and are left out. No constant was chosen on the others, nor on their
 seed, but one: the deepest bounce that is tried, after glass lacked light, which makes ours slower there.
-**asked** is the wanted PSNR; **reached** what a frame has against the reference; **stated** what its own measured error
-says. **obvious** is the loop that one would write
+**asked** is the wanted PSNR; **reached** what a frame has against the reference; **stated** what its own error
+says: measured noise, and the bounces left out by the pilot. **obvious** is the loop that one would write
 first, with as many samples (a power of two) as it needs for the same PSNR.
 """
 

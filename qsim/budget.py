@@ -2,9 +2,9 @@
 
     choose(scene, ..., psnr=40, ppp=26) -> Budget;  explain(budget) -> what is modelled, left out, and how large it is
 
-A pilot renders every n-th pixel in its true size at three times of the clip. The allowed rms error E is the stricter of
+A pilot (pilot.py) looks at every n-th pixel in its true size. The allowed rms error E is the stricter of
 
-    target:  peak * 10^(-psnr / 20), peak = 99.9th percentile of the radiance
+    target:  peak * 10^(-psnr / 20), peak = 99.9th percentile of the radiance, blurred as it will be
     sensor:  Monte-Carlo variance in electrons^2 at most 1 % of the shot variance: mean * sqrt(0.01 / (QE * PPP))
 
 and is shared: bounces and blur may each take 30 % of it (rms), the samples get all that those leave.
@@ -107,10 +107,13 @@ def choose(
     if blurs:
         instants, blurred, about_blur = _instants(pilot.travel, share, contrast, lambda k: pilot.changes(k, bounces))
     noise = math.sqrt(allowed**2 - min(dimmed, share) ** 2 - min(blurred, share) ** 2)
-    samples, about_samples = _samples(halves, instants, noise)
+    errors = _errors(halves)
+    samples, about_samples = _samples(errors, instants, noise, float(np.percentile(bright, 99.9)))
     fewer, about_denoiser = None, Finding("denoiser", "off", "not asked for")
     if denoise is not False:
-        fewer, about_denoiser = denoised_samples(pilot, instants, bounces, noise, samples, denoise)
+        fewer, about_denoiser = denoised_samples(
+            pilot, instants, bounces, noise, samples, denoise, lambda n: _error(errors, n / instants) / instants**0.5
+        )
     if fewer is not None:
         samples = fewer
         about_samples = Finding("samples", f"{samples} per pixel, denoised", f"without: {about_samples.chosen}")
@@ -123,6 +126,14 @@ def explain(budget: Budget) -> str:
     """What was modelled, what was left out, and how large it would have been; one line each."""
     width = max((len(finding.effect) for finding in budget.findings), default=0)
     return "\n".join(f"{f.effect:{width}}  {f.chosen}; {f.size}" for f in budget.findings)
+
+
+def shortfall(reached: float | None, asked: float) -> str:
+    """What to say of a clip whose measured PSNR misses the one asked for by more than chance, 0.5 dB; else nothing."""
+    if reached is None or reached >= asked - 0.5:
+        return ""
+    why = "the pilot foresaw less error; a higher psnr takes more samples"
+    return f"{reached:.1f} dB where {asked:g} were asked for: {why}"
 
 
 def grid_samples(samples: int) -> int:
@@ -234,19 +245,22 @@ def _instants(
     return count, blurred, Finding("motion blur", f"mean of {count} instants", size)
 
 
-def _samples(pilots: list[Array], instants: int, target: float) -> tuple[int, Finding]:
-    """Samples per pixel and frame; the error between the pilots' counts is taken as a power of the samples.
+def _errors(pilots: list[Array]) -> list[float]:
+    """The rms errors of pilots, given as halves [2, times, H, W] with COUNTS samples.
 
-    `pilots` are halves [2, times, H, W] with COUNTS samples.
+    Paths that are rare and bright are missed by small pilots: fewer samples err at least as 1 / sqrt(n) makes it.
     """
     errors = [float(np.sqrt(np.mean((halves[0] - halves[1]) ** 2))) / 2 for halves in pilots]
-    # Paths that are rare and bright are missed by small pilots: fewer samples err at least as 1 / sqrt(n) makes it.
     for i in (1, 0):
         errors[i] = max(errors[i], errors[i + 1] * math.sqrt(COUNTS[i + 1] / COUNTS[i]))
-    peak = float(np.percentile(pilots[-1].mean(axis=0), 99.9))
-    if min(errors) <= 0:
-        return COUNTS[0] * instants, Finding("samples", f"{COUNTS[0] * instants} per pixel", "the pilot found no noise")
+    return errors
+
+
+def _samples(errors: list[float], instants: int, target: float, peak: float) -> tuple[int, Finding]:
+    """Samples per pixel and frame; the error between the pilots' counts is taken as a power of the samples."""
     each = 2 * grid_samples(COUNTS[0] // 2)
+    if min(errors) <= 0:
+        return each * instants, Finding("samples", f"{each * instants} per pixel", "the pilot found no noise")
     while _error(errors, each) > target * math.sqrt(instants) and each * instants < MOST_SAMPLES:
         each = 2 * grid_samples(each // 2 + 1)
     expected = _error(errors, each) / math.sqrt(instants)
@@ -256,8 +270,10 @@ def _samples(pilots: list[Array], instants: int, target: float) -> tuple[int, Fi
     return each * instants, Finding("samples", f"{each * instants} per pixel", size)
 
 
-def _error(errors: list[float], samples: int) -> float:
+def _error(errors: list[float], samples: float) -> float:
     """Error at a number of samples: a power law through the two nearest pilots, beyond them 0.5 to 0.75."""
+    if min(errors) <= 0:
+        return 0.0
     i = 0 if samples <= COUNTS[1] else 1
     power = math.log(errors[i] / errors[i + 1]) / math.log(COUNTS[i + 1] / COUNTS[i])
     if samples > COUNTS[-1]:

@@ -163,6 +163,7 @@ def _run_render(args: argparse.Namespace) -> int:
     text = f"{clip.path}: {len(clip)} frames of {args.height} x {args.width}"
     text += f", mean radiance {clip.mean_radiance:.4g} W/m2/sr"
     text += f", {clip.mean_photons:.4g} photons per pixel" + (f", error {psnr:.1f} dB" if psnr else "")
+    text += (missed := budget.shortfall(psnr, args.psnr)) and f"\nerror: {missed}"
     if "fireflies_per_frame" in clip.meta:
         fireflies, pixels = sum(clip.meta["fireflies_per_frame"]), math.prod(clip.shape)
         how = "counted before denoising" if chosen.denoise else "counted and left in"

@@ -7,8 +7,9 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from qsim import checks
+from qsim import checks, files
 from qsim.console import GOES_ON, bar, checked, command, output
+from qsim.recipe import Job
 
 # generate
 
@@ -53,10 +54,21 @@ def _run_generate(args: argparse.Namespace) -> int:
     lines += [f"repaired {problem}" for problem in summary.repaired]
     lines += [f"FAILED {name}: {why}" for name, why in sorted(summary.failed.items())]
     lines += [f"SHARED {problem}" for problem in summary.shared]
+    lines += [f"NOISY {line}" for line in _noisy(folder, chosen)]
     if summary.failed:
         lines.append("run again with --retry after mending the cause")
     output(args, {"dataset": str(folder)} | dataclasses.asdict(summary), lines)
     return 0 if summary.done == summary.jobs and not summary.shared else 1
+
+
+def _noisy(folder: Path, jobs: list[Job]) -> list[str]:
+    """The finished clips whose radiance misses the error that the recipe asks for."""
+    from qsim.budget import shortfall
+
+    described = {job.name: folder / "clips" / job.name / "clip.json" for job in jobs}
+    found = {name: files.read_json(path).get("psnr_of_truth") for name, path in described.items() if path.is_file()}
+    missed = {job.name: shortfall(found.get(job.name), job.settings.psnr) for job in jobs}
+    return [f"{name}: {why}" for name, why in missed.items() if why]
 
 
 def _cluster(args: argparse.Namespace) -> Any:

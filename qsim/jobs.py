@@ -71,6 +71,7 @@ def render_job(job: Job, path: Path) -> object:
         seed=render_seed(job),
         budget=choose_budget(job, scene),
         extra=provenance(job) | {"assets": sorted(assets(scene.to_dict()) + photographs(scene))},
+        force=True,  # what an earlier version of the program began is nobody's
     )
 
 

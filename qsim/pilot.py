@@ -1,13 +1,15 @@
 """What a pilot of a scene measures, for budget.py to decide on: every n-th pixel, in its true size.
 
-Motion and bodies are looked at in every frame, by rays alone. Light is rendered in a few frames: the first, the middle
-and the last; those that show what these do not; with an open shutter, those in which things move fastest. Noise is told
-from what noise is not by two independent halves. Equal frames draw equal paths, whatever the depth.
+Motion and bodies are looked at in every frame (of more than MOST_LOOKS, in so many), by rays alone. Light is rendered
+in a few frames: the first, the middle and the last; those that show what these do not; with an open shutter, those in
+which things move fastest. Noise is told from what is not by two independent halves. Equal frames draw equal paths,
+whatever the depth.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +24,9 @@ from qsim.scene import Camera, Motion, Scene
 PIXELS = 3000
 MOST_MORE = 3  # frames beyond the first, the middle and the last for what these do not show, and for what moves
 WINDOW = 96  # px, side of the windows in which the denoiser is tried, one in the middle of each quarter of the frame
+MOST_LOOKS = 256  # frames of a clip in which motion and bodies are looked at
 STAGE = 18  # of the random keys
+LUCK = 3.0  # times less raw noise than the pilot's: chance
 MOST_DENOISED = 256  # samples per instant up to which the error of denoised pictures is foretold
 
 
@@ -31,28 +35,30 @@ class Pilot:
     """A loaded scene seen in some of its pixels, what moves there, and the frames in which light is looked at."""
 
     renderer: Renderer
-    shutter: float
-    travel: Array  # [frames, H, W], px in the exposure, in a whole frame time if the shutter is 0
+    travel: Array  # [frames looked at, H, W], px in the exposure, in a whole frame time if the shutter is 0
     middle: int  # frame
-    times: tuple[int, ...]  # frames
+    times: tuple[int, ...]  # frames in which light is looked at
 
     @classmethod
     def of(cls, scene: Scene, frame_rate: float, shutter: float, frames: int, seed: int) -> Pilot:
         """About PIXELS pixels of a scene."""
         thinned = max(1, math.isqrt(scene.camera.height * scene.camera.width // PIXELS))
-        renderer = Renderer(scene, frame_rate=frame_rate, seed=seed, budget=Budget(), thinned=thinned)
-        seen = [renderer.travel(t, (shutter or 1.0) / frame_rate) for t in range(frames)]
-        travel, bodies = (np.stack(each) for each in zip(*seen, strict=True))
+        renderer = Renderer(scene, frame_rate=frame_rate, shutter=shutter, seed=seed, budget=Budget(), thinned=thinned)
+        looks = np.unique(np.linspace(0, frames - 1, min(frames, MOST_LOOKS)).round().astype(int)).tolist()
+        travel, bodies = (np.stack(each) for each in zip(*map(renderer.travel, looks), strict=True))
         times = {0, frames // 2, frames - 1}
+        known = set(np.unique([renderer.travel(t)[1] for t in times]).tolist())
         for _ in range(MOST_MORE):
-            hidden = ~np.isin(bodies, np.unique(bodies[list(times)]))
+            hidden = ~np.isin(bodies, list(known))
             if not hidden.any():
                 break
-            times.add(int(np.argmax(hidden.sum(axis=(1, 2)))))
+            most = int(np.argmax(hidden.sum(axis=(1, 2))))
+            known |= set(np.unique(bodies[most]).tolist())
+            times.add(looks[most])
         if shutter > 0:
-            times.add(int(np.argmax(np.percentile(travel, 99.9, axis=(1, 2)))))
-            times |= _fastest(scene, [renderer.time(t) for t in range(frames)], times)
-        return cls(renderer, shutter, travel, frames // 2, tuple(sorted(times)))
+            times.add(looks[int(np.argmax(np.percentile(travel, 99.9, axis=(1, 2))))])
+            times |= _fastest(scene, {t: renderer.time(t) for t in {*looks, *times}}, times)
+        return cls(renderer, travel, frames // 2, tuple(sorted(times)))
 
     def halves(self, samples: int, bounces: int) -> Array:
         """Two independent estimates of the sharp radiance, float64 [2, times, H, W], W m^-2 sr^-1."""
@@ -86,7 +92,7 @@ class Pilot:
 
     def exposed(self, t: int, count: int) -> list[float]:
         """So many instants of the exposure of frame t [s]."""
-        return instants(self.renderer.time(t), self.shutter / self.renderer.frame_rate, count)
+        return instants(self.renderer.time(t), self.renderer.shutter / self.renderer.frame_rate, count)
 
     def _drawn(self, t: int, instant: float, budget: Budget) -> Array:
         return self.renderer.halves([instant], budget, self.renderer.key(t, STAGE))
@@ -94,7 +100,7 @@ class Pilot:
 
 def rests(scene: Scene) -> bool:
     """Whether nothing in a scene moves, seen or not."""
-    return not _moving(scene) and not any(body.deforms for body in scene.bodies)
+    return not _moving(scene)
 
 
 def _moving(scene: Scene) -> list[Motion]:
@@ -103,26 +109,36 @@ def _moving(scene: Scene) -> list[Motion]:
     return [motion for motion in motions if motion is not None and not isinstance(motion, Still)]
 
 
-def _fastest(scene: Scene, moments: list[float], known: set[int]) -> set[int]:
-    """Frames, at most MOST_MORE, in which things go that are slow in the known ones: below half of their fastest."""
-    speeds = np.array([[sum(map(np.linalg.norm, m.velocity(t))) for t in moments] for m in _moving(scene)])
+def _fastest(scene: Scene, moments: dict[int, float], known: set[int]) -> set[int]:
+    """Frames, at most MOST_MORE, in which things go that are slow in the known ones: below half of their fastest.
+
+    `moments` are the times [s] of the frames that come into question, the known ones among them.
+    """
+    frames = sorted(moments)
+    speeds = np.array([[sum(map(np.linalg.norm, m.velocity(moments[t]))) for t in frames] for m in _moving(scene)])
     found: set[int] = set()
     while len(speeds) and len(found) < MOST_MORE:
-        slow = speeds[:, sorted(known | found)].max(axis=1) < 0.5 * speeds.max(axis=1)
+        slow = speeds[:, [t in known | found for t in frames]].max(axis=1) < 0.5 * speeds.max(axis=1)
         if not slow.any():
             break
         speeds = speeds[slow]
-        found.add(int(np.argmax((speeds / speeds.max(axis=1, keepdims=True)).sum(axis=0))))
+        found.add(frames[int(np.argmax((speeds / speeds.max(axis=1, keepdims=True)).sum(axis=0)))])
     return found
 
 
 def denoised_samples(
-    pilot: Pilot, count: int, bounces: int, target: float, raw: int, wanted: bool | None
+    pilot: Pilot,
+    count: int,
+    bounces: int,
+    target: float,
+    raw: int,
+    wanted: bool | None,
+    expected: Callable[[int], float],
 ) -> tuple[int | None, Finding]:
     """Samples of a frame with which denoised windows have the error asked for, or None where `raw` ones cost less.
 
     Windows of the clip's middle frame, every pixel of them, with `count` instants. `wanted` None means: where it costs
-    less.
+    less. `expected(samples)` is the rms error of raw ones: a trial far below has missed rare paths and is not believed.
     """
     renderer, t = pilot.renderer, pilot.middle
     camera = renderer.scene.camera
@@ -139,10 +155,13 @@ def denoised_samples(
     surfaces = [window.surfaces(times, key) for window in windows]
     errors: list[float] = []
     for samples in tried:
-        squares = 0.0
+        noisy, cleaned = 0.0, 0.0
         for window, (albedo, normal) in zip(windows, surfaces, strict=True):
-            squares += cleaned_mean(window.halves(times, Budget(samples, bounces), key), albedo, normal)[1] ** 2
-        errors.append(math.sqrt(squares / len(windows)))
+            halves = window.halves(times, Budget(samples, bounces), key)
+            noisy += float(np.mean((halves[0] - halves[1]) ** 2)) / 4 / len(windows)
+            cleaned += cleaned_mean(halves, albedo, normal)[1] ** 2 / len(windows)
+        missed = LUCK * math.sqrt(noisy) < expected(samples)
+        errors.append(expected(samples) if missed else math.sqrt(cleaned))
         if errors[-1] <= target:
             break
     where = f"{'' if len(windows) == 1 else 'four windows of '}frame {t}"

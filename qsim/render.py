@@ -341,16 +341,18 @@ class Renderer:
             "body_id": hits.number.reshape(shape),
         }
 
-    def travel(self, t: int, exposure: float) -> tuple[Array, Array]:
-        """How far what each pixel sees runs in so long an exposure [px], and the body that it is, both [H, W].
+    def travel(self, t: int) -> tuple[Array, Array]:
+        """How far what each pixel sees runs in the exposure [px], and the body that it is, both [H, W].
 
-        From its largest speed, not from where it comes to lie: a wheel that turns once has not rested.
+        From its largest speed, not from where it comes to lie: a wheel that turns once has not rested. With the shutter
+        at 0, by its speed at the instant, in a whole frame time.
         """
+        exposure, parts = (self.shutter or 1.0) / self.frame_rate, SPEED_PARTS if self.shutter > 0 else (0.0,)
         rays, now = truth.pixel_rays(self.scene.camera, self.crop, self.thinned), self.time(t)
         self._stage.place(now)
         hits = self._cast(self.scene.camera.pose(now), rays)
         fastest, step = np.zeros(rays.shape[1]), exposure / SPEED_STEPS
-        for part in SPEED_PARTS:
+        for part in parts:
             ends = [now + part * exposure + step / 2, now + part * exposure - step / 2]
             late, early = (truth.flow_between(self.scene, rays, hits, now, end)[0] for end in ends)
             fastest = np.maximum(fastest, np.hypot(*(late - early)))

@@ -116,7 +116,7 @@ def dataset_section(path: Path, step: Callable[[], None] = lambda: None) -> str:
         step()
     headers = [
         "clip", "split", "frames × rows × columns", "mean radiance", "photons per pixel",
-        "motion of what moves [px/frame]", "largest", "truth's own PSNR [dB]",
+        "motion of what moves [px/frame]", "largest", "radiance's PSNR, peak = 99.9th percentile [dB]",
     ]  # fmt: skip
     missing = f"; not made yet: {', '.join(data.missing)}" if data.missing else ""
     caption = f"{len(rows)} clips{missing}; motion in the middle frame, of pixels that move 0.05 px or more"

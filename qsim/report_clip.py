@@ -48,7 +48,7 @@ def stream_panels(stream: Stream, frames: range) -> list[page.Panel]:
     shown_average = pictures.tone(averages, pictures.peak(averages))
     return [
         page.Panel(f"codes, {bits} bit ({stream.name})", fit(pictures.code_levels(shown, bits))),
-        page.Panel(f"plain average of {pictures.AVERAGE} frames", fit(shown_average)),
+        page.Panel(f"plain average of {pictures.AVERAGE} frames, white at its own peak", fit(shown_average)),
     ]
 
 
@@ -148,7 +148,7 @@ def error_lines(meta: dict[str, Any]) -> list[str]:
             f"Monte-Carlo error of a frame: {rms:.3g} rms in the unit of the radiance, worst {max(errors):.3g}"
         )
     if meta.get("psnr_of_truth") is not None:
-        lines.append(f"PSNR of the truth itself: {meta['psnr_of_truth']:.1f} dB")
+        lines.append(f"PSNR of the radiance itself, peak = 99.9th percentile: {meta['psnr_of_truth']:.1f} dB")
     return lines
 
 

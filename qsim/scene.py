@@ -119,6 +119,9 @@ class Diffuse:
     reflectance: float | Texture = 0.5  # 0..1
     relief: Relief = None
 
+    def __post_init__(self) -> None:
+        _check_reflectance(self)
+
 
 @dataclass(frozen=True, eq=False)
 class RoughPlastic:
@@ -128,6 +131,9 @@ class RoughPlastic:
     roughness: float = 0.1  # GGX alpha
     ior: float = 1.49
     relief: Relief = None
+
+    def __post_init__(self) -> None:
+        _check_reflectance(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +165,9 @@ class Glow:
 
     radiance: float  # W m^-2 sr^-1
 
+    def __post_init__(self) -> None:
+        _check_light(self, "radiance")
+
 
 Material = Diffuse | RoughPlastic | Conductor | Dielectric | Glow
 
@@ -168,6 +177,9 @@ class Constant:
     """The same radiance from every direction."""
 
     radiance: float  # W m^-2 sr^-1
+
+    def __post_init__(self) -> None:
+        _check_light(self, "radiance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +196,9 @@ class SunSky:
     ground_reflectance: float = 0.2  # 0..1
     sun_radius: float = 4.65e-3  # rad; the real sun's mean angular radius
 
+    def __post_init__(self) -> None:
+        _check_light(self, "sun_irradiance", "sky_irradiance")
+
 
 @dataclass(frozen=True, eq=False)
 class AreaLamp:
@@ -196,6 +211,9 @@ class AreaLamp:
     radiance: float  # W m^-2 sr^-1
     motion: Motion | None = None  # world motion: pose(t) is applied after the placement
 
+    def __post_init__(self) -> None:
+        _check_light(self, "radiance")
+
 
 @dataclass(frozen=True, eq=False)
 class PointLight:
@@ -204,6 +222,9 @@ class PointLight:
     position: Vector
     intensity: float  # W sr^-1
     motion: Motion | None = None
+
+    def __post_init__(self) -> None:
+        _check_light(self, "intensity")
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,7 +312,7 @@ class Camera:
     def __post_init__(self) -> None:
         if not 0 < self.pixel_pitch < 1e-3:
             raise ValueError(f"Camera.pixel_pitch is in metres, got {self.pixel_pitch!r}; a 1.1 um pixel is 1.1e-6")
-        if not 0 < self.focal_length < 100:
+        if not 0 < self.focal_length < 3:
             raise ValueError(f"Camera.focal_length is in metres, got {self.focal_length!r}; 8 mm is 8e-3")
         if not 100e-9 <= self.wavelength <= 20e-6:
             raise ValueError(f"Camera.wavelength is in metres, got {self.wavelength!r}; 550 nm is 550e-9")
@@ -371,6 +392,10 @@ class Scene:
     parts: tuple[Part, ...] = ()  # the file's shapes, in its order
 
     def __post_init__(self) -> None:
+        for name in ("lights", "bodies"):
+            if not isinstance(getattr(self, name), list | tuple):
+                kind = type(getattr(self, name)).__name__
+                raise ValueError(f"Scene.{name}: a tuple is expected, got a {kind}; one alone is ({kind}(...),)")
         environments = [light for light in self.lights if isinstance(light, ENVIRONMENTS)]
         if len(environments) > 1:
             kinds = " and ".join(type(light).__name__ for light in environments)
@@ -509,3 +534,16 @@ def _require_finite(name: str, values: np.ndarray) -> None:
 
 def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
+
+
+def _check_reflectance(material: Diffuse | RoughPlastic) -> None:
+    found, kind = material.reflectance, type(material).__name__
+    if not isinstance(found, Texture) and not (isinstance(found, int | float | np.number) and 0 <= found <= 1):
+        raise ValueError(f"{kind}.reflectance: a number from 0 to 1 or a Texture is expected, got {found!r}")
+
+
+def _check_light(light: Any, *names: str) -> None:
+    for name in names:
+        found = getattr(light, name)
+        if not (isinstance(found, int | float | np.number) and np.isfinite(found) and found >= 0):
+            raise ValueError(f"{type(light).__name__}.{name}: a finite number from 0 up is expected, got {found!r}")

@@ -101,8 +101,7 @@ class Sensor(ABC):
 
     def arrivals(self, photons: Array, exposure: float) -> Array:
         """Expected Poisson events per pixel and exposure; ValueError for photons that are no light level."""
-        if not (isfinite(exposure) and exposure > 0):
-            raise ValueError(f"exposure is in seconds, finite and above 0, got {exposure!r}")
+        _check_exposure(exposure)
         values = np.asarray(photons, np.float64)
         wrong = ~(np.isfinite(values) & (values >= 0))
         if wrong.any():
@@ -192,6 +191,7 @@ class Sensor(ABC):
         pixels per million; "auto" takes the fast one where it can run.
         """
         photons = _checked(photons, engine)
+        _check_exposure(exposure)
         if engine != "reference" and _fast_engine():
             from qsim import kernels
 
@@ -211,6 +211,7 @@ class Sensor(ABC):
         The compiled engine joins the bits itself, without a byte per code in between.
         """
         photons = _checked(photons, engine)
+        _check_exposure(exposure)
         if engine != "reference" and _fast_engine():
             from qsim import kernels
 
@@ -244,6 +245,11 @@ class Sensor(ABC):
     def to_dict(self) -> dict[str, Any]:
         """The record as written into files: {"model": name of the class, field: value, ...}."""
         return {"model": type(self).__name__, **asdict(self)}  # type: ignore[call-overload]
+
+
+def _check_exposure(exposure: float) -> None:
+    if not (isfinite(exposure) and exposure > 0):
+        raise ValueError(f"exposure is in seconds, finite and above 0, got {exposure!r}")
 
 
 def _checked(photons: Array, engine: str) -> Array:

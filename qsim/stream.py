@@ -251,7 +251,7 @@ class Sensing:
             return check_name(self.name)
         light = (
             "asis" if self.ppp is self.lux is None else f"{self.ppp:g}ppp" if self.lux is None else f"{self.lux:g}lx"
-        )
+        ).replace("e+", "e")  # a name holds no +
         bits = "" if self.bits is None else f"_{self.bits}bit"
         seed = f"_seed{self.seed}" if self.seed else ""
         sensor = Path(self.sensor).name.removesuffix(".toml")

@@ -42,7 +42,8 @@ class ClipWriter:
     `meta` is clip.json without what the writer measures (means, errors, checksums); it must hold shape, frame_rate,
     exposure and radiance_unit, and camera (a dict) unless the unit is relative. A writer with the same meta goes on
     where an interrupted one stopped: `has(t)` tells. `FileExistsError` if the clip exists and `force` is not set, or
-    if it is no clip; `ValueError` if PATH.part holds what no writer left there.
+    if it is no clip; `ValueError` if PATH.part holds what no writer left there, or, without `force`, frames of a clip
+    with other meta.
     """
 
     def __init__(self, path: str | os.PathLike[str], meta: dict[str, Any], *, force: bool = False) -> None:
@@ -75,6 +76,12 @@ class ClipWriter:
                     raise ValueError(message)
                 files.write_bytes(begun, b"")  # before anything goes: a clearing cut short is still a writer's
             if begun.read_bytes() != identity:
+                done = 0 if self.force else len(_read_journal(self.part))
+                if done:
+                    raise ValueError(
+                        f"{self.part}: {done} frames are there, asked for with other settings; ask for the same to go "
+                        "on, name another with -o, or use --force to begin anew"
+                    )
                 self._clear()
                 files.write_bytes(begun, identity)
             files.sweep(self.part)

@@ -50,7 +50,7 @@ def _add_restore(sub: Any) -> None:
     parser = command(
         sub, "restore", _run_restore, "Restore a stream, a clip or a photon cube; no ground truth is needed.",
         "quiver restore out/starter/clips/fan_0003 -o out/fan.npy\n"
-        "quiver restore out/fan/streams/quiver-physical_3bit_3.25ppp.npy -o out/fan.npy --method out/nano\n"
+        "quiver restore out/fan/streams/quiver-physical_3bit_3.25ppp.npy -o out/fan.npy --method out/mine\n"
         "quiver restore out/fan --ppp 3.25 -o out/fan.npy --method moment\n"
         "quiver restore cube.npy --width 320 --planes 7 --sensor spad-320x240 --frame-rate 1428 -o out/cube.npy",
         goes_on=True,
@@ -77,9 +77,9 @@ def _run_restore(args: argparse.Namespace) -> int:
     from quiver.restored_file import restore_to_file
     from quiver.restoring import restorer
 
-    target: Path = args.output if args.output.suffix else args.output.with_suffix(".npy")
+    target: Path = args.output
     if target.suffix != ".npy":
-        raise ValueError(f"{target}: restored video is written as .npy")
+        raise ValueError(f"{target}: restored video is written as .npy; name a file that ends so")
     codes = _source(args)
     for path in (target, target.with_suffix(".json")):
         if path.exists() and not args.force:
@@ -116,6 +116,8 @@ def _source(args: argparse.Namespace) -> Any:
         if args.stream is not None or args.ppp is None:
             return stream_codes(clip.stream(args.stream or clip.streams[0]))
         return sensed(clip, Light(light.sensor, args.ppp, args.bits or 3), args.seed)[0]
+    if path.with_name(f"{path.name}.part").is_dir() and not path.exists():
+        open_clips(path)  # which says that it is unfinished
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if path.suffix not in (".npy", ".json"):
@@ -132,7 +134,7 @@ def _source(args: argparse.Namespace) -> Any:
 def _add_evaluate(sub: Any) -> None:
     parser = command(
         sub, "evaluate", _run_evaluate, "Compare methods on held-out clips, or on real photons of a static object.",
-        "quiver evaluate out/starter -o out/table --methods naive,moment,out/nano,out/unet --ppp 3.25,9.75,26\n"
+        "quiver evaluate out/starter -o out/table --methods naive,moment,out/mine,out/unet --ppp 3.25,9.75,26\n"
         "quiver evaluate out/starter/clips/fan_0003 -o out/fan_table --methods moment,nano --split all\n"
         "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,nano", goes_on=True,
     )  # fmt: skip

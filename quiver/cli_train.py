@@ -32,7 +32,7 @@ from quiver.options import (
 def add_train(sub: Any) -> None:
     parser = command(
         sub, "train", _run_train, "Train a network on the clips of a data set; the same command again goes on.",
-        "quiver train out/starter -o out/nano --minutes 20\n"
+        "quiver train out/starter -o out/mine --minutes 20\n"
         "quiver train out/starter -o out/unet --preset unet --protocol control --minutes 20\n"
         "torchrun --nproc-per-node 4 -m quiver train out/starter -o out/s --preset quiver-s --protocol published",
         goes_on=True,

@@ -199,8 +199,8 @@ def draw_curve(folder: Path) -> Path | None:
     axes.set_xlabel("minutes")
     axes.set_ylabel("validation PSNR [dB]")
     losses = axes.twinx()
-    losses.plot(minutes, [entry["loss"] for entry in history], ":", color="grey", label="training loss")
-    losses.set_ylabel("training loss of one batch")
+    losses.plot(minutes, [entry["loss"] for entry in history], ":", color="grey")
+    losses.set_ylabel("training loss of one batch (dotted)")
     axes.legend(fontsize="small", loc="lower right")
     with replacing(folder / "curve.png") as file:
         canvas.figure.savefig(file, format="png", dpi=120)

@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from qsim.checks import suggest
@@ -63,18 +65,34 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
     if str(name) in FAMILIES:
         return FAMILIES[str(name)](seed, speed=speed)
     if str(name).endswith(".py"):
-        found = _from_file(Path(name))(seed, speed=speed)
+        with _naming_mistakes(Path(name)):
+            found = _from_file(Path(name))(seed, speed=speed)
         if not isinstance(found, Scene):
             raise ValueError(f"{name}: scene() returned a {type(found).__name__}; it must return a qsim.scene.Scene")
         return found
     if str(name).endswith(".xml"):
         return Scene.from_mitsuba(name)
+    if (Path(name) / "clip.json").is_file():
+        raise ValueError(f"{name}: is a clip, made from a scene already; name a family, a .py or .xml file or a folder")
     if Path(name).is_dir():
         return own.scene(seed, speed=speed, folder=name)
     raise ValueError(
         f"no scene family {str(name)!r}{suggest(str(name), FAMILIES)}; there are {', '.join(FAMILIES)}, "
         "or give a .py or .xml file or a folder"
     )
+
+
+@contextlib.contextmanager
+def _naming_mistakes(path: Path) -> Iterator[None]:
+    """What a scene file raises, as a ValueError that names its line."""
+    try:
+        yield
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == path.resolve()]
+        if not lines:  # ours, about the file as a whole
+            raise
+        raise ValueError(f"{path}:{lines[-1]}: {type(error).__name__}: {error}") from error
 
 
 def _from_file(path: Path) -> Family:

@@ -102,6 +102,9 @@ MISTAKES = [
         "qsim convert light.npy data --force --frame-rate 2000 --exposure 1e-4 --transfer linear",
         "data: exists and is no",
     ),
+    ("quiver restore lit -o x --ppp 3", "x: restored video is written as .npy; name a file that ends so"),
+    ("qsim render lit -o x", "lit: is a clip, made from a scene already"),
+    ("qsim render raises.py -o x", "raises.py:2: ZeroDivisionError: division by zero"),
     ("quiver restore text.txt -o x.npy", "text.txt: no stream, clip folder or .npy array"),
     # Recipes
     ("qsim generate none.toml", "none.toml: no such recipe"),
@@ -198,6 +201,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sensor = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 1.6\nread_noise = 0.2\nbits = 3\n'
     texts = {
         "text.txt": "words\n",
+        "raises.py": "def scene(seed=0, *, speed=1.0):\n    return 1 / 0\n",
         "broken.png": "\x89PNG\r\n",
         "odd.bin": "x" * 1001,
         "broken.py": "def scene(:\n",

@@ -55,18 +55,18 @@ def truth(t: int) -> dict[str, np.ndarray]:
     }
 
 
-def write(path: Path, **changes: Any) -> Clip:
-    with ClipWriter(path, meta(**changes)) as writer:
+def write(path: Path, *, force: bool = False, **changes: Any) -> Clip:
+    with ClipWriter(path, meta(**changes), force=force) as writer:
         for t in range(FRAMES):
             writer.add(t, radiance(t), sharp=radiance(50 + t) if t == 2 else None, truth=truth(t), error=0.01)
     return Clip.open(path)
 
 
-def interrupted(path: Path, *frames: int, **changes: Any) -> list[int]:
+def interrupted(path: Path, *frames: int, force: bool = False, **changes: Any) -> list[int]:
     """A writer that is stopped after some frames; returns those which it found done."""
     found: list[int] = []
     try:
-        with ClipWriter(path, meta(**changes)) as writer:
+        with ClipWriter(path, meta(**changes), force=force) as writer:
             found += [t for t in range(FRAMES) if writer.has(t)]
             for t in frames:
                 writer.add(t, radiance(t))
@@ -168,7 +168,7 @@ def test_a_writer_killed_at_every_step_can_begin_again(tmp_path: Path, left: dic
         steps += 1
         code = -os.waitstatus_to_exitcode(os.waitpid(forked(functools.partial(killed_at, steps, path)), 0)[1])
         if not path.exists():
-            write(path)
+            write(path, force=True)
         assert Clip.open(path).verify() == []
         assert [item.name for item in path.parent.iterdir()] == ["a"]
         assert sorted(item.name for item in path.iterdir()) == ["clip.json", "radiance", "sharp", "truth"]
@@ -188,7 +188,7 @@ def killed_at(step: int, path: Path) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
 
     sys.addaudithook(watch)
-    write(path)
+    write(path, force=True)
 
 
 def test_a_damaged_frame_of_an_interrupted_writer_is_done_again(tmp_path: Path):
@@ -198,10 +198,13 @@ def test_a_damaged_frame_of_an_interrupted_writer_is_done_again(tmp_path: Path):
     assert interrupted(tmp_path / "a") == []
 
 
-def test_other_settings_start_again(tmp_path: Path):
+def test_other_settings_are_refused_or_start_again(tmp_path: Path):
     interrupted(tmp_path / "a", 0)
     assert interrupted(tmp_path / "a", 1) == [0]
-    assert interrupted(tmp_path / "a", frame_rate=1000.0) == []
+    with pytest.raises(ValueError, match=r"a\.part: 2 frames are there, asked for with other settings"):
+        interrupted(tmp_path / "a", frame_rate=1000.0)
+    assert interrupted(tmp_path / "a") == [0, 1]
+    assert interrupted(tmp_path / "a", force=True, frame_rate=1000.0) == []
 
 
 def test_two_writers_of_one_clip(tmp_path: Path):
