@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import json
 import os
 import re
@@ -172,6 +173,10 @@ def note(text: str) -> None:
 def one_line(error: BaseException) -> str:
     """The message of an error in one line; an `OSError` of the system names its file and the reason."""
     if isinstance(error, OSError) and error.strerror and error.filename:
+        if error.errno in (errno.ENOTDIR, errno.EEXIST):
+            path = Path(os.fsdecode(error.filename))
+            for in_the_way in filter(Path.is_file, (path, *path.parents)):
+                return f"{in_the_way}: is a file where a folder is needed; name another with -o"
         return f"{error.filename}: {error.strerror}" + (f"; {_MAKE_SPACE}" if error.errno in FULL else "")
     if isinstance(error, OSError) and error.errno in FULL and error.strerror:
         return f"{error.strerror}; {_MAKE_SPACE}"
@@ -208,11 +213,19 @@ def checked(check: Callable[[Any], Any]) -> Callable[[str], Any]:
 
 
 def refuse_existing(path: Path, force: bool) -> None:
-    """`FileExistsError` with the cure if a file that is to be written is there already and `force` is not set."""
+    """An `OSError` with the cure if a file cannot be written, or is there already and `force` is not set.
+
+    Called before the work, so that nothing is computed that has no place to go.
+    """
     if path.is_dir():
         raise FileExistsError(f"{path}: is a folder; name a file with -o")
     if path.exists() and not force:
         raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
+    folder = next(parent for parent in path.parents if parent.exists())
+    if not folder.is_dir():
+        raise NotADirectoryError(f"{folder}: is a file where a folder is needed; name another with -o")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(f"{path}: nothing may be written into {folder}; name another with -o")
 
 
 @contextlib.contextmanager

@@ -27,7 +27,7 @@ def add_convert(sub: Any) -> None:
         "qsim convert out/starter out/starter_mp4 --to mp4\n"
         "qsim convert out/fan/streams/spad.json out/fan_cube.npy",
     )  # fmt: skip
-    parser.add_argument("input", type=Path, help="a file, a folder, a clip, a stream's .json, or a data set")
+    parser.add_argument("input", type=Path, help="a file, a folder, a clip, a stream (its .npy or .json), a data set")
     parser.add_argument(
         "output", type=Path, help="clip folder, stream name, .npy, .mp4 or .zarr, or a folder with --to"
     )
@@ -57,6 +57,8 @@ def add_convert(sub: Any) -> None:
 
 def _run_convert(args: argparse.Namespace) -> int:
     source = args.input
+    if source.suffix == ".npy" and _is_stream(source.with_suffix(".json")):  # its codes name a stream as well
+        source = args.input = source.with_suffix(".json")
     ours = source.is_dir() and any((source / name).is_file() for name in ("clip.json", "dataset.json"))
     made = _export(args) if ours or _is_stream(source) else _import(args)
     output(args, {"made": [str(path) for path in made]}, [f"{path}" for path in made])

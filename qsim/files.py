@@ -45,15 +45,16 @@ def sync_folder(folder: Path) -> None:
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """A binary file that appears under `path` when the block ends well, and not at all otherwise.
 
-    An `OSError` of the system (a full disk) names the file.
+    An `OSError` of the system (a full disk, a folder that is not ours) names the file.
     """
     temporary = path.with_name(f"{path.name}.tmp-{os.getpid()}")
     try:
-        with _naming(path), open(temporary, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        with _naming(path, temporary):
+            with open(temporary, "wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
@@ -69,13 +70,14 @@ def append_line(path: Path, line: bytes) -> None:
 
 
 @contextlib.contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Writes that fail do not say where: add the file to their `OSError`."""
+def _naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """Writes that fail do not say where, or name a temporary file: put the file's own name into their `OSError`."""
     try:
         yield
     except OSError as error:
-        if error.errno is not None and error.filename is None:
+        if error.errno is not None and error.filename in (None, str(temporary)):
             error.filename = str(path)
+            error.filename2 = None
         raise
 
 

@@ -145,6 +145,10 @@ MISTAKES = [
         "qsim report empty -o x.html",
         "nothing to report; expected a clip, a data set, a restored video or an evaluation",
     ),
+    ("qsim report empty -o text.txt/sub/x.html", "text.txt: is a file where a folder is needed; name another with -o"),
+    ("qsim render fan -o text.txt/x", "text.txt: is a file where a folder is needed; name another with -o"),
+    ("qsim convert lit text.txt/x.npy", "text.txt: is a file where a folder is needed"),
+    ("quiver restore lit -o text.txt/x.npy --ppp 3 --method moment", "text.txt: is a file where a folder is needed"),
     ("qsim report lit -o x.pdf", "x.pdf: a page is a .html file, as in -o x.html"),
     ("qsim preview lit -o x.webm", "x.webm: a preview is a .mp4, .gif, .png file, as in -o x.mp4"),
     ("qsim preview data", "data: is a data set; name one of its clips, as in data/clips/NAME"),
@@ -303,6 +307,15 @@ def test_a_full_disk(folder, tmp_path, monkeypatch, capsys, line, target):
     assert "No space left on device" in err
     assert "make space and run the same command again" in err
     assert not Path(target).exists()
+
+
+def test_a_folder_that_is_not_ours(folder, monkeypatch, capsys):
+    """A page that has no place to go is not drawn first."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("qsim.report.build", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != Path("empty"))
+    said = told(capsys, "qsim report lit -o empty/deep/x.html")
+    assert "nothing may be written into empty; name another with -o" in said
 
 
 def test_no_gpu(folder, monkeypatch, capsys):

@@ -858,6 +858,15 @@ def test_our_one_bit_stream_is_a_photon_cube_for_others(tmp_path: Path):
         np.testing.assert_array_equal(np.asarray(Image.open(image).convert("L")) > 0, plane > 0)
 
 
+def test_a_stream_is_named_by_its_codes_too(tmp_path: Path):
+    """`convert STREAM.npy` is `convert STREAM.json`: our own codes are nothing foreign that needs a frame rate."""
+    np.save(tmp_path / "p.npy", random_planes(4, 6, 16).astype(bool))
+    stream = formats.to_stream(formats.read(tmp_path / "p.npy"), tmp_path / "mine", CAPTURE)
+    for suffix in (".npy", ".json"):
+        assert main(["convert", str(stream.path.with_suffix(suffix)), str(tmp_path / f"from{suffix}.npy")]) == 0
+    assert (tmp_path / "from.npy.npy").read_bytes() == (tmp_path / "from.json.npy").read_bytes()
+
+
 @pytest.mark.parametrize("full", [False, True])
 def test_our_camera_files_are_read_alike_by_others(tmp_path: Path, full: bool):
     photoncube = pytest.importorskip("photoncube", reason="the package photoncube is not installed")
