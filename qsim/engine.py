@@ -126,6 +126,17 @@ def kernels_timed() -> Iterator[list[float]]:
         dr.set_flag(dr.JitFlag.KernelHistory, before)
 
 
+@contextmanager
+def errors_only(mi: Any) -> Iterator[None]:
+    """Mitsuba's log inside the block without warnings that say nothing here; the caller says which."""
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(level)
+
+
 def opaque(value: Any) -> Any:
     """A Dr.Jit value as data: were it code, every kernel would be compiled anew whenever it changes."""
     import drjit as dr

@@ -17,6 +17,7 @@ import numpy as np
 
 from qsim import files
 from qsim.checks import suggest
+from qsim.engine import errors_only
 from qsim.scene import Camera, MitsubaFile, Motion, Part, Scene, Vector
 
 F_NUMBER, PITCH = 2.8, 1.1e-6  # of the camera that is made from the file's, which has no pixels in metres
@@ -48,14 +49,11 @@ def load(mi: Any, path: str) -> Any:
     """Mitsuba's scene object, every shape with an id: those that the file left unnamed are numbered."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    level = mi.log_level()
-    mi.set_log_level(mi.LogLevel.Error)  # it warns that a colour film becomes grey, and we use no film
     try:
-        loaded = mi.load_file(path, optimize=False)  # optimising would merge shapes and lose their names
+        with errors_only(mi):  # it warns that a colour film becomes grey, and we use no film
+            loaded = mi.load_file(path, optimize=False)  # optimising would merge shapes and lose their names
     except RuntimeError as error:
         raise ValueError(f"{path}: Mitsuba cannot load it: {' '.join(str(error).split())}") from None
-    finally:
-        mi.set_log_level(level)
     if not isinstance(loaded, mi.Scene):
         raise ValueError(f"{path}: its root is no <scene>")
     for i, shape in enumerate(loaded.shapes()):

@@ -19,7 +19,7 @@ from numpy import ndarray as Array
 
 from qsim import mitsuba_file
 from qsim import scene as records
-from qsim.engine import opaque
+from qsim.engine import errors_only, opaque
 from qsim.scene import Body, Scene
 from qsim.sky import environment_map, sky_map, sun_direction, sun_radiance
 
@@ -60,7 +60,8 @@ class Stage:
         for part in self.scene.parts:
             if part.motion is not None:
                 self._place_part(part.name, part.pose(t), self._rest[part.name])
-        self._parameters.update()
+        with errors_only(self.mi):  # the scalar engine warns of normals that it cannot make; ours replace them
+            self._parameters.update()
         if self._normals:
             for key, normals in self._normals.items():
                 self._parameters[key] = normals.ravel()
@@ -193,7 +194,8 @@ def _mesh(mi: Any, body: Body, name: str, vertices: Array) -> Any:
     parameters["faces"] = body.mesh.faces.astype(np.uint32).ravel()
     if uv is not None:
         parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
-    parameters.update()
+    with errors_only(mi):  # as in `place`
+        parameters.update()
     if body.mesh.smooth:
         # Mitsuba sums normals over faces in parallel, in an order that changes from run to run.
         parameters["vertex_normals"] = vertex_normals(vertices, body.mesh.faces).ravel()
