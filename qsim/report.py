@@ -20,7 +20,7 @@ from qsim import files, page, pictures, report_tables
 from qsim.clip import Clip, Stream
 from qsim.dataset import Dataset
 from qsim.optics import clip_photons
-from qsim.report_clip import chosen_frames, clip_section, fit, flow_panel, legend, motion, stream_panels
+from qsim.report_clip import chosen_frames, clip_section, fit, flow_panel, legend, light_name, motion, stream_panels
 from qsim.stream import Progress
 
 INSIDE_CLIPS = {"streams", "truth", "radiance", "sharp", "jobs", "failed", "logs", "locks", "work"}
@@ -137,7 +137,7 @@ def restored_section(path: Path) -> str:
     if clip is not None and stream is not None and len(clip) >= len(frames):
         photons = np.stack([clip_photons(clip, t, stream.photons_factor, sharp=True) for t in frames])
         white = pictures.peak(photons)
-        panels = [page.Panel("truth", fit(pictures.tone(photons, white))), *stream_panels(stream, frames)]
+        panels = [page.Panel(light_name(clip), fit(pictures.tone(photons, white))), *stream_panels(stream, frames)]
     place = len(panels)
     panels.append(page.Panel(f"restored by {meta['method']}", fit(pictures.tone(shown, white))))
     wheel = ""

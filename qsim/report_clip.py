@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsim import page, pictures
-from qsim.clip import Clip, Stream
+from qsim.clip import RELATIVE, Clip, Stream
 from qsim.optics import clip_photons
 from qsim.stream import electrons_per_photon
 
@@ -28,6 +28,11 @@ def fit(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Every n-th row and column so that a panel stays within WIDTH."""
     step = -(-frames.shape[2] // WIDTH)
     return frames[:, ::step, ::step]
+
+
+def light_name(clip: Clip) -> str:
+    """What a clip's light is called: rendered light is the truth, an imported video has its camera's errors."""
+    return "recorded video" if clip.meta["radiance_unit"] == RELATIVE else "truth"
 
 
 def truth_stack(clip: Clip, frames: range) -> NDArray[np.float32]:
@@ -81,7 +86,7 @@ def clip_section(clip: Clip) -> str:
     frames = chosen_frames(len(clip))
     truth = truth_stack(clip, frames)
     white = pictures.peak(truth)
-    panels = [page.Panel("truth", fit(pictures.tone(truth, white)))]
+    panels = [page.Panel(light_name(clip), fit(pictures.tone(truth, white)))]
     figures: list[str] = []
     lines = [light_line(clip)]
     for name in clip.streams:
@@ -139,13 +144,14 @@ def motion_line(clip: Clip, frames: range) -> str:
 
 
 def error_lines(meta: dict[str, Any]) -> list[str]:
-    """The measured Monte-Carlo error, as lines."""
+    """The stated error of the frames, as lines."""
     lines = []
     errors = meta.get("error_per_frame")
     if errors:
         rms = float(np.sqrt(np.mean(np.square(errors))))
         lines.append(
-            f"Monte-Carlo error of a frame: {rms:.3g} rms in the unit of the radiance, worst {max(errors):.3g}"
+            f"Error of a frame (noise, blur, bounces left out): {rms:.3g} rms in the unit of the radiance, "
+            f"worst {max(errors):.3g}"
         )
     if meta.get("psnr_of_truth") is not None:
         lines.append(f"PSNR of the radiance itself, peak = 99.9th percentile: {meta['psnr_of_truth']:.1f} dB")
@@ -202,7 +208,7 @@ def _light_histogram(truth: NDArray[np.floating], clip: Clip) -> str:
     axes, save = page.axes(f"radiance [{unit}]", "share of pixels")
     axes.hist(truth.ravel(), bins=64, weights=np.full(truth.size, 1 / truth.size), color="tab:blue")
     axes.set_yscale("log")
-    return page.figure(save(), "light of the truth, all pixels")
+    return page.figure(save(), f"light of the {light_name(clip)}, all pixels")
 
 
 def error_curve(errors: Sequence[float]) -> str:
@@ -210,4 +216,4 @@ def error_curve(errors: Sequence[float]) -> str:
     axes, save = page.axes("frame", "rms error of the radiance")
     axes.plot(errors, ".-")
     axes.set_ylim(0, 1.15 * max(max(errors), 1e-30))
-    return page.figure(save(), "Monte-Carlo error, measured in every frame from independent halves")
+    return page.figure(save(), "error of every frame: noise from independent halves, blur, bounces left out")

@@ -62,6 +62,8 @@ def test_page_shows_everything_and_loads_nothing(folder):
         assert words in page, words
     assert "&lt;moment&gt;" in page
     assert page.count('class="player"') == 2
+    assert "recorded video" in page  # what another camera saw is not called the truth
+    assert "light of the truth" not in page
     addresses = re.findall(r'(?:src|href|data-strip)="([^"]*)"', page)
     assert all(address.startswith("data:") for address in addresses)
 
@@ -114,8 +116,8 @@ def test_clip_section_says_light_motion_model_and_error(tmp_path):
     assert f"3.25 photons per pixel (the clip&#x27;s light × {stream.photons_factor:.4g}), as much as 1.313 lx" in page
     assert "2.6 e⁻ per pixel; 3 bit, QIS (multibit): quantum_efficiency 0.8 e-/photon" in page
     assert "<td>bounces</td><td>2</td><td>later ones &lt;1 %</td>" in page
-    assert "Monte-Carlo error of a frame: 0.01 rms in the unit of the radiance, worst 0.01" in page
-    for words in ("light of the truth", "drawn, and expected from the light", "measured in every frame"):
+    assert "Error of a frame (noise, blur, bounces left out): 0.01 rms in the unit of the radiance, worst 0.01" in page
+    for words in ("light of the truth", "drawn, and expected from the light", "error of every frame"):
         assert words in page, words
 
 
