@@ -221,9 +221,10 @@ class Renderer:
         """
         import drjit as dr
 
+        integrator = self._integrator(bounces)  # first: loading amid what follows would change the kernel once
         sampler, position = self._film_positions(seed, samples, part, 2)
         ray = self._camera_ray(pose, position, sampler)
-        radiance, _, _ = self._integrator(bounces).sample(self._stage.loaded, sampler, ray)
+        radiance, _, _ = integrator.sample(self._stage.loaded, sampler, ray)
         mean = dr.block_sum(radiance[0], samples) / samples
         return np.array(mean, np.float64).reshape(2, len(part))
 

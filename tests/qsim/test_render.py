@@ -386,6 +386,23 @@ def test_what_moves_is_data_and_compiles_no_kernel_anew(made):
     assert seen[2] | seen[3] <= seen[0] | seen[1]
 
 
+def test_the_kernel_of_the_first_frame_serves_the_second():
+    """Loading anything amid what is traced gives the first pass of a depth a kernel of its own, half a second more."""
+    made = renderer(plate(Translation((40.0, 0, 0))))
+    if made.engine.backend == "scalar":
+        pytest.skip("the scalar engine compiles nothing")
+    import drjit as dr
+
+    largest = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        for t in range(2):
+            dr.kernel_history_clear()
+            made.halves([made.time(t)], CHEAP, made.key(t))
+            kernels = [launch for launch in dr.kernel_history() if "hash" in launch]
+            largest.append(max(kernels, key=lambda launch: launch["operation_count"])["hash"])
+    assert largest[0] == largest[1]
+
+
 def test_the_measured_error_is_the_error():
     """rms of (A - B) / 2 against the spread of many independent renders of the same instant."""
     made = plate(None, light=SunSky())
