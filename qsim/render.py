@@ -4,8 +4,9 @@
 
 Frame t is exposed around t / frame_rate: K instants, evenly spread over shutter / frame_rate seconds, are averaged
 (Mitsuba's wheels have no motion blur). Every pixel integrates its own area (box filter). Samples come in two
-independent halves A and B; radiance is their mean, its noise the rms of (A - B) / 2; the error that a
-frame states holds its blur and the bounces left out as well. The sampler's seeds are words of qsim.keys, so any frame can be rendered alone, in any order. With engine.py, the only importer of Mitsuba.
+independent halves A and B; radiance is their mean, its noise the rms of (A - B) / 2; the error that a frame states
+holds its blur and the bounces left out as well. The sampler's seeds are words of qsim.keys, so any frame can be
+rendered alone, in any order. With engine.py, the only importer of Mitsuba.
 """
 
 from __future__ import annotations
