@@ -122,7 +122,8 @@ class Plan:
             f"{c.per_frame.wall + c.sensing.wall:8.3f} {c.hours:8.3f} {c.gigabytes:8.3f}"
             for c in self.costs
         ]
-        day, faster = max(1, math.ceil(self.hours / 24)), max(1.0, self.hours / 24)
+        day = max(1, math.ceil(self.hours / 24))
+        faster = f", or one that is {self.hours / 24:.2g} times as fast" if day > 1 else ""
         return [
             head,
             *rows,
@@ -131,7 +132,7 @@ class Plan:
             f"{self.peak_memory:.2g} GiB of memory per worker",
             f"{_machines(machines)} like this: {self.hours / machines:.3g} hours{' each' if machines > 1 else ''}"
             + (", by --shard or --cluster" if machines > 1 else ""),
-            f"within a day: {_machines(day)} like this, or one that is {faster:.2g} times as fast"
+            f"within a day: {_machines(day)} like this{faster}"
             + ("" if "cuda" in self.engine else "; run this command on a machine with a GPU to have that measured"),
         ]
 

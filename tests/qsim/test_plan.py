@@ -42,7 +42,10 @@ def test_the_arithmetic_of_a_forecast():
     assert whole.processor_hours == pytest.approx((2 * 1100 + 20 * START / Limits().jobs) / 3600)
     assert whole.gigabytes == pytest.approx(2.4)
     assert f"10 machines like this: {whole.hours / 10:.3g} hours each" in "\n".join(whole.lines(10))
-    assert "GPU" in whole.lines(1)[-1]
+    assert whole.lines(1)[-1].startswith("within a day: 1 machine like this; run this command on a machine with a GPU")
+    days = Plan((cost,) * 200, "cuda", 0.5)  # 33 hours and a little
+    times = f"{days.hours / 24:.2g} times as fast"
+    assert days.lines(1)[-1] == f"within a day: 2 machines like this, or one that is {times}"
     assert " 8-72 " in whole.lines(1)[1]
     kind = whole.to_dict()["kinds"][0]
     assert (kind["frames"], kind["per_frame_seconds"]) == (300, {"wall": 1.5, "processor": 2.9})
