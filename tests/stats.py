@@ -5,7 +5,7 @@ A correct program exceeds a limit with the stated probability, shared by `checks
 
 from __future__ import annotations
 
-from math import expm1, log1p, sqrt
+from math import expm1, log, log1p, sqrt
 from statistics import NormalDist
 
 import numpy as np
@@ -51,6 +51,19 @@ def assert_variance(
     assert abs(z) < limit, (
         f"variance {found:.8g}, expected {variance:.8g} +- {sigma:.2g}: z = {z:.1f}, limit {limit:.1f}"
     )
+
+
+def assert_same_rms(
+    first: np.ndarray, second: np.ndarray, *, false_alarm: float = FALSE_ALARM, checks: int = 1
+) -> None:
+    """Two samples of independent errors have one rms; var(mean square) = (mu4 - mu2^2) / n, from the samples."""
+    squares = [np.square(sample, dtype=np.float64).ravel() for sample in (first, second)]
+    means = [float(square.mean()) for square in squares]
+    assert min(means) > 0, "a sample without errors has no rms to compare"
+    sigma = sqrt(sum(float(s.var()) / s.size / m**2 for s, m in zip(squares, means, strict=True))) / 2
+    z, limit = log(means[0] / means[1]) / 2 / sigma, critical_z(false_alarm, checks)
+    found = f"rms {sqrt(means[0]):.4g} and {sqrt(means[1]):.4g}, their ratio known to {sigma:.2g}"
+    assert abs(z) < limit, f"{found}: z = {z:.1f}, limit {limit:.1f}"
 
 
 def assert_share(hits: int, n: int, share: float, *, false_alarm: float = FALSE_ALARM, checks: int = 1) -> None:

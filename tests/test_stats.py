@@ -5,6 +5,7 @@ import pytest
 from stats import (
     assert_histogram,
     assert_mean,
+    assert_same_rms,
     assert_share,
     assert_variance,
     critical_z,
@@ -42,6 +43,14 @@ def test_the_variance_alarms_as_rarely_as_promised():
     """s^2 of 2000 draws is still a little skewed: allow 3 % to 8 %."""
     share = share_of_alarms(assert_variance, lambda r: r.poisson(LIGHT, 2000), LIGHT, POISSON_FOURTH, false_alarm=0.05)
     assert 0.03 < share < 0.08
+
+
+def test_one_rms_alarms_as_rarely_as_promised():
+    def both(rng: np.random.Generator) -> np.ndarray:
+        return rng.normal(size=(2, 400))
+
+    share = share_of_alarms(lambda pair, **rest: assert_same_rms(*pair, **rest), both, false_alarm=0.05)
+    assert 0.03 < share < 0.07
 
 
 def test_histograms_alarm_as_rarely_as_promised():
@@ -97,6 +106,15 @@ def test_five_percent_more_variance_is_caught():
     rng = np.random.default_rng(4)
     wide = LIGHT + (rng.poisson(LIGHT, 100_000) - LIGHT) * np.sqrt(1.05)
     assert trips(assert_variance, wide, LIGHT, POISSON_FOURTH)
+
+
+def test_a_fifth_more_error_is_caught():
+    """sigma of the ratio of two rms of 4000 is 1.6 %: 18 % are eleven of them."""
+    rng = np.random.default_rng(3)
+    errors = rng.normal(size=(2, 4000))
+    assert not trips(assert_same_rms, *errors)
+    assert trips(assert_same_rms, errors[0], 1.2 * errors[1])
+    assert trips(assert_same_rms, errors[0], 0 * errors[1])
 
 
 def test_an_image_without_noise_fails_everywhere():

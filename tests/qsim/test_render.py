@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from small_scenes import CAMERA, CHEAP, RATE, plate, renderer, scene, square
-from stats import critical_z
+from stats import assert_same_rms, critical_z
 
 from qsim import shapes
 from qsim.budget import Budget
@@ -404,27 +404,26 @@ def test_the_kernel_of_the_first_frame_serves_the_second():
 
 
 def test_the_measured_error_is_the_error():
-    """rms of (A - B) / 2 against the spread of many independent renders of the same instant."""
-    made = plate(None, light=SunSky())
-    frames = [renderer(made, seed=seed).frame(0, with_truth=False) for seed in range(6)]
-    stack = np.stack([frame.radiance for frame in frames])
-    spread = math.sqrt(np.mean(stack.var(axis=0, ddof=1)))
-    stated = math.sqrt(np.mean([frame.error**2 for frame in frames]))
-    assert spread == pytest.approx(stated, rel=0.15)
+    """(A - B) / 2 within six renders of one instant against the differences between three pairs of them."""
+    views = [renderer(plate(None, light=SunSky()), seed=seed) for seed in range(6)]
+    halves = np.stack([view.halves([0.0], view.budget, view.key(0)) for view in views])  # [6, 2, H, W]
+    frames = [view.frame(0, with_truth=False) for view in views]
+    within = (halves[:, 0] - halves[:, 1]) / 2
+    np.testing.assert_allclose([frame.error for frame in frames], np.sqrt(np.mean(within**2, axis=(1, 2))), rtol=1e-6)
+    images = np.stack([frame.radiance for frame in frames]).astype(np.float64)
+    assert_same_rms(within, (images[::2] - images[1::2]) / math.sqrt(2))
 
 
 def test_a_frame_in_parts_is_no_worse_than_a_whole_one(monkeypatch):
-    """Pixels are shared among the parts, not samples: grids of 64 in 16 parts, not 16 grids of 4 (1.7 times the error).
-
-    The error is that of 792 pixels, known to some percent; the mean is the same.
-    """
+    """Pixels are shared among the parts, not samples: grids of 64 in 16 parts, not 16 grids of 4 (1.7 times worse)."""
     made = plate(None, light=SunSky(), camera=CAMERA)
-    whole = renderer(made, budget=Budget(128, 2)).frame(1, with_truth=False)
+    entire, parts = (renderer(made, budget=Budget(128, 2)) for _ in range(2))
+    whole = entire.frame(1, with_truth=False)
+    halves = entire.halves([entire.time(1)], entire.budget, entire.key(1))
     monkeypatch.setattr("qsim.render.MAX_LANES", 128 * 50)
-    parts = renderer(made, budget=Budget(128, 2))
     assert [len(part) for part in parts._parts(128)] == [49, 50] * 8
     split = parts.frame(1, with_truth=False)
-    assert split.error == pytest.approx(whole.error, rel=0.25)
+    assert_same_rms(np.subtract(*halves), np.subtract(*parts.halves([parts.time(1)], parts.budget, parts.key(1))))
     assert abs(split.radiance - whole.radiance).mean() < 2 * whole.error
     albedo = [one.surfaces([0.0], one.key(0))[0].mean() for one in (renderer(made), parts)]
     assert albedo[0] == pytest.approx(albedo[1], abs=0.01)
