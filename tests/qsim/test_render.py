@@ -7,6 +7,7 @@ critical z of tests/stats.py; deterministic light (one sample decides) is compar
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from qsim import shapes
 from qsim.budget import Budget
 from qsim.denoise import available
 from qsim.motion import Oscillation, Spin, Still, Translation
-from qsim.render import render_clip
+from qsim.render import Renderer, render_clip
 from qsim.scene import (
     AreaLamp,
     Body,
@@ -355,6 +356,18 @@ def test_any_frame_alone_is_the_same_frame_and_seeds_differ():
     assert (renderer(made, seed=1).frame(2).radiance != alone.radiance).any()
 
 
+def launches(made: Renderer, work: Callable[[], object]) -> list[dict]:
+    """The compiled kernels that some work starts, as Dr.Jit records them."""
+    if made.engine.backend == "scalar":
+        pytest.skip("the scalar engine compiles nothing")
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        work()
+        return [launch for launch in dr.kernel_history() if "hash" in launch]
+
+
 SHAKEN = Camera(focal_length=2e-3, f_number=2.8, pixel_pitch=5e-5, height=24, width=33, motion=Translation((1.0, 0, 0)))
 SWINGING = AreaLamp((1, 1, 3), (0, 0, 0), 0.5, 0.5, 9.0, Oscillation((0.3, 0, 0), 100.0))
 
@@ -372,16 +385,7 @@ SWINGING = AreaLamp((1, 1, 3), (0, 0, 0), 0.5, 0.5, 9.0, Oscillation((0.3, 0, 0)
 def test_what_moves_is_data_and_compiles_no_kernel_anew(made):
     """A kernel per place of the camera or of a lamp costs half a second each, many times what a small frame takes."""
     made = renderer(made)
-    if made.engine.backend == "scalar":
-        pytest.skip("the scalar engine compiles nothing")
-    import drjit as dr
-
-    seen = []
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        for t in range(4):
-            dr.kernel_history_clear()
-            made.frame(t)
-            seen.append({launch["hash"] for launch in dr.kernel_history() if "hash" in launch})
+    seen = [{launch["hash"] for launch in launches(made, lambda t=t: made.frame(t))} for t in range(4)]
     assert seen[0]
     assert seen[2] | seen[3] <= seen[0] | seen[1]
 
@@ -389,18 +393,9 @@ def test_what_moves_is_data_and_compiles_no_kernel_anew(made):
 def test_the_kernel_of_the_first_frame_serves_the_second():
     """Loading anything amid what is traced gives the first pass of a depth a kernel of its own, half a second more."""
     made = renderer(plate(Translation((40.0, 0, 0))))
-    if made.engine.backend == "scalar":
-        pytest.skip("the scalar engine compiles nothing")
-    import drjit as dr
-
-    largest = []
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        for t in range(2):
-            dr.kernel_history_clear()
-            made.halves([made.time(t)], CHEAP, made.key(t))
-            kernels = [launch for launch in dr.kernel_history() if "hash" in launch]
-            largest.append(max(kernels, key=lambda launch: launch["operation_count"])["hash"])
-    assert largest[0] == largest[1]
+    seen = [launches(made, lambda t=t: made.halves([made.time(t)], CHEAP, made.key(t))) for t in range(2)]
+    first, second = (max(each, key=lambda launch: launch["operation_count"])["hash"] for each in seen)
+    assert first == second
 
 
 def test_the_measured_error_is_the_error():
