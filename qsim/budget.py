@@ -132,7 +132,7 @@ def shortfall(reached: float | None, asked: float) -> str:
     """What to say of a clip whose measured PSNR misses the one asked for by more than chance, 0.5 dB; else nothing."""
     if reached is None or reached >= asked - 0.5:
         return ""
-    why = "the pilot foresaw less error; a higher psnr takes more samples"
+    why = "the pilot foresaw less error or brighter highlights; a higher psnr takes more samples"
     return f"{reached:.1f} dB where {asked:g} were asked for: {why}"
 
 
