@@ -15,6 +15,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple
 
 from qsim import jobs, stream
@@ -162,22 +163,24 @@ def plan(recipe: Recipe, *, frames: int = 5, progress: stream.Progress | None = 
 
 
 def _measure(members: list[Job], folder: Path, frames: int) -> Cost:
-    """The second rendering counts: kernels are then compiled and cached, as they are for nearly all jobs."""
-    budgets = [jobs.choose_budget(job, jobs.load_scene(job)) for job in _spread(members)]
+    """Every job is met for the first time, as in a run: a scene has kernels of its own, which its pilot compiles."""
+    looked_at = _spread(members)
+    budgets, choosing = zip(*map(_budget, looked_at), strict=True)
     work = [_work(budget) for budget in budgets]
-    _first_frames(members[0], folder / "warm", min(2, members[0].settings.frames))
-    job = _spread(members)[len(budgets) // 2]
+    typical = Seconds(*map(median, zip(*choosing, strict=True)))  # the first of a process also imports
+    middle = len(looked_at) // 2
+    job = looked_at[middle]
     settings = job.settings
     started = Seconds.now()
-    clip, moments = _first_frames(job, folder / "measured", min(frames, settings.frames))
-    # The first frame carries scene, budget and loading; the others are what each further frame costs.
+    clip, moments = _first_frames(job, budgets[middle], folder, min(frames, settings.frames))
+    # The first frame carries scene and compilation; the others are what each further frame costs.
     first, more = moments[0].since(started), moments[-1].since(moments[0])
     if len(moments) > 1:
         per_frame = Seconds(*(seconds / (len(moments) - 1) for seconds in more))
-        setup = Seconds(*(max(0.0, seconds) for seconds in first.since(per_frame)))
+        setup = Seconds(*(a + max(0.0, b) for a, b in zip(typical, first.since(per_frame), strict=True)))
     else:
-        per_frame, setup = first, Seconds(0.0, 0.0)
-    dearer = sum(work) / len(work) / work[len(work) // 2]
+        per_frame, setup = first, typical
+    dearer = sum(work) / len(work) / work[middle]
     sensing, codes = _sense(job, clip)
     stored = sum(file.stat().st_size for file in clip.path.rglob("*.exr")) / len(clip)
     return Cost(
@@ -199,26 +202,31 @@ def _spread(members: list[Job]) -> list[Job]:
     return [members[round(i * (len(members) - 1) / max(1, count - 1))] for i in range(count)]
 
 
+def _budget(job: Job) -> tuple[Budget, Seconds]:
+    """A job's budget, and what its choice took."""
+    scene, started = jobs.load_scene(job), Seconds.now()
+    return jobs.choose_budget(job, scene), Seconds.now().since(started)
+
+
 def _work(budget: Budget) -> float:
     """What a frame costs, in samples per pixel: nearly everything else that a frame needs is small beside them."""
     return budget.samples + (DENOISE_COST if budget.denoise else 0.0)
 
 
-def _first_frames(job: Job, path: Path, frames: int) -> tuple[Clip, list[Seconds]]:
+def _first_frames(job: Job, budget: Budget, path: Path, frames: int) -> tuple[Clip, list[Seconds]]:
     """The first frames of a job's clip, and when each was done."""
     from qsim import render
 
     settings = job.settings
     moments: list[Seconds] = []
-    scene = jobs.load_scene(job)
     clip = render.render_clip(
-        scene,
+        jobs.load_scene(job),
         path,
         frames=frames,
         frame_rate=settings.frame_rate,
         shutter=settings.shutter,
         seed=jobs.render_seed(job),
-        budget=jobs.choose_budget(job, scene),
+        budget=budget,
         progress=lambda done, total: moments.append(Seconds.now()),
     )
     return clip, moments
