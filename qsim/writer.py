@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 FORMAT_VERSION = 1
 PHYSICAL = "W m^-2 sr^-1"
 RELATIVE = "relative"
+MEASURED = (  # in clip.json, beyond what was asked for
+    *("mean_radiance", "mean_photons", "clipped_pixels", "checksums", "software"),
+    *("error_per_frame", "psnr_of_truth", "fireflies_per_frame"),
+)
 TRUTH = {  # channel of the EXR file -> quantity
     "u": "flow",
     "v": "flow",
@@ -61,6 +65,7 @@ class ClipWriter:
         self.part = self.path.with_name(self.path.name + ".part")
         self._camera = camera_of(self.meta, self.path)
         self._frames: dict[int, dict[str, Any]] = {}
+        self._whole = False  # all frames and clip.json are there
         self._lock = files.Lock(self.part / "lock")
 
     def __enter__(self) -> ClipWriter:
@@ -70,19 +75,18 @@ class ClipWriter:
             raise ValueError(f"{self.part}: another process is writing this clip; wait for it, or name another with -o")
         try:
             begun = self.part / "begun.json"
-            if not begun.is_file():
-                if not self._left_by_a_writer():
-                    message = f"{self.part}: holds files of somebody else; move them away, or name another with -o"
-                    raise ValueError(message)
-                files.write_bytes(begun, b"")  # before anything goes: a clearing cut short is still a writer's
+            if not begun.is_file():  # before anything goes: a clearing cut short is still a writer's
+                files.write_bytes(begun, self._asked_before())
+            self._whole = self._is_whole()
             if begun.read_bytes() != identity:
-                done = 0 if self.force else len(_read_journal(self.part))
-                if done:
+                done = self.meta["shape"][0] if self._whole else len(_read_journal(self.part))
+                if done and not self.force:
                     raise ValueError(
                         f"{self.part}: {done} frames are there, asked for with other settings; ask for the same to go "
                         "on, name another with -o, or use --force to begin anew"
                     )
                 self._clear()
+                self._whole = False
                 files.write_bytes(begun, identity)
             files.sweep(self.part)
             self._frames = _read_journal(self.part)
@@ -93,7 +97,7 @@ class ClipWriter:
 
     def has(self, t: int) -> bool:
         """Whether an earlier, interrupted writer already finished frame t."""
-        return t in self._frames
+        return self._whole or t in self._frames
 
     def add(
         self,
@@ -140,6 +144,7 @@ class ClipWriter:
             photons = optics.expected_photons(stored, self._camera, self.meta["exposure"], origin=origin)
             entry["mean_photons"] = float(photons.mean())
         self._frames[t] = entry
+        self._whole = False
         files.append_line(self.part / "journal.jsonl", json.dumps(entry, sort_keys=True).encode())
 
     def __exit__(
@@ -148,17 +153,28 @@ class ClipWriter:
         try:
             if kind is None:
                 self._finish()
-            elif not self._frames:
+            elif not (self._frames or self._whole):
                 self._clear()
                 shutil.rmtree(self.part)
         finally:
             self._lock.release()
 
-    def _left_by_a_writer(self) -> bool:
-        """Whether a .part without begun.json is a writer's: killed before it began, or between the last two steps."""
+    def _asked_before(self) -> bytes:
+        """begun.json anew, of a .part without: killed before it began, or while it gave the folder its name."""
         with contextlib.suppress(OSError, ValueError):
-            return bool(files.read_json(self.part / "clip.json").get("name") == self.path.name)
-        return all(item.name.startswith(("lock", "begun.json.tmp-")) for item in self.part.iterdir())
+            left = files.read_json(self.part / "clip.json")
+            if left.get("name") == self.path.name:
+                return files.to_json({key: value for key, value in left.items() if key not in MEASURED})
+        if all(item.name.startswith(("lock", "begun.json.tmp-")) for item in self.part.iterdir()):
+            return b""
+        raise ValueError(f"{self.part}: holds files of somebody else; move them away, or name another with -o")
+
+    def _is_whole(self) -> bool:
+        """Whether all is there but the clip's name: the writer was killed while giving it."""
+        path = self.part / "clip.json"
+        return path.is_file() and not any(
+            files.differs(self.part / name, digest) for name, digest in files.read_json(path)["checksums"].items()
+        )
 
     def _clear(self) -> None:
         """Delete what a writer left; begun.json, which says that it was one, stays."""
@@ -183,11 +199,22 @@ class ClipWriter:
 
     def _finish(self) -> None:
         frames = self.meta["shape"][0]
-        missing = [t for t in range(frames) if t not in self._frames]
+        missing = [t for t in range(frames) if not self.has(t)]
         if missing:
             raise ValueError(
                 f"{self.path}: frame {missing[0]} was never written ({len(missing)} of {frames} are missing)"
             )
+        if not self._whole:
+            self._write_meta(frames)
+        for name in ("begun.json", "journal.jsonl", "lock"):
+            (self.part / name).unlink(missing_ok=True)
+        if self.path.exists():
+            files.remove_folder(self.path)
+        os.replace(self.part, self.path)
+        files.sync_folder(self.path.parent)
+
+    def _write_meta(self, frames: int) -> None:
+        """clip.json: what was asked for and what was measured (MEASURED)."""
         entries = [self._frames[t] for t in range(frames)]
         meta = dict(self.meta)
         meta["mean_radiance"] = math.fsum(e["mean_radiance"] for e in entries) / frames
@@ -202,12 +229,6 @@ class ClipWriter:
         if all("fireflies" in e for e in entries):
             meta["fireflies_per_frame"] = [e["fireflies"] for e in entries]
         files.write_json(self.part / "clip.json", meta)
-        for name in ("begun.json", "journal.jsonl", "lock"):
-            (self.part / name).unlink(missing_ok=True)
-        if self.path.exists():
-            files.remove_folder(self.path)
-        os.replace(self.part, self.path)
-        files.sync_folder(self.path.parent)
 
     def _psnr(self, errors: list[float]) -> float | None:
         """PSNR of the radiance, dB; the peak is the clip's 99.9th percentile (over at most 4 million even samples)."""

@@ -2,9 +2,13 @@
 
 import contextlib
 import gc
+import itertools
 import os
+import signal
+import sys
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 
@@ -22,3 +26,26 @@ def forked(action: Callable[[], Any]) -> int:
         os._exit(code)
     gc.unfreeze()
     return child
+
+
+def killed_at(step: int, place: Path, action: Callable[[], Any]) -> bool:
+    """Run `action` in a fork that SIGKILL ends before its so-many-th event of the file system; False if it had fewer.
+
+    Events: what is opened below `place`, and whatever is made, removed or renamed.
+    """
+    events = itertools.count(1)
+
+    def watch(event: str, arguments: tuple[Any, ...]) -> None:
+        ours = event in ("os.mkdir", "os.rename", "os.remove", "os.rmdir") or (
+            event == "open" and str(place) in str(arguments[0])
+        )
+        if ours and next(events) == step:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def watched() -> None:
+        sys.addaudithook(watch)
+        action()
+
+    code = os.waitstatus_to_exitcode(os.waitpid(forked(watched), 0)[1])
+    assert code in (0, -signal.SIGKILL)
+    return code != 0

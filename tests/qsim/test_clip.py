@@ -1,17 +1,14 @@
 """Clip folders: what is written is read, and nothing that is not whole is accepted."""
 
 import functools
-import itertools
 import json
 import os
-import signal
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from forks import forked
+from forks import killed_at
 
 from qsim import exr, files, optics
 from qsim.clip import PHYSICAL, RELATIVE, Clip, ClipWriter
@@ -58,7 +55,9 @@ def truth(t: int) -> dict[str, np.ndarray]:
 def write(path: Path, *, force: bool = False, **changes: Any) -> Clip:
     with ClipWriter(path, meta(**changes), force=force) as writer:
         for t in range(FRAMES):
-            writer.add(t, radiance(t), sharp=radiance(50 + t) if t == 2 else None, truth=truth(t), error=0.01)
+            if not writer.has(t):
+                sharp = radiance(50 + t) if t == 2 else None
+                writer.add(t, radiance(t), sharp=sharp, truth=truth(t), error=0.01, fireflies=t)
     return Clip.open(path)
 
 
@@ -156,39 +155,50 @@ def test_an_interrupted_writer_leaves_nothing_readable_and_goes_on(tmp_path: Pat
     assert sorted(p.name for p in path.iterdir()) == ["clip.json", "radiance"]
 
 
-@pytest.mark.parametrize("left", [None, {}, {"frame_rate": 1000.0}])
-def test_a_writer_killed_at_every_step_can_begin_again(tmp_path: Path, left: dict[str, Any] | None):
+@pytest.mark.parametrize(("left", "force"), [(None, False), ({}, False), ({}, True), ({"frame_rate": 1000.0}, True)])
+def test_a_writer_killed_at_every_step_can_begin_again(tmp_path: Path, left: dict[str, Any] | None, force: bool):
     """Before each file it opens, removes or renames; in an empty folder, going on, and clearing what is of no use."""
-    code, steps = signal.SIGKILL, 0
-    while code == signal.SIGKILL:
+    killed, steps = True, 0
+    while killed:
         path = tmp_path / str(steps) / "a"
         path.parent.mkdir()
         if left is not None:
             interrupted(path, 0, **left)
         steps += 1
-        code = -os.waitstatus_to_exitcode(os.waitpid(forked(functools.partial(killed_at, steps, path)), 0)[1])
+        killed = killed_at(steps, path, functools.partial(write, path, force=force))
         if not path.exists():
-            write(path, force=True)
+            write(path, force=force)
         assert Clip.open(path).verify() == []
         assert [item.name for item in path.parent.iterdir()] == ["a"]
         assert sorted(item.name for item in path.iterdir()) == ["clip.json", "radiance", "sharp", "truth"]
-    assert code == 0
     assert steps > 50
 
 
-def killed_at(step: int, path: Path) -> None:
-    """Write a clip, and die of SIGKILL before the so-many-th event of the file system."""
-    events = itertools.count(1)
+@pytest.mark.parametrize("gone", [(), ("begun.json",), ("begun.json", "journal.jsonl"), ("begun.json", "lock")])
+def test_a_clip_that_lacks_only_its_name_is_not_made_again(tmp_path: Path, monkeypatch, gone: tuple[str, ...]):
+    """Killed after clip.json was written: no frame is lost, and other settings do not get it."""
+    part = tmp_path / "a.part"
 
-    def watch(event: str, arguments: tuple[Any, ...]) -> None:
-        ours = event in ("os.mkdir", "os.rename", "os.remove", "os.rmdir") or (
-            event == "open" and str(path) in str(arguments[0])
-        )
-        if ours and next(events) == step:
-            os.kill(os.getpid(), signal.SIGKILL)
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
 
-    sys.addaudithook(watch)
-    write(path, force=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", lambda a, b: killed() if Path(a) == part else os.rename(a, b))
+        patch.setattr(Path, "unlink", lambda self, **_: os.remove(self) if self.name in gone else None)
+        with pytest.raises(KeyboardInterrupt):
+            write(tmp_path / "a")
+    frame = part / "radiance" / "000000.exr"
+    made, kept = frame.stat().st_ino, frame.read_bytes()
+    with pytest.raises(ValueError, match=r"a\.part: 5 frames are there, asked for with other settings"):
+        write(tmp_path / "a", frame_rate=1000.0)
+    assert interrupted(tmp_path / "a") == list(range(FRAMES))
+    clip = write(tmp_path / "a")
+    assert clip.verify() == []
+    assert (clip.path / "radiance" / "000000.exr").stat().st_ino == made
+    assert clip.meta == write(tmp_path / "b" / "a").meta
+    clip.path.rename(part)
+    frame.write_bytes(kept[:-1])  # and what is damaged is not taken for whole
+    assert interrupted(tmp_path / "a") == []
 
 
 def test_a_damaged_frame_of_an_interrupted_writer_is_done_again(tmp_path: Path):

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 import small_scenes
 from fakes import RECIPE, die_on_tumble, fail_on_tumble, hoard_on_tumble, make, make_slowly, tree
-from forks import forked
+from forks import forked, killed_at
 
 from qsim import files, jobs, recipe, stream, textures
 from qsim.dataset import Dataset
@@ -115,6 +115,23 @@ def test_killed_at_random_moments_sixty_times(tmp_path: Path, undisturbed: dict[
         assert tree(folder) == undisturbed
         shutil.rmtree(folder)
     assert rounds < 60
+
+
+def test_killed_before_every_step(tmp_path: Path):
+    """One job; whatever was opened, made, removed or renamed last, the same command then makes the same bytes."""
+    head, _, tumble = RECIPE.split("[[scenes]]")
+    one = recipe.parse(f"{head}[[scenes]]{tumble}".replace("[1, 3]", "[3]"))
+    generate(one, tmp_path / "undisturbed", HERE, make=make)
+    expected = tree(tmp_path / "undisturbed")
+    killed, steps = True, 0
+    while killed:
+        folder = tmp_path / str(steps)
+        steps += 1
+        run = functools.partial(generate, one, folder, HERE, make=make)
+        killed = killed_at(steps, folder, run)
+        assert run().failed == {}
+        assert tree(folder) == expected
+    assert steps > 50
 
 
 def test_a_killed_parent_leaves_no_workers_and_its_folder_resumes(tmp_path: Path, undisturbed: dict[str, bytes]):
