@@ -89,6 +89,8 @@ class ClipWriter:
                 self._whole = False
                 files.write_bytes(begun, identity)
             files.sweep(self.part)
+            for leftover in self.path.parent.glob(f"{self.path.name}.removed-*"):  # of a replacement cut short
+                shutil.rmtree(leftover)
             self._frames = _read_journal(self.part)
         except BaseException:
             self._lock.release()
@@ -159,22 +161,25 @@ class ClipWriter:
         finally:
             self._lock.release()
 
-    def _asked_before(self) -> bytes:
-        """begun.json anew, of a .part without: killed before it began, or while it gave the folder its name."""
+    def _left(self) -> dict[str, Any]:
+        """This clip's clip.json in .part: the writer was killed while giving the folder its name. Else empty."""
         with contextlib.suppress(OSError, ValueError):
             left = files.read_json(self.part / "clip.json")
-            if left.get("name") == self.path.name:
-                return files.to_json({key: value for key, value in left.items() if key not in MEASURED})
+            return left if left.get("name") == self.path.name else {}
+        return {}
+
+    def _asked_before(self) -> bytes:
+        """begun.json anew, of a .part without: killed before it began, or while it gave the folder its name."""
+        if left := self._left():
+            return files.to_json({key: value for key, value in left.items() if key not in MEASURED})
         if all(item.name.startswith(("lock", "begun.json.tmp-")) for item in self.part.iterdir()):
             return b""
         raise ValueError(f"{self.part}: holds files of somebody else; move them away, or name another with -o")
 
     def _is_whole(self) -> bool:
-        """Whether all is there but the clip's name: the writer was killed while giving it."""
-        path = self.part / "clip.json"
-        return path.is_file() and not any(
-            files.differs(self.part / name, digest) for name, digest in files.read_json(path)["checksums"].items()
-        )
+        """Whether all is there but the clip's name."""
+        checksums = self._left().get("checksums", {})
+        return bool(checksums) and not any(files.differs(self.part / name, d) for name, d in checksums.items())
 
     def _clear(self) -> None:
         """Delete what a writer left; begun.json, which says that it was one, stays."""

@@ -155,20 +155,34 @@ def test_an_interrupted_writer_leaves_nothing_readable_and_goes_on(tmp_path: Pat
     assert sorted(p.name for p in path.iterdir()) == ["clip.json", "radiance"]
 
 
-@pytest.mark.parametrize(("left", "force"), [(None, False), ({}, False), ({}, True), ({"frame_rate": 1000.0}, True)])
-def test_a_writer_killed_at_every_step_can_begin_again(tmp_path: Path, left: dict[str, Any] | None, force: bool):
-    """Before each file it opens, removes or renames; in an empty folder, going on, and clearing what is of no use."""
+@pytest.mark.parametrize(
+    ("left", "replaced", "force"),
+    [
+        (None, False, False),
+        ({}, False, False),
+        ({}, False, True),
+        ({"frame_rate": 1000.0}, False, True),
+        ({}, True, True),
+    ],
+)
+def test_a_writer_killed_at_every_step_can_begin_again(
+    tmp_path: Path, left: dict[str, Any] | None, replaced: bool, force: bool
+):
+    """Before each file it opens, removes or renames: in an empty folder, going on, clearing, replacing a clip."""
     killed, steps = True, 0
     while killed:
         path = tmp_path / str(steps) / "a"
         path.parent.mkdir()
+        if replaced:
+            write(path, frame_rate=500.0)
         if left is not None:
-            interrupted(path, 0, **left)
+            interrupted(path, 0, force=force, **left)
         steps += 1
         killed = killed_at(steps, path, functools.partial(write, path, force=force))
-        if not path.exists():
+        if not path.exists() or Clip.open(path).frame_rate == 500.0:
             write(path, force=force)
-        assert Clip.open(path).verify() == []
+        clip = Clip.open(path)
+        assert (clip.frame_rate, clip.verify()) == (2000.0, [])
         assert [item.name for item in path.parent.iterdir()] == ["a"]
         assert sorted(item.name for item in path.iterdir()) == ["clip.json", "radiance", "sharp", "truth"]
     assert steps > 50
