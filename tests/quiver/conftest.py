@@ -1,13 +1,20 @@
-"""Tiny clips and data sets in the folders of a test."""
+"""Tiny clips and data sets in the folders of a test; torch draws the same in every order of tests."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+import torch
 from clips import ClipMaker, write_clip, write_dataset
 
 from qsim.clip import Clip
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Before the test's fixtures: weights that it draws do not depend on which tests its process ran before."""
+    torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session")
