@@ -79,7 +79,7 @@ class ClipWriter:
                 files.write_bytes(begun, self._asked_before())
             self._whole = self._is_whole()
             if begun.read_bytes() != identity:
-                done = self.meta["shape"][0] if self._whole else len(_read_journal(self.part))
+                done = self._left()["shape"][0] if self._whole else len(_read_journal(self.part))
                 if done and not self.force:
                     raise ValueError(
                         f"{self.part}: {done} frames are there, asked for with other settings; ask for the same to go "

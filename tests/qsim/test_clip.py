@@ -204,7 +204,7 @@ def test_a_clip_that_lacks_only_its_name_is_not_made_again(tmp_path: Path, monke
     frame = part / "radiance" / "000000.exr"
     made, kept = frame.stat().st_ino, frame.read_bytes()
     with pytest.raises(ValueError, match=r"a\.part: 5 frames are there, asked for with other settings"):
-        write(tmp_path / "a", frame_rate=1000.0)
+        write(tmp_path / "a", shape=[FRAMES - 1, HEIGHT, WIDTH])
     assert interrupted(tmp_path / "a") == list(range(FRAMES))
     clip = write(tmp_path / "a")
     assert clip.verify() == []
