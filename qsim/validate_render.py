@@ -151,9 +151,10 @@ def _compare(
     samples, obvious_psnr = _obvious_samples(ours, level, target)
     timed = min(samples, most_samples)
     theirs, own, stated = [], [], 0.0
-    begun, i = time.perf_counter(), -1
-    while i < rounds or (i < MOST_ROUNDS and time.perf_counter() < begun + ENOUGH):
-        i += 1  # the first round compiles and does not count
+    end = time.perf_counter() + ENOUGH
+    for i in range(max(rounds, MOST_ROUNDS) + 1):  # the first round compiles and does not count
+        if i > rounds and time.perf_counter() > end:
+            break
         started = _clocks()
         _obvious(ours, FRAME + i, timed)
         between = _clocks()

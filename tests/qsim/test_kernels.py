@@ -296,11 +296,11 @@ os._exit(0)
 
 @needs_engine
 def test_memory_is_the_output_and_what_launches_hold():
-    """Bytes per pixel of a launch, beyond the codes: the 13 of kernels.py, and 3 for finishing a frame.
+    """Bytes per pixel of a launch, beyond the codes: the 13 of kernels.py, and 3 for finishing (2 to 8 seen).
 
     40 frames in float64: their float32 would be 160 bytes, their codes once more 40, or 15 packed. In a process of its
-    own, which never stops tracing: before Python 3.12.9 that crashes while another thread, here Dr.Jit's that lets go
-    of an array, waits for the interpreter (python/cpython issue 128679).
+    own, which never stops tracing: in Python 3.11 that crashes while another thread, here Dr.Jit's that lets go of an
+    array, waits for the interpreter (python/cpython issue 128679).
     """
     line = [sys.executable, "-X", "tracemalloc", "-c", MEMORY]
     done = subprocess.run(line, timeout=120, capture_output=True, text=True, check=False)
