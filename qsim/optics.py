@@ -25,6 +25,7 @@ PLANCK = 6.62607015e-34  # J s, exact (SI)
 LIGHT_SPEED = 299792458.0  # m s^-1, exact (SI)
 LUMINOUS_EFFICACY = 683.0  # lm W^-1 at 540 THz, exact (SI); K_m at 555 nm
 LUX_WAVELENGTH = 555e-9  # m, where V(lambda) = 1: every lux of this module is light of this wavelength
+WHITE_PER_MEAN = 2.5  # white of a clip or stream, in units of its mean light: the peak of scores and of asked errors
 
 Crop = tuple[int, int, int, int]  # y, x, height, width
 
