@@ -7,8 +7,10 @@ A pixel's code is the number of steps F_k that its uniform number u has passed. 
     CountingSPAD   F_k = sum_(n <= k) Pois(n; lambda s_k)   s_k: share of the exposure that is live after k counts
     BinarySPAD     F_0 = exp(-lambda) in each of M planes   a code is the number of planes that fired
 
-The Poisson weights are carried as q_n = exp(-shift) (lambda / scale)^n with coefficients scale^n / n!, so that one
-multiplication and one addition per term suffice and both sides of u exp(lambda - shift) >= sum stay within float32.
+The Poisson weights are carried as (lambda / scale)^n with coefficients scale^n / n!, so that one multiplication and
+one addition per term suffice. Short sums are compared as u exp(lambda) >= sum; longer ones have half of the exponential
+on either side, u exp(lambda / 2) >= exp(-lambda / 2) sum. A weight that underflows is then below 1e-10 of the unit, at
+any light: with one exponential of a fixed shift in all weights, dark pixels of long sums lost terms that count.
 """
 
 from __future__ import annotations
@@ -25,8 +27,9 @@ from qsim.sensor import Sensor
 from qsim.spad import BinarySPAD, CountingSPAD
 
 _MAX_WORK = 1200  # terms of all sums of one kernel together
-_SINGLE_TERMS = 75  # electrons up to which float32 has the range
-_DOUBLE_TERMS = 500  # and float64
+_SINGLE_TERMS = 75  # electrons up to which float32 has the range, halved: exp(165 / 2)
+_DOUBLE_TERMS = 500  # and float64: exp(687)
+_SINGLE_EXPONENT, _DOUBLE_EXPONENT = 85.0, 700.0  # exp of more overflows
 _NEGLIGIBLE = 1e-12  # a coefficient that small moves no step by more than float64's rounding of the reference
 
 
@@ -35,7 +38,7 @@ class Electrons:
     """Sums over electrons: q_0 ... q_(n-1), and for each step how many come in full and which are weighted."""
 
     highest: float  # arrivals beyond which every step without a floor is 0; more light changes nothing
-    shift: float
+    halved: bool  # half of exp(highest) is what the float has room for
     scale: float
     full: Array  # [n] coefficient of a whole term, scale^n / n!
     prefix: tuple[int, ...]  # per step: terms 0 ... prefix - 1 in full
@@ -103,10 +106,10 @@ def electrons(sensor: QIS) -> Electrons | None:
     ends = [int(np.flatnonzero(np.append(True, column > _NEGLIGIBLE))[-1]) for column in weights.T]
     if 2 * n + sum(max(end - start, 0) for start, end in zip(prefix, ends, strict=True)) > _MAX_WORK:
         return None
-    # Above lambda = highest even the last step is certain to be passed; below, exp(lambda - shift) must not overflow
-    highest, limit = n + 7 * sqrt(n) + 30, 85.0 if n <= _SINGLE_TERMS else 700.0
+    # Above lambda = highest even the last step is certain to be passed
+    highest, limit = n + 7 * sqrt(n) + 30, _SINGLE_EXPONENT if n <= _SINGLE_TERMS else _DOUBLE_EXPONENT
     scale = 2.0 ** max(0, ceil(log2(max(n / e, 1))))
     numbers = np.arange(n)
     full = np.exp(numbers * log(scale) - np.array([lgamma(m + 1) for m in numbers]))
     band = [weights[a:b, k] * full[a:b] for k, (a, b) in enumerate(zip(prefix, ends, strict=True))]
-    return Electrons(highest, max(0.0, highest - limit), scale, full, tuple(prefix), tuple(band), floor)
+    return Electrons(highest, highest > limit, scale, full, tuple(prefix), tuple(band), floor)

@@ -12,7 +12,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from functools import cache, lru_cache
-from math import exp, log
+from math import log
 from typing import Any
 
 import numpy as np
@@ -227,11 +227,11 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
             result.append(total * _exp_below_zero(-live))
         return result + [real(2)] * (steps.levels - 1 - len(result)), real(1)  # no live time: never passed
     n = len(steps.full)
-    highest, shift, scale, seed = scalars[:4]
-    full, bands = scalars[4 : 4 + n], iter(scalars[4 + n :])
+    highest, scale = scalars[:2]
+    full, bands = scalars[2 : 2 + n], iter(scalars[2 + n :])
     mean = _smaller(mean, highest)
-    unit, grow = dr.exp(mean - shift), mean * scale
-    terms = [seed]
+    unit, grow = dr.exp(mean * 0.5 if steps.halved else mean), mean * scale
+    terms = [1 / unit if steps.halved else real(1)]
     for _ in range(1, n):
         terms.append(terms[-1] * grow)
     result, total, summed = [], real(0), 0
@@ -274,7 +274,7 @@ def _numbers(plan: Plan) -> list[float]:
     steps = plan.steps
     if isinstance(steps, Live):
         return [*values, *steps.shares]
-    values += [steps.highest, steps.shift, 1 / steps.scale, exp(-steps.shift), *steps.full]
+    values += [steps.highest, 1 / steps.scale, *steps.full]
     for band, floor in zip(steps.band, steps.floor, strict=True):
         values += [*band, floor] if floor else [*band]
     return [float(value) for value in values]
