@@ -34,10 +34,11 @@ def evaluation_section(path: Path) -> str:
         [
             line["method"],
             line["light"],
-            _pm(line["scores"]["psnr"], 2),
-            _pm(line["scores"]["psnr_matched"], 2),
+            _pm(line["scores"]["psnr"], 2) + _near(line, "psnr"),
+            _pm(line["scores"]["psnr_matched"], 2) + _near(line, "psnr_matched"),
             _pm(line["scores"]["ssim_matched"], 3),
             line["seconds_per_frame"],
+            _percent(line.get("above_peak")),
             line["truth_psnr"],
         ]
         for line in found["table"]
@@ -52,19 +53,43 @@ def evaluation_section(path: Path) -> str:
         "PSNR matched [dB]",
         "SSIM matched",
         "s/frame",
-        "truth's own PSNR, peak = white [dB]",
+        "truth above the peak",
+        "truth's own PSNR [dB]",
     ]
-    caption = "mean ± half of the 95 % interval over scenes; matched = after one best factor per clip"
+    caption = f"mean ± half of the 95 % interval over scenes; {_definition(found)}"
+    if any(line.get("near_truth") for line in found["table"]):
+        caption += (
+            "; † in one clip or more within 3 dB of the truth's own PSNR, whose error is a large part of this score"
+        )
     missing = f"Not built yet: {', '.join(found['not_built_yet'])}." if found.get("not_built_yet") else ""
     table = page.table(page.Table(caption, headers, rows, frozenset(best)))
-    return page.section(f"Methods compared: {path.parent.name}", table, page.text(missing), _speed_against_error(found))
+    remarks = [page.text(remark) for remark in (*found.get("remarks", []), missing)]
+    return page.section(f"Methods compared: {path.parent.name}", table, *remarks, _speed_against_error(found))
+
+
+def _definition(found: dict[str, Any]) -> str:
+    """What the scores of an evaluation mean; before format 2 they were others."""
+    if "peak" not in found:
+        return (
+            "scores as they were defined before (peak = the sensor's white, matched = after the factor of least "
+            "squares without the clamp); they do not compare with later ones"
+        )
+    return f"peak = {found['peak']}; matched = after the one factor that is best behind the clamp at the peak"
+
+
+def _near(line: dict[str, Any], name: str) -> str:
+    return " †" if name in line.get("near_truth", ()) else ""
+
+
+def _percent(share: object) -> str | None:
+    return f"{100 * share:.1f} %" if isinstance(share, int | float) else None
 
 
 def _pm(interval: dict[str, Any], digits: int) -> str:
     """`23.45 ± 0.67`, without the half-width where there is one scene."""
     mean, half = interval["mean"], interval["half_width"]
     if not isinstance(mean, int | float):
-        return "failed"
+        return "n/a" if interval.get("scenes") else "failed"
     return f"{mean:.{digits}f}" + (f" ± {half:.{digits}f}" if isinstance(half, int | float) else "")
 
 
@@ -76,7 +101,8 @@ def static_section(path: Path) -> str:
     rows = [[score[key] for key in keys] for score in found["scores"]]
     caption = (
         f"{Path(found['counts']).name}: real photons clipped to {found['bits']} bits, restored from {found['frames']} "
-        "frames, scored against the others; the reference's own variance is taken off"
+        "frames, scored against the others; the reference's own variance is taken off; "
+        + (f"peak = {found['peak']:.4g} photons" if "peak" in found else "peak = the largest code, as it was before")
     )
     return page.section("Real photons", page.table(page.Table(caption, headers, rows)))
 

@@ -22,7 +22,7 @@ from numpy import ndarray as Array
 
 from quiver import metrics
 from quiver.baselines import METHODS
-from quiver.data import Codes, Key, Light, array_codes, draw_codes, replacing
+from quiver.data import Codes, Key, Light, array_codes, draw_codes, peak_of, replacing
 from quiver.memory import peak_memory, reset_peak
 from quiver.restoring import Options, Restorer, network_restorer, pick_device, restorer, weights_path, wrap_network
 
@@ -121,7 +121,8 @@ def measure(case: Case, setting: Setting) -> Cost:
     started = time.perf_counter()
     restored = method.restore(codes, first, last)
     seconds = (time.perf_counter() - started) / setting.restored
-    score = metrics.score(restored / codes.white, photons[first:last] / codes.white)
+    white = peak_of(setting.ppp)
+    score = metrics.score(restored / white, photons[first:last] / white)
     return Cost(
         **asdict(case),
         trained=trained,

@@ -46,11 +46,11 @@ def by_motion(matched: Array, target: Array, speed: Array) -> tuple[tuple[int, .
 
 
 def pooled(counts: Sequence[Sequence[int]], squares: Sequence[Sequence[float]]) -> list[float]:
-    """PSNR [dB] of every bin over several clips; NaN for a bin without pixels."""
+    """PSNR [dB] of every bin over several clips; NaN for a bin without pixels, or whose error the clamp hides."""
     if not counts:
         return [math.nan] * (len(EDGES) - 1)
     pixels, total = np.sum(counts, axis=0), np.sum(squares, axis=0)
-    return [metrics.decibel(s / n) if n else math.nan for n, s in zip(pixels, total, strict=True)]
+    return [metrics.decibel(s / n) if s > 0 else math.nan for n, s in zip(pixels, total, strict=True)]
 
 
 # Crops
@@ -77,7 +77,7 @@ def crop_file(out: Path, light: str, clip: str, method: str) -> Path:
 
 
 def save_crop(path: Path, picture: Array) -> None:
-    """A float16 picture in units of white."""
+    """A float16 picture in units of the peak."""
     path.parent.mkdir(exist_ok=True)
     with replacing(path) as file:
         np.save(file, picture.astype(np.float16))

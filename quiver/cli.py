@@ -149,6 +149,9 @@ def _add_evaluate(sub: Any) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the test noise or of the random splits (default 0)")
     parser.add_argument("--published", action="store_true", help="every window exposed, scaled and scored on its own")
     parser.add_argument(
+        "--peak", type=positive, help="photons per pixel that the scores refer to (default 2.5 x the mean light)"
+    )
+    parser.add_argument(
         "--static", type=Path, metavar="COUNTS", help="photon counts [N,H,W] or [T,K,H,W], .npy or .npz"
     )
     parser.add_argument("--frames", type=count, default=11, help="static: frames to restore from (default 11)")
@@ -172,7 +175,13 @@ def _run_evaluate(args: argparse.Namespace) -> int:
     sensor = args.sensor or ("quiver-published" if args.published else "quiver-physical")
     lights = tuple(Light(sensor, ppp, bits) for bits in args.bits or (3,) for ppp in args.ppp or (3.25,))
     plan = Plan(
-        args.source, None if args.split == "all" else args.split, lights, args.seed, args.published, args.stream
+        args.source,
+        None if args.split == "all" else args.split,
+        lights,
+        args.seed,
+        args.published,
+        args.stream,
+        args.peak,
     )
     if args.force and args.output.exists():
         renew(args.output, "plan.json")
@@ -184,7 +193,7 @@ def _run_evaluate(args: argparse.Namespace) -> int:
 
 
 def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
-    from quiver.data import output
+    from quiver.data import output, peak_of
     from quiver.evaluate import json_safe
     from quiver.static import FORMAT, evaluate_static, markdown, read_counts
 
@@ -192,10 +201,13 @@ def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
         raise FileNotFoundError(f"{args.static}: no such file")
     counts = read_counts(args.static)
     bits = (args.bits or (3,))[0]
-    scores = evaluate_static(counts, methods, frames=args.frames, bits=bits, splits=args.splits, seed=args.seed)
+    scores = evaluate_static(
+        counts, methods, frames=args.frames, bits=bits, splits=args.splits, seed=args.seed, peak=args.peak
+    )
     found = {"format": FORMAT, "counts": str(args.static), "frames": args.frames, "bits": bits}
+    found["peak"] = peak_of(counts.light, args.peak)
     found["scores"] = [asdict(score) for score in scores]
-    output(args, json_safe(found), markdown(counts, scores, args.frames, bits))
+    output(args, json_safe(found), markdown(counts, scores, args.frames, bits, args.peak))
     return 1 if any(score.failure for score in scores) else 0
 
 

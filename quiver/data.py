@@ -22,8 +22,9 @@ from qsim.completion import add_completion
 from qsim.console import GOES_ON, STARTS_AGAIN, Parser, bar, command, output, run
 from qsim.dataset import Dataset
 from qsim.files import read_json, replacing, write_bytes, write_json
+from qsim.footage import reading
 from qsim.keys import Key, hash_name
-from qsim.optics import clip_photons, light_level
+from qsim.optics import WHITE_PER_MEAN, clip_photons, light_level
 from qsim.qis import QIS
 from qsim.sensor import Sensor
 from qsim.stream import Sensing, Stream, prepare
@@ -50,10 +51,13 @@ __all__ = [
     "has_sharp",
     "ideal_counter",
     "light_level",
+    "mean_light",
     "open_clips",
     "open_stream",
     "output",
+    "peak_of",
     "read_json",
+    "reading",
     "replacing",
     "run",
     "sensed",
@@ -229,6 +233,22 @@ def stored(clip: Clip, name: str) -> tuple[Codes, float]:
 def truth(clip: Clip, factor: float, start: int, stop: int) -> Array:
     """Sharp expected photons [stop - start, H, W] of a clip under a light factor: what a restorer should return."""
     return np.stack([clip_photons(clip, t, factor, sharp=True) for t in range(start, stop)])
+
+
+def mean_light(clip: Clip, factor: float) -> float:
+    """Mean expected photons per pixel and exposure of a clip under a light factor."""
+    return factor * (clip.mean_radiance if clip.camera is None else clip.mean_photons)
+
+
+def peak_of(light: float, peak: float | None = None) -> float:
+    """The peak of a score [photons]: `peak` if given, else 2.5 times the mean light of the stream.
+
+    `ValueError` for a stream without light.
+    """
+    found = WHITE_PER_MEAN * light if peak is None else peak
+    if not 0 < found < float("inf"):
+        raise ValueError(f"the peak of a score is a number of photons above 0, got {found!r}; is there any light?")
+    return found
 
 
 def cube_codes(

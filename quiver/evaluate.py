@@ -27,7 +27,9 @@ from quiver.data import (
     Codes,
     Light,
     array_codes,
+    mean_light,
     open_clips,
+    peak_of,
     read_json,
     sensed,
     stored,
@@ -38,8 +40,8 @@ from quiver.data import (
 from quiver.memory import peak_memory, reset_peak
 from quiver.restoring import Restorer
 
-FORMAT = "quiver-evaluation-1"
-PLAN_FORMAT = "quiver-plan-1"
+FORMAT = "quiver-evaluation-2"  # 1: peak = the sensor's white, factor of the least unclamped error
+PLAN_FORMAT = "quiver-plan-2"
 PUBLISHED_EDGE = 5  # frames at each end that the published evaluation leaves out
 
 Progress = Callable[[str, int, int], None]  # (what is restored, rows done, rows in all)
@@ -55,6 +57,7 @@ class Plan:
     seed: int = 0  # of the test noise: the same for all methods and all runs
     published: bool = False  # every window exposed, drawn, scaled and scored on its own; ends of clips left out
     stream: str | None = None  # score this stored stream instead of sensing at `lights`
+    peak: float | None = None  # of the scores, photons per pixel; None = 2.5 x mean light (published: sensor's white)
 
     def to_dict(self) -> dict[str, Any]:
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
@@ -73,9 +76,10 @@ class Row:
     score: metrics.Score | None = None
     seconds_per_frame: float = math.nan
     peak_bytes: int | None = None  # of memory while restoring, beyond what was in use before
-    truth_psnr: float | None = None  # dB; what a perfect restorer would score against this truth
+    peak: float = math.nan  # photons per pixel that the scores refer to
+    truth_psnr: float | None = None  # dB; what a perfect restorer would score against this truth, at least
     motion_pixels: tuple[int, ...] = ()  # per bin of breakdown.EDGES; empty where the clip has no flow
-    motion_squares: tuple[float, ...] = ()  # squared error summed over them, matched, in units of white
+    motion_squares: tuple[float, ...] = ()  # squared error summed over them, matched, in units of the peak
     failure: str | None = None
 
     @property
@@ -93,9 +97,10 @@ class Row:
         if score is not None:
             numbers: dict[str, Any] = {name: math.nan if v is None else v for name, v in score.items()}
             score = metrics.Score(**numbers)
-        seconds = values.pop("seconds_per_frame")
+        seconds, peak = values.pop("seconds_per_frame"), values.pop("peak")
         values |= {name: tuple(values[name]) for name in ("motion_pixels", "motion_squares")}
-        return cls(score=score, seconds_per_frame=math.nan if seconds is None else seconds, **values)
+        values |= {"seconds_per_frame": math.nan if seconds is None else seconds}
+        return cls(score=score, peak=math.nan if peak is None else peak, **values)
 
 
 def json_safe(value: Any) -> Any:
@@ -118,17 +123,24 @@ def scene_of(clip: Clip) -> str:
     return f"{scene['family']}:{scene.get('seed', 0)}" if "family" in scene else clip.name
 
 
-def truth_psnr(clip: Clip, factor: float, white: float) -> float | None:
-    """PSNR [dB] of the clip's own truth in units of white, from its measured error; None if that was not measured.
+def truth_psnr(clip: Clip, factor: float, peak: float, frames: range) -> float | None:
+    """PSNR [dB] of the clip's own truth at a peak in photons, from its measured errors; None if there are none.
 
-    The error is measured in radiance; photons are proportional to it.
+    At least so much: a stated error that was not clamped counts as if all of it lay below the peak. Errors are
+    measured in radiance; photons are proportional to it.
     """
     errors = clip.meta.get("error_per_frame")
     if not errors or clip.mean_radiance <= 0:
         return None
-    photons_per_radiance = clip.mean_photons / clip.mean_radiance if clip.camera is not None else 1.0
-    rms = math.sqrt(math.fsum(e * e for e in errors) / len(errors))
-    return metrics.truth_psnr(rms * photons_per_radiance * factor / white)
+    unit = mean_light(clip, factor) / clip.mean_radiance / peak
+    return metrics.truth_psnr([errors[t] * unit for t in frames])
+
+
+def peak_in_photons(plan: Plan, clip: Clip, codes: Codes, factor: float) -> float:
+    """The peak of a clip's scores: as the plan says, else 2.5 times the mean light, or as published the white."""
+    if plan.peak is None and plan.published:
+        return codes.white
+    return peak_of(mean_light(clip, factor), plan.peak)
 
 
 def restore_clip(
@@ -137,7 +149,8 @@ def restore_clip(
     """Restore and score one clip, and keep a crop of its middle frame under OUT; a failure becomes the row's reason."""
     row = Row(method.name, method.description, plan.stream or light.label, clip.name, scene_of(clip))
     frames = scored_frames(len(clip), plan.published)
-    target = truth(clip, factor, frames.start, frames.stop) / codes.white
+    white = peak_in_photons(plan, clip, codes, factor)
+    target = truth(clip, factor, frames.start, frames.stop) / white
     windows = list(windows_sensed(clip, light, plan.seed, frames)) if plan.published else []
     before, started = reset_peak(), time.perf_counter()
     try:
@@ -148,10 +161,10 @@ def restore_clip(
             restored = method.restore(codes)
         seconds = (time.perf_counter() - started) / len(frames)
         peak = peak_memory() - before
-        score = metrics.score(restored / np.float32(codes.white), target, per_frame_scale=plan.published)
+        score = metrics.score(restored / np.float32(white), target, per_frame_scale=plan.published)
     except Exception as error:  # whatever a method dies of is its result
         return replace(row, failure=f"{type(error).__name__}: {' '.join(str(error).split())}")
-    matched = restored * np.float32(score.scale / codes.white)
+    matched = restored * np.float32(score.scale / white)
     speed = breakdown.speeds(clip, frames)
     pixels, squares = ((), ()) if speed is None else breakdown.by_motion(matched, target, speed)
     if out is not None:
@@ -161,7 +174,8 @@ def restore_clip(
         score=score,
         seconds_per_frame=seconds,
         peak_bytes=peak,
-        truth_psnr=truth_psnr(clip, factor, codes.white),
+        peak=white,
+        truth_psnr=truth_psnr(clip, factor, white, frames),
         motion_pixels=pixels,
         motion_squares=squares,
     )

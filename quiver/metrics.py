@@ -1,10 +1,13 @@
 """How close a restored clip is to the truth: PSNR, one brightness factor per clip, SSIM, and intervals over scenes.
 
-    restored x, target x  [T, H, W], in units of the peak (photons / white)  ->  numbers
+    restored x, target x  [T, H, W], in units of the peak (photons / peak)  ->  numbers
 
-Output and target are clamped to [0, 1] and PSNR = 10 log10(1 / MSE) of whole frames, no border left out. Few-bit input
-does not tell the absolute brightness when the light level is unknown, so every score has two forms: raw, and after the
-best single factor. Nothing here knows files, sensors or torch.
+The peak is 2.5 times the mean light (`data.peak_of`), for every sensor and depth. Output and target are clamped to
+[0, 1] and PSNR = 10 log10(1 / MSE) of whole frames, no border left out. Few-bit input does not tell the absolute
+brightness when the light level is unknown, so every score has two forms: raw, and after the single factor that is best
+behind the clamp. A frame whose error lies wholly above the peak has no score (NaN); only equal arrays are infinite.
+`valid` [T, H, W], where it is given, is false where the target is not known; these pixels count nowhere.
+Nothing here knows files, sensors or torch.
 """
 
 from __future__ import annotations
@@ -17,6 +20,10 @@ import numpy as np
 
 SSIM_WINDOW = 7  # px; uniform window and sample covariance are the defaults of the field (spec 5.3)
 SSIM_K1, SSIM_K2 = 0.01, 0.03
+FACTORS = (0.01, 100.0)  # between these the best factor is looked for
+ABOVE_PEAK = 0.05  # share of target pixels above the peak from which a score is doubtful
+NEAR_TRUTH = 3.0  # dB; a score so close to the truth's own error says little about the method
+CHUNK = 1 << 20  # clamping points looked at together
 
 
 @dataclass(frozen=True)
@@ -27,9 +34,10 @@ class Score:
     psnr_matched: float  # dB, after the output was multiplied by `scale`
     ssim: float  # raw; NaN below 7 px
     ssim_matched: float  # after `scale`
-    scale: float  # best factor, sum(O G) / sum(O O) (mean over windows if matched per window)
+    scale: float  # best factor, see `best_scale` (mean over windows if matched per window)
     scale_spread: float  # standard deviation of the factor over windows, 0 for one factor per clip
-    frames: int
+    frames: int  # that have a score
+    above_peak: float = 0.0  # share of target pixels above the peak
 
     def to_dict(self) -> dict[str, float]:
         return asdict(self)
@@ -59,23 +67,107 @@ def decibel(mse: float) -> float:
     return inf if mse <= 0 else -10 * log10(mse)
 
 
-def psnr(output: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """PSNR [dB] of every frame, [T], both inputs clamped to [0, 1]."""
-    one, two = _pair(output, target)
-    squares = (np.clip(one, 0, 1) - np.clip(two, 0, 1)) ** 2
-    return np.array([decibel(float(mse)) for mse in squares.mean(axis=(1, 2))])
+def above_peak(target: np.ndarray, valid: np.ndarray | None = None) -> float:
+    """Share of the (valid) target pixels above the peak, where the clamp hides errors; NaN without any pixel."""
+    stack = _stack("target", target)
+    over = stack > 1
+    keep = _kept(valid, stack)
+    return float(over.mean() if keep is None else over[keep].mean() if keep.any() else nan)
 
 
-def best_scale(output: np.ndarray, target: np.ndarray) -> float:
-    """The factor s = sum(O G) / sum(O O) of the least squares |s O - G|, over pixels where the target is not clipped.
+def doubtful(what: str, share: float) -> str:
+    """The warning of a table in which more than ABOVE_PEAK of the target lies above the peak."""
+    return (
+        f"Warning: {100 * share:.1f} % of the pixels of {what} lie above the peak, where the clamp hides errors. "
+        "A larger --peak counts them."
+    )
 
-    Targets above 1 are left out, because the clamp hides their error: a perfect output then has exactly s = 1.
-    Without a positive factor (black output, all of the target clipped) the answer is 1.
+
+def _kept(valid: np.ndarray | None, like: np.ndarray) -> np.ndarray | None:
+    if valid is None:
+        return None
+    keep = np.asarray(valid)
+    keep = keep[None] if keep.ndim == 2 else keep
+    if keep.shape != like.shape or keep.dtype != bool:
+        raise ValueError(f"valid: expected bool {list(like.shape)}, got {keep.dtype} {list(keep.shape)}")
+    return keep
+
+
+def psnr(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
+    """PSNR [dB] of every frame, [T], both inputs clamped to [0, 1].
+
+    Infinite for equal frames. NaN where the frames differ and the clamp hides all of it, and without a valid pixel.
     """
     one, two = _pair(output, target)
-    inside = two <= 1
-    product, square = float(np.sum(one * two, where=inside)), float(np.sum(one * one, where=inside))
-    return product / square if square > 0 and product > 0 else 1.0
+    keep = _kept(valid, two)
+    found = []
+    for t, (a, b) in enumerate(zip(one, two, strict=True)):
+        if keep is not None:
+            a, b = a[keep[t]], b[keep[t]]
+        mse = float(np.mean((np.clip(a, 0, 1) - np.clip(b, 0, 1)) ** 2)) if a.size else nan
+        found.append(decibel(mse) if mse > 0 or (a.size and np.array_equal(a, b)) else nan)
+    return np.array(found)
+
+
+def best_scale(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None = None) -> float:
+    """The factor s in FACTORS with the least clamped error, sum (clip(s O) - clip(G))^2 over all (valid) pixels.
+
+    Exact: the error is quadratic in s between the points 1/O at which a pixel reaches the peak, and each piece gives
+    its least value. 1 where no factor is better than 1, as for a black output.
+    """
+    one, two = _pair(output, target)
+    keep = _kept(valid, two)
+    bright = one > 0 if keep is None else (one > 0) & keep
+    values, goal = one[bright], np.clip(two[bright], 0, 1)
+
+    def error(s: float) -> float:
+        return float(np.sum((np.minimum(s * values, 1) - goal) ** 2))
+
+    def refined(s: float) -> float:
+        """Least squares over the pixels that s leaves below the peak, free of the rounding of running sums."""
+        below = s * values < 1
+        square = float(np.sum(values * values, where=below))
+        return float(np.sum(values * goal, where=below)) / square if square > 0 else s
+
+    if not values.size or error(1.0) == 0:
+        return 1.0
+    order = np.argsort(-values)  # the brightest reach the peak first
+    values, goal = values[order], goal[order]
+    found = _least(values, goal)
+    low, high = FACTORS
+    return min((1.0, found, min(max(refined(found), low), high)), key=error)
+
+
+def _least(values: np.ndarray, goal: np.ndarray) -> float:
+    """The factor of the least error over all pieces; `values` > 0 falling, `goal` in [0, 1]."""
+    low, high = FACTORS
+    white = 0.0  # error of the pixels that are at the peak already
+    square, product, rest = (float(np.sum(x)) for x in (values * values, values * goal, goal * goal))
+    least, best, edge = inf, 1.0, 0.0
+    for start in range(0, len(values) + 1, CHUNK):
+        v, g = values[start : start + CHUNK], goal[start : start + CHUNK]
+        edges = 1 / np.maximum(v, 1e-300)
+        last = start + CHUNK > len(values)  # the piece in which every pixel is at the peak
+        ends = np.append(edges, inf) if last else edges
+        starts = np.append(edge, edges)[: len(ends)]
+        a, b, c, w = (
+            np.append(total, total + sign * np.cumsum(part))
+            for total, sign, part in (
+                (square, -1, v * v), (product, -1, v * g), (rest, -1, g * g), (white, 1, (1 - g) ** 2)
+            )
+        )  # fmt: skip
+        square, product, rest, white = (float(x[-1]) for x in (a, b, c, w))
+        edge = float(edges[-1]) if len(edges) else edge
+        a, b, c, w = (x[: len(ends)] for x in (a, b, c, w))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            s = np.where(a > 0, b / a, starts)
+        s = np.clip(np.clip(s, starts, ends), low, high)
+        inside = (starts <= high) & (ends >= low)
+        errors = np.where(inside, w + s * s * a - 2 * s * b + c, inf)
+        i = int(np.argmin(errors))
+        if errors[i] < least:
+            least, best = float(errors[i]), float(s[i])
+    return best
 
 
 def _box(image: np.ndarray, size: int) -> np.ndarray:
@@ -87,19 +179,22 @@ def _box(image: np.ndarray, size: int) -> np.ndarray:
     return image
 
 
-def ssim(output: np.ndarray, target: np.ndarray) -> np.ndarray:
+def ssim(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
     """Structural similarity of every frame, [T]: 7 x 7 uniform window, sample covariance, data range 1, clamped inputs.
 
-    The mean runs over windows that lie inside the frame (Wang et al. 2004, as the common libraries compute it). NaN
-    where a side is below 7 px: no window fits.
+    The mean runs over windows that lie inside the frame (Wang et al. 2004, as the common libraries compute it) and
+    hold valid pixels alone. NaN where there is none, as where a side is below 7 px.
     """
     one, two = (np.clip(image, 0, 1) for image in _pair(output, target))
+    keep = _kept(valid, two)
     if min(one.shape[1:]) < SSIM_WINDOW:
         return np.full(len(one), nan)
-    return np.array([_ssim_frame(a, b) for a, b in zip(one, two, strict=True)])
+    return np.array(
+        [_ssim_frame(a, b, None if keep is None else keep[t]) for t, (a, b) in enumerate(zip(one, two, strict=True))]
+    )
 
 
-def _ssim_frame(a: np.ndarray, b: np.ndarray) -> float:
+def _ssim_frame(a: np.ndarray, b: np.ndarray, keep: np.ndarray | None = None) -> float:
     pixels = SSIM_WINDOW**2
     sample = pixels / (pixels - 1)
     mean_a, mean_b = _box(a, SSIM_WINDOW), _box(b, SSIM_WINDOW)
@@ -109,30 +204,57 @@ def _ssim_frame(a: np.ndarray, b: np.ndarray) -> float:
     c1, c2 = SSIM_K1**2, SSIM_K2**2
     luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
     structure = (2 * covariance + c2) / (var_a + var_b + c2)
-    return float(np.mean(luminance * structure))
+    index = luminance * structure
+    if keep is not None:
+        index = index[_box(keep.astype(float), SSIM_WINDOW) > 1 - 0.5 / pixels]
+    return float(np.mean(index)) if index.size else nan
 
 
-def score(output: np.ndarray, target: np.ndarray, *, per_frame_scale: bool = False) -> Score:
-    """All numbers of one clip, [T, H, W] in units of the peak.
+def score(
+    output: np.ndarray, target: np.ndarray, *, per_frame_scale: bool = False, valid: np.ndarray | None = None
+) -> Score:
+    """All numbers of one clip, [T, H, W] in units of the peak; frames without a score are left out of every mean.
 
     One factor for the whole clip, because a clip has one light level; `per_frame_scale` gives every frame its own, for
-    the published protocol that forces the exposure of every window.
+    the published protocol that forces the exposure of every window. The factor is that of the least clamped error of
+    the clip. It is 1 where the mean over frames would fall or a frame would lose its score, so that matched scores are
+    never below raw ones.
     """
     one, two = _pair(output, target)
+    keep = _kept(valid, two)
+    raw = psnr(one, two, keep)
     if per_frame_scale:
-        scales = np.array([best_scale(a, b) for a, b in zip(one, two, strict=True)])
+        each = [
+            best_scale(a, b, None if keep is None else keep[t]) for t, (a, b) in enumerate(zip(one, two, strict=True))
+        ]
+        scales = np.array(each)
     else:
-        scales = np.full(len(one), best_scale(one, two))
-    matched = one * scales[:, None, None]
+        scales = np.full(len(one), best_scale(one, two, keep))
+    matched = psnr(one * scales[:, None, None], two, keep)
+    if per_frame_scale:
+        worse = ~(matched >= raw)
+    else:
+        scored = ~np.isnan(raw)
+        better = not np.isnan(matched[scored]).any() and _mean(matched[scored]) >= _mean(raw)
+        worse = np.full(len(one), not better)
+    scales, matched = np.where(worse, 1.0, scales), np.where(worse | np.isnan(raw), raw, matched)
+    hidden = np.isnan(raw)
     return Score(
-        psnr=float(psnr(one, two).mean()),
-        psnr_matched=float(psnr(matched, two).mean()),
-        ssim=float(ssim(one, two).mean()),
-        ssim_matched=float(ssim(matched, two).mean()),
+        psnr=_mean(raw),
+        psnr_matched=_mean(matched),
+        ssim=_mean(np.where(hidden, nan, ssim(one, two, keep))),
+        ssim_matched=_mean(np.where(hidden, nan, ssim(one * scales[:, None, None], two, keep))),
         scale=float(scales.mean()),
         scale_spread=float(scales.std()),
-        frames=len(one),
+        frames=int(np.count_nonzero(~hidden)),
+        above_peak=above_peak(two, keep),
     )
+
+
+def _mean(values: np.ndarray) -> float:
+    """Mean of what is a number; NaN without any."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if known.size else nan
 
 
 @dataclass(frozen=True)
@@ -182,8 +304,12 @@ def clamped_variance(mean: np.ndarray, variance: np.ndarray, peak: float = 1.0) 
     return np.where(spread > 0, np.maximum(second - first**2, 0), 0.0)
 
 
-def truth_psnr(rms_error: float) -> float:
-    """PSNR [dB] that a perfect restorer scores against a truth with this rms error (in units of the peak)."""
-    if not isfinite(rms_error) or rms_error < 0:
-        raise ValueError(f"truth_psnr: the rms error must be a finite number >= 0, got {rms_error!r}")
-    return decibel(rms_error**2)
+def truth_psnr(errors: Sequence[float]) -> float:
+    """PSNR [dB] that a perfect restorer scores against frames with these rms errors (in units of the peak).
+
+    The mean over frames, as a score is; infinite where a frame has no error.
+    """
+    for rms in errors:
+        if not isfinite(rms) or rms < 0:
+            raise ValueError(f"truth_psnr: an rms error must be a finite number >= 0, got {rms!r}")
+    return _mean(np.array([decibel(rms**2) for rms in errors]))

@@ -68,6 +68,19 @@ def test_page_shows_everything_and_loads_nothing(folder):
     assert all(address.startswith("data:") for address in addresses)
 
 
+def test_an_evaluation_says_what_its_scores_mean(folder):
+    """Before format 2 the peak was the sensor's white and the factor unclamped; a page never mixes the two."""
+    assert "peak = the sensor&#x27;s white" in report.build(folder, title="All")
+    path = folder / "evaluation.json"
+    found = json.loads(path.read_text()) | {"peak": "2.5 x the stream's mean light", "remarks": ["<nano> was never"]}
+    line = found["table"][0] | {"above_peak": 0.0961, "truth_psnr": 21.0, "near_truth": ["psnr_matched"]}
+    path.write_text(json.dumps(found | {"table": [line]}))
+    page = report.build(folder, title="All")
+    for words in ("behind the clamp", "9.6 %", "20.00 ± 1.00 †", "within 3 dB of the truth", "&lt;nano&gt; was never"):
+        assert words in page, words
+    assert "as they were defined before" not in page
+
+
 def test_average_is_the_mean_of_the_codes_around(folder):
     stream = Clip.open(folder / "square").stream(Clip.open(folder / "square").streams[0])
     codes = stream.codes(0, 5)

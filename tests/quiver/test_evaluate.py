@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from dataclasses import replace
@@ -140,8 +141,90 @@ def test_truth_psnr_is_the_radiance_error_in_units_of_white(make_clip: ClipMaker
     clip = make_clip(relative=True, error=0.01)
     _, factor = sensed(clip, Light())
     expected = -20 * math.log10(0.01 * (3.25 / clip.mean_radiance) / 8.125)
-    assert truth_psnr(clip, factor, 8.125) == pytest.approx(expected)
-    assert truth_psnr(make_clip("unknown", error=None), 1.0, 8.125) is None
+    assert truth_psnr(clip, factor, 8.125, range(4)) == pytest.approx(expected)
+    assert truth_psnr(make_clip("unknown", error=None), 1.0, 8.125, range(4)) is None
+
+
+def bright_clip(make_clip: ClipMaker, share: float, **options: object):
+    """A clip in which so many pixels are about nine times as bright as the others."""
+    rng = np.random.default_rng(9)
+    radiance = rng.uniform(0.8, 1.2, (12, 24, 30)) * np.where(rng.random((24, 30)) < share, 9.0, 1.0)
+    return make_clip(f"bright_{share:g}", radiance=radiance, **options)
+
+
+def test_every_sensor_is_scored_at_one_peak(make_clip: ClipMaker):
+    """2.5 times the light, whatever the sensor: no score is infinite, and the same pixels lie above the peak."""
+    clip = bright_clip(make_clip, 0.1)
+    rng = np.random.default_rng(10)
+    sensors = [("spad-320x240", 1), ("quiver-physical", 3), ("quiver-paper", 5), ("megax-b", 4), ("qis-ma2017", 1)]
+    methods = [restorer("naive"), restorer("moment:3")]
+    for sensor, bits in sensors:
+        ppp = float(np.exp(rng.uniform(np.log(0.3), np.log(100))))
+        rows = evaluate(Plan(str(clip.path), None, (Light(sensor, ppp, bits),)), methods)
+        assert [row.failure for row in rows] == [None, None]
+        assert [row.peak for row in rows] == pytest.approx([2.5 * ppp] * 2)
+        light = clip.mean_radiance  # of light in units of the peak: radiance / (2.5 mean)
+        above = np.mean([clip.sharp(t) > 2.5 * light for t in range(len(clip))])
+        assert rows[0].score.above_peak == pytest.approx(above)
+        assert all(math.isfinite(row.score.psnr) and row.score.psnr_matched >= row.score.psnr for row in rows)
+
+
+def test_a_one_bit_sensor_in_much_light_is_not_perfect(make_clip: ClipMaker):
+    """At 10 PPP every pixel of a 1-bit code lies above its own white: there all guesses were perfect, `moment` inf."""
+    plan = Plan(str(make_clip().path), None, (Light("spad-320x240", 1.0, 1), Light("spad-320x240", 10.0, 1)))
+    dim, bright = evaluate(plan, [restorer("moment")])
+    assert bright.score.psnr < dim.score.psnr < 40
+    hidden = evaluate(replace(plan, peak=1.0), [restorer("moment")])[1]
+    assert hidden.score.above_peak > 0.9
+    assert not math.isinf(hidden.score.psnr)
+    text = table.markdown(replace(plan, peak=1.0), [restorer("moment")], [dim, hidden])
+    assert "peak = 1 photons per pixel" in text
+    assert "Warning: 100.0 % of the pixels of sliding_0 at 10 PPP, 1 bit lie above the peak" in text
+    assert " inf " not in text
+
+
+def test_another_peak_moves_scores_by_its_ratio(make_clip: ClipMaker):
+    """With nothing above either peak, twice the peak is 6.02 dB more, and the matching factor stays."""
+    plan = Plan(str(make_clip().path), None)
+    one, two = (evaluate(replace(plan, peak=peak), [restorer("moment")])[0] for peak in (40.0, 80.0))
+    assert two.score.psnr - one.score.psnr == pytest.approx(20 * math.log10(2), abs=1e-6)
+    assert two.score.scale == pytest.approx(one.score.scale)
+    assert two.truth_psnr - one.truth_psnr == pytest.approx(20 * math.log10(2))
+    assert two.peak == 80.0
+    with pytest.raises(ValueError, match="number of photons above 0"):
+        evaluate(replace(plan, peak=-1.0), [restorer("moment")])
+
+
+def test_the_published_protocol_keeps_its_white(make_clip: ClipMaker):
+    """Peak = white of the sensor as published; with the default gain that is 2.5 times the light."""
+    clip = make_clip()
+    paper = Plan(str(clip.path), None, (Light("quiver-paper"),), published=True)
+    assert evaluate(paper, [restorer("moment")])[0].peak == pytest.approx(7 / 0.8)
+    assert evaluate(replace(paper, lights=(Light(),)), [restorer("moment")])[0].peak == pytest.approx(2.5 * 3.25)
+    assert evaluate(replace(paper, peak=3.0), [restorer("moment")])[0].peak == 3.0
+    assert "the sensor's white, as published" in table.peak_name(paper)
+
+
+def test_scores_near_the_truth_are_marked(make_clip: ClipMaker):
+    """A truth with an error of 3 % of its mean is worth 38.4 dB; an answer of 36 dB is marked, one of 20 dB is not."""
+    clip = make_clip("rough", error=0.03 * make_clip().mean_radiance)
+    rng = np.random.default_rng(11)
+
+    def wrong(psnr: float) -> Restorer:
+        sigma = 2.5 * 3.25 * 10 ** (-psnr / 20)
+        exact = truth(clip, sensed(clip, Light())[1], 0, len(clip))
+        return method(f"at {psnr:g}", lambda codes: exact + rng.normal(0, sigma, exact.shape))
+
+    plan, methods = Plan(str(clip.path), None), [wrong(36.0), wrong(20.0)]
+    rows = evaluate(plan, methods)
+    assert rows[0].truth_psnr == pytest.approx(20 * math.log10(2.5 / 0.03), abs=0.01)
+    near, far = table.summarise(rows)
+    assert near.near_truth == ("psnr", "psnr_matched")
+    assert far.near_truth == ()
+    text = table.markdown(plan, methods, rows)
+    assert f"{near.scores['psnr'].mean:.2f} † |" in text
+    assert f"{far.scores['psnr'].mean:.2f} |" in text
+    assert "† In one clip or more within 3 dB of the truth's own PSNR" in text
 
 
 def test_published_windows_are_counted_as_published():
@@ -258,8 +341,41 @@ def test_bad_counts_are_named(tmp_path):
     (tmp_path / "text.npy").write_text("hello")
     with pytest.raises(ValueError, match="not readable as an array"):
         read_counts(tmp_path / "text.npy")
+    np.savez(tmp_path / "two.npz", a=dark, b=dark)
+    with pytest.raises(ValueError, match=r"two.npz: not readable .*holds 2 arrays \(a, b\); one is read"):
+        read_counts(tmp_path / "two.npz")
+    with pytest.raises(ValueError, match="codes of 1 to 8 bits, got 9"):
+        evaluate_static(Counts(dark, np.ones(3), "x"), [restorer("moment")], frames=1, bits=9)
     with pytest.raises(ValueError, match="leave none of 3 for the reference"):
         evaluate_static(Counts(dark, np.ones(3), "x"), [restorer("moment")], frames=3)
+
+
+@pytest.mark.parametrize("name", ["counts.npz", "counts.npy"])
+def test_a_damaged_file_of_counts_is_one_line(tmp_path, name):
+    """Cut anywhere, any byte changed, or foreign bytes: read as whole counts, or one `ValueError` with the name."""
+    counts = np.random.default_rng(12).poisson(3.0, (6, 5, 4)).astype(np.uint16)
+    path = tmp_path / name
+    np.savez_compressed(path, counts) if name.endswith("npz") else np.save(path, counts)
+    good, rng, refused = path.read_bytes(), np.random.default_rng(13), 0
+    cases = [b"", b"PK\3\4", b"PK\5\6" + bytes(18), b"\x93NUMPY", good[:1]]
+    for _ in range(250):
+        content = bytearray(good[: rng.integers(1, len(good) + 1)] if rng.random() < 0.4 else good)
+        for _ in range(int(rng.integers(1, 4))):
+            content[rng.integers(len(content))] = rng.integers(256)
+        cases.append(bytes(content))
+    for content in cases:
+        path.write_bytes(content)
+        with contextlib.suppress(ValueError):
+            read_counts(path)
+            continue
+        with pytest.raises(ValueError, match=f"^{path}: [^\n]*$"):
+            read_counts(path)
+        refused += 1
+    assert refused > 100
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        read_counts(tmp_path / f"none{name}")
+    with pytest.raises(ValueError, match=r"photon counts are a .npy, or a .npz"):
+        read_counts(tmp_path / "counts.txt")
 
 
 def test_an_ideal_counter_counts():
