@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable, Iterable
 from typing import Any
 
 SPLITS = ("train", "val", "test")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")  # of clips and streams: a safe file name
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
     """` (did you mean '...'?)`, or nothing if no known word is close."""
     close = difflib.get_close_matches(word, list(known), n=1)
     return f" (did you mean '{close[0]}'?)" if close else ""
+
+
+def check_name(name: Any) -> str:
+    """A stream or clip name that is also a safe file name, else `ValueError`."""
+    if not isinstance(name, str) or not NAME.fullmatch(name):
+        raise ValueError(f"name {name!r:.80}: use letters, digits, '.', '_' and '-' only, as in fan_03 or qis-3bit")
+    return name
 
 
 def text(value: Any) -> str:

@@ -127,23 +127,24 @@ def _run_plan(args: argparse.Namespace) -> int:
 
 def add_check(sub: Any) -> None:
     parser = command(
-        sub, "check", _run_check, "Compare clips and data sets with their checksums; exit code 1 if a file is damaged.",
-        "qsim check out/starter out/fan",
+        sub, "check", _run_check, "Compare what was made with its checksums; exit code 1 if a file is damaged.",
+        "qsim check out/starter out/fan out/fan_restored.npy",
     )  # fmt: skip
-    parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="clips or data sets")
+    parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="data sets, clips, streams, restored video")
 
 
 def _run_check(args: argparse.Namespace) -> int:
-    from qsim.clip import Clip
-    from qsim.dataset import Dataset
+    from qsim import checking
 
     problems: list[str] = []
+    unsealed: list[Path] = []
     for path in args.paths:
-        made_of_clips = (path / "dataset.json").is_file()
-        opened = Dataset.open(path) if made_of_clips else Clip.open(path)
-        with bar(str(path), "clip" if made_of_clips else "file") as progress:
-            problems += opened.verify(progress)
+        with bar(str(path), "clip" if (path / "dataset.json").is_file() else "file") as progress:
+            found = checking.check(path, progress)
+        problems += found.problems
+        unsealed += found.unsealed
     names = ", ".join(str(path) for path in args.paths)
-    lines = problems or [f"{names}: every file is what was written"]
-    output(args, {"paths": [str(path) for path in args.paths], "problems": problems}, lines)
+    facts = {"paths": [str(path) for path in args.paths], "problems": problems}
+    facts["without_checksum"] = [str(path) for path in unsealed]
+    output(args, facts, checking.Verdict(problems, unsealed).lines(names))
     return 1 if problems else 0

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import exr, files, optics
+from qsim import descriptions, exr, files, optics
 from qsim.stream import Progress, Stream, check_crop, write_stream
 from qsim.writer import FORMAT_VERSION, PHYSICAL, RELATIVE, TRUTH, ClipWriter, camera_of
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["FORMAT_VERSION", "PHYSICAL", "RELATIVE", "Clip", "ClipWriter", "Stream", "write_stream"]
 
-_REQUIRED = ("shape", "frame_rate", "exposure", "radiance_unit", "mean_radiance", "checksums")
+_DAMAGED = "the file is damaged; make the clip again, or take clip.json from a copy"
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,16 +49,19 @@ class Clip:
             raise FileNotFoundError(_why_not(path))
         meta = files.read_json(manifest)
         files.check_version(manifest, meta.get("format_version"), FORMAT_VERSION)
-        for key in _REQUIRED:
-            if key not in meta:
-                raise ValueError(f"{manifest}: key '{key}' is missing; the file is damaged")
-        shape = meta["shape"]
-        if not (isinstance(shape, list) and len(shape) == 3 and all(isinstance(n, int) and n > 0 for n in shape)):
-            raise ValueError(f"{manifest}: shape must be [frames, height, width] of at least 1, found {shape!r}")
+        descriptions.structure(manifest, meta, descriptions.CLIP, _DAMAGED)
         if meta["radiance_unit"] not in (PHYSICAL, RELATIVE):
             raise ValueError(
                 f"{manifest}: radiance_unit {meta['radiance_unit']!r}; known are '{PHYSICAL}' and '{RELATIVE}'"
             )
+        if (meta.get("camera") is None) != (meta["radiance_unit"] == RELATIVE):
+            raise ValueError(
+                f"{manifest}: a clip in {PHYSICAL} needs a camera, and a relative one has none; {_DAMAGED}"
+            )
+        for t in range(meta["shape"][0]):
+            if f"radiance/{t:06d}.exr" not in meta["checksums"]:
+                raise ValueError(f"{manifest}: checksums lack radiance/{t:06d}.exr of frame {t}; {_DAMAGED}")
+        files.check_own(manifest, meta, _DAMAGED)
         return Clip(path, meta)
 
     def __len__(self) -> int:
@@ -75,7 +78,7 @@ class Clip:
 
     @property
     def name(self) -> str:
-        return str(self.meta.get("name", self.path.name))
+        return str(self.meta.get("name") or self.path.name)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -96,7 +99,7 @@ class Clip:
     @property
     def origin(self) -> tuple[int, int]:
         """(y, x) of the first pixel in the camera's frame: not (0, 0) if only a crop was rendered."""
-        y, x = self.meta.get("origin", (0, 0))
+        y, x = self.meta.get("origin") or (0, 0)
         return int(y), int(x)
 
     @property
@@ -181,6 +184,16 @@ class Clip:
                 problems.append(str(error))
             report(done, total)
         return problems
+
+    def unsealed(self) -> list[Path]:
+        """Descriptions of the clip and its streams without a checksum of their own: an earlier version made them."""
+        found = [] if "checksum" in self.meta else [self.path / "clip.json"]
+        for path in sorted((self.path / "streams").glob("*.json")):
+            try:
+                found += [] if "checksum" in files.read_json(path) else [path]
+            except (ValueError, OSError):  # a problem that `verify` names
+                continue
+        return found
 
     def _half(self, folder: str, t: int, crop: optics.Crop | None) -> Array:
         self._check_frame(t)

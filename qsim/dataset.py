@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qsim import files
+from qsim import descriptions, files
 from qsim.clip import Clip
 from qsim.jobs import record_path
 from qsim.recipe import SPLITS
@@ -50,11 +50,16 @@ class Dataset:
         except ValueError as error:
             raise Damaged(f"{error}; {remedy}") from None
         files.check_version(manifest, meta.get("format_version"), FORMAT_VERSION)
-        if meta.get("checksum", checksum(meta)) != checksum(meta):
-            raise Damaged(f"{manifest}: contents changed (checksum differs); {remedy}")
-        for key in ("name", "recipe", "jobs"):
-            if key not in meta:
-                raise Damaged(f"{manifest}: key '{key}' is missing; {remedy}")
+        try:
+            descriptions.structure(manifest, meta, descriptions.DATASET, remedy)
+            if odd := [name for name in meta["jobs"] if not descriptions.is_name(name)]:
+                raise ValueError(f"{manifest}: jobs holds {odd[0]!r:.60}, which is not the name of a clip; {remedy}")
+            descriptions.structure(
+                manifest, meta["jobs"], dict.fromkeys(meta["jobs"], descriptions.JOB), remedy, "jobs."
+            )
+            files.check_own(manifest, meta, remedy)
+        except ValueError as error:
+            raise Damaged(str(error)) from None
         return Dataset(path, meta)
 
     def __repr__(self) -> str:
@@ -107,6 +112,19 @@ class Dataset:
                 progress(done, len(names))
         return problems + self.shared_between_splits()
 
+    def unsealed(self) -> list[Path]:
+        """Descriptions of clips and streams that hold no checksum of their own and that no record vouches for."""
+        found = []
+        for name in self.names():
+            try:
+                clip = Clip.open(self.path / "clips" / name)
+                record = _read_record(record_path(self.path, name))
+            except (ValueError, OSError):  # a problem that `verify` names
+                continue
+            vouched = {clip.path / "streams" / f"{stream}.json" for stream in record["streams"]}
+            found += [path for path in clip.unsealed() if path not in vouched | {clip.path / "clip.json"}]
+        return found
+
     def shared_between_splits(self) -> list[str]:
         """Scenes, meshes and textures of the test split that another split has too, in words; empty if it is honest.
 
@@ -132,9 +150,11 @@ def _seen_in(path: Path) -> list[str]:
         return []
 
 
-def checksum(meta: dict[str, Any]) -> str:
-    """SHA-256 of a manifest's content, without the checksum that it holds itself."""
-    return files.sha256(files.to_json({key: value for key, value in meta.items() if key != "checksum"}))
+def _read_record(path: Path) -> dict[str, Any]:
+    record = files.read_json(path)
+    cure = "`qsim generate RECIPE -o FOLDER --repair` makes it again"
+    descriptions.structure(path, record, descriptions.RECORD, cure)
+    return record
 
 
 def verify_job(folder: Path, name: str, expected: dict[str, Any]) -> list[str]:
@@ -148,7 +168,7 @@ def verify_job(folder: Path, name: str, expected: dict[str, Any]) -> list[str]:
     if not about.is_file():
         return [*problems, f"{about}: missing"]
     try:
-        record = {} if problems else files.read_json(path)
+        record = {} if problems else _read_record(path)
         clip = Clip.open(about.parent)
     except (ValueError, OSError) as error:
         return [*problems, str(error)]

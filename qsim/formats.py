@@ -206,7 +206,7 @@ def to_stream(
         "sha256": files.sha256(npy),
         "software": {"qsim": __version__},
     }
-    files.write_json(description, meta)
+    files.write_description(description, meta)
     return Stream.open(description)
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import __version__, files
-from qsim.dataset import FORMAT_VERSION, Damaged, Dataset, checksum, verify_job
+from qsim.dataset import FORMAT_VERSION, Damaged, Dataset, verify_job
 from qsim.jobs import Make, Result, make_record, record_path, render_job
 from qsim.recipe import Job, Recipe
 from qsim.stream import Progress
@@ -190,7 +190,7 @@ def write_manifest(recipe: Recipe, folder: Path) -> None:
             "complete": all(entry["state"] == "done" for entry in jobs.values()),
             "software": {"qsim": __version__},
         }
-        files.write_json(folder / "dataset.json", manifest | {"checksum": checksum(manifest)})
+        files.write_description(folder / "dataset.json", manifest)
 
 
 def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:

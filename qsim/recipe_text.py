@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from qsim import files
 from qsim.checks import suggest
 
 _NEEDED = object()  # the default of a key that has none
@@ -27,12 +27,7 @@ class Text:
 
     def content(self) -> dict[str, Any]:
         """What it says; `ValueError` as `FILE:LINE: ...` if it is no TOML."""
-        try:
-            return tomllib.loads(self.text)
-        except tomllib.TOMLDecodeError as error:
-            found = re.search(r"at line (\d+)", str(error))
-            line = found[1] if found else len(self.lines)  # else the parser says "at end of document"
-            raise ValueError(f"{self.path}:{line}: not valid TOML: {error}") from None
+        return files.parse_toml(self.path, self.text)
 
     def where(self, section: str | None, i: int, key: str | None = None) -> str:
         """`FILE:LINE` of a key in the i-th section of that name (of the section's head without a key)."""

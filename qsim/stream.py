@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,16 +19,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import __version__, codes, files, optics
+from qsim import __version__, arrays, codes, descriptions, files, optics
+from qsim.checks import check_name as check_name
 from qsim.drawing import Draw, plane_of, prepare
-from qsim.footage import reading
 
 if TYPE_CHECKING:
     from qsim.clip import Clip
     from qsim.sensor import Sensor
 
 FORMAT_VERSION = 1
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_DAMAGED = "the file is damaged, sense again with --force"
 
 Progress = Callable[[int, int], None]  # (frames done, frames in all)
 
@@ -48,13 +47,11 @@ class Stream:
             raise FileNotFoundError(f"{json_path}: no such stream")
         meta = files.read_json(json_path)
         files.check_version(json_path, meta.get("format_version"), FORMAT_VERSION)
-        for key in ("shape", "bits", "width", "sensor", "ppp_factor", "exposure", "frame_rate"):
-            if key not in meta:
-                raise ValueError(f"{json_path}: key '{key}' is missing; the file is damaged, sense again with --force")
-        for key, good in _GOOD.items():
-            if not good(meta[key]):
-                found = f"{key} = {meta[key]!r}"[:80]
-                raise ValueError(f"{json_path}: {found} cannot be; the file is damaged, sense again with --force")
+        descriptions.structure(json_path, meta, descriptions.STREAM, _DAMAGED)
+        bits, width = meta["sensor"].get("bits", meta["bits"]), meta["shape"][2]
+        if (bits, width) != (meta["bits"], meta["width"]):
+            raise ValueError(f"{json_path}: bits or width contradict the sensor or the shape; {_DAMAGED}")
+        files.check_own(json_path, meta, _DAMAGED)
         return Stream(json_path.with_suffix(".npy") if json_path.suffix == ".json" else json_path, meta)
 
     def __len__(self) -> int:
@@ -106,8 +103,7 @@ class Stream:
         expected = (frames, height, codes.packed_width(width, self.bits))
         if not self.path.is_file():
             raise FileNotFoundError(f"{self.path}: no such file, though its json is there; sense again with --force")
-        with reading(self.path, ".npy; sense again with --force"):
-            array = np.load(self.path, mmap_mode="r", allow_pickle=False)
+        array = arrays.load_npy(self.path)
         if array.shape != expected or array.dtype != np.uint8:
             raise ValueError(
                 f"{self.path}: expected uint8 {list(expected)}, found {array.dtype} {list(array.shape)}; "
@@ -131,24 +127,13 @@ class Stream:
         part = np.asarray(self.packed[start:stop, y : y + h, low:high])
         return codes.unpack(part, self.bits, x + w - first)[..., x - first :]
 
-    def verify(self) -> list[str]:
+    def verify(self, progress: Progress | None = None) -> list[str]:
         """Problems of the stream's files in words; empty if they are what was written."""
         return files.differs(self.path, self.meta.get("sha256"))
 
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < float("inf")
-
-
-_GOOD: dict[str, Callable[[Any], bool]] = {  # what a stream's json may say
-    "shape": lambda n: isinstance(n, list) and len(n) == 3 and all(type(i) is int and 0 < i < 2**40 for i in n),
-    "bits": lambda n: type(n) is int and 1 <= n <= 16,
-    "width": lambda n: type(n) is int,
-    "sensor": lambda described: isinstance(described, dict),
-    "ppp_factor": lambda factor: factor is None or _is_number(factor),
-    "exposure": _is_number,
-    "frame_rate": _is_number,
-}
+    def unsealed(self) -> list[Path]:
+        """The description, if it holds no checksum of its own: an earlier version made it."""
+        return [] if "checksum" in self.meta else [self.path.with_suffix(".json")]
 
 
 def check_crop(crop: optics.Crop, height: int, width: int, where: str) -> optics.Crop:
@@ -157,13 +142,6 @@ def check_crop(crop: optics.Crop, height: int, width: int, where: str) -> optics
     if y < 0 or x < 0 or h < 1 or w < 1 or y + h > height or x + w > width:
         raise ValueError(f"{where}: crop (y, x, h, w) = {(y, x, h, w)} is not inside {height} x {width} pixels")
     return crop
-
-
-def check_name(name: str) -> str:
-    """A stream or clip name that is also a safe file name, else `ValueError`."""
-    if not _NAME.fullmatch(name):
-        raise ValueError(f"name {name!r}: use letters, digits, '.', '_' and '-' only, as in fan_03 or qis-3bit")
-    return name
 
 
 def orientation(meta: dict[str, Any]) -> str:
@@ -225,7 +203,7 @@ def write_packed(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor,
         "software": {"qsim": __version__},
     } | meta
     full["shape"] = [frames, height, width]
-    files.write_json(json_path, full)
+    files.write_description(json_path, full)
     return Stream.open(json_path)
 
 
@@ -320,7 +298,10 @@ def replay(clip: Clip, stream: Stream, frame: int) -> tuple[Array, Array]:
     from qsim.keys import Key
 
     meta = stream.meta
-    planes = int(meta.get("planes_per_code", 1))
+    for name in ("seed", "clip_key", "ppp", "mean_photons_before", "ppp_factor"):
+        if meta.get(name) is None:
+            raise ValueError(f"{stream.path}: its description holds no {name}: it was not drawn from a clip of ours")
+    planes = int(meta.get("planes_per_code") or 1)
     plane = plane_of(stream.sensor, planes)
     level = optics.LightLevel(stream.photons_factor, meta["ppp"] / planes, meta["mean_photons_before"] / planes, None)
     key = Key(seed=meta["seed"], clip=meta["clip_key"])

@@ -17,7 +17,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import __version__, exr, files, optics
-from qsim.stream import check_name
+from qsim.checks import check_name
 
 if TYPE_CHECKING:
     from qsim.scene import Camera
@@ -26,7 +26,7 @@ FORMAT_VERSION = 1
 PHYSICAL = "W m^-2 sr^-1"
 RELATIVE = "relative"
 MEASURED = (  # in clip.json, beyond what was asked for
-    *("mean_radiance", "mean_photons", "clipped_pixels", "checksums", "software"),
+    *("mean_radiance", "mean_photons", "clipped_pixels", "checksums", "software", "checksum"),
     *("error_per_frame", "psnr_of_truth", "fireflies_per_frame"),
 )
 TRUTH = {  # channel of the EXR file -> quantity
@@ -233,7 +233,7 @@ class ClipWriter:
             meta["psnr_of_truth"] = self._psnr(meta["error_per_frame"])
         if all("fireflies" in e for e in entries):
             meta["fireflies_per_frame"] = [e["fireflies"] for e in entries]
-        files.write_json(self.part / "clip.json", meta)
+        files.write_description(self.part / "clip.json", meta)
 
     def _psnr(self, errors: list[float]) -> float | None:
         """PSNR of the radiance, dB; the peak is the clip's 99.9th percentile (over at most 4 million even samples)."""
@@ -260,7 +260,7 @@ def camera_of(meta: dict[str, Any], where: Path) -> Camera | None:
             values[key] = tuple(values[key])
     try:
         return Camera(**values)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: camera: {error}") from None
 
 

@@ -507,7 +507,7 @@ def test_what_training_sees_of_the_test_split_is_reported(tmp_path: Path, asset:
     generate(SMALL, tmp_path / "d", HERE, make=make)
     for name, assets in [("fan_0001", [asset, "mesh m"]), ("tumble_0004", ["mesh n", asset])]:
         path = tmp_path / "d" / "clips" / name / "clip.json"
-        path.write_text(json.dumps(json.loads(path.read_text()) | {"assets": assets}))
+        files.write_description(path, files.read_json(path) | {"assets": assets})
     shared = generate(SMALL, tmp_path / "d", HERE, make=make).shared
     assert len(shared) == 1
     assert f"its {asset} is also in fan_0001, which is not a test clip" in shared[0]

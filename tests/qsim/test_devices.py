@@ -129,7 +129,7 @@ GOOD = {"model": '"BinarySPAD"', "pde": "0.3", "dark_count_rate": "25", "bits": 
         ({"pde": "nan"}, "BinarySPAD.pde"),
         ({"[source]\nx": "1"}, "unknown table [source] (did you mean 'sources'?)"),
         ({"[sources]\npd": '"x"'}, "unknown key 'pd' in [sources] (did you mean 'pde'?)"),
-        ({"pde": "="}, "not a TOML file"),
+        ({"pde": "="}, "mine.toml:3: not valid TOML"),
     ],
 )
 def test_a_wrong_file_is_refused_with_what_and_where(tmp_path, change, text):
