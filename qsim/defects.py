@@ -210,6 +210,43 @@ def lit(sensor: Sensor, photons: Array, exposure: float, maps: Maps) -> tuple[Se
     return _without_dark(sensor), light + maps.dark * (sensor.dark_rate * exposure / sensor.efficiency)
 
 
+def pmf(sensor: Sensor, photons: Array, exposure: float, maps: Maps) -> Array:
+    """P(code) of every pixel of a frame with maps, [..., H, W] -> [..., H, W, levels]; exact, without disturbances."""
+    sensor, light = lit(sensor, photons, exposure, maps)
+    if maps.offset is None and maps.read_noise is None:
+        chances = sensor.pmf(light, exposure)
+    elif isinstance(sensor, QIS):
+        chances = _read_out_pmf(sensor, light, exposure, maps)
+    else:
+        raise ValueError(f"{type(sensor).__name__} has no read-out: maps of offset and read noise are for a QIS")
+    if maps.dead is not None:
+        chances = np.where(maps.dead[..., None], np.arange(sensor.levels) == 0, chances)
+    return chances
+
+
+def _read_out_pmf(sensor: QIS, photons: Array, exposure: float, maps: Maps) -> Array:
+    """What `_read_out` draws: sum over electrons n of Pois(n) P(code | n), each pixel with its own noise and offset."""
+    from scipy.special import ndtr, pdtr, pdtrik
+
+    mean = sensor.arrivals(photons, exposure)
+    noise = np.broadcast_to(sensor.read_noise * (1.0 if maps.read_noise is None else maps.read_noise), mean.shape)
+    offset = np.broadcast_to((0.0 if maps.offset is None else maps.offset) / sensor.gain, mean.shape)
+    steps = (np.arange(sensor.levels - 1) + 0.5 - sensor.offset) / sensor.gain
+    last = int(np.ceil(pdtrik(1 - 1e-12, max(float(mean.max()), 1e-6)))) + 1
+    below, cdf = np.zeros_like(mean), np.zeros((*mean.shape, sensor.levels))
+    for n in range(last + 1):
+        up_to = pdtr(n, mean) if n < last else np.ones_like(mean)
+        electrons = n if sensor.full_well is None else min(n, sensor.full_well)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            passed = ndtr((steps - (electrons + offset)[..., None]) / noise[..., None])
+        exact = sensor.codes_of(electrons + offset)[..., None] <= np.arange(sensor.levels - 1)
+        passed = np.where(noise[..., None] > 0, passed, exact)
+        cdf[..., :-1] += (up_to - below)[..., None] * passed
+        below = up_to
+    cdf[..., -1] = 1.0
+    return np.diff(cdf, axis=-1, prepend=0.0)
+
+
 def _draw(
     sensor: Sensor,
     photons: Array,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qsim import page, pictures
+from qsim import defects, flaws, page, pictures
 from qsim.clip import RELATIVE, Clip, Stream
 from qsim.optics import clip_photons
 from qsim.stream import electrons_per_photon
@@ -129,7 +130,19 @@ def stream_line(stream: Stream) -> str:
     light = "" if ppp is None else f": {ppp:.4g} photons per pixel (the clip's light × {stream.photons_factor:.4g})"
     light += "" if lux is None else f", as much as {lux:.4g} lx at 555 nm"
     light += "" if ppp is None else f", {ppp * electrons_per_photon(stream.sensor):.3g} e⁻ per pixel"
-    return f"Stream {stream.name}{light}; {stream.bits} bit, {stream.sensor}"
+    return f"Stream {stream.name}{light}; {stream.bits} bit, {stream.sensor}{defects_words(stream)}"
+
+
+def defects_words(stream: Stream) -> str:
+    """`; defects: prnu 0.01, dark_map my_dark.npy`; empty without any."""
+    words = []
+    for name, value in stream.meta.get("defects", {}).items():
+        text = f"{value:g}" if isinstance(value, float) else str(value)
+        if isinstance(value, dict):
+            parts = (f"{key} {v:g}" for key, v in value.items() if isinstance(v, int | float))
+            text = Path(str(value["file"])).name if "file" in value else f"({', '.join(parts)})"
+        words.append(f"{name} {text}")
+    return f"; defects: {', '.join(words)}" if words else ""
 
 
 def motion_line(clip: Clip, frames: range) -> str:
@@ -178,21 +191,57 @@ def code_histogram(clip: Clip, stream: Stream) -> str:
     few = levels <= 64
     axes.bar(np.arange(levels), drawn, width=0.8 if few else 1.0, color="tab:blue", label="drawn")
     words = f"codes of {stream.name}: drawn"
-    if few and int(stream.meta.get("planes_per_code", 1)) == 1 and len(stream) == len(clip):
-        axes.plot(np.arange(levels), _expected(clip, stream, count), "k_", markersize=14, label="expected")
-        words += ", and expected from the light by the sensor's exact distribution"
+    missing = unexpected(clip, stream)
+    if missing is None:
+        try:
+            expected = expected_codes(clip, stream, count)
+        except (ValueError, OSError) as error:  # a measured map that has gone or changed
+            missing = str(error)
+        else:
+            axes.plot(np.arange(levels), expected, "k_", markersize=14, label="expected")
+            mixed = " and its map of defects" if "defects" in stream.meta else ""
+            words += f", and expected from the light by the sensor's exact distribution{mixed}"
+    if missing is not None:
+        words += f"; no expectation is shown: {missing}"
     axes.legend()
     return page.figure(save(), words)
 
 
-def _expected(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64]:
-    """Mean probability of each code over the light of some frames (every n-th pixel of a few of them)."""
+def unexpected(clip: Clip, stream: Stream) -> str | None:
+    """Why nothing can be expected of a stream's codes; None if it can."""
+    own = stream.meta.get("defects", {})
+    if 2**stream.bits > 64:
+        return "more than 64 codes"
+    if int(stream.meta.get("planes_per_code", 1)) > 1 or len(stream) != len(clip):
+        return "a code sums planes of several frames of the clip"
+    if stream.meta["ppp_factor"] is None:
+        return "its light is not known"
+    if own.get("crosstalk") or own.get("afterpulse"):
+        return "crosstalk and afterpulses make a code depend on its neighbours or on the frame before"
+    if stream.meta.get("drawn_by") == "events":
+        return "dead time inside and between exposures was followed photon by photon"
+    return None
+
+
+def expected_codes(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64]:
+    """Mean probability of each code over the light of some frames (every n-th pixel of a few of them).
+
+    Mixed over the stream's maps of defects; `ValueError` or `OSError` where a measured map has changed or gone.
+    """
     chosen = np.unique(np.linspace(0, count - 1, min(count, 6)).astype(int))
-    step = max(1, int(np.sqrt(clip.shape[1] * clip.shape[2] / _PIXELS)))
+    height, width = clip.shape[1:]
+    step = max(1, int(np.sqrt(height * width / _PIXELS)))
     blurred = bool(stream.meta.get("diffraction", False))
     light = [clip_photons(clip, int(t), stream.photons_factor, diffraction=blurred)[::step, ::step] for t in chosen]
-    probabilities: NDArray[np.float64] = stream.sensor.pmf(np.stack(light), stream.exposure)
-    return probabilities.reshape(-1, probabilities.shape[-1]).mean(axis=0)
+    sensor, maps = stream.sensor, defects.PERFECT
+    if "defects" in stream.meta:
+        found = flaws.from_dict(stream.meta["defects"], f"{stream.name}: defects")
+        device = flaws.of_sensor(found, sensor, height, width)
+        thinned = {name: None if m is None else m[::step, ::step] for name, m in vars(device.maps).items()}
+        sensor, maps = device.sensor, defects.Maps(**thinned)
+    probabilities = defects.pmf(sensor, np.stack(light), stream.exposure, maps)
+    mean: NDArray[np.float64] = probabilities.reshape(-1, probabilities.shape[-1]).mean(axis=0)
+    return mean
 
 
 def _motion_histogram(speed: NDArray[np.floating]) -> str:

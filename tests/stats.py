@@ -104,3 +104,30 @@ def assert_histogram(
     """Codes are compatible with a probability per code."""
     p = histogram_p_value(codes, pmf, fitted)
     assert p > per_check(false_alarm, checks), f"chi-square p = {p:.3g} is below {per_check(false_alarm, checks):.3g}"
+
+
+def mixture_p_value(codes: np.ndarray, pmf: np.ndarray) -> float:
+    """Chi-square of a histogram whose draws differ: code i has the probabilities pmf[i], [N] and [N, levels].
+
+    The counts have the mean sum p and the covariance sum (diag(p) - p p'); codes expected less than five times are
+    pooled with their neighbours, as for one distribution.
+    """
+    observed = np.bincount(codes.ravel(), minlength=pmf.shape[1]).astype(float)
+    chances = pmf.reshape(-1, pmf.shape[-1])
+    groups, current = [], []
+    for k, expected in enumerate(chances.sum(axis=0)):
+        current.append((k, expected))
+        if sum(e for _, e in current) >= 5:
+            groups.append([k for k, _ in current])
+            current = []
+    if not groups:
+        raise ValueError(f"{codes.size} codes are too few for a chi-square test: no bin expects 5")
+    groups[-1] += [k for k, _ in current]
+    pooled = np.stack([chances[:, g].sum(axis=1) for g in groups], axis=1)
+    counts = np.array([observed[g].sum() for g in groups])
+    if len(groups) == 1:
+        return 1.0
+    difference = (counts - pooled.sum(axis=0))[1:]  # the counts add up: one of them says nothing
+    covariance = np.diag(pooled.sum(axis=0)) - pooled.T @ pooled
+    chi2 = float(difference @ np.linalg.solve(covariance[1:, 1:], difference))
+    return float(_scipy_stats.chi2.sf(chi2, len(groups) - 1))

@@ -10,6 +10,7 @@ from stats import (
     assert_variance,
     critical_z,
     histogram_p_value,
+    mixture_p_value,
     per_check,
 )
 
@@ -43,6 +44,17 @@ def test_the_variance_alarms_as_rarely_as_promised():
     """s^2 of 2000 draws is still a little skewed: allow 3 % to 8 %."""
     share = share_of_alarms(assert_variance, lambda r: r.poisson(LIGHT, 2000), LIGHT, POISSON_FOURTH, false_alarm=0.05)
     assert 0.03 < share < 0.08
+
+
+def test_the_mixture_s_chi_square_alarms_as_rarely_as_promised():
+    """400 draws of which each has probabilities of its own; p-values of the plain chi-square would be too large."""
+    rng = np.random.default_rng(0)
+    pmf = rng.dirichlet([0.4] * 5, 400)
+    steps = pmf.cumsum(axis=1)[:, :-1]
+    drawn = (rng.random((2000, 400, 1)) > steps).sum(axis=2)
+    alarms = [mixture_p_value(codes, pmf) < 0.05 for codes in drawn]
+    assert 0.03 < np.mean(alarms) < 0.07
+    assert mixture_p_value(drawn[0] // 2, pmf) < 1e-6
 
 
 def test_one_rms_alarms_as_rarely_as_promised():

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stats import assert_histogram, assert_mean, assert_share, assert_variance
+from stats import FALSE_ALARM, assert_histogram, assert_mean, assert_share, assert_variance, mixture_p_value, per_check
 
-from qsim.defects import PERFECT, DarkSpread, Defects, Maps, draw_maps, measured_dark_map, sample
+from qsim.defects import PERFECT, DarkSpread, Defects, Maps, draw_maps, measured_dark_map, pmf, sample
 from qsim.keys import Key
 from qsim.qis import QIS
 from qsim.spad import BinarySPAD, CountingSPAD
@@ -164,6 +164,55 @@ def test_drawn_read_out_maps_have_their_spread():
 
 
 # ---- Afterpulses and crosstalk
+
+
+def drawn_device(rng: np.random.Generator, shape: tuple[int, int]):
+    """A random sensor with random maps; each map is absent in half of the cases."""
+    bits, some = int(rng.integers(1, 5)), lambda: bool(rng.random() < 0.5)
+    rate = float(rng.choice([0.0, 300.0, 3000.0]))
+    kind = rng.integers(3)
+    if kind == 0:
+        noise, well = float(rng.choice([0.0, 0.2, 0.7])), float(rng.uniform(3, 30)) if some() else None
+        sensor = QIS(0.8, rate, noise, bits, gain=float(np.exp(rng.normal(0, 0.7))), offset=0.3, full_well=well)
+    elif kind == 1:
+        sensor = BinarySPAD(0.4, rate, bits)
+    else:
+        sensor = CountingSPAD(0.5, rate, float(rng.choice([0.0, 2e-5])), bits)
+    pattern = Defects(
+        device_seed=int(rng.integers(1000)),
+        prnu=0.3 if some() else 0.0,
+        dark=DarkSpread(hot_share=0.1) if some() else None,
+        dead=0.05 if some() else 0.0,
+        offset=0.4 if kind == 0 and some() else 0.0,
+        read_noise=0.5 if kind == 0 and some() else 0.0,
+    )
+    return sensor, draw_maps(pattern, shape)
+
+
+def test_the_exact_distribution_holds_for_random_devices():
+    """Drawn codes of random sensors and maps against `pmf`, by chi-square; without the maps most of them fail."""
+    rng = np.random.default_rng(21)
+    devices, shape, blind = 60, (24, 25), 0
+    for i in range(devices):
+        sensor, maps = drawn_device(rng, shape)
+        photons = rng.uniform(0.1, 6, shape) * float(np.exp(rng.normal(0, 0.7)))
+        codes = sample(sensor, np.repeat(photons[None], 12, axis=0), 5e-4, key=Key(seed=i, clip=3), maps=maps)
+        chances = pmf(sensor, photons, 5e-4, maps)
+        assert chances.min() > -1e-9
+        np.testing.assert_allclose(chances.sum(axis=-1), 1, atol=1e-9)
+        flat = chances.reshape(-1, sensor.levels)
+        assert mixture_p_value(codes, np.tile(flat, (12, 1))) > per_check(FALSE_ALARM, devices), (sensor, maps)
+        plain = sensor.pmf(photons, 5e-4).reshape(-1, sensor.levels)
+        blind += mixture_p_value(codes, np.tile(plain, (12, 1))) > per_check(FALSE_ALARM, devices)
+    assert blind < devices / 2
+
+
+def test_the_exact_distribution_without_maps_is_the_sensor_s_own():
+    photons = light((4, 5))
+    for sensor in (QIS(0.8, 100.0, 0.2, 3), BinarySPAD(0.4, 50.0, 2)):
+        np.testing.assert_array_equal(pmf(sensor, photons, 5e-4, PERFECT), sensor.pmf(photons, 5e-4))
+    with pytest.raises(ValueError, match="has no read-out"):
+        pmf(BinarySPAD(0.4, 50.0, 2), photons, 5e-4, Maps(offset=np.zeros((4, 5))))
 
 
 def test_afterpulses_reach_the_stationary_rate():

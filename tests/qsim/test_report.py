@@ -4,15 +4,18 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from clips import write_clip, write_dataset
+from stats import mixture_p_value
 
 from qsim import report, report_clip
 from qsim.cli import main
 from qsim.clip import RELATIVE, Clip, ClipWriter
 from qsim.optics import clip_photons
+from qsim.stream import Sensing, sense
 from qsim.validate_reading import Report
 
 
@@ -66,6 +69,57 @@ def test_page_shows_everything_and_loads_nothing(folder):
     assert "light of the truth" not in page
     addresses = re.findall(r'(?:src|href|data-strip)="([^"]*)"', page)
     assert all(address.startswith("data:") for address in addresses)
+
+
+DEVICES = {
+    "dark map": '[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 900.0\nbits = 2\n'
+    "[defects]\ndevice_seed = 3\ndead = 0.05\ndark = { hot_share = 0.2 }\n",
+    "QIS": '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 400.0\nread_noise = 0.2\nbits = 3\n'
+    "[defects]\ndevice_seed = 4\nprnu = 0.3\ndead = 0.1\noffset = 0.6\nread_noise = 0.5\n",
+    "measured": '[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 1.0\nbits = 1\n'
+    '[defects]\ndark_map = "rates.npy"\n',
+}
+
+
+@pytest.mark.parametrize("name", DEVICES)
+def test_the_expected_codes_include_the_maps(tmp_path, name):
+    """The drawn histogram against the marks, by chi-square; the sensor's own distribution without the maps fails it."""
+    (tmp_path / "device.toml").write_text(DEVICES[name])
+    rates = np.random.default_rng(5).lognormal(7, 1, (40, 60))
+    np.save(tmp_path / "rates.npy", rates)
+    clip = make_clip(tmp_path / "clip", frames=6, size=(24, 33))
+    stream, _ = sense(clip, Sensing(str(tmp_path / "device.toml"), ppp=2.0, name="mine"))
+    clip = Clip.open(clip.path)
+    assert report_clip.unexpected(clip, stream) is None
+    expected = report_clip.expected_codes(clip, stream, len(stream))
+    codes = stream.codes()
+    assert mixture_p_value(codes, np.tile(expected, (codes.size, 1))) > 1e-6
+    photons = np.stack([clip_photons(clip, t, stream.photons_factor) for t in range(6)])
+    blind = stream.sensor.pmf(photons, stream.exposure).reshape(-1, 2**stream.bits)
+    assert mixture_p_value(codes, blind) < 1e-6
+    section = report_clip.clip_section(clip)
+    assert "exact distribution and its map of defects" in section
+    assert "; defects: " in section
+    if name == "measured":
+        assert "dark_map rates.npy" in section
+        np.save(tmp_path / "rates.npy", rates * 2)
+        assert "rates.npy has changed since the stream was drawn" in report_clip.clip_section(clip)
+
+
+def test_marks_are_left_out_where_nothing_exact_is_known(tmp_path):
+    text = '[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 900.0\nbits = 1\n[defects]\n'
+    clip = make_clip(tmp_path / "clip", frames=3, size=(12, 14))
+    for cause in ("crosstalk", "afterpulse"):
+        (tmp_path / "device.toml").write_text(f"{text}{cause} = 0.05\n")
+        stream, _ = sense(clip, Sensing(str(tmp_path / "device.toml"), ppp=2.0, name=cause))
+        assert "crosstalk and afterpulses" in str(report_clip.unexpected(clip, stream))
+        words = report_clip.code_histogram(clip, stream)
+        assert "no expectation is shown: crosstalk and afterpulses" in words
+        assert f"defects: {cause} 0.05" in report_clip.stream_line(stream)
+    grouped, _ = sense(clip, Sensing("spad-320x240", bits=2, ppp=2.0, name="grouped", group=True))
+    assert "sums planes" in str(report_clip.unexpected(clip, grouped))
+    unknown = replace(stream, meta=stream.meta | {"ppp_factor": None, "defects": {}})
+    assert "light is not known" in str(report_clip.unexpected(clip, unknown))
 
 
 def test_an_evaluation_says_what_its_scores_mean(folder):
@@ -150,7 +204,7 @@ def test_expected_histogram_is_the_mean_of_the_exact_distribution(tmp_path):
     clip = write_clip(tmp_path / "even", radiance=np.full((4, 40, 50), 1.0))
     assert main(["sense", str(clip.path), "--ppp", "3.25", "--bits", "3", "-o", "mine"]) == 0
     stream = clip.stream("mine")
-    expected = report_clip._expected(clip, stream, 4)
+    expected = report_clip.expected_codes(clip, stream, 4)
     light = np.stack([clip_photons(clip, t, stream.photons_factor) for t in range(4)])
     exact = stream.sensor.pmf(light, stream.exposure).mean(axis=(0, 1, 2))
     np.testing.assert_allclose(expected, exact, atol=2e-3)  # every n-th pixel of light that falls off as cos^4
