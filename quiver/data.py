@@ -7,10 +7,12 @@ Nothing here needs torch. Training windows, a `torch` data set, are in samples.p
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy import ndarray as Array
@@ -19,15 +21,16 @@ from qsim import __version__, devices, keys
 from qsim.checks import suggest
 from qsim.clip import Clip
 from qsim.completion import add_completion
-from qsim.console import GOES_ON, STARTS_AGAIN, Parser, bar, command, output, run
+from qsim.console import GOES_ON, STARTS_AGAIN, Parser, bar, command, note, output, run
 from qsim.dataset import Dataset
-from qsim.files import read_json, replacing, write_bytes, write_json
+from qsim.files import Lock, read_json, replacing, sha256, sync_folder, to_json, write_bytes, write_json
 from qsim.footage import reading
 from qsim.keys import Key, hash_name
 from qsim.optics import WHITE_PER_MEAN, clip_photons, light_level
 from qsim.qis import QIS
 from qsim.sensor import Sensor
-from qsim.stream import Sensing, Stream, prepare
+from qsim.spad import BinarySPAD
+from qsim.stream import Sensing, Stream, describe, prepare
 from quiver.code_table import TABLE_BITS, CodeTable
 
 __all__ = [
@@ -37,6 +40,7 @@ __all__ = [
     "Codes",
     "Key",
     "Light",
+    "Lock",
     "Parser",
     "Sensor",
     "Stream",
@@ -48,10 +52,12 @@ __all__ = [
     "command",
     "cube_codes",
     "draw_codes",
+    "follows_light",
     "has_sharp",
     "ideal_counter",
     "light_level",
     "mean_light",
+    "note",
     "open_clips",
     "open_stream",
     "output",
@@ -64,6 +70,7 @@ __all__ = [
     "stored",
     "stream_codes",
     "suggest",
+    "sync_folder",
     "truth",
     "windows_sensed",
     "write_bytes",
@@ -71,6 +78,8 @@ __all__ = [
 ]
 
 
+DIGEST_BYTES = 1 << 24  # of an array, hashed at a time
+PLANE_PIXELS = 1 << 24  # of packed planes that are unpacked at a time: 16 MB
 WINDOW_STAGE = 1000  # of the random keys of published test windows, + frame; 0 is `qsim sense`
 
 
@@ -113,6 +122,11 @@ def _code_table(sensor: Sensor, exposure: float) -> CodeTable | None:
         return None
 
 
+def follows_light(sensor: str) -> bool:
+    """Whether the gain of a named sensor is set from the photons per pixel."""
+    return sensor in devices.DEVICES and devices.DEVICES[sensor].follows_light
+
+
 def draw_codes(sensor: Sensor, photons: Array, exposure: float, key: Key) -> Array:
     """Codes [T, H, W] of expected photons [T, H, W], frame t under `key.at(key.frame + t)`; quick, without Dr.Jit.
 
@@ -151,11 +165,23 @@ class Codes:
     frame_rate: float  # codes per second
     read: Callable[[int, int], Array]  # codes uint8 [stop - start, H, W] of frames start .. stop - 1
     source: str  # where they come from, for provenance
+    digest: Callable[[], str] = str  # SHA-256 of what is read, computed when asked for; empty: not known
+    sensor_name: str = ""  # of a device or a file; empty: the sensor's model
+    ppp: float | None = None  # mean photons per pixel and code; None: not known
 
     @property
     def white(self) -> float:
         """Photons at which x = 1."""
         return self.sensor.white(self.exposure)
+
+
+def array_digest(array: Array) -> str:
+    """SHA-256 of an array's type, shape and values; a memory map is read piece by piece."""
+    found = hashlib.sha256(f"{array.dtype.str} {array.shape}".encode())
+    step = max(1, DIGEST_BYTES // max(1, array[:1].nbytes))
+    for start in range(0, len(array), step):
+        found.update(np.ascontiguousarray(array[start : start + step]).data)
+    return found.hexdigest()
 
 
 def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "codes", source: str = "memory") -> Codes:
@@ -173,12 +199,13 @@ def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "code
             )
         return part
 
-    return Codes(name, codes.shape, sensor, exposure, 1 / exposure, read, source)
+    return Codes(name, codes.shape, sensor, exposure, 1 / exposure, read, source, lambda: array_digest(codes))
 
 
 def sensed(clip: Clip, light: Light, seed: int = 0) -> tuple[Codes, float]:
     """A clip as a sensor sees it, drawn when read, and the light factor: the codes that `qsim sense` would store."""
-    draw = prepare(clip, Sensing(light.sensor, bits=light.bits, ppp=light.ppp, seed=seed))
+    sensing = Sensing(light.sensor, bits=light.bits, ppp=light.ppp, seed=seed)
+    draw = prepare(clip, sensing)
 
     def read(start: int, stop: int) -> Array:
         try:
@@ -194,6 +221,9 @@ def sensed(clip: Clip, light: Light, seed: int = 0) -> tuple[Codes, float]:
         frame_rate=clip.frame_rate,
         read=read,
         source=f"{clip.path} seen by {light.sensor} ({light.label}), seed {seed}",
+        digest=lambda: sha256(to_json({"clip_meta": clip.meta} | describe(clip, sensing, draw))),
+        sensor_name=light.sensor,
+        ppp=draw.level.ppp,
     )
     return codes, draw.level.factor
 
@@ -209,6 +239,9 @@ def stream_codes(stream: Stream) -> Codes:
         float(meta["frame_rate"]),
         stream.codes,
         str(stream.path),
+        lambda: array_digest(stream.packed),
+        str(meta.get("sensor_name") or ""),
+        meta.get("ppp"),
     )
 
 
@@ -254,30 +287,71 @@ def peak_of(light: float, peak: float | None = None) -> float:
 def cube_codes(
     path: Path, light: Light, frame_rate: float, *, planes: int | None = None, width: int | None = None
 ) -> Codes:
-    """Codes from a bare .npy: uint8 codes [T, H, W], or with `width` binary planes [T, H, ceil(W/8)], first pixel in
-    the highest bit. `planes` = 2^b - 1 of them are summed to one b-bit code; `frame_rate` counts codes per second.
+    """Codes from a bare .npy: integers [T, H, W], or with `width` binary planes [T, H, ceil(W/8)], first pixel in the
+    highest bit. Every `planes` = 2^b - 1 of them (default 1) are summed to one b-bit code of a clocked SPAD; what is
+    left at the end is not used. `frame_rate` counts codes per second. `ValueError` where these do not fit together.
     """
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError):
+    except (ValueError, EOFError, BadZipFile):
         raise ValueError(f"{path}: not readable as an array of numbers; save the codes with np.save") from None
-    if width is not None:
-        array = _summed_planes(path, array, planes or 1, width)
-    sensor = light.device(1 / frame_rate)
-    return array_codes(array, sensor, 1 / frame_rate, name=path.name, source=str(path))
+    if not isinstance(array, np.ndarray):
+        raise ValueError(f"{path}: is an archive (.npz) under the name .npy; save the codes alone with np.save")
+    if width is None:
+        if planes is not None:
+            raise ValueError(f"{path}: planes = {planes} sums packed binary planes; give their width in pixels, too")
+        codes = array_codes(array, light.device(1 / frame_rate), 1 / frame_rate, path.name, str(path))
+    else:
+        codes = _summed(path, array, light, frame_rate, planes or 1, width)
+    return replace(codes, digest=lambda: array_digest(array), sensor_name=light.sensor)
 
 
-def _summed_planes(path: Path, cube: Array, planes: int, width: int) -> Array:
-    if cube.ndim != 3 or cube.dtype != np.uint8 or cube.shape[2] != (width + 7) // 8:
+def plane_bits(planes: int) -> int:
+    """Bits of a code that sums so many binary planes; `ValueError` unless that is 2^b - 1 with b = 1 ... 16."""
+    bits = planes.bit_length()
+    if 1 <= planes == 2**bits - 1 < 2**16:
+        return bits
+    lower, higher = 2 ** ((planes + 1).bit_length() - 1) - 1, 2 ** (planes + 1).bit_length() - 1
+    near = 1 if planes < 1 else 65535 if higher > 65535 else f"{lower} or {higher}"
+    raise ValueError(f"planes: a b-bit code sums 2^b - 1 binary planes, got {planes}; use {near}")
+
+
+def _summed(path: Path, cube: Array, light: Light, frame_rate: float, planes: int, width: int) -> Codes:
+    """Packed planes as codes, summed when they are read."""
+    bits = plane_bits(planes)
+    if light.bits not in (None, bits):
+        raise ValueError(f"{path}: sums of {planes} planes are {bits}-bit codes, got bits = {light.bits}; leave it out")
+    sensor = replace(light, bits=bits).device(1 / frame_rate)
+    if planes > 1 and not isinstance(sensor, BinarySPAD):
+        raise ValueError(
+            f"{light.sensor}: only a clocked SPAD sums planes, this is a {type(sensor).__name__}; "
+            "give another sensor, as in spad-320x240"
+        )
+    if cube.ndim != 3 or cube.dtype != np.uint8 or cube.shape[2] != (width + 7) // 8 or 0 in cube.shape:
         raise ValueError(
             f"{path}: {cube.dtype} {list(cube.shape)} is no cube of packed planes {width} px wide; "
             f"that would be uint8 [T, H, {(width + 7) // 8}]"
         )
-    frames = len(cube) // planes
-    if frames == 0:
+    if len(cube) < planes:
         raise ValueError(f"{path}: {len(cube)} planes are fewer than the {planes} of one code")
-    groups = (np.unpackbits(cube[t * planes : (t + 1) * planes], axis=2, count=width) for t in range(frames))
-    return np.stack([group.sum(axis=0, dtype=np.uint8) for group in groups])
+    together = max(1, PLANE_PIXELS // (cube.shape[1] * width))  # planes unpacked at a time
+
+    def code(t: int) -> Array:
+        total = np.zeros((cube.shape[1], width), np.uint16)  # at most 65535
+        for start in range(t * planes, (t + 1) * planes, together):
+            part = cube[start : min(start + together, (t + 1) * planes)]
+            total += np.unpackbits(part, axis=2, count=width).sum(axis=0, dtype=np.uint16)
+        return total.astype(np.uint8 if bits <= 8 else np.uint16)
+
+    return Codes(
+        name=path.name,
+        shape=(len(cube) // planes, cube.shape[1], width),
+        sensor=sensor,
+        exposure=1 / frame_rate,
+        frame_rate=frame_rate,
+        read=lambda start, stop: np.stack([code(t) for t in range(start, stop)]),
+        source=str(path),
+    )
 
 
 def windows_sensed(clip: Clip, light: Light, seed: int, centres: range) -> Iterator[Codes]:

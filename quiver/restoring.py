@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import hashlib
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -69,6 +69,7 @@ class Restorer:
     description: str
     fill: Fill
     seamless: bool = True  # a range of frames restored alone equals that part of the whole
+    identity: Mapping[str, object] = field(default_factory=dict)  # settings and weights that change the answer
 
     def restore(self, codes: Codes, first: int = 0, last: int | None = None, progress: Progress | None = None) -> Array:
         """Restored photons float32 [last - first, H, W] of frames first ... last - 1, all of them by default."""
@@ -96,7 +97,8 @@ def restorer(name: str, options: Options | None = None) -> Restorer:
     def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
         fill_classical(run, frames, codes, out, first, options.memory, progress)
 
-    return Restorer(name, frames, look_ahead(frames), False, method.description, fill)
+    identity = {"method": base, "window": frames}
+    return Restorer(name, frames, look_ahead(frames), False, method.description, fill, identity=identity)
 
 
 def shipped_names() -> list[str]:
@@ -152,21 +154,26 @@ def network_restorer(path: Path, options: Options) -> Restorer:
     from quiver.weights import load
 
     model = load(path)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
     name = path.parent.name if path.name == "best.safetensors" else path.stem
-    return wrap_network(model, name, f"{type(model).__name__}, weights {digest}, {options.mode}", options)
+    description = f"{type(model).__name__}, weights {digest[:12]}, {options.mode}"
+    return wrap_network(model, name, description, options, weights_sha256=digest)
 
 
-def wrap_network(model: nn.Module, name: str, description: str, options: Options) -> Restorer:
-    """A network as a method."""
-    from quiver.model import RADIUS, WINDOW
+def wrap_network(
+    model: nn.Module, name: str, description: str, options: Options, weights_sha256: str | None = None
+) -> Restorer:
+    """A network as a method; the checksum is that of its weights file."""
+    from quiver.model import QUIVER, RADIUS, WINDOW
 
+    mode = options.mode if isinstance(model, QUIVER) else "windows"  # others share no work between frames
     model.to(pick_device(options.device)).eval()
 
     def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
         fill_network(model, codes, out, first, options, progress)
 
-    return Restorer(name, WINDOW, RADIUS, True, description, fill, seamless=options.mode != "streaming")
+    identity = {"weights_sha256": weights_sha256, "mode": mode, "precision": options.precision}
+    return Restorer(name, WINDOW, RADIUS, True, description, fill, mode != "streaming", identity)
 
 
 def pick_device(wanted: str) -> str:
