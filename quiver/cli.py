@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import os
 import signal
+import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 
 from quiver.cli_train import add_ablate, add_train
 from quiver.options import (
+    DEFAULT_METHOD,
     add_light,
     add_running,
     command,
@@ -58,36 +60,47 @@ def _add_restore(sub: Any) -> None:
     parser.add_argument("source", type=Path, help="stream (.npy with its .json), clip folder, or bare .npy array")
     parser.add_argument("-o", "--output", type=Path, required=True, help=".npy to write; a .json appears beside it")
     parser.add_argument(
-        "--method", default="nano", help="classical method, shipped weights, file or run (default nano)"
+        "--method",
+        default=DEFAULT_METHOD,
+        help=f"classical method, shipped weights, file or run (default {DEFAULT_METHOD})",
     )
     parser.add_argument("--stream", help="which stream of a clip (default: the only one)")
     add_light(parser, several=False)
-    parser.add_argument("--seed", type=int, default=0, help="of the noise, where a clip is sensed now (default 0)")
+    parser.add_argument("--seed", type=int, help="of the noise, where a clip is sensed now (default 0)")
     parser.add_argument("--width", type=count, help="bare array: packed binary planes of this many pixels per row")
-    parser.add_argument("--planes", type=count, help="packed planes: so many are summed to one code, as in 7")
-    parser.add_argument(
-        "--frame-rate", type=positive, default=2000.0, help="bare array: codes per second (default 2000)"
-    )
+    parser.add_argument("--planes", type=count, help="packed planes: 2^b - 1 are summed to one code (default 1)")
+    parser.add_argument("--frame-rate", type=positive, help="bare array: codes per second (default 2000)")
     add_running(parser)
     parser.add_argument("--force", action="store_true", help="replace an existing result")
 
 
 def _run_restore(args: argparse.Namespace) -> int:
-    from quiver.data import bar, output
+    from quiver.data import bar, note, output
     from quiver.restored_file import restore_to_file
     from quiver.restoring import restorer
+    from quiver.sources import assumed, codes_to_restore, refuse_idle
 
     target: Path = args.output
     if target.suffix != ".npy":
         raise ValueError(f"{target}: restored video is written as .npy; name a file that ends so")
-    codes = _source(args)
+    codes = codes_to_restore(args)
     for path in (target, target.with_suffix(".json")):
         if path.exists() and not args.force:
             raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
     method = restorer(args.method, running_options(args))
+    refuse_idle(vars(args), [method])
     target.parent.mkdir(parents=True, exist_ok=True)
+    lines, started = [assumed(codes, method)], time.monotonic()
     with bar(method.name) as progress:
-        meta = restore_to_file(codes, method, target, progress)
+
+        def shown(done: int, total: int) -> None:
+            while lines and time.monotonic() > started + 2:  # as the bar: a mistake is one line without it
+                note(lines.pop())
+            progress(done, total)
+
+        meta = restore_to_file(codes, method, target, shown, force=args.force, note=note)
+    for line in lines:
+        note(line)
     length, height, width = codes.shape
     output(
         args,
@@ -96,36 +109,6 @@ def _run_restore(args: argparse.Namespace) -> int:
         f"{meta['seconds_per_frame']:.3g} s per frame; photons, white = {codes.white:.4g}",
     )
     return 0
-
-
-def _source(args: argparse.Namespace) -> Any:
-    """The codes that a path and the options mean."""
-    from quiver.data import Light, cube_codes, open_clips, open_stream, sensed, stream_codes
-
-    light = Light(args.sensor or "quiver-physical", args.ppp, args.bits)
-    path: Path = args.source
-    if path.is_dir():
-        clips = open_clips(path)
-        if not (path / "clip.json").exists():
-            one = f", as in {clips[0].path}" if clips else "; none is finished yet"
-            raise ValueError(f"{path}: is a data set; name one of its clips{one}")
-        clip = clips[0]
-        if args.ppp is None and args.stream is None and len(clip.streams) != 1:
-            there = ", ".join(clip.streams) or "none"
-            raise ValueError(f"{path}: choose one of its streams with --stream ({there}), or sense it now with --ppp")
-        if args.stream is not None or args.ppp is None:
-            return stream_codes(clip.stream(args.stream or clip.streams[0]))
-        return sensed(clip, Light(light.sensor, args.ppp, args.bits or 3), args.seed)[0]
-    if path.with_name(f"{path.name}.part").is_dir() and not path.exists():
-        open_clips(path)  # which says that it is unfinished
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file or folder")
-    if path.suffix not in (".npy", ".json"):
-        raise ValueError(f"{path}: no stream, clip folder or .npy array; `qsim convert` makes a clip of other files")
-    if path.with_suffix(".json").is_file() and args.width is None:
-        return stream_codes(open_stream(path))
-    bits = args.bits or (args.planes.bit_length() if args.planes else 3)
-    return cube_codes(path, Light(light.sensor, args.ppp, bits), args.frame_rate, planes=args.planes, width=args.width)
 
 
 # evaluate
@@ -143,10 +126,10 @@ def _add_evaluate(sub: Any) -> None:
     parser.add_argument(
         "--methods", type=words, default="naive,moment", help="with commas; window as in moment:3; all = all"
     )
-    parser.add_argument("--split", default="test", choices=("train", "val", "test", "all"), help="default test")
+    parser.add_argument("--split", choices=("train", "val", "test", "all"), help="of a data set (default test)")
     parser.add_argument("--stream", help="score this stored stream of every clip instead of sensing now")
     add_light(parser, several=True)
-    parser.add_argument("--seed", type=int, default=0, help="of the test noise or of the random splits (default 0)")
+    parser.add_argument("--seed", type=int, help="of the test noise or of the random splits (default 0)")
     parser.add_argument("--published", action="store_true", help="every window exposed, scaled and scored on its own")
     parser.add_argument(
         "--peak", type=positive, help="photons per pixel that the scores refer to (default 2.5 x the mean light)"
@@ -154,35 +137,28 @@ def _add_evaluate(sub: Any) -> None:
     parser.add_argument(
         "--static", type=Path, metavar="COUNTS", help="photon counts [N,H,W] or [T,K,H,W], .npy or .npz"
     )
-    parser.add_argument("--frames", type=count, default=11, help="static: frames to restore from (default 11)")
-    parser.add_argument("--splits", type=count, default=3, help="static: random splits (default 3)")
+    parser.add_argument("--frames", type=count, help="static: frames to restore from (default 11)")
+    parser.add_argument("--splits", type=count, help="static: random splits (default 3)")
     add_running(parser)
     parser.add_argument("--force", action="store_true", help="start anew where an evaluation is")
 
 
 def _run_evaluate(args: argparse.Namespace) -> int:
     from quiver.restoring import restorers
+    from quiver.sources import refuse_idle
 
     methods = restorers(args.methods, running_options(args))
+    refuse_idle(vars(args), methods)
     if args.static is not None:
         return _run_static(args, methods)
     if args.source is None or args.output is None:
         raise ValueError("give a data set or clip folder and -o, or --static COUNTS")
     from quiver import table
-    from quiver.data import Light, bar, output
-    from quiver.evaluate import Plan, evaluate
+    from quiver.data import bar, output
+    from quiver.evaluate import evaluate
+    from quiver.sources import plan_of
 
-    sensor = args.sensor or ("quiver-published" if args.published else "quiver-physical")
-    lights = tuple(Light(sensor, ppp, bits) for bits in args.bits or (3,) for ppp in args.ppp or (3.25,))
-    plan = Plan(
-        args.source,
-        None if args.split == "all" else args.split,
-        lights,
-        args.seed,
-        args.published,
-        args.stream,
-        args.peak,
-    )
+    plan = plan_of(args)
     if args.force and args.output.exists():
         renew(args.output, "plan.json")
     with bar("rows", "row") as progress:
@@ -195,19 +171,21 @@ def _run_evaluate(args: argparse.Namespace) -> int:
 def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
     from quiver.data import output, peak_of
     from quiver.evaluate import json_safe
+    from quiver.sources import refuse_for_counts
     from quiver.static import FORMAT, evaluate_static, markdown, read_counts
 
+    refuse_for_counts(args)
     if not args.static.is_file():
         raise FileNotFoundError(f"{args.static}: no such file")
     counts = read_counts(args.static)
-    bits = (args.bits or (3,))[0]
+    bits, frames = (args.bits or (3,))[0], args.frames or 11
     scores = evaluate_static(
-        counts, methods, frames=args.frames, bits=bits, splits=args.splits, seed=args.seed, peak=args.peak
+        counts, methods, frames=frames, bits=bits, splits=args.splits or 3, seed=args.seed or 0, peak=args.peak
     )
-    found = {"format": FORMAT, "counts": str(args.static), "frames": args.frames, "bits": bits}
+    found = {"format": FORMAT, "counts": str(args.static), "frames": frames, "bits": bits}
     found["peak"] = peak_of(counts.light, args.peak)
     found["scores"] = [asdict(score) for score in scores]
-    output(args, json_safe(found), markdown(counts, scores, args.frames, bits, args.peak))
+    output(args, json_safe(found), markdown(counts, scores, frames, bits, args.peak))
     return 1 if any(score.failure for score in scores) else 0
 
 

@@ -9,38 +9,45 @@ import numpy as np
 from numpy import ndarray as Array
 
 from quiver.data import Clip, Codes, Light, Sensor, Stream, array_codes, open_stream, sensed, stream_codes
+from quiver.options import DEFAULT_METHOD
 from quiver.restoring import Options, restorer
+from quiver.sources import refuse_idle
 
 Source = Stream | Clip | str | os.PathLike[str] | Array
 
 
 def restore(
     source: Source,
-    method: str = "moment",
+    method: str = DEFAULT_METHOD,
     *,
     sensor: Sensor | None = None,
     exposure: float | None = None,
     ppp: float | None = None,
-    device: str = "auto",
-    mode: str = "exact",
+    device: str | None = None,
+    mode: str | None = None,
 ) -> Array:
     """Restored video, float32 [T, H, W], in photons per pixel and exposure (expected, before quantum efficiency).
 
     `source` is a `Stream`; a `Clip` (its only stream; with `ppp` it is sensed now by the default sensor); the path of
     either; or integer codes [T, H, W], for which `sensor` and `exposure` [s] must be given. `method` is a classical
-    method (naive, moment, likelihood, transform-denoise, qbp, qbp-bm3d), shipped weights, a .safetensors file or a
-    folder of `quiver train`. `ValueError` or `FileNotFoundError` where these do not fit together.
+    method (naive, moment, likelihood, transform-denoise, qbp, qbp-bm3d), shipped weights (default nano), a .safetensors
+    file or a folder of `quiver train`; `device` (auto, cpu, cuda) and `mode` (exact, streaming, windows) are for
+    networks. `ValueError` or `FileNotFoundError` where these do not fit together.
 
         video = quiver.restore("out/fan", "moment")
     """
     codes = _codes(source, sensor, exposure, ppp)
-    return restorer(method, Options(device=device, mode=mode)).restore(codes)
+    chosen = restorer(method, Options(device=device or "auto", mode=mode or "exact"))
+    refuse_idle({"device": device, "mode": mode}, [chosen])
+    return chosen.restore(codes)
 
 
 def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: float | None) -> Codes:
     if isinstance(source, np.ndarray):
         if sensor is None or exposure is None:
             raise ValueError("codes in an array do not say what made them; give sensor= and exposure= in seconds")
+        if ppp is not None:
+            raise ValueError("ppp= senses a clip now; the codes of an array are there already")
         return array_codes(source, sensor, exposure)
     if sensor is not None or exposure is not None:
         raise ValueError("sensor= and exposure= are for arrays; a clip and a stream know theirs")
@@ -48,6 +55,8 @@ def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: f
         path = Path(source)
         source = Clip.open(path) if path.is_dir() or not path.exists() else open_stream(path)
     if isinstance(source, Stream):
+        if ppp is not None:
+            raise ValueError("ppp= senses a clip now; a stream knows its light")
         return stream_codes(source)
     if ppp is not None:
         return sensed(source, Light("quiver-physical", ppp, 3))[0]

@@ -16,6 +16,7 @@ from typing import Any
 
 NETWORKS = ("nano", "quiver-s", "quiver", "unet")  # see model.py
 PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see run.py
+DEFAULT_METHOD = "nano"  # of `quiver restore` and `quiver.restore`
 MODES = ("exact", "streaming", "windows")  # see restoring.py
 
 
@@ -91,16 +92,16 @@ def add_light(parser: argparse.ArgumentParser, several: bool) -> None:
 
 def add_running(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--memory", type=size, default="2GB", help="working memory, as in 500MB (default 2GB)")
-    parser.add_argument("--mode", default="exact", choices=MODES, help="how frames share work (default exact)")
-    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
-    parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"), help="default float32")
+    parser.add_argument("--mode", choices=MODES, help="networks: how frames share work (default exact)")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="networks: where they run (default auto)")
+    parser.add_argument("--precision", choices=("float32", "bfloat16"), help="networks: default float32")
 
 
 def running_options(args: argparse.Namespace) -> Any:
     """What `add_running` asked for, as `restoring.Options`."""
     from quiver.restoring import Options
 
-    return Options(args.memory, args.mode, args.device, args.precision)
+    return Options(args.memory, args.mode or "exact", args.device or "auto", args.precision or "float32")
 
 
 def renew(folder: Path, mark: str) -> None:
