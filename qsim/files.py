@@ -29,9 +29,9 @@ _TOO_LARGE = "a whole number of more than 64 bits"
 _TOO_DEEP = f"nested more than {DEEPEST} levels deep"
 
 
-def sha256(source: bytes | Path) -> str:
+def sha256(source: bytes | memoryview | Path) -> str:
     """Hexadecimal SHA-256 of some bytes or of a file."""
-    if isinstance(source, bytes):
+    if not isinstance(source, Path):
         return hashlib.sha256(source).hexdigest()
     with open(source, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -98,7 +98,7 @@ def sweep(folder: Path, pattern: str = "*") -> None:
             leftover.unlink(missing_ok=True)
 
 
-def write_bytes(path: Path, content: bytes) -> str:
+def write_bytes(path: Path, content: bytes | memoryview) -> str:
     """Write a whole file atomically; returns its SHA-256."""
     with replacing(path) as file:
         file.write(content)

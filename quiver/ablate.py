@@ -18,7 +18,7 @@ from quiver.config import ABLATIONS, PRESETS, Config
 from quiver.evaluate import Plan, Row, evaluate
 from quiver.model import QUIVER, ablated, parameter_count
 from quiver.restoring import Options, Restorer, pick_device, restorer
-from quiver.run import Settings
+from quiver.run import Settings, alone_in
 from quiver.train import train
 
 
@@ -42,6 +42,15 @@ def run_ablation(
 
     None if `should_stop` ended it; the same call goes on. ValueError if the preset has no ablation.
     """
+    out = Path(settings.out)
+    out.mkdir(parents=True, exist_ok=True)
+    with alone_in(out, "works"):
+        return _run_ablation(settings, plan, options, should_stop, progress)
+
+
+def _run_ablation(
+    settings: Settings, plan: Plan, options: Options, should_stop: Callable[[], bool], progress: bool
+) -> tuple[list[Restorer], list[Row]] | None:
     out = Path(settings.out)
     for name, config in networks(settings.network).items():
         torch.manual_seed(settings.seed)

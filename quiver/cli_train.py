@@ -22,7 +22,6 @@ from quiver.options import (
     handling,
     nonnegative,
     positive,
-    renew,
     running_options,
 )
 
@@ -71,8 +70,6 @@ def _run_train(args: argparse.Namespace) -> int:
 
     settings = _settings(args)
     folder, leads = Path(settings.out), os.environ.get("RANK", "0") == "0"
-    if args.force and folder.exists() and leads:
-        renew(folder, "settings.json")
     torch.manual_seed(settings.seed)
     try:
         with _signals() as interrupted:
@@ -82,12 +79,13 @@ def _run_train(args: argparse.Namespace) -> int:
                 device=pick_device(args.device),
                 should_stop=lambda: bool(interrupted),
                 progress=not (args.json or args.quiet),
+                force=args.force,
             )
     except Diverged as error:
         print(f"quiver: {error}", file=sys.stderr)
         return 1
     if leads:
-        draw_curve(folder)
+        draw_curve(folder, state.history)
         output(args, *_summary(folder, state))
     if interrupted:
         print("quiver: interrupted; the same command goes on where it stopped", file=sys.stderr)

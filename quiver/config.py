@@ -2,6 +2,39 @@
 
 from dataclasses import asdict, dataclass, fields
 
+# Least and largest value of each number: a configuration comes from a file, and a network is built before its weights
+# are compared with it.
+_WHOLE = {
+    "channels": (2, 1024),
+    "deformable_groups": (1, 1024),
+    "deformable_kernel": (1, 15),
+    "denoiser_growth": (1, 1024),
+    "denoiser_passes": (1, 64),
+    "flow_kernel": (1, 31),
+    "flow_levels": (3, 10),
+    "cell_blocks": (1, 64),
+    "cell_growth": (1, 8192),
+    "attention_width": (1, 2**16),
+    "fold": (1, 16),
+    "baseline": (0, 1024),
+}
+_REAL = {"attention_temperature": (-1e6, 1e6), "sweep": (0.0, 32.0)}
+_FLAGS = ("lecun", "pre_denoiser", "flow", "multi_scale")
+_OPTIONAL = ("cell_growth", "attention_width", "attention_temperature")  # may be None
+_FLOW_LAYERS = 8  # at most, of one level
+
+
+def whole_number(name: str, value: object, least: int, most: int) -> None:
+    """`ValueError` unless the value is an integer in least ... most."""
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        raise ValueError(f"{name} must be a whole number from {least} to {most}, got {_short(value)}")
+
+
+def _short(value: object) -> str:
+    if isinstance(value, int) and abs(value) >= 10**30:
+        return "a number of more than 30 digits"
+    return repr(value)[:60]
+
 
 @dataclass(frozen=True)
 class Config:
@@ -28,16 +61,31 @@ class Config:
     multi_scale: bool = True  # ablation: False makes a picture at full scale only
 
     def __post_init__(self) -> None:
-        if self.channels < 2 or self.channels % 2 or self.channels % self.deformable_groups:
+        """`ValueError` for a value that no network of ours has."""
+        for name, (least, most) in _WHOLE.items():
+            value = getattr(self, name)
+            if value is not None or name not in _OPTIONAL:
+                whole_number(f"Config.{name}", value, least, most)
+        for name, (low, high) in _REAL.items():
+            value = getattr(self, name)
+            if value is None and name in _OPTIONAL:
+                continue
+            if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+                raise ValueError(f"Config.{name} must be a number from {low:g} to {high:g}, got {_short(value)}")
+        for name in _FLAGS:
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"Config.{name} must be true or false, got {_short(getattr(self, name))}")
+        if not isinstance(self.flow_channels, tuple) or not 1 <= len(self.flow_channels) <= _FLOW_LAYERS:
+            raise ValueError(
+                f"Config.flow_channels must be 1 to {_FLOW_LAYERS} widths, got {_short(self.flow_channels)}"
+            )
+        for value in self.flow_channels:
+            whole_number("Config.flow_channels", value, 1, 1024)
+        if self.channels % 2 or self.channels % self.deformable_groups:
             raise ValueError(
                 f"Config.channels must be even and a multiple of the {self.deformable_groups} deformable groups, "
                 f"got {self.channels}"
             )
-        for name in ("denoiser_growth", "denoiser_passes", "cell_blocks", "fold", "flow_kernel"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"Config.{name} must be at least 1, got {getattr(self, name)}")
-        if self.flow_levels < 3:
-            raise ValueError(f"Config.flow_levels must be at least 3, one for each scale, got {self.flow_levels}")
         for name in ("flow_kernel", "deformable_kernel"):
             if getattr(self, name) % 2 == 0:
                 raise ValueError(f"Config.{name} must be odd, got {getattr(self, name)}")
@@ -48,13 +96,15 @@ class Config:
 
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> "Config":
-        """Inverse of `to_dict`; ValueError for a field that does not exist."""
+        """Inverse of `to_dict`; ValueError for anything else."""
         names = {field.name for field in fields(cls)}
+        if not isinstance(values, dict):
+            raise ValueError(f"QUIVER Config is a table of values, got {_short(values)}")
         for name in values:
             if name not in names:
-                raise ValueError(f"QUIVER Config has no field {name!r}; known: {', '.join(sorted(names))}")
+                raise ValueError(f"QUIVER Config has no field {name[:60]!r}; known: {', '.join(sorted(names))}")
         values = dict(values)
-        if "flow_channels" in values:
+        if isinstance(values.get("flow_channels"), list):
             values["flow_channels"] = tuple(values["flow_channels"])  # type: ignore[arg-type]
         return cls(**values)  # type: ignore[arg-type]
 

@@ -15,6 +15,7 @@ from torch import nn
 
 Kind = Literal["adam", "muon"]
 OPTIMISERS: tuple[Kind, ...] = ("adam", "muon")
+_STORED = ({"step", "exp_avg", "exp_avg_sq"}, {"momentum_buffer"})  # of one weight, by Adam and by Muon
 EDGES = ("leave",)  # names of last layers: Muon is for what lies between
 
 
@@ -52,8 +53,30 @@ class Optimiser:
         return {"parts": [part.state_dict() for part in self.parts]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of `state_dict`; ValueError if it is another optimiser's."""
-        if len(state["parts"]) != len(self.parts):
+        """Inverse of `state_dict`; ValueError if it is another optimiser's or no such state. Rates are kept."""
+        parts = state.get("parts") if isinstance(state, dict) else None
+        if not isinstance(parts, list) or len(parts) != len(self.parts):
             raise ValueError("the state of another optimiser")
-        for part, content in zip(self.parts, state["parts"], strict=True):
-            part.load_state_dict(content)
+        for part, content in zip(self.parts, parts, strict=True):
+            part.load_state_dict(_checked(part, content))
+
+
+def _checked(part: torch.optim.Optimizer, content: Any) -> dict[str, Any]:
+    """A stored state with the settings of `part`; ValueError unless every tensor fits its weight."""
+    ours = part.state_dict()
+    weights = [weight for group in part.param_groups for weight in group["params"]]
+    stored = content.get("state") if isinstance(content, dict) else None
+    if not isinstance(stored, dict):
+        raise ValueError("the state of another optimiser")
+    for number, values in stored.items():
+        if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < len(weights):
+            raise ValueError(f"an optimiser state for weight {str(number)[:60]}, which is not there")
+        if not isinstance(values, dict) or set(values) not in _STORED:
+            raise ValueError("the state of another optimiser")
+        for name, value in values.items():
+            shape = torch.Size() if name == "step" else weights[number].shape
+            if not isinstance(value, torch.Tensor) or value.layout != torch.strided or value.shape != shape:
+                raise ValueError(f"{name} of weight {number} is not a tensor of shape {list(shape)}")
+            if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
+                raise ValueError(f"{name} of weight {number} holds values that are not finite numbers")
+    return ours | {"state": stored}

@@ -1,18 +1,21 @@
 """A training run as a folder: its settings, its state, its files.
 
     settings.json  checkpoint.pt  best.safetensors  last.safetensors  history.json  curve.png
-    failed.pt (only after NaN)  events.out.tfevents...
+    failed.pt (only after NaN)  events.out.tfevents...  lock
 
-Every file is whole or absent. A folder accepts the settings it was made with and no others, so that a run that is
-started again goes on where it stopped and never mixes two experiments.
+Every file is whole or absent, and one process at a time trains in a folder. A folder accepts the settings it was made
+with and no others, so that the same command resumes, and two experiments are never mixed.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import math
-import pickle
-from dataclasses import asdict, dataclass, field
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +23,12 @@ import torch
 from torch import nn
 
 from quiver import weights
-from quiver.data import Light, read_json, replacing, write_json
+from quiver.data import Light, Lock, read_json, replacing, write_bytes, write_json
 from quiver.loss import PRESETS as LOSSES
 from quiver.optimiser import OPTIMISERS, Kind, Optimiser
 
 SCHEDULES = ("cosine", "plateau")
+LOCK = "lock"  # of a folder of results: held by the process that works in it
 PRECISIONS = ("auto", "float32", "bfloat16")
 
 
@@ -114,6 +118,72 @@ class State:
     finished: bool = False
     history: list[dict[str, float]] = field(default_factory=list)  # one entry per validation
 
+    @classmethod
+    def from_dict(cls, values: Any) -> State:
+        """What `asdict` gave; strict, ValueError."""
+        kinds = {field.name: field.type for field in fields(cls)}
+        if not isinstance(values, dict) or set(values) != set(kinds):
+            raise ValueError(f"a state has {', '.join(kinds)}")
+        for name, value in values.items():
+            kind = type(value).__name__
+            if name == "history":
+                good = isinstance(value, list) and all(_is_entry(entry) for entry in value)
+            elif kinds[name] == "int":
+                good = kind == "int" and 0 <= value < 2**53
+            else:
+                good = kind == kinds[name] and value == value  # nothing is NaN
+            if not good:
+                raise ValueError(f"{name} is {repr(value)[:60]}")
+        if values["elapsed"] < 0 or math.isinf(values["elapsed"]):
+            raise ValueError(f"elapsed is {values['elapsed']}")
+        return cls(**values)
+
+
+def _is_entry(entry: Any) -> bool:
+    """Whether this is one validation's numbers, as `train` writes them."""
+    return (
+        isinstance(entry, dict)
+        and {"step", "elapsed", "loss", "psnr", "psnr_matched"} <= entry.keys()
+        and all(isinstance(v, int | float) and not isinstance(v, bool) for v in entry.values())
+    )
+
+
+def _load_weights(model: nn.Module, stored: Any) -> None:
+    """Put stored weights into the model; ValueError unless they are all there, in their shapes, and finite."""
+    own = model.state_dict()
+    if not isinstance(stored, dict) or set(stored) != set(own):
+        raise ValueError("weights of another network")
+    for name, value in stored.items():
+        if not isinstance(value, torch.Tensor) or value.layout != torch.strided or value.shape != own[name].shape:
+            raise ValueError(f"{name} is not a tensor of shape {list(own[name].shape)}")
+        if value.dtype != own[name].dtype or not bool(torch.isfinite(value).all()):
+            raise ValueError(f"{name} holds values that are not finite numbers of the kind {own[name].dtype}")
+    model.load_state_dict(stored)
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path, doing: str) -> Iterator[None]:
+    """Hold the lock of a folder of results; `ValueError` if another process holds it."""
+    lock = Lock(folder / LOCK)
+    if not lock.acquire():
+        raise ValueError(f"{folder}: another process {doing} here; wait for it to end, or choose another -o")
+    with lock:
+        yield
+
+
+def empty(folder: Path) -> None:
+    """Remove all but the lock, which the caller holds; settings.json last, so that it stays ours until then."""
+    for path in sorted(folder.iterdir(), key=lambda path: path.name == "settings.json"):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif path.name != LOCK:
+            path.unlink()
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:200]} ..."
+
 
 class Run:
     """The folder of a run."""
@@ -122,22 +192,41 @@ class Run:
         self.settings, self.folder = settings, Path(settings.out)
         self.checkpoint = self.folder / "checkpoint.pt"
 
-    def open(self) -> None:
-        """Make the folder, or check that it holds a run with these settings; FileExistsError if it does not."""
-        path = self.folder / "settings.json"
-        wanted = self.settings.to_dict()
-        if not path.exists():
-            if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
-                raise FileExistsError(f"{self.folder} exists and is no training run; choose another -o")
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_json(path, wanted)
+    @contextlib.contextmanager
+    def open(self, *, force: bool = False) -> Iterator[None]:
+        """Make the folder, or check that it holds a run with these settings, and keep others out while it is open.
+
+        `force` begins again where a run is. `FileExistsError` if the folder holds something else or a run with other
+        settings, `ValueError` while another process trains in it.
+        """
+        self._check_ours(force)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with alone_in(self.folder, "trains"):
+            self._check_ours(force)
+            if force:
+                empty(self.folder)
+            path = self.folder / "settings.json"
+            if not path.exists():
+                write_json(path, self.settings.to_dict())
+            self._check_settings()
+            yield
+
+    def _check_ours(self, force: bool) -> None:
+        folder = self.folder
+        if (folder / "settings.json").is_file() or not folder.exists():
             return
-        found = read_json(path)
+        if not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir()):
+            if force:
+                raise FileExistsError(f"{folder} holds no settings.json; --force removes only what this command made")
+            raise FileExistsError(f"{folder} exists and is no training run; choose another -o")
+
+    def _check_settings(self) -> None:
+        wanted, found = self.settings.to_dict(), read_json(self.folder / "settings.json")
         for name in wanted:
             if name not in ("out", "workers") and found.get(name) != wanted[name]:
                 raise FileExistsError(
-                    f"{self.folder} holds a run with {name} {found.get(name)!r}, now it is {wanted[name]!r}; "
-                    "choose another -o, or start anew with --force"
+                    f"{self.folder} holds a run with {name} {_short(found.get(name))}, now it is "
+                    f"{_short(wanted[name])}; choose another -o, or start again with --force"
                 )
 
     def save(self, path: Path, model: nn.Module, optimiser: Optimiser, state: State, **extra: Any) -> None:
@@ -150,25 +239,28 @@ class Run:
             "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
             **extra,
         }
-        with replacing(path) as file:
-            torch.save(content, file)
+        buffer = io.BytesIO()  # a disk that is full halfway is then the system's error, not torch's
+        torch.save(content, buffer)
+        write_bytes(path, buffer.getbuffer())
 
     def load(self, model: nn.Module, optimiser: Optimiser, device: torch.device) -> State:
         """The newest state, put into model and optimiser; a fresh one if there is none, ValueError if it is damaged."""
         if not self.checkpoint.exists():
             return State()
         try:
-            content = torch.load(self.checkpoint, map_location=device, weights_only=True)
-            model.load_state_dict(content["model"])
+            content = weights.read_torch(self.checkpoint, device)
+            if not isinstance(content, dict):
+                raise ValueError(f"it holds a {type(content).__name__}")
+            state = State.from_dict(content["state"])
+            _load_weights(model, content["model"])
             optimiser.load_state_dict(content["optimiser"])
             torch.set_rng_state(content["torch_rng"].cpu())
             if content["cuda_rng"] and torch.cuda.is_available():
                 torch.cuda.set_rng_state_all([state.cpu() for state in content["cuda_rng"]])
-            return State(**content["state"])
-        except (RuntimeError, EOFError, KeyError, ValueError, TypeError, pickle.UnpicklingError) as error:
-            reason = str(error).split(". ")[0].splitlines()[0]
+            return state
+        except weights.DAMAGE as error:
             raise ValueError(
-                f"{self.checkpoint}: not a state of this run ({reason}); start anew with --force"
+                f"{self.checkpoint}: not a state of this run ({weights.short_reason(error)}); start again with --force"
             ) from None
 
     def save_weights(self, name: str, model: nn.Module, state: State) -> None:
@@ -183,14 +275,13 @@ class Run:
         write_json(self.folder / "history.json", {"settings": self.settings.to_dict(), "history": state.history})
 
 
-def draw_curve(folder: Path) -> Path | None:
-    """curve.png of a run from its history.json: validation PSNR and loss over minutes; None before any validation."""
+def draw_curve(folder: Path, history: Sequence[Mapping[str, float]]) -> Path | None:
+    """curve.png of a run: validation PSNR and loss over minutes; None before any validation."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    if not (folder / "history.json").exists():
+    if not history:
         return None
-    history = read_json(folder / "history.json")["history"]
     minutes = [entry["elapsed"] / 60 for entry in history]
     canvas = FigureCanvasAgg(Figure(figsize=(6, 3.5), layout="constrained"))
     axes = canvas.figure.subplots()

@@ -260,18 +260,20 @@ def train(
     device: str = "cpu",
     should_stop: Callable[[], bool] = lambda: False,
     progress: bool = True,
+    force: bool = False,
 ) -> State:
     """Train `model` in place until the end that the settings name, or until `should_stop`; returns the state reached.
 
-    Goes on with the run in `settings.out` if there is one. Raises ValueError and OSError for settings and folders that
-    do not fit, `Diverged` for NaN or Inf. From then on denormal numbers count as zero in this process.
+    Resumes the run in `settings.out` if there is one; `force` begins it again. Raises ValueError and OSError for
+    settings and folders that do not fit, `Diverged` for NaN or Inf. Denormal numbers count as zero in this process from
+    then on.
     """
     torch.set_flush_denormal(True)  # gradients through the tails of GELU are such numbers: a step can be twice as slow
     with joined(device) as process, contextlib.ExitStack() as stack:
         windows, fixed = make_windows(settings, int(model.multiple))  # type: ignore[arg-type]
         run = Run(settings)
         if process.leads:
-            run.open()
+            stack.enter_context(run.open(force=force))
         process.wait()
         model.to(process.device).train()
         optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from quiver.blocks import WINDOW, Hourglass
+from quiver.config import whole_number
 from quiver.model import Output, check_input
 
 
@@ -19,8 +20,7 @@ class UNetConfig:
     width: int = 32
 
     def __post_init__(self) -> None:
-        if self.width < 1:
-            raise ValueError(f"UNetConfig.width must be at least 1, got {self.width}")
+        whole_number("UNetConfig.width", self.width, 1, 1024)
 
     def to_dict(self) -> dict[str, object]:
         """Plain values, for JSON."""
@@ -29,9 +29,9 @@ class UNetConfig:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> "UNetConfig":
         """Inverse of `to_dict`; ValueError for anything but a width."""
-        if set(values) != {"width"}:
-            raise ValueError(f"UNetConfig has the one field width, got {', '.join(sorted(values)) or 'none'}")
-        return cls(int(str(values["width"])))
+        if not isinstance(values, dict) or set(values) != {"width"}:
+            raise ValueError(f"UNetConfig has the one field width, got {', '.join(sorted(values))[:60] or 'none'}")
+        return cls(values["width"])  # type: ignore[arg-type]  # checked there
 
 
 class UNet(nn.Module):

@@ -8,8 +8,10 @@ import json
 import pickle
 import re
 import warnings
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -21,6 +23,12 @@ from quiver.model import QUIVER, Config
 from quiver.unet import UNet, UNetConfig
 
 FORMAT = "quiver-1"  # value of the metadata key "format" in our files
+MAX_CONFIG = 10_000  # characters of a configuration
+MAX_REASON = 300  # characters of torch's that are shown
+DAMAGE = (  # what torch raises for files that hold something else
+    *(RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError, OverflowError, MemoryError),
+    *(RecursionError, pickle.UnpicklingError, zipfile.BadZipFile, NotImplementedError, AssertionError),
+)
 WRAPPERS = ("state_dict", "model_state_dict", "model", "params", "net")  # keys under which trainers nest a state dict
 
 # Our module -> published prefix, longest first where one begins another.
@@ -172,13 +180,10 @@ def _read_foreign(path: Path) -> dict[str, Tensor]:
     if path.suffix == ".safetensors":
         return _read_safetensors(path)[0]
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # about pickle dialects that end as the error below
-            content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError) as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        content = read_torch(path)
+    except ValueError as error:
         raise ValueError(
-            f"{path}: torch cannot read it as plain tensors ({reason}); pickled programs are never run: "
+            f"{path}: torch cannot read it as plain tensors ({error}); pickled programs are never run: "
             "save the bare state dict with torch.save(model.state_dict(), FILE) and convert that"
         ) from None
     for key in WRAPPERS:
@@ -187,6 +192,30 @@ def _read_foreign(path: Path) -> dict[str, Tensor]:
     if not isinstance(content, Mapping) or not all(isinstance(name, str) for name in content):
         raise ValueError(f"{path}: expected a dictionary of named tensors, found {type(content).__name__}")
     return {name.removeprefix("module."): value for name, value in content.items()}
+
+
+def read_torch(path: Path, device: torch.device | str = "cpu") -> Any:
+    """Tensors and plain values of a file of torch, nothing executed; ValueError with a short reason for any other file.
+
+    A zip whose parts are said to be larger than the file is refused unread: torch does not compress.
+    """
+    try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                told = sum(part.file_size for part in archive.infolist())
+            if told > path.stat().st_size:
+                raise ValueError(f"parts of {told} bytes in a file of {path.stat().st_size}")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # about pickle dialects that end as the error below
+            return torch.load(path, map_location=device, weights_only=True)
+    except DAMAGE as error:
+        raise ValueError(short_reason(error)) from None
+
+
+def short_reason(error: BaseException) -> str:
+    """The first line of torch's explanation, at most MAX_REASON characters."""
+    lines = str(error).strip().splitlines()
+    return lines[0][:MAX_REASON] if lines else type(error).__name__
 
 
 def save(network: nn.Module, config: Config | UNetConfig, path: Path, notes: Mapping[str, str] | None = None) -> None:
@@ -204,17 +233,27 @@ def save(network: nn.Module, config: Config | UNetConfig, path: Path, notes: Map
 
 
 def load(path: Path) -> QUIVER | UNet:
-    """The network stored by `save`, on the CPU, in evaluation mode; ValueError for any other file."""
+    """The network stored by `save`, on the CPU, in evaluation mode; ValueError for any other file.
+
+    Layers are made without memory, from a configuration whose numbers are bounded (config.py): what a file can ask for
+    is about its own size.
+    """
     tensors, metadata = _read_safetensors(path)
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path}: not weights of this program (no format {FORMAT!r}); see `quiver convert-weights`")
     try:
+        if len(metadata["config"]) > MAX_CONFIG:
+            raise ValueError(f"a configuration of {len(metadata['config'])} characters")
         values = json.loads(metadata["config"])
         with torch.device("meta"):
             network = _build(metadata["network"], values)
+        for name, value in network.state_dict().items():
+            if name in tensors and tensors[name].dtype != value.dtype:
+                raise ValueError(f"{name} holds {tensors[name].dtype}, the network {value.dtype}")
         network.load_state_dict(tensors, assign=True)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{path}: weights and configuration do not fit ({' '.join(str(error).split())})") from None
+    except DAMAGE as error:
+        reason = " ".join(str(error).split())[:MAX_REASON]
+        raise ValueError(f"{path}: weights and configuration do not fit ({reason})") from None
     return network.requires_grad_(True).eval()
 
 
@@ -223,7 +262,7 @@ def _build(kind: str, values: dict[str, object]) -> QUIVER | UNet:
         return QUIVER(Config.from_dict(values))
     if kind == "UNet":
         return UNet(UNetConfig.from_dict(values))
-    raise ValueError(f"no network is called {kind!r}")
+    raise ValueError(f"no network is called {kind[:60]!r}")
 
 
 def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -17,9 +18,12 @@ from clips import write_dataset
 from safetensors import safe_open
 from torch import Tensor, nn
 
+from qsim import files
 from quiver import train as training
+from quiver.cli import main
 from quiver.config import PRESETS
 from quiver.model import QUIVER, Output
+from quiver.optimiser import Optimiser
 from quiver.run import PROTOCOLS, Run, Settings, State
 from quiver.train import Diverged, learning_rate, make_windows, note_plateau, time_is_up, train
 from quiver.unet import UNet, UNetConfig
@@ -171,14 +175,83 @@ def test_ten_times_the_rate_stays_finite_or_stops(tiny_dataset, tmp_path, networ
 
 
 def test_other_settings_are_refused(tiny_dataset, tmp_path):
-    Run(settings(tiny_dataset, tmp_path / "r")).open()
-    Run(settings(tiny_dataset, tmp_path / "r", workers=3)).open()  # decides nothing
+    opened(settings(tiny_dataset, tmp_path / "r"))
+    opened(settings(tiny_dataset, tmp_path / "r", workers=3))  # decides nothing
     with pytest.raises(FileExistsError, match="holds a run with seed 0, now it is 1"):
-        Run(settings(tiny_dataset, tmp_path / "r", seed=1)).open()
+        opened(settings(tiny_dataset, tmp_path / "r", seed=1))
     (tmp_path / "other").mkdir()
     (tmp_path / "other/file").write_text("mine")
-    with pytest.raises(FileExistsError, match="no training run"):
-        Run(settings(tiny_dataset, tmp_path / "other")).open()
+    for force in (False, True):
+        with pytest.raises(FileExistsError, match=r"is no training run|removes only what this command made"):
+            opened(settings(tiny_dataset, tmp_path / "other"), force=force)
+    assert (tmp_path / "other/file").read_text() == "mine"
+
+
+def opened(wanted: Settings, *, force: bool = False) -> None:
+    with Run(wanted).open(force=force):
+        pass
+
+
+def test_one_process_at_a_time_trains_in_a_folder(tiny_dataset, tmp_path):
+    """A second command, with --force or without, is refused in one line; the folder stays as it is, and free after."""
+    mine = settings(tiny_dataset, tmp_path / "r")
+    words = [sys.executable, "-m", "quiver", "train", tiny_dataset, "-o", mine.out, "--steps", 6, "--crop", 16]
+    words += ["--preset", "unet"]
+    with Run(mine).open():
+        before = {path.name: path.read_bytes() for path in Path(mine.out).iterdir()}
+        done = subprocess.run([str(w) for w in words], cwd=ROOT, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert f"{mine.out}: another process trains here; wait for it to end" in done.stderr
+        assert done.stderr.count("\n") == 1
+        assert main([str(w) for w in [*words[3:], "--force"]]) == 2
+        assert {path.name: path.read_bytes() for path in Path(mine.out).iterdir()} == before
+    opened(mine)
+
+
+def test_a_full_disk_inside_a_checkpoint(tiny_dataset, tmp_path, monkeypatch):
+    """The system's error with the file's name, and nothing half-written: every file of the folder is whole."""
+    mine = settings(tiny_dataset, tmp_path / "r", steps=2)
+    train(small_network(), mine, progress=False)
+    whole = (tmp_path / "r/checkpoint.pt").read_bytes()
+
+    def full(number: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(files.os, "fsync", full)
+    network = small_network()
+    with pytest.raises(OSError, match="No space left") as error:
+        Run(mine).save(tmp_path / "r/checkpoint.pt", network, Optimiser(network, "adam", 1e-3, (0.9, 0.99)), State())
+    assert error.value.filename == str(tmp_path / "r/checkpoint.pt")
+    assert (tmp_path / "r/checkpoint.pt").read_bytes() == whole
+    assert not list((tmp_path / "r").glob("*.tmp-*"))
+
+
+FILLED = """
+import resource, signal, sys
+from pathlib import Path
+from quiver.optimiser import Optimiser
+from quiver.run import Run, Settings, State
+from quiver.unet import UNet, UNetConfig
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+run, network = Run(Settings("d", sys.argv[1], steps=2)), UNet(UNetConfig(4))
+optimiser = Optimiser(network, "adam", 1e-3, (0.9, 0.99))
+run.save(run.checkpoint, network, optimiser, State())
+whole = run.checkpoint.read_bytes()
+for share in (0.9, 0.5, 0.1, 0.0):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * len(whole)), -1))
+    try:
+        run.save(run.checkpoint, network, optimiser, State(step=1))
+    except OSError as error:
+        print(error.filename, run.checkpoint.read_bytes() == whole, len(list(run.folder.iterdir())))
+"""
+
+
+def test_a_disk_that_is_full_after_some_bytes_of_a_checkpoint(tmp_path):
+    """The write itself fails halfway, at the system's limit on a file's size: its error, and the old file stays."""
+    words = [sys.executable, "-c", FILLED, str(tmp_path)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == 4 * [f"{tmp_path / 'checkpoint.pt'} True 1"]
 
 
 def test_a_damaged_state_is_named(tiny_dataset, tmp_path):
