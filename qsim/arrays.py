@@ -7,7 +7,10 @@ pixel whose value is no code. Bare streams of bits: planes.py.
 from __future__ import annotations
 
 import gzip
+import itertools
 import json
+import math
+import os
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -15,6 +18,13 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.footage import Footage, Hints, check_shape, numbered, reading
+
+_LARGEST_CHUNK = 1 << 29  # bytes of a zarr chunk in memory; one of quanta-spad-sim has up to 200 MB
+_LARGEST_METADATA = 1 << 22  # bytes
+_ZARR_METADATA = ("zarr.json", ".zarray", ".zattrs", ".zgroup", ".zmetadata")
+# Of zarr; others execute what a file holds (pickle), or expand a few bytes without a limit (bz2, lzma).
+_CODECS = {"blosc", "bytes", "crc32c", "delta", "gzip", "lz4", "packbits", "sharding_indexed", "shuffle", "transpose",
+           "zlib", "zstd"}  # fmt: skip
 
 
 def read_cube(path: Path, hints: Hints) -> Footage:
@@ -79,34 +89,77 @@ def read_mat(path: Path, hints: Hints) -> Footage:
 
 
 def read_zarr(path: Path, hints: Hints) -> Footage:
-    """zarr v2 or v3: the array `frames` of a group, or an array at the root; [T, H, W], one code a pixel."""
+    """zarr v2 or v3 in a folder: array `frames` of a group, or an array at the root; [T, H, W], one code a pixel."""
     import zarr
 
+    folder = path / "frames" if (path / "frames").is_dir() else path
+    codecs = _zarr_codecs(path, folder)
+    if unknown := sorted(codecs - _CODECS):
+        raise ValueError(f"{path}: stored by the codec {unknown[0]!r}; read are {', '.join(sorted(_CODECS))}")
     with reading(path, "zarr"):
-        node = zarr.open(store=str(path), mode="r")
-        array: Any = node
-        if isinstance(node, zarr.Group):
-            if "frames" not in node:
-                raise ValueError(f"{path}: a zarr group without the array 'frames'; it holds {sorted(node.keys())}")
-            array = node["frames"]
+        array: Any = zarr.open_array(store=str(folder), mode="r")
+        node: Any = array if folder == path else zarr.open_group(store=str(path), mode="r", use_consolidated=False)
         attributes = {k: v for k, v in dict(node.attrs).items() if isinstance(v, str | int | float | list)}
         shape = check_shape(path, array.shape)
         if array.dtype.kind not in "bu":
             raise ValueError(f"{path}: expected unsigned codes, found {array.dtype}")
-        if array.nchunks_initialized < array.nchunks:
-            stored = f"{array.nchunks_initialized} of {array.nchunks} chunks are there"
+        stored = getattr(array, "shards", None) or array.chunks
+        if float(np.prod(stored, dtype=float)) * array.dtype.itemsize > _LARGEST_CHUNK:
             raise ValueError(
-                f"{path}: {stored}; the recording is incomplete (or its dark chunks were left out: write them too)"
+                f"{path}: chunks of {list(stored)} pixels; up to {_LARGEST_CHUNK} bytes are read at a time"
             )
-        if np.prod(array.chunks, dtype=float) > 1 << 31:
-            raise ValueError(f"{path}: chunks of {array.chunks} pixels are too large to read")
+        wanted = math.prod(-(-n // chunk) for n, chunk in zip(shape, stored, strict=True))
+        found = _count_files(folder, wanted)  # before the library lists all the chunks that there should be
+        if found >= wanted:
+            found = min(found, array.nchunks_initialized) if stored == array.chunks else found
+        if found < wanted:
+            raise ValueError(
+                f"{path}: {found} of {wanted} chunks are there; the recording is incomplete (or its dark chunks were "
+                "left out: write them too)"
+            )
     bits = hints.bits or 1
 
     def read(start: int, stop: int) -> Array:
-        with reading(path, "zarr"):
+        with reading(path, "zarr"), zarr.config.set({"async.concurrency": 1}):  # one chunk in memory at a time
             return checked_codes(path, np.asarray(array[start:stop]), bits, start)
 
     return Footage(shape, read, "zarr", bits, meta={"attributes": attributes})
+
+
+def _zarr_codecs(path: Path, folder: Path) -> set[str]:
+    """The codecs named by an array's own metadata; `ValueError` if `folder` holds no array, or too much metadata."""
+    if not path.is_dir():
+        raise ValueError(f"{path}: is a single file; a zarr is read from its folder, so unpack it first")
+    described = [folder / name for name in ("zarr.json", ".zarray") if (folder / name).is_file()]
+    for file in [*described, *(path / name for name in ("zarr.json", ".zattrs", ".zgroup")), folder / ".zattrs"]:
+        if file.is_file() and file.stat().st_size > _LARGEST_METADATA:
+            raise ValueError(f"{file}: {file.stat().st_size} bytes of metadata; up to {_LARGEST_METADATA} are read")
+    found: set[str] = set()
+    for file in described:
+        with reading(file, "JSON"):
+            content = json.loads(file.read_text("utf-8"))
+            waiting = [content[key] for key in ("codecs", "filters", "compressor") if key in content]
+            while waiting:
+                item = waiting.pop()
+                if isinstance(item, dict):
+                    found |= {str(item[key]) for key in ("id", "name") if key in item}
+                    waiting += item.values()
+                elif isinstance(item, list):
+                    waiting += item
+    if not any((folder / ".zarray" == file) or b'"array"' in file.read_bytes() for file in described):
+        inside = sorted(item.name for item in itertools.islice(path.iterdir(), 100) if item.is_dir())
+        raise ValueError(f"{path}: a zarr group without the array 'frames'; it holds {inside}")
+    return {name.removeprefix("numcodecs.") for name in found}
+
+
+def _count_files(folder: Path, enough: int) -> int:
+    """Files below a folder other than zarr's metadata, counted no further than `enough`."""
+    count = 0
+    for _, _, names in os.walk(folder):
+        count += sum(name not in _ZARR_METADATA for name in names)
+        if count >= enough:
+            break
+    return count
 
 
 def read_visionsim(path: Path, hints: Hints) -> Footage:
@@ -135,6 +188,8 @@ def read_visionsim(path: Path, hints: Hints) -> Footage:
             raise ValueError(f"{shard}: {array.shape[2]} columns do not hold the width {width} of transforms.json")
         parts.append(array[..., channel])
     bits = 1 if packed else hints.bits or int(info.get("bitplanes", 1)).bit_length()
+    if not 1 <= bits <= 16:
+        raise ValueError(f"{description}: sums of {info['bitplanes']!r:.40} bitplanes; 1 to 65535 are read")
     ends = np.cumsum([len(part) for part in parts])
     shape = check_shape(path, (int(ends[-1]), parts[0].shape[1], width))
 
@@ -151,12 +206,17 @@ def read_visionsim(path: Path, hints: Hints) -> Footage:
 
 
 def load_npy(path: Path) -> Array:
-    """A .npy array as a memory map, or a .npy.gz in memory; `ValueError` for objects and lying headers."""
+    """A .npy array of numbers as a memory map, or a .npy.gz in memory.
+
+    `FileNotFoundError` or `ValueError` for another kind of file, objects, a number without axes, lying headers.
+    """
     if path.suffix == ".gz":
         with reading(path, "gzipped .npy"), gzip.open(path, "rb") as packed:
             return _read_npy(path, packed)
     with reading(path, ".npy"):
         array = np.lib.format.open_memmap(path, mode="r")
+        if array.ndim == 0:
+            raise ValueError(f"{path}: a single number without axes; an array is expected")
         if array.dtype.hasobject or array.dtype.kind not in "buif":
             raise ValueError(f"{path}: an array of {array.dtype}; numbers are expected")
         if array.ndim and array.nbytes + 64 > path.stat().st_size:
@@ -202,9 +262,14 @@ def _hdf_output(path: Path) -> Array:
     import h5py
 
     with reading(path, "MATLAB 7.3 .mat"), h5py.File(path, "r") as file:
-        if "OUTPUT" not in file or not isinstance(file["OUTPUT"], h5py.Dataset):
+        link = file.get("OUTPUT", getlink=True)
+        if link is not None and not isinstance(link, h5py.HardLink):
+            raise ValueError(f"{path}: OUTPUT is a link, which may lead into another file; store the planes themselves")
+        if link is None or not isinstance(file["OUTPUT"], h5py.Dataset):
             raise ValueError(f"{path}: has no variable OUTPUT; it holds {sorted(file)}")
         stored = file["OUTPUT"]
+        if stored.external or stored.is_virtual:
+            raise ValueError(f"{path}: OUTPUT lies in other files, which are not read; store the planes themselves")
         _plausible(path, stored.shape)
         if stored.dtype.kind not in "bu" or stored.ndim != 3:
             raise ValueError(f"{path}: OUTPUT is {stored.dtype} {list(stored.shape)}, expected unsigned [T, W, H]")
@@ -221,12 +286,16 @@ def _plausible(path: Path, shape: tuple[int, ...]) -> None:
 def _read_npy(path: Path, file: gzip.GzipFile | BinaryIO) -> Array:
     """An array from a stream; memory grows with what is really there, not with what the header says."""
     version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0), (3, 0)):
+        raise ValueError(f"{path}: version {version} of .npy is not known")
     reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = reader(file)
     if fortran or dtype.hasobject or dtype.kind not in "buif":
         raise ValueError(
             f"{path}: {dtype} in column order; only numbers in row order are read" if fortran else f"{path}: {dtype}"
         )
+    if not shape:
+        raise ValueError(f"{path}: a single number without axes; an array is expected")
     wanted = int(np.prod(shape, dtype=object)) * dtype.itemsize
     content = bytearray()
     while len(content) < wanted:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files, formats
+from qsim.arrays import load_npy
 from qsim.calibrate import Calibration
 from qsim.footage import Hints
 from qsim.qis import QIS
@@ -47,12 +48,7 @@ def read_stack(path: Path, *, bits: int, exposure: float, photons: float | None,
 
 def read_counts(path: Path) -> Array:
     """Frames [T, H, W] of an `.npy`, mapped; `ValueError` or `FileNotFoundError` naming the file."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    try:
-        array: Array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"{path}: not readable as an array ({error})") from None
+    array = load_npy(path)
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or array.size == 0:
         raise ValueError(f"{path}: expected frames [T, H, W], found shape {list(array.shape)}")

@@ -10,9 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from numpy import ndarray as Array
+
 from qsim import descriptions, files
+from qsim.arrays import load_npy
 from qsim.clip import Clip
 from qsim.dataset import Dataset
+from qsim.footage import check_shape
 from qsim.stream import Progress, Stream
 
 
@@ -66,6 +70,14 @@ class Restored:
         descriptions.structure(description, meta, descriptions.RESTORED, cure)
         files.check_own(description, meta, cure)
         return Restored(description.with_suffix(".npy"), meta)
+
+    def frames(self) -> Array:
+        """The video as a memory map; `ValueError` if the file does not fit its description."""
+        array = load_npy(self.path)
+        check_shape(self.path, array.shape)
+        if array.dtype.kind != "f" or self.meta.get("shape", list(array.shape)) != list(array.shape):
+            raise ValueError(f"{self.path}: {array.dtype} {list(array.shape)} is not what its .json describes")
+        return array
 
     def verify(self, progress: Progress | None = None) -> list[str]:
         """Problems of the two files; a video of an earlier version without a checksum has to be there, no more."""

@@ -200,15 +200,23 @@ class Clip:
         _, height, width = self.shape
         if crop is not None:
             check_crop(crop, height, width, str(self.path))
-        return exr.read_half(self.path / folder / f"{t:06d}.exr", height, width, crop)
+        path = self.path / folder / f"{t:06d}.exr"
+        try:
+            return exr.read_half(path, height, width, crop)
+        except FileNotFoundError:
+            raise FileNotFoundError(
+                f"{path}: no such file; the clip is damaged, run `qsim check {self.path}`"
+            ) from None
 
     def _truth(self, t: int, channel: str) -> Array:
         self._check_frame(t)
         path = self.path / "truth" / f"{t:06d}.exr"
         if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file; this clip has no ground truth for frame {t}")
+            kept = f"truth/{t:06d}.exr" in self.meta["checksums"]
+            why = f"the clip is damaged, run `qsim check {self.path}`" if kept else f"frame {t} has no ground truth"
+            raise FileNotFoundError(f"{path}: no such file; {why}")
         status = path.stat()
-        channels = _read_truth(path, status.st_mtime_ns, status.st_size)
+        channels = _read_truth(path, *self.shape[1:], status.st_mtime_ns, status.st_size)
         if channel not in channels:
             raise ValueError(f"{path}: has no channel '{channel}' ({TRUTH[channel]})")
         return channels[channel]
@@ -229,8 +237,10 @@ def _why_not(path: Path) -> str:
 
 
 @functools.lru_cache(maxsize=2)
-def _read_truth(path: Path, modified: int, size: int) -> dict[str, Array]:
-    channels = exr.read(path)
-    for array in channels.values():
+def _read_truth(path: Path, height: int, width: int, modified: int, size: int) -> dict[str, Array]:
+    channels = exr.read(path, (height, width))
+    for name, array in channels.items():
+        if array.dtype != (np.uint32 if name in ("valid", "id", "saturated") else np.float32):
+            raise ValueError(f"{path}: channel '{name}' is {array.dtype}; the file is damaged, run `qsim check`")
         array.setflags(write=False)
     return channels

@@ -19,6 +19,8 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.footage import reading
+
 MAGIC = bytes((0x76, 0x2F, 0x31, 0x01)) + struct.pack("<i", 2)
 _PIXEL_TYPES = {np.dtype("<u4"): 0, np.dtype("<f2"): 1, np.dtype("<f4"): 2}
 _ZIP_ROWS = 16  # rows per chunk of the ZIP method
@@ -79,17 +81,34 @@ def read_half(path: Path, height: int, width: int, crop: Crop | None = None) -> 
     return np.ascontiguousarray(pixels).view("<f2").astype(np.float32)
 
 
-def read(path: Path) -> dict[str, Array]:
-    """All channels [H, W] of any scan-line EXR file, by the OpenEXR library; `ValueError` if it cannot be read."""
+def read(path: Path, size: tuple[int, int] | None = None) -> dict[str, Array]:
+    """The channels [H, W] of a scan-line EXR file, by the OpenEXR library; `size` = (height, width), if it is known.
+
+    `ValueError` if it cannot be read, has another size, or promises more than its bytes can hold.
+    """
     import OpenEXR
 
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    try:
+        raise FileNotFoundError(f"{path}: no such file; the clip is damaged, run `qsim check`")
+    with reading(path, "OpenEXR; the file is damaged, run `qsim check`"):
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            header = dict(file.header())  # a copy: closing empties it
+            names = [channel.name for channel in header["channels"]]
+        first, last = (np.asarray(corner) for corner in header["dataWindow"])
+        found = [int(n) for n in (last - first + 1)[::-1]]
+        height, width = size or found
+        if found != [height, width] or header["type"] != OpenEXR.scanlineimage:
+            raise ValueError(f"{path}: holds {header['type']} {found}, expected scan lines {[height, width]}")
+        if 2 * height * width * len(names) > 1032 * path.stat().st_size:  # the most that deflate can shrink
+            raise ValueError(f"{path}: {path.stat().st_size} bytes cannot hold {len(names)} channels of {found}")
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError, TypeError) as error:
-        raise ValueError(f"{path}: not readable as OpenEXR ({error}); the file is damaged, run `qsim check`") from None
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+        for name, array in channels.items():
+            if array.shape != (height, width):
+                raise ValueError(
+                    f"{path}: channel {name!r} is {array.dtype} {list(array.shape)}, not {[height, width]}"
+                )
+    return channels
 
 
 def _attribute(name: str, kind: str, value: bytes) -> bytes:

@@ -209,7 +209,7 @@ def _no_constant(name: str) -> float:
 
 def _too_much(value: Any, text: str, infinite: bool = False) -> tuple[int, str] | None:
     """(line, problem) of the first value that is nested too deeply or too large; None if there is none."""
-    waiting = [(value, 1)]
+    waiting: list[tuple[Any, int]] = [([value], 0)]
     while waiting:
         item, depth = waiting.pop()
         for inner in item.values() if isinstance(item, dict) else item:

@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import defects, events, files
+from qsim import arrays, defects, events, files
 from qsim.checks import suggest
 from qsim.defects import DarkSpread, Defects, Maps
 from qsim.keys import Key
@@ -228,10 +228,7 @@ def _with_dark(sensor: Sensor, rate: float) -> Sensor:
 
 
 def _read_map(path: str, key: str) -> Array:
-    try:
-        array: Array = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"{path}: not readable as an array ({error})") from None
+    array = np.array(arrays.load_npy(Path(path)))
     if array.ndim != 2 or not array.size or array.dtype.kind not in "fuib" or not np.isfinite(array).all():
         raise ValueError(f"{path}: a {key} is [H, W] of finite numbers, found {array.dtype} {list(array.shape)}")
     if key != "offset_map" and (array < 0).any():

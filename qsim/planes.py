@@ -72,7 +72,7 @@ def read_spike(path: Path, hints: Hints) -> Footage:
     height, width = hints.height, hints.width
     config = path.parent / "config.yaml"
     if height is None and width is None and config.is_file():
-        found = dict(re.findall(r"^\s*(spike_h|spike_w)\s*:\s*(\d+)", config.read_text("utf-8", "replace"), re.M))
+        found = dict(re.findall(r"^\s*(spike_h|spike_w)\s*:\s*(\d{1,9})\b", config.read_text("utf-8", "replace"), re.M))
         height, width = int(found.get("spike_h", 0)) or None, int(found.get("spike_w", 0)) or None
     if height is None or width is None:
         raise ValueError(f"{path}: a spike file does not hold its size; add --height and --width, as in 250 and 400")

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from qsim import files, page, pictures, report_tables
+from qsim.checking import Restored
 from qsim.clip import Clip, Stream
 from qsim.dataset import Dataset
 from qsim.optics import clip_photons
@@ -127,8 +128,8 @@ def dataset_section(path: Path, step: Callable[[], None] = lambda: None) -> str:
 
 def restored_section(path: Path) -> str:
     """Restored video beside its codes and truth, all at one white."""
-    meta = files.read_json(path)
-    restored = np.load(path.with_suffix(".npy"), mmap_mode="r")
+    video = Restored.open(path)
+    meta, restored = video.meta, video.frames()
     frames = chosen_frames(len(restored))
     shown = np.asarray(restored[: len(frames)])
     clip, stream = _source(meta)

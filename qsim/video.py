@@ -15,12 +15,27 @@ from numpy import ndarray as Array
 
 from qsim import codes, exr, files
 from qsim.arrays import checked_codes
-from qsim.footage import Footage, Hints, check_shape, from_linear, need_transfer, numbered, reading, to_linear
+from qsim.footage import (
+    MAX_PIXELS,
+    Footage,
+    Hints,
+    check_shape,
+    from_linear,
+    need_transfer,
+    numbered,
+    reading,
+    to_linear,
+)
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709
 _FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG
 EXACT = 2 | 0x2000 | 0x40000  # FFmpeg's BILINEAR, FULL_CHR_H_INT, ACCURATE_RND; else colours come a code dark
 BLOCK = 16  # frames read at a time
+# FFmpeg's readers of files that hold their frames themselves; its "concat" and "hls" open whatever a text names.
+_CONTAINERS = (
+    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,mpegvideo,m4v,h264,hevc,yuv4mpegpipe,flv,asf,ogg,mxf,nut,ivf,"
+    "mjpeg,gif"
+)
 
 
 def read_png(path: Path, hints: Hints) -> Footage:
@@ -235,9 +250,7 @@ class _Decoder:
         return found
 
     def _decode(self) -> Iterator[Array]:
-        import av
-
-        with av.open(str(self.path)) as container:
+        with _open_video(self.path) as container:
             for frame in container.decode(video=0):
                 if (frame.height, frame.width) != self.size:
                     raise ValueError(f"{self.path}: a frame of {frame.height} x {frame.width} among {self.size}")
@@ -247,12 +260,20 @@ class _Decoder:
                     yield frame.to_ndarray(format="rgb24", interpolation=EXACT)
 
 
-def _video_shape(path: Path) -> tuple[int, int, int]:
+def _open_video(path: Path) -> Any:
+    """A video's container; a file that names other files (a playlist) or promises too large frames is not read."""
     import av
 
+    container = av.open(str(path), options={"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"})
+    for stream in container.streams.video:
+        stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+    return container
+
+
+def _video_shape(path: Path) -> tuple[int, int, int]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    with av.open(str(path)) as container:
+    with _open_video(path) as container:
         if not container.streams.video:
             raise ValueError(f"{path}: has no video stream")
         stream = container.streams.video[0]
@@ -278,7 +299,7 @@ def _tiff_pages(path: Path) -> int:
     import tifffile
 
     with reading(path, "TIFF"), tifffile.TiffFile(path) as opened:
-        return len(opened.pages)
+        return len(opened.pages)  # a chain of pages that bites its tail is refused by the library
 
 
 def _tiff(path: Path, page: int) -> Array:
@@ -287,10 +308,19 @@ def _tiff(path: Path, page: int) -> Array:
     with reading(path, "TIFF"), tifffile.TiffFile(path) as opened:
         found: Any = opened.pages[page]
         check_shape(path, (1, found.imagelength, found.imagewidth))
-        promised, size = found.nbytes, path.stat().st_size
-        if promised > 1032 * size or (found.compression == 1 and found.bitspersample >= 8 and promised > size):
-            raise ValueError(f"{path}: page {page} promises {promised} bytes, the file has {size}")
+        promised, there = found.nbytes, path.stat().st_size
+        if promised > 1032 * there or (found.compression == 1 and found.bitspersample >= 8 and promised > there):
+            raise ValueError(f"{path}: page {page} promises {promised} bytes, the file has {there}")
+        if float(np.prod(found.chunks, dtype=float)) > max(MAX_PIXELS, 4 * found.imagelength * found.imagewidth):
+            raise ValueError(
+                f"{path}: page {page} is stored in tiles of {list(found.chunks)} pixels, too large to read"
+            )
         pixels: Array = found.asarray()
+        size = (found.imagelength, found.imagewidth)
+        if pixels.shape not in (size, (*size, 3), (*size, 4)):
+            raise ValueError(
+                f"{path}: page {page} is {list(pixels.shape)}; grey or colour pictures [H, W(, 3)] are read"
+            )
         if found.bitspersample == 1:
             pixels = pixels.astype(bool)
         if found.photometric == tifffile.PHOTOMETRIC.MINISWHITE:

@@ -5,8 +5,10 @@ The reading happens in a fork, so that a crash of a C library or a swollen memor
 """
 
 import gzip
+import io
 import json
 import os
+import pickle
 import random
 import resource
 import shutil
@@ -21,10 +23,12 @@ import raw_planes
 from fakes import RECIPE
 from forks import forked
 
-from qsim import exr, formats, recipe, video
+from qsim import calibrate_files, checking, devices, exr, files, flaws, formats, recipe, video
+from qsim.cli import main
 from qsim.clip import RELATIVE, Clip, ClipWriter
 from qsim.footage import Hints
 from qsim.stream import Stream
+from quiver.data import Light, cube_codes
 
 MEMORY = 400 << 20  # bytes that a reader of these tiny files may take at most
 T, H, W = 4, 6, 16
@@ -143,6 +147,48 @@ def reader(hints: Hints, file: str | None = None) -> Callable[[Path], None]:
 
 
 LIGHT = Hints(transfer="srgb")
+
+
+def make_counts(folder: Path) -> None:
+    np.save(folder / "a.npy", some_planes())
+
+
+def make_map(folder: Path) -> None:
+    np.save(folder / "gain.npy", np.ones((H, W), np.float32))
+    (folder / "d.toml").write_text('[defects]\ngain_map = "gain.npy"\n')
+
+
+def read_map(folder: Path) -> None:
+    found = flaws.from_toml(folder / "d.toml")
+    if found is not None:
+        flaws.of_sensor(found, devices.load("quiver-physical", ppp=3.25), H, W)
+
+
+def make_video(folder: Path) -> None:
+    np.save(folder / "v.npy", np.ones((T, H, W), np.float32))
+    about = {"method": "moment", "seconds_per_frame": 0.1, "shape": [T, H, W], "sha256": files.sha256(folder / "v.npy")}
+    files.write_description(folder / "v.json", about)
+
+
+def read_video(folder: Path) -> None:
+    restored = checking.Restored.open(folder / "v.json")
+    restored.verify()
+    assert restored.frames().shape == (T, H, W)
+
+
+def read_bare(folder: Path) -> None:
+    codes = cube_codes(folder / "a.npy", Light(), 2000.0)
+    codes.read(0, min(codes.shape[0], 9))
+
+
+def read_detected(folder: Path) -> None:
+    assert formats.detect(folder / "a.npy") in formats.LAYOUTS
+
+
+def read_calibration(folder: Path) -> None:
+    calibrate_files.read_stack(folder / "a.npy", bits=3, exposure=1e-3, photons=None)
+
+
 FORMATS: dict[str, tuple[Callable[[Path], None], Callable[[Path], None]]] = {
     "cube": (make_npy, reader(Hints("cube"), "a.npy")),
     "cube.gz": (make_gz, reader(Hints("cube"), "a.npy.gz")),
@@ -162,6 +208,11 @@ FORMATS: dict[str, tuple[Callable[[Path], None], Callable[[Path], None]]] = {
     "spad512s": (make_raw(raw_planes.spad512s, 512), reader(Hints("spad512s"), "a.bin")),
     "clip": (make_clip, read_clip),
     "stream": (make_stream, read_stream),
+    "detected": (make_float, read_detected),
+    "map of defects": (make_map, read_map),
+    "restored": (make_video, read_video),
+    "bare codes": (make_counts, read_bare),
+    "calibration": (make_counts, read_calibration),
     "recipe": (make_recipe, lambda folder: recipe.load(folder / "r.toml")),
 }
 
@@ -212,7 +263,7 @@ def attack(name: str, folder: Path, rounds: int) -> str:
             read(victim)
         except (ValueError, OSError) as error:
             refused += 1
-            if str(victim) not in str(error) or "\n" in str(error):
+            if (target.name not in str(error) and str(victim) not in str(error)) or "\n" in str(error):
                 return f"round {n}, {target.name}: the message does not name the file in one line: {error!r}"
         except BaseException as error:
             shutil.copytree(victim, folder / "culprit")
@@ -224,12 +275,80 @@ def attack(name: str, folder: Path, rounds: int) -> str:
     return "" if refused > rounds // 10 else f"only {refused} of {rounds} were refused: the attack is too weak"
 
 
-def fuzz(name: str, folder: Path, rounds: int) -> None:
+def npy(array: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+def other_kinds() -> dict[str, bytes]:
+    """Contents that do not belong under a name: files of other kinds, arrays that are none, headers that lie."""
+    archive, header = io.BytesIO(), io.BytesIO()
+    np.savez(archive, a=np.zeros(3))
+    np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": (1 << 40, 6, 2)})
+    flat = npy(np.zeros((4, 6, 2), np.uint8))
+    return {
+        "empty": b"",
+        "npz": archive.getvalue(),
+        "zip": b"PK\3\4",
+        "no axes": npy(np.uint8(3)),
+        "no axes, gzipped": gzip.compress(npy(np.uint8(3))),
+        "objects": npy(np.array([{1: 2}, None], dtype=object)),
+        "texts": npy(np.array(["a", "b"])),
+        "complex": npy(np.zeros((4, 6, 2), complex)),
+        "structured": npy(np.zeros((4, 6), "u1,f4")),
+        "no frames": npy(np.zeros((0, 6, 2), np.uint8)),
+        "five axes": npy(np.zeros((1, 1, 4, 6, 2), np.uint8)),
+        "a petabyte": header.getvalue(),
+        "version 9": flat[:6] + b"\x09\x09" + flat[8:],
+        "deep header": flat.replace(b"(4, 6, 2)", b"(" * 9),
+        "text": b"hello\n" * 9,
+        "null": b"null",
+        "deep": b"[" * 9999,
+        "digits": b'{"no_parts": ' + b"9" * 5000 + b', "w": 1e999, "shape": [NaN]}',
+        "list of files": b"ffconcat version 1.0\nfile 'a.mp4'\n",
+        "playlist": b"#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\n/etc/passwd\n#EXT-X-ENDLIST\n",
+        "png": b"\x89PNG\r\n\x1a\n" + bytes(40),
+        "hdf5": b"\x89HDF\r\n\x1a\n" + bytes(90),
+        "tiff": b"II*\0\x08\0\0\0\xff\xff" + bytes(40),
+        "exr": exr.MAGIC + b"channels\0chlist\0\xff\xff\xff\x7f",
+    }
+
+
+def swap(name: str, folder: Path, rounds: int) -> str:
+    """Each file of a format replaced by each other kind; "" or what went wrong."""
+    make, read = FORMATS[name]
+    original = folder / "original"
+    original.mkdir()
+    make(original)
+    read(original)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    for target in [path for path in sorted(original.rglob("*")) if path.is_file()][:rounds]:
+        for kind, content in other_kinds().items():
+            victim = folder / "victim"
+            shutil.rmtree(victim, ignore_errors=True)
+            shutil.copytree(original, victim)
+            (victim / target.relative_to(original)).write_bytes(content)
+            try:
+                read(victim)
+            except (ValueError, OSError) as error:
+                named = str(victim) in str(error) or target.name in str(error)
+                if not named or "\n" in str(error) or "pickle" in str(error):
+                    return f"{target.name} as {kind}: {error!r}"
+            except BaseException as error:
+                return f"{target.name} as {kind}: {error!r}"
+            grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
+            if grown > MEMORY:
+                return f"{target.name} as {kind}: {grown >> 20} MiB"
+    return ""
+
+
+def fuzz(name: str, folder: Path, rounds: int, how: Callable[[str, Path, int], str]) -> None:
     report = folder / "report"
 
     def work() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # decoders complain to stderr
-        report.write_text(attack(name, folder, rounds))
+        report.write_text(how(name, folder, rounds))
 
     _, status = os.waitpid(forked(work), 0)
     assert os.waitstatus_to_exitcode(status) == 0, f"the reader of {name} took the process down"
@@ -238,13 +357,18 @@ def fuzz(name: str, folder: Path, rounds: int) -> None:
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_mutated_files_are_refused_in_one_line(name: str, tmp_path: Path):
-    fuzz(name, tmp_path, 60)
+    fuzz(name, tmp_path, 60, attack)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_files_of_another_kind_are_refused_in_one_line(name: str, tmp_path: Path):
+    fuzz(name, tmp_path, 3, swap)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 def test_ten_thousand_mutated_files(name: str, tmp_path: Path):
-    fuzz(name, tmp_path, -(-10_000 // len(FORMATS)))
+    fuzz(name, tmp_path, -(-10_000 // len(FORMATS)), attack)
 
 
 def test_a_header_that_promises_a_terabyte(tmp_path: Path):
@@ -277,3 +401,108 @@ def test_the_exr_reader_survives_every_truncation(tmp_path: Path):
         path.write_bytes(content[:length])
         with pytest.raises(ValueError, match="truncated or damaged"):
             exr.read_half(path, 5, 7)
+
+
+def described_zarr(folder: Path, **changes: object) -> Path:
+    """A zarr of the planes whose array says something else."""
+    folder.mkdir()
+    make_zarr(folder)
+    about = folder / "frames" / "zarr.json"
+    about.write_text(json.dumps(json.loads(about.read_text()) | changes))
+    return folder
+
+
+def test_zarrs_that_promise_more_than_there_is(tmp_path: Path):
+    """Chunks are counted in the folder before the library lists all that there should be: 10^15 of them took 22 GB."""
+    grid = {"name": "regular", "configuration": {"chunk_shape": [1, 1, 1]}}
+    huge = described_zarr(tmp_path / "huge", shape=[10**9, 1000, 1000], chunk_grid=grid)
+    grid = {"name": "regular", "configuration": {"chunk_shape": [1 << 20, 1 << 10, 1]}}
+    thick = described_zarr(tmp_path / "thick", chunk_grid=grid)
+    large = described_zarr(tmp_path / "large", attributes={"a": "x" * (1 << 22)})
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    for folder, words in [(huge, r"1 of 1000000000000000 chunks"), (thick, "at a time"), (large, "bytes of metadata")]:
+        with pytest.raises(ValueError, match=words):
+            formats.read(folder, Hints("zarr"))
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before < MEMORY
+
+
+@pytest.mark.parametrize("codec", ["pickle", "numcodecs.pickle", "bz2", "lzma", "json2"])
+def test_zarr_codecs_that_execute_or_expand_are_refused(tmp_path: Path, codec: str):
+    codecs = [{"name": "bytes"}, {"name": "sharding_indexed", "configuration": {"codecs": [{"name": codec}]}}]
+    with pytest.raises(ValueError, match=f"stored by the codec '{codec.removeprefix('numcodecs.')}'"):
+        formats.read(described_zarr(tmp_path / "v3", codecs=codecs), Hints("zarr"))
+    (tmp_path / "v2").mkdir()
+    about = {"zarr_format": 2, "shape": [4, 6, 16], "chunks": [4, 6, 16], "dtype": "|u1", "order": "C", "fill_value": 0}
+    about |= {"compressor": None, "filters": [{"id": codec}]}
+    (tmp_path / "v2" / ".zarray").write_text(json.dumps(about))
+    (tmp_path / "v2" / "0.0.0").write_bytes(pickle.dumps(some_planes().tobytes()))
+    with pytest.raises(ValueError, match="stored by the codec"):
+        formats.read(tmp_path / "v2", Hints("zarr"))
+
+
+def test_planes_that_lie_in_another_file_are_refused(tmp_path: Path):
+    """HDF5 can name any file of the machine as the place of its data: external storage, links, virtual data sets."""
+    import h5py
+
+    (tmp_path / "secret").write_bytes(bytes(T * W * H))
+    with h5py.File(tmp_path / "other.mat", "w") as file:
+        file["OUTPUT"] = np.zeros((T, W, H), np.uint8)
+    with h5py.File(tmp_path / "external.mat", "w") as file:
+        place = [(str(tmp_path / "secret"), 0, h5py.h5f.UNLIMITED)]
+        file.create_dataset("OUTPUT", (T, W, H), "u1", external=place)
+    with h5py.File(tmp_path / "link.mat", "w") as file:
+        file["OUTPUT"] = h5py.ExternalLink("other.mat", "OUTPUT")
+    with h5py.File(tmp_path / "soft.mat", "w") as file:
+        file["there"] = h5py.ExternalLink("other.mat", "/")
+        file["OUTPUT"] = h5py.SoftLink("/there/OUTPUT")
+    with h5py.File(tmp_path / "virtual.mat", "w") as file:
+        layout = h5py.VirtualLayout((T, W, H), "u1")
+        layout[:] = h5py.VirtualSource(str(tmp_path / "other.mat"), "OUTPUT", (T, W, H))
+        file.create_virtual_dataset("OUTPUT", layout)
+    formats.read(tmp_path / "other.mat")
+    for name in ("external", "link", "soft", "virtual"):
+        with pytest.raises(ValueError, match=rf"{name}\.mat: OUTPUT (lies in other files|is a link)"):
+            formats.read(tmp_path / f"{name}.mat")
+
+
+def test_a_video_that_names_other_videos_is_refused(tmp_path: Path):
+    make_mp4(tmp_path)
+    assert formats.read(tmp_path / "a.mp4", LIGHT).shape == (T, H, W)
+    (tmp_path / "list.mp4").write_text("ffconcat version 1.0\nfile 'a.mp4'\n")
+    with pytest.raises(ValueError, match=r"list\.mp4: not readable as video"):
+        formats.read(tmp_path / "list.mp4", LIGHT)
+
+
+def test_truth_of_another_size_or_type_is_refused(tmp_path: Path):
+    """clip.json says the size; the file may not be larger or of other numbers, and its bytes have to be there."""
+    make_clip(tmp_path)
+    clip = Clip.open(tmp_path / "clip")
+    place = clip.path / "truth" / "000000.exr"
+    for channels in (
+        {name: np.zeros((H + 1, W), "<f4") for name in "uv"},
+        {name: np.zeros((H, W), "<f2") for name in "uv"},
+        {"u": np.zeros((H, W), "<u4"), "v": np.zeros((H, W), "<f4")},
+        {"w": np.zeros((H, W), "<f4")},
+    ):
+        place.write_bytes(exr.encode(channels, compress=True))
+        with pytest.raises(ValueError, match=r"truth/000000\.exr"):
+            clip.flow(0)
+    window = struct.pack("<iiii", 0, 0, W - 1, H - 1)
+    bomb = exr.encode({name: np.zeros((H, W), "<f4") for name in "uv"}, compress=True)
+    place.write_bytes(bomb.replace(window, struct.pack("<iiii", 0, 0, 32767, 32767)))
+    with pytest.raises(ValueError, match="expected scan lines"):
+        clip.flow(0)
+    with pytest.raises(ValueError, match="bytes cannot hold"):
+        exr.read(place)
+
+
+def test_a_missing_frame_says_that_the_clip_is_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    make_clip(tmp_path)
+    place = tmp_path / "clip"
+    for folder in ("truth", "radiance"):
+        for file in (place / folder).iterdir():
+            file.unlink()
+        assert main(["preview", str(place), "--frame", "0", "-o", str(tmp_path / f"{folder}.png")]) == 2
+        said = capsys.readouterr().err
+        assert f"{place / folder}/" in said
+        assert "the clip is damaged, run `qsim check" in said
