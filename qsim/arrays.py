@@ -214,6 +214,9 @@ def load_npy(path: Path) -> Array:
         with reading(path, "gzipped .npy"), gzip.open(path, "rb") as packed:
             return _read_npy(path, packed)
     with reading(path, ".npy"):
+        with open(path, "rb") as file:
+            if file.read(2) == b"PK":
+                raise ValueError(f"{path}: is an archive (.npz) under another name; save the array alone with np.save")
         array = np.lib.format.open_memmap(path, mode="r")
         if array.ndim == 0:
             raise ValueError(f"{path}: a single number without axes; an array is expected")

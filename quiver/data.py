@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim import __version__, devices, keys
+from qsim.arrays import load_npy
 from qsim.checks import suggest
 from qsim.clip import Clip
 from qsim.completion import add_completion
@@ -291,12 +291,7 @@ def cube_codes(
     highest bit. Every `planes` = 2^b - 1 of them (default 1) are summed to one b-bit code of a clocked SPAD; what is
     left at the end is not used. `frame_rate` counts codes per second. `ValueError` where these do not fit together.
     """
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError, BadZipFile):
-        raise ValueError(f"{path}: not readable as an array of numbers; save the codes with np.save") from None
-    if not isinstance(array, np.ndarray):
-        raise ValueError(f"{path}: is an archive (.npz) under the name .npy; save the codes alone with np.save")
+    array = load_npy(path)
     if width is None:
         if planes is not None:
             raise ValueError(f"{path}: planes = {planes} sums packed binary planes; give their width in pixels, too")
