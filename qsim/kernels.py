@@ -2,13 +2,14 @@
 
     photons of one frame -> a lane per 2 neighbours -> 2 codes, as bytes or as bits
 
-Every pixel compares the same Philox word with the same cdf as `Sensor.sample(engine="reference")`, but in float32 and
-without ever writing the cdf down (ladders.py). A pixel whose word comes so near to a step F_k that float32 could not
-decide (about 40 in a million) is flagged by the kernel and drawn by the reference in float64 (pixels.py), so the codes
-are the reference's on every kind of machine; tails, where a second word is drawn, come out right for the same reason.
+Every pixel compares the same Philox word with the same cdf as `Sensor.sample(engine="reference")`, but in float32, by
+short sums (ladders.py) or along curves over light (curves.py). A pixel whose word comes so near to a step F_k that
+float32 could not decide (about 40 in a million) is flagged by the kernel and drawn by the reference in float64
+(pixels.py), so the codes are the reference's on every kind of machine; tails, where a second word is drawn, come out
+right for the same reason.
 
-Where no short form exists (codes above 8 bits, paralyzable pixels, very long sums) or a block is tiny, the reference
-itself draws. Peak memory: the output, one frame, and what launches hold. They have at most four million pixels, where
+Above 8 bits, or where a block is tiny, the reference itself draws; so it does single paralyzable pixels in light beyond
+their curves. Peak memory: the output, one frame, and what launches hold. They have at most four million pixels, where
 the cost of starting one has faded, and hold, per pixel, 4 bytes of converted light, 2 of places for each of two shapes,
 and 2.5 that each of two launches writes: at most 55 MB.
 """

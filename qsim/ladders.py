@@ -1,4 +1,4 @@
-"""The steps F_0 ... F_(top-1) of a sensor as short sums that a compiled kernel can afford.
+"""How a compiled kernel has the steps F_0 ... F_(top-1) of a sensor: as short sums, or as curves that it looks up.
 
 A pixel's code is the number of steps F_k that its uniform number u has passed. With lambda expected arrivals:
 
@@ -6,6 +6,8 @@ A pixel's code is the number of steps F_k that its uniform number u has passed. 
                                                             where read noise blurs the threshold: a narrow band
     CountingSPAD   F_k = sum_(n <= k) Pois(n; lambda s_k)   s_k: share of the exposure that is live after k counts
     BinarySPAD     F_0 = exp(-lambda) in each of M planes   a code is the number of planes that fired
+
+Where the sums are long, or there are none (paralyzable pixels), steps are curves over light: curves.py.
 
 The Poisson weights are carried as (lambda / scale)^n with coefficients scale^n / n!, so that one multiplication and
 one addition per term suffice. Short sums are compared as u exp(lambda) >= sum; longer ones have half of the exponential
@@ -15,6 +17,7 @@ any light: with one exponential of a fixed shift in all weights, dark pixels of 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from math import ceil, e, lgamma, log, log2, sqrt
@@ -22,14 +25,18 @@ from math import ceil, e, lgamma, log, log2, sqrt
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.qis import QIS, electron_table
+from qsim.curves import Curves, below, falling
+from qsim.qis import QIS, electron_table, table_length, thresholds
 from qsim.sensor import Sensor
 from qsim.spad import BinarySPAD, CountingSPAD
 
-_MAX_WORK = 1200  # terms of all sums of one kernel together
-_SINGLE_TERMS = 75  # electrons up to which float32 has the range, halved: exp(165 / 2)
-_DOUBLE_TERMS = 500  # and float64: exp(687)
-_SINGLE_EXPONENT, _DOUBLE_EXPONENT = 85.0, 700.0  # exp of more overflows
+_MOST_BITS = 8  # a code is a byte
+_LIVE_BITS = 4  # of counters whose steps are added up
+_MAX_WORK = 260  # terms of all sums of one kernel together; looking up curves is quicker than more
+_TERMS = 75  # electrons up to which float32 has the range, halved: exp(165 / 2)
+_LONGEST_TABLE = 2048  # electrons in a table that is looked through for short sums
+_PARALYSED = (85.0, 250.0)  # arrivals up to which paralyzable pixels have curves: few bits, more; tables of 256, 512
+_EXPONENT = 85.0  # exp of more overflows
 _NEGLIGIBLE = 1e-12  # a coefficient that small moves no step by more than float64's rounding of the reference
 
 
@@ -61,27 +68,51 @@ class Plan:
     efficiency: float  # arrivals per photon, of one plane
     dark: float  # arrivals without light, of one plane
     planes: int  # summed into one code; 1 unless BinarySPAD
-    steps: Electrons | Live  # of one plane
-    double: bool  # float64 where float32 lacks the range
+    steps: Electrons | Live | Curves  # of one plane
     margin: float  # nearer than this to a step, float arithmetic does not decide
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=32)
 def plan(sensor: Sensor, exposure: float) -> Plan | None:
-    """The plan of a sensor; None where no short form exists and the reference has to draw."""
+    """The plan of a sensor; None where no kernel serves and the reference has to draw."""
     efficiency, dark = sensor.efficiency, sensor.dark_rate * exposure
-    if isinstance(sensor, BinarySPAD) and sensor.bits <= 8:
+    if sensor.bits > _MOST_BITS:
+        return None
+    if isinstance(sensor, BinarySPAD):
         m = sensor.planes
-        return Plan(efficiency / m, dark / m, m, Live(2, (1.0,)), False, _margin(1))
-    if isinstance(sensor, CountingSPAD) and not sensor.paralyzable and sensor.bits <= 4:
+        return Plan(efficiency / m, dark / m, m, Live(2, (1.0,)), _margin(1))
+    if isinstance(sensor, CountingSPAD) and sensor.dead_time_law(exposure) is None and sensor.bits <= _LIVE_BITS:
         shares = 1 - np.arange(sensor.levels - 1) * (sensor.dead_time / exposure)
         live = tuple(float(s) for s in shares[shares > 0])
-        return Plan(efficiency, dark, 1, Live(sensor.levels, live), False, _margin(len(live)))
-    if isinstance(sensor, QIS) and sensor.bits <= 8:
-        steps = electrons(sensor)
-        if steps is not None:
-            double = len(steps.full) > _SINGLE_TERMS
-            return Plan(efficiency, dark, 1, steps, double, 2.0**-31 if double else _margin(len(steps.full)))
+        return Plan(efficiency, dark, 1, Live(sensor.levels, live), _margin(len(live)))
+    if isinstance(sensor, QIS) and (short := electrons(sensor)) is not None:
+        return Plan(efficiency, dark, 1, short, _margin(len(short.full)))
+    found = _curves(sensor, exposure)
+    return None if found is None else Plan(efficiency, dark, 1, found, found.margin)
+
+
+def _curves(sensor: Sensor, exposure: float) -> Curves | None:
+    """Curves of a sensor whose steps can be computed one by one, or whose table is short at usual light."""
+    count = sensor.levels - 1
+    codes = np.arange(count)[:, None]
+
+    def pairs(step: Callable[[Array, Array], Array]) -> Callable[[Array], Array]:
+        return lambda mean: step(np.broadcast_to(codes, mean.shape).ravel(), mean.ravel()).reshape(mean.shape)
+
+    if isinstance(sensor, QIS):
+        steps = thresholds(sensor)
+        return None if steps is None else falling(pairs(steps.cdf), pairs(steps.slope), count)
+    if isinstance(sensor, CountingSPAD):
+        paralyzable = sensor.dead_time_law(exposure)
+        if paralyzable is None:
+            cdf, slope = sensor.steps(exposure)
+            return falling(pairs(cdf), pairs(slope), count)
+        return below(
+            lambda mean: paralyzable.cdf(mean[0])[:, :-1].T,
+            lambda mean: paralyzable.slope(mean[0])[:, :-1].T,
+            count,
+            _PARALYSED[sensor.bits > _LIVE_BITS],
+        )
     return None
 
 
@@ -92,6 +123,8 @@ def _margin(terms: int) -> float:
 
 def electrons(sensor: QIS) -> Electrons | None:
     """The sums of a QIS of at most 8 bits, or None if they are too long."""
+    if table_length(sensor) > _LONGEST_TABLE:
+        return None
     table = electron_table(sensor, 0, sensor.levels)
     floor = np.where(table.tail_cdf[:-1] > _NEGLIGIBLE, table.tail_cdf[:-1], 0.0)
     weights = np.concatenate([np.ones((table.first, sensor.levels - 1)), table.cdf[:, :-1]]) - floor
@@ -99,7 +132,7 @@ def electrons(sensor: QIS) -> Electrons | None:
     if not terms.size:
         return None
     n = int(terms[0])
-    if n > _DOUBLE_TERMS:
+    if n > _TERMS:
         return None
     weights = weights[:n]
     prefix = [int(np.argmin(np.append(column > 1 - _NEGLIGIBLE, False))) for column in weights.T]
@@ -107,9 +140,9 @@ def electrons(sensor: QIS) -> Electrons | None:
     if 2 * n + sum(max(end - start, 0) for start, end in zip(prefix, ends, strict=True)) > _MAX_WORK:
         return None
     # Above lambda = highest even the last step is certain to be passed
-    highest, limit = n + 7 * sqrt(n) + 30, _SINGLE_EXPONENT if n <= _SINGLE_TERMS else _DOUBLE_EXPONENT
+    highest = n + 7 * sqrt(n) + 30
     scale = 2.0 ** max(0, ceil(log2(max(n / e, 1))))
     numbers = np.arange(n)
     full = np.exp(numbers * log(scale) - np.array([lgamma(m + 1) for m in numbers]))
     band = [weights[a:b, k] * full[a:b] for k, (a, b) in enumerate(zip(prefix, ends, strict=True))]
-    return Electrons(highest, highest > limit, scale, full, tuple(prefix), tuple(band), floor)
+    return Electrons(highest, highest > _EXPONENT, scale, full, tuple(prefix), tuple(band), floor)

@@ -7,9 +7,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
-import warnings
 from collections.abc import Callable
 from functools import cache, lru_cache
 from math import log
@@ -18,21 +15,17 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import engine
+from qsim import lookup
+from qsim.curves import Curves
+from qsim.jit import available, backend, no_light, smaller, uniform32
 from qsim.keys import ROUNDS, Key
 from qsim.ladders import Electrons, Live, Plan, plan
 from qsim.sensor import Sensor
 
 _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # of Philox4x32; see keys.py
 _KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
-_INFINITY = 0x7F800000  # float32; larger bit patterns are NaN or negative
 _CERTAIN = 80.0  # arrivals that are sure to bring 15: P(N < 15) = 1e-19
 _CONSTANT_PLANS = 32  # sensors of a process that get kernels of their own
-
-
-def available() -> bool:
-    """Whether Dr.Jit can run here: CUDA or a usable LLVM, and not in a child forked from a process that used it."""
-    return not _in_broken_child and backend() is not None
 
 
 def steps(sensor: Sensor, photons: Array, exposure: float) -> Array:
@@ -46,10 +39,15 @@ def steps(sensor: Sensor, photons: Array, exposure: float) -> Array:
     import drjit as dr
 
     jit = backend()
-    real = jit.Float64 if chosen.double else jit.Float
-    efficiency, dark, _, *scalars = [real(number) for number in _numbers(chosen)]
-    mean = dr.fma(real(jit.Float(np.asarray(photons, np.float32))), efficiency, dark)
-    values, unit = _steps(chosen.steps, mean, scalars)
+    light = jit.Float(np.asarray(photons, np.float32))
+    if isinstance(chosen.steps, Curves):
+        efficiency, dark, _, _, *curves = lookup.arguments(chosen.efficiency, chosen.dark, chosen.margin, chosen.steps)
+        x = dr.sqrt(dr.fma(jit.Float64(light), efficiency, dark))
+        each = [lookup.curve(curves, jit.UInt32(k), x).numpy().astype(float) for k in range(len(chosen.steps.rate))]
+        return np.stack(np.broadcast_arrays(*each, photons)[:-1], axis=1)
+    efficiency, dark, _, *scalars = [jit.Float(number) for number in _numbers(chosen)]
+    mean = dr.fma(light, efficiency, dark)
+    values, unit = _steps(_sums(chosen), mean, scalars)
     columns = [(value / unit).numpy().astype(float) for value in values]
     return np.stack(np.broadcast_arrays(*columns, photons)[:-1], axis=1)
 
@@ -96,23 +94,46 @@ def launch(
 
     jit = backend()
     numbers = [dr.opaque(jit.UInt32, number) for number in first]
-    return list(_kernel(plan, bits)(jit.UInt64(light), *numbers, _arguments(plan), _places(shape), *fixed))
+    if isinstance(plan.steps, Curves):
+        kernel = _curve_kernel(len(plan.steps.rate), bits)
+    else:
+        kernel = _kernel(plan, bits)
+    return list(kernel(jit.UInt64(light), *numbers, _arguments(plan), _places(shape), *fixed))
 
 
 @lru_cache(maxsize=64)
 def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
     """The kernel of a plan, traced once and replayed after that (`drjit.freeze`)."""
+    real = backend().Float
+    return _traced(
+        lambda photons, words, given: _count(plan, photons, words, given or [real(n) for n in _numbers(plan)]),
+        plan.planes,
+        bits,
+    )
+
+
+@cache
+def _curve_kernel(steps: int, bits: int | None) -> Callable[..., tuple[Any, Any]]:
+    """The one kernel of all sensors with so many steps whose sums are too long."""
+    return _traced(lambda photons, words, given: lookup.count(steps, photons, words, given), 1, bits)
+
+
+def _traced(
+    count: Callable[[list[Any], Callable[[Any], list[Any]], list[Any]], tuple[list[Any], Any]],
+    planes: int,
+    bits: int | None,
+) -> Callable[..., tuple[Any, Any]]:
+    """A kernel that draws with `count`: photons, words and arguments of a lane -> its codes and a doubt."""
     import drjit as dr
 
     jit = backend()
-    real = jit.Float64 if plan.double else jit.Float
 
     def draw(
         pair: Any, frame: Any, row: Any, arguments: list[Any], places: list[Any], block: Any, high: Any, low: Any
     ) -> tuple[Any, Any]:
         place, below_y, below_t, mask_x, mask_y = places
         t, y, x = place >> below_t, (place & mask_y) >> below_y, place & mask_x
-        first_plane = (frame + t) * plan.planes
+        first_plane = (frame + t) * planes
         photons = [dr.reinterpret_array(jit.Float, jit.UInt32(half)) for half in (pair, pair >> 32)]
 
         def words(plane: Any) -> list[Any]:
@@ -121,7 +142,7 @@ def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
             right = (x & 1) == 1
             return [dr.select(right, w[2], w[0]), dr.select(right, w[3], w[1])]
 
-        codes, doubt = _count(plan, photons, words, arguments or [real(number) for number in _numbers(plan)])
+        codes, doubt = count(photons, words, arguments)
         if bits is None:
             out = codes[0] | (codes[1] << 8)
         else:
@@ -151,46 +172,33 @@ def _count(
     """Codes of the pixels of a lane, and whether one of them is doubtful."""
     import drjit as dr
 
-    jit = backend()
-    real = jit.Float64 if plan.double else jit.Float
+    jit, real = backend(), backend().Float
+    sums = _sums(plan)
     efficiency, dark, margin, *scalars = scalars
-    doubt: Any = jit.Bool(False)
-    for theta in photons:  # negative, infinite and NaN by their bits: the reference says what is wrong
-        pattern: Any = dr.reinterpret_array(jit.UInt32, theta)
-        doubt |= pattern >= _INFINITY
-    arrivals = [dr.fma(real(theta), efficiency, dark) for theta in photons]
-
-    def uniform32(word: Any) -> Any:
-        return dr.fma(real(word), 2.0**-32, 2.0**-33)
+    doubt = no_light(photons)
+    arrivals = [dr.fma(theta, efficiency, dark) for theta in photons]
 
     if plan.planes == 1:
         codes = []
         for mean, word in zip(arrivals, words(jit.UInt32(0)), strict=True):
-            steps, unit = _steps(plan.steps, mean, scalars)
+            steps, unit = _steps(sums, mean, scalars)
             code, near = _search(steps, uniform32(word) * unit)
             codes.append(code)
             doubt |= ~(near >= margin * unit)
         return codes, doubt
-    nothing = [_steps(plan.steps, mean, scalars)[0][0] for mean in arrivals]
+    nothing = [_steps(sums, mean, scalars)[0][0] for mean in arrivals]
 
     def add_plane(plane: Any, near: Any, *counts: Any) -> tuple[Any, ...]:
         sums = []
         for count, word, step in zip(counts, words(plane), nothing, strict=True):
             code, distance = _search([step], uniform32(word))
             sums.append(count + code)
-            near = _smaller(near, distance)
+            near = smaller(near, distance)
         return (plane + 1, near, *sums)
 
     state = (jit.UInt32(0), real(1), *(jit.UInt32(0) for _ in photons))
     _, near, *codes = dr.while_loop(state, lambda plane, *_: plane < plan.planes, add_plane)
     return codes, doubt | ~(near >= margin)
-
-
-def _smaller(a: Any, b: Any) -> Any:
-    """The smaller one, in one instruction: `drjit.minimum` minds NaN and signed zeros, which do not come here."""
-    import drjit as dr
-
-    return dr.select(a < b, a, b)
 
 
 def _search(steps: list[Any], u: Any) -> tuple[Any, Any]:
@@ -206,7 +214,7 @@ def _search(steps: list[Any], u: Any) -> tuple[Any, Any]:
         half = len(steps) // 2
         distance = u - steps[half]
         passed = distance >= 0
-        near = _smaller(near, dr.abs(distance))
+        near = smaller(near, dr.abs(distance))
         code += dr.select(passed, count(half + 1), count(0))
         steps = [dr.select(passed, steps[half + 1 + i], steps[i]) for i in range(half)]
     return code, near
@@ -220,7 +228,7 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
     if isinstance(steps, Live):
         result = []
         for k in range(len(steps.shares)):
-            live = _smaller(mean * scalars[k], real(_CERTAIN))
+            live = smaller(mean * scalars[k], real(_CERTAIN))
             total = real(1)
             for n in range(k, 0, -1):
                 total = dr.fma(total, live * (1 / n), 1)
@@ -229,7 +237,7 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
     n = len(steps.full)
     highest, scale = scalars[:2]
     full, bands = scalars[2 : 2 + n], iter(scalars[2 + n :])
-    mean = _smaller(mean, highest)
+    mean = smaller(mean, highest)
     unit, grow = dr.exp(mean * 0.5 if steps.halved else mean), mean * scale
     terms = [1 / unit if steps.halved else real(1)]
     for _ in range(1, n):
@@ -270,8 +278,7 @@ def _exp_below_zero(x: Any) -> Any:
 
 def _numbers(plan: Plan) -> list[float]:
     """The numbers of a plan, in the order in which `_count` and `_steps` take them."""
-    values = [plan.efficiency, plan.dark, plan.margin]
-    steps = plan.steps
+    values, steps = [plan.efficiency, plan.dark, plan.margin], _sums(plan)
     if isinstance(steps, Live):
         return [*values, *steps.shares]
     values += [steps.highest, 1 / steps.scale, *steps.full]
@@ -280,45 +287,20 @@ def _numbers(plan: Plan) -> list[float]:
     return [float(value) for value in values]
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=32)
 def _arguments(plan: Plan) -> list[Any]:
     """Nothing for the first sensors of a process, whose numbers are constants of kernels of their own; for the rest the
     numbers, as arguments of a shared (about 20 % slower) kernel: a training that varies its sensors compiles once.
     """
     import drjit as dr
 
+    if isinstance(plan.steps, Curves):
+        return lookup.arguments(plan.efficiency, plan.dark, plan.margin, plan.steps)
     if _arguments.cache_info().misses <= _CONSTANT_PLANS:
         return []
-    real = backend().Float64 if plan.double else backend().Float
-    return [dr.opaque(real, number) for number in _numbers(plan)]
+    return [dr.opaque(backend().Float, number) for number in _numbers(plan)]
 
 
-# ---- Which Dr.Jit
-
-
-@cache
-def backend() -> Any:
-    """`drjit.cuda` or `drjit.llvm`; None where neither works here."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Sensor.sample says that the reference draws
-        chosen = engine.choose()
-    if chosen.backend == "scalar":
-        return None
-    if chosen.llvm_path:
-        os.environ["DRJIT_LIBLLVM_PATH"] = chosen.llvm_path
-    import drjit as dr
-
-    return getattr(dr, chosen.backend)
-
-
-_in_broken_child: list[int] = []  # the process id, in a child of a process that had loaded Dr.Jit
-
-
-def _after_fork() -> None:
-    """Dr.Jit's threads do not survive a fork: such a child draws with the reference."""
-    if "drjit" in sys.modules:
-        _in_broken_child[:] = [os.getpid()]
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
+def _sums(plan: Plan) -> Electrons | Live:
+    assert not isinstance(plan.steps, Curves)
+    return plan.steps

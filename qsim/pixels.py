@@ -34,9 +34,7 @@ def draw_at(sensor: Sensor, photons: Array, exposure: float, key: Key, origin: t
 
 def _draw(sensor: Sensor, light: Array, exposure: float, key: Key, place: tuple[Array, Array, Array]) -> Array:
     first = _words(key, place, 0)
-    cdf, u = sensor.cdf(light, exposure)[..., :-1], uniform(first)[:, None]
-    drawn = np.count_nonzero(u >= cdf, axis=-1)
-    tail = (np.abs(u - cdf) <= 2.0**-32).any(axis=-1)
+    drawn, tail = sensor.decide(uniform(first), light, exposure)
     if tail.any():
         x, y, frame = (np.broadcast_to(axis, tail.shape)[tail] for axis in place)
         drawn[tail] = sensor.codes_at(first[tail], _words(key, (x, y, frame), 1), light[tail], exposure)

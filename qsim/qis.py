@@ -21,9 +21,14 @@ from numpy import ndarray as Array
 from qsim.keys import Key, uniform_pair, words
 from qsim.mixture import Mixture
 from qsim.sensor import Sensor, require_bits, require_number
+from qsim.thresholds import Thresholds, decide
 
 _REACH = 39.0  # sigmas: Phi(-39) = 1e-333 is 0 in float64
 _BLOCK, _SPAN = 256, 4096  # most levels, and electrons between them, that share one table
+_LONG = 1 << 13  # electrons of a table x (codes + 32); above, few steps are looked at, each by itself
+_BLUR = 8.3  # sigmas: 1 - Phi(8.3) = 5e-17 is nothing beside 1
+_FARTHEST = 1e15  # electrons; no light reaches further
+_WIDEST = 1 << 22  # numbers in all thresholds of a sensor
 _PROCESS_BITS = 8  # above, codes are drawn step by step instead of through their cdf
 
 
@@ -86,6 +91,23 @@ class QIS(Sensor):
         """The ADC: float electrons, read noise included -> codes; the only place where gain and rounding happen."""
         return np.clip(np.rint(self.gain * electrons + self.offset), 0, self.levels - 1).astype(self.dtype)
 
+    def decide(self, u: Array, photons: Array, exposure: float) -> tuple[Array, Array]:
+        """As every sensor; where the table is long, the steps around the code alone, to the same 1e-13."""
+        from scipy.special import ndtri
+
+        steps = thresholds(self) if table_length(self) * (self.levels + 32) > _LONG else None
+        if steps is None:
+            return super().decide(u, photons, exposure)
+        mean = self.arrivals(photons, exposure).ravel()
+        variance, z = mean + self.read_noise**2, ndtri(u.ravel())
+        skew = np.divide(mean, variance, out=np.zeros_like(mean), where=variance > 0) * (z * z - 1) / 6
+        electrons = mean + z * np.sqrt(variance) + skew
+        if self.full_well is not None:
+            electrons = np.minimum(electrons, self.full_well)
+        guess = np.clip(np.rint(self.gain * electrons + self.offset), 0, self.levels - 1)
+        codes, near = decide(steps.cdf, self.levels - 1, u.ravel(), mean, guess)
+        return codes.reshape(u.shape), near.reshape(u.shape) <= 2.0**-32
+
     def _draw(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
         if self.bits <= _PROCESS_BITS:
             return super()._draw(photons, exposure, key, origin)
@@ -108,6 +130,37 @@ class QIS(Sensor):
             below, above = uniform_pair(w[2], w[3])
             electrons = electrons + self.read_noise * np.where(below < 0.5, ndtri(below), -ndtri(above))
         return self.codes_of(electrons)
+
+
+def table_length(sensor: QIS) -> float:
+    """Electrons in the table of all codes, as `electron_table` has it."""
+    high = (sensor.levels - 1.5 - sensor.offset) / sensor.gain + _REACH * sensor.read_noise + 1
+    return max(min(high, inf if sensor.full_well is None else sensor.full_well), 0.0)
+
+
+@lru_cache(maxsize=32)
+def thresholds(sensor: QIS) -> Thresholds | None:
+    """The steps of a sensor of at most 8 bits one by one; None where read noise blurs more than memory should hold."""
+    from scipy.special import ndtr
+
+    top, noise = sensor.levels - 1, sensor.read_noise
+    codes, well = np.arange(top), inf if sensor.full_well is None else sensor.full_well
+    at = (codes + 0.5 - sensor.offset) / sensor.gain  # electrons
+    width = ceil(2 * _BLUR * noise) + 1 if noise else 0
+    if top * width > _WIDEST:
+        return None
+    if noise:
+        first = np.clip(np.floor(at - _BLUR * noise), 0, _FARTHEST)
+        electrons = np.minimum(first[:, None] + np.arange(width), well)
+        tail = ndtr((at - well) / noise)
+        return Thresholds(first.astype(np.int64), ndtr((at[:, None] - electrons) / noise), tail)
+    around = np.floor(at)[:, None] + np.arange(-1, 3)
+    kept = sensor.codes_of(around) <= codes[:, None]  # ties as the ADC has them
+    first = np.clip(
+        np.minimum(around[:, 0] + np.count_nonzero(kept, axis=1), ceil(well) if well < inf else inf), 0, _FARTHEST
+    )
+    never = np.full(top, False) if well == inf else sensor.codes_of(np.array(well)) <= codes
+    return Thresholds(first.astype(np.int64), np.empty((top, 0)), never.astype(float))
 
 
 @lru_cache(maxsize=32)

@@ -226,14 +226,17 @@ class Sensor(ABC):
             block = np.asarray(photons[y : y + rows], np.float64)
             place = (origin[0] + y, origin[1])
             first = words(key, block.shape, place)
-            cdf, u = self.cdf(block, exposure)[..., :-1], uniform(first)[..., None]
-            drawn = np.count_nonzero(u >= cdf, axis=-1)
-            tail = (np.abs(u - cdf) <= 2.0**-32).any(axis=-1)
+            drawn, tail = self.decide(uniform(first), block, exposure)
             if tail.any():
                 second = words(key, block.shape, place, redraw=1)
                 drawn[tail] = self.codes_at(first[tail], second[tail], block[tail], exposure)
             codes[y : y + rows] = drawn
         return codes
+
+    def decide(self, u: Array, photons: Array, exposure: float) -> tuple[Array, Array]:
+        """Codes of uniform numbers of 32 bits, and where those do not decide: [...], bool [...] from [...] each."""
+        cdf, u = self.cdf(photons, exposure)[..., :-1], u[..., None]
+        return np.count_nonzero(u >= cdf, axis=-1), (np.abs(u - cdf) <= 2.0**-32).any(axis=-1)
 
     def codes_at(self, first: Array, second: Array, photons: Array, exposure: float) -> Array:
         """Codes of single pixels [p] from two words each: a 64-bit number, compared from the nearer end."""

@@ -6,6 +6,7 @@ expected in an exposure.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import inf
 from typing import ClassVar
@@ -174,8 +175,8 @@ class CountingSPAD(SPAD):
             return inf
         return (1 / (a * (1 - a)) - self.dark_count_rate * exposure) / self.pde
 
-    def _paralyzable(self, exposure: float) -> Paralyzable | None:
-        """The other dead-time law; without dead time the two are one."""
+    def dead_time_law(self, exposure: float) -> Paralyzable | None:
+        """That of a paralyzable pixel; None for the other one, without dead time the two are one."""
         return Paralyzable(exposure / self.dead_time, self.levels) if self.paralyzable and self.dead_time else None
 
     def _live(self, arrivals: Array, exposure: float) -> Array:
@@ -183,11 +184,21 @@ class CountingSPAD(SPAD):
         share = 1 - np.arange(self.levels) * (self.dead_time / exposure)
         return arrivals[:, None] * np.maximum(share, 0)
 
+    def steps(self, exposure: float) -> tuple[Callable[[Array, Array], Array], Callable[[Array, Array], Array]]:
+        """F_k and dF_k/darrivals of a non-paralyzable pixel for pairs: codes int [p], Poisson means [p] -> [p]."""
+        from scipy.special import gammaincc
+
+        share = np.maximum(1 - np.arange(self.levels) * (self.dead_time / exposure), 0)
+        return (
+            lambda k, mean: gammaincc(k + 1.0, mean * share[k]),
+            lambda k, mean: -share[k] * np.exp(poisson_log_pmf(mean * share[k], k)),
+        )
+
     def _cdf(self, arrivals: Array, exposure: float) -> Array:
         """F_k = P(N < k + 1) = Q(k + 1, live_k): the regularised incomplete gamma function."""
         from scipy.special import gammaincc
 
-        if (paralyzable := self._paralyzable(exposure)) is not None:
+        if (paralyzable := self.dead_time_law(exposure)) is not None:
             return paralyzable.cdf(arrivals)
         cdf = gammaincc(np.arange(1.0, self.levels + 1), self._live(arrivals, exposure))
         cdf[:, -1] = 1.0
@@ -197,7 +208,7 @@ class CountingSPAD(SPAD):
         """P(N = k) = Pois(k; live_(k-1)) + integral of Pois(k; x) from live_k to live_(k-1): two positive terms."""
         from scipy.special import gammainc, gammaincc
 
-        if (paralyzable := self._paralyzable(exposure)) is not None:
+        if (paralyzable := self.dead_time_law(exposure)) is not None:
             return paralyzable.log_pmf(arrivals, wanted)
         live = self._live(arrivals, exposure)
         before, k = np.column_stack([arrivals, live[:, :-1]]), np.arange(self.levels)
@@ -241,7 +252,7 @@ class CountingSPAD(SPAD):
 
     def _slope(self, arrivals: Array, exposure: float) -> Array:
         """dF_k/dlive_k = -Pois(k; live_k)."""
-        if (paralyzable := self._paralyzable(exposure)) is not None:
+        if (paralyzable := self.dead_time_law(exposure)) is not None:
             return paralyzable.slope(arrivals)
         k = np.arange(self.levels)
         share = np.maximum(1 - k * (self.dead_time / exposure), 0)

@@ -48,7 +48,7 @@ def test_arrows_point_one_way(path):
     if "mitsuba" in used:
         assert name in {"qsim/engine.py", "qsim/render.py"}, "only engine.py and render.py import Mitsuba"
     if "drjit" in used:
-        assert name in {"qsim/engine.py", "qsim/render.py", "qsim/lanes.py"}
+        assert name in {"qsim/engine.py", "qsim/render.py", "qsim/lanes.py", "qsim/jit.py", "qsim/lookup.py"}
     if name.startswith("quiver/") and "qsim" in used:
         allowed = name == "quiver/data.py" or name.startswith("quiver/baselines/")
         assert allowed, "quiver reaches qsim through data.py and baselines/ only"
