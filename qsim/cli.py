@@ -10,6 +10,7 @@ import math
 import os
 import sys
 from collections.abc import Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from qsim.cli_data import add_check, add_generate, add_plan
 from qsim.cli_look import add_preview, add_report
 from qsim.cli_studies import add_calibrate, add_tradeoff, add_validate
 from qsim.completion import add_completion
-from qsim.console import EXTRAS, GOES_ON, Parser, bar, checked, command, output, run
+from qsim.console import EXTRAS, GOES_ON, Parser, bar, checked, command, note, output, run
 from qsim.convert import add_convert
 
 
@@ -232,14 +233,16 @@ def _run_sense(args: argparse.Namespace) -> int:
     with bar("sensing") as progress:
         for clip in clips:
             for sensing in wanted:
+                drawn: list[int] = []
 
-                def count(done: int, _: int, start: int = before) -> None:
+                def count(done: int, _: int, start: int = before, drawn: list[int] = drawn) -> None:
+                    drawn.append(done)
                     progress(start + done, frames)
 
-                known = not args.force and sensing.stream_name in clip.streams
-                found, line = stream.sense(clip, sensing, force=args.force, progress=count)
+                waiting = partial(note, f"{clip.path}: waiting for another process that senses this clip")
+                found, line = stream.sense(clip, sensing, force=args.force, progress=count, on_wait=waiting)
                 before += len(clip)
-                facts = {"clip": str(clip.path), "stream": found.name, "made": not known, "light": line}
+                facts = {"clip": str(clip.path), "stream": found.name, "made": bool(drawn), "light": line}
                 made.append(facts | _light(found.meta))
     lines = [f"{m['light']}; {'made' if m['made'] else 'there already'}: stream {m['stream']}" for m in made]
     output(args, {"streams": made}, lines)

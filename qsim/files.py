@@ -39,11 +39,12 @@ def sha256(source: bytes | memoryview | Path) -> str:
 
 def sync_folder(folder: Path) -> None:
     """Make renames inside `folder` survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    with _naming(folder):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 @contextlib.contextmanager
@@ -66,6 +67,30 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     sync_folder(path.parent)
 
 
+@contextlib.contextmanager
+def replacing_described(path: Path, description: Path) -> Iterator[tuple[BinaryIO, BinaryIO]]:
+    """As `replacing`, for a file and its description: what is there under the second name always describes the first.
+
+    Both are complete and synced before the old description goes, so that it is missing for three renames only.
+    """
+    parts = [file.with_name(f"{file.name}.tmp-{os.getpid()}") for file in (path, description)]
+    try:
+        with _naming(description, parts[1]), _naming(path, parts[0]):
+            with open(parts[0], "wb") as file, open(parts[1], "wb") as text:
+                yield file, text
+                for written in (file, text):
+                    written.flush()
+                    os.fsync(written.fileno())
+            description.unlink(missing_ok=True)
+            os.replace(parts[0], path)
+            os.replace(parts[1], description)
+    except BaseException:
+        for part in parts:
+            part.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
 def append_line(path: Path, line: bytes) -> None:
     """Add a line to a journal, synced; a killed writer leaves at most a last line cut short."""
     with _naming(path), open(path, "ab") as journal:
@@ -80,22 +105,47 @@ def _naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno is not None and error.filename in (None, str(temporary)):
+        if error.errno is not None and (error.filename is None or str(error.filename) == str(temporary)):
             error.filename = str(path)
-            error.filename2 = None
+            with contextlib.suppress(AttributeError):
+                del error.filename2  # None would be printed: "-> None"
         raise
 
 
-def sweep(folder: Path, pattern: str = "*") -> None:
-    """Delete what killed writers of `folder` left: temporary files and half-removed folders of files named `pattern`.
+def wording(error: BaseException) -> str:
+    """An error in one line; an `OSError` of the system as `FILE: reason`, without number, quotes and second file."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{os.fsdecode(error.filename)}: {error.strerror}" if error.filename else error.strerror
+    return " ".join(str(error).split()) or type(error).__name__
 
-    Only for a caller who holds the lock that all writers of the folder take.
+
+_LEFTOVER = re.compile(r"(.+)\.(?:tmp|removed)-\d+", re.DOTALL)
+
+
+def sweep(path: Path) -> None:
+    """Delete what killed writers of `path` left beside it: NAME.tmp-PID and NAME.removed-PID, of this exact NAME.
+
+    Only for a caller who holds the lock that all writers of `path` take.
     """
-    for leftover in [*folder.rglob(f"{pattern}.tmp-*"), *folder.glob(f"{pattern}.removed-*")]:
-        if leftover.is_dir():
-            shutil.rmtree(leftover)
-        else:
-            leftover.unlink(missing_ok=True)
+    for leftover in path.parent.iterdir():
+        found = _LEFTOVER.fullmatch(leftover.name)
+        if found and found[1] == path.name:
+            _remove(leftover)
+
+
+def sweep_below(folder: Path) -> None:
+    """Delete every temporary file in `folder` and below; for a caller who is the only writer there."""
+    for leftover in list(folder.rglob("*.tmp-*")):
+        if _LEFTOVER.fullmatch(leftover.name):
+            _remove(leftover)
+
+
+def _remove(path: Path) -> None:
+    """Delete a file or folder; of a symbolic link only the link."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def write_bytes(path: Path, content: bytes | memoryview) -> str:
@@ -254,7 +304,15 @@ def check_version(path: Path, found: object, known: int) -> None:
 
 
 def remove_folder(folder: Path) -> None:
-    """Delete a folder so that no moment leaves something that looks whole: it first loses its name."""
+    """Delete a folder so that no moment leaves something that looks whole: it first loses its name.
+
+    `ValueError` for a symbolic link, which stays, with what it points to.
+    """
+    if folder.is_symlink():
+        raise ValueError(
+            f"{folder}: is a symbolic link to {os.readlink(folder)}, which is not replaced; move the folder here, "
+            "or delete the link"
+        )
     doomed = folder.with_name(f"{folder.name}.removed-{os.getpid()}")
     os.replace(folder, doomed)
     shutil.rmtree(doomed)
@@ -273,19 +331,40 @@ class Lock:
 
     def acquire(self, *, wait: bool = False, on_wait: Callable[[], None] | None = None) -> bool:
         """Take the lock. With `wait`, `on_wait` is called once before waiting for another holder."""
-        # Open as long as the lock is held; for reading too, because NFS wants that for a shared lock.
-        file = open(self.path, "a+b")  # noqa: SIM115
-        try:
-            fcntl.flock(file, self.mode | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if not wait:
+        while True:
+            # Open as long as the lock is held; for reading too, because NFS wants that for a shared lock.
+            file = open(self.path, "a+b")  # noqa: SIM115
+            try:
+                try:
+                    fcntl.flock(file, self.mode | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    if not wait:
+                        file.close()
+                        return False
+                    if on_wait is not None:
+                        on_wait()
+                        on_wait = None
+                    fcntl.flock(file, self.mode)
+                if self._is_current(file):
+                    self._file = file
+                    return True
+            except BaseException:
                 file.close()
-                return False
-            if on_wait is not None:
-                on_wait()
-            fcntl.flock(file, self.mode)
-        self._file = file
-        return True
+                raise
+            file.close()  # its holder deleted it: the lock is on another file by now
+
+    def _is_current(self, file: BinaryIO) -> bool:
+        """Whether the opened file is still the one of that name."""
+        try:
+            return os.path.samestat(os.fstat(file.fileno()), os.stat(self.path))
+        except FileNotFoundError:
+            return False
+
+    def delete(self) -> None:
+        """Delete the lock's file and give the lock back; who waits for it takes a new one."""
+        if self._file is not None:
+            self.path.unlink(missing_ok=True)
+        self.release()
 
     def is_current(self) -> bool:
         """Whether the locked file still has its name: a holder before us may have deleted it while we opened it."""

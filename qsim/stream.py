@@ -8,7 +8,10 @@ NAME.json is written last and holds everything needed to draw any frame again: s
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import hashlib
+import io
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -98,7 +101,30 @@ class Stream:
 
     @cached_property
     def packed(self) -> Array:
-        """The packed array [T, H, ceil(W*bits/8)] as a memory map; `ValueError` if the file does not fit its json."""
+        """The packed array [T, H, ceil(W*bits/8)] as a memory map; `ValueError` if the file does not fit its json.
+
+        Also if both were replaced since the stream was opened. Once mapped, the codes stay those of this json.
+        """
+        while True:
+            before = self._written()
+            array = self._mapped()
+            if self._written() == before:  # no writer came between json and codes
+                return array
+
+    def _written(self) -> tuple[int, ...]:
+        """Which file the json is now; `ValueError` if it describes other codes than when it was opened."""
+        described = self.path.with_suffix(".json")
+        problem = f"{described}: was replaced since it was opened; open the stream again"
+        try:
+            status = described.stat()
+            now = files.read_json(described)
+        except FileNotFoundError:
+            raise ValueError(problem) from None
+        if now.get("sha256", now) != self.meta.get("sha256", self.meta):
+            raise ValueError(problem)
+        return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+    def _mapped(self) -> Array:
         frames, height, width = self.shape
         expected = (frames, height, codes.packed_width(width, self.bits))
         if not self.path.is_file():
@@ -129,7 +155,13 @@ class Stream:
 
     def verify(self, progress: Progress | None = None) -> list[str]:
         """Problems of the stream's files in words; empty if they are what was written."""
-        return files.differs(self.path, self.meta.get("sha256"))
+        problems = files.differs(self.path, self.meta.get("sha256"))
+        try:
+            if problems:
+                self._written()
+        except ValueError as error:  # replaced meanwhile
+            return [str(error)]
+        return problems
 
     def unsealed(self) -> list[Path]:
         """The description, if it holds no checksum of its own: an earlier version made it."""
@@ -172,39 +204,76 @@ def write_stream(clip: Clip, name: str, codes_iter: Iterable[Array], sensor: Sen
 
 def write_packed(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
     """As `write_stream` for blocks that are packed already: uint8 [t, H, ceil(W bits / 8)]."""
+    with writing(clip):
+        return _write(clip, name, blocks, sensor, meta)
+
+
+@contextlib.contextmanager
+def writing(clip: Clip, on_wait: Callable[[], None] | None = None) -> Iterator[None]:
+    """One process at a time writes streams of a clip; the others wait, after a call of `on_wait`."""
+    folder = clip.path / "streams"
+    folder.mkdir(exist_ok=True)
+    lock = files.Lock(folder / "lock")
+    lock.acquire(wait=True, on_wait=on_wait)
+    try:
+        yield
+    finally:
+        lock.delete()
+
+
+def _tidy(clip: Clip) -> None:
+    """Delete the lock of a writer that was killed between writing its stream and deleting it."""
+    lock = files.Lock(clip.path / "streams" / "lock")
+    with contextlib.suppress(OSError):  # a folder that may only be read
+        if lock.path.exists() and lock.acquire():
+            lock.delete()
+
+
+def _write(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
+    """Write the codes and the json; the caller holds the clip's lock."""
     frames, height, width = meta["shape"]
     bits = sensor.bits
     row = codes.packed_width(width, bits)
     folder = clip.path / "streams"
-    folder.mkdir(exist_ok=True)
     json_path, path = folder / f"{check_name(name)}.json", folder / f"{name}.npy"
-    json_path.unlink(missing_ok=True)  # from here on the old stream, if any, is not accepted any more
-    done = 0
-    with files.replacing(path) as file:
-        header = {"descr": "|u1", "fortran_order": False, "shape": (frames, height, row)}
-        np.lib.format.write_array_header_1_0(file, header)
+    for file in (json_path, path):
+        files.sweep(file)
+    done, digest = 0, hashlib.sha256()
+    with files.replacing_described(path, json_path) as (stored, described):
+        head = _header(frames, height, row)
+        stored.write(head)
+        digest.update(head)
         for block in blocks:
             if block.shape[1:] != (height, row) or block.dtype != np.uint8:
                 raise ValueError(f"{path}: packed frame {done} is {block.dtype} {block.shape[1:]}, not {(height, row)}")
-            file.write(np.ascontiguousarray(block).data)
+            part = np.ascontiguousarray(block).data
+            stored.write(part)
+            digest.update(part)
             done += len(block)
         if done != frames:
             raise ValueError(f"{path}: got {done} frames, expected {frames}")
-    full = {
-        "format_version": FORMAT_VERSION,
-        "bits": bits,
-        "width": width,
-        "bit_order": "msb",
-        "orientation": orientation(clip.meta),
-        "code_model": sensor.code_model,
-        "sensor": sensor.to_dict(),
-        "planes_per_code": 1,
-        "sha256": files.sha256(path),
-        "software": {"qsim": __version__},
-    } | meta
-    full["shape"] = [frames, height, width]
-    files.write_description(json_path, full)
+        full = {
+            "format_version": FORMAT_VERSION,
+            "bits": bits,
+            "width": width,
+            "bit_order": "msb",
+            "orientation": orientation(clip.meta),
+            "code_model": sensor.code_model,
+            "sensor": sensor.to_dict(),
+            "planes_per_code": 1,
+            "sha256": digest.hexdigest(),
+            "software": {"qsim": __version__},
+        } | meta
+        full["shape"] = [frames, height, width]
+        described.write(files.to_json(files.sealed(full)))
     return Stream.open(json_path)
+
+
+def _header(*shape: int) -> bytes:
+    """The head of a .npy of bytes."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": shape})
+    return file.getvalue()
 
 
 @dataclass(frozen=True)
@@ -260,10 +329,18 @@ def describe(clip: Clip, sensing: Sensing, draw: Draw) -> dict[str, Any]:
     } | ({} if draw.flaws is None else {"defects": draw.flaws.to_dict()})
 
 
-def sense(clip: Clip, sensing: Sensing, *, force: bool = False, progress: Progress | None = None) -> tuple[Stream, str]:
+def sense(
+    clip: Clip,
+    sensing: Sensing,
+    *,
+    force: bool = False,
+    progress: Progress | None = None,
+    on_wait: Callable[[], None] | None = None,
+) -> tuple[Stream, str]:
     """Draw and store a stream; returns it and its line of light. A stream that is already there as asked is kept.
 
-    `FileExistsError` if the name is taken by another stream and `force` is not set.
+    Waits, after a call of `on_wait`, while another process senses this clip. `FileExistsError` if the name is taken by
+    another stream and `force` is not set.
     """
     draw = prepare(clip, sensing)
     meta = describe(clip, sensing, draw)
@@ -276,18 +353,32 @@ def sense(clip: Clip, sensing: Sensing, *, force: bool = False, progress: Progre
         meta["drawn_by"] = "events" if draw.followed else "closed form"
         meta["dead_time_effects"] = dataclasses.asdict(missed)
         line += f"; {missed}: {'photon by photon' if draw.followed else 'below ' + str(TOLERANCE) + ', closed form'}"
+    kept = None if force else _kept(clip, sensing, draw, meta)
+    if kept is not None:
+        _tidy(clip)
+        return kept, line
+    with writing(clip, on_wait):
+        kept = None if force else _kept(clip, sensing, draw, meta)  # made by the process that was waited for
+        if kept is not None:
+            return kept, line
+        blocks = draw.packed(clip, meta["shape"][0], progress)
+        return _write(clip, sensing.stream_name, blocks, draw.sensor, meta), line
+
+
+def _kept(clip: Clip, sensing: Sensing, draw: Draw, meta: dict[str, Any]) -> Stream | None:
+    """The stream that is there as asked, or None; `FileExistsError` if another one has its name."""
     json_path = clip.path / "streams" / f"{sensing.stream_name}.json"
-    if json_path.is_file() and not force:
+    try:
         old = Stream.open(json_path)
-        if (
-            all(old.meta.get(key) == value for key, value in meta.items())
-            and old.meta.get("defects") == meta.get("defects")
-            and old.meta["sensor"] == draw.sensor.to_dict()
-        ):
-            return old, line
-        raise FileExistsError(f"{json_path}: exists with other settings; name this stream with --name, or use --force")
-    blocks = draw.packed(clip, meta["shape"][0], progress)
-    return write_packed(clip, sensing.stream_name, blocks, draw.sensor, meta), line
+    except FileNotFoundError:
+        return None
+    if (
+        all(old.meta.get(key) == value for key, value in meta.items())
+        and old.meta.get("defects") == meta.get("defects")
+        and old.meta["sensor"] == draw.sensor.to_dict()
+    ):
+        return old
+    raise FileExistsError(f"{json_path}: exists with other settings; name this stream with --name, or use --force")
 
 
 def replay(clip: Clip, stream: Stream, frame: int) -> tuple[Array, Array]:
