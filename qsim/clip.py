@@ -181,7 +181,7 @@ class Clip:
             try:
                 problems += Stream.open(path).verify()
             except (ValueError, OSError) as error:
-                problems.append(str(error))
+                problems.append(files.wording(error))
             report(done, total)
         return problems
 

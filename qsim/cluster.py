@@ -93,4 +93,4 @@ def _distributed() -> Any:
 
 
 def _short(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
+    return files.wording(error)[:200]

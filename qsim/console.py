@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 
 from qsim import stream
 from qsim.checks import suggest
-from qsim.files import FULL
+from qsim.files import FULL, wording
 
 GOES_ON = "the same command goes on where it stopped"
 STARTS_AGAIN = "nothing half-written is left; run the same command again"
@@ -172,20 +172,18 @@ def note(text: str) -> None:
 
 def one_line(error: BaseException) -> str:
     """The message of an error in one line; an `OSError` of the system names its file and the reason."""
-    if isinstance(error, OSError) and error.strerror and error.filename:
-        if error.errno in (errno.ENOTDIR, errno.EEXIST):
-            path = Path(os.fsdecode(error.filename))
-            for in_the_way in filter(Path.is_file, (path, *path.parents)):
-                return f"{in_the_way}: is a file where a folder is needed; name another with -o"
-        return f"{error.filename}: {error.strerror}" + (f"; {_MAKE_SPACE}" if error.errno in FULL else "")
+    if isinstance(error, OSError) and error.filename and error.errno in (errno.ENOTDIR, errno.EEXIST):
+        path = Path(os.fsdecode(error.filename))
+        for in_the_way in filter(Path.is_file, (path, *path.parents)):
+            return f"{in_the_way}: is a file where a folder is needed; name another with -o"
     if isinstance(error, OSError) and error.errno in FULL and error.strerror:
-        return f"{error.strerror}; {_MAKE_SPACE}"
+        return f"{wording(error)}; {_MAKE_SPACE}"
     if isinstance(error, ModuleNotFoundError):
         package = (error.name or "").split(".")[0]
         return f"needs the package {package}, which is not installed: pip install 'qsim[{EXTRAS[package]}]'"
     if isinstance(error, MemoryError):
         return f"not enough memory ({' '.join(str(error).split()) or 'no more to have'}); try fewer or smaller frames"
-    return " ".join(str(error).split()) or type(error).__name__
+    return wording(error)
 
 
 def output(args: argparse.Namespace, found: dict[str, Any], text: str | Sequence[str]) -> None:

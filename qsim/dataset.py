@@ -171,7 +171,7 @@ def verify_job(folder: Path, name: str, expected: dict[str, Any]) -> list[str]:
         record = {} if problems else _read_record(path)
         clip = Clip.open(about.parent)
     except (ValueError, OSError) as error:
-        return [*problems, str(error)]
+        return [*problems, files.wording(error)]
     if not problems and any(record.get(key) != expected[key] for key in ("digest", "split")):
         problems = [f"{path}: is the record of another job"]
     if problems:  # then nothing that it says can be used

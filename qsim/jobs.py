@@ -161,6 +161,11 @@ def record_path(folder: Path, name: str) -> Path:
     return folder / "jobs" / f"{name}.json"
 
 
+def failure_path(folder: Path, name: str) -> Path:
+    """Why the job failed, if it did."""
+    return folder / "failed" / f"{name}.json"
+
+
 def run_job(job: Job, folder: Path, make: Make = render_job) -> Result:
     """Do whatever of a job is not done yet. Failures are written to failed/ and returned, not raised."""
     lock = files.Lock(folder / "locks" / job.name)
@@ -174,7 +179,7 @@ def run_job(job: Job, folder: Path, make: Make = render_job) -> Result:
             if isinstance(error, OSError) and error.errno in files.FULL:
                 raise
             _log(folder, job.name, traceback.format_exc())
-            message = " ".join(str(error).split()) or type(error).__name__
+            message = files.wording(error)
             if not isinstance(error, ValueError | OSError):
                 message = f"{type(error).__name__}: {message}"
             mark_failed(folder, job, message)
@@ -190,16 +195,15 @@ def run_job(job: Job, folder: Path, make: Make = render_job) -> Result:
 def _do(job: Job, folder: Path, make: Make) -> Result:
     """Clip, streams, record: each whole before the next begins."""
     started, worked = time.monotonic(), time.process_time()
-    files.sweep(folder / "clips" / job.name)
-    for place in (folder / "jobs", folder / "failed", folder / "clips"):
-        files.sweep(place, f"{job.name}*")
+    for path in (record_path(folder, job.name), failure_path(folder, job.name), folder / "clips" / job.name):
+        files.sweep(path)
     clip = _clip(job, folder, make)
     rendered = time.monotonic()
     for sensing in job.streams:
         _, line = stream.sense(clip, sensing)
         _log(folder, job.name, line)
     files.write_json(record_path(folder, job.name), make_record(job, clip.path))
-    (folder / "failed" / f"{job.name}.json").unlink(missing_ok=True)
+    failure_path(folder, job.name).unlink(missing_ok=True)
     seconds = (rendered - started, time.monotonic() - rendered)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     spent = f"clip {seconds[0]:.2f} s, streams {seconds[1]:.2f} s, "
@@ -219,12 +223,17 @@ def make_record(job: Job, clip: Path) -> dict[str, Any]:
 
 def mark_failed(folder: Path, job: Job, message: str) -> None:
     """Remember a failure; `generate` lists it until it is retried."""
-    files.write_json(folder / "failed" / f"{job.name}.json", {"name": job.name, "digest": job.digest, "error": message})
+    files.write_json(failure_path(folder, job.name), {"name": job.name, "digest": job.digest, "error": message})
 
 
 def _clip(job: Job, folder: Path, make: Make) -> Clip:
     """The job's finished clip, rendered if it is not there."""
     path, work = folder / "clips" / job.name, folder / "work" / job.name
+    if path.is_symlink() and not path.is_dir():
+        raise ValueError(
+            f"{path}: is a symbolic link to {os.readlink(path)}, which is not there; mount or move it back, or delete "
+            "the link"
+        )
     if not path.is_dir():
         if not work.is_dir():
             _log(folder, job.name, f"rendering on {platform.node()}, process {os.getpid()}")

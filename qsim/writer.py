@@ -53,14 +53,16 @@ class ClipWriter:
     def __init__(self, path: str | os.PathLike[str], meta: dict[str, Any], *, force: bool = False) -> None:
         self.path = Path(path)
         self.force = force
-        check_name(self.path.name)
+        self.name = check_name(self.path.name)
+        if self.path.is_symlink():  # the link stays; the clip is written where it points to
+            self.path = self.path.resolve()
         if self.path.exists() and not force:
             raise FileExistsError(f"{self.path}: exists; name another with -o, or use --force to replace it")
         if self.path.exists() and not (self.path / "clip.json").is_file():
             raise FileExistsError(
                 f"{self.path}: exists and is no clip, which is all that --force replaces; use another -o"
             )
-        self.meta = json.loads(files.to_json({"format_version": FORMAT_VERSION, "name": self.path.name} | meta))
+        self.meta = json.loads(files.to_json({"format_version": FORMAT_VERSION, "name": self.name} | meta))
         _check_new(self.path, self.meta)
         self.part = self.path.with_name(self.path.name + ".part")
         self._camera = camera_of(self.meta, self.path)
@@ -88,9 +90,8 @@ class ClipWriter:
                 self._clear()
                 self._whole = False
                 files.write_bytes(begun, identity)
-            files.sweep(self.part)
-            for leftover in self.path.parent.glob(f"{self.path.name}.removed-*"):  # of a replacement cut short
-                shutil.rmtree(leftover)
+            files.sweep_below(self.part)
+            files.sweep(self.path)  # a replacement cut short
             self._frames = _read_journal(self.part)
         except BaseException:
             self._lock.release()
@@ -165,7 +166,7 @@ class ClipWriter:
         """This clip's clip.json in .part: the writer was killed while giving the folder its name. Else empty."""
         with contextlib.suppress(OSError, ValueError):
             left = files.read_json(self.part / "clip.json")
-            return left if left.get("name") == self.path.name else {}
+            return left if left.get("name") == self.name else {}
         return {}
 
     def _asked_before(self) -> bytes:
