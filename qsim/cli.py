@@ -115,7 +115,12 @@ def _add_render(sub: Any) -> None:
     rate, shutter, psnr = (checked(check) for check in (checks.frame_rate, checks.shutter, checks.psnr))
     parser.add_argument("--frame-rate", type=rate, default=2000.0, help="frames per second (default 2000)")
     parser.add_argument("--shutter", type=shutter, default=0.0, help="open share of a frame, 0..1 (default 0: sharp)")
-    parser.add_argument("--psnr", type=psnr, default=40.0, help="wanted error of the radiance, dB (default 40)")
+    parser.add_argument(
+        "--psnr",
+        type=psnr,
+        default=40.0,
+        help="wanted error of the radiance, dB below white, clamped there (default 40)",
+    )
     light = checked(checks.positive)
     parser.add_argument("--ppp", type=light, help="brightest light level that will be sensed, photons per pixel")
     parser.add_argument(
@@ -127,6 +132,7 @@ def _add_render(sub: Any) -> None:
 def _run_render(args: argparse.Namespace) -> int:
     import scenes
     from qsim import budget, engine, optics, render
+    from qsim.white import stated
 
     if args.output is None and not args.explain:
         raise ValueError("the following arguments are required: -o/--output; only --explain does without")
@@ -160,11 +166,12 @@ def _run_render(args: argparse.Namespace) -> int:
             progress=progress,
             force=args.force,
         )
-    psnr = clip.meta.get("psnr_of_truth")
+    found = stated(clip.meta)
     text = f"{clip.path}: {len(clip)} frames of {args.height} x {args.width}"
     text += f", mean radiance {clip.mean_radiance:.4g} W/m2/sr"
-    text += f", {clip.mean_photons:.4g} photons per pixel" + (f", error {psnr:.1f} dB" if psnr else "")
-    text += (missed := budget.shortfall(psnr, args.psnr)) and f"\nerror: {missed}"
+    text += f", {clip.mean_photons:.4g} photons per pixel"
+    text += "" if found is None else f"\nerror: {found.line}"
+    text += (missed := budget.shortfall(found, args.psnr)) and f"\nerror: {missed}"
     if "fireflies_per_frame" in clip.meta:
         fireflies, pixels = sum(clip.meta["fireflies_per_frame"]), math.prod(clip.shape)
         how = "counted before denoising" if chosen.denoise else "counted and left in"

@@ -64,9 +64,10 @@ def _run_generate(args: argparse.Namespace) -> int:
 def _noisy(folder: Path, jobs: list[Job]) -> list[str]:
     """The finished clips whose radiance misses the error that the recipe asks for."""
     from qsim.budget import shortfall
+    from qsim.white import stated
 
     described = {job.name: folder / "clips" / job.name / "clip.json" for job in jobs}
-    found = {name: files.read_json(path).get("psnr_of_truth") for name, path in described.items() if path.is_file()}
+    found = {name: stated(files.read_json(path)) for name, path in described.items() if path.is_file()}
     missed = {job.name: shortfall(found.get(job.name), job.settings.psnr) for job in jobs}
     return [f"{name}: {why}" for name, why in missed.items() if why]
 

@@ -234,6 +234,11 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
     for job in recipe.jobs:
         if job.name not in old:
             raise ValueError(f"{folder}: was made from another recipe, without the clip {job.name}; use another folder")
+        if old[job.name]["digest"] == job.digest_with():
+            raise ValueError(
+                f"{folder}: was begun by an earlier version, whose psnr meant dB below the 99.9th percentile; now it "
+                "is dB below white, and one data set holds one kind: finish it with that version, or use another folder"
+            )
         if old[job.name]["digest"] != job.digest:
             raise ValueError(f"{folder}: its clip {job.name} was asked for with other settings; use another folder")
     extra = sorted(set(old) - {job.name for job in recipe.jobs})

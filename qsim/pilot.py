@@ -15,11 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.budget import COUNTS, Budget, Finding, grid_samples
+from qsim.budget import COUNTS, Allowed, Budget, Finding, grid_samples
 from qsim.denoise import AROUND, DENOISE_COST, available, cleaned_mean
 from qsim.motion import Still
 from qsim.render import Renderer, instants
 from qsim.scene import Camera, Motion, Scene
+from qsim.white import Errors
 
 PIXELS = 3000
 MOST_MORE = 3  # frames beyond the first, the middle and the last for what these do not show, and for what moves
@@ -27,6 +28,7 @@ WINDOW = 96  # px, side of the windows in which the denoiser is tried, one in th
 MOST_LOOKS = 256  # frames of a clip in which motion and bodies are looked at
 STAGE = 18  # of the random keys
 LUCK = 3.0  # times less raw noise than the pilot's: chance
+CAREFUL = 2.0  # standard errors added to the error of a trial: a lucky one would hold for the whole clip
 MOST_DENOISED = 256  # samples per instant up to which the error of denoised pictures is foretold
 
 
@@ -72,18 +74,19 @@ class Pilot:
         """Flow, depth and the rest at each time."""
         return [self.renderer.truth(t) for t in self.times]
 
-    def changes(self, count: int, bounces: int) -> float:
-        """The rms difference between the means of K and of 3 K or 5 K instants, the larger [W m^-2 sr^-1].
+    def changes(self, count: int, bounces: int, white: float) -> Errors:
+        """The differences between the means of K and of 3 K or 5 K instants, the larger ones.
 
         Two, because what returns after a third of a step looks like rest among 3 K. The K are among both, and all
         instants draw the same paths, so that what rests adds nothing. The square is the product of the differences of
         two independent halves, which noise changes by nothing on average.
         """
-        squares = np.zeros(2)
+        squares = np.zeros((2, 2))
         for t in self.times:
-            few, *more = (self.blurred(t, count * times, bounces) for times in (1, 3, 5))
-            squares += [float(np.mean(np.prod(few - many, axis=0))) / len(self.times) for many in more]
-        return math.sqrt(max(*squares, 0.0))
+            means = [self.blurred(t, count * times, bounces) for times in (1, 3, 5)]
+            for i, (few, *more) in enumerate((np.minimum(means, white), means)):
+                squares[i] += [float(np.mean(np.prod(few - many, axis=0))) / len(self.times) for many in more]
+        return Errors(*np.sqrt(np.maximum(squares.max(axis=1), 0)).tolist())
 
     def blurred(self, t: int, count: int, bounces: int) -> Array:
         """Two independent estimates of frame t's mean over so many instants, [2, H, W], with the same paths in each."""
@@ -130,15 +133,17 @@ def denoised_samples(
     pilot: Pilot,
     count: int,
     bounces: int,
-    target: float,
+    allowed: Allowed,
+    share: float,
     raw: int,
     wanted: bool | None,
-    expected: Callable[[int], float],
+    expected: Callable[[int], Errors],
 ) -> tuple[int | None, Finding]:
     """Samples of a frame with which denoised windows have the error asked for, or None where `raw` ones cost less.
 
     Windows of the clip's middle frame, every pixel of them, with `count` instants. `wanted` None means: where it costs
-    less. `expected(samples)` is the rms error of raw ones: a trial far below has missed rare paths and is not believed.
+    less. `expected(samples)` are the errors of raw ones: a trial far below has missed rare paths and is not believed.
+    The error asked for is this share of what is allowed.
     """
     renderer, t = pilot.renderer, pilot.middle
     camera = renderer.scene.camera
@@ -155,22 +160,24 @@ def denoised_samples(
     surfaces = [window.surfaces(times, key) for window in windows]
     errors: list[float] = []
     for samples in tried:
-        noisy, cleaned = 0.0, 0.0
+        squares = np.zeros(3)  # of the raw halves, and of what is made of them, at white and without a clamp
         for window, (albedo, normal) in zip(windows, surfaces, strict=True):
             halves = window.halves(times, Budget(samples, bounces), key)
-            noisy += float(np.mean((halves[0] - halves[1]) ** 2)) / 4 / len(windows)
-            cleaned += cleaned_mean(halves, albedo, normal)[1] ** 2 / len(windows)
-        missed = LUCK * math.sqrt(noisy) < expected(samples)
-        errors.append(expected(samples) if missed else math.sqrt(cleaned))
-        if errors[-1] <= target:
+            mixed = cleaned_mean(halves, albedo, normal, allowed.white)
+            found = (Errors.of_halves(halves, allowed.white).plain, mixed.error_at(allowed.white, CAREFUL), mixed.error)
+            squares += np.square(found) / len(windows)
+        noisy, *cleaned = np.sqrt(squares).tolist()
+        missed = LUCK * noisy < expected(samples).plain
+        errors.append(allowed.part(expected(samples) if missed else Errors(*cleaned)))
+        if errors[-1] <= share:
             break
     where = f"{'' if len(windows) == 1 else 'four windows of '}frame {t}"
-    needed, size = _needed(tried, errors, target), f"rms {target:.2g} in {where}"
+    needed, size = _needed(tried, errors, share), f"tried in {where}"
     most = MOST_DENOISED * count
     if needed > most:
         if not wanted:
             return None, cheap
-        needed, size = most, f"rms {errors[-1]:.2g} with {samples} samples, above the target"
+        needed, size = most, f"{errors[-1]:.2g} times the error allowed with {samples} samples"
     chosen = 2 * count * grid_samples(math.ceil(needed / count / 2))
     if not wanted and chosen + DENOISE_COST >= raw:
         return None, cheap

@@ -7,7 +7,7 @@
     width = 128
     frame_rate = 2000.0        # frames per second of the scene's time
     shutter = 0.0              # open share of a frame, 0..1; 0: a sharp instant with the light of a whole frame
-    psnr = 40.0                # wanted error of the radiance, dB
+    psnr = 40.0                # wanted error of the radiance, dB below white, clamped there (white.py)
     seed = 0                   # of the samples and of the noise
 
     [[scenes]]                 # one clip per family, seed and speed
@@ -55,7 +55,7 @@ class Settings:
     width: int  # pixels
     frame_rate: float  # Hz
     shutter: float = 0.0  # open share of a frame
-    psnr: float = 40.0  # dB, wanted error of the radiance
+    psnr: float = 40.0  # dB below white, wanted error of the radiance
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,10 @@ class Job:
     @property
     def digest(self) -> str:
         """SHA-256 of everything that decides the job's files."""
+        return self.digest_with(psnr_unit="below white")
+
+    def digest_with(self, **more: str) -> str:
+        """The same with what else decides; without any, that of versions whose psnr was below the 99.9th percentile."""
         described = dataclasses.asdict(self) | {"family": Path(self.family).stem}
         described["streams"] = [stream | {"sensor": Path(stream["sensor"]).name} for stream in described["streams"]]
         for stream in described["streams"]:  # what is off stays out, so that data sets of earlier versions go on
@@ -93,7 +97,7 @@ class Job:
         own = [path for path in (self.family, *(stream.sensor for stream in self.streams)) if Path(path).is_absolute()]
         if own:  # by content: what a file says decides, not what it is called
             described["own"] = [_contents(path) for path in own]
-        return hashlib.sha256(to_json(described)).hexdigest()
+        return hashlib.sha256(to_json(described | more)).hexdigest()
 
 
 def _contents(path: str) -> str:

@@ -31,6 +31,7 @@ from qsim.keys import Key, hash_name, words
 from qsim.scene import Camera, Motion, Scene, describe
 from qsim.translate import Stage
 from qsim.truth import Hits
+from qsim.white import Errors, frame_errors, rms, white_in
 
 Crop = tuple[int, int, int, int]  # y, x, height, width
 
@@ -49,6 +50,7 @@ class Frame:
 
     radiance: Array  # float32 [H, W], W m^-2 sr^-1, mean over the exposure
     error: float  # rms error of `radiance`, W m^-2 sr^-1: noise and blur as measured, and the budget's `left_out`
+    errors_at: tuple[tuple[float, float], ...]  # (white, the same clamped there), rising; empty without light
     fireflies: int  # pixels whose halves differ by more than FIREFLY rms, or are not finite (and made 0)
     sharp: Array | None = None  # float32 [H, W], the instant at mid-exposure, only for an open shutter
     flow: Array | None = None  # float32 [2, H, W], px, mid-exposure of t to that of t + 1
@@ -111,13 +113,13 @@ class Renderer:
     def frame(self, t: int, *, with_truth: bool = True) -> Frame:
         """Render frame t."""
         engines.activate(self.engine)
-        instants = self.instants(t)
-        radiance, error, fireflies = self._exposed(instants, self.key(t))
+        radiance, error, errors_at, fireflies = self._exposed(self.instants(t), self.key(t))
         sharp = None
         if self.shutter > 0 and self.budget.sharp:
             sharp = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))[0]
         # Last, because it leaves the scene at t + 1, where the next frame wants it.
-        return Frame(radiance, error, fireflies, sharp, **(self.truth(t) if with_truth else {}))
+        found = self.truth(t) if with_truth else {}
+        return Frame(radiance, error, errors_at, fireflies, sharp, **found)
 
     def window(self, crop: Crop) -> Renderer:
         """The same loaded scene seen through another crop, every pixel of it."""
@@ -171,20 +173,27 @@ class Renderer:
         """The random key of frame t: another seed, scene or stage draws other samples."""
         return replace(self._key, frame=t, stage=stage)
 
-    def _exposed(self, instants: list[float], key: Key) -> tuple[Array, float, int]:
-        """Mean radiance over the instants, its rms error and the number of fireflies."""
+    def _exposed(self, instants: list[float], key: Key) -> tuple[Array, float, tuple[tuple[float, float], ...], int]:
+        """Mean radiance over the instants, its rms error, the same clamped at some whites, and the fireflies."""
         means = self._means(instants, self.budget, key)
         halves, broken = means[0], ~np.isfinite(means[0]).all(axis=0)
         means[:, :, broken] = 0  # or the denoiser and every mean around would break too
-        blur = blur_left(means, len(instants))
         difference = (halves[0] - halves[1]) / 2
-        error = float(np.sqrt(np.mean(difference**2)))
+        error, radiance = rms(difference), halves.mean(axis=0)
         fireflies = int(np.count_nonzero(broken | ((np.abs(difference) > FIREFLY * error) & (error > 0))))
-        radiance = halves.mean(axis=0)
+        white = self.budget.white or white_in(radiance)
+        mixed = None
         if self.budget.denoise:
-            radiance, error = cleaned_mean(halves, *self.surfaces(instants, key))
-        error = math.hypot(error, blur, self.budget.left_out)
-        return radiance.astype(np.float32), error, fireflies
+            mixed = cleaned_mean(halves, *self.surfaces(instants, key), white)
+            radiance, error = mixed.picture, mixed.error
+
+        def error_at(white: float) -> float:
+            noise = mixed.error_at(white) if mixed else Errors.of_halves(halves, white).at_white
+            left_out = self.budget.left_out_at_white if self.budget.white else self.budget.left_out
+            return math.hypot(noise, blur_left(np.minimum(means, white), len(instants)), left_out)
+
+        whole = math.hypot(error, blur_left(means, len(instants)), self.budget.left_out)
+        return radiance.astype(np.float32), whole, frame_errors(error_at, white), fireflies
 
     def surfaces(self, instants: list[float], key: Key) -> tuple[Array, Array]:
         """Albedo [H, W] (1 where nothing or a mirror is) and normals [H, W, 3] of first surfaces, for the denoiser."""
@@ -476,7 +485,7 @@ def render_clip(
         for t in range(frames):
             if not writer.has(t):
                 frame = renderer.frame(t)
-                writer.add(t, frame.radiance, frame.sharp, frame.truth, frame.error, frame.fireflies)
+                writer.add(t, frame.radiance, frame.sharp, frame.truth, frame.error, frame.fireflies, frame.errors_at)
             if progress is not None:
                 progress(t + 1, frames)
     return Clip.open(path)

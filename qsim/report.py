@@ -23,6 +23,8 @@ from qsim.dataset import Dataset
 from qsim.optics import clip_photons
 from qsim.report_clip import chosen_frames, clip_section, fit, flow_panel, legend, light_name, motion, stream_panels
 from qsim.stream import Progress
+from qsim.truth import MOVING
+from qsim.white import stated
 
 INSIDE_CLIPS = {"streams", "truth", "radiance", "sharp", "jobs", "failed", "logs", "locks", "work"}
 
@@ -105,22 +107,24 @@ def _steps(kind: str, file: Path) -> int:
 def dataset_section(path: Path, step: Callable[[], None] = lambda: None) -> str:
     """A table of the clips of a data set, `step` after each, and the first clip of each split in pictures."""
     data = Dataset.open(path.parent)
-    rows = []
+    rows, below = [], set()
     for name in data.names():
         clip = Clip.open(data.path / "clips" / name)
         split = data.meta["jobs"][name]["split"]
         frames, height, width = clip.shape
         mean, largest = motion(clip, [len(clip) // 2]) if clip.has_truth else (None, None)
-        size = f"{frames} × {height} × {width}"
+        size, found = f"{frames} × {height} × {width}", stated(clip.meta)
         rows.append([name, split, size, clip.mean_radiance, clip.meta.get("mean_photons"), mean, largest,
-                     clip.meta.get("psnr_of_truth")])  # fmt: skip
+                     None if found is None else found.psnr])  # fmt: skip
+        below |= set() if found is None else {found.below.split(" (")[0]}
         step()
+    unit = " or ".join(sorted(below)) or "white"
     headers = [
         "clip", "split", "frames × rows × columns", "mean radiance", "photons per pixel",
-        "motion of what moves [px/frame]", "largest", "radiance's PSNR, peak = 99.9th percentile [dB]",
+        "motion of what moves [px/frame]", "largest", f"radiance's PSNR [dB below {unit}]",
     ]  # fmt: skip
     missing = f"; not made yet: {', '.join(data.missing)}" if data.missing else ""
-    caption = f"{len(rows)} clips{missing}; motion in the middle frame, of pixels that move 0.05 px or more"
+    caption = f"{len(rows)} clips{missing}; motion in the middle frame, of pixels that move more than {MOVING:g} px"
     overview = page.section(f"Data set {data.name}", page.table(page.Table(caption, headers, rows)))
     shown = [clip for split in ("test", "train", "val") for clip in data.clips(split)[:1]]
     return overview + "".join(clip_section(clip) for clip in shown)

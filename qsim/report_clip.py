@@ -13,10 +13,11 @@ from qsim import defects, flaws, page, pictures
 from qsim.clip import RELATIVE, Clip, Stream
 from qsim.optics import clip_photons
 from qsim.stream import electrons_per_photon
+from qsim.truth import MOVING
+from qsim.white import stated
 
 FRAMES = 48  # of a player
 WIDTH = 512  # columns of a panel; wider pictures are shown smaller by a whole factor
-MOVING = 0.05  # px/frame from which a pixel counts as moving
 _PIXELS = 4096  # of a frame, at most, for the expected histogram of codes
 
 
@@ -78,7 +79,7 @@ def motion(clip: Clip, frames: Sequence[int]) -> tuple[float | None, float]:
     """Mean motion of the pixels that move (None if none does) and the 99.9th percentile of all, in px/frame."""
     speed = np.stack([np.hypot(*clip.flow(t)) for t in frames])
     known = speed[np.isfinite(speed)]
-    moving = known[known >= MOVING]
+    moving = known[known > MOVING]
     return float(moving.mean()) if moving.size else None, float(np.percentile(known, 99.9)) if known.size else 0.0
 
 
@@ -151,7 +152,7 @@ def motion_line(clip: Clip, frames: range) -> str:
     moving = (
         "nothing moves"
         if mean is None
-        else f"what moves ({MOVING:g} px/frame or more) moves {mean:.3g} px/frame on average"
+        else f"what moves (more than {MOVING:g} px/frame) moves {mean:.3g} px/frame on average"
     )
     return f"Motion: {moving}; 99.9 % of all pixels at most {largest:.3g} px/frame"
 
@@ -166,8 +167,9 @@ def error_lines(meta: dict[str, Any]) -> list[str]:
             f"Error of a frame (noise, blur, bounces left out): {rms:.3g} rms in the unit of the radiance, "
             f"worst {max(errors):.3g}"
         )
-    if meta.get("psnr_of_truth") is not None:
-        lines.append(f"PSNR of the radiance itself, peak = 99.9th percentile: {meta['psnr_of_truth']:.1f} dB")
+    found = stated(meta)
+    if found is not None:
+        lines.append(f"PSNR of the radiance itself: {found.line}")
     return lines
 
 

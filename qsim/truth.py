@@ -20,6 +20,7 @@ from numpy import ndarray as Array
 
 from qsim.scene import Body, Camera, Scene
 
+MOVING = 0.1  # px per frame; what moves farther counts as moving
 OCCLUSION_TOLERANCE = 1e-4  # relative distance by which a surface may lie before the point that it is itself
 
 

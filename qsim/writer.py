@@ -9,6 +9,7 @@ import json
 import math
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import __version__, exr, files, optics
+from qsim import __version__, exr, files, optics, white
 from qsim.checks import check_name
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ PHYSICAL = "W m^-2 sr^-1"
 RELATIVE = "relative"
 MEASURED = (  # in clip.json, beyond what was asked for
     *("mean_radiance", "mean_photons", "clipped_pixels", "checksums", "software", "checksum"),
-    *("error_per_frame", "psnr_of_truth", "fireflies_per_frame"),
+    *("error_per_frame", "error_at_white_per_frame", "white", "psnr_of_truth", "psnr_unclamped", "fireflies_per_frame"),
 )
 TRUTH = {  # channel of the EXR file -> quantity
     "u": "flow",
@@ -110,10 +111,12 @@ class ClipWriter:
         truth: dict[str, Array] | None = None,
         error: float | None = None,
         fireflies: int | None = None,
+        errors_at: Sequence[Sequence[float]] = (),
     ) -> None:
         """Store frame t: radiance [H, W], optionally the sharp instant, ground truth and the rms error of the radiance.
 
-        `fireflies` counts the pixels that the renderer does not trust; clip.json keeps it beside the error.
+        `fireflies` counts the pixels that the renderer does not trust; clip.json keeps it beside the error. `errors_at`
+        are pairs (white, rms error of radiance and truth clamped there), from which clip.json gets that at its white.
 
         `truth` may hold flow [2, H, W], flow_back [2, H, W], valid, depth, body_id [H, W]. `ValueError` for radiance
         that is negative or not finite, naming frame and pixel.
@@ -140,6 +143,7 @@ class ClipWriter:
         }
         if error is not None:
             entry["error"] = float(error)
+            entry["errors_at"] = [[float(value) for value in pair] for pair in errors_at]
         if fireflies is not None:
             entry["fireflies"] = int(fireflies)
         if self._camera is not None:
@@ -230,22 +234,20 @@ class ClipWriter:
         meta["checksums"] = {name: digest for e in entries for name, digest in e["checksums"].items()}
         meta["software"] = _software()
         if all("error" in e for e in entries):
-            meta["error_per_frame"] = [e["error"] for e in entries]
-            meta["psnr_of_truth"] = self._psnr(meta["error_per_frame"])
+            errors, errors_at = [e["error"] for e in entries], [e.get("errors_at", []) for e in entries]
+            meta |= white.measured(meta["mean_radiance"], self._high(), errors, errors_at)
         if all("fireflies" in e for e in entries):
             meta["fireflies_per_frame"] = [e["fireflies"] for e in entries]
         files.write_description(self.part / "clip.json", meta)
 
-    def _psnr(self, errors: list[float]) -> float | None:
-        """PSNR of the radiance, dB; the peak is the clip's 99.9th percentile (over at most 4 million even samples)."""
+    def _high(self) -> float:
+        """The 99.9th percentile of the radiance, over at most 4 million even samples."""
         frames, height, width = self.meta["shape"]
         step = max(1, math.isqrt(frames * height * width // 4_000_000))
         samples = [
             exr.read_half(self.part / "radiance" / f"{t:06d}.exr", height, width)[::step, ::step] for t in range(frames)
         ]
-        peak = float(np.percentile(np.stack(samples), 99.9))
-        rms = math.sqrt(math.fsum(e * e for e in errors) / frames)
-        return 20 * math.log10(peak / rms) if peak > 0 and rms > 0 else None
+        return float(np.percentile(np.stack(samples), 99.9))
 
 
 def camera_of(meta: dict[str, Any], where: Path) -> Camera | None:

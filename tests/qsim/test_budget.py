@@ -10,11 +10,12 @@ import pytest
 from small_scenes import CAMERA, plate, renderer, scene, square
 
 from qsim import budget, pilot
-from qsim.budget import Budget, blur_error, choose, explain, grid_samples, shortfall
+from qsim.budget import Allowed, Budget, Noise, blur_error, choose, explain, grid_samples, shortfall
 from qsim.denoise import available, mixture
 from qsim.motion import Oscillation, Spin, Translation
 from qsim.render import Renderer, blur_left
 from qsim.scene import Body, Diffuse, Glow, PointLight, Scene, SunSky, Texture
+from qsim.white import Errors, Stated, decibels, error_at, white_in
 
 
 def test_sample_counts_are_those_of_the_sampler(capfd):
@@ -61,8 +62,8 @@ def test_the_error_asked_for_is_reached_without_waste(psnr):
     made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
     chosen = choose(made, psnr=psnr, denoise=False)
     frames = [Renderer(made, budget=chosen).frame(t, with_truth=False) for t in (1, 9)]
-    peak = np.percentile([frame.radiance for frame in frames], 99.9)
-    reached = -20 * math.log10(math.sqrt(np.mean([frame.error**2 for frame in frames])) / peak)
+    white = white_in(np.stack([frame.radiance for frame in frames]))
+    reached = decibels(white, math.sqrt(np.mean([error_at(white, frame.errors_at) ** 2 for frame in frames])))
     assert psnr - 1 < reached < psnr + 10  # samples come in even squares: 4, 16, 36
 
 
@@ -114,19 +115,20 @@ def test_a_shadow_that_moves_on_a_wall_at_rest_is_blurred_too():
     for count in (3, chosen.sub_frames, 45):
         one = renderer(made, shutter=1.0, budget=replace(chosen, samples=64 * count, sub_frames=count))
         means[count] = one.frame(10, with_truth=False).radiance
-    allowed = np.percentile(means[45], 99.9) * 10 ** (-55 / 20)
+    allowed = white_in(means[45]) * 10 ** (-55 / 20)
     far = {count: math.sqrt(np.mean((image - means[45]) ** 2)) for count, image in means.items()}
     assert far[chosen.sub_frames] < allowed < far[3]
 
 
 def held(made: Scene, psnr: float, t: int) -> tuple[Budget, float, float, float]:
-    """What is chosen for an open shutter; rms error allowed, of frame t against 315 instants, and stated."""
+    """What is chosen for an open shutter; rms error at white allowed, of frame t against 315 instants, and stated."""
     chosen = choose(made, shutter=1.0, psnr=psnr, denoise=False)
     frame = renderer(made, shutter=1.0, budget=chosen).frame(t, with_truth=False)
     many = Budget(8 * 315, chosen.bounces, 315, sharp=False)
     truth = renderer(made, shutter=1.0, seed=1, budget=many).frame(t, with_truth=False).radiance
-    allowed = float(np.percentile(truth, 99.9)) * 10 ** (-psnr / 20)
-    return chosen, allowed, float(np.sqrt(np.mean((frame.radiance - truth) ** 2))), frame.error
+    white = white_in(truth)
+    real = Errors.between(frame.radiance, truth, white).at_white
+    return chosen, white * 10 ** (-psnr / 20), real, error_at(white, frame.errors_at)
 
 
 def test_a_wheel_that_turns_once_in_the_exposure_has_not_rested():
@@ -137,7 +139,7 @@ def test_a_wheel_that_turns_once_in_the_exposure_has_not_rested():
     assert chosen.sub_frames >= 15
     assert real < allowed
     assert 0.3 < stated / real < 4  # its instants are told by thirds, of a shape with four of everything
-    assert "motion up to 0.00" not in explain(chosen)
+    assert "0 % of the pixels move" not in explain(chosen)
 
 
 def test_a_body_that_no_pilot_frame_shows_is_found():
@@ -184,20 +186,21 @@ def test_every_third_instant_tells_the_error_of_all(count, edges):
 
 def test_instants_are_foretold_beyond_the_trials_and_their_limit_is_said():
     rest = np.zeros((1, 8, 8))
-    count, left, finding = budget._instants(rest, 0.01, 1.0, lambda k: 0.9 / k)
+    count, left, finding = budget.fewest_instants(rest, 1.0, lambda k: 27 / k)
     assert 90 <= count <= 96
-    assert left == pytest.approx(0.9 / count)
+    assert left == pytest.approx(27 / count)
     assert "light and shadow" in finding.size
-    count, left, finding = budget._instants(rest, 1e-5, 1.0, lambda k: 0.9 / k)
+    count, left, finding = budget.fewest_instants(rest, 1.0, lambda k: 2700 / k)
     assert count == budget.MOST_INSTANTS
-    assert left > 1e-3
+    assert left > 1
     assert f"the limit of {count} instants is reached" in finding.size
 
 
 def test_a_lucky_small_pilot_is_not_believed():
     """A caustic that 8 samples missed: errors of 0.001, 0.09 and 0.03 with 8, 32 and 128 samples."""
     halves = [np.array([np.full((1, 4, 4), error), np.full((1, 4, 4), -error)]) + 1 for error in (0.001, 0.09, 0.03)]
-    samples, finding = budget._samples(budget._errors(halves), 1, 0.0025, 1.0)
+    allowed = Allowed(white=100.0, target=0.0025)
+    samples, finding = budget.fewest_samples(Noise.of(halves, 100.0), 1, allowed, 1.0)
     assert samples >= 128 * (0.03 / 0.0025) ** (1 / 0.75) * 0.99
     assert "expected" in finding.size
 
@@ -217,15 +220,17 @@ def test_later_bounces_are_part_of_the_stated_error():
 
 
 def test_a_clip_that_misses_what_was_asked_is_told():
-    assert shortfall(39.6, 40) == shortfall(None, 40) == ""
-    assert "38.9 dB where 40 were asked for" in shortfall(38.9, 40)
+    low = Stated(38.9, 30.0, "white")
+    assert shortfall(replace(low, psnr=39.6), 40) == shortfall(None, 40) == ""
+    assert "38.9 dB below white, clamped there; 30.0 dB unclamped, where 40 were asked for" in shortfall(low, 40)
+    assert shortfall(replace(low, unclamped=None), 40) == ""  # an earlier version's, of another unit
 
 
 def test_bounces_that_no_pilot_tried_are_not_called_nothing():
     full = np.full((1, 4, 4), 2.0)
-    bounces, left_out, finding = budget._bounces(lambda depth: full - 0.1, full, 0.01)
+    bounces, cut, finding = budget.fewest_bounces(lambda depth: full - 0.1, full, Allowed(5.0, 0.03))
     assert bounces == budget.DEEPEST
-    assert left_out == pytest.approx(0.1)
+    assert Errors.between(cut, full, 5.0).plain == pytest.approx(0.1)
     assert "deeper ones were not tried" in finding.size
 
 
@@ -268,7 +273,8 @@ def test_the_best_mixture_is_known_without_the_truth(bias):
     rng = np.random.default_rng(3)
     truth = rng.random((200, 200))
     halves = truth + 0.5 * rng.standard_normal((2, 200, 200))
-    share, error = mixture(halves, np.stack([truth + bias] * 2))
+    mixed = mixture(halves, np.stack([truth + bias] * 2))
+    share, error = mixed.share, mixed.error
     best = 0.125 / (0.125 + bias**2)
     assert share.mean() == pytest.approx(best, abs=0.05)
     assert error**2 == pytest.approx(max(best * bias**2, 0.00125), abs=0.006)
@@ -282,7 +288,8 @@ def test_halves_whose_noise_the_filter_keeps_are_known_for_it():
     """
     rng = np.random.default_rng(5)
     noise = rng.standard_normal((2, 400, 400))
-    share, error = mixture(1 + noise, 1 + 0.6 * noise)
+    mixed = mixture(1 + noise, 1 + 0.6 * noise)
+    share, error = mixed.share, mixed.error
     assert share.mean() > 0.9
     assert error**2 == pytest.approx(0.36 / 2, rel=0.03)
 
@@ -296,7 +303,7 @@ def test_each_part_of_a_picture_is_mixed_by_its_own_errors():
     rng = np.random.default_rng(6)
     truth = np.ones((120, 300))
     cleaned = truth + np.where(np.arange(300) < 150, 0.0, 3.0)
-    share, _ = mixture(truth + 0.3 * rng.standard_normal((2, 120, 300)), np.stack([cleaned] * 2))
+    share = mixture(truth + 0.3 * rng.standard_normal((2, 120, 300)), np.stack([cleaned] * 2)).share
     assert share[:, :120].min() > 0.6
     assert share[:, :120].mean() > 0.95
     assert share[:, 180:].max() < 0.05
@@ -304,8 +311,7 @@ def test_each_part_of_a_picture_is_mixed_by_its_own_errors():
 
 def test_a_filter_that_does_nothing_is_not_trusted():
     halves = np.random.default_rng(4).standard_normal((2, 100, 100))
-    _, error = mixture(halves, halves)
-    assert error == pytest.approx(math.sqrt(0.5), rel=0.05)
+    assert mixture(halves, halves).error == pytest.approx(math.sqrt(0.5), rel=0.05)
 
 
 @pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
@@ -328,17 +334,17 @@ def test_the_denoiser_is_tried_beside_the_middle_of_a_large_frame():
     made = scene(Body("wall", square(12, -1), Diffuse(leaves)), lamp, light=SunSky(), camera=camera)
     chosen = choose(made, psnr=42, denoise=True)
     frame = Renderer(made, budget=chosen).frame(3, with_truth=False)
-    peak = np.percentile(frame.radiance, 99.9)
-    assert -20 * math.log10(frame.error / peak) > 41
+    white = white_in(frame.radiance)
+    assert decibels(white, error_at(white, frame.errors_at)) > 41
 
 
 @pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
 def test_a_denoised_trial_with_far_less_noise_than_the_pilots_is_not_believed():
     """Its windows have missed the rare, bright paths that the pilots found; denoising knows of none."""
     made = plate(None, light=SunSky(), camera=replace(CAMERA, height=48, width=64))
-    loaded = pilot.Pilot.of(made, 2000.0, 0.0, 1, 0)
+    loaded, allowed = pilot.Pilot.of(made, 2000.0, 0.0, 1, 0), Allowed(white=10.0, target=0.02)
     lucky, plain = (
-        pilot.denoised_samples(loaded, 1, 2, 0.02, 5000, None, lambda n, noise=noise: noise)[0]
+        pilot.denoised_samples(loaded, 1, 2, allowed, 1.0, 5000, None, lambda n, noise=noise: Errors(noise, noise))[0]
         for noise in (100.0, 0.0)
     )
     assert lucky is None

@@ -193,7 +193,7 @@ def test_motion_is_that_of_the_pixels_that_move(folder):
     assert report_clip.motion(Clip.open(folder / "square"), range(5)) == (1.0, 1.0)
     page = report.build(folder / "square")
     assert (
-        "what moves (0.05 px/frame or more) moves 1 px/frame on average; 99.9 % of all pixels at most 1 px/frame"
+        "what moves (more than 0.1 px/frame) moves 1 px/frame on average; 99.9 % of all pixels at most 1 px/frame"
         in page
     )
     assert "rim = 1 px/frame" in page

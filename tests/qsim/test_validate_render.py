@@ -14,7 +14,7 @@ from qsim import validate_render
 from qsim.budget import Budget
 from qsim.motion import Spin
 from qsim.scene import SunSky
-from qsim.validate_render import Report, Row, _Target
+from qsim.validate_render import Report, Row, Target
 
 ROW = Row("a/0", 40.0, 1024, 40.2, 3.0, False, 32, True, 4, 40.6, 40.1, 0.25)
 
@@ -41,10 +41,10 @@ def test_calls_of_the_obvious_loop_draw_other_samples():
 def test_the_variance_of_the_reference_is_not_held_against_an_image():
     rng = np.random.default_rng(1)
     truth = np.ones((300, 300))
-    target = _Target(truth + 0.02 * rng.standard_normal((2, 300, 300)))
+    target = Target(truth + 0.02 * rng.standard_normal((2, 300, 300)))
     image = truth + 0.01 * rng.standard_normal((300, 300))
     # Without the correction the distance would be sqrt(0.01^2 + 0.02^2 / 2) and 4.8 dB worse.
-    assert target.psnr(image) == pytest.approx(20 * math.log10(target.peak / 0.01), abs=0.3)
+    assert target.psnr(image) == pytest.approx(20 * math.log10(target.white / 0.01), abs=0.3)
 
 
 def test_the_verdict_needs_the_median_and_no_scene_slower():
