@@ -126,12 +126,15 @@ def scene_of(clip: Clip) -> str:
 def truth_psnr(clip: Clip, factor: float, peak: float, frames: range) -> float | None:
     """PSNR [dB] of the clip's own truth at a peak in photons, from its measured errors; None if there are none.
 
-    At least so much: a stated error that was not clamped counts as if all of it lay below the peak. Errors are
+    At least so much. Errors that were measured clamped at white serve peaks up to 2.5 times the mean light. At another
+    peak, and for clips of earlier versions, an unclamped error counts as if all of it lay below the peak. Errors are
     measured in radiance; photons are proportional to it.
     """
     errors = clip.meta.get("error_per_frame")
     if not errors or clip.mean_radiance <= 0:
         return None
+    if peak <= peak_of(mean_light(clip, factor), None) * (1 + 1e-6):
+        errors = clip.meta.get("error_at_white_per_frame", errors)
     unit = mean_light(clip, factor) / clip.mean_radiance / peak
     return metrics.truth_psnr([errors[t] * unit for t in frames])
 

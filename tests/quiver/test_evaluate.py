@@ -143,6 +143,10 @@ def test_truth_psnr_is_the_radiance_error_in_units_of_white(make_clip: ClipMaker
     expected = -20 * math.log10(0.01 * (3.25 / clip.mean_radiance) / 8.125)
     assert truth_psnr(clip, factor, 8.125, range(4)) == pytest.approx(expected)
     assert truth_psnr(make_clip("unknown", error=None), 1.0, 8.125, range(4)) is None
+    # Measured clamped at white, it counts up to 2.5 x the mean light; a higher peak takes the unclamped one.
+    halved = replace(clip, meta=clip.meta | {"error_at_white_per_frame": [0.005] * len(clip)})
+    assert truth_psnr(halved, factor, 8.125, range(4)) == pytest.approx(expected + 20 * math.log10(2))
+    assert truth_psnr(halved, factor, 16.25, range(4)) == truth_psnr(clip, factor, 16.25, range(4))
 
 
 def bright_clip(make_clip: ClipMaker, share: float, **options: object):
