@@ -6,13 +6,13 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from qsim import export, files, formats
+from qsim import checks, export, files, formats
 from qsim.clip import Clip
 from qsim.console import bar, command, output
 from qsim.dataset import Dataset
 from qsim.footage import TRANSFERS, Hints
 from qsim.recipe import SPLITS
-from qsim.stream import Stream, check_name
+from qsim.stream import Stream
 
 _SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr"}
 
@@ -83,8 +83,9 @@ def _export(args: argparse.Namespace) -> list[Path]:
     clips = Dataset.open(args.input).clips()
     with bar("converting", "clip") as progress:
         for n, clip in enumerate(clips, 1):
-            split = clip.meta.get("split") or "all"
-            target = args.output / split / f"{clip.name}{suffix}"
+            split = clip.meta.get("split")  # it becomes a folder, and the name a file
+            folder = args.output / ("all" if split is None else checks.split(split))
+            target = folder / f"{checks.check_name(clip.name)}{suffix}"
             made.append(export.export(clip, target, wanted, force=args.force))
             progress(n, len(clips))
     return made
@@ -97,7 +98,7 @@ def _import(args: argparse.Namespace) -> list[Path]:
                   args.stretched)  # fmt: skip
     capture = formats.Capture(args.frame_rate, args.exposure, args.sensor, args.ppp, args.split)
     found = formats.recordings(args.input, args.layout)
-    pairs = [(source, args.output / check_name(_flat_name(source, args.input))) for source in found]
+    pairs = [(source, args.output / checks.check_name(_flat_name(source, args.input))) for source in found]
     made = []
     with bar("converting") as progress:
         for source, target in pairs or [(args.input, args.output)]:

@@ -34,18 +34,23 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
     """
     if wanted.kind not in EXPORTS:
         raise ValueError(f"{path}: unknown kind {wanted.kind!r}; there are {', '.join(EXPORTS)}")
-    if path.exists() and not force:
+    if (path.exists() or path.is_symlink()) and not force:
         raise FileExistsError(f"{path}: exists; name another, or use --force to replace it")
     meta = _export_meta(source, wanted)
     path.parent.mkdir(parents=True, exist_ok=True)
-    if wanted.kind in ("cube", "mp4"):
+    single = wanted.kind in ("cube", "mp4")
+    side, part = path.with_name(path.name + ".json"), path.with_name(path.name + ".part")
+    for place in [path, *([side] if single else [part])]:
+        _check_ours(place, side if single else place / "meta.json", single)
+    if single:
         EXPORTS[wanted.kind](source, path, wanted, meta)
-        files.write_json(path.with_name(path.name + ".json"), meta)
+        files.write_json(side, meta)
         return path
-    part = path.with_name(path.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
+    if part.exists():  # of an export that was interrupted
+        files.remove_folder(part)
     part.mkdir()
     try:
+        files.write_json(part / "meta.json", _MARK)
         EXPORTS[wanted.kind](source, part, wanted, meta)
         files.write_json(part / "meta.json", meta)
     except BaseException:
@@ -56,6 +61,29 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
     part.rename(path)
     files.sync_folder(path.parent)
     return path
+
+
+_MARK = {"software": {"qsim": __version__}}  # of every description of an export: we made what it describes
+_NAMES = r"meta\.json|[0-9]{6,}\.(png|exr)|zarr\.json|frames/zarr\.json|frames/c/[0-9]+/[0-9]+/[0-9]+"
+
+
+def _check_ours(place: Path, description: Path, single: bool) -> None:
+    """`FileExistsError` if something is at `place` that no export made: it is replaced only beside its description."""
+    if not place.exists() and not place.is_symlink():
+        return
+    foreign = FileExistsError(
+        f"{place}: was not made by `qsim convert`, which replaces only what it made; move it away, or name another"
+    )
+    if place.is_symlink() or place.is_dir() == single or not description.is_file():
+        raise foreign
+    try:
+        software = files.read_json(description).get("software")
+    except ValueError:
+        raise foreign from None
+    if not isinstance(software, dict) or "qsim" not in software:
+        raise foreign
+    if not single:
+        files.check_ours(place, _NAMES)
 
 
 def _cube(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:

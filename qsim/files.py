@@ -303,6 +303,20 @@ def check_version(path: Path, found: object, known: int) -> None:
     raise ValueError(f"{path}: format version {found!r}, this qsim reads version {known}; {advice}")
 
 
+def check_ours(folder: Path, names: str) -> None:
+    """`FileExistsError` that names what a folder holds beside files whose relative paths match the pattern `names`.
+
+    For whoever is about to delete the folder: only what the program made itself is replaced.
+    """
+    for item in sorted(folder.rglob("*")):
+        relative = item.relative_to(folder).as_posix()
+        if item.is_symlink() or not (item.is_dir() or re.fullmatch(rf"(?:{names})(?:\.tmp-.*)?", relative)):
+            raise FileExistsError(
+                f"{item}: was not made by this program, and --force replaces only what it made; move it away, or name "
+                "another output"
+            )
+
+
 def remove_folder(folder: Path) -> None:
     """Delete a folder so that no moment leaves something that looks whole: it first loses its name.
 

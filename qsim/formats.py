@@ -173,10 +173,13 @@ def to_stream(
     for file in (npy, description):
         if file.exists() and not force:
             raise FileExistsError(f"{file}: exists; name another, or use --force to replace it")
+        if file.exists() and (not description.is_file() or "ppp_factor" not in files.read_json(description)):
+            raise FileExistsError(
+                f"{file}: is not a stream, which is all that --force replaces; move it away, or name another"
+            )
     frames, height, width = footage.shape
     sensor = _sensor(footage, capture, devices)
     npy.parent.mkdir(parents=True, exist_ok=True)
-    description.unlink(missing_ok=True)
     with files.replacing(npy) as target:
         packed = (frames, height, codes.packed_width(width, footage.bits))
         np.lib.format.write_array_header_1_0(target, {"descr": "|u1", "fortran_order": False, "shape": packed})
@@ -184,6 +187,7 @@ def to_stream(
             target.write(codes.pack(block, footage.bits).tobytes())
             if progress is not None:
                 progress(start + len(block), frames)
+        description.unlink(missing_ok=True)  # the old stream is accepted until the new one is whole
     meta = {
         "format_version": FORMAT_VERSION,
         "shape": [frames, height, width],

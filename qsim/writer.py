@@ -30,6 +30,7 @@ MEASURED = (  # in clip.json, beyond what was asked for
     *("mean_radiance", "mean_photons", "clipped_pixels", "checksums", "software", "checksum"),
     *("error_per_frame", "error_at_white_per_frame", "white", "psnr_of_truth", "psnr_unclamped", "fireflies_per_frame"),
 )
+OURS = r"clip\.json|(radiance|sharp|truth|saturated)/[0-9]{6,}\.exr|streams/lock|streams/[A-Za-z0-9._-]+\.(npy|json)"
 TRUTH = {  # channel of the EXR file -> quantity
     "u": "flow",
     "v": "flow",
@@ -63,6 +64,8 @@ class ClipWriter:
             raise FileExistsError(
                 f"{self.path}: exists and is no clip, which is all that --force replaces; use another -o"
             )
+        if self.path.exists():
+            files.check_ours(self.path, OURS)
         self.meta = json.loads(files.to_json({"format_version": FORMAT_VERSION, "name": self.name} | meta))
         _check_new(self.path, self.meta)
         self.part = self.path.with_name(self.path.name + ".part")

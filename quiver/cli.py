@@ -160,7 +160,7 @@ def _run_evaluate(args: argparse.Namespace) -> int:
 
     plan = plan_of(args)
     if args.force and args.output.exists():
-        renew(args.output, "plan.json")
+        renew(args.output, "plan.json", r"plan\.json|rows\.jsonl|evaluation\.(json|md|png)|crops_[^/]*\.png|lock")
     with bar("rows", "row") as progress:
         rows = evaluate(plan, methods, args.output, lambda what, done, total: progress(done, total))
     table.write(args.output, plan, methods, rows)

@@ -23,7 +23,7 @@ from qsim.clip import Clip
 from qsim.completion import add_completion
 from qsim.console import GOES_ON, STARTS_AGAIN, Parser, bar, command, note, output, run
 from qsim.dataset import Dataset
-from qsim.files import Lock, read_json, replacing, sha256, sync_folder, to_json, write_bytes, write_json
+from qsim.files import Lock, check_ours, read_json, replacing, sha256, sync_folder, to_json, write_bytes, write_json
 from qsim.footage import reading
 from qsim.keys import Key, hash_name
 from qsim.optics import WHITE_PER_MEAN, clip_photons, light_level
@@ -48,6 +48,7 @@ __all__ = [
     "add_completion",
     "array_codes",
     "bar",
+    "check_ours",
     "clip_photons",
     "command",
     "cube_codes",

@@ -104,9 +104,12 @@ def running_options(args: argparse.Namespace) -> Any:
     return Options(args.memory, args.mode or "exact", args.device or "auto", args.precision or "float32")
 
 
-def renew(folder: Path, mark: str) -> None:
-    """Remove a folder of ours (it holds `mark`), to start anew."""
+def renew(folder: Path, mark: str, ours: str) -> None:
+    """Remove a folder that holds the file `mark`, and files whose names match the pattern `ours` only."""
+    from quiver.data import check_ours
+
     if (folder / mark).is_file():
+        check_ours(folder, ours)
         shutil.rmtree(folder)
     elif folder.exists():
         raise FileExistsError(f"{folder} holds no {mark}; --force removes only what this command made")

@@ -23,11 +23,12 @@ import torch
 from torch import nn
 
 from quiver import weights
-from quiver.data import Light, Lock, read_json, replacing, write_bytes, write_json
+from quiver.data import Light, Lock, check_ours, read_json, replacing, write_bytes, write_json
 from quiver.loss import PRESETS as LOSSES
 from quiver.optimiser import OPTIMISERS, Kind, Optimiser
 
 SCHEDULES = ("cosine", "plateau")
+OURS = r"(settings|history)\.json|checkpoint\.pt|(best|last)\.safetensors|curve\.png|lock"  # what a run writes
 LOCK = "lock"  # of a folder of results: held by the process that works in it
 PRECISIONS = ("auto", "float32", "bfloat16")
 
@@ -204,6 +205,7 @@ class Run:
         with alone_in(self.folder, "trains"):
             self._check_ours(force)
             if force:
+                check_ours(self.folder, OURS)
                 empty(self.folder)
             path = self.folder / "settings.json"
             if not path.exists():
