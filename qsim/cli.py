@@ -1,5 +1,5 @@
 """The command `qsim`: parse, call, print. Each command is a pair `_add_X` (its options) and `_run_X` (what it does);
-most are in cli_data.py, cli_look.py, cli_studies.py and convert.py.
+most are in cli_data.py, cli_look.py, cli_studies.py, cli_validate.py and convert.py.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from typing import Any
 from qsim import __version__, checks
 from qsim.cli_data import add_check, add_generate, add_plan
 from qsim.cli_look import add_preview, add_report
-from qsim.cli_studies import add_calibrate, add_tradeoff, add_validate
+from qsim.cli_studies import add_calibrate, add_tradeoff
+from qsim.cli_validate import add_validate
 from qsim.completion import add_completion
-from qsim.console import EXTRAS, GOES_ON, Parser, bar, checked, command, note, output, run
+from qsim.console import EXTRAS, GOES_ON, Parser, bar, checked, command, note, output, refuse_idle, run
 from qsim.convert import add_convert
 
 
@@ -136,6 +137,8 @@ def _run_render(args: argparse.Namespace) -> int:
 
     if args.output is None and not args.explain:
         raise ValueError("the following arguments are required: -o/--output; only --explain does without")
+    if args.output is None:
+        refuse_idle(args, "render without --output", ["force"])
     if args.output is not None and args.output.exists() and not args.force:
         raise FileExistsError(f"{args.output}: exists; name another with -o, or use --force to replace it")
     if args.engine is not None:

@@ -44,6 +44,8 @@ def _run_generate(args: argparse.Namespace) -> int:
     # None: not given, which --cluster must tell from given (`_cluster`).
     count = generation.Options.workers if args.workers is None else args.workers
     limits = Limits() if args.memory is None else Limits(memory=args.memory)
+    if count == 0 and args.memory is not None:
+        raise ValueError("--memory: bounds worker processes, and --workers 0 has none; leave one of them out")
     if count < 0:
         raise ValueError(f"--workers: expected 0 (in this process) or more, got {count}")
     options = generation.Options(count, args.shard, args.retry, args.repair, args.wait, limits)
@@ -119,7 +121,8 @@ def _run_plan(args: argparse.Namespace) -> int:
     wanted = recipe.load(args.recipe)
     with bar("planning", "kind") as progress:
         found = plan.plan(wanted, frames=args.frames, progress=progress)
-    output(args, {"recipe": wanted.name} | found.to_dict(), found.lines(args.machines))
+    facts = {"recipe": wanted.name, "machines": args.machines, "hours_each": found.hours / args.machines}
+    output(args, facts | found.to_dict(), found.lines(args.machines))
     return 0
 
 

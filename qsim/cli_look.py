@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import files
-from qsim.console import bar, command, output, refuse_existing
+from qsim.console import bar, command, output, refuse_existing, refuse_idle
 
 PREVIEWS = (".mp4", ".gif", ".png")
 
@@ -32,7 +32,7 @@ def add_preview(sub: Any) -> None:
     parser.add_argument("--what", type=_kinds, help="of sharp,radiance,codes,average,flow,depth; with commas")
     parser.add_argument("--stream", help="which stream of a clip (default: the first)")
     parser.add_argument("--frame", type=int, help="one frame (default: the middle one, or all in a film)")
-    parser.add_argument("--fps", type=float, default=12.0, help="frames shown per second (default 12)")
+    parser.add_argument("--fps", type=float, help="frames of a film shown per second (default 12)")
     parser.add_argument("--scale", type=int, help="pixels per pixel (default: so that captions can be read)")
     parser.add_argument("--bits", type=int, help="a bare array holds codes of so many bits")
     parser.add_argument("--width", type=int, help="a bare array holds packed binary planes of so many columns")
@@ -58,14 +58,25 @@ def _run_preview(args: argparse.Namespace) -> int:
         if target.suffix not in PREVIEWS:
             raise ValueError(f"{target}: a preview is a {', '.join(PREVIEWS)} file, as in -o {target.stem}.mp4")
         refuse_existing(target, args.force)
-    if not 0 < args.fps <= 1000:
+    if args.fps is not None and not 0 < args.fps <= 1000:
         raise ValueError(f"--fps: expected frames per second between 0 and 1000, got {args.fps:g}")
     if args.scale is not None and not 1 <= args.scale <= 64:
         raise ValueError(f"--scale: expected a whole factor of 1 to 64, got {args.scale}")
+    if args.play and target is not None:
+        raise ValueError("--play: shows frames in the terminal; leave it out with --output, which writes all of them")
+    if target is None:
+        refuse_idle(args, "preview in the terminal", ["force", "scale"])
+    if args.fps is not None and (not args.play if target is None else target.suffix == ".png"):
+        raise ValueError("--fps: one picture has no rate; leave it out, or ask for a film (.mp4, .gif) or --play")
+    if args.frame is not None and (args.play or args.fps is not None):
+        raise ValueError("--frame: shows one frame; leave out --play and --fps, or leave it out for a film of all")
+    args.fps = 12.0 if args.fps is None else args.fps
     source = preview.open_source(args.path, bits=args.bits, width=args.width, stream=args.stream)
     if args.frame is not None and not 0 <= args.frame < source.length:
         raise ValueError(f"--frame {args.frame}: {source.name} has frames 0..{source.length - 1}")
     views = preview.choose(source, args.what, several=target is not None)
+    if args.stream is not None and not any(view.kind in ("codes", "average") for view in views):
+        raise ValueError(f"--stream {args.stream}: no picture of codes is shown; add --what codes, or leave it out")
     film = args.frame is None and (args.play if target is None else target.suffix != ".png")
     first = source.length // 2 if args.frame is None else args.frame
     frames = range(source.length) if film else range(first, first + 1)

@@ -1,4 +1,4 @@
-"""Commands that study: `tradeoff`, `calibrate`, `validate`; pairs `add_X`, `_run_X` as in cli.py."""
+"""Commands that study: `tradeoff`, `calibrate`; pairs `add_X`, `_run_X` as in cli.py."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks, files
-from qsim.console import bar, checked, command, note, output, refuse_existing
+from qsim.console import bar, checked, command, output, refuse_existing
 
 # tradeoff
 
@@ -287,86 +287,3 @@ def _doublings(low: float, high: float) -> int:
 
     octaves = log2(high / low)
     return round(octaves) + 1 if 0 < octaves < 5.5 and isclose(octaves, round(octaves)) else 6
-
-
-# validate
-
-
-def add_validate(sub: Any) -> None:
-    parser = command(
-        sub, "validate", _run_validate, "Measure sensor engines, the renderer or reading here: speed against error.",
-        "qsim validate sensor --json -o out/sensor.png\nqsim validate render -o out/render.png\n"
-        "qsim validate engines --scenes fan glass\nqsim validate reading",
-    )  # fmt: skip
-    parser.add_argument("what", choices=["sensor", "render", "engines", "reading"], help="what to validate")
-    parser.add_argument("-o", "--output", type=Path, help="figure of speed against error (.png, .svg or .pdf)")
-    parser.add_argument("--pixels", type=int, default=1 << 22, help="pixels of a draw (default 4194304)")
-    parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the draws (default 0)")
-    parser.add_argument("--require-speed", action="store_true", help="a speed below its target is a failure too")
-    parser.add_argument("--scenes", nargs="+", metavar="FAMILY", help="render, engines: families (default: four)")
-    whole = checked(checks.whole)
-    parser.add_argument("--height", type=whole, default=128, help="render, engines: pixels (default 128)")
-    parser.add_argument("--width", type=whole, default=256, help="render, engines: pixels (default 256)")
-    parser.add_argument("--force", action="store_true", help="replace an existing figure")
-
-
-def _run_validate(args: argparse.Namespace) -> int:
-    from qsim import validate
-
-    if args.what == "reading":
-        return _validate_reading(args)
-    if args.what == "engines":
-        return _validate_engines(args)
-    if args.output is not None:
-        validate.check_figure(args.output)
-        refuse_existing(args.output, args.force)
-    if args.what == "render":
-        return _validate_render(args)
-    with bar("measuring", "model") as progress:
-        report = validate.run(args.pixels, args.seed, require_speed=args.require_speed, progress=progress)
-    if args.output is not None:
-        validate.figure(report, args.output)
-    output(args, report.to_dict(), validate.table(report))
-    return 0 if report.ok else 1
-
-
-def _validate_reading(args: argparse.Namespace) -> int:
-    from qsim import validate_reading
-
-    if args.output is not None:
-        raise ValueError("validate reading: prints numbers and draws no figure; leave out --output")
-    report = validate_reading.run(seed=args.seed)
-    output(args, report.to_dict(), report.lines())
-    return 0 if report.ok else 1
-
-
-def _validate_engines(args: argparse.Namespace) -> int:
-    from qsim import validate_engines
-
-    if args.output is not None:
-        raise ValueError("validate engines: prints numbers and draws no figure; leave out --output")
-    report = validate_engines.run(
-        _families(args), height=args.height, width=args.width, seed=args.seed + 3, progress=note
-    )
-    output(args, report.to_dict(), validate_engines.table(report))
-    return 0 if report.ok else 1
-
-
-def _families(args: argparse.Namespace) -> list[str]:
-    """Those asked for, or the first four that did not tune the budget."""
-    import scenes
-    from qsim import validate_render
-
-    return args.scenes or [name for name in scenes.FAMILIES if name not in validate_render.TUNED][:4]
-
-
-def _validate_render(args: argparse.Namespace) -> int:
-    import scenes
-    from qsim import validate_render
-
-    chosen = [scenes.load(name, seed=args.seed + 3).resized(args.height, args.width) for name in _families(args)]
-    report = validate_render.run(chosen, progress=note)
-    if args.output is not None:
-        validate_render.figure(report, args.output)
-    output(args, report.to_dict(), validate_render.table(report))
-    return 0 if report.ok else 1

@@ -210,6 +210,13 @@ def checked(check: Callable[[Any], Any]) -> Callable[[str], Any]:
     return parse
 
 
+def refuse_idle(args: argparse.Namespace, where: str, names: Sequence[str]) -> None:
+    """A `ValueError` if one of these options is given, which change nothing there; their defaults are None or False."""
+    for name in names:
+        if getattr(args, name) not in (None, False):
+            raise ValueError(f"{where}: --{name.replace('_', '-')} changes nothing here; leave it out")
+
+
 def refuse_existing(path: Path, force: bool) -> None:
     """An `OSError` with the cure if a file cannot be written, or is there already and `force` is not set.
 

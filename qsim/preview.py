@@ -60,14 +60,25 @@ def open_source(path: Path, *, bits: int | None = None, width: int | None = None
     if (path / "dataset.json").is_file():
         raise ValueError(f"{path}: is a data set; name one of its clips, as in {path / 'clips'}/NAME")
     if path.is_dir() or not path.exists():
-        return _clip_source(Clip.open(path), stream)
+        clip = Clip.open(path)
+        _refuse(path, "a clip, whose streams know their bits", bits=bits, width=width)
+        return _clip_source(clip, stream)
+    _refuse(path, "no clip", stream=stream)
     sidecar = path.with_suffix(".json")
     described = files.read_json(sidecar) if sidecar.is_file() else {}
     if "ppp_factor" in described:
+        _refuse(path, "a stream, which knows its bits", bits=bits, width=width)
         return _stream_source(Stream.open(sidecar))
     if path.suffix != ".npy":
         raise ValueError(f"{path}: expected a clip folder, a stream or a .npy array; `qsim convert` reads other files")
     return _array_source(path, bits, width, described)
+
+
+def _refuse(path: Path, what: str, **options: int | str | None) -> None:
+    """A `ValueError` for options that change nothing of what a path holds."""
+    for name, value in options.items():
+        if value is not None:
+            raise ValueError(f"{path}: is {what}; leave out --{name}")
 
 
 def _clip_source(clip: Clip, chosen: str | None) -> Source:
@@ -99,13 +110,16 @@ def _array_source(path: Path, bits: int | None, width: int | None, described: di
     length = check_shape(path, array.shape)[0]
     rate = described.get("frame_rate")
     if array.dtype.kind == "f":
+        _refuse(path, "an array of values, no codes", bits=bits, width=width)
         what, unit = described.get("method", "values"), described.get("unit", "as stored")
         title = f"restored by {what}" if "method" in described else what
         view = _light_view("values", title, unit, length, lambda t: np.asarray(array[t], np.float64))
         return Source(path.stem, length, rate, {"values": view})
     if array.dtype.kind == "b":
+        _refuse(path, "an array of truth values", bits=bits, width=width)
         bits = 1
     elif width is not None:
+        _refuse(path, "packed planes of 1 bit, as --width says", bits=bits)
         return _packed_source(path, array, width)
     if bits is None:
         raise ValueError(f"{path}: whole numbers are codes or packed planes; say --bits 3, or --width 320 for planes")

@@ -11,6 +11,8 @@ import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
+
 from qsim.checks import suggest
 from qsim.scene import Scene
 from scenes import (
@@ -60,7 +62,7 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
 
     What a folder may hold is in `own.py`. An XML scene stands still and knows no seed: a Python file that calls
     `Scene.from_mitsuba` moves its shapes. Raises ValueError for a name that is none of these, FileNotFoundError for a
-    missing file.
+    missing file, and for a speed other than 1 that changes no motion of a .py or .xml scene.
     """
     if str(name) in FAMILIES:
         return FAMILIES[str(name)](seed, speed=speed)
@@ -69,8 +71,12 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
             found = _from_file(Path(name))(seed, speed=speed)
         if not isinstance(found, Scene):
             raise ValueError(f"{name}: scene() returned a {type(found).__name__}; it must return a qsim.scene.Scene")
+        if speed != 1 and _moves_alike(found, _from_file(Path(name))(seed, speed=1.0)):
+            raise ValueError(f"{name}: moves at speed {speed:g} as at 1; let scene() use its speed, or leave it out")
         return found
     if str(name).endswith(".xml"):
+        if speed != 1:
+            raise ValueError(f"{name}: stands still, so that speed {speed:g} changes nothing; leave it out")
         return Scene.from_mitsuba(name)
     if (Path(name) / "clip.json").is_file():
         raise ValueError(f"{name}: is a clip, made from a scene already; name a family, a .py or .xml file or a folder")
@@ -80,6 +86,20 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
         f"no scene family {str(name)!r}{suggest(str(name), FAMILIES)}; there are {', '.join(FAMILIES)}, "
         "or give a .py or .xml file or a folder"
     )
+
+
+def _moves_alike(one: Scene, other: Scene) -> bool:
+    """Whether camera, bodies, lamps and parts of two scenes are at the same places at some moments."""
+    moments = (0.0, 5e-4, 3.3e-3, 0.0107)  # s
+    return all(all(map(np.array_equal, _places(one, t), _places(other, t))) for t in moments)
+
+
+def _places(scene: Scene, t: float) -> list[np.ndarray]:
+    """Poses of all things at time t [s], and the vertices of what deforms."""
+    things = (*scene.lights, *scene.bodies, *scene.parts)
+    motions = [motion for thing in things if (motion := getattr(thing, "motion", None)) is not None]
+    shapes = [body.vertices(t) for body in scene.bodies if body.deforms]
+    return [scene.camera.pose(t), *(np.asarray(motion.pose(t)) for motion in motions), *shapes]
 
 
 @contextlib.contextmanager
