@@ -13,6 +13,7 @@ clip from its first frame, and optical crosstalk needs a margin of one pixel aro
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +27,8 @@ from qsim.spad import SPAD, BinarySPAD
 _DEVICE = hash_name("qsim fixed pattern")  # the "clip" of all device maps
 _AFTERPULSE, _CROSSTALK = 101, 102  # stages of a clip's key; crosstalk takes one per direction
 _DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))  # from a pixel to the neighbour that it disturbs
+
+Sampler = Callable[[Sensor, Array, float, Key, tuple[int, int]], Array]  # photons, exposure, key, origin -> codes
 
 
 @dataclass(frozen=True)
@@ -176,11 +179,12 @@ def sample_after(
     maps: Maps = PERFECT,
     disturbances: tuple[float, float] = (0.0, 0.0),
     origin: tuple[int, int] = (0, 0),
-    engine: str = "auto",
+    engine: str | Sampler = "auto",
 ) -> tuple[Array, Array | None]:
     """As `sample` with `disturbances` = (afterpulse, crosstalk), for a clip that comes in blocks of frames.
 
-    `before` is what the block before this one gave as its second result, None at the clip's first frame.
+    `before` is what the block before this one gave as its second result, None at the clip's first frame. `engine` is
+    that of `Sensor.sample`, or a function that draws the codes of pixels without defects in its place.
     """
     afterpulse, crosstalk = disturbances
     for name, value in (("afterpulse", afterpulse), ("crosstalk", crosstalk)):
@@ -254,12 +258,16 @@ def _draw(
     key: Key,
     maps: Maps,
     origin: tuple[int, int],
-    engine: str,
+    engine: str | Sampler,
 ) -> Array:
     """Codes [T, H, W] of pixels that differ from each other."""
     sensor, light = lit(sensor, photons, exposure, maps)
     if maps.offset is None and maps.read_noise is None:
-        codes = sensor.sample(light, exposure, key=key, origin=origin, engine=engine)
+        codes = (
+            sensor.sample(light, exposure, key=key, origin=origin, engine=engine)
+            if isinstance(engine, str)
+            else engine(sensor, light, exposure, key, origin)
+        )
     elif isinstance(sensor, QIS):
         codes = np.stack(
             [_read_out(sensor, frame, exposure, key.at(key.frame + t), maps, origin) for t, frame in enumerate(light)]
@@ -306,7 +314,7 @@ def _sum_of_planes(
     maps: Maps,
     disturbances: tuple[float, float],
     origin: tuple[int, int],
-    engine: str,
+    engine: str | Sampler,
 ) -> tuple[Array, Array | None]:
     """A code as its M planes one after the other, as BinarySPAD draws them, each disturbed by the one before."""
     m, plane = sensor.planes, replace(sensor, bits=1)

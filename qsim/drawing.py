@@ -159,6 +159,14 @@ class Draw:
 
 def prepare(clip: Clip, sensing: Sensing) -> Draw:
     """The sensor, light factor and key for one clip; `ValueError` if they do not fit it."""
+    from qsim import flaws
+
+    source = sensing.defects or (sensing.sensor if sensing.sensor.endswith(".toml") else None)
+    return assemble(clip, sensing, None if source is None else flaws.from_toml(source))
+
+
+def assemble(clip: Clip, sensing: Sensing, found: Flaws | None, own: Sensor | None = None) -> Draw:
+    """As `prepare`, with these defects, and with this sensor in place of the one that `sensing` names."""
     from qsim import devices, flaws, keys
 
     planes = sensing.slices
@@ -173,9 +181,9 @@ def prepare(clip: Clip, sensing: Sensing) -> Draw:
         raise ValueError(f"{clip.name}: {len(clip)} frames are too few for {what}")
     target = None if sensing.ppp is None else sensing.ppp / planes
     level = optics.light_level(clip, ppp=target, lux=sensing.lux)
-    sensor = devices.load(sensing.sensor, ppp=level.ppp * planes, bits=sensing.bits, exposure=clip.exposure * planes)
-    source = sensing.defects or (sensing.sensor if sensing.sensor.endswith(".toml") else None)
-    found = None if source is None else flaws.from_toml(source)
+    sensor = own or devices.load(
+        sensing.sensor, ppp=level.ppp * planes, bits=sensing.bits, exposure=clip.exposure * planes
+    )
     if found is not None:  # measured dark counts take the place of the sensor's
         sensor = flaws.of_sensor(found, sensor, *clip.shape[1:]).sensor
     _check_planes(sensor, sensing, clip)

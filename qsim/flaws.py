@@ -29,6 +29,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import reduce
+from math import ceil, log
 from pathlib import Path
 from typing import Any
 
@@ -159,8 +160,38 @@ class Flawed:
         """Whether a frame depends on those before it."""
         return bool(self.flaws.afterpulse and isinstance(self.sensor, BinarySPAD))
 
-    def blocks(self, photons: Iterable[Array], exposure: float, key: Key) -> Iterator[Array]:
-        """Codes of successive blocks of photons [t, H, W], the first of which is frame key.frame."""
+    @property
+    def follows_photons(self) -> bool:
+        """Whether a counting pixel remembers the exposure before."""
+        return isinstance(self.sensor, CountingSPAD) and bool(self.flaws.carry_dead_time or self.flaws.afterpulse)
+
+    @property
+    def reach(self) -> int:
+        """Pixels beyond a crop that its codes depend on."""
+        return 1 if self.flaws.crosstalk else 0
+
+    def lead(self, chance: float) -> int:
+        """Frames before a frame after which what went before matters with this chance at most."""
+        if not (self.memory and isinstance(self.sensor, BinarySPAD)):
+            return 0
+        return ceil(log(chance) / log(self.flaws.afterpulse) / self.sensor.planes)
+
+    def crop(self, y: int, x: int, height: int, width: int) -> Flawed:
+        """A part of the frame, with the maps of its pixels."""
+        return replace(self, maps=self.maps.crop(y, x, height, width))
+
+    def blocks(
+        self,
+        photons: Iterable[Array],
+        exposure: float,
+        key: Key,
+        origin: tuple[int, int] = (0, 0),
+        engine: str | defects.Sampler = "auto",
+    ) -> Iterator[Array]:
+        """Codes of successive blocks of photons [t, H, W], the first of which is frame key.frame.
+
+        `origin` (y, x) places a crop in the full frame; `engine` as in `defects.sample_after`.
+        """
         afterpulse = self.flaws.afterpulse if isinstance(self.sensor, BinarySPAD) else 0.0
         before = None
         for block in photons:
@@ -172,6 +203,8 @@ class Flawed:
                 key=key,
                 maps=self.maps,
                 disturbances=(afterpulse, self.flaws.crosstalk),
+                origin=origin,
+                engine=engine,
             )
             key = key.at(key.frame + len(block)) if key.frame + len(block) < 2**32 else key
             yield codes

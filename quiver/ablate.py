@@ -18,7 +18,7 @@ from quiver.config import ABLATIONS, PRESETS, Config
 from quiver.evaluate import Plan, Row, evaluate
 from quiver.model import QUIVER, ablated, parameter_count
 from quiver.restoring import Options, Restorer, pick_device, restorer
-from quiver.run import Settings, alone_in
+from quiver.run import Settings, alone_in, settled
 from quiver.train import train
 
 
@@ -28,6 +28,15 @@ def networks(preset: str) -> dict[str, Config]:
         raise ValueError(f"no ablation of {preset!r}; there is one of {', '.join(PRESETS)}")
     whole = replace(PRESETS[preset], baseline=0, sweep=0.0)
     return {name: ablated(whole, name) for name in ABLATIONS}
+
+
+def one_noise(settings: Settings) -> tuple[Settings, list[str]]:
+    """The settings with the noise that all six share, that of the first one where it has begun; and lines that say it.
+
+    ValueError as for `run.settled`.
+    """
+    found, lines = settled(replace(settings, out=str(Path(settings.out) / next(iter(ABLATIONS)))))
+    return replace(settings, noise=found.noise), lines
 
 
 def run_ablation(

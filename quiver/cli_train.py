@@ -15,7 +15,7 @@ from typing import Any
 from quiver.options import (
     NETWORKS,
     PROTOCOLS,
-    add_light,
+    add_noise,
     add_running,
     command,
     count,
@@ -42,7 +42,7 @@ def add_train(sub: Any) -> None:
     parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
     parser.add_argument("--steps", type=count, help="optimiser steps")
     parser.add_argument("--minutes", type=positive, help="wall-clock limit; the learning rate is planned for it")
-    add_light(parser, several=True)
+    add_noise(parser)
     parser.add_argument("--crop", type=count, help="px, side of the training windows")
     parser.add_argument("--frames", type=count, help="of a training window (default 11, one restored frame; 16: six)")
     parser.add_argument("--batch", type=count, help="windows per step and process")
@@ -62,7 +62,7 @@ def add_train(sub: Any) -> None:
 def _run_train(args: argparse.Namespace) -> int:
     import torch
 
-    from quiver.data import output
+    from quiver.data import note, output
     from quiver.model import build
     from quiver.restoring import pick_device
     from quiver.run import draw_curve
@@ -80,6 +80,7 @@ def _run_train(args: argparse.Namespace) -> int:
                 should_stop=lambda: bool(interrupted),
                 progress=not (args.json or args.quiet),
                 force=args.force,
+                note=note,
             )
     except Diverged as error:
         print(f"quiver: {error}", file=sys.stderr)
@@ -134,6 +135,7 @@ def add_ablate(sub: Any) -> None:
     parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
     parser.add_argument("--steps", type=count, help="optimiser steps of each")
     parser.add_argument("--minutes", type=positive, help="wall-clock limit of each")
+    add_noise(parser)
     parser.add_argument("--crop", type=count, help="px, side of the training windows")
     parser.add_argument("--batch", type=count, help="windows per step and process")
     parser.add_argument("--split", default="test", choices=("train", "val", "test"), help="to score on (default test)")
@@ -143,14 +145,17 @@ def add_ablate(sub: Any) -> None:
 
 def _run_ablate(args: argparse.Namespace) -> int:
     from quiver import table
-    from quiver.ablate import markdown, run_ablation
-    from quiver.data import output
+    from quiver.ablate import markdown, one_noise, run_ablation
+    from quiver.data import note, output
     from quiver.evaluate import Plan
 
     args.precision, precision = None, args.precision  # of restoring; training keeps its own default
     settings = _settings(args)
     args.precision = precision
-    plan = Plan(args.data, args.split, settings.lights, settings.seed)
+    settings, lines = one_noise(settings)
+    for line in lines:
+        note(line)
+    plan = Plan(args.data, args.split, tuple(noise.simple for noise in settings.noise or ()), settings.seed)
     with _signals() as interrupted:
         options, show = running_options(args), not (args.json or args.quiet)
         found = run_ablation(settings, plan, options, should_stop=lambda: bool(interrupted), progress=show)

@@ -8,10 +8,11 @@ Nothing here needs torch. Training windows, a `torch` data set, are in samples.p
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -23,7 +24,10 @@ from qsim.clip import Clip
 from qsim.completion import add_completion
 from qsim.console import GOES_ON, STARTS_AGAIN, Parser, bar, command, note, output, run
 from qsim.dataset import Dataset
+from qsim.drawing import Draw, assemble
 from qsim.files import Lock, check_ours, read_json, replacing, sha256, sync_folder, to_json, write_bytes, write_json
+from qsim.flaws import Flawed, Flaws, from_toml, of_sensor
+from qsim.flaws import from_dict as read_defects
 from qsim.footage import reading
 from qsim.keys import Key, hash_name
 from qsim.optics import WHITE_PER_MEAN, clip_photons, light_level
@@ -38,15 +42,20 @@ __all__ = [
     "STARTS_AGAIN",
     "Clip",
     "Codes",
+    "Draw",
+    "Flawed",
+    "Flaws",
     "Key",
     "Light",
     "Lock",
     "Parser",
+    "Sensing",
     "Sensor",
     "Stream",
     "__version__",
     "add_completion",
     "array_codes",
+    "assemble",
     "bar",
     "check_ours",
     "clip_photons",
@@ -59,11 +68,14 @@ __all__ = [
     "light_level",
     "mean_light",
     "note",
+    "of_sensor",
     "open_clips",
     "open_stream",
     "output",
     "peak_of",
+    "read_defects",
     "read_json",
+    "read_sensor",
     "reading",
     "replacing",
     "run",
@@ -96,6 +108,14 @@ class Light:
         """The sensor for clips with this exposure [s]."""
         return _device(self, exposure)
 
+    def sensing(self, seed: int = 0) -> Sensing:
+        """The same in qsim's words."""
+        return Sensing(self.sensor, bits=self.bits, ppp=self.ppp, seed=seed)
+
+    def draw(self, clip: Clip, seed: int = 0) -> Draw:
+        """All that decides the codes of a clip, with the defects of a sensor file; `ValueError` if it does not fit."""
+        return prepare(clip, self.sensing(seed))
+
     @property
     def label(self) -> str:
         """`3.25 PPP, 3 bit`, as tables show it."""
@@ -105,6 +125,13 @@ class Light:
                 "own bits" if self.bits is None else f"{self.bits} bit",
             )
         )
+
+
+def read_sensor(source: str | Mapping[str, Any], bits: int | None = None) -> tuple[Sensor, Flaws | None]:
+    """The sensor of a file with its defects, or of the record of one; `ValueError` if it has other bits."""
+    if isinstance(source, str):
+        return devices.load(source, bits=bits), from_toml(source)
+    return devices.from_dict(source), None
 
 
 @lru_cache(maxsize=64)
@@ -128,20 +155,22 @@ def follows_light(sensor: str) -> bool:
     return sensor in devices.DEVICES and devices.DEVICES[sensor].follows_light
 
 
-def draw_codes(sensor: Sensor, photons: Array, exposure: float, key: Key) -> Array:
+def draw_codes(sensor: Sensor, photons: Array, exposure: float, key: Key, origin: tuple[int, int] = (0, 0)) -> Array:
     """Codes [T, H, W] of expected photons [T, H, W], frame t under `key.at(key.frame + t)`; quick, without Dr.Jit.
+
+    `origin` (y, x) places a crop in the full frame.
 
     The codes of `sensor.sample(..., engine="reference")` where a sensor draws one number per pixel. A clocked SPAD
     draws one per plane: its codes have the same exact distribution, from other numbers.
     """
     table = _code_table(sensor, exposure)
     if table is None or not (photons.min() >= 0 and photons.max() < np.inf):  # the sensor names the bad pixel
-        return sensor.sample(photons, exposure, key=key, engine="reference")
-    first = keys.words(key, photons.shape)
+        return sensor.sample(photons, exposure, key=key, origin=origin, engine="reference")
+    first = keys.words(key, photons.shape, origin)
     try:
         return table.draw(photons, first)
     except LookupError:
-        return table.draw(photons, first, keys.words(key, photons.shape, redraw=1))
+        return table.draw(photons, first, keys.words(key, photons.shape, origin, redraw=1))
 
 
 def open_clips(path: Path | str, split: str | None = None) -> list[Clip]:
@@ -205,8 +234,7 @@ def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "code
 
 def sensed(clip: Clip, light: Light, seed: int = 0) -> tuple[Codes, float]:
     """A clip as a sensor sees it, drawn when read, and the light factor: the codes that `qsim sense` would store."""
-    sensing = Sensing(light.sensor, bits=light.bits, ppp=light.ppp, seed=seed)
-    draw = prepare(clip, sensing)
+    sensing, draw = light.sensing(seed), light.draw(clip, seed)
 
     def read(start: int, stop: int) -> Array:
         try:

@@ -90,6 +90,19 @@ def add_light(parser: argparse.ArgumentParser, several: bool) -> None:
     parser.add_argument("--bits", type=whole, help="bits per code (default 3)")
 
 
+def add_noise(parser: argparse.ArgumentParser) -> None:
+    """Of training: what is not given is taken from the data set's streams."""
+    parser.add_argument(
+        "--sensor",
+        type=words,
+        help="names of `qsim doctor --devices` or .toml files, comma-separated (default: the data set's streams')",
+    )
+    parser.add_argument(
+        "--ppp", type=numbers, help="mean photons per pixel and exposure; several: 1,10 (default: the streams')"
+    )
+    parser.add_argument("--bits", type=whole_numbers, help="bits per code; several: 1,3 (default: the streams')")
+
+
 def add_running(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--memory", type=size, default="2GB", help="working memory, as in 500MB (default 2GB)")
     parser.add_argument("--mode", choices=MODES, help="networks: how frames share work (default exact)")

@@ -15,7 +15,7 @@ import json
 import math
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,16 @@ import torch
 from torch import nn
 
 from quiver import weights
-from quiver.data import Light, Lock, check_ours, read_json, replacing, write_bytes, write_json
+from quiver.data import Light, Lock, check_ours, open_clips, read_json, replacing, write_bytes, write_json
 from quiver.loss import PRESETS as LOSSES
+from quiver.noise import Mixture, Noise, choose, describe
 from quiver.optimiser import OPTIMISERS, Kind, Optimiser
 
 SCHEDULES = ("cosine", "plateau")
-OURS = r"(settings|history)\.json|checkpoint\.pt|(best|last)\.safetensors|curve\.png|lock"  # what a run writes
+OURS = (  # what a run writes
+    r"(settings|history)\.json|(checkpoint|failed(-\d+)?)\.pt|(best|last)\.safetensors|curve\.png|lock|"
+    r"events\.out\.tfevents\..*"
+)
 LOCK = "lock"  # of a folder of results: held by the process that works in it
 PRECISIONS = ("auto", "float32", "bfloat16")
 
@@ -42,9 +46,10 @@ class Settings:
     network: str = "nano"  # name of the model, for the record
     steps: int | None = None  # optimiser steps; with `minutes`, whichever ends first
     minutes: float | None = None  # wall-clock limit, validation included
-    sensor: str = "quiver-physical"
-    ppp: tuple[float, ...] = (3.25,)  # light levels; every sample draws one
-    bits: tuple[int, ...] = (3,)  # bit depths; every sample draws one
+    sensor: str | tuple[str, ...] | None = None  # as asked for; None: those of the data set's streams
+    ppp: tuple[float, ...] | None = None  # light levels as asked for; None: those of the streams
+    bits: tuple[int, ...] | None = None  # bit depths as asked for; None: those of the streams
+    noise: tuple[Noise, ...] | None = None  # what these come to, filled in by `settled`; every window draws one
     crop: int = 64  # px
     frames: int = 11  # of a training window; each one beyond eleven is one more restored frame for little more work
     batch: int = 8  # of each process
@@ -67,6 +72,7 @@ class Settings:
     workers: int = 0  # processes that draw samples, beside the training one
     precision: str = "auto"  # float32, bfloat16; auto = bfloat16 on CUDA
     seed: int = 0
+    threads: int | None = None  # of torch; None: measured
 
     def __post_init__(self) -> None:
         if self.steps is None and self.minutes is None:
@@ -83,17 +89,30 @@ class Settings:
                 raise ValueError(f"no {name} is called {getattr(self, name)!r}; known are {', '.join(known)}")
 
     @property
+    def sensors(self) -> tuple[str, ...] | None:
+        """Names or files of the sensors that are asked for."""
+        return (self.sensor,) if isinstance(self.sensor, str) else self.sensor
+
+    @property
     def lights(self) -> tuple[Light, ...]:
-        """Every combination of bit depth and light level."""
-        return tuple(Light(self.sensor, ppp, bits) for bits in self.bits for ppp in self.ppp)
+        """Every combination of sensor, bit depth and light level, with the defaults for what is not asked for."""
+        if self.noise is not None:
+            return self.noise
+        return tuple(
+            Light(sensor, ppp, bits)
+            for sensor in self.sensors or ("quiver-physical",)
+            for bits in self.bits or (3,)
+            for ppp in self.ppp or (3.25,)
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON gives it back: lists for tuples."""
-        return {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self).items()}
+        plain = {name: list(v) if isinstance(v, tuple) else v for name, v in vars(self).items()}
+        return plain | {"noise": None if self.noise is None else [noise.to_dict() for noise in self.noise]}
 
 
 # Ours, and what the authors' program and the paper's text say (spec 5.2): bundles of defaults; options override.
-_PUBLISHED = {"schedule": "plateau", "warmup": 0, "crop": 128, "reverse": False}
+_PUBLISHED = {"schedule": "plateau", "warmup": 0, "crop": 128, "reverse": False, "ppp": (3.25,), "bits": (3,)}
 PROTOCOLS: dict[str, dict[str, Any]] = {
     "quick": {"optimiser": "muon", "learning_rate": 6e-3, "loss": "scales-l1", "drift": 3, "head_start": 0.85},
     "control": {"loss": "l1"},
@@ -101,8 +120,51 @@ PROTOCOLS: dict[str, dict[str, Any]] = {
     | {"sensor": "quiver-published", "force_exposure": True, "learning_rate": 1e-4, "steps": 48_000},
     "paper": _PUBLISHED
     | {"sensor": "quiver-paper", "learning_rate": 2.5e-5, "batch": 4, "loss": "paper", "steps": 94_500},
-    "spad-sum": {"sensor": "spad-320x240", "ppp": (4.9,)},
+    "spad-sum": {"sensor": "spad-320x240", "ppp": (4.9,), "bits": (3,)},
 }
+_ASKED = ("sensor", "ppp", "bits")
+
+
+def settled(settings: Settings, *, force: bool = False) -> tuple[Settings, list[str]]:
+    """The settings with the noise of a run, and what there is to say of it; `ValueError` where it cannot be drawn.
+
+    A folder that holds a run keeps its noise, and what is not asked for is what was asked for then.
+    """
+    if settings.noise is not None:
+        return settings, Mixture(settings.noise).lines
+    clips = open_clips(settings.data, "train")
+    mixture = choose(clips, settings.sensors, settings.ppp, settings.bits)
+    path = Path(settings.out) / "settings.json"
+    if force or not path.is_file():
+        return replace(settings, noise=mixture.noises), mixture.lines
+    found = read_json(path)
+    try:
+        asked = {name: getattr(settings, name) or _as_tuple(found.get(name)) for name in _ASKED}
+        noise = _recorded(found)
+        told = replace(settings, **asked, noise=noise)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}; the file is damaged, start again with --force") from None
+    files = tuple(name for name in settings.sensors or () if name.endswith(".toml"))
+    if files and "noise" in found and set(mixture.noises) != set(noise):
+        raise FileExistsError(
+            f"{settings.out} holds a run with noise: {describe(noise)}; {', '.join(files)} says something else now; "
+            "choose another -o, or start again with --force"
+        )
+    return told, Mixture(noise, "as this run began", mixture.streams).lines
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _recorded(found: Mapping[str, Any]) -> tuple[Noise, ...]:
+    """The noise of a run from its settings; runs of earlier versions had sensor, bits and ppp, and drew no defects."""
+    if found.get("noise") is not None:
+        if not isinstance(found["noise"], list) or not found["noise"]:
+            raise ValueError(f"noise is {_short(found['noise'])}")
+        return tuple(Noise.from_dict(values) for values in found["noise"])
+    old = Settings("", "", steps=1, **{name: _as_tuple(found.get(name)) for name in _ASKED})
+    return tuple(replace(Noise.of(light), defects=None) for light in old.lights)
 
 
 @dataclass
@@ -166,10 +228,17 @@ def _load_weights(model: nn.Module, stored: Any) -> None:
 def alone_in(folder: Path, doing: str) -> Iterator[None]:
     """Hold the lock of a folder of results; `ValueError` if another process holds it."""
     lock = Lock(folder / LOCK)
-    if not lock.acquire():
-        raise ValueError(f"{folder}: another process {doing} here; wait for it to end, or choose another -o")
-    with lock:
+    while True:
+        if not lock.acquire():
+            raise ValueError(f"{folder}: another process {doing} here; wait for it to end, or choose another -o")
+        if lock.is_current():
+            break
+        lock.release()  # its holder deleted the file between our opening and our locking it
+    try:
         yield
+    finally:
+        lock.path.unlink(missing_ok=True)
+        lock.release()
 
 
 def empty(folder: Path) -> None:
@@ -224,11 +293,13 @@ class Run:
 
     def _check_settings(self) -> None:
         wanted, found = self.settings.to_dict(), read_json(self.folder / "settings.json")
+        free = {"out", "workers", "threads"} | ({"noise"} - found.keys())  # earlier versions wrote no noise
         for name in wanted:
-            if name not in ("out", "workers") and found.get(name) != wanted[name]:
+            if name not in free and found.get(name) != wanted[name]:
+                before = "as in its data set" if found.get(name) is None else _short(found[name])
                 raise FileExistsError(
-                    f"{self.folder} holds a run with {name} {_short(found.get(name))}, now it is "
-                    f"{_short(wanted[name])}; choose another -o, or start again with --force"
+                    f"{self.folder} holds a run with {name} {before}, now it is {_short(wanted[name])}; choose "
+                    "another -o, or start again with --force"
                 )
 
     def save(self, path: Path, model: nn.Module, optimiser: Optimiser, state: State, **extra: Any) -> None:
@@ -267,14 +338,30 @@ class Run:
 
     def save_weights(self, name: str, model: nn.Module, state: State) -> None:
         """NAME.safetensors with the settings in its notes; of folders only the name, because weights travel."""
-        settings = self.settings.to_dict()
-        settings |= {name: Path(settings[name]).name for name in ("data", "out")}
+        settings = portable(self.settings)
         notes = {"step": str(state.step), "settings": json.dumps(settings, sort_keys=True)}
         weights.save(model, model.config, self.folder / f"{name}.safetensors", notes)  # type: ignore[arg-type]
 
     def save_history(self, state: State) -> None:
         """The curve so far, one entry per validation."""
         write_json(self.folder / "history.json", {"settings": self.settings.to_dict(), "history": state.history})
+
+
+def portable(settings: Settings) -> dict[str, Any]:
+    """Settings for a weights file: of folders and files only the names; sensor, ppp and bits are those of the noise."""
+    found = settings.to_dict()
+    found |= {name: Path(found[name]).name for name in ("data", "out")}
+    for noise in found["noise"] or ():
+        noise["sensor"] = Path(noise["sensor"]).name
+        for value in (noise["defects"] or {}).values():
+            if isinstance(value, dict) and "file" in value:
+                value["file"] = Path(value["file"]).name
+    if found["noise"]:
+        sensors = list(dict.fromkeys(noise["sensor"] for noise in found["noise"]))
+        found["sensor"] = sensors[0] if len(sensors) == 1 else sensors
+        for name in ("ppp", "bits"):
+            found[name] = list(dict.fromkeys(noise[name] for noise in found["noise"] if noise[name] is not None))
+    return found
 
 
 def draw_curve(folder: Path, history: Sequence[Mapping[str, float]]) -> Path | None:

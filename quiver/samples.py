@@ -5,7 +5,7 @@
 Sample n is a function of (seed, n) alone: which clip, where, how turned, at which light level, and every bit of its
 noise; so 0, 1 or 8 workers give the same bytes and a killed run goes on with the sample it would have drawn. Sample
 n + e * len(windows) is sample n of epoch e: count on to get fresh noise. Dr.Jit, which does not survive a fork, is
-never touched.
+never touched. Sensor, light and defects are those of the clips' streams unless the settings name others (noise.py).
 
     windows = Windows(open_clips("out/starter", "train"), WindowSettings(crop=64))
     loader = DataLoader(windows, batch_sampler=Batches(8, first=0, last=1000))
@@ -14,7 +14,7 @@ never touched.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,8 @@ import torch
 from numpy import ndarray as Array
 from torch.utils.data import Dataset, Sampler
 
-from quiver.data import Clip, Key, Light, Sensor, clip_photons, draw_codes, has_sharp, light_level
+from quiver.data import Clip, Draw, Key, Light, Sensor, clip_photons, draw_codes, has_sharp
+from quiver.noise import Mixture, Noise, check_windows, choose, window_codes
 
 TRAINING, VALIDATION = 1, 2  # stages of the random keys: no two uses share noise (0 is `qsim sense`)
 
@@ -31,7 +32,7 @@ TRAINING, VALIDATION = 1, 2  # stages of the random keys: no two uses share nois
 class WindowSettings:
     """What a training sample is."""
 
-    lights: tuple[Light, ...] = (Light(),)  # each sample draws one
+    lights: tuple[Light, ...] | None = None  # each sample draws one; None: those of the clips' streams
     frames: int = 11
     crop: int = 64  # px, side of the square; validation takes the centre
     flips: bool = True  # the eight flips and quarter turns
@@ -44,8 +45,8 @@ class WindowSettings:
     def __post_init__(self) -> None:
         if self.frames < 1 or self.crop < 1:
             raise ValueError(f"WindowSettings: frames and crop must be at least 1, got {self.frames} and {self.crop}")
-        if not self.lights:
-            raise ValueError("WindowSettings.lights is empty; give at least one light level")
+        if self.lights is not None and not self.lights:
+            raise ValueError("WindowSettings.lights is empty; give at least one light level, or None for the streams'")
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,9 @@ class Windows(Dataset[dict[str, Any]]):
     """Windows of `frames` frames from the clips of a folder, with fresh noise: a map-style `torch` data set.
 
     item: codes float32 [T, 1, h, w] in [0, 1], target float32 [T, 1, h, w] = sharp photons / white (up to `ceiling`),
-    white [photons], ppp, sample (its number), key (text: clip, place, light, random key). `ValueError` for a folder
-    without clips and for clips shorter or smaller than a window.
+    white [photons], ppp, sample (its number), key (text: clip, place, light, random key). Codes and target follow the
+    sensor of their window. `noise` is the mixture that windows draw from, `print(windows)` says it. `ValueError` for a
+    folder without clips, for clips shorter or smaller than a window, and for noise that windows cannot have.
     """
 
     def __init__(
@@ -80,8 +82,14 @@ class Windows(Dataset[dict[str, Any]]):
         """
         check_clips(clips, settings)
         self.clips, self.settings, self.fixed = tuple(clips), settings, fixed
-        self.length = len(clips) * (len(settings.lights) if fixed else repeats)
-        self._factors: dict[tuple[int, int], float] = {}
+        self.noise = choose(clips) if settings.lights is None else Mixture(tuple(map(Noise.of, settings.lights)))
+        for noise in self.noise.noises:
+            check_windows(noise, clips[0])
+        self.length = len(clips) * (len(self.noise.noises) if fixed else repeats)
+        self._draws: dict[tuple[int, int], Draw] = {}
+
+    def __repr__(self) -> str:
+        return f"<Windows of {len(self.clips)} clips; {'; '.join(self.noise.lines)}>"
 
     def __len__(self) -> int:
         return self.length
@@ -106,7 +114,7 @@ class Windows(Dataset[dict[str, Any]]):
             y=y,
             x=x,
             drift=drift,
-            light=int(rng.integers(len(settings.lights))),
+            light=int(rng.integers(len(self.noise.noises))),
             turn=int(rng.integers(8)) if settings.flips else 0,
             backwards=bool(rng.integers(2)) if settings.reverse else False,
             key=Key(seed=settings.seed, clip=n, stage=TRAINING),
@@ -130,49 +138,60 @@ class Windows(Dataset[dict[str, Any]]):
 
     def __getitem__(self, n: int) -> dict[str, Any]:
         place = self.place(n)
-        clip, light = self.clips[place.clip], self.settings.lights[place.light]
-        sensor = light.device(clip.exposure)
+        clip, noise, draw = self.clips[place.clip], self.noise.noises[place.light], self._draw(place)
         photons, sharp = self._photons(place)
-        exposed = photons
-        if self.settings.force_exposure and light.ppp is not None:
-            exposed = photons * (light.ppp / max(float(photons.mean()), 1e-9))
+        scale = 1.0
+        if self.settings.force_exposure and noise.ppp is not None:
+            scale = noise.ppp / max(float(photons.mean()), 1e-9)
         try:
-            codes = draw_codes(sensor, exposed, clip.exposure, place.key)
+            if noise.defects is None:
+                codes = draw_codes(draw.sensor, photons * scale, clip.exposure, place.key)
+            else:
+                drawn = window_codes(noise, draw, clip, place, self.settings.frames, self.settings.crop, scale)
+                codes = turned(drawn, replace(place, backwards=False))  # drawn in the order in which they are seen
         except ValueError as error:
             raise ValueError(f"{clip.path}: window from frame {place.start}: {error}") from None
-        white = sensor.white(clip.exposure)
+        white = draw.sensor.white(clip.exposure)
         return {
-            "codes": as_input(codes, sensor),
+            "codes": as_input(codes, draw.sensor),
             "target": torch.from_numpy(np.minimum(sharp / white, self.settings.ceiling).astype(np.float32))[:, None],
             "white": white,
-            "ppp": float(exposed.mean()),
+            "ppp": float((photons * scale).mean()),
             "sample": n,
             "key": f"{clip.name} frame {place.start}, (y, x) ({place.y}, {place.x}), turn {place.turn}, "
-            f"{'backwards, ' if place.backwards else ''}{light.label}, {place.key}",
+            f"{'backwards, ' if place.backwards else ''}{noise.label}, {place.key}",
         }
 
     def _photons(self, place: Place) -> tuple[Array, Array]:
         """Expected photons of the exposed and of the sharp window, [T, h, w], turned."""
         clip, side = self.clips[place.clip], self.settings.crop
-        (dy, dx), factor = place.drift, self._factor(place.clip, place.light)
+        (dy, dx), draw = place.drift, self._draw(place)
 
         def taken(sharp: bool) -> Array:
             return np.stack(
                 [
                     clip_photons(
-                        clip, place.start + i, factor, (place.y + dy * i, place.x + dx * i, side, side), sharp=sharp
+                        clip,
+                        place.start + i,
+                        draw.level.factor,
+                        (place.y + dy * i, place.x + dx * i, side, side),
+                        sharp=sharp,
+                        diffraction=draw.diffraction and not sharp,
                     )
                     for i in range(self.settings.frames)
                 ]
             )
 
         exposed = taken(sharp=False)
-        return turned(exposed, place), turned(taken(sharp=True) if has_sharp(clip) else exposed, place)
+        return turned(exposed, place), turned(
+            taken(sharp=True) if has_sharp(clip) or draw.diffraction else exposed, place
+        )
 
-    def _factor(self, clip: int, light: int) -> float:
-        if (clip, light) not in self._factors:
-            self._factors[clip, light] = light_level(self.clips[clip], ppp=self.settings.lights[light].ppp).factor
-        return self._factors[clip, light]
+    def _draw(self, place: Place) -> Draw:
+        """Sensor and light factor of a place's clip and noise."""
+        if (place.clip, place.light) not in self._draws:
+            self._draws[place.clip, place.light] = self.noise.noises[place.light].draw(self.clips[place.clip])
+        return self._draws[place.clip, place.light]
 
 
 def turned(window: Array, place: Place) -> Array:

@@ -30,7 +30,7 @@ from quiver.loss import PRESETS as LOSSES
 from quiver.loss import training_loss
 from quiver.model import RADIUS, WINDOW
 from quiver.optimiser import Optimiser
-from quiver.run import Run, Settings, State
+from quiver.run import Run, Settings, State, settled
 from quiver.samples import Batches, Windows, WindowSettings
 
 CHECKPOINT_SECONDS = 120.0
@@ -139,7 +139,7 @@ def make_windows(settings: Settings, multiple: int) -> tuple[Windows, Subset[dic
     if settings.crop % multiple:
         raise ValueError(f"--crop {settings.crop}: this network needs a multiple of {multiple}")
     window = WindowSettings(
-        lights=settings.lights,
+        lights=settings.noise,
         frames=settings.frames,
         crop=settings.crop,
         flips=settings.flips,
@@ -261,15 +261,17 @@ def train(
     should_stop: Callable[[], bool] = lambda: False,
     progress: bool = True,
     force: bool = False,
+    note: Callable[[str], None] = lambda line: None,
 ) -> State:
     """Train `model` in place until the end that the settings name, or until `should_stop`; returns the state reached.
 
-    Resumes the run in `settings.out` if there is one; `force` begins it again. Raises ValueError and OSError for
-    settings and folders that do not fit, `Diverged` for NaN or Inf. Denormal numbers count as zero in this process from
-    then on.
+    Resumes the run in `settings.out` if there is one; `force` begins it again. `note` gets a line or two on the
+    noise that windows are drawn with. Raises ValueError and OSError for settings and folders that do not fit,
+    `Diverged` for NaN or Inf. Denormal numbers count as zero in this process from then on.
     """
     torch.set_flush_denormal(True)  # gradients through the tails of GELU are such numbers: a step can be twice as slow
     with joined(device) as process, contextlib.ExitStack() as stack:
+        settings, lines = settled(settings, force=force)
         windows, fixed = make_windows(settings, int(model.multiple))  # type: ignore[arg-type]
         run = Run(settings)
         if process.leads:
@@ -278,6 +280,8 @@ def train(
         model.to(process.device).train()
         optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)
         state = run.load(model, optimiser, process.device)
+        for line in lines if process.leads else ():
+            note(line)
         parallel = (
             nn.parallel.DistributedDataParallel(model, find_unused_parameters=True) if process.world > 1 else model
         )
