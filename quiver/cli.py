@@ -8,16 +8,18 @@ import argparse
 import os
 import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from quiver.cli_domain import add_domain
 from quiver.cli_train import add_ablate, add_train
 from quiver.options import (
     DEFAULT_METHOD,
     add_light,
     add_running,
+    add_strict,
     command,
     count,
     handling,
@@ -38,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--version", action="version", version=f"quiver {__version__}")
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
-    for add in (add_train, _add_restore, _add_evaluate, add_ablate, _add_bench, _add_convert_weights):
+    for add in (add_train, _add_restore, _add_evaluate, add_domain, add_ablate, _add_bench, _add_convert_weights):
         add(sub)
     add_completion(sub, parser)
     with handling(signal.default_int_handler, signal.SIGTERM):  # termination cleans up like Ctrl-C
@@ -71,6 +73,7 @@ def _add_restore(sub: Any) -> None:
     parser.add_argument("--planes", type=count, help="packed planes: 2^b - 1 are summed to one code (default 1)")
     parser.add_argument("--frame-rate", type=positive, help="bare array: codes per second (default 2000)")
     add_running(parser)
+    add_strict(parser)
     parser.add_argument("--force", action="store_true", help="replace an existing result")
 
 
@@ -89,6 +92,7 @@ def _run_restore(args: argparse.Namespace) -> int:
             raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
     method = restorer(args.method, running_options(args))
     refuse_idle(vars(args), [method])
+    _check_domain(args, [method], [codes])
     target.parent.mkdir(parents=True, exist_ok=True)
     lines, started = [assumed(codes, method)], time.monotonic()
     with bar(method.name) as progress:
@@ -109,6 +113,24 @@ def _run_restore(args: argparse.Namespace) -> int:
         f"{meta['seconds_per_frame']:.3g} s per frame; photons, white = {codes.white:.4g}",
     )
     return 0
+
+
+def _check_domain(args: argparse.Namespace, methods: Sequence[Any], streams: Iterable[Any]) -> list[str]:
+    """A line on stderr for each network outside of what it was measured for; `ValueError` with --strict."""
+    from quiver.data import note
+    from quiver.domain import measured_at, refuse_outside, remarks
+
+    found: list[str] = []
+    for codes in streams:
+        found += [text for text in remarks(methods, codes) if text not in found]
+        if args.strict:
+            refuse_outside(methods, found)
+        if args.verbose:
+            for text in filter(None, (measured_at(method, codes) for method in methods)):
+                note(f"quiver: {text}")
+    for text in found:
+        note(f"quiver: warning: {text}")
+    return found
 
 
 # evaluate
@@ -140,7 +162,8 @@ def _add_evaluate(sub: Any) -> None:
     parser.add_argument("--frames", type=count, help="static: frames to restore from (default 11)")
     parser.add_argument("--splits", type=count, help="static: random splits (default 3)")
     add_running(parser)
-    parser.add_argument("--force", action="store_true", help="start anew where an evaluation is")
+    add_strict(parser)
+    parser.add_argument("--force", action="store_true", help="start again where an evaluation is")
 
 
 def _run_evaluate(args: argparse.Namespace) -> int:
@@ -155,16 +178,17 @@ def _run_evaluate(args: argparse.Namespace) -> int:
         raise ValueError("give a data set or clip folder and -o, or --static COUNTS")
     from quiver import table
     from quiver.data import bar, output
-    from quiver.evaluate import evaluate
+    from quiver.evaluate import evaluate, streams
     from quiver.sources import plan_of
 
     plan = plan_of(args)
+    remarks = _check_domain(args, methods, streams(plan))
     if args.force and args.output.exists():
         renew(args.output, "plan.json", r"plan\.json|rows\.jsonl|evaluation\.(json|md|png)|crops_[^/]*\.png|lock")
     with bar("rows", "row") as progress:
         rows = evaluate(plan, methods, args.output, lambda what, done, total: progress(done, total))
-    table.write(args.output, plan, methods, rows)
-    output(args, table.as_dict(plan, methods, rows), table.markdown(plan, methods, rows))
+    table.write(args.output, plan, methods, rows, remarks)
+    output(args, table.as_dict(plan, methods, rows, remarks), table.markdown(plan, methods, rows, remarks))
     return 1 if any(row.failure for row in rows) else 0
 
 
@@ -172,13 +196,14 @@ def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
     from quiver.data import output, peak_of
     from quiver.evaluate import json_safe
     from quiver.sources import refuse_for_counts
-    from quiver.static import FORMAT, evaluate_static, markdown, read_counts
+    from quiver.static import FORMAT, counted, evaluate_static, markdown, read_counts
 
     refuse_for_counts(args)
     if not args.static.is_file():
         raise FileNotFoundError(f"{args.static}: no such file")
     counts = read_counts(args.static)
     bits, frames = (args.bits or (3,))[0], args.frames or 11
+    _check_domain(args, methods, [counted(counts, bits)])
     scores = evaluate_static(
         counts, methods, frames=frames, bits=bits, splits=args.splits or 3, seed=args.seed or 0, peak=args.peak
     )

@@ -232,6 +232,13 @@ def evaluate(
     return rows
 
 
+def streams(plan: Plan) -> Iterator[Codes]:
+    """Every stream of a plan, nothing drawn yet; as `evaluate` for what cannot be scored."""
+    for light in plan.lights:
+        for clip in open_clips(plan.source, plan.split):
+            yield (sensed(clip, light, plan.seed) if plan.stream is None else stored(clip, plan.stream))[0]
+
+
 def in_memory(codes: Codes) -> Codes:
     """The same, drawn once for all methods."""
     return replace(codes, read=array_codes(codes.read(0, codes.shape[0]), codes.sensor, codes.exposure).read)

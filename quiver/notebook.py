@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 
 import numpy as np
 from numpy import ndarray as Array
 
 from quiver.data import Clip, Codes, Light, Sensor, Stream, array_codes, open_stream, sensed, stream_codes
+from quiver.domain import refuse_outside, remarks
 from quiver.options import DEFAULT_METHOD
 from quiver.restoring import Options, restorer
 from quiver.sources import refuse_idle
@@ -25,6 +27,7 @@ def restore(
     ppp: float | None = None,
     device: str | None = None,
     mode: str | None = None,
+    strict: bool = False,
 ) -> Array:
     """Restored video, float32 [T, H, W], in photons per pixel and exposure (expected, before quantum efficiency).
 
@@ -32,13 +35,19 @@ def restore(
     either; or integer codes [T, H, W], for which `sensor` and `exposure` [s] must be given. `method` is a classical
     method (naive, moment, likelihood, transform-denoise, qbp, qbp-bm3d), shipped weights (default nano), a .safetensors
     file or a folder of `quiver train`; `device` (auto, cpu, cuda) and `mode` (exact, streaming, windows) are for
-    networks. `ValueError` or `FileNotFoundError` where these do not fit together.
+    networks. A network outside of what it was measured for warns, and with `strict` it is a `ValueError`. `ValueError`
+    or `FileNotFoundError` where these do not fit together.
 
         video = quiver.restore("out/fan", "moment")
     """
     codes = _codes(source, sensor, exposure, ppp)
     chosen = restorer(method, Options(device=device or "auto", mode=mode or "exact"))
     refuse_idle({"device": device, "mode": mode}, [chosen])
+    found = remarks([chosen], codes)
+    if strict:
+        refuse_outside([chosen], found)
+    for text in found:
+        warnings.warn(text, stacklevel=2)
     return chosen.restore(codes)
 
 

@@ -110,6 +110,12 @@ def add_running(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--precision", choices=("float32", "bfloat16"), help="networks: default float32")
 
 
+def add_strict(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--strict", action="store_true", help="networks: refuse a stream outside of what they were measured for"
+    )
+
+
 def running_options(args: argparse.Namespace) -> Any:
     """What `add_running` asked for, as `restoring.Options`."""
     from quiver.restoring import Options

@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +28,8 @@ from quiver.tiles import plan_tiles
 if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
+
+    from quiver.domain import Scope
 
 PRETRAINED = Path(__file__).parent / "pretrained"  # weights that ship with the package
 DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory beside the weights
@@ -70,6 +72,7 @@ class Restorer:
     fill: Fill
     seamless: bool = True  # a range of frames restored alone equals that part of the whole
     identity: Mapping[str, object] = field(default_factory=dict)  # settings and weights that change the answer
+    scope: Scope | None = None  # of a network: what it was measured for or trained on; None: not known
 
     def restore(self, codes: Codes, first: int = 0, last: int | None = None, progress: Progress | None = None) -> Array:
         """Restored photons float32 [last - first, H, W] of frames first ... last - 1, all of them by default."""
@@ -151,13 +154,29 @@ def weights_path(name: str) -> Path:
 
 def network_restorer(path: Path, options: Options) -> Restorer:
     """The network stored in a weights file; a training run is named after its folder."""
-    from quiver.weights import load
+    from quiver.domain import read_scope
+    from quiver.weights import load, metadata_of
 
     model = load(path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     name = path.parent.name if path.name == "best.safetensors" else path.stem
-    description = f"{type(model).__name__}, weights {digest[:12]}, {options.mode}"
-    return wrap_network(model, name, description, options, weights_sha256=digest)
+    description = f"{network_title(model)}, weights {digest[:12]}, {options.mode}"
+    method = wrap_network(model, name, description, options, weights_sha256=digest)
+    return replace(method, scope=read_scope(path, metadata_of(path)))
+
+
+def network_title(model: nn.Module) -> str:
+    """What a network is, for people: `nano (U-Net on aligned frames)`, `QUIVER (quiver-s)`, `U-Net`."""
+    from quiver.config import PRESETS
+    from quiver.model import QUIVER
+
+    if not isinstance(model, QUIVER):
+        return "U-Net"
+    preset = next((name for name, config in PRESETS.items() if config == model.config), None)
+    if model.config.baseline:  # its picture is that of the hourglass; the recurrent part hardly adds to it
+        what = "U-Net on aligned frames" if model.config.sweep else "U-Net with a recurrent part"
+        return what if preset is None else f"{preset} ({what})"
+    return "QUIVER" if preset is None else f"QUIVER ({preset})"
 
 
 def wrap_network(

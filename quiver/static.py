@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import nan
 from pathlib import Path
 from typing import IO
@@ -22,7 +22,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from quiver import metrics
-from quiver.data import array_codes, ideal_counter, peak_of, reading
+from quiver.data import Codes, array_codes, ideal_counter, peak_of, reading
 from quiver.restoring import Restorer
 
 FORMAT = "quiver-static-2"  # of the JSON that `quiver evaluate --static` prints; 1: peak = the largest code
@@ -114,6 +114,19 @@ def reference(counts: Counts, chosen: Array) -> tuple[Array, Array]:
     return estimate, estimate / light
 
 
+def counted(counts: Counts, bits: int, given: Array | slice = slice(None)) -> Codes:
+    """The chosen frames as codes of an ideal counter of so many bits."""
+    _check_bits(counts, bits)
+    sensor = ideal_counter(bits)
+    codes = np.minimum(counts.frames[given], sensor.levels - 1).astype(np.uint8)
+    return replace(array_codes(codes, sensor, 1.0, counts.name), ppp=counts.light, sensor_name="ideal counter")
+
+
+def _check_bits(counts: Counts, bits: int) -> None:
+    if not 1 <= bits <= 8:
+        raise ValueError(f"{counts.name}: counts are clipped to codes of 1 to 8 bits, got {bits}")
+
+
 def mean_square(output: Array, target: Array, noise: Array) -> float:
     """Mean squared error of clamped images, in units of the peak, without what the target's variance adds to it."""
     squares = (np.clip(output, 0, 1) - np.clip(target, 0, 1)) ** 2
@@ -132,10 +145,8 @@ def score_split(
 
     `given` frames are restored.
     """
-    sensor, exposure = ideal_counter(bits), 1.0
-    codes = np.minimum(counts.frames[given], sensor.levels - 1).astype(np.uint8)
     centre = len(given) // 2
-    restored = method.restore(array_codes(codes, sensor, exposure), centre, centre + 1)[0]
+    restored = method.restore(counted(counts, bits, given), centre, centre + 1)[0]
     output = restored / (peak * float(counts.shares[given].mean()))
     others = np.setdiff1d(np.arange(len(counts.frames)), given)
     target, variance = reference(counts, others)
@@ -164,8 +175,7 @@ def evaluate_static(
 
     ValueError if no frame is left for the reference, and for codes of more than 8 bits.
     """
-    if bits > 8:
-        raise ValueError(f"{counts.name}: counts are clipped to codes of 1 to 8 bits, got {bits}")
+    _check_bits(counts, bits)
     if not 1 <= frames < len(counts.frames):
         raise ValueError(
             f"{counts.name}: {frames} frames to restore from leave none of {len(counts.frames)} for the reference"

@@ -257,6 +257,19 @@ def load(path: Path) -> QUIVER | UNet:
     return network.requires_grad_(True).eval()
 
 
+def metadata_of(path: Path) -> dict[str, str]:
+    """The notes of a safetensors file; FileNotFoundError or ValueError for any other file."""
+    return _read_safetensors(path)[1]
+
+
+def annotate(path: Path, notes: Mapping[str, str]) -> None:
+    """Add notes to a weights file of ours; its tensors stay the same, bit for bit."""
+    tensors, metadata = _read_safetensors(path)
+    if metadata.get("format") != FORMAT:
+        raise ValueError(f"{path}: not weights of this program (no format {FORMAT!r}); see `quiver convert-weights`")
+    write_bytes(path, to_safetensors(tensors, metadata | dict(notes)))
+
+
 def _build(kind: str, values: dict[str, object]) -> QUIVER | UNet:
     if kind == "QUIVER":
         return QUIVER(Config.from_dict(values))

@@ -15,7 +15,7 @@ from quiver.data import open_clips
 from quiver.options import size
 
 ROOT = Path(__file__).parents[2]
-COMMANDS = ("train", "restore", "evaluate", "ablate", "bench", "convert-weights")
+COMMANDS = ("train", "restore", "evaluate", "domain", "ablate", "bench", "convert-weights")
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:

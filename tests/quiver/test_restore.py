@@ -218,7 +218,7 @@ def test_weights_are_found_by_file_folder_and_name(tmp_path):
     found = network_restorer(tmp_path / "best.safetensors", Options(device="cpu"))
     assert found.name == tmp_path.name
     assert found.learned
-    assert "UNet, weights " in found.description
+    assert found.description.startswith("U-Net, weights ")
     with pytest.raises(FileNotFoundError, match="no such weights file"):
         restorer(str(tmp_path / "none.safetensors"))
     with pytest.raises(ValueError, match=r"no method 'momnt' \(did you mean 'moment'\?\); known are naive, "):
