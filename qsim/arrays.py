@@ -65,7 +65,10 @@ def read_codes_npy(path: Path, hints: Hints) -> Footage:
 
 
 def read_mat(path: Path, hints: Hints) -> Footage:
-    """SwissSPAD .mat: OUTPUT [H, W, T] of one file, or of part_1.mat ... part_n.mat in a folder with info.json."""
+    """SwissSPAD .mat: OUTPUT [H, W, T] of one file, or of part_1.mat ... part_n.mat in a folder with info.json.
+
+    Another name is taken from `hints.variable`, or if it is the only array of frames.
+    """
     files = [path]
     if path.is_dir():
         files = numbered(list(path.glob("part_*.mat")))
@@ -79,7 +82,7 @@ def read_mat(path: Path, hints: Hints) -> Footage:
                 raise FileNotFoundError(f"{file}: missing, though info.json speaks of {len(files)} parts")
         if not files:
             raise FileNotFoundError(f"{path}: holds no part_1.mat")
-    parts = [_mat_output(file) for file in files]
+    parts = [mat_array(file, hints.variable) for file in files]
     if len({part.shape[1:] for part in parts}) > 1:
         raise ValueError(f"{path}: the parts differ in size: {sorted({part.shape[1:] for part in parts})}")
     planes = np.concatenate(parts)
@@ -239,44 +242,77 @@ def checked_codes(path: Path, values: Array, bits: int, first: int) -> Array:
     return values.astype(np.uint8 if bits <= 8 else np.uint16)
 
 
-def _mat_output(path: Path) -> Array:
-    """OUTPUT of a .mat file as [T, H, W]: level 5 by scipy, 7.3 (HDF5, axes reversed) by h5py."""
+def mat_array(path: Path, variable: str | None = None) -> Array:
+    """An array of a .mat file as [T, H, W]: level 5 by scipy, 7.3 (HDF5, axes reversed) by h5py; [H, W] is one frame.
+
+    The one called `variable`; without a name OUTPUT, or the only array of numbers in two or three dimensions.
+    """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     with open(path, "rb") as file:
         head = file.read(1024)
     if b"\x89HDF\r\n\x1a\n" in head:
-        return _hdf_output(path)
+        return _hdf_array(path, variable)
     import scipy.io
 
     with reading(path, "MATLAB 5 .mat"):
-        shapes = {name: shape for name, shape, _ in scipy.io.whosmat(path)}
-        if "OUTPUT" not in shapes:
-            raise ValueError(f"{path}: has no variable OUTPUT; it holds {sorted(shapes)}")
-        _plausible(path, shapes["OUTPUT"])
-        planes = scipy.io.loadmat(path, variable_names=["OUTPUT"])["OUTPUT"]
-        if planes.dtype.kind not in "bu" or planes.ndim not in (2, 3):
-            raise ValueError(f"{path}: OUTPUT is {planes.dtype} {list(planes.shape)}, expected unsigned [H, W, T]")
-        planes = planes if planes.ndim == 3 else planes[..., None]
-        return np.ascontiguousarray(planes.transpose(2, 0, 1))
+        numbers = ("int", "uint", "single", "double", "logical")
+        shapes = {name: shape for name, shape, kind in scipy.io.whosmat(path) if kind.startswith(numbers)}
+        name = _chosen(path, variable, shapes)
+        _plausible(path, shapes[name])
+        return _frames_first(path, name, scipy.io.loadmat(path, variable_names=[name])[name])
 
 
-def _hdf_output(path: Path) -> Array:
+def _hdf_array(path: Path, variable: str | None) -> Array:
     import h5py
 
     with reading(path, "MATLAB 7.3 .mat"), h5py.File(path, "r") as file:
-        link = file.get("OUTPUT", getlink=True)
-        if link is not None and not isinstance(link, h5py.HardLink):
-            raise ValueError(f"{path}: OUTPUT is a link, which may lead into another file; store the planes themselves")
-        if link is None or not isinstance(file["OUTPUT"], h5py.Dataset):
-            raise ValueError(f"{path}: has no variable OUTPUT; it holds {sorted(file)}")
-        stored = file["OUTPUT"]
+        own = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
+        wanted = variable or "OUTPUT"
+        if wanted in file.keys() - set(own):
+            raise ValueError(
+                f"{path}: {wanted} is a link, which may lead into another file; store the planes themselves"
+            )
+        shapes = {name: file[name].shape for name in own if isinstance(file[name], h5py.Dataset)}
+        name = _chosen(path, variable, shapes)
+        stored = file[name]
         if stored.external or stored.is_virtual:
-            raise ValueError(f"{path}: OUTPUT lies in other files, which are not read; store the planes themselves")
+            raise ValueError(f"{path}: {name} lies in other files, which are not read; store the planes themselves")
         _plausible(path, stored.shape)
-        if stored.dtype.kind not in "bu" or stored.ndim != 3:
-            raise ValueError(f"{path}: OUTPUT is {stored.dtype} {list(stored.shape)}, expected unsigned [T, W, H]")
-        return np.ascontiguousarray(stored[...].transpose(0, 2, 1))
+        if stored.dtype.kind not in "buif":
+            raise ValueError(f"{path}: {name} is {stored.dtype} {list(stored.shape)}, expected numbers [T, W, H]")
+        return _frames_first(path, name, stored[...].T)
+
+
+def _chosen(path: Path, variable: str | None, shapes: dict[str, tuple[int, ...]]) -> str:
+    """The array to read; `ValueError` with the names found where the choice is open."""
+    if variable is not None:
+        if variable not in shapes:
+            raise ValueError(f"{path}: has no array {variable}; it holds {sorted(shapes)}")
+        return variable
+    if "OUTPUT" in shapes:
+        return "OUTPUT"
+    images = sorted(
+        name for name, shape in shapes.items() if len(shape) in (2, 3) and min(shape) > 0 and max(shape) > 1
+    )
+    if len(images) == 1:
+        return images[0]
+    if not images:
+        raise ValueError(f"{path}: has no array of frames; it holds {sorted(shapes)}")
+    raise ValueError(f"{path}: holds the arrays {images}; choose one with --variable {images[0]}")
+
+
+def _frames_first(path: Path, name: str, planes: Array) -> Array:
+    """MATLAB's [H, W, T] or [H, W] as [T, H, W]; whole numbers stored as floats become integers."""
+    if planes.dtype.kind not in "buif" or planes.ndim not in (2, 3):
+        raise ValueError(f"{path}: {name} is {planes.dtype} {list(planes.shape)}, expected unsigned [H, W, T]")
+    planes = planes if planes.ndim == 3 else planes[..., None]
+    if planes.dtype.kind in "if":
+        whole = np.rint(planes)
+        if planes.size and not (np.isfinite(planes).all() and (whole == planes).all() and whole.min() >= 0):
+            raise ValueError(f"{path}: {name} holds values that are no counts: expected whole numbers from 0 up")
+        planes = whole.astype(np.uint32) if not planes.size or whole.max() < 2**32 else planes
+    return np.ascontiguousarray(planes.transpose(2, 0, 1))
 
 
 def _plausible(path: Path, shape: tuple[int, ...]) -> None:

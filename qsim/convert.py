@@ -43,6 +43,7 @@ def add_convert(sub: Any) -> None:
     reading.add_argument("--channel", type=int, help="of a colour cube: 0, 1 or 2")
     reading.add_argument("--flip", choices=("none", "lr", "ud", "both"), default="none", help="turn the frames")
     reading.add_argument("--columns", type=int, help="keep only the first columns (Vidar dumps: 400 of 416)")
+    reading.add_argument("--variable", help="array of a .mat file (default: OUTPUT, or the only one)")
     reading.add_argument("--sensor", help="that made the codes, by name or file (default: an ideal binary counter)")
     reading.add_argument("--ppp", type=float, help="light level the sensor's gain was set for")
     reading.add_argument("--split", choices=SPLITS, help="stored in the clips")
@@ -95,7 +96,7 @@ def _import(args: argparse.Namespace) -> list[Path]:
     if args.frame_rate is None:
         raise ValueError(f"{args.input}: files do not say how fast the capture was; add --frame-rate, as in 2000")
     hints = Hints(args.layout, args.height, args.width, args.bits, args.transfer, args.channel, args.flip, args.columns,
-                  args.stretched)  # fmt: skip
+                  args.stretched, args.variable)  # fmt: skip
     capture = formats.Capture(args.frame_rate, args.exposure, args.sensor, args.ppp, args.split)
     found = formats.recordings(args.input, args.layout)
     pairs = [(source, args.output / checks.check_name(_flat_name(source, args.input))) for source in found]

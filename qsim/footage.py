@@ -51,6 +51,7 @@ class Hints:
     flip: str = "none"  # lr, ud or both: put right what a reader of unknown convention turned
     columns: int | None = None  # keep only the first columns (raw Vidar dumps have 416, of which 400 are pixels)
     stretched: bool = False  # codes were stretched to 0 ... 255
+    variable: str | None = None  # the array of a .mat file, where it holds several
 
 
 @contextlib.contextmanager

@@ -102,6 +102,8 @@ def read(path: Path, hints: Hints | None = None) -> Footage:
         raise ValueError(f"layout {layout!r}: known are {', '.join(LAYOUTS)}")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file")
+    if hints.variable is not None and layout != "mat":
+        raise ValueError(f"{path}: --variable names an array of a .mat file, and this is {layout}; leave it out")
     footage = LAYOUTS[layout](path, hints)
     if layout in ASSUMED:
         footage = stated(footage, *ASSUMED[layout])
