@@ -7,64 +7,26 @@
 Model of a flat field of one light level: pixel p expects lambda (1 + s x_p) electrons, x_p normal with variance 1 (the
 PRNU s), plus dark electrons D t. All frames of a pixel share x_p, so codes of one pixel are not independent: the
 covariance of the fit is the sandwich I^-1 J I^-1, whose J holds that term (White, Econometrica 50, 1982).
-Left out: a spread of the dark current, of the offset and of the read noise between pixels; a gradient of the light,
-which is counted as PRNU; lag between frames.
+Left out of the fit: a spread of the dark current, of the offset and of the read noise between pixels; lag between
+frames. The PRNU that is reported comes from calibrate_pattern.py: without hot pixels, without a gradient of the light.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from math import exp, inf, isfinite, log, sqrt
 
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.calibrate_flats import qis_flats
+from qsim.calibrate_pattern import measure_pattern
+from qsim.calibrate_values import Calibration, Value, log_interval, normal_interval, root_interval
 from qsim.qis import QIS
 from qsim.stacks import Stack
 
-Z95 = 1.959963984540054  # two-sided 95 % of the normal distribution
 HIDDEN_PEAKS = 0.5  # e-: above this read noise the histogram has no separate electron peaks
-
-
-@dataclass(frozen=True)
-class Value:
-    """An estimate and its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-    unit: str
-    method: str
-
-    def __str__(self) -> str:
-        return f"{self.value:.5g} [{self.low:.5g}, {self.high:.5g}] {self.unit}"
-
-
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """What was found: `values` by name, what the data cannot tell in `warnings`, and the fit's goodness."""
-
-    model: str  # QIS, BinarySPAD or CountingSPAD
-    bits: int
-    values: Mapping[str, Value]
-    p_value: float  # of the fitted histograms; small means: the model is wrong. NaN where nothing is left to test
-    warnings: tuple[str, ...] = ()
-    residuals: tuple[Array, ...] = field(default=(), repr=False)  # per stack, (observed - fitted) / sigma per level
-    maps: Mapping[str, Array] = field(default_factory=dict, repr=False)  # [H, W]
-    paralyzable: bool = False  # of a CountingSPAD
-
-
-def normal_interval(value: float, variance: float, unit: str, method: str, *, floor: float = -inf) -> Value:
-    """value +- 1.96 sigma, cut at `floor`."""
-    reach = Z95 * sqrt(max(variance, 0.0))
-    return Value(max(value, floor), max(value - reach, floor), max(value + reach, floor), unit, method)
-
-
-def log_interval(value: float, log_variance: float, unit: str, method: str) -> Value:
-    """value times e^(+-1.96 sigma): the interval of a positive scale."""
-    factor = exp(min(Z95 * sqrt(max(log_variance, 0.0)), 700.0))
-    return Value(value, value / factor, value * factor, unit, method)
 
 
 # Mean and variance (photon transfer)
@@ -146,22 +108,17 @@ def _dark_line(darks: Sequence[Stack]) -> tuple[float, float, float, Array]:
     return slope, float(np.average(mean, weights=weight) - slope * centre), 1 / lever, levers
 
 
-def prnu(flats: Sequence[Stack], dark_mean: float) -> tuple[float, float]:
-    """PRNU^2 and its variance from the spread of the pixels' means; (0, inf) where nothing tells."""
-    squares, variances = [], []
+def spread_of_means(flats: Sequence[Stack], dark_mean: float) -> float:
+    """Relative variance between **all** pixels' means, shading and hot pixels included: what widens the histograms."""
+    best = (0.0, inf)
     for flat in flats:
         signal = flat.mean - dark_mean
         if flat.frames < 2 or flat.pixels < 3 or signal <= 0:
             continue
         between = float((flat.total / flat.frames).var(ddof=1))
-        squares.append((between - flat.variance / flat.frames) / signal**2)
-        variances.append(2 * between**2 / (flat.pixels - 1) / signal**4)
-    if not squares:
-        return 0.0, inf
-    # The same pixels in every flat share their pattern: the levels are no independent evidence of its size,
-    # so the level that tells most speaks, not the mean of all.
-    best = int(np.argmin(variances))
-    return squares[best], variances[best]
+        if between / signal**2 < best[1]:
+            best = ((between - flat.variance / flat.frames) / signal**2, between / signal**2)
+    return best[0]
 
 
 # The photon-counting histogram
@@ -320,6 +277,11 @@ def calibrate_qis(darks: Sequence[Stack], flats: Sequence[Stack], *, bits: int) 
     no dark or no flat stack, or if nothing varies.
     """
     check_stacks(darks, flats)
+    if bits < 2:
+        raise ValueError(
+            "calibrate: 1 bit per code cannot tell gain, offset and read noise apart; calibrate binary planes with "
+            "--model spad (calibrate_spad)"
+        )
     if not darks or not flats:
         missing = "dark" if not darks else "flat"
         raise ValueError(f"calibrate: no {missing} frames; at least one dark and one flat stack are needed")
@@ -335,8 +297,7 @@ def calibrate_qis(darks: Sequence[Stack], flats: Sequence[Stack], *, bits: int) 
             "calibrate: the variance of the flats does not grow with their mean; are they saturated or equal?"
         )
     dark_mean = min(stack.mean for stack in darks)
-    square, square_variance = prnu(flats, dark_mean)
-    s = sqrt(max(square, 0.0))
+    s = sqrt(max(spread_of_means(flats, dark_mean), 0.0))
     fit = _best_fit(darks, flats, bits, transfer, s)
     gain, read_noise = exp(fit.parameters[0]), exp(fit.parameters[2])
     spread = np.diag(fit.covariance)
@@ -351,8 +312,10 @@ def calibrate_qis(darks: Sequence[Stack], flats: Sequence[Stack], *, bits: int) 
             transfer.read_variance, transfer.read_variance_variance, "e-", "mean-variance"
         ),
     }
-    if isfinite(square_variance):
-        values["prnu"] = root_interval(square, square_variance, "of the signal", "spread of pixel means")
+    levels, hot = qis_flats(flats, darks, _sensor(fit.parameters, bits))
+    pattern = measure_pattern(levels, hot)
+    if pattern is not None:
+        values |= pattern.values()
     if len({stack.exposure for stack in darks}) > 1:
         values["dark_current_transfer"] = normal_interval(
             transfer.dark_current, transfer.dark_current_variance, "e-/s", "dark mean over exposure", floor=0.0
@@ -396,13 +359,6 @@ def _efficiency(flats: Sequence[Stack], fit: _Fit) -> dict[str, Value]:
     value = float(weights @ (fit.parameters[rows] / photons))
     variance = float(weights @ covariance @ weights)
     return {"quantum_efficiency": normal_interval(value, variance, "e-/photon", "light standard", floor=0.0)}
-
-
-def root_interval(square: float, variance: float, unit: str, method: str) -> Value:
-    """Interval of a standard deviation from that of its square; the square may be below 0 by noise."""
-    reach = Z95 * sqrt(variance)
-    low, middle, high = (sqrt(max(x, 0.0)) for x in (square - reach, square, square + reach))
-    return Value(middle, low, high, unit, method)
 
 
 def check_stacks(darks: Sequence[Stack], flats: Sequence[Stack]) -> None:

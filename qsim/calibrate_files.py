@@ -19,35 +19,60 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files, formats
-from qsim.arrays import load_npy
-from qsim.calibrate import Calibration
+from qsim.arrays import load_npy, mat_array
+from qsim.calibrate_values import Calibration
 from qsim.footage import Hints
 from qsim.qis import QIS
 from qsim.sensor import Sensor
 from qsim.spad import BinarySPAD, CountingSPAD
-from qsim.stacks import Stack, measure
+from qsim.stacks import Stack, measure, measure_sums
 
 _BLOCK_BYTES = 1 << 25
 
 
-def read_stack(path: Path, *, bits: int, exposure: float, photons: float | None, width: int | None = None) -> Stack:
+def read_stack(
+    path: Path,
+    *,
+    bits: int,
+    exposure: float,
+    photons: float | None,
+    width: int | None = None,
+    planes: int | None = None,
+    variable: str | None = None,
+) -> Stack:
     """Statistics of frames: `.npy` of codes (floats too, if they are whole), TIFF, or any capture of `convert`.
 
-    `width` says that an `.npy` is a photon cube of packed planes. `ValueError` or `FileNotFoundError` naming the file.
+    `width` says that an `.npy` is a photon cube of packed planes, `planes` that every value is the sum of so many
+    binary planes, `variable` which array of a `.mat` to take. `ValueError` or `FileNotFoundError` naming the file.
     """
+    if planes is None:
+        blocks = _blocks(path, bits, width, variable)
+        return measure(blocks, bits=bits, exposure=exposure, photons=photons, name=str(path))
+    blocks = _blocks(path, planes.bit_length(), width, variable)
+    return measure_sums(blocks, planes=planes, exposure=exposure, photons=photons, name=str(path))
+
+
+def _blocks(path: Path, bits: int, width: int | None, variable: str | None) -> Iterator[Array]:
+    if variable is not None and path.suffix != ".mat" and not path.is_dir():
+        raise ValueError(f"{path}: --variable names an array of a .mat file; leave it out")
     if path.suffix == ".npy" and width is None:
-        array = read_counts(path)
-        blocks = _array_blocks(array)
-    else:
-        footage = formats.read(path, Hints(bits=bits, width=width))
-        if footage.is_light or footage.bits != bits:
-            raise ValueError(f"{path}: holds {footage.source}, not codes of {bits} bits")
-        blocks = (block for _, block in formats.blocks(footage))
-    return measure(blocks, bits=bits, exposure=exposure, photons=photons, name=str(path))
+        return _array_blocks(read_counts(path))
+    if path.suffix == ".mat":
+        if width is not None:
+            raise ValueError(f"{path}: --width is of packed planes, and a .mat holds one value per pixel; leave it out")
+        return _array_blocks(mat_array(path, variable))
+    footage = formats.read(path, Hints(bits=min(bits, 16), width=width, variable=variable))
+    if footage.is_light or footage.bits != bits:
+        raise ValueError(f"{path}: holds {footage.source}, not values of {bits} bits")
+    return (block for _, block in formats.blocks(footage))
 
 
-def read_counts(path: Path) -> Array:
-    """Frames [T, H, W] of an `.npy`, mapped; `ValueError` or `FileNotFoundError` naming the file."""
+def read_counts(path: Path, variable: str | None = None) -> Array:
+    """Frames [T, H, W] of an `.npy`, mapped, or of a `.mat`; `ValueError` or `FileNotFoundError` naming the file."""
+    if path.suffix == ".mat":
+        return mat_array(path, variable)
+    if variable is not None:
+        raise ValueError(f"{path}: --variable names an array of a .mat file; leave it out")
     array = load_npy(path)
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or array.size == 0:

@@ -18,21 +18,13 @@ from math import inf, isfinite, nan, sqrt
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.calibrate import (
-    NODES,
-    WEIGHTS,
-    Z95,
-    Calibration,
-    Value,
-    check_stacks,
-    goodness,
-    normal_interval,
-    root_interval,
-)
+from qsim.calibrate import NODES, WEIGHTS, check_stacks, goodness
+from qsim.calibrate_flats import Response, dark_rates, spad_flats
+from qsim.calibrate_pattern import BY_FLAT, HOT, measure_pattern
+from qsim.calibrate_values import Z95, Calibration, Value, normal_interval
 from qsim.spad import CountingSPAD
 from qsim.stacks import Stack
 
-HOT = 10.0  # times the median dark-count rate
 PERCENTILES = (1, 10, 25, 75, 90, 99, 99.9)  # of the DCR map, beside the median
 
 
@@ -45,16 +37,18 @@ def calibrate_spad(
     then taken as 0 and said so), and so may `flats`. `ValueError` if both are.
     """
     check_stacks(darks, flats)
-    warnings: list[str] = []
+    warnings = _dispersed([*darks, *flats])
     values: dict[str, Value] = {}
     maps: dict[str, Array] = {}
     fano = fitted_dead_time(flats, bits, paralyzable) if bits > 1 and flats and dead_time else None
     ratio = 0.0 if fano is None else fano.value
     response = Response(bits, ratio, paralyzable)
     if darks:
-        dcr_map, variance = _dark_rates(darks, response)
+        dcr_map, of_map = dark_rates(darks, response)
         maps["dark_count_rate"] = dcr_map
-        values["dark_count_rate"] = normal_interval(float(dcr_map.mean()), variance, "1/s", "array mean", floor=0.0)
+        values["dark_count_rate"] = normal_interval(
+            float(dcr_map.mean()), float(of_map.sum()) / dcr_map.size**2, "1/s", "array mean", floor=0.0
+        )
         values |= _distribution(dcr_map)
         if all(stack.total.sum() == 0 for stack in darks):
             time = sum(stack.frames * stack.exposure * stack.pixels for stack in darks)
@@ -65,9 +59,12 @@ def calibrate_spad(
     if flats:
         warnings += _saturation(flats)
         values |= _efficiency(flats, darks, response, 0.0 if fano is None else fano.variance)
-        square, square_variance = _pattern(flats, darks, response)
-        if isfinite(square_variance):
-            values["prnu"] = root_interval(square, square_variance, "of the signal", "spread of pixel means")
+        levels, hot = spad_flats(flats, darks, response)
+        pattern = measure_pattern(levels, hot)
+        if pattern is not None:
+            values |= pattern.values()
+            if not darks and pattern.left_out.any():
+                warnings.append(f"{pattern.left_out.sum()} pixels left out of PRNU as hot {BY_FLAT}")
         else:
             warnings.append("PRNU: one frame, or no light above the dark counts, tells nothing of it")
     if fano is not None:
@@ -75,8 +72,8 @@ def calibrate_spad(
         method = "Fano factor against flux" + (", paralyzable" if paralyzable else "")
         values["dead_time"] = normal_interval(ratio * exposure, fano.variance * exposure**2, "s", method, floor=0.0)
     values |= _afterpulsing([*darks, *flats], bits)
-    pattern = values["prnu"].value if "prnu" in values else 0.0
-    p_value, residuals = _goodness(flats, bits, ratio, pattern, paralyzable, len(flats) + (fano is not None))
+    spread = _spread(flats, darks, response)
+    p_value, residuals = _goodness(flats, bits, ratio, spread, paralyzable, len(flats) + (fano is not None))
     if p_value < 1e-3:
         warnings.append(
             f"the fitted histograms do not describe the counts (p = {p_value:.1g}): the model is wrong here"
@@ -85,67 +82,7 @@ def calibrate_spad(
     return Calibration(model, bits, values, p_value, tuple(warnings), residuals, maps, paralyzable)
 
 
-# Arrivals of every pixel
-
-
-@dataclass(frozen=True, eq=False)
-class Response:
-    """Mean code against arrivals of one pixel, and back: exact, with the dead time found."""
-
-    bits: int
-    ratio: float  # dead time in exposures; 0 for 1-bit planes
-    paralyzable: bool
-
-    def table(self, largest: float) -> tuple[Array, Array]:
-        """(arrivals, mean code), rising, up to a mean of `largest` or to where the mean stops rising."""
-        top = 2 * largest + 10
-        for _ in range(12):
-            arrivals = np.linspace(0, np.sqrt(top), 1500) ** 2
-            codes = self.mean(arrivals)
-            end = int(np.argmax(codes))
-            if codes[end] >= largest or end < len(codes) - 1:
-                break
-            top *= 2
-        return arrivals[: end + 1], codes[: end + 1]
-
-    def mean(self, arrivals: Array) -> Array:
-        """Expected code, exact."""
-        if self.bits == 1:
-            return -np.expm1(-arrivals)
-        return CountingSPAD(1.0, 0.0, self.ratio, self.bits, self.paralyzable).mean(arrivals, 1.0)
-
-    def of_stack(self, stack: Stack) -> tuple[Array, float, float]:
-        """Arrivals per exposure of every pixel [H, W], the variance of their mean over pixels, and d code / d arrivals.
-
-        The bias of a curved inverse, f''/2 times the variance of the pixel's mean, is taken off.
-        """
-        t = stack.frames
-        mean = stack.total / t
-        if self.bits == 1:
-            mean = np.minimum(mean, 1 - 0.5 / t)
-        arrivals, codes = self.table(float(mean.max()))
-        found = np.interp(mean, codes, arrivals)
-        at = np.interp(stack.mean, codes, arrivals)
-        slope_table = np.gradient(codes, arrivals)
-        slope = float(np.interp(at, arrivals, slope_table))
-        variance = np.where(stack.pixel_variance > 0, stack.pixel_variance, 0.0) if t > 1 else mean
-        slopes = np.interp(found, arrivals, slope_table)
-        curvature = np.interp(found, arrivals, np.gradient(slope_table, arrivals))
-        found = found + 0.5 * curvature / slopes**3 * variance / t
-        return np.maximum(found, 0.0), float(np.sum(variance / (t * slopes**2))) / stack.pixels**2, slope
-
-
-def _dark_rates(darks: Sequence[Stack], response: Response) -> tuple[Array, float]:
-    """DCR of every pixel [1/s] from all exposures, and the variance of its mean over the array."""
-    weight = np.array([stack.frames * stack.exposure for stack in darks])
-    weight = weight / weight.sum()
-    rate = np.zeros(darks[0].total.shape)
-    variance = 0.0
-    for stack, share in zip(darks, weight, strict=True):
-        arrivals, of_mean, _ = response.of_stack(stack)
-        rate += share * arrivals / stack.exposure
-        variance += of_mean * (share / stack.exposure) ** 2
-    return rate, variance
+# The dark-count map and the efficiency
 
 
 def _distribution(rates: Array) -> dict[str, Value]:
@@ -187,12 +124,13 @@ def _efficiency(
         return {}
 
     def slopes(used: Response) -> tuple[Array, Array]:
-        rate, rate_variance = _dark_rates(darks, used) if darks else (np.zeros(1), 0.0)
+        rate, of_rate = dark_rates(darks, used) if darks else (np.zeros(1), np.zeros(1))
+        rate_variance = float(of_rate.sum()) / rate.size**2
         values, variances = [], []
         for flat, photons in known:
-            arrivals, of_mean, _ = used.of_stack(flat)
+            arrivals, of_map, _ = used.of_stack(flat)
             values.append(float(arrivals.mean() - rate.mean() * flat.exposure) / photons)
-            variances.append((of_mean + rate_variance * flat.exposure**2) / photons**2)
+            variances.append((float(of_map.sum()) / flat.pixels**2 + rate_variance * flat.exposure**2) / photons**2)
         return np.array(values), np.maximum(variances, 1e-300)
 
     values, variances = slopes(response)
@@ -209,12 +147,9 @@ def _efficiency(
     }
 
 
-def _pattern(flats: Sequence[Stack], darks: Sequence[Stack], response: Response) -> tuple[float, float]:
-    """PRNU^2 and its variance: spread of the pixels' mean codes, less noise and dark pattern, over the light's share.
-
-    All levels share the pixels' pattern, so the level that tells most speaks; (0, inf) where nothing tells.
-    """
-    rate, _ = _dark_rates(darks, response) if darks else (np.zeros(1), 0.0)
+def _spread(flats: Sequence[Stack], darks: Sequence[Stack], response: Response) -> float:
+    """Relative spread of the light over **all** pixels, shading and hot ones included: widens the histograms."""
+    rate = dark_rates(darks, response)[0] if darks else np.zeros(1)
     dark_spread = sum(max(s.fixed_pattern, 0.0) / s.exposure**2 for s in darks if s.frames > 1) / max(len(darks), 1)
     best = (0.0, inf)
     for flat in flats:
@@ -224,11 +159,25 @@ def _pattern(flats: Sequence[Stack], darks: Sequence[Stack], response: Response)
         signal = slope * float(arrivals.mean() - rate.mean() * flat.exposure)
         if signal <= 0:
             continue
-        between = float((flat.total / flat.frames).var(ddof=1))
-        variance = 2 * between**2 / (flat.pixels - 1) / signal**4
+        variance = float((flat.total / flat.frames).var(ddof=1)) / signal**2
         if variance < best[1]:
             best = ((flat.fixed_pattern - dark_spread * (slope * flat.exposure) ** 2) / signal**2, variance)
-    return best
+    return sqrt(max(best[0], 0.0))
+
+
+def _dispersed(stacks: Sequence[Stack]) -> list[str]:
+    """Sums of planes that scatter in time more or less than a binomial: wrong number of planes, or unsteady light."""
+    words = []
+    for i, stack in enumerate(stacks):
+        error = sqrt(2 / (stack.pixels * max(stack.sums - 1, 1)))
+        if isfinite(stack.dispersion) and abs(stack.dispersion - 1) > max(5 * error, 0.02):
+            words.append(
+                f"stack {i}: its sums scatter {stack.dispersion:.2f} times as much in time as so many planes would: "
+                "another number of planes, light that is not steady, or afterpulses"
+            )
+    if stacks and all(stack.sums or (stack.frames and not isfinite(stack.lag_covariance)) for stack in stacks):
+        words.append("sums of planes do not keep their order: afterpulsing is not measured")
+    return words
 
 
 def _saturation(flats: Sequence[Stack]) -> list[str]:

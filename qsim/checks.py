@@ -81,6 +81,12 @@ def bits(value: Any) -> int:
     return value
 
 
+def planes(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 1 << 24:
+        raise ValueError(f"expected the number of binary planes in one value, 1 to 16777216, got {value!r}")
+    return value
+
+
 def frame_rate(value: Any) -> float:
     number = positive(value)
     if not 1 <= number <= 1e8:

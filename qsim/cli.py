@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from qsim import __version__, checks
+from qsim.cli_calibrate import add_calibrate
 from qsim.cli_data import add_check, add_generate, add_plan
 from qsim.cli_look import add_preview, add_report
-from qsim.cli_studies import add_calibrate, add_tradeoff
+from qsim.cli_studies import add_tradeoff
 from qsim.cli_validate import add_validate
 from qsim.completion import add_completion
 from qsim.console import EXTRAS, GOES_ON, Parser, bar, checked, command, note, output, refuse_idle, run

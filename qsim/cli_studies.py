@@ -1,4 +1,4 @@
-"""Commands that study: `tradeoff`, `calibrate`; pairs `add_X`, `_run_X` as in cli.py."""
+"""The command `tradeoff`: `add_X`, `_run_X` as in cli.py."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from qsim import checks, files
-from qsim.console import bar, checked, command, output, refuse_existing
+from qsim import files
+from qsim.console import bar, command, output
 
 # tradeoff
 
@@ -154,96 +154,6 @@ def _tradeoff_table(args: argparse.Namespace) -> int:
     ]
     output(args, {"rows": [asdict(r) for r in rows]}, text)
     return 0
-
-
-# calibrate
-
-
-def add_calibrate(sub: Any) -> None:
-    parser = command(
-        sub, "calibrate", _run_calibrate, "Dark and flat frames -> a sensor file, numbers with confidence intervals.",
-        "qsim calibrate --bits 8 --dark d1.npy 1e-3 --dark d2.npy 0.1 --flat f.npy 1e-3 --flat g.npy 1e-3 -o my.toml\n"
-        "qsim calibrate --model spad --bits 1 --dark dark.npy 1e-5 --flat flat.npy 1e-5 0.8 -o spad.toml\n"
-        "qsim calibrate --bits 8 --static counts.npy 6.33e-6 -o counter.toml",
-    )  # fmt: skip
-    for option, names, what in (
-        ("--dark", ("FILE", "SECONDS"), "frames without light, and their exposure"),
-        ("--flat", ("FILE", "SECONDS"), "evenly lit frames, their exposure, and the photons per pixel if known"),
-    ):
-        parser.add_argument(option, metavar=names, help=what, action="append", nargs="+", default=[])
-    parser.add_argument(
-        "--static",
-        nargs=2,
-        metavar=("FILE", "SECONDS"),
-        help="counts of a static scene instead: dead time from Fano factors",
-    )
-    parser.add_argument("--bits", type=checked(checks.bits), required=True, help="of a code; 1 for binary planes")
-    parser.add_argument("--model", choices=("qis", "spad"), default="qis", help="default qis")
-    parser.add_argument("--paralyzable", action="store_true", help="spad: every arrival restarts the dead time")
-    parser.add_argument("--ignore-dead-time", action="store_true", help="spad: take the counts as Poisson")
-    parser.add_argument("--width", type=int, help=".npy files are photon cubes (packed planes) of so many pixels")
-    parser.add_argument("-o", "--output", type=Path, required=True, help=".toml to write; .json and .png beside it")
-    parser.add_argument("--force", action="store_true", help="replace existing files")
-
-
-def _run_calibrate(args: argparse.Namespace) -> int:
-    from qsim import calibrate_files
-    from qsim.calibrate import calibrate_qis
-    from qsim.calibrate_spad import calibrate_spad
-
-    if args.output.suffix != ".toml":
-        raise ValueError(f"{args.output}: the sensor file is a .toml, as in -o my_sensor.toml")
-    refuse_existing(args.output, args.force)
-    darks = [_stack(words, args, dark=True) for words in args.dark]
-    flats = [_stack(words, args, dark=False) for words in args.flat]
-    if args.static:
-        found = _static(args)
-    elif args.model == "qis":
-        found = calibrate_qis(darks, flats, bits=args.bits)
-    else:
-        found = calibrate_spad(
-            darks, flats, bits=args.bits, dead_time=not args.ignore_dead_time, paralyzable=args.paralyzable
-        )
-    args.output.parent.mkdir(parents=True, exist_ok=True)
-    written = calibrate_files.write(
-        found, args.output, f"calibrated from {len(darks)} dark and {len(flats)} flat stacks"
-    )
-    width = max(len(name) for name in found.values)
-    text = [f"{name:{width}}  {value}  ({value.method})" for name, value in found.values.items()]
-    text += [f"warning: {words}" for words in found.warnings]
-    text += ["written: " + ", ".join(str(path) for path in written)]
-    output(args, calibrate_files.as_dict(found) | {"files": [str(path) for path in written]}, text)
-    return 0
-
-
-def _static(args: argparse.Namespace) -> Any:
-    from qsim.calibrate_files import read_counts
-    from qsim.calibrate_static import calibrate_static
-
-    if args.dark or args.flat:
-        raise ValueError("--static stands alone: a static scene takes the place of dark and flat frames")
-    counts = read_counts(Path(args.static[0]))
-    return calibrate_static(counts, bits=args.bits, exposure=_number(args.static[1]), paralyzable=args.paralyzable)
-
-
-def _number(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        raise ValueError(f"{word!r} is no number; give seconds, as in 1e-3") from None
-
-
-def _stack(words: list[str], args: argparse.Namespace, *, dark: bool) -> Any:
-    from qsim.calibrate_files import read_stack
-
-    kind, most = ("--dark", 2) if dark else ("--flat", 3)
-    if not 2 <= len(words) <= most:
-        raise ValueError(
-            f"{kind} {' '.join(words)}: give a file and its exposure in seconds, as in {kind} frames.npy 1e-3"
-        )
-    numbers = [_number(word) for word in words[1:]]
-    photons = 0.0 if dark else numbers[1] if len(numbers) > 1 else None
-    return read_stack(Path(words[0]), bits=args.bits, exposure=numbers[0], photons=photons, width=args.width)
 
 
 def size(text: str) -> tuple[int, int]:

@@ -8,7 +8,7 @@ A million frames cost the same memory as one. Codes are integers; float arrays a
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy import ndarray as Array
@@ -27,6 +27,8 @@ class Stack:
     lagged: Array  # float64 [H, W], sum of code(t) code(t + 1)
     first: Array  # float64 [H, W], the first and the last frame
     last: Array
+    dispersion: float = float("nan")  # of sums of planes: variance in time over that of a binomial; 1 is right
+    sums: int = 0  # frames of sums that the planes came in
 
     @property
     def pixels(self) -> int:
@@ -86,10 +88,7 @@ def measure(
     `ValueError` naming the stack, the frame and the pixel for codes that are no integers 0 ... 2^bits - 1, for frames
     of different sizes, and for a stack without frames.
     """
-    if not (np.isfinite(exposure) and exposure > 0):
-        raise ValueError(f"{name}: the exposure is in seconds and above 0, got {exposure!r}")
-    if photons is not None and not (np.isfinite(photons) and photons >= 0):
-        raise ValueError(f"{name}: photons are a number of at least 0 (0 = dark), got {photons!r}")
+    _check_light(exposure, photons, name)
     frames, sums = 0, None
     histogram = np.zeros(1 << bits, np.int64)
     for block in blocks:
@@ -110,7 +109,8 @@ def measure(
         frames += len(values)
     if sums is None:
         raise ValueError(f"{name}: has no frames")
-    return Stack(frames, float(exposure), photons, histogram, first=first, last=previous, **sums)
+    total, square, lagged = sums["total"], sums["square"], sums["lagged"]
+    return Stack(frames, float(exposure), photons, histogram, total, square, lagged, first, previous)
 
 
 def from_ones(ones: Array, *, frames: int, exposure: float, photons: float | None) -> Stack:
@@ -124,21 +124,67 @@ def from_ones(ones: Array, *, frames: int, exposure: float, photons: float | Non
     return Stack(frames, float(exposure), photons, histogram, total, total, unknown, unknown, unknown)
 
 
+def measure_sums(
+    blocks: Iterable[Array], *, planes: int, exposure: float, photons: float | None, name: str = "stack"
+) -> Stack:
+    """Frames [t, H, W] or [H, W] of which each value sums `planes` binary planes: the stack of all these planes.
+
+    `exposure` and `photons` are those of one plane. All but the order of the planes is known, so every statistic is
+    that of the planes themselves except `lag_covariance`. Several sums also tell their `dispersion`. `ValueError` as
+    `measure`; values are 0 ... `planes`.
+    """
+    if planes < 1:
+        raise ValueError(f"{name}: sums hold at least 1 plane, got {planes}")
+    _check_light(exposure, photons, name)
+    ones, squares, frames = None, None, 0
+    for block in blocks:
+        sums = _as_values(block, planes, f"sum of {planes} planes", name, frames).astype(np.float64)
+        if ones is None or squares is None:
+            ones, squares = np.zeros(sums.shape[1:]), np.zeros(sums.shape[1:])
+        elif sums.shape[1:] != ones.shape:
+            raise ValueError(f"{name}: frame {frames} is {sums.shape[1:]}, the frames before are {ones.shape}")
+        ones += sums.sum(axis=0)
+        squares += np.einsum("tyx,tyx->yx", sums, sums)
+        frames += len(sums)
+    if ones is None or squares is None:
+        raise ValueError(f"{name}: has no frames")
+    whole = from_ones(ones, frames=frames * planes, exposure=exposure, photons=photons)
+    if frames < 2 or planes < 2:
+        return whole
+    observed = float((squares - ones**2 / frames).sum()) / (frames - 1)
+    expected = float(whole.pixel_variance.sum()) * planes
+    return replace(whole, dispersion=observed / expected if expected > 0 else float("nan"), sums=frames)
+
+
+def _check_light(exposure: float, photons: float | None, name: str) -> None:
+    if not (np.isfinite(exposure) and exposure > 0):
+        raise ValueError(f"{name}: the exposure is in seconds and above 0, got {exposure!r}")
+    if photons is not None and not (np.isfinite(photons) and photons >= 0):
+        raise ValueError(f"{name}: photons are a number of at least 0 (0 = dark), got {photons!r}")
+
+
 def _as_codes(block: Array, bits: int, name: str, frame: int) -> Array:
     """A block as integers [t, H, W]."""
+    return _as_values(block, (1 << bits) - 1, f"code of {bits} bits", name, frame)
+
+
+def _as_values(block: Array, top: int, what: str, name: str, frame: int) -> Array:
+    """A block of values 0 ... `top` as integers [t, H, W]."""
     block = np.asarray(block)
     block = block[None] if block.ndim == 2 else block
     if block.ndim != 3 or block.size == 0:
         raise ValueError(f"{name}: expected frames [t, H, W] with at least one pixel, got shape {block.shape}")
-    wrong = ~((block >= 0) & (block < 1 << bits))
+    wrong = ~((block >= 0) & (block <= top))
     if block.dtype.kind == "f":
         wrong |= block != np.floor(block)
     elif block.dtype.kind not in "uib":
         raise ValueError(f"{name}: expected numbers, got {block.dtype}")
     if wrong.any():
         t, y, x = (int(i) for i in np.argwhere(wrong)[0])
+        cure = ""
+        if top == 1 and block[t, y, x] > 1:
+            cure = "; sums of N binary planes are calibrated with --planes N"
         raise ValueError(
-            f"{name}: {block[t, y, x]} at (t, y, x) = ({frame + t}, {y}, {x}) is no code of {bits} bits, "
-            f"0..{(1 << bits) - 1}"
+            f"{name}: {block[t, y, x]} at (t, y, x) = ({frame + t}, {y}, {x}) is no {what}, 0..{top}{cure}"
         )
     return block.astype(np.int64)

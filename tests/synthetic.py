@@ -128,3 +128,57 @@ def coverage(case: QISCase | SPADCase, runs: int, seed: int) -> tuple[dict[str, 
         for name, value in truth.items():
             hits[name] = hits.get(name, 0) + (found.values[name].low <= value <= found.values[name].high)
     return hits, p_values
+
+
+@dataclass(frozen=True)
+class Array:
+    """An array with a fixed pattern, vignetting and hot pixels, measured in some way; all of it drawn at random."""
+
+    readout: str  # "qis", "planes" or "counts"
+    prnu: float  # 0.01 ... 0.3
+    vignetting: float  # light lost in the corner, 0 ... 0.6
+    centre: tuple[float, float]  # of the vignetting, -0.3 ... 0.3 of the half side
+    hot: float  # share of the pixels, 0 ... 0.15
+    side: int
+    frames: int
+    light: float  # electrons or avalanches per exposure, in the middle
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> Array:
+        readout = str(rng.choice(["qis", "planes", "counts"]))
+        light = {"qis": (0.5, 8.0), "planes": (0.2, 1.2), "counts": (1.0, 14.0)}[readout]
+        return cls(
+            readout=readout,
+            prnu=float(np.exp(rng.uniform(np.log(0.01), np.log(0.3)))),
+            vignetting=float(rng.uniform(0, 0.6)),
+            centre=tuple(rng.uniform(-0.3, 0.3, 2)),
+            hot=float(rng.uniform(0, 0.15)),
+            side=int(rng.integers(10, 41)),
+            frames=int(np.exp(rng.uniform(np.log(2), np.log(60)))) * (10 if readout == "planes" else 1),
+            light=float(np.exp(rng.uniform(*np.log(light)))),
+        )
+
+    def calibrate(self, rng: np.random.Generator, *, darks: bool = True) -> Calibration:
+        shape = (self.side, self.side)
+        y, x = np.meshgrid(*[np.linspace(-1, 1, self.side)] * 2, indexing="ij")
+        radius = ((y - self.centre[0]) ** 2 + (x - self.centre[1]) ** 2) / 2
+        fall = (1 - self.vignetting) ** -0.5 - 1  # cos^4 = (1 + r^2)^-2, so much lost at r = 1
+        light = self.light * (1 + fall * radius) ** -2.0
+        light = light * np.maximum(1 + self.prnu * rng.standard_normal(shape), 0)
+        dark = 0.002 * rng.lognormal(0, 0.5, shape)
+        hot = rng.random(shape) < self.hot
+        dark[hot] = 0.002 * np.exp(rng.uniform(np.log(10), np.log(1000), int(hot.sum())))
+
+        def stack(electrons: np.ndarray, exposure: float, photons: float | None, frames: int) -> Stack:
+            drawn = rng.poisson(electrons * exposure / 1e-3, (frames, *shape))
+            bits = {"qis": 8, "planes": 1, "counts": 7}[self.readout]
+            if self.readout == "qis":
+                drawn = np.rint(6 * (drawn + 0.3 * rng.standard_normal(drawn.shape)) + 20)
+            codes = np.clip(drawn, 0, 2**bits - 1).astype(np.int64)
+            return measure([codes], bits=bits, exposure=exposure, photons=photons)
+
+        flats = [stack(level * light + dark, 1e-3, None, self.frames) for level in (1.0, 0.4)]
+        taken = [stack(dark, t, 0.0, max(self.frames, 10)) for t in (1e-3, 1e-2)] if darks else []
+        if self.readout == "qis":
+            return calibrate_qis(taken, flats, bits=8)
+        return calibrate_spad(taken, flats, bits=1 if self.readout == "planes" else 7)

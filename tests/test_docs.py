@@ -154,6 +154,8 @@ def _calibration(folder: Path) -> None:
             folder / f"{name}.npy",
             np.minimum(rng.poisson(mean, (200, 24, 24)), 1 if mean < 1 else 255).astype(np.uint8),
         )
+    for name, share in (("dark_sums", 0.01), ("flat_sums", 0.3)):
+        np.save(folder / f"{name}.npy", rng.binomial(50, share, (4, 24, 24)).astype(np.uint16))
     subprocess.run([sys.executable, "-m", "qsim", "render", "fan", "-o", "out/fan", "--frames", "3", "--height", "32",
                     "--width", "32", "-q"], cwd=folder, check=True, env=_environment())  # fmt: skip
 

@@ -1,0 +1,58 @@
+"""What a calibration answers with: values, their 95 % intervals, and the record of all that was found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import exp, inf, sqrt
+
+from numpy import ndarray as Array
+
+Z95 = 1.959963984540054  # two-sided 95 % of the normal distribution
+
+
+@dataclass(frozen=True)
+class Value:
+    """An estimate and its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+    method: str
+
+    def __str__(self) -> str:
+        return f"{self.value:.5g} [{self.low:.5g}, {self.high:.5g}] {self.unit}"
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What was found: `values` by name, what the data cannot tell in `warnings`, and the fit's goodness."""
+
+    model: str  # QIS, BinarySPAD or CountingSPAD
+    bits: int
+    values: Mapping[str, Value]
+    p_value: float  # of the fitted histograms; small means: the model is wrong. NaN where nothing is left to test
+    warnings: tuple[str, ...] = ()
+    residuals: tuple[Array, ...] = field(default=(), repr=False)  # per stack, (observed - fitted) / sigma per level
+    maps: Mapping[str, Array] = field(default_factory=dict, repr=False)  # [H, W]
+    paralyzable: bool = False  # of a CountingSPAD
+
+
+def normal_interval(value: float, variance: float, unit: str, method: str, *, floor: float = -inf) -> Value:
+    """value +- 1.96 sigma, cut at `floor`."""
+    reach = Z95 * sqrt(max(variance, 0.0))
+    return Value(max(value, floor), max(value - reach, floor), max(value + reach, floor), unit, method)
+
+
+def log_interval(value: float, log_variance: float, unit: str, method: str) -> Value:
+    """value times e^(+-1.96 sigma): the interval of a positive scale."""
+    factor = exp(min(Z95 * sqrt(max(log_variance, 0.0)), 700.0))
+    return Value(value, value / factor, value * factor, unit, method)
+
+
+def root_interval(square: float, variance: float, unit: str, method: str) -> Value:
+    """Interval of a standard deviation from that of its square; the square may be below 0 by noise."""
+    reach = Z95 * sqrt(variance)
+    low, middle, high = (sqrt(max(x, 0.0)) for x in (square - reach, square, square + reach))
+    return Value(middle, low, high, unit, method)
