@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks
-from qsim.console import checked, command, note, output, refuse_existing
+from qsim.console import checked, command, output, refuse_existing
 
 
 def add_calibrate(sub: Any) -> None:
@@ -53,7 +53,6 @@ def _run_calibrate(args: argparse.Namespace) -> int:
         raise ValueError(f"{args.output}: the sensor file is a .toml, as in -o my_sensor.toml")
     model, bits = _calibration_kind(args)
     refuse_existing(args.output, args.force)
-    note(_assumed(args, model, bits))
     darks = [_stack(words, args, bits, dark=True) for words in args.dark]
     flats = [_stack(words, args, bits, dark=False) for words in args.flat]
     if args.static:
@@ -69,10 +68,12 @@ def _run_calibrate(args: argparse.Namespace) -> int:
         found, args.output, f"calibrated from {len(darks)} dark and {len(flats)} flat stacks"
     )
     width = max(len(name) for name in found.values)
-    text = [f"{name:{width}}  {value}  ({value.method})" for name, value in found.values.items()]
+    assumed = _assumed(args, model, bits)
+    text = [f"taken as: {assumed}"]
+    text += [f"{name:{width}}  {value}  ({value.method})" for name, value in found.values.items()]
     text += [f"warning: {words}" for words in found.warnings]
     text += ["written: " + ", ".join(str(path) for path in written)]
-    output(args, calibrate_files.as_dict(found) | {"files": [str(path) for path in written]}, text)
+    output(args, calibrate_files.as_dict(found) | {"assumed": assumed, "files": [str(path) for path in written]}, text)
     return 0
 
 
@@ -122,12 +123,12 @@ def _calibration_kind(args: argparse.Namespace) -> tuple[str, int]:
 def _assumed(args: argparse.Namespace, model: str, bits: int) -> str:
     """What the numbers in the files are taken for, in a line."""
     if args.planes is not None and args.planes > 1:
-        return f"taken as: sums of {args.planes} binary planes of a SPAD; seconds and photons are those of one plane"
+        return f"sums of {args.planes} binary planes of a SPAD; seconds and photons are those of one plane"
     if args.static:
-        return f"taken as: counts of one exposure each, {bits} bits, of a static scene (for sums of planes: --planes)"
+        return f"counts of one exposure each, {bits} bits, of a static scene (for sums of planes: --planes)"
     if model == "spad" and bits > 1:
-        return f"taken as: counts of one exposure each, {bits} bits (for sums of N binary planes: --planes N)"
-    return f"taken as: {'binary planes of a SPAD' if model == 'spad' else f'{bits}-bit codes of a QIS'}"
+        return f"counts of one exposure each, {bits} bits (for sums of N binary planes: --planes N)"
+    return f"{'binary planes of a SPAD' if model == 'spad' else f'{bits}-bit codes of a QIS'}"
 
 
 def _static(args: argparse.Namespace, bits: int) -> Any:

@@ -118,10 +118,10 @@ def test_what_is_assumed_is_printed(folder, capsys):
     assert main(["calibrate", "--planes", "50", "--dark", "dark.npy", "1e-5", "-o", "a.toml"]) == 0
     assert (
         "taken as: sums of 50 binary planes of a SPAD; seconds and photons are those of one plane"
-        in capsys.readouterr().err
+        in capsys.readouterr().out
     )
     assert main(["calibrate", "--model", "spad", "--bits", "6", "--dark", "dark.npy", "1e-5", "-o", "b.toml"]) == 0
-    assert "taken as: counts of one exposure each, 6 bits (for sums of N binary planes" in capsys.readouterr().err
+    assert "taken as: counts of one exposure each, 6 bits (for sums of N binary planes" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_options_that_cannot_act_are_refused(folder, capsys, words, message):
     assert main(["calibrate", *words.split(), "-o", "x.toml"]) == 2
     error = capsys.readouterr().err
     assert message in error
-    assert [line for line in error.splitlines() if not line.startswith("taken as: ")][1:] == []
+    assert error.count("\n") == 1
     assert not (folder / "x.toml").exists()
 
 
