@@ -121,9 +121,11 @@ def list_of(check: Callable[[Any], Any]) -> Callable[[Any], list[Any]]:
         values = [check(item) for item in value] if isinstance(value, list) else [check(value)]
         if not values:
             raise ValueError("expected at least one value, got an empty list")
-        for n, item in enumerate(values):
-            if item in values[:n]:
+        seen = set()
+        for item in values:
+            if item in seen:
                 raise ValueError(f"{item!r} is listed twice")
+            seen.add(item)
         return values
 
     return checked

@@ -5,7 +5,7 @@
     frames = 21                # per clip
     height = 128               # pixels
     width = 128
-    frame_rate = 2000.0        # frames per second of the scene's time
+    frame_rate = 2000.0        # frames per second of the scene's time; default 2000
     shutter = 0.0              # open share of a frame, 0..1; 0: a sharp instant with the light of a whole frame
     psnr = 40.0                # wanted error of the radiance, dB below white, clamped there (white.py)
     seed = 0                   # of the samples and of the noise
@@ -44,6 +44,7 @@ from qsim.recipe_text import Section, Text
 from qsim.stream import Sensing, check_name
 
 SPLITS = checks.SPLITS
+MAX_STEM = 180  # characters of a scene's name: with seed, speed and a temporary ending it must be a file's name
 
 
 @dataclass(frozen=True)
@@ -149,13 +150,14 @@ def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
     if not isinstance(whole.table.get("recipe"), dict):
         raise ValueError(f"{path}: the section [recipe] is missing")
     head = Section(written, "recipe", 0, whole.table["recipe"])
-    head.check_keys(("name", "seed", *_SETTINGS), needed=("name", "frames", "height", "width", "frame_rate"))
+    head.check_keys(("name", "seed", *_SETTINGS), needed=("name", "frames", "height", "width"))
     name = head.value("name", _name)
     seed = head.value("seed", checks.seed, 0)
-    defaults = _settings(head)
+    defaults = {"frame_rate": 2000.0} | _settings(head)
     streams: list[Sensing] = []
+    taken: set[str] = set()
     for section in whole.sections("streams"):
-        streams += _streams(section, seed, {stream.stream_name for stream in streams})
+        streams += _streams(section, seed, taken)
     jobs: list[tuple[Job, Section]] = []
     for section in whole.sections("scenes"):
         jobs += [(job, section) for job in _jobs(section, defaults, seed, tuple(streams))]
@@ -171,25 +173,24 @@ def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
     split_of: dict[str, str] = {}
     tested = {job.stem for job, _ in jobs if job.split == "test"}
     for job, section in jobs:
-        where = section.where()
         if job.name in seen:
-            raise ValueError(f"{where}: the clip {job.name} is asked for twice; give one of them other seeds")
+            raise ValueError(f"{section.where()}: the clip {job.name} is asked for twice; give one of them other seeds")
         seen.add(job.name)
         if split_of.setdefault(job.scene, job.split) != job.split:
             raise ValueError(
-                f"{where}: scene {job.scene} is in the splits '{split_of[job.scene]}' and '{job.split}'; splits "
-                "are by scene, whatever the speed: give one of them other seeds"
+                f"{section.where()}: scene {job.scene} is in the splits '{split_of[job.scene]}' and '{job.split}'; "
+                "splits are by scene, whatever the speed: give one of them other seeds"
             )
         if job.split != "test" and job.stem in tested:
             raise ValueError(
-                f"{where}: family {job.stem} is in the splits '{job.split}' and 'test'; the test split holds "
+                f"{section.where()}: family {job.stem} is in the splits '{job.split}' and 'test'; the test split holds "
                 "families that training never sees: move its scenes"
             )
         for sensing in job.streams:
             if sensing.group and job.settings.frames < 2 ** (sensing.bits or 1) - 1:
                 raise ValueError(
-                    f"{where}: {job.settings.frames} frames are too few for {sensing.stream_name}, whose codes "
-                    f"sum {2 ** (sensing.bits or 1) - 1} of them"
+                    f"{section.where()}: {job.settings.frames} frames are too few for {sensing.stream_name}, whose "
+                    f"codes sum {2 ** (sensing.bits or 1) - 1} of them"
                 )
 
 
@@ -211,6 +212,15 @@ def _jobs(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[
             f"{MAX_PIXELS} pixels are rendered"
         )
     stem = Path(family).stem
+    try:
+        check_name(f"{stem}_{seeds[0]:04d}")
+    except ValueError as error:
+        raise ValueError(f"{section.where('family')}: clips are named after the scene: {error}") from None
+    if len(stem) > MAX_STEM:
+        raise ValueError(
+            f"{section.where('family')}: clips are named after the scene, whose name has {len(stem)} characters; "
+            f"at most {MAX_STEM}"
+        )
     return [
         Job(
             name=f"{stem}_{s:04d}" + ("" if speed == 1 else f"_x{speed:g}"),
@@ -260,14 +270,18 @@ def _seeds(section: Section) -> list[int]:
                 raise ValueError(f"{section.where(key)}: give either seeds or count, not both")
         return list(section.value("seeds", checks.list_of(checks.seed)))
     first = section.value("first", checks.seed, 0)
-    return list(range(first, first + section.value("count", checks.whole, 1)))
+    count = section.value("count", checks.whole, 1)
+    if first + count > 2**31:
+        key = "count" if "count" in section else "first"
+        raise ValueError(f"{section.where(key)}: seeds {first} to {first + count - 1}; the largest is 2^31 - 1")
+    return list(range(first, first + count))
 
 
 # ---- [[streams]]
 
 
 def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
-    """One stream per bits and light level, under names that are not taken."""
+    """One stream per bits and light level, under names that are not taken; they are added to `taken`."""
     keys = ("sensor", "bits", "ppp", "lux", "absolute", "seed", "name", "group", "diffraction")
     section.check_keys(keys, needed=("sensor",))
     unit, levels = _light(section)
@@ -292,10 +306,14 @@ def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
         for b in bits
         for level in levels
     ]
-    names = [stream.stream_name for stream in found]
-    for n, stream in enumerate(names):
-        if stream in taken or stream in names[:n]:
+    for sensing in found:
+        try:
+            stream = sensing.stream_name
+        except ValueError as error:
+            raise ValueError(f"{section.where('sensor')}: streams are named after the sensor: {error}") from None
+        if stream in taken:
             raise ValueError(f"{section.where()}: two [[streams]] are called '{stream}'; give one of them a name")
+        taken.add(stream)
     return found
 
 

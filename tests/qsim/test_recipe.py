@@ -1,10 +1,15 @@
 """Recipes: what they mean, and every mistake named with file, line and key."""
 
+import json
+import random
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from fakes import make
 
-from qsim import jobs, recipe
+from qsim import checks, jobs, recipe
 from qsim.recipe import Recipe, parse
 
 HEAD = """[recipe]
@@ -73,7 +78,8 @@ AGAIN = "[[scenes]]\nfamily = "
 MISTAKES = [
     # (text in the good recipe, its replacement, line, what the message says)
     ("frames = 3", "frame = 3", 3, r"unknown key 'frame' in \[recipe\] \(did you mean 'frames'\?\)"),
-    ("frame_rate = 2000.0\n", "", 1, r"key 'frame_rate' is missing in \[recipe\]"),
+    ("width = 10\n", "", 1, r"key 'width' is missing in \[recipe\]"),
+    ("first = 5", "first = 2147483647", 16, r"seeds 2147483647 to 2147483648; the largest is 2\^31 - 1"),
     ("frame_rate = 2000.0", "frame_rate = 0.0005", 6, r"frames per second .* 0\.5 ms per frame is 2000\.0"),
     ("frame_rate = 2000.0", 'frame_rate = "2000 fps"', 6, r"frame_rate: expected a number, got '2000 fps'"),
     ("height = 8", "height = 0", 4, r"height: expected a whole number from 1"),
@@ -241,3 +247,102 @@ def test_no_mesh_or_texture_of_a_test_scene_is_in_training(path: Path):
     for split in ("train", "test"):
         assert {asset.split()[0] for asset in found[split]} >= {"mesh", "texture"}
     assert found["test"].isdisjoint(found["train"] | found["val"])
+
+
+def calls(action: Callable[[], object]) -> int:
+    """Calls of functions, ours and built in, that an action makes."""
+    count = 0
+
+    def see(frame: object, event: str, argument: object) -> None:
+        nonlocal count
+        count += event in ("call", "c_call")
+
+    sys.setprofile(see)
+    try:
+        action()
+    finally:
+        sys.setprofile(None)
+    return count
+
+
+@pytest.mark.parametrize("kind", ["scenes", "streams", "seeds"])
+def test_the_work_of_reading_a_recipe_is_linear(kind: str):
+    """Four times as many sections or seeds: at most five times the calls. It was sixteen times for sections."""
+
+    def text(n: int) -> str:
+        scenes = [f'[[scenes]]\nfamily = "fan"\nseeds = [{i}]\n' for i in range(n if kind == "scenes" else 1)]
+        if kind == "seeds":
+            scenes = [f'[[scenes]]\nfamily = "fan"\nseeds = {list(range(n))}\n']
+        streams = [
+            f'[[streams]]\nsensor = "quiver-physical"\nbits = 3\nppp = {i + 1}\n'
+            for i in range(n if kind == "streams" else 1)
+        ]
+        return HEAD + "".join(scenes + streams)
+
+    parse(text(2))  # imports
+    assert calls(lambda: parse(text(200))) < 5 * calls(lambda: parse(text(50)))
+
+
+def test_a_list_is_looked_through_once():
+    """Values are compared for repetitions by hash, not each with each: 20 000 seeds took seconds."""
+
+    class Value:
+        compared = 0
+
+        def __init__(self, number: int) -> None:
+            self.number = number
+
+        def __hash__(self) -> int:
+            return hash(self.number)
+
+        def __eq__(self, other: object) -> bool:
+            Value.compared += 1
+            return self.number == other.number
+
+    values = [Value(i) for i in range(1000)]
+    assert checks.list_of(lambda value: value)(values) == values
+    assert Value.compared < 2000
+    with pytest.raises(ValueError, match="listed twice"):
+        checks.list_of(lambda value: value)([*values, Value(7)])
+
+
+def accepted_by_the_jobs(stem: str, folder: Path) -> bool:
+    """Whether a job with such a name makes its clip, writes its record, and tidies up."""
+    found = recipe.Settings(1, 2, 3, 2000.0)
+    job = recipe.Job(f"{stem}_0000_x0.001", f"{stem}.py", 0, 1.0, "train", found, 0, ())
+    for name in ("jobs", "failed", "clips", "logs", "locks", "work"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    try:
+        return jobs.run_job(job, folder, make).state == "done"
+    except OSError:  # a name that the file system does not take
+        return False
+
+
+@pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
+def test_a_scene_file_is_accepted_exactly_when_its_jobs_are(tmp_path: Path, count: int):
+    """Random names of own scenes: the recipe refuses, with its line, just those that a job would fail on."""
+    rng = random.Random(1)
+    alphabet = "ab0_-. \u00fc\n\"'*[\\\t$"
+    names = ["a b", "\u00fc", "__init__", "-x", "", "a" * 180, "a.tmp-1", "x.part", ".hidden", "CON"]
+    names += ["".join(rng.choices(alphabet, k=rng.randrange(1, 6))) for _ in range(count)]
+    names += ["".join(rng.choices("ab.-_", k=rng.randrange(1, 6))) for _ in range(count)]
+    verdicts = set()
+    for n, stem in enumerate(dict.fromkeys(names)):
+        folder = tmp_path / str(n)
+        folder.mkdir()
+        (folder / f"{stem}.py").touch()
+        path = folder / "r.toml"
+        path.write_text(HEAD + "[[scenes]]\nfamily = " + json.dumps(f"{stem}.py", ensure_ascii=False))
+        expected = accepted_by_the_jobs(Path(f"{stem}.py").stem, tmp_path / "jobs")
+        if expected:
+            recipe.load(path)
+        else:
+            with pytest.raises(ValueError, match=r"r\.toml:8: clips are named after the scene"):
+                recipe.load(path)
+        verdicts.add(expected)
+    assert verdicts == {True, False}
+    long = tmp_path / ("a" * 181 + ".py")
+    long.touch()
+    (tmp_path / "r.toml").write_text(HEAD + f'[[scenes]]\nfamily = "{long.name}"\n')
+    with pytest.raises(ValueError, match=r"r\.toml:8: .* has 181 characters; at most 180"):
+        recipe.load(tmp_path / "r.toml")
