@@ -132,8 +132,7 @@ def _add_render(sub: Any) -> None:
 
 
 def _run_render(args: argparse.Namespace) -> int:
-    import scenes
-    from qsim import budget, engine, optics, render
+    from qsim import budget, engine, optics, reads, render
     from qsim.white import stated
 
     if args.output is None and not args.explain:
@@ -145,7 +144,8 @@ def _run_render(args: argparse.Namespace) -> int:
     if args.engine is not None:
         os.environ["QSIM_ENGINE"] = args.engine
         engine.choose()
-    scene = scenes.load(args.scene, seed=args.seed, speed=args.speed).resized(args.height, args.width)
+    loaded, read = reads.load(args.scene, seed=args.seed, speed=args.speed)
+    scene = loaded.resized(args.height, args.width)
     with bar(args.output.name if args.output else "pilot") as progress:
         chosen = budget.choose(
             scene,
@@ -168,6 +168,7 @@ def _run_render(args: argparse.Namespace) -> int:
             seed=args.seed,
             budget=chosen,
             progress=progress,
+            extra={"reads": read} if read else None,
             force=args.force,
         )
     found = stated(clip.meta)

@@ -221,6 +221,7 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
         (folder / name).mkdir(exist_ok=True)
     if not (folder / "dataset.json").is_file():
         _check_records(recipe, folder)
+        _check_reads(recipe, folder)
         write_manifest(recipe, folder)
         return ()
     try:
@@ -231,6 +232,7 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
         _check_records(recipe, folder)
         write_manifest(recipe, folder)
         return (str(error),)
+    _check_reads(recipe, folder)
     for job in recipe.jobs:
         if job.name not in old:
             raise ValueError(f"{folder}: was made from another recipe, without the clip {job.name}; use another folder")
@@ -245,6 +247,33 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
     if extra:
         raise ValueError(f"{folder}: holds the clip {extra[0]}, which is not in this recipe; use another folder")
     return ()
+
+
+def _check_reads(recipe: Recipe, folder: Path) -> None:
+    """`ValueError` if a file that an own scene reads is not what it was when a clip was rendered.
+
+    Clips of earlier versions do not say what they read: for these the scene's own file decides, by the job's digest.
+    """
+    from qsim import reads
+
+    seen: set[tuple[str, str, str]] = set()
+    for job in recipe.jobs:
+        if not Path(job.family).is_absolute():
+            continue
+        for about in (folder / "clips" / job.name / "clip.json", folder / "work" / job.name / "clip.json"):
+            read = None
+            with contextlib.suppress(OSError, ValueError):  # none, or damaged: a check finds it
+                read = files.read_json(about).get("reads")
+            entries = read.items() if isinstance(read, dict) else ()
+            for name, digest in sorted(entries, key=lambda entry: "*" in entry[0]):  # single files first
+                key = (job.family, name, str(digest))
+                problem = None if key in seen else reads.change(*key)
+                seen.add(key)
+                if problem:
+                    raise ValueError(
+                        f"{folder}: {problem} since its clip {job.name} was made, whose scene reads it; put back what "
+                        "was there, or use another folder"
+                    )
 
 
 def _check_records(recipe: Recipe, folder: Path) -> None:

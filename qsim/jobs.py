@@ -50,10 +50,13 @@ class Result:
     message: str = ""
 
 
-def provenance(job: Job) -> dict[str, Any]:
-    """What a job's clip.json says beside what the renderer knows: which job it is, its scene and split."""
+def provenance(job: Job, read: dict[str, str] | None = None) -> dict[str, Any]:
+    """What a job's clip.json says beside what the renderer knows: which job it is, its scene and split.
+
+    `read` are the files of the user's that the scene was made from (reads.py).
+    """
     scene = {"family": Path(job.family).stem, "seed": job.scene_seed, "speed": job.speed}
-    return {"name": job.name, "job": job.digest, "split": job.split, "scene": scene}
+    return {"name": job.name, "job": job.digest, "split": job.split, "scene": scene} | ({"reads": read} if read else {})
 
 
 def render_job(job: Job, path: Path) -> object:
@@ -61,7 +64,7 @@ def render_job(job: Job, path: Path) -> object:
     from qsim import render
 
     settings = job.settings
-    scene = load_scene(job)
+    scene, read = load_traced(job)
     return render.render_clip(
         scene,
         path,
@@ -70,17 +73,22 @@ def render_job(job: Job, path: Path) -> object:
         shutter=settings.shutter,
         seed=render_seed(job),
         budget=choose_budget(job, scene),
-        extra=provenance(job) | {"assets": sorted(assets(scene.to_dict()) + photographs(scene))},
+        extra=provenance(job, read) | {"assets": sorted(assets(scene.to_dict()) + photographs(scene))},
         force=True,  # what an earlier version of the program began is nobody's
     )
 
 
 def load_scene(job: Job) -> Scene:
     """The job's scene at its size."""
-    import scenes
+    return load_traced(job)[0]
 
-    scene = scenes.load(job.family, seed=job.scene_seed, speed=job.speed)
-    return scene.resized(job.settings.height, job.settings.width)
+
+def load_traced(job: Job) -> tuple[Scene, dict[str, str]]:
+    """The job's scene at its size, and the SHA-256 of each file of the user's that it read."""
+    from qsim import reads
+
+    scene, read = reads.load(job.family, seed=job.scene_seed, speed=job.speed)
+    return scene.resized(job.settings.height, job.settings.width), read
 
 
 def render_seed(job: Job) -> int:

@@ -105,14 +105,16 @@ def _contents(path: str) -> str:
     """SHA-256 of a scene or sensor file, or of all files in a folder with their names."""
     root = Path(path)
     parts = sorted(part for part in root.rglob("*") if part.is_file()) if root.is_dir() else [root]
-    state = tuple((str(part.relative_to(root)), part.stat().st_mtime_ns, part.stat().st_size) for part in parts)
+    # With the time of the last change of the inode, which nobody can set back.
+    states = [(str(part.relative_to(root)), part.stat()) for part in parts]
+    state = tuple((name, (of.st_mtime_ns, of.st_ctime_ns, of.st_ino, of.st_size)) for name, of in states)
     return _read_contents(path, state)
 
 
 @functools.lru_cache(maxsize=64)
-def _read_contents(path: str, state: tuple[tuple[str, int, int], ...]) -> str:
+def _read_contents(path: str, state: tuple[tuple[str, tuple[int, ...]], ...]) -> str:
     """The same, read once as long as no file changes."""
-    listed = [(name, files.sha256(Path(path) / name)) for name, _, _ in state]
+    listed = [(name, files.sha256(Path(path) / name)) for name, _ in state]
     return files.sha256(to_json(listed))
 
 
