@@ -8,8 +8,12 @@ import warnings
 from functools import cache
 from typing import Any
 
+import numpy as np
+from numpy import ndarray as Array
+
 from qsim import engine
 
+_PACKET = 16  # numbers that a kernel works on at a time, at most
 _INFINITY = 0x7F800000  # float32; larger bit patterns are NaN or negative
 
 
@@ -44,6 +48,16 @@ def _after_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
+
+
+def whole_packets(numbers: Array) -> Array:
+    """The same numbers [n] in memory that a kernel may read to the end of its last packet.
+
+    Dr.Jit takes over the memory of NumPy's arrays. A packet that reached beyond them, and beyond the last page, ended
+    the process.
+    """
+    missing = -numbers.size % _PACKET
+    return np.append(numbers, np.zeros(missing, numbers.dtype))[: numbers.size] if missing else numbers
 
 
 # ---- Pieces of kernels

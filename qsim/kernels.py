@@ -23,6 +23,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.codes import pack, packed_width
+from qsim.jit import whole_packets
 from qsim.keys import Key
 from qsim.ladders import Plan, plan
 from qsim.lanes import available, fixed_scalars, launch
@@ -164,7 +165,7 @@ def _parts(
             with np.errstate(over="ignore"):  # beyond float32 the reference decides
                 light[: shape[0], : shape[1], left : left + width] = some
             some = light[: shape[0], : shape[1]]
-        pairs = np.ascontiguousarray(some).reshape(-1).view(np.uint64)
+        pairs = whole_packets(np.ascontiguousarray(some).reshape(-1).view(np.uint64))
         first = (key.frame + part[0].start, origin[0] + part[1].start)
         return launch(chosen, pairs, shape, first, fixed, bits)
 

@@ -17,7 +17,7 @@ from numpy import ndarray as Array
 
 from qsim import lookup
 from qsim.curves import Curves
-from qsim.jit import available, backend, no_light, smaller, uniform32
+from qsim.jit import available, backend, no_light, smaller, uniform32, whole_packets
 from qsim.keys import ROUNDS, Key
 from qsim.ladders import Electrons, Live, Plan, plan
 from qsim.sensor import Sensor
@@ -74,7 +74,7 @@ def _places(shape: tuple[int, int, int]) -> list[Any]:
     below_t = below_y + (shape[1] - 1).bit_length()
     number = (t << below_t | y << below_y | x).astype(np.uint32)
     masks = (1 << below_y) - 1, (1 << below_t) - 1
-    return [u32(number.reshape(-1)), *(dr.opaque(u32, n) for n in (below_y, below_t, *masks))]
+    return [u32(whole_packets(number.reshape(-1))), *(dr.opaque(u32, n) for n in (below_y, below_t, *masks))]
 
 
 def launch(

@@ -345,6 +345,27 @@ def test_memory_is_the_output_and_what_launches_hold():
     assert max(held) < 16, held
 
 
+ODD = """
+import os, sys
+import numpy as np
+from qsim import kernels
+from qsim.keys import Key
+from qsim.spad import BinarySPAD
+for kind in (np.float32, np.float64):
+    photons = np.full((65535, 2, 4), 0.5, kind)
+    for draw in (kernels.sample, kernels.sample_packed):
+        draw(BinarySPAD(0.5, 10.0), photons, 5e-4, key=Key(1, 2))
+os._exit(0)
+"""
+
+
+@needs_engine
+def test_no_kernel_reads_beyond_its_light():
+    """32 bytes below two mebibytes: the last packet reached into a page that is not there, and the process ended."""
+    done = subprocess.run([sys.executable, "-c", ODD], timeout=120, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 FORK = """
 import os, sys, warnings
 import numpy as np
