@@ -132,23 +132,35 @@ def _run_plan(args: argparse.Namespace) -> int:
 def add_check(sub: Any) -> None:
     parser = command(
         sub, "check", _run_check, "Compare what was made with its checksums; exit code 1 if a file is damaged.",
-        "qsim check out/starter out/fan out/fan_restored.npy",
+        "qsim check out/starter out/fan out/fan_restored.npy\n"
+        "qsim check out/starter --redraw",
     )  # fmt: skip
     parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="data sets, clips, streams, restored video")
+    parser.add_argument(
+        "--redraw", action="store_true", help="draw streams again by the reference engine, name those that differ; slow"
+    )
 
 
 def _run_check(args: argparse.Namespace) -> int:
-    from qsim import checking
+    from qsim import checking, redraw
 
     problems: list[str] = []
     unsealed: list[Path] = []
+    again: list[redraw.Redrawn] = []
     for path in args.paths:
         with bar(str(path), "clip" if (path / "dataset.json").is_file() else "file") as progress:
             found = checking.check(path, progress)
         problems += found.problems
         unsealed += found.unsealed
+        if args.redraw:
+            with bar(f"{path} again", "stream") as progress:
+                again += redraw.redraw(path, progress)
     names = ", ".join(str(path) for path in args.paths)
-    facts = {"paths": [str(path) for path in args.paths], "problems": problems}
+    facts: dict[str, Any] = {"paths": [str(path) for path in args.paths], "problems": problems}
     facts["without_checksum"] = [str(path) for path in unsealed]
-    output(args, facts, checking.Verdict(problems, unsealed).lines(names))
-    return 1 if problems else 0
+    lines = checking.Verdict(problems, unsealed).lines(names)
+    if args.redraw:
+        facts["redrawn"] = [dataclasses.asdict(one) | {"path": str(one.path), "wrong": one.wrong} for one in again]
+        lines += redraw.lines(again)
+    output(args, facts, lines)
+    return 1 if problems or any(one.wrong for one in again) else 0

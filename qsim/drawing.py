@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from qsim.flaws import Flawed, Flaws, Light
     from qsim.keys import Key
     from qsim.sensor import Sensor
-    from qsim.stream import Progress, Sensing
+    from qsim.stream import Progress, Sensing, Stream
 
+LAWS = ("table", "process", "planes", "closed form", "events")  # of `Draw.law`
 _BLOCK_PIXELS = 1 << 22  # photons held in memory at a time while sensing: 32 MiB of float64
 
 
@@ -41,6 +42,30 @@ class Draw:
     diffraction: bool
     flaws: Flaws | None = None
     followed: Effects | None = None  # counting pixels: what the closed form misses, where photons have to be followed
+    engine: str = "auto"
+
+    @property
+    def law(self) -> str:
+        """How its codes come from random numbers, `drawn_by` of a stream; another law draws other codes.
+
+        "table": one number against the cdf. "process": step by step, or the sum of all planes at once. "planes": one by
+        one. "closed form" and "events": counting pixels, by their cdf and photon by photon.
+        """
+        from qsim.qis import QIS
+        from qsim.spad import BinarySPAD, PlaneByPlane
+
+        if self.followed is not None:
+            return "events"
+        few = self.sensor.bits <= 8
+        if isinstance(self.sensor, QIS):
+            pattern = None if self.flaws is None else self.flaws.pattern
+            maps = {} if self.flaws is None else self.flaws.maps
+            read_out = pattern is not None and (pattern.offset or pattern.read_noise)
+            return "process" if not few or read_out or {"offset_map", "read_noise_map"} & set(maps) else "table"
+        if not isinstance(self.sensor, BinarySPAD):
+            return "closed form"
+        disturbed = self.flaws is not None and (self.flaws.afterpulse or self.flaws.crosstalk)
+        return "planes" if few or self.sums or disturbed or isinstance(self.sensor, PlaneByPlane) else "process"
 
     def light(self, clip: Clip, start: int, stop: int) -> Array:
         """Photons [stop - start, H, W] of clip frames."""
@@ -58,28 +83,35 @@ class Draw:
         return np.concatenate([block for n, block in enumerate(blocks, first) if n >= start])
 
     def blocks(self, clip: Clip, start: int, stop: int, step: int) -> Iterator[Array]:
-        """Codes of stream frames start ... stop - 1, `step` at a time."""
+        """Codes of stream frames start ... stop - 1, `step` at a time; all at once where photons are followed."""
+        if self.followed is not None:
+            yield self._follow(clip, stop)[start:]
+            return
         places = [(t * self.planes, min(t + step, stop) * self.planes) for t in range(start, stop, step)]
         light = (self._exposed(self.light(clip, *place)) for place in places)
         flawed = self._flawed(clip)
         if flawed is not None:
-            drawn: Iterator[Array] = flawed.blocks(light, self._exposure(clip), self.key.at(self._number(start)))
+            drawn: Iterator[Array] = flawed.blocks(light, self._exposure(clip), self.key.at(self._number(start)), engine=self.engine)
         else:
             keys = (self.key.at(self._number(t)) for t in range(start, stop, step))
-            drawn = (self.plane.sample(p, self._exposure(clip), key=key) for p, key in zip(light, keys, strict=True))
+            exposure, engine = self._exposure(clip), self.engine
+            each = zip(light, keys, strict=True)
+            drawn = (self.plane.sample(p, exposure, key=key, engine=engine) for p, key in each)
         for block in drawn:
             yield self._summed(block)
 
     def packed(self, clip: Clip, frames: int, progress: Progress | None = None) -> Iterator[Array]:
         """All codes of a stream, packed row by row, some frames at a time."""
         step = max(1, _BLOCK_PIXELS // (clip.shape[1] * clip.shape[2] * self.planes))
-        if self.followed is not None:
-            blocks: Iterator[Array] = (codes.pack(self._follow(clip, frames), self.sensor.bits) for _ in range(1))
-        elif self.flaws is not None or self.planes > 1:
-            blocks = (codes.pack(block, self.sensor.bits) for block in self.blocks(clip, 0, frames, step))
+        if self.followed is not None or self.flaws is not None or self.planes > 1:
+            blocks: Iterator[Array] = (
+                codes.pack(block, self.sensor.bits) for block in self.blocks(clip, 0, frames, step)
+            )
         else:
             blocks = (
-                self.plane.sample_packed(self.light(clip, t, min(t + step, frames)), clip.exposure, key=self.key.at(t))
+                self.plane.sample_packed(
+                    self.light(clip, t, min(t + step, frames)), clip.exposure, key=self.key.at(t), engine=self.engine
+                )
                 for t in range(0, frames, step)
             )
         done = 0
@@ -189,6 +221,33 @@ def assemble(clip: Clip, sensing: Sensing, found: Flaws | None, own: Sensor | No
     _check_planes(sensor, sensing, clip)
     key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
     return Draw(sensor, plane_of(sensor, planes), level, key, planes, sensing.diffraction, found)
+
+
+def stored(stream: Stream) -> Draw:
+    """What drew a stream, from its json alone, by the law of its time; `ValueError` if it was not drawn here."""
+    from qsim import events, flaws
+    from qsim.keys import Key
+    from qsim.spad import BinarySPAD, PlaneByPlane
+
+    meta = stream.meta
+    for name in ("seed", "clip_key", "ppp", "mean_photons_before", "ppp_factor"):
+        if meta.get(name) is None:
+            raise ValueError(f"{stream.path}: its description holds no {name}: it was not drawn from a clip of ours")
+    planes, law = int(meta.get("planes_per_code") or 1), meta.get("drawn_by")
+    if law not in (None, *LAWS):
+        raise ValueError(
+            f"{stream.path}: drawn by {law!r}, which this version does not know; there are {', '.join(LAWS)}"
+        )
+    sensor = stream.sensor
+    if law in (None, "planes") and isinstance(sensor, BinarySPAD):
+        sensor = PlaneByPlane(**vars(sensor))
+    level = optics.LightLevel(stream.photons_factor, meta["ppp"] / planes, meta["mean_photons_before"] / planes, None)
+    key = Key(seed=meta["seed"], clip=meta["clip_key"])
+    where = f"{stream.path.with_suffix('.json')}: defects"
+    found = flaws.from_dict(meta["defects"], where) if "defects" in meta else None
+    followed = events.Effects(**meta["dead_time_effects"]) if law == "events" else None
+    diffraction = bool(meta.get("diffraction", False))
+    return Draw(sensor, plane_of(sensor, planes), level, key, planes, diffraction, found, followed)
 
 
 def plane_of(sensor: Sensor, planes: int) -> Sensor:

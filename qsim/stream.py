@@ -24,7 +24,7 @@ from numpy import ndarray as Array
 
 from qsim import __version__, arrays, codes, descriptions, files, optics
 from qsim.checks import check_name as check_name
-from qsim.drawing import Draw, plane_of, prepare
+from qsim.drawing import Draw, prepare, stored
 
 if TYPE_CHECKING:
     from qsim.clip import Clip
@@ -326,6 +326,7 @@ def describe(clip: Clip, sensing: Sensing, draw: Draw) -> dict[str, Any]:
         "frame_rate": clip.frame_rate / draw.planes,
         "exposure": clip.exposure * draw.planes,
         "planes_per_code": draw.planes,
+        "drawn_by": draw.law,
     } | ({} if draw.flaws is None else {"defects": draw.flaws.to_dict()})
 
 
@@ -350,7 +351,7 @@ def sense(
         from qsim.events import TOLERANCE
 
         draw = dataclasses.replace(draw, followed=missed if missed.largest > TOLERANCE else None)
-        meta["drawn_by"] = "events" if draw.followed else "closed form"
+        meta["drawn_by"] = draw.law
         meta["dead_time_effects"] = dataclasses.asdict(missed)
         line += f"; {missed}: {'photon by photon' if draw.followed else 'below ' + str(TOLERANCE) + ', closed form'}"
     kept = None if force else _kept(clip, sensing, draw, meta)
@@ -373,7 +374,7 @@ def _kept(clip: Clip, sensing: Sensing, draw: Draw, meta: dict[str, Any]) -> Str
     except FileNotFoundError:
         return None
     if (
-        all(old.meta.get(key) == value for key, value in meta.items())
+        all(old.meta.get(key, value if key == "drawn_by" else None) == value for key, value in meta.items())
         and old.meta.get("defects") == meta.get("defects")
         and old.meta["sensor"] == draw.sensor.to_dict()
     ):
@@ -385,22 +386,7 @@ def replay(clip: Clip, stream: Stream, frame: int) -> tuple[Array, Array]:
     """One frame drawn again from the stream's json alone, and the stored one: both codes [H, W]."""
     if not 0 <= frame < len(stream):
         raise ValueError(f"{stream.path}: frame {frame} asked for, the stream has frames 0..{len(stream) - 1}")
-    from qsim import events, flaws
-    from qsim.keys import Key
-
-    meta = stream.meta
-    for name in ("seed", "clip_key", "ppp", "mean_photons_before", "ppp_factor"):
-        if meta.get(name) is None:
-            raise ValueError(f"{stream.path}: its description holds no {name}: it was not drawn from a clip of ours")
-    planes = int(meta.get("planes_per_code") or 1)
-    plane = plane_of(stream.sensor, planes)
-    level = optics.LightLevel(stream.photons_factor, meta["ppp"] / planes, meta["mean_photons_before"] / planes, None)
-    key = Key(seed=meta["seed"], clip=meta["clip_key"])
-    where = f"{stream.path.with_suffix('.json')}: defects"
-    found = flaws.from_dict(meta["defects"], where) if "defects" in meta else None
-    followed = events.Effects(**meta["dead_time_effects"]) if meta.get("drawn_by") == "events" else None
-    draw = Draw(stream.sensor, plane, level, key, planes, bool(meta.get("diffraction", False)), found, followed)
-    return draw.frames(clip, frame, frame + 1)[0], stream.codes(frame, frame + 1)[0]
+    return stored(stream).frames(clip, frame, frame + 1)[0], stream.codes(frame, frame + 1)[0]
 
 
 def electrons_per_photon(sensor: Sensor) -> float:

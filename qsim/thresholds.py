@@ -77,25 +77,35 @@ class Thresholds:
 
 
 def decide(cdf: Callable[[Array, Array], Array], top: int, u: Array, mean: Array, guess: Array) -> tuple[Array, Array]:
-    """The smallest codes k with u < F_k (`top` at most), and how near u comes to a step: [p], [p] from [p] each.
+    """The smallest codes k with u < F_k (`top` at most), and how near u comes to a step: [p], [p] from [p] each."""
+    near = np.full(len(u), np.inf)
+
+    def passed(k: Array, left: Array) -> Array:
+        distance = u[left] - cdf(k, mean[left])
+        near[left] = np.minimum(near[left], np.abs(distance))
+        return distance >= 0
+
+    return search(passed, top, guess), near
+
+
+def search(passed: Callable[[Array, Array], Array], top: int, guess: Array) -> Array:
+    """The smallest codes whose step is not passed, `top` at most: [p]. `passed`: codes of some pixels, which -> bool.
 
     From the guess on in growing strides, then by bisection; only pixels that are undecided are looked at again.
     """
-    low, high = np.full(len(u), -1), np.full(len(u), top)
-    probe, near = np.clip(guess, 0, max(top - 1, 0)).astype(np.intp), np.full(len(u), np.inf)
+    low, high = np.full(len(guess), -1), np.full(len(guess), top)
+    probe = np.clip(guess, 0, max(top - 1, 0)).astype(np.intp)
     left, stride = np.flatnonzero(high - low > 1), 1
     while left.size:
         k = probe[left]
-        distance = u[left] - cdf(k, mean[left])
-        near[left] = np.minimum(near[left], np.abs(distance))
-        passed = distance >= 0
-        low[left], high[left] = np.where(passed, k, low[left]), np.where(passed, high[left], k)
+        up = passed(k, left)
+        low[left], high[left] = np.where(up, k, low[left]), np.where(up, high[left], k)
         below, above = low[left], high[left]
         probe[left] = np.where(
-            passed, np.minimum(k + stride, (below + above + 1) // 2), np.maximum(k - stride, (below + above) // 2)
+            up, np.minimum(k + stride, (below + above + 1) // 2), np.maximum(k - stride, (below + above) // 2)
         )
         left, stride = left[above - below > 1], 2 * stride
-    return high, near
+    return high
 
 
 def _in_blocks(function: Callable[[Array, Array], Array], codes: Array, mean: Array) -> Array:
