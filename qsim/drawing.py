@@ -91,7 +91,9 @@ class Draw:
         light = (self._exposed(self.light(clip, *place)) for place in places)
         flawed = self._flawed(clip)
         if flawed is not None:
-            drawn: Iterator[Array] = flawed.blocks(light, self._exposure(clip), self.key.at(self._number(start)), engine=self.engine)
+            drawn: Iterator[Array] = flawed.blocks(
+                light, self._exposure(clip), self.key.at(self._number(start)), engine=self.engine
+            )
         else:
             keys = (self.key.at(self._number(t)) for t in range(start, stop, step))
             exposure, engine = self._exposure(clip), self.engine
