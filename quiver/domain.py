@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from quiver.baselines import METHODS
 from quiver.data import Codes, Light, Sensor
+from quiver.noise import Noise
 
 if TYPE_CHECKING:
     from quiver.restoring import Restorer
@@ -152,6 +153,8 @@ def _trained(text: str | None) -> tuple[Light, ...]:
     """Sensors, bits and light of the settings that training leaves in a weights file; empty where they do not say."""
     try:
         settings = json.loads(text or "{}")
+        if settings.get("noise"):
+            return tuple(Noise.from_dict(values) for values in settings["noise"])
         sensors, bits, ppp = (_listed(settings.get(name)) for name in ("sensor", "bits", "ppp"))
         return tuple(
             Light(str(sensor), None if light is None else float(light), None if depth is None else int(depth))

@@ -13,7 +13,7 @@ Nothing here knows files, sensors or torch.
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from math import inf, isfinite, log10, nan, pi, sqrt
 
 import numpy as np
@@ -249,6 +249,12 @@ def score(
         frames=int(np.count_nonzero(~hidden)),
         above_peak=above_peak(two, keep),
     )
+
+
+def mean_score(scores: Sequence[Score]) -> Score:
+    """Every number's mean over the windows that have one."""
+    found = {field.name: _mean(np.array([getattr(s, field.name) for s in scores], float)) for field in fields(Score)}
+    return Score(**found)  # type: ignore[arg-type]  # frames become a mean, too
 
 
 def _mean(values: np.ndarray) -> float:

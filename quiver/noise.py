@@ -128,6 +128,10 @@ class Noise(Light):
         """The same in qsim's words, without record and defects."""
         return Sensing(self.sensor, bits=self.bits, ppp=self.ppp, lux=self.lux, seed=seed, diffraction=self.diffraction)
 
+    def device(self, exposure: float) -> Sensor:
+        """The sensor for clips with this exposure [s]."""
+        return super().device(exposure) if self.record is None else _sensor(self.record)
+
     def draw(self, clip: Clip, seed: int = 0) -> Draw:
         """All that decides the codes of a clip; `ValueError` where this noise does not fit it."""
         own = None if self.record is None else _sensor(self.record)

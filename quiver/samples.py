@@ -22,7 +22,7 @@ import torch
 from numpy import ndarray as Array
 from torch.utils.data import Dataset, Sampler
 
-from quiver.data import Clip, Draw, Key, Light, Sensor, clip_photons, draw_codes, has_sharp
+from quiver.data import Clip, Draw, Key, Light, Sensor, clip_photons, draw_codes, has_sharp, peak_of
 from quiver.noise import Mixture, Noise, check_windows, choose, window_codes
 
 TRAINING, VALIDATION = 1, 2  # stages of the random keys: no two uses share noise (0 is `qsim sense`)
@@ -68,9 +68,10 @@ class Windows(Dataset[dict[str, Any]]):
     """Windows of `frames` frames from the clips of a folder, with fresh noise: a map-style `torch` data set.
 
     item: codes float32 [T, 1, h, w] in [0, 1], target float32 [T, 1, h, w] = sharp photons / white (up to `ceiling`),
-    white [photons], ppp, sample (its number), key (text: clip, place, light, random key). Codes and target follow the
-    sensor of their window. `noise` is the mixture that windows draw from, `print(windows)` says it. `ValueError` for a
-    folder without clips, for clips shorter or smaller than a window, and for noise that windows cannot have.
+    white [photons], peak [photons] of its scores, ppp, sample (its number), key (text: clip, place, light, random key).
+    Codes and target follow the sensor of their window. `noise` is the mixture that windows draw from, `print(windows)`
+    says it. `ValueError` for a folder without clips, for clips shorter or smaller than a window, and for noise that
+    windows cannot have.
     """
 
     def __init__(
@@ -156,6 +157,7 @@ class Windows(Dataset[dict[str, Any]]):
             "codes": as_input(codes, draw.sensor),
             "target": torch.from_numpy(np.minimum(sharp / white, self.settings.ceiling).astype(np.float32))[:, None],
             "white": white,
+            "peak": white if self.settings.force_exposure else peak_of(draw.level.ppp),
             "ppp": float((photons * scale).mean()),
             "sample": n,
             "key": f"{clip.name} frame {place.start}, (y, x) ({place.y}, {place.x}), turn {place.turn}, "

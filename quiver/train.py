@@ -15,7 +15,7 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -155,7 +155,9 @@ def make_windows(settings: Settings, multiple: int) -> tuple[Windows, Subset[dic
         warnings.warn(f"{settings.data}: no clip in split '{split}'; validating on training clips", stacklevel=2)
         validation = training
     side = min(VALIDATION_SIDE, *(min(clip.shape[1:]) for clip in validation)) // multiple * multiple
-    fixed = Windows(validation, replace(window, drift=0, frames=WINDOW, crop=max(side, multiple)), fixed=True)
+    fixed = Windows(
+        validation, replace(window, drift=0, frames=WINDOW, crop=max(side, multiple), ceiling=math.inf), fixed=True
+    )
     return windows, Subset(fixed, range(0, len(fixed), -(-len(fixed) // settings.validation_windows)))
 
 
@@ -186,12 +188,12 @@ def validate(model: nn.Module, windows: Subset[dict[str, Any]], device: torch.de
         target = sample["target"][RADIUS : RADIUS + len(output), 0]
         if not bool(torch.isfinite(output).all()):
             output = torch.zeros_like(output)  # scored as black; the next training step says why
-        scores.append(metrics.score(output.numpy(), target.numpy()))
+        unit = float(sample["white"]) / float(sample["peak"])  # scores have one peak for every sensor
+        scores.append(metrics.score(output.numpy() * unit, target.numpy() * unit))
         if i == 0:
             picture = torch.cat([sample["codes"][RADIUS, 0], output[0], target[0]], dim=1).clamp(0, 1)
     model.train()
-    mean = {name: sum(getattr(s, name) for s in scores) / len(scores) for name in asdict(scores[0])}
-    return metrics.Score(**mean), picture
+    return metrics.mean_score(scores), picture
 
 
 class Board:

@@ -19,6 +19,7 @@ from quiver import domain, domain_measure
 from quiver.cli import main
 from quiver.data import Codes, Light, array_codes, open_clips
 from quiver.domain import Cell, Domain, Place, Scope
+from quiver.noise import Noise
 from quiver.restoring import PRETRAINED, Options, network_restorer, network_title, restorer
 from quiver.unet import UNet, UNetConfig
 from quiver.weights import annotate, load, metadata_of, save
@@ -134,6 +135,13 @@ def test_weights_without_cells_say_what_they_were_trained_on(tmp_path):
     )
     assert "it was trained on quiver-physical, 1, 3 bit, 3.25, 9.75 PPP, this stream is spad512s, 1 bit" in str(other)
     assert "does not say what it was trained on" in str(domain.remark("old", Scope(), stream()))
+    own = Noise("mine.toml", 2.0, 1, record=json.dumps(devices.load("spad512s", bits=1).to_dict()), lux=None)
+    path = weights(tmp_path, settings={"sensor": None, "noise": [own.to_dict(), Noise().to_dict()]})
+    scope = domain.read_scope(path, metadata_of(path))
+    assert [light.sensor for light in scope.trained] == ["mine.toml", "quiver-physical"]
+    assert "trained on such streams" in str(domain.remark("mine", scope, stream("spad512s", 2, 1)))
+    assert "trained on such streams" in str(domain.remark("mine", scope, stream()))
+    assert "this stream is" in str(domain.remark("mine", scope, stream(bits=2)))
     several = {"sensor": ["quiver-physical", "none.toml"], "bits": [3], "ppp": [1]}
     path = weights(tmp_path, settings=several)
     assert len(domain.read_scope(path, metadata_of(path)).trained) == 2

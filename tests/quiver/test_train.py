@@ -19,12 +19,13 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from qsim import files
+from quiver import metrics
 from quiver import train as training
 from quiver.cli import main
 from quiver.config import PRESETS
-from quiver.model import QUIVER, Output
+from quiver.model import QUIVER, RADIUS, Output
 from quiver.optimiser import Optimiser
-from quiver.run import PROTOCOLS, Run, Settings, State
+from quiver.run import PROTOCOLS, Run, Settings, State, settled
 from quiver.train import Diverged, learning_rate, make_windows, note_plateau, time_is_up, train
 from quiver.unet import UNet, UNetConfig
 from quiver.weights import load
@@ -401,3 +402,28 @@ def test_a_head_start_trains_the_baseline_alone(tiny_dataset, tmp_path):
     assert moved(4, "more") >= {"denoiser", "baseline", "flow", "cell", "attention", "refine"}
     plain = train(small_network(), settings(tiny_dataset, tmp_path / "unet", head_start=0.5), progress=False)
     assert plain.finished, "a network without a baseline is trained as always"
+
+
+def test_validation_has_one_peak_for_every_sensor(tiny_dataset, tmp_path):
+    """A 1-bit code at 10 PPP: the peak is 25 photons, not the white of 1 that every pixel of the truth passes."""
+    asked = settings(tiny_dataset, tmp_path / "r", sensor="spad-320x240", ppp=(10.0,), bits=(1,))
+    windows = make_windows(settled(asked)[0], 4)[1]
+    sample = windows[0]
+    assert (float(sample["white"]), float(sample["peak"])) == (1.0, pytest.approx(25.0))
+    assert float(sample["target"].max()) > 8  # the ceiling of training targets does not cut the truth
+
+    class Exact(torch.nn.Module):
+        """Answers with so much of the truth."""
+
+        share = 0.8
+
+        def forward(self, x: Tensor) -> Output:
+            restored = self.share * sample["target"][RADIUS : RADIUS + 1][None]
+            return Output(None, restored, None, None)
+
+    only = torch.utils.data.Subset(windows.dataset, [windows.indices[0]])
+    score, _ = training.validate(Exact(), only, torch.device("cpu"))
+    truth = sample["target"][RADIUS].numpy() / 25.0
+    assert score.psnr == pytest.approx(float(metrics.psnr(0.8 * truth, truth)[0]), abs=1e-3)
+    assert score.psnr < 30
+    assert score.above_peak < 0.05
