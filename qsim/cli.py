@@ -256,6 +256,8 @@ def _run_sense(args: argparse.Namespace) -> int:
                 before += len(clip)
                 facts = {"clip": str(clip.path), "stream": found.name, "made": bool(drawn), "light": line}
                 made.append(facts | _light(found.meta))
+    if len(levels) > 1:
+        note("streams of a clip with the same --seed share their random numbers: another --seed makes them independent")
     lines = [f"{m['light']}; {'made' if m['made'] else 'there already'}: stream {m['stream']}" for m in made]
     output(args, {"streams": made}, lines)
     return 0

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks, files
-from qsim.console import GOES_ON, bar, checked, command, output
+from qsim.console import GOES_ON, bar, checked, command, note, output
 from qsim.recipe import Job
 
 # generate
@@ -90,6 +90,8 @@ def _cluster(args: argparse.Namespace) -> Any:
             )
     from qsim.cluster import Cluster
 
+    if not args.cluster.startswith("tls://"):
+        note(f"{args.cluster}: without TLS, so whoever reaches this port can run any program as its workers' user")
     return Cluster(args.cluster, gpus=args.gpus)
 
 

@@ -16,8 +16,8 @@ from typing import Any
 
 from qsim import descriptions, files
 from qsim.clip import Clip
-from qsim.jobs import record_path
-from qsim.recipe import SPLITS
+from qsim.jobs import make_record, record_path
+from qsim.recipe import SPLITS, Job
 from qsim.stream import Progress
 
 FORMAT_VERSION = 1
@@ -180,3 +180,24 @@ def verify_job(folder: Path, name: str, expected: dict[str, Any]) -> list[str]:
     for stream, digest in record.get("streams", {}).items():
         problems += files.differs(clip.path / "streams" / f"{stream}.json", digest)
     return list(dict.fromkeys(problems))
+
+
+def unproven(folder: Path, job: Job) -> str | None:
+    """Why a job that a worker calls done is not done, or None.
+
+    The record must be that of this job and vouch for clip.json and the json of each stream as they are; every file that
+    they name must be there, and the codes must have the size that their json says. Contents are left to `verify_job`.
+    """
+    path, place = record_path(folder, job.name), folder / "clips" / job.name
+    try:
+        clip = Clip.open(place)
+        if files.read_json(path) != make_record(job, place) or clip.meta.get("job") != job.digest:
+            return f"{path}: is not the record of this job and its clip"
+        for name in clip.meta["checksums"]:
+            if not (place / name).is_file() or (place / name).stat().st_size == 0:
+                return f"{place / name}: missing or empty"
+        for sensing in job.streams:
+            _ = clip.stream(sensing.stream_name).packed
+    except (ValueError, OSError) as error:
+        return files.wording(error)
+    return None

@@ -16,13 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from qsim import __version__, files
-from qsim.dataset import FORMAT_VERSION, Damaged, Dataset, verify_job
-from qsim.jobs import Make, Result, make_record, record_path, render_job
+from qsim.dataset import FORMAT_VERSION, Damaged, Dataset, unproven, verify_job
+from qsim.jobs import FOLDERS, Make, Result, failure_path, make_record, mark_failed, record_path, render_job
 from qsim.recipe import Job, Recipe
 from qsim.stream import Progress
 from qsim.workers import Limits, run_here, run_local
-
-_FOLDERS = ("clips", "jobs", "failed", "logs", "locks", "work")
 
 Run = Callable[[list[Job], Path, Make], Generator[Result]]
 
@@ -82,14 +80,16 @@ def generate(
                 for result in results:
                     if result.state == "full":
                         raise OSError(errno.ENOSPC, result.message)
+                    if result.state == "gone":
+                        raise FileNotFoundError(result.message)
                     if result.state == "done":
                         made.append(result.name)
                     else:
                         failed[result.name] = result.message
                     if on_result is not None:
                         on_result(result)
+            failed |= _unproven(folder, todo, made)
             write_manifest(recipe, folder)
-            failed |= {name: _ELSEWHERE for name in made if not record_path(folder, name).is_file()}
             done = sum(record_path(folder, job.name).is_file() for job in jobs)
             shared = tuple(Dataset.open(folder).shared_between_splits())
     except OSError as error:
@@ -99,6 +99,21 @@ def generate(
         raise OSError(message) from None
     made = [name for name in made if name not in failed]
     return Summary(len(jobs), done, len(made), failed, repaired, shared)
+
+
+def _unproven(folder: Path, jobs: list[Job], made: list[str]) -> dict[str, str]:
+    """The jobs that a worker calls done and that are not, with the reason; their records go: no reader sees them."""
+    by_name, failed = {job.name: job for job in jobs}, {}
+    for name in made:
+        if name not in by_name:
+            failed[name] = "a worker says that it is done, but it was given to none"
+        elif not record_path(folder, name).is_file():
+            failed[name] = _ELSEWHERE
+        elif problem := unproven(folder, by_name[name]):
+            failed[name] = f"a worker says that it is done, but {problem}"
+            mark_failed(folder, by_name[name], failed[name])
+            record_path(folder, name).unlink()
+    return failed
 
 
 def shard(jobs: tuple[Job, ...], part: tuple[int, int] | None) -> list[Job]:
@@ -217,7 +232,7 @@ def write_manifest(recipe: Recipe, folder: Path) -> None:
 
 def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
     """Folders and manifest; what had to be repaired of the manifest. `ValueError` if it is another recipe's."""
-    for name in _FOLDERS:
+    for name in FOLDERS:
         (folder / name).mkdir(exist_ok=True)
     if not (folder / "dataset.json").is_file():
         _check_records(recipe, folder)
@@ -290,7 +305,7 @@ def _check_records(recipe: Recipe, folder: Path) -> None:
 @contextlib.contextmanager
 def _locked(folder: Path, options: Options) -> Iterator[None]:
     """One generator per folder, or any number of different shards."""
-    if folder.exists() and not (folder / "locks").is_dir() and any(folder.iterdir()):
+    if folder.exists() and not _is_data_set(folder):
         raise ValueError(f"{folder}: is not empty and not a data set; use another folder")
     (folder / "locks").mkdir(parents=True, exist_ok=True)
     locks = [files.Lock(folder / "locks" / "generate", shared=options.shard is not None)]
@@ -306,10 +321,17 @@ def _locked(folder: Path, options: Options) -> Iterator[None]:
             lock.release()
 
 
+def _is_data_set(folder: Path) -> bool:
+    """Whether a folder is a data set, what is left of one, or empty."""
+    if (folder / "locks").is_dir() or (folder / "dataset.json").is_file():
+        return True
+    return all(item.name in FOLDERS and item.is_dir() for item in folder.iterdir())
+
+
 def _failures(folder: Path, jobs: list[Job]) -> dict[str, str]:
     found = {}
     for job in jobs:
-        path = folder / "failed" / f"{job.name}.json"
+        path = failure_path(folder, job.name)
         if path.is_file():
             found[job.name] = str(files.read_json(path).get("error"))
     return found

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 Make = Callable[[Job, Path], object]  # renders a job's clip to a path; tests hand in a quick one
 
+FOLDERS = ("clips", "jobs", "failed", "logs", "locks", "work")  # of a data set
+
 _ASSETS = {  # record of scene.py -> its array or file, and what it is
     "Texture": ("image", "texture"),
     "NormalMap": ("image", "texture"),
@@ -46,7 +48,8 @@ class Result:
     """What became of one job."""
 
     name: str
-    state: str  # "done", "failed", "full" (no space left) or "died" (the worker process did not survive it)
+    # "done", "failed", "full" (no space left), "gone" (the data set's folder) or "died" (the worker process)
+    state: str
     message: str = ""
 
 
@@ -174,6 +177,12 @@ def failure_path(folder: Path, name: str) -> Path:
     return folder / "failed" / f"{name}.json"
 
 
+def removed(folder: Path) -> str:
+    """Which part of a data set's folder is no longer there, and what to do; empty if all are."""
+    gone = [place for place in (folder, *(folder / name for name in FOLDERS)) if not place.is_dir()]
+    return f"{gone[0]}: was removed while the data set was being made; run the same command again" if gone else ""
+
+
 def run_job(job: Job, folder: Path, make: Make = render_job) -> Result:
     """Do whatever of a job is not done yet. Failures are written to failed/ and returned, not raised."""
     lock = files.Lock(folder / "locks" / job.name)
@@ -184,7 +193,7 @@ def run_job(job: Job, folder: Path, make: Make = render_job) -> Result:
         try:
             return _do(job, folder, make)
         except Exception as error:
-            if isinstance(error, OSError) and error.errno in files.FULL:
+            if isinstance(error, OSError) and (error.errno in files.FULL or removed(folder)):
                 raise
             _log(folder, job.name, traceback.format_exc())
             message = files.wording(error)
@@ -193,9 +202,11 @@ def run_job(job: Job, folder: Path, make: Make = render_job) -> Result:
             mark_failed(folder, job, message)
             return Result(job.name, "failed", message)
     except OSError as error:
-        if error.errno not in files.FULL:
-            raise
-        return Result(job.name, "full", f"{error.strerror} while making {job.name}")
+        if error.errno in files.FULL:
+            return Result(job.name, "full", f"{error.strerror} while making {job.name}")
+        if lost := removed(folder):
+            return Result(job.name, "gone", lost)
+        raise
     finally:
         lock.release()
 

@@ -259,3 +259,11 @@ def test_options_that_are_not_given_are_the_defaults(options_used: list[Options]
 def test_gpus_are_the_clusters(options_used: list[Options], capsys: pytest.CaptureFixture[str], given: str, text: str):
     assert qsim.cli.main(["generate", "r.toml", *given.split()]) == 2
     assert text in capsys.readouterr().err
+
+
+def test_a_scheduler_without_tls_is_named(options_used: list[Options], capsys: pytest.CaptureFixture[str]):
+    """Pickled work is taken from whoever reaches its port; the line comes before anything is sent."""
+    assert qsim.cli.main(["generate", "r.toml", "--cluster", "tcp://127.0.0.1:1"]) == 0
+    assert "tcp://127.0.0.1:1: without TLS, so whoever reaches this port can run any program" in capsys.readouterr().err
+    assert qsim.cli.main(["generate", "r.toml", "--cluster", "tls://127.0.0.1:1"]) == 0
+    assert "TLS" not in capsys.readouterr().err

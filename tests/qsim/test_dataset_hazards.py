@@ -5,11 +5,13 @@ import itertools
 import os
 import random
 import shutil
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import RECIPE, make, tree
+from fakes import RECIPE, make, make_slowly, tree
 
 from qsim import files, jobs, recipe
 from qsim.dataset import Dataset
@@ -207,3 +209,118 @@ def test_wordings():
     with pytest.raises(OSError) as caught, files.replacing(Path("/nowhere/x")):
         pass
     assert "None" not in str(caught.value)
+
+
+# Folders that go
+
+
+@pytest.mark.parametrize("part", [None, "locks", "jobs"])
+def test_a_folder_that_is_removed_while_workers_write(tmp_path: Path, part: str | None, capfd):
+    """One line, no worker's traceback; what is left is a data set to the next run, which makes the same files."""
+    wanted, folder = recipe.parse(RECIPE.replace("[0, 1]", "[0, 1, 2, 3, 5, 6]")), tmp_path / "d"
+    stop = threading.Event()
+
+    def remove() -> None:
+        while not stop.is_set():  # as `rm -r` that is repeated until nothing is left
+            if any((folder / "logs").glob("*")):
+                shutil.rmtree(folder / part if part else folder, ignore_errors=True)
+            stop.wait(0.02)
+
+    thread = threading.Thread(target=remove)
+    thread.start()
+    try:
+        with pytest.raises(FileNotFoundError) as caught:
+            generate(wanted, folder, Options(workers=2), make=make_slowly)
+    finally:
+        stop.set()
+        thread.join()
+    assert str(folder) in files.wording(caught.value)
+    out, err = capfd.readouterr()
+    assert "Traceback" not in out + err
+    assert generate(wanted, folder, Options(workers=0, retry=True), make=make).failed == {}
+    assert Dataset.open(folder).verify() == []
+
+
+def test_a_folder_of_somebody_else_is_still_refused(tmp_path: Path):
+    (tmp_path / "d" / "clips").mkdir(parents=True)
+    (tmp_path / "d" / "thesis.tex").touch()
+    with pytest.raises(ValueError, match="is not empty and not a data set"):
+        generate(recipe.parse(RECIPE), tmp_path / "d", HERE, make=make)
+    assert sorted(os.listdir(tmp_path / "d")) == ["clips", "thesis.tex"]
+
+
+# Answers of workers
+
+
+def first(folder: Path, pattern: str) -> Path:
+    return min((folder / "clips" / "fan_0000").glob(pattern))
+
+
+LIES = {  # name -> what a worker does to a job's files before it answers "done"; the record is written last
+    "an empty record": lambda folder, record: record.write_text("{}"),
+    "no JSON": lambda folder, record: record.write_text("done"),
+    "the record of another job": lambda folder, record: record.write_bytes(
+        (folder / "jobs" / "fan_0001.json").read_bytes()
+    ),
+    "no clip": lambda folder, record: shutil.rmtree(folder / "clips" / "fan_0000"),
+    "another clip.json": lambda folder, record: first(folder, "clip.json").write_text(
+        first(folder, "clip.json").read_text() + " "
+    ),
+    "a missing frame": lambda folder, record: first(folder, "radiance/*.exr").unlink(),
+    "an empty frame": lambda folder, record: first(folder, "truth/*.exr").write_bytes(b""),
+    "a stream without json": lambda folder, record: first(folder, "streams/*.json").unlink(),
+    "a stream without codes": lambda folder, record: first(folder, "streams/*.npy").unlink(),
+    "codes cut short": lambda folder, record: first(folder, "streams/*.npy").write_bytes(
+        first(folder, "streams/*.npy").read_bytes()[:-3]
+    ),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_an_answer_counts_only_when_its_files_agree(tmp_path: Path, lie: str):
+    wanted, folder = recipe.parse(RECIPE), tmp_path / "d"
+
+    def run(chosen, place, maker):
+        for job in reversed(chosen):
+            found = jobs.run_job(job, place, maker)
+            if job.name == "fan_0000":
+                LIES[lie](place, place / "jobs" / "fan_0000.json")
+            yield found
+
+    found = generate(wanted, folder, HERE, make=make, run=run)
+    assert (found.done, found.made, set(found.failed)) == (2, 2, {"fan_0000"})
+    assert found.failed["fan_0000"].startswith("a worker says that it is done, but ")
+    opened = Dataset.open(folder)
+    assert opened.names() == ["fan_0001", "tumble_0004"]
+    assert opened.meta["jobs"]["fan_0000"]["state"] == "failed"
+
+
+def test_an_answer_for_a_job_that_nobody_asked_for(tmp_path: Path):
+    def run(chosen, place, maker):
+        yield jobs.Result("fan_0099", "done")
+        yield jobs.Result("fan_0000", "done")
+
+    found = generate(recipe.parse(RECIPE), tmp_path / "d", HERE, make=make, run=run)
+    assert (found.done, found.made) == (0, 0)
+    assert "given to none" in found.failed["fan_0099"]
+    assert "it is not here" in found.failed["fan_0000"]
+
+
+def test_jumps_of_the_clock_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The wall clock and the times of files go back and forth by years between and during two runs: the same bytes."""
+    wanted = recipe.parse(RECIPE)
+    generate(wanted, tmp_path / "undisturbed", HERE, make=make)
+    rng, now = random.Random(0), time.time
+    monkeypatch.setattr(time, "time", lambda: now() + rng.uniform(-1e9, 1e9))
+
+    def make_then_shake(job: Job, path: Path) -> object:
+        made = make(job, path)
+        for file in (tmp_path / "d").rglob("*"):
+            moment = rng.uniform(0, 2e9)
+            os.utime(file, (moment, moment))
+        return made
+
+    for _ in range(2):
+        assert generate(wanted, tmp_path / "d", HERE, make=make_then_shake).done == 3
+    assert tree(tmp_path / "d") == tree(tmp_path / "undisturbed")
+    assert Dataset.open(tmp_path / "d").verify() == []

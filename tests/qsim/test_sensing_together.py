@@ -142,3 +142,20 @@ def test_a_lock_whose_file_is_deleted_is_taken_on_the_new_one(tmp_path: Path):
     assert third.acquire()
     third.delete()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_two_light_levels_share_their_random_numbers_and_another_seed_does_not(tmp_path: Path):
+    """3.25 and 4 PPP, 3 bits: correlated by 0.96, as docs/datasets.md says; with another seed by 0 within 5 sigma.
+
+    0.01 is half a unit of the last digit and 5 sigma = 5 (1 - 0.96^2) / sqrt(8192) = 0.0043.
+    """
+    light = np.ones((2, 64, 64))
+    clip = write_clip(tmp_path / "c", radiance=light)
+
+    def noise(ppp: float, seed: int = 0) -> np.ndarray:
+        wanted = stream.Sensing("quiver-physical", 3, ppp, seed=seed)
+        return stream.sense(clip, wanted)[0].codes().astype(float).ravel()
+
+    low, high, other = noise(3.25), noise(4.0), noise(4.0, seed=1)
+    assert np.corrcoef(low, high)[0, 1] == pytest.approx(0.96, abs=0.01)
+    assert abs(np.corrcoef(low, other)[0, 1]) < 5 / np.sqrt(light.size)
