@@ -249,8 +249,8 @@ def test_options_of_local_processes_are_refused_with_a_cluster(
 def test_options_that_are_not_given_are_the_defaults(options_used: list[Options]):
     assert qsim.cli.main(["generate", "r.toml", "--cluster", "tcp://127.0.0.1:1"]) == 0
     assert qsim.cli.main(["generate", "r.toml"]) == 0
-    assert qsim.cli.main(["generate", "r.toml", "--workers", "0", "--memory", "8"]) == 0
-    assert options_used == [Options(), Options(), Options(workers=0, limits=Limits(memory=8))]
+    assert qsim.cli.main(["generate", "r.toml", "--workers", "3", "--memory", "8"]) == 0
+    assert options_used == [Options(), Options(), Options(workers=3, limits=Limits(memory=8))]
 
 
 @pytest.mark.parametrize(
