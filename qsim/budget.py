@@ -162,7 +162,9 @@ def choose(
         samples = fewer
         about_samples = Finding("samples", f"{samples} per pixel, denoised", f"without: {about_samples.chosen}")
     lens = _left_out(scene.camera, pilot.truths())
-    about_light, about_motion = _light(dimmed, fewer is not None), moving(pilot.travel, shutter)
+    pixels = scene.camera.height * scene.camera.width
+    noisy = noise.at(samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
+    about_light, about_motion = _light(dimmed, noisy, fewer is not None), moving(pilot.travel, shutter)
     findings = (limit, about_samples, about_denoiser, about_bounces, about_light, about_motion, about_blur, *lens)
     return Budget(
         samples,
@@ -264,11 +266,13 @@ def dimming(full: Array, cut: Array) -> tuple[float, float]:
     return float(missing.mean() / full.mean()), float(missing.std() / math.sqrt(missing.size) / full.mean())
 
 
-def _light(dimmed: tuple[float, float], denoises: bool) -> Finding:
-    """How far the mean light of the clip will be from that of a converged one."""
+def _light(dimmed: tuple[float, float], noisy: float, denoises: bool) -> Finding:
+    """How far the mean light of a frame will be from that of a converged one; `noisy` is by chance, as a share."""
     low, error = (100 * share for share in dimmed)
-    size = f"the bounces left out, known to +- {error:.2g} %; beside that only the noise of its samples"
-    kept = ", whose mean the denoised frames keep" if denoises else ""
+    size = (
+        f"the bounces left out, known to +- {error:.2g} %; beside that the noise of a frame's mean, {100 * noisy:.2g} %"
+    )
+    kept = ", that of its raw samples, which denoising keeps" if denoises else ""
     return Finding("mean light", f"{low:.2g} % too low" if low else "all of it", size + kept)
 
 

@@ -190,7 +190,8 @@ class Renderer:
         def error_at(white: float) -> float:
             noise = mixed.error_at(white) if mixed else Errors.of_halves(halves, white).at_white
             left_out = self.budget.left_out_at_white if self.budget.white else self.budget.left_out
-            return math.hypot(noise, blur_left(np.minimum(means, white), len(instants)), left_out)
+            blur = blur_left(np.minimum(means, white), len(instants)) if len(instants) > 1 else 0.0
+            return math.hypot(noise, blur, left_out)
 
         whole = math.hypot(error, blur_left(means, len(instants)), self.budget.left_out)
         return radiance.astype(np.float32), whole, frame_errors(error_at, white), fireflies

@@ -49,8 +49,8 @@ def rms(difference: Array) -> float:
 
 
 def white_of(mean: float, high: float) -> float:
-    """White of a mean radiance and a 99.9th percentile, in their unit."""
-    return min(WHITE_PER_MEAN * mean, high)
+    """White of a mean radiance and a 99.9th percentile, in their unit; of the mean alone where nearly all is black."""
+    return min(WHITE_PER_MEAN * mean, high) if high > 0 else WHITE_PER_MEAN * mean
 
 
 def white_in(radiance: Array) -> float:

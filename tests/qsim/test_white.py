@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from qsim.clip import Clip
 from qsim.dataset import Dataset
 from qsim.optics import WHITE_PER_MEAN
 from qsim.recipe import Job
-from qsim.scene import Body, Diffuse, EnvironmentImage, RoughPlastic
+from qsim.scene import Body, Diffuse, EnvironmentImage, Glow, PointLight, RoughPlastic
 from qsim.shapes import ball
 from qsim.white import (
     STEPS,
@@ -76,6 +77,16 @@ def test_without_anything_above_white_the_clamp_changes_nothing():
 def test_white_is_the_lower_of_two():
     assert white_of(1.0, 10.0) == WHITE_PER_MEAN
     assert white_of(1.0, 1.2) == 1.2
+    assert white_of(1.0, 0.0) == WHITE_PER_MEAN  # a spark in the dark
+
+
+def test_a_spark_in_the_dark_gets_a_budget():
+    """Fewer than one pixel in a thousand has light: the 99.9th percentile is 0."""
+    spark = scene(Body("spark", square(0.05), Glow(5.0)), light=PointLight((0, 0, -5), 1e-9))
+    chosen = choose(replace(spark, camera=CAMERA.resized(64, 88)), psnr=20, frames=1, denoise=False)
+    assert chosen.white > 0
+    frame = renderer(replace(spark, camera=CAMERA.resized(64, 88)), budget=chosen).frame(0, with_truth=False)
+    assert np.percentile(frame.radiance, 99.9) == 0 < frame.radiance.mean()
 
 
 @pytest.mark.parametrize("seed", range(20))
