@@ -178,10 +178,13 @@ def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
         if job.name in seen:
             raise ValueError(f"{section.where()}: the clip {job.name} is asked for twice; give one of them other seeds")
         seen.add(job.name)
-        if split_of.setdefault(job.scene, job.split) != job.split:
+        same = job.family.endswith(".xml")  # whatever the seed, which draws other samples of it
+        scene = job.stem if same else job.scene
+        if split_of.setdefault(scene, job.split) != job.split:
+            cure = "an .xml scene is one scene whatever the seed: leave one of them out"
             raise ValueError(
-                f"{section.where()}: scene {job.scene} is in the splits '{split_of[job.scene]}' and '{job.split}'; "
-                "splits are by scene, whatever the speed: give one of them other seeds"
+                f"{section.where()}: scene {scene} is in the splits '{split_of[scene]}' and '{job.split}'; "
+                + (cure if same else "splits are by scene, whatever the speed: give one of them other seeds")
             )
         if job.split != "test" and job.stem in tested:
             raise ValueError(
@@ -206,6 +209,10 @@ def _jobs(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[
     family = _family(section)
     seeds = _seeds(section)
     speeds = section.value("speed", checks.list_of(checks.speed), [1.0])
+    if family.endswith(".xml") and speeds != [1.0]:
+        raise ValueError(
+            f"{section.where('speed')}: an .xml scene stands still, its speed changes nothing; leave it out"
+        )
     split = section.value("split", checks.split, "train")
     settings = Settings(**(defaults | _settings(section)))
     if settings.height * settings.width > MAX_PIXELS:

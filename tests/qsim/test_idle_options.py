@@ -12,7 +12,7 @@ from clips import write_clip
 from small_scenes import plate
 
 import scenes
-from qsim import validate_light
+from qsim import recipe, validate_light
 from qsim.cli import main
 from qsim.cli_validate import ACTING
 from qsim.scene import SunSky
@@ -34,8 +34,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     still = "from small_scenes import plate\n\n\ndef scene(seed=0, *, speed=1.0):\n    return plate(None)\n"
     (folder / "still.py").write_text(still)
     (folder / "still.xml").write_text("<scene version='3.0.0'/>")
-    recipe = "[recipe]\nname='t'\nframes=2\nheight=8\nwidth=8\nframe_rate=2000.0\n[[scenes]]\nfamily='fan'\n"
-    (folder / "t.toml").write_text(recipe)
+    text = "[recipe]\nname='t'\nframes=2\nheight=8\nwidth=8\nframe_rate=2000.0\n[[scenes]]\nfamily='fan'\n"
+    (folder / "t.toml").write_text(text)
     return folder
 
 
@@ -92,6 +92,18 @@ def test_a_scene_file_that_uses_its_speed_is_taken(place):
     moving.write_text(text + "    return plate(Spin((0, 0, 1), 200.0 * speed))\n")
     assert scenes.load(moving, speed=2.0).bodies[1].motion.rate == 400.0
     assert scenes.load(place / "still.py").name == "test"
+
+
+def test_a_recipe_knows_that_an_xml_scene_stands_still_and_is_one(place):
+    head = (place / "t.toml").read_text().replace("family='fan'", "family='still.xml'")
+    with pytest.raises(ValueError, match=r"t\.toml:9: an \.xml scene stands still, its speed changes nothing"):
+        recipe.parse(head + "speed=2.0\n", place / "t.toml")
+    again = "[[scenes]]\nfamily='still.xml'\nseeds=[1]\nsplit='val'\n"
+    with pytest.raises(
+        ValueError, match=r"scene still is in the splits 'train' and 'val'; an \.xml scene is one scene"
+    ):
+        recipe.parse(head + again, place / "t.toml")
+    assert len(recipe.parse(head + "count=2\n", place / "t.toml").jobs) == 2
 
 
 def test_a_plan_for_programs_knows_its_machines(monkeypatch, place, capsys):
