@@ -83,6 +83,7 @@ TESTS = """## What the tests hold
 | light is counted right: worked numbers, EMVA formula, laws | `tests/qsim/test_optics.py` |
 | radiance of a closed box and of a Lambertian plane | `tests/qsim/test_render.py` |
 | stated error of a frame is its error | `tests/qsim/test_budget.py`, `tests/qsim/test_validate_render.py` |
+| compiled and reference engine agree over 10 000 random sensors | `tests/qsim/test_codes_search.py` |
 | codes have the exact distribution: tails, ties, dead times | `tests/qsim/test_sensor.py`, `test_qis.py` |
 | closed forms agree with following every photon | `tests/qsim/test_events.py` |
 | no two frames are equal; any order, any workers, same bytes | `tests/qsim/test_dataset.py`, `test_keys.py` |
