@@ -4,6 +4,7 @@
     radiance/000000.exr  Y, half, uncompressed: what a sensor integrates
     sharp/000000.exr     the same at mid-exposure, only where it differs
     truth/000000.exr     u v bu bv valid Z id: flow to the next and the previous frame, validity, depth, body; zipped
+    saturated/000000.exr 1 where the camera of an imported video was saturated, only of frames in which it was; zipped
     streams/NAME.npy     codes, and NAME.json (stream.py)
 
 A clip grows in NAME.part and gets its name when it is whole; an interrupted one goes on where it stopped.
@@ -148,6 +149,18 @@ class Clip:
         """int32 [H, W]: number of the body seen, -1 where nothing is."""
         return self._truth(t, "id").view(np.int32)
 
+    def saturated(self, t: int, crop: optics.Crop | None = None) -> Array:
+        """bool [H, W]: True where the light of frame t is a lower bound, because the camera saturated.
+
+        `meta["saturated_pixels"]` counts them over all frames; `meta["saturation"]` says at which pixel value.
+        """
+        self._check_frame(t)
+        _, height, width = self.shape
+        y, x, h, w = (0, 0, height, width) if crop is None else check_crop(crop, height, width, str(self.path))
+        if f"saturated/{t:06d}.exr" not in self.meta["checksums"]:
+            return np.zeros((h, w), bool)
+        return self._channel("saturated", t, "saturated")[y : y + h, x : x + w] != 0
+
     @property
     def has_truth(self) -> bool:
         """Whether flow, validity, depth and ids were stored."""
@@ -209,16 +222,19 @@ class Clip:
             ) from None
 
     def _truth(self, t: int, channel: str) -> Array:
+        return self._channel("truth", t, channel)
+
+    def _channel(self, folder: str, t: int, channel: str) -> Array:
         self._check_frame(t)
-        path = self.path / "truth" / f"{t:06d}.exr"
+        path = self.path / folder / f"{t:06d}.exr"
         if not path.is_file():
-            kept = f"truth/{t:06d}.exr" in self.meta["checksums"]
+            kept = f"{folder}/{t:06d}.exr" in self.meta["checksums"]
             why = f"the clip is damaged, run `qsim check {self.path}`" if kept else f"frame {t} has no ground truth"
             raise FileNotFoundError(f"{path}: no such file; {why}")
         status = path.stat()
         channels = _read_truth(path, *self.shape[1:], status.st_mtime_ns, status.st_size)
         if channel not in channels:
-            raise ValueError(f"{path}: has no channel '{channel}' ({TRUTH[channel]})")
+            raise ValueError(f"{path}: has no channel '{channel}' ({TRUTH.get(channel, channel)})")
         return channels[channel]
 
     def _check_frame(self, t: int) -> None:

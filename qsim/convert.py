@@ -22,6 +22,7 @@ def add_convert(sub: Any) -> None:
     parser = command(
         sub, "convert", _run_convert, "Read foreign recordings as clips or streams; write ours for others.",
         "qsim convert ball.npy out/ball --frame-rate 30000 --exposure 20e-6 --transfer linear\n"
+        "qsim convert camera.tif out/camera --frame-rate 1000 --transfer linear --white 4095\n"
         "qsim convert I2-2000FPS/test out/i2_test --frame-rate 2000 --transfer 'gamma 2.2' --split test\n"
         "qsim convert capture.bin out/capture --layout swissspad2-half --frame-rate 96800\n"
         "qsim convert out/starter out/starter_mp4 --to mp4\n"
@@ -52,7 +53,11 @@ def add_convert(sub: Any) -> None:
     writing.add_argument(
         "--lossy", action="store_true", help="mp4 with FFmpeg's ordinary settings: noise does not survive"
     )
-    writing.add_argument("--white", type=float, help="light that becomes full scale (default: the 99.9th percentile)")
+    parser.add_argument(
+        "--white", type=float,
+        help="reading: pixel value at which the camera saturates, as in 4095 (default: the largest that whole numbers "
+        "hold); writing mp4 and png: light that becomes full scale (default: the 99.9th percentile)",
+    )  # fmt: skip
     parser.add_argument("--force", action="store_true", help="replace what is there")
 
 
@@ -62,7 +67,7 @@ def _run_convert(args: argparse.Namespace) -> int:
         source = args.input = source.with_suffix(".json")
     ours = source.is_dir() and any((source / name).is_file() for name in ("clip.json", "dataset.json"))
     made = _export(args) if ours or _is_stream(source) else _import(args)
-    output(args, {"made": [str(path) for path in made]}, [f"{path}" for path in made])
+    output(args, {"made": [str(path) for path, _ in made]}, [f"{path}: {about}" for path, about in made])
     return 0
 
 
@@ -70,15 +75,17 @@ def _is_stream(path: Path) -> bool:
     return path.suffix == ".json" and path.is_file() and "ppp_factor" in files.read_json(path)
 
 
-def _export(args: argparse.Namespace) -> list[Path]:
+def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
     kind = args.to or _SUFFIXES.get(args.output.suffix)
     if kind is None:
         known = ", ".join(sorted(export.EXPORTS))
         raise ValueError(f"{args.output}: say what to write with --to: {known}")
     wanted = export.Export(kind, args.transfer or "gamma 2.2", args.white, not args.lossy)
+    if args.white is not None and (kind not in ("mp4", "png") or args.input.suffix == ".json"):
+        raise ValueError("--white: is of light written as mp4 or png; leave it out")
     if not (args.input / "dataset.json").is_file():
         opened = Stream.open(args.input) if args.input.suffix == ".json" else Clip.open(args.input)
-        return [export.export(opened, args.output, wanted, force=args.force)]
+        return [export.described(opened, args.output, wanted, force=args.force)]
     suffix = {"cube": ".npy", "mp4": ".mp4", "zarr": ".zarr"}.get(kind, "")
     made = []
     clips = Dataset.open(args.input).clips()
@@ -87,16 +94,16 @@ def _export(args: argparse.Namespace) -> list[Path]:
             split = clip.meta.get("split")  # it becomes a folder, and the name a file
             folder = args.output / ("all" if split is None else checks.split(split))
             target = folder / f"{checks.check_name(clip.name)}{suffix}"
-            made.append(export.export(clip, target, wanted, force=args.force))
+            made.append(export.described(clip, target, wanted, force=args.force))
             progress(n, len(clips))
     return made
 
 
-def _import(args: argparse.Namespace) -> list[Path]:
+def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
     if args.frame_rate is None:
         raise ValueError(f"{args.input}: files do not say how fast the capture was; add --frame-rate, as in 2000")
     hints = Hints(args.layout, args.height, args.width, args.bits, args.transfer, args.channel, args.flip, args.columns,
-                  args.stretched, args.variable)  # fmt: skip
+                  args.stretched, args.variable, args.white)  # fmt: skip
     capture = formats.Capture(args.frame_rate, args.exposure, args.sensor, args.ppp, args.split)
     found = formats.recordings(args.input, args.layout)
     pairs = [(source, args.output / checks.check_name(_flat_name(source, args.input))) for source in found]
@@ -104,9 +111,21 @@ def _import(args: argparse.Namespace) -> list[Path]:
     with bar("converting") as progress:
         for source, target in pairs or [(args.input, args.output)]:
             footage = formats.read(source, hints)
-            make = formats.to_clip if footage.is_light else formats.to_stream
-            made.append(make(footage, target, capture, force=args.force, progress=progress).path)
+            if footage.is_light:
+                clip = formats.to_clip(footage, target, capture, force=args.force, progress=progress)
+                made.append((clip.path, f"{_size(clip)}, light of {footage.source}; {formats.saturation_line(clip)}"))
+                continue
+            if args.white is not None:
+                raise ValueError(f"{source}: --white is of light, this holds {footage.bits}-bit codes; leave it out")
+            stream = formats.to_stream(footage, target, capture, force=args.force, progress=progress)
+            made.append((stream.path, f"{_size(stream)}, codes of {stream.bits} bits, {footage.source}"))
     return made
+
+
+def _size(made: Clip | Stream) -> str:
+    frames, height, width = made.shape
+    rate, exposure = float(made.meta["frame_rate"]), made.exposure
+    return f"{frames} frames of {height} x {width} pixels at {rate:g} per second, exposure {exposure * 1e6:.4g} us"
 
 
 def _flat_name(file: Path, folder: Path) -> str:

@@ -63,6 +63,22 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
     return path
 
 
+def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = False) -> tuple[Path, str]:
+    """Export, and say in one line what was written: kind, frames, size, rates, white."""
+    made = export(source, path, wanted, force=force)
+    side = made / "meta.json" if made.is_dir() else made.with_name(made.name + ".json")
+    meta, (frames, height, width) = files.read_json(side), source.shape
+    shown = f", played at {wanted.playback:g}" if wanted.kind == "mp4" else ""
+    if isinstance(source, Stream):
+        about = f"codes of {source.bits} bits" + (", stretched to 0..255" if meta.get("stretched") else "")
+    elif "white" in meta:
+        about = f"light by {meta['transfer']}, white {meta['white']:.4g} {source.meta['radiance_unit']}"
+    else:
+        about = f"linear light in {source.meta['radiance_unit']}"
+    rate = float(source.meta["frame_rate"])
+    return made, f"{wanted.kind}, {frames} frames of {height} x {width} pixels at {rate:g} per second{shown}, {about}"
+
+
 _MARK = {"software": {"qsim": __version__}}  # of every description of an export: we made what it describes
 _NAMES = r"meta\.json|[0-9]{6,}\.(png|exr)|zarr\.json|frames/zarr\.json|frames/c/[0-9]+/[0-9]+/[0-9]+"
 

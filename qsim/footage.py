@@ -22,6 +22,9 @@ MAX_PIXELS = 1 << 26  # of one frame: 8192 x 8192
 TRANSFERS = ("linear", "srgb", "gamma 2.2")
 
 
+Marked = Callable[[int, int], tuple[Array, Array]]
+
+
 @dataclass(frozen=True, eq=False)
 class Footage:
     """Frames [T, H, W] that are read when asked for."""
@@ -32,6 +35,9 @@ class Footage:
     bits: int | None = None  # of codes; None: light
     code_model: str = "binary_sum"
     meta: dict[str, Any] = field(default_factory=dict)  # what else the file said, or its reader assumed
+    marked: Marked | None = None  # light, and bool [t, H, W]: True where the camera was saturated
+    white: float | None = None  # pixel value at which the camera saturates; None: not known
+    white_assumed: bool = False  # it is the largest value that the pixels can hold: nobody said so
 
     @property
     def is_light(self) -> bool:
@@ -52,6 +58,7 @@ class Hints:
     columns: int | None = None  # keep only the first columns (raw Vidar dumps have 416, of which 400 are pixels)
     stretched: bool = False  # codes were stretched to 0 ... 255
     variable: str | None = None  # the array of a .mat file, where it holds several
+    white: float | None = None  # of light: pixel value at which the camera saturates; None: full scale of whole numbers
 
 
 @contextlib.contextmanager
@@ -129,6 +136,37 @@ def from_linear(light: Array, transfer: str, top: int) -> Array:
     return np.rint(coded * top).astype(np.uint8 if top < 256 else np.uint16)
 
 
+def light_footage(
+    path: Path,
+    shape: tuple[int, int, int],
+    marked: Marked,
+    source: str,
+    meta: dict[str, Any],
+    hints: Hints,
+    full: float,
+) -> Footage:
+    """Footage of light; `full` is the largest value that the file's pixels can hold, infinite for floats."""
+    white, assumed = white_of(path, hints, full)
+    return Footage(shape, lambda a, b: marked(a, b)[0], source, None, "", meta, marked, white, assumed)
+
+
+def white_of(path: Path, hints: Hints, full: float) -> tuple[float | None, bool]:
+    """The pixel value at which the camera saturates, and whether it is only assumed; `ValueError` for one beyond."""
+    if hints.white is None:
+        return (None, True) if full == float("inf") else (full, True)
+    if not 0 < hints.white <= full or hints.white == float("inf"):
+        raise ValueError(f"{path}: --white {hints.white:g}: pixels hold values up to {full:g}; give one of them")
+    return hints.white, False
+
+
+def reached(values: Array, white: float | None, colour: bool = False) -> Array:
+    """bool [..., H, W]: where a value (of colours any of them) is at or above the white of the camera."""
+    if white is None:
+        return np.zeros(values.shape[:-1] if colour else values.shape, bool)
+    found: Array = values >= white
+    return np.asarray(found.any(axis=-1)) if colour else found
+
+
 def need_transfer(path: Path, hints: Hints) -> str:
     """The declared transfer curve; `ValueError` if the user did not say."""
     if hints.transfer is None:
@@ -160,7 +198,13 @@ def turned(footage: Footage, hints: Hints) -> Footage:
     def read(start: int, stop: int) -> Array:
         return np.ascontiguousarray(footage.read(start, stop)[..., :columns][:, rows, across])
 
+    def marked(start: int, stop: int) -> tuple[Array, Array]:
+        assert footage.marked is not None
+        light, mask = (block[..., :columns][:, rows, across] for block in footage.marked(start, stop))
+        return np.ascontiguousarray(light), np.ascontiguousarray(mask)
+
     meta = footage.meta | {"flip": hints.flip, "columns_kept": columns}
     if hints.flip != "none":
         meta["orientation"] = f"{footage.meta.get('orientation', 'unknown')}; then --flip {hints.flip}"
-    return Footage((frames, height, columns), read, footage.source, footage.bits, footage.code_model, meta)
+    kept = marked if footage.marked is not None else None
+    return replace(footage, shape=(frames, height, columns), read=read, meta=meta, marked=kept)

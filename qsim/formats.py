@@ -10,6 +10,7 @@ made.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from numpy import ndarray as Array
 
 from qsim import __version__, arrays, files, planes, video
 from qsim.clip import RELATIVE, Clip, ClipWriter
-from qsim.footage import Footage, Hints, stated, turned
+from qsim.footage import Footage, Hints, Marked, stated, turned
 from qsim.stream import FORMAT_VERSION, Progress, Stream
 
 Reader = Callable[[Path, Hints], Footage]
@@ -151,15 +152,39 @@ def to_clip(
         "camera": None,
         "source": {"format": footage.source} | footage.meta,
         "split": capture.split,
+        "saturation": {"white": footage.white, "assumed": footage.white_assumed},
     }
+    marked = footage.marked or _unmarked(footage)
     with ClipWriter(path, meta, force=force) as writer:
-        for start, block in blocks(footage):
-            for i, image in enumerate(block):
-                if not writer.has(start + i):
-                    writer.add(start + i, image)
+        for start, stop in _ranges(footage):
+            for t, image, mask in zip(range(start, stop), *marked(start, stop), strict=True):
+                if not writer.has(t):
+                    writer.add(t, image, saturated=mask)
             if progress is not None:
-                progress(start + len(block), frames)
+                progress(stop, frames)
     return Clip.open(path)
+
+
+def _unmarked(footage: Footage) -> Marked:
+    """Light of which no reader said where it saturates."""
+
+    def marked(start: int, stop: int) -> tuple[Array, Array]:
+        light = footage.read(start, stop)
+        return light, np.zeros(light.shape, bool)
+
+    return marked
+
+
+def saturation_line(clip: Clip) -> str:
+    """What is known of the saturation of an imported clip, and the share of its pixels."""
+    known = clip.meta.get("saturation") or {"white": None, "assumed": True}
+    white, count = known["white"], int(clip.meta.get("saturated_pixels") or 0)
+    if white is None:
+        return "saturation not known: floats have no largest value; say with --white where the camera saturates"
+    said = f"white {white:g}{' assumed' if known['assumed'] else ''}"
+    if count:
+        return f"{said}: {100 * count / math.prod(clip.shape):.3g} % of pixels saturated"
+    return f"{said}: no pixel reaches it" + ("; if the camera saturates below, say --white" if known["assumed"] else "")
 
 
 def to_stream(
@@ -218,10 +243,16 @@ def to_stream(
 
 def blocks(footage: Footage) -> Iterator[tuple[int, Array]]:
     """The frames in order, some at a time: (number of the first, frames)."""
+    for start, stop in _ranges(footage):
+        yield start, footage.read(start, stop)
+
+
+def _ranges(footage: Footage) -> Iterator[tuple[int, int]]:
+    """Numbers of the frames that are read at a time: (first, last + 1)."""
     frames, height, width = footage.shape
     step = max(1, min(256, (1 << 25) // (height * width)))
     for start in range(0, frames, step):
-        yield start, footage.read(start, min(start + step, frames))
+        yield start, min(start + step, frames)
 
 
 def _sensor(footage: Footage, capture: Capture, devices: Any) -> Any:

@@ -21,10 +21,13 @@ from qsim.footage import (
     Hints,
     check_shape,
     from_linear,
+    light_footage,
     need_transfer,
     numbered,
+    reached,
     reading,
     to_linear,
+    white_of,
 )
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709
@@ -80,11 +83,15 @@ def read_video(path: Path, hints: Hints) -> Footage:
     shape = check_shape(path, (frames, height, width))
     decoder = _Decoder(path, height, width)
 
-    def read(start: int, stop: int) -> Array:
-        with reading(path, "video"):
-            return np.stack([to_luminance(f, transfer, 255, f.ndim == 3) for f in decoder.frames(start, stop)])
+    white, _ = white_of(path, hints, 255)
 
-    return Footage(shape, read, "video", meta={"transfer": transfer})
+    def marked(start: int, stop: int) -> tuple[Array, Array]:
+        with reading(path, "video"):
+            found = decoder.frames(start, stop)
+            light = np.stack([to_luminance(f, transfer, 255, f.ndim == 3) for f in found])
+            return light, np.stack([reached(f, white, f.ndim == 3) for f in found])
+
+    return light_footage(path, shape, marked, "video", {"transfer": transfer}, hints, 255)
 
 
 def read_light_npy(path: Path, hints: Hints) -> Footage:
@@ -93,19 +100,18 @@ def read_light_npy(path: Path, hints: Hints) -> Footage:
 
     array = load_npy(path)
     shape = check_shape(path, array.shape)
-    if array.dtype.kind == "f" and hints.transfer in (None, "linear"):
+    floats = array.dtype.kind == "f"
+    transfer = "linear" if floats and hints.transfer is None else need_transfer(path, hints)
+    top = 1.0 if floats else float(np.iinfo(array.dtype).max)
+    full = float("inf") if floats else top
+    white, _ = white_of(path, hints, full)
 
-        def linear(start: int, stop: int) -> Array:
-            return _checked_light(path, array[start:stop], start).astype(np.float32)
+    def marked(start: int, stop: int) -> tuple[Array, Array]:
+        values = _checked_light(path, array[start:stop], start)
+        light = values.astype(np.float32) if floats and transfer == "linear" else to_linear(values, transfer, top)
+        return light, reached(values, white)
 
-        return Footage(shape, linear, ".npy", meta={"transfer": "linear"})
-    transfer = need_transfer(path, hints)
-    top = 1.0 if array.dtype.kind == "f" else float(np.iinfo(array.dtype).max)
-
-    def read(start: int, stop: int) -> Array:
-        return to_linear(_checked_light(path, array[start:stop], start), transfer, top)
-
-    return Footage(shape, read, ".npy", meta={"transfer": transfer})
+    return light_footage(path, shape, marked, ".npy", {"transfer": transfer}, hints, full)
 
 
 def picture(path: Path, shape: tuple[int, int, int], raw: Any, dtype: np.dtype, source: str, hints: Hints) -> Footage:
@@ -132,11 +138,14 @@ def picture(path: Path, shape: tuple[int, int, int], raw: Any, dtype: np.dtype, 
     transfer = need_transfer(path, hints)
     full = float(np.iinfo(dtype).max)
 
-    def read(start: int, stop: int) -> Array:
-        values = raw(start, stop)
-        return to_luminance(values, transfer, full, values.ndim == 4)
+    white, _ = white_of(path, hints, full)
 
-    return Footage(shape, read, source, meta={"transfer": transfer})
+    def marked(start: int, stop: int) -> tuple[Array, Array]:
+        values = raw(start, stop)
+        colour = values.ndim == 4
+        return to_luminance(values, transfer, full, colour), reached(values, white, colour)
+
+    return light_footage(path, shape, marked, source, {"transfer": transfer}, hints, full)
 
 
 def to_luminance(values: Array, transfer: str, top: float, colour: bool) -> Array:

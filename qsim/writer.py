@@ -27,7 +27,7 @@ FORMAT_VERSION = 1
 PHYSICAL = "W m^-2 sr^-1"
 RELATIVE = "relative"
 MEASURED = (  # in clip.json, beyond what was asked for
-    *("mean_radiance", "mean_photons", "clipped_pixels", "checksums", "software", "checksum"),
+    *("mean_radiance", "mean_photons", "clipped_pixels", "saturated_pixels", "checksums", "software", "checksum"),
     *("error_per_frame", "error_at_white_per_frame", "white", "psnr_of_truth", "psnr_unclamped", "fireflies_per_frame"),
 )
 OURS = r"clip\.json|(radiance|sharp|truth|saturated)/[0-9]{6,}\.exr|streams/lock|streams/[A-Za-z0-9._-]+\.(npy|json)"
@@ -115,11 +115,15 @@ class ClipWriter:
         error: float | None = None,
         fireflies: int | None = None,
         errors_at: Sequence[Sequence[float]] = (),
+        saturated: Array | None = None,
     ) -> None:
         """Store frame t: radiance [H, W], optionally the sharp instant, ground truth and the rms error of the radiance.
 
         `fireflies` counts the pixels that the renderer does not trust; clip.json keeps it beside the error. `errors_at`
         are pairs (white, rms error of radiance and truth clamped there), from which clip.json gets that at its white.
+
+        `saturated` [H, W] is True where a camera could not count further: the radiance there is a lower bound. It is
+        stored where any pixel is, together with what the largest half cuts off, and counted in clip.json.
 
         `truth` may hold flow [2, H, W], flow_back [2, H, W], valid, depth, body_id [H, W]. `ValueError` for radiance
         that is negative or not finite, naming frame and pixel.
@@ -132,6 +136,10 @@ class ClipWriter:
             self._encode(t, "sharp", sharp, contents)
         if truth:
             contents[f"truth/{t:06d}.exr"] = exr.encode(_truth_channels(truth), compress=True)
+        if saturated is not None and saturated.any():
+            mask = saturated | (radiance > exr.HALF_MAX)
+            clipped = int(np.count_nonzero(mask))
+            contents[f"saturated/{t:06d}.exr"] = exr.encode({"saturated": mask.astype("<u4")}, compress=True)
         checksums = {}
         for relative, content in contents.items():
             target = self.part / relative
@@ -144,6 +152,8 @@ class ClipWriter:
             "mean_radiance": float(stored.mean()),
             "clipped": clipped,
         }
+        if saturated is not None:
+            entry["saturated"] = int(np.count_nonzero(saturated))
         if error is not None:
             entry["error"] = float(error)
             entry["errors_at"] = [[float(value) for value in pair] for pair in errors_at]
@@ -234,6 +244,8 @@ class ClipWriter:
         if self._camera is not None:
             meta["mean_photons"] = math.fsum(e["mean_photons"] for e in entries) / frames
         meta["clipped_pixels"] = sum(e["clipped"] for e in entries)
+        if any("saturated" in e for e in entries):
+            meta["saturated_pixels"] = sum(e.get("saturated", 0) for e in entries)
         meta["checksums"] = {name: digest for e in entries for name, digest in e["checksums"].items()}
         meta["software"] = _software()
         if all("error" in e for e in entries):
@@ -262,7 +274,9 @@ def camera_of(meta: dict[str, Any], where: Path) -> Camera | None:
 
     values = {key: value for key, value in described.items() if key not in ("kind", "motion")}
     for key in ("origin", "target", "up"):
-        if key in values:
+        if values.get(key) is None:
+            values.pop(key, None)
+        else:
             values[key] = tuple(values[key])
     try:
         return Camera(**values)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import raw_planes
+from clips import write_clip
 from fakes import RECIPE, make
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -896,3 +897,90 @@ def test_opening_an_unfinished_stream(tmp_path: Path):
     (tmp_path / "s.json").write_text('{"format_version": 1}')
     with pytest.raises(ValueError, match="key 'shape' is missing"):
         Stream.open(tmp_path / "s.json")
+
+
+SATURATING = {  # kind -> (largest value of the file's pixels, colour)
+    "png8": (255, False), "png16": (65535, False), "colour": (255, True), "tiff": (65535, False),
+    "npy": (65535, False), "mp4": (255, False), "floats": (None, False),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SATURATING)
+@pytest.mark.parametrize("white", [None, 40, 200])
+def test_saturated_pixels_are_counted_marked_and_reported(
+    tmp_path: Path, kind: str, white: int | None, capsys: pytest.CaptureFixture[str]
+):
+    """Every pixel at or above white, of every reader of light, flips included; without --white the full scale is it."""
+    import tifffile
+    from PIL import Image
+
+    full, colour = SATURATING[kind]
+    rng = np.random.default_rng(len(kind))
+    values = rng.integers(0, 256, (3, 8, 10))
+    values[1] = np.minimum(values[1], 39)  # one frame without any
+    values[2, 0, 0] = 255
+    shown = np.where(values == 255, full, values) if full else values / 255
+    source, mask = tmp_path / "in", values >= (white or 255)
+    source.mkdir()
+    if kind in ("png8", "png16", "colour"):
+        for t, image in enumerate(shown.astype(np.uint16 if kind == "png16" else np.uint8)):
+            # one channel only has the value: any of them saturates the pixel
+            picture = np.stack([image // 2, image, np.zeros_like(image)], axis=-1) if colour else image
+            Image.fromarray(picture).save(source / f"{t}.png")
+    elif kind == "tiff":
+        source = source / "a.tif"
+        tifffile.imwrite(source, shown.astype(np.uint16), photometric="minisblack")
+    elif kind == "mp4":
+        source = source / "a.mp4"
+        video.write_video(source, iter(shown.astype(np.uint8)), 30, lossless=True)
+    else:
+        source = source / "a.npy"
+        np.save(source, shown.astype(np.float32 if kind == "floats" else np.uint16))
+    level = [] if white is None else ["--white", str(white / 255 if kind == "floats" else white)]
+    line = ["convert", str(source), str(tmp_path / "clip"), "--frame-rate", "1000", "--transfer", "linear",
+            "--layout", {"tiff": "tiff", "mp4": "video"}.get(kind, "png" if source.is_dir() else "light"),
+            "--flip", "lr", *level]  # fmt: skip
+    assert main(line) == 0
+    said = capsys.readouterr().out
+    assert "3 frames of 8 x 10 pixels at 1000 per second, exposure 1000 us" in said
+    clip = Clip.open(tmp_path / "clip")
+    if kind == "floats" and white is None:
+        assert "saturation not known" in said
+        mask = np.zeros_like(mask)
+    else:
+        assert f"white {white / 255 if kind == 'floats' else white:g}: " in said if white else "assumed: " in said
+        assert f"{100 * mask.mean():.3g} % of pixels saturated" in said
+    found = np.stack([clip.saturated(t) for t in range(3)])
+    np.testing.assert_array_equal(found, mask[..., ::-1])
+    np.testing.assert_array_equal(clip.saturated(2, (1, 2, 4, 5)), found[2, 1:5, 2:7])
+    assert clip.meta["saturated_pixels"] == clip.meta["clipped_pixels"] == mask.sum()
+    assert clip.meta["saturation"]["assumed"] == (white is None)
+    assert sorted(path.name for path in (clip.path).glob("saturated/*")) == [
+        f"{t:06d}.exr" for t in range(3) if mask[t].any()
+    ]
+    assert clip.verify() == []
+    assert not clip.has_truth
+
+
+def test_a_white_that_cannot_act_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    np.save(tmp_path / "codes.npy", np.zeros((2, 6, 8), np.uint8))
+    np.save(tmp_path / "light.npy", np.zeros((2, 6, 8), np.uint16))
+    clip = write_clip(tmp_path / "clip", frames=2, height=6, width=8)
+    for line, words in [
+        (["codes.npy", "o", "--layout", "codes", "--bits", "3", "--frame-rate", "9"], "this holds 3-bit codes"),
+        (["light.npy", "o", "--transfer", "linear", "--frame-rate", "9"], "pixels hold values up to 65535"),
+        ([str(clip.path), "o", "--to", "exr"], "light written as mp4 or png"),
+    ]:
+        assert main(["convert", str(tmp_path / line[0]), str(tmp_path / "o"), *line[2:], "--white", "70000"]) == 2
+        assert words in capsys.readouterr().err
+        assert not (tmp_path / "o").exists()
+
+
+def test_what_was_written_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    clip = write_clip(tmp_path / "clip", frames=2, height=6, width=8)
+    for kind, words in [
+        ("mp4", "mp4, 2 frames of 6 x 8 pixels at 2000 per second, played at 30, light by gamma 2.2, white"),
+        ("exr", "exr, 2 frames of 6 x 8 pixels at 2000 per second, linear light in W m^-2 sr^-1"),
+    ]:
+        assert main(["convert", str(clip.path), str(tmp_path / kind), "--to", kind]) == 0
+        assert f"{tmp_path / kind}: {words}" in capsys.readouterr().out
