@@ -25,7 +25,18 @@ from qsim.completion import add_completion
 from qsim.console import GOES_ON, STARTS_AGAIN, Parser, bar, command, note, output, run
 from qsim.dataset import Dataset
 from qsim.drawing import Draw, assemble
-from qsim.files import Lock, check_ours, read_json, replacing, sha256, sync_folder, to_json, write_bytes, write_json
+from qsim.files import (
+    Lock,
+    check_ours,
+    read_json,
+    replacing,
+    sealed,
+    sha256,
+    sync_folder,
+    to_json,
+    write_bytes,
+    write_json,
+)
 from qsim.flaws import Flawed, Flaws, from_toml, of_sensor
 from qsim.flaws import from_dict as read_defects
 from qsim.footage import reading
@@ -79,7 +90,9 @@ __all__ = [
     "reading",
     "replacing",
     "run",
+    "sealed",
     "sensed",
+    "sha256",
     "stored",
     "stream_codes",
     "suggest",

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from quiver.data import Codes, Lock, __version__, read_json, sync_folder, write_json
+from quiver.data import Codes, Lock, __version__, read_json, sealed, sha256, sync_folder, write_json
 from quiver.restoring import Progress, Restorer, check_finite
 
 FORMAT = "quiver-restored-1"
@@ -73,6 +73,8 @@ def restore_to_file(
         try:
             seconds = _fill_file(codes, method, part, journal, meta, progress, note)
             meta["seconds_per_frame"] = seconds / codes.shape[0]
+            meta["sha256"] = sha256(part)
+            meta = sealed(meta)
             write_json(journal, meta)  # takes its space before anything is replaced
         except BaseException as error:
             if isinstance(error, Exception) or not journal.exists():
@@ -175,6 +177,8 @@ def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, 
     try:
         found = read_json(journal)
         done, seconds = int(found.pop("done", 0)), float(found.pop("seconds", 0.0))
+        for key in ("sha256", "checksum"):
+            found.pop(key, None)
         if "seconds_per_frame" in found:  # whole: killed before it was given its name
             done, seconds = meta["shape"][0], meta["shape"][0] * float(found.pop("seconds_per_frame"))
     except (ValueError, TypeError) as error:

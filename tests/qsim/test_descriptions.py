@@ -1,7 +1,10 @@
 """What JSON and TOML files may say: a changed digit is found, and whatever else they hold ends in one line."""
 
 import json
-from collections.abc import Iterator
+import random
+import shutil
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +13,16 @@ import numpy as np
 import pytest
 from clips import write_clip
 
-from qsim import checking, files, formats, generation, recipe
+from qsim import checking, export, files, formats, generation, preview, recipe, report
 from qsim.cli import main
 from qsim.clip import Clip
+from qsim.dataset import Dataset
+from qsim.export import Export
 from qsim.footage import Hints
-from qsim.stream import Sensing, sense
+from qsim.stream import Sensing, Stream, replay, sense
+from quiver import data
+from quiver.restored_file import restore_to_file
+from quiver.restoring import restorer
 
 BOMBS = {  # text of a value -> words of the answer
     "[" * 5000 + "]" * 5000: "nested more than 64 levels deep",
@@ -92,12 +100,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     footage = formats.read(folder / "codes.npy", Hints("codes", bits=3))
     formats.to_stream(footage, folder / "capture", formats.Capture(1000.0))
     (folder / "codes.npy").unlink()
-    np.save(folder / "video.npy", np.ones((3, 6, 8), np.float32))
-    video = {"format": "quiver-restored-1", "method": "moment", "description": "mean", "seconds_per_frame": 0.1,
-             "unit": "photons", "white": 8.0, "shape": [3, 6, 8], "frame_rate": 2000.0, "exposure": 5e-4,
-             "sensor": clip.stream("counts").meta["sensor"], "source": str(clip.stream("counts").path),
-             "sha256": files.sha256(folder / "video.npy")}  # fmt: skip
-    files.write_description(folder / "video.json", video)
+    restore_to_file(data.stream_codes(clip.stream("counts")), restorer("moment"), folder / "video.npy")
     return folder
 
 
@@ -158,3 +161,104 @@ def test_what_an_earlier_version_made_is_read_and_counted(made: Path, capsys: py
         for path, content in before.items():
             path.write_bytes(content)
     assert checking.check(made / "data").unsealed == []
+
+
+HOSTILE: list[Any] = [
+    *(None, True, "", "x", "../../x", [], {}, [1], [[1]], {"a": 1}, {"a": None}, [None], "0" * 64),
+    *(0, 1, -1, 2, 7, 0.5, -0.5, 2**31, 2**63, 2**64 - 1, 1e-300, 1e300, -1e300, 1e30, 1e-30, 1e-9),
+]
+
+
+def use_clip(folder: Path) -> None:
+    """Whatever reads the description of a clip and of its stream."""
+    clip = Clip.open(folder / "clip")
+    assert repr(clip)
+    last = len(clip) - 1
+    for read in (clip.radiance, clip.sharp, clip.flow, clip.flow_back, clip.valid):
+        read(last)
+    stream = clip.stream("counts")
+    assert repr(stream)
+    stream.codes(0, 1)
+    replay(clip, stream, 0)
+    sense(clip, Sensing("quiver-physical", bits=2, ppp=1.0, name="new"), force=True)
+    export.export(clip, folder / "out", Export("exr"), force=True)
+    codes, _ = data.stored(clip, "new")
+    restorer("moment").restore(codes, 0, 1)
+
+
+def use_report(folder: Path) -> None:
+    report.build(folder / "clip")
+    report.build(folder / "video.json")
+
+
+def use_rest(folder: Path) -> None:
+    """The same for the data set, the stream beside no clip, and restored video."""
+    dataset = Dataset.open(folder / "data")
+    assert repr(dataset)
+    for clip in dataset.clips():
+        clip.radiance(0)
+    stream = Stream.open(folder / "capture.json")
+    assert repr(stream)
+    stream.codes(0, 1)
+    assert stream.sensor.levels
+    export.export(stream, folder / "png", Export("png"), force=True)
+    data.open_stream(folder / "capture.npy")
+    preview.open_source(folder / "video.npy").views["values"].picture(0)
+    data.open_stream(folder / "video.npy")
+
+
+def use_check(folder: Path) -> None:
+    for name in ("clip", "data", "capture.npy", "video.npy"):
+        checking.check(folder / name)
+
+
+def hostile_descriptions(made: Path, folder: Path, wanted: int | None, *uses: Callable[[Path], None]) -> int:
+    """So many (or all) changes of one value in one description, sealed as an attacker would; the number refused."""
+    victim = folder / "victim"
+    shutil.copytree(made, victim)
+    cases = [
+        (path, place, value)
+        for path, _ in described(victim)
+        for place in places(files.read_json(path))
+        for value in (*HOSTILE, "GONE")
+        if place[0] not in ("checksum", "software")
+    ]
+    chosen = cases if wanted is None else random.Random(18).sample(cases, wanted)
+    refused = 0
+    for path, place, value in chosen:
+        before = path.read_bytes()
+        found = changed(json.loads(before), place, value)
+        if value == "GONE":
+            inside = at(found, place[:-1])
+            inside.pop(place[-1])
+        files.write_description(path, found)
+        for use in (
+            *uses,
+            lambda folder: [checking.check(folder / name) for name in ("clip", "data", "capture.npy", "video.npy")],
+        ):
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # of numbers that overflow
+                    use(victim)
+            except (ValueError, OSError) as error:
+                refused += 1
+                if "\n" in str(error) or len(str(error)) > 1000:
+                    raise AssertionError(f"{path}: {place} = {value!r:.60}: more than a line: {error!r}") from error
+            except Exception as error:
+                raise AssertionError(f"{path}: {place} = {value!r:.60}: {error!r}") from error
+        path.write_bytes(before)
+    return refused
+
+
+def test_a_value_of_another_kind_is_one_line(made: Path, tmp_path: Path):
+    assert hostile_descriptions(made, tmp_path, 60, use_clip, use_rest) > 20
+
+
+@pytest.mark.slow
+def test_every_value_of_another_kind_is_one_line(made: Path, tmp_path: Path):
+    hostile_descriptions(made, tmp_path, None, use_clip, use_rest)
+
+
+@pytest.mark.slow
+def test_reports_of_values_of_another_kind(made: Path, tmp_path: Path):
+    hostile_descriptions(made, tmp_path, 400, use_report)
