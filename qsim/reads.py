@@ -27,7 +27,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import scenes
-from qsim import files
+from qsim import engine, files
 from qsim.scene import Scene
 
 _INSTALLED = [sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")]
@@ -46,7 +46,9 @@ def load(family: str | Path, seed: int = 0, speed: float = 1.0) -> tuple[Scene, 
         return scenes.load(family, seed, speed), {}
     with _tracing() as trace:
         scene = scenes.load(family, seed, speed)
-    if path.is_dir():
+    if path.suffix == ".xml":
+        found = of_xml(path)
+    elif path.is_dir():
         found = {file for file in path.rglob("*") if file.is_file()}
     else:
         found = {path, *trace.opened, *_named_in(scene)}
@@ -55,7 +57,7 @@ def load(family: str | Path, seed: int = 0, speed: float = 1.0) -> tuple[Scene, 
     for file in [file for file in found if file.suffix == ".xml"]:
         found |= of_xml(file)
     kept = sorted(file for file in found if file.is_file() and (path.is_dir() or file == path or _counts(file)))
-    listed = {file.parent / f"*{file.suffix}" for file in kept if path.is_file() and file.parent in trace.listed}
+    listed = {file.parent / f"*{file.suffix}" for file in kept if path.suffix == ".py" and file.parent in trace.listed}
     root = path if path.is_dir() else path.parent
     return scene, {_name(file, root): _digest(file) for file in sorted({*kept, *listed})}
 
@@ -142,12 +144,12 @@ def _tracing() -> Iterator[_Trace]:
 
 
 def _see(event: str, arguments: tuple[Any, ...]) -> None:
-    """The audit hook: what is opened or listed while a scene is made, but not by the import of a package."""
+    """The audit hook: what a scene opens or lists while it is made, without imports of packages and the engine."""
     if event not in ("open", "os.listdir", "os.scandir") or (trace := _active.get()) is None:
         return
     with contextlib.suppress(Exception):  # a hook that raises would stop the scene
         path = Path(os.path.realpath(os.fsdecode(arguments[0])))
-        if not _counts(path) or _importing():
+        if not _counts(path) or _for_itself():
             return
         if event != "open":
             trace.listed.add(path)
@@ -155,12 +157,12 @@ def _see(event: str, arguments: tuple[Any, ...]) -> None:
             trace.opened.add(path)
 
 
-def _importing() -> bool:
-    """Whether Python's importer is at work between the open and the nearest file of the user's."""
+def _for_itself() -> bool:
+    """Whether Python's importer or our choice of an engine opens the file, and not the user's scene."""
     frame = sys._getframe(2)
     while frame is not None:
         name = frame.f_code.co_filename
-        if name.startswith("<frozen importlib"):
+        if name.startswith("<frozen importlib") or name == engine.__file__:
             return True
         if not name.startswith("<") and _counts(Path(os.path.realpath(name))):
             return False

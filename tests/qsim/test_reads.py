@@ -2,6 +2,7 @@
 
 import os
 import random
+import subprocess
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from qsim.generation import Options, generate
 from qsim.recipe import Job
 
 HERE = Options(workers=0)
+ROOT = str(Path(__file__).parents[2])
 
 SCENE = '''"""A scene that reads all kinds of things."""
 import sys
@@ -197,3 +199,32 @@ def test_an_xml_scene_names_meshes_bitmaps_and_includes(tmp_path: Path):
     )
     found = {str(path.relative_to(tmp_path)) for path in reads.of_xml(tmp_path / "s.xml")}
     assert found == {"s.xml", *names} - {"unrelated.png"}
+
+
+MOVED = """from pathlib import Path
+from qsim.scene import Scene
+
+def scene(seed=0, *, speed=1.0):
+    return Scene.from_mitsuba(Path(__file__).with_name("s.xml"))
+"""
+SMALL_XML = """<scene version="3.0.0">
+  <sensor type="perspective"><film type="hdrfilm"/></sensor>
+  <emitter type="constant"/>
+  <shape type="obj"><string name="filename" value="m.obj"/></shape>
+</scene>
+"""
+
+
+@pytest.mark.parametrize("name", ["s.xml", "moved.py"])
+def test_choosing_an_engine_is_no_reading_of_the_scene(tmp_path: Path, name: str):
+    """In a fresh process, whose first scene starts Mitsuba: the first time names the same files as the second."""
+    (tmp_path / "moved.py").write_text(MOVED)
+    (tmp_path / "s.xml").write_text(SMALL_XML)
+    (tmp_path / "m.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")
+    code = (
+        "import sys; from qsim import reads; print(*(sorted(reads.load(sys.argv[1])[1]) for _ in range(2)), sep='\\n')"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / name)]
+    made = subprocess.run(command, env=os.environ | {"PYTHONPATH": ROOT}, capture_output=True, text=True, check=True)
+    expected = sorted({name, "s.xml", "m.obj"})
+    assert made.stdout.splitlines() == [str(expected)] * 2
