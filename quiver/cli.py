@@ -184,7 +184,7 @@ def _run_evaluate(args: argparse.Namespace) -> int:
     plan = plan_of(args)
     remarks = _check_domain(args, methods, streams(plan))
     if args.force and args.output.exists():
-        renew(args.output, "plan.json", r"plan\.json|rows\.jsonl|evaluation\.(json|md|png)|crops_[^/]*\.png|lock")
+        renew(args.output, "plan.json", r"plan\.json|rows\.jsonl|evaluation\.(json|md|png)|crops_[^/]*\.png|crops/[^/]*\.npy|lock")
     with bar("rows", "row") as progress:
         rows = evaluate(plan, methods, args.output, lambda what, done, total: progress(done, total))
     table.write(args.output, plan, methods, rows, remarks)
