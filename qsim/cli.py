@@ -100,6 +100,7 @@ def _add_render(sub: Any) -> None:
         sub, "render", _run_render, "Render a scene into a clip: radiance, sharp frames, flow, depth, body ids.",
         "qsim render fan -o out/fan --frames 21 --height 128 --width 128\n"
         "qsim render fan --explain", GOES_ON,
+        threads="of the renderer (Dr.Jit); the picture does not depend on it",
     )  # fmt: skip
     parser.add_argument(
         "scene", help="a family of scenes/, a .py file with scene(seed, speed=...), Mitsuba .xml, a folder of assets"
@@ -196,6 +197,7 @@ def _add_sense(sub: Any) -> None:
         "qsim sense out/starter --sensor spad-320x240 --bits 1 --ppp 0.5,3.25,26\n"
         "qsim sense out/starter --name quiver-physical_3bit_3.25ppp --replay fan_0003:7",
         "the same command goes on with the streams that are missing",
+        threads="of the compiled engine (Dr.Jit) that draws codes; codes do not depend on it",
     )  # fmt: skip
     parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="clips or data sets")
     parser.add_argument(

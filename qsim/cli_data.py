@@ -19,6 +19,7 @@ def add_generate(sub: Any) -> None:
         sub, "generate", _run_generate, "Make a data set from a recipe; whatever is done already is kept.",
         "qsim generate scenes/starter.toml -o out/starter --workers 2\n"
         "qsim generate scenes/i2_2000fps.toml -o /data/i2 --shard 7/100", GOES_ON,
+        threads="of the renderer (Dr.Jit) in each worker",
     )  # fmt: skip
     parser.add_argument("recipe", type=Path, help="a .toml file; its format is described in qsim/recipe.py")
     parser.add_argument("-o", "--output", type=Path, help="data set folder (default out/NAME of the recipe)")
@@ -36,6 +37,8 @@ def add_generate(sub: Any) -> None:
 
 
 def _run_generate(args: argparse.Namespace) -> int:
+    if args.threads is not None and args.cluster is not None:
+        raise ValueError("--threads: is of processes of this machine; start Dask workers with QSIM_THREADS=N instead")
     from qsim import generation, recipe
     from qsim.workers import Limits
 
@@ -109,6 +112,7 @@ def add_plan(sub: Any) -> None:
     parser = command(
         sub, "plan", _run_plan, "Render one tiny job of each kind and say what the recipe will cost.",
         "qsim plan scenes/i2_2000fps.toml --machines 10",
+        threads="of the renderer (Dr.Jit)",
     )  # fmt: skip
     parser.add_argument("recipe", type=Path, help="a .toml file")
     parser.add_argument("--machines", type=int, default=10, help="to spread the work over (default 10)")

@@ -20,6 +20,7 @@ def add_tradeoff(sub: Any) -> None:
         "qsim tradeoff out/fast --ppp 0.65 -o out/bits\n"
         "qsim tradeoff fan --speed 0.5:8 --ppp 0.1:30 -o out/sweep\n"
         "qsim tradeoff --paper-figure 1 -o out/figure1",
+        threads="of the compiled engine (Dr.Jit)",
     )  # fmt: skip
     parser.add_argument("source", nargs="?", help="a clip of at least 10000 fps, or a scene (rendered into -o)")
     parser.add_argument("--table", action="store_true", help="only print the table of bit depths, from numbers alone")

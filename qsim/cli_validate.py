@@ -27,6 +27,7 @@ def add_validate(sub: Any) -> None:
         "qsim validate sensor --json -o out/sensor.png\nqsim validate render -o out/render.png\n"
         "qsim validate light --scenes glossy room --height 64 --width 96\n"
         "qsim validate engines --scenes fan glass\nqsim validate reading",
+        threads="of the compiled engine (Dr.Jit)",
     )  # fmt: skip
     parser.add_argument("what", choices=list(ACTING), help="what to validate")
     parser.add_argument("-o", "--output", type=Path, help="sensor, render: figure (.png, .svg or .pdf)")

@@ -103,8 +103,13 @@ def command(
     what: str,
     example: str,
     after_interrupt: str = STARTS_AGAIN,
+    *,
+    threads: str | None = None,
 ) -> argparse.ArgumentParser:
-    """A command's parser with its example and what all have; `run(args)` does it and returns the exit code."""
+    """A command's parser with its example and what all have; `run(args)` does it and returns the exit code.
+
+    With `threads`, which says of what, it has the option --threads.
+    """
     parser: argparse.ArgumentParser = sub.add_parser(
         name, help=what, description=what, epilog="example:\n" + "".join(f"  {line}\n" for line in example.split("\n"))
     )
@@ -112,8 +117,41 @@ def command(
     loudness = parser.add_mutually_exclusive_group()
     loudness.add_argument("-q", "--quiet", action="store_true", help="no progress and no warnings, only the result")
     loudness.add_argument("-v", "--verbose", action="store_true", help="time and memory; the traceback of a mistake")
+    if threads is not None:
+        run = _with_threads(run)
+        parser.add_argument("--threads", type=int, help=f"{threads} (default: all cores)")
     parser.set_defaults(run=run, after_interrupt=after_interrupt)
     return parser
+
+
+def _with_threads(run: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
+    """The command with as many threads of the compiled engine as --threads asks for, in its worker processes too."""
+
+    def limited(args: argparse.Namespace) -> int:
+        if args.threads is None:
+            return run(args)
+        cores = os.cpu_count() or 1
+        if not 1 <= args.threads <= cores:
+            raise ValueError(f"--threads {args.threads}: this machine has {cores} cores; give 1 to {cores}")
+        before = os.environ.get("QSIM_THREADS")
+        try:
+            _limit(str(args.threads))
+            return run(args)
+        finally:  # later commands of this process are not limited
+            _limit(before or str(cores))
+            if before is None:
+                del os.environ["QSIM_THREADS"]
+
+    return limited
+
+
+def _limit(threads: str) -> None:
+    """Threads of the compiled engine, if it is loaded already, and of processes that are started from now on."""
+    os.environ["QSIM_THREADS"] = threads
+    if "drjit" in sys.modules:
+        from qsim.engine import limit_threads
+
+        limit_threads()
 
 
 def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:

@@ -105,6 +105,17 @@ def activate(engine: Engine) -> None:
 
     if mi.variant() != engine.variant:
         mi.set_variant(engine.variant)
+    limit_threads()
+
+
+def limit_threads() -> None:
+    """Give Dr.Jit the number of threads that QSIM_THREADS names, if any; processes that are started inherit it."""
+    wanted = os.environ.get("QSIM_THREADS")
+    if wanted:
+        import drjit as dr
+
+        if dr.thread_count() != int(wanted):
+            dr.set_thread_count(int(wanted))
 
 
 @contextmanager

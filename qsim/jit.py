@@ -34,6 +34,7 @@ def backend() -> Any:
         os.environ["DRJIT_LIBLLVM_PATH"] = chosen.llvm_path
     import drjit as dr
 
+    engine.limit_threads()
     return getattr(dr, chosen.backend)
 
 

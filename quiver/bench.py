@@ -22,9 +22,18 @@ from numpy import ndarray as Array
 
 from quiver import metrics
 from quiver.baselines import METHODS
-from quiver.data import Codes, Key, Light, array_codes, draw_codes, peak_of, replacing
+from quiver.data import Codes, Key, Light, array_codes, draw_codes, peak_of, replacing, suggest
 from quiver.memory import peak_memory, reset_peak
-from quiver.restoring import Options, Restorer, network_restorer, pick_device, restorer, weights_path, wrap_network
+from quiver.restoring import (
+    MODES,
+    Options,
+    Restorer,
+    network_restorer,
+    pick_device,
+    restorer,
+    weights_path,
+    wrap_network,
+)
 
 EXPOSURE = 5e-4  # s
 PRESETS = ("nano", "quiver-s", "quiver", "unet")
@@ -49,7 +58,7 @@ class Setting:
     restored: int = 16  # in its middle: all that have five neighbours on both sides
     ppp: float = 3.25
     device: str = "auto"
-    threads: int | None = None  # of torch on the CPU; None = its own choice
+    threads: int | None = None  # of torch on the CPU; None = torch's own choice
 
 
 @dataclass(frozen=True)
@@ -64,6 +73,7 @@ class Cost:
     peak_bytes: int  # above the process before the run (CPU), allocated (CUDA)
     gmac_per_frame: float
     psnr_matched: float  # dB; NaN without trained weights
+    threads: int | None = None  # of torch
     failure: str | None = None
 
 
@@ -130,6 +140,7 @@ def measure(case: Case, setting: Setting) -> Cost:
         peak_bytes=peak,
         gmac_per_frame=multiply_accumulates(method, codes, first) / 1e9 if method.learned else math.nan,
         psnr_matched=score.psnr_matched if trained else math.nan,
+        threads=torch.get_num_threads(),
     )
 
 
@@ -190,6 +201,30 @@ def cases_of(methods: Sequence[str], modes: Sequence[str], precisions: Sequence[
         for mode in modes[:1] if classical or method == "unet" else modes:
             cases += [Case(method, mode, precision) for precision in (precisions[:1] if classical else precisions)]
     return cases
+
+
+def checked_cases(
+    methods: Sequence[str], modes: Sequence[str] | None, precisions: Sequence[str] | None, device: str | None
+) -> list[Case]:
+    """As `cases_of`, with the defaults for None; `ValueError` for unknown names and for options that cannot act."""
+    networks = [method for method in methods if method.partition(":")[0] not in METHODS]
+    for method in methods:
+        if method not in networks:
+            restorer(method)
+        elif method not in PRESETS:
+            weights_path(method)
+    for option, given, known in (("modes", modes, MODES), ("precisions", precisions, ("float32", "bfloat16"))):
+        for name in given or ():
+            if name not in known:
+                raise ValueError(f"--{option}: no {name!r}{suggest(name, known)}; known are {', '.join(known)}")
+    for option, value in (("modes", modes), ("precisions", precisions), ("device", device)):
+        if value is not None and not networks:
+            raise ValueError(f"--{option}: acts on networks, and {', '.join(methods)} is classical; leave it out")
+    if modes is not None and networks and all(network == "unet" for network in networks):
+        raise ValueError("--modes: unet shares no work between frames, it has one mode; leave it out")
+    if networks:
+        pick_device(device or "auto")
+    return cases_of(methods, modes or ("exact", "streaming"), precisions or ("float32",))
 
 
 def markdown(costs: Sequence[Cost], setting: Setting) -> str:

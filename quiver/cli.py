@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import signal
 import time
@@ -20,6 +21,7 @@ from quiver.options import (
     add_light,
     add_running,
     add_strict,
+    add_threads,
     command,
     count,
     handling,
@@ -27,6 +29,7 @@ from quiver.options import (
     positive,
     renew,
     running_options,
+    use_threads,
     words,
 )
 
@@ -34,7 +37,9 @@ from quiver.options import (
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; returns the exit code."""
     from quiver.data import Parser, __version__, add_completion, run
+    from quiver.threads import wait_without_spinning
 
+    wait_without_spinning()
     parser = Parser(
         prog="quiver", description="Restore blur-free video from few-bit quanta streams; train and compare."
     )
@@ -78,6 +83,7 @@ def _add_restore(sub: Any) -> None:
 
 
 def _run_restore(args: argparse.Namespace) -> int:
+    from quiver import threads
     from quiver.data import bar, note, output
     from quiver.restored_file import restore_to_file
     from quiver.restoring import restorer
@@ -90,9 +96,11 @@ def _run_restore(args: argparse.Namespace) -> int:
     for path in (target, target.with_suffix(".json")):
         if path.exists() and not args.force:
             raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
+    threads.check(args.threads)
     method = restorer(args.method, running_options(args))
     refuse_idle(vars(args), [method])
     _check_domain(args, [method], [codes])
+    used = use_threads(args, threads.recorded(target.with_name(f"{target.name}.part.json")))
     target.parent.mkdir(parents=True, exist_ok=True)
     lines, started = [assumed(codes, method)], time.monotonic()
     with bar(method.name) as progress:
@@ -102,7 +110,7 @@ def _run_restore(args: argparse.Namespace) -> int:
                 note(lines.pop())
             progress(done, total)
 
-        meta = restore_to_file(codes, method, target, shown, force=args.force, note=note)
+        meta = restore_to_file(codes, method, target, shown, force=args.force, note=note, threads=used)
     for line in lines:
         note(line)
     length, height, width = codes.shape
@@ -167,11 +175,14 @@ def _add_evaluate(sub: Any) -> None:
 
 
 def _run_evaluate(args: argparse.Namespace) -> int:
+    from quiver import threads
     from quiver.restoring import restorers
     from quiver.sources import refuse_idle
 
+    threads.check(args.threads)
     methods = restorers(args.methods, running_options(args))
     refuse_idle(vars(args), methods)
+    use_threads(args)
     if args.static is not None:
         return _run_static(args, methods)
     if args.source is None or args.output is None:
@@ -184,7 +195,11 @@ def _run_evaluate(args: argparse.Namespace) -> int:
     plan = plan_of(args)
     remarks = _check_domain(args, methods, streams(plan))
     if args.force and args.output.exists():
-        renew(args.output, "plan.json", r"plan\.json|rows\.jsonl|evaluation\.(json|md|png)|crops_[^/]*\.png|crops/[^/]*\.npy|lock")
+        renew(
+            args.output,
+            "plan.json",
+            r"plan\.json|rows\.jsonl|evaluation\.(json|md|png)|crops_[^/]*\.png|crops/[^/]*\.npy|lock",
+        )
     with bar("rows", "row") as progress:
         rows = evaluate(plan, methods, args.output, lambda what, done, total: progress(done, total))
     table.write(args.output, plan, methods, rows, remarks)
@@ -226,36 +241,46 @@ def _add_bench(sub: Any) -> None:
     parser.add_argument(
         "--methods", type=words, default="moment,unet,nano", help="with commas (default moment,unet,nano)"
     )
-    parser.add_argument("--modes", type=words, default="exact,streaming", help="of networks (default exact,streaming)")
-    parser.add_argument("--precisions", type=words, default="float32", help="float32, bfloat16 or both")
+    parser.add_argument("--modes", type=words, help="of networks (default exact,streaming)")
+    parser.add_argument("--precisions", type=words, help="of networks: float32, bfloat16 or both (default float32)")
     parser.add_argument("--size", type=height_width, default="64x64", help="HEIGHTxWIDTH in px (default 64x64)")
     parser.add_argument("--ppp", type=positive, default=3.25, help="light of the fixed clip (default 3.25)")
-    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
-    parser.add_argument("--threads", type=count, help="of torch on the CPU (default: its own choice)")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="of networks (default auto)")
+    add_threads(parser)
     parser.add_argument("-o", "--output", type=Path, help="folder for bench.md, bench.json, bench.png")
     parser.add_argument("--force", action="store_true", help="replace an existing result")
 
 
 def _run_bench(args: argparse.Namespace) -> int:
-    from quiver.bench import Setting, bench, cases_of, figure, markdown
+    from quiver import threads
+    from quiver.bench import Setting, bench, checked_cases, figure, markdown
     from quiver.data import bar, output, write_bytes, write_json
     from quiver.evaluate import json_safe
+    from quiver.run import alone_in
 
+    if args.output is None and args.force:
+        raise ValueError("--force: replaces a result in -o FOLDER, which is not given; leave it out")
     if args.output is not None and (args.output / "bench.json").exists() and not args.force:
         raise FileExistsError(
             f"{args.output / 'bench.json'}: exists; name another with -o, or use --force to replace it"
         )
+    threads.check(args.threads)
+    cases = checked_cases(args.methods, args.modes, args.precisions, args.device)
     height, width = args.size
-    setting = Setting(height, width, ppp=args.ppp, device=args.device, threads=args.threads)
-    with bar("cases", "case") as progress:
-        costs = bench(cases_of(args.methods, args.modes, args.precisions), setting, progress)
-    text = markdown(costs, setting)
-    found = json_safe({"setting": asdict(setting), "costs": [asdict(cost) for cost in costs]})
-    if args.output is not None:
-        args.output.mkdir(parents=True, exist_ok=True)
-        write_bytes(args.output / "bench.md", text.encode())
-        figure(costs, args.output / "bench.png")
-        write_json(args.output / "bench.json", found)
+    with contextlib.ExitStack() as stack:
+        if args.output is not None:
+            args.output.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(alone_in(args.output, "measures"))
+        device = args.device or "auto"
+        setting = Setting(height, width, ppp=args.ppp, device=device, threads=use_threads(args))
+        progress = stack.enter_context(bar("cases", "case"))
+        costs = bench(cases, setting, progress)
+        text = markdown(costs, setting)
+        found = json_safe({"setting": asdict(setting), "costs": [asdict(cost) for cost in costs]})
+        if args.output is not None:
+            write_bytes(args.output / "bench.md", text.encode())
+            figure(costs, args.output / "bench.png")
+            write_json(args.output / "bench.json", found)
     output(args, found, text)
     return 1 if any(cost.failure for cost in costs) else 0
 

@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +17,14 @@ from quiver.options import (
     PROTOCOLS,
     add_noise,
     add_running,
+    add_threads,
     command,
     count,
     handling,
     nonnegative,
     positive,
     running_options,
+    use_threads,
 )
 
 # train
@@ -53,6 +55,7 @@ def add_train(sub: Any) -> None:
     parser.add_argument("--validate-every", type=count, help="steps")
     parser.add_argument("--validation-split", choices=("train", "val", "test"), help="default val")
     parser.add_argument("--workers", type=nonnegative, help="processes that draw samples (default 0: this one)")
+    add_threads(parser)
     parser.add_argument("--precision", choices=("auto", "float32", "bfloat16"), help="default auto: bfloat16 on CUDA")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
     parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
@@ -62,14 +65,20 @@ def add_train(sub: Any) -> None:
 def _run_train(args: argparse.Namespace) -> int:
     import torch
 
+    from quiver import threads
     from quiver.data import note, output
     from quiver.model import build
     from quiver.restoring import pick_device
-    from quiver.run import draw_curve
+    from quiver.run import PROTOCOLS, draw_curve
     from quiver.train import Diverged, train
 
+    if args.validate_every is not None and args.steps is None and "steps" not in PROTOCOLS[args.protocol]:
+        raise ValueError("--validate-every: counts steps of a run with --steps; one that --minutes ends is validated "
+                         "after every tenth of its time; leave it out")  # fmt: skip
     settings = _settings(args)
     folder, leads = Path(settings.out), os.environ.get("RANK", "0") == "0"
+    earlier = None if args.force else threads.recorded(folder / "settings.json")
+    settings = replace(settings, threads=use_threads(args, earlier))
     torch.manual_seed(settings.seed)
     try:
         with _signals() as interrupted:
@@ -144,14 +153,17 @@ def add_ablate(sub: Any) -> None:
 
 
 def _run_ablate(args: argparse.Namespace) -> int:
-    from quiver import table
+    from quiver import table, threads
     from quiver.ablate import markdown, one_noise, run_ablation
+    from quiver.config import ABLATIONS
     from quiver.data import note, output
     from quiver.evaluate import Plan
 
     args.precision, precision = None, args.precision  # of restoring; training keeps its own default
     settings = _settings(args)
     args.precision = precision
+    first = Path(args.output) / next(iter(ABLATIONS)) / "settings.json"
+    settings = replace(settings, threads=use_threads(args, threads.recorded(first)))
     settings, lines = one_noise(settings)
     for line in lines:
         note(line)

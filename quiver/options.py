@@ -108,6 +108,24 @@ def add_running(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mode", choices=MODES, help="networks: how frames share work (default exact)")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="networks: where they run (default auto)")
     parser.add_argument("--precision", choices=("float32", "bfloat16"), help="networks: default float32")
+    add_threads(parser)
+
+
+def add_threads(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--threads", type=count, help="of torch on the CPU (default: measured at start; work that is resumed keeps its)"
+    )
+
+
+def use_threads(args: argparse.Namespace, earlier: int | None = None) -> int:
+    """Set the number of torch's threads, and say which with --verbose."""
+    from quiver import threads
+    from quiver.data import note
+
+    chosen = threads.use(args.threads, earlier)
+    if args.verbose:
+        note(f"threads: {chosen}")
+    return chosen.number
 
 
 def add_strict(parser: argparse.ArgumentParser) -> None:

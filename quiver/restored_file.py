@@ -42,13 +42,15 @@ def restore_to_file(
     *,
     force: bool = True,
     note: Callable[[str], None] | None = None,
+    threads: int | None = None,
 ) -> dict[str, Any]:
     """Restore a stream into PATH.npy (float32 photons [T, H, W]) and PATH.json; both appear when whole, the json last.
 
     Returns what the json says. Works on disk, BLOCK_FRAMES at a time, in PATH.npy.part: an interrupted restoration of
     the same codes by the same method that has finished a block is resumed; one of others starts again, and `note` is
-    told why. A failure leaves nothing behind. A link is followed. `ValueError` while another process writes PATH,
-    `FileExistsError` if a result is there and `force` is not set, or if what is there is no restored video.
+    told why. `threads` is noted in the description. A failure leaves nothing behind. A link is followed. `ValueError`
+    while another process writes PATH, `FileExistsError` if a result is there and `force` is not set, or if what is
+    there is no restored video.
     """
     path = path.resolve()
     part, journal = path.with_name(path.name + ".part"), path.with_name(path.name + ".part.json")
@@ -71,9 +73,8 @@ def restore_to_file(
             "codes_sha256": codes.digest(),
         }
         try:
-            seconds = _fill_file(codes, method, part, journal, meta, progress, note)
-            meta["seconds_per_frame"] = seconds / codes.shape[0]
-            meta["sha256"] = sha256(part)
+            seconds = _fill_file(codes, method, part, journal, meta, progress, note, threads)
+            meta |= {"seconds_per_frame": seconds / codes.shape[0], "threads": threads, "sha256": sha256(part)}
             meta = sealed(meta)
             write_json(journal, meta)  # takes its space before anything is replaced
         except BaseException as error:
@@ -135,6 +136,7 @@ def _fill_file(
     meta: dict[str, Any],
     progress: Progress | None,
     note: Callable[[str], None] | None,
+    threads: int | None,
 ) -> float:
     """Restore what is missing of PART, block by block, noting each in JOURNAL; the seconds it took, all in all."""
     length = codes.shape[0]
@@ -153,7 +155,7 @@ def _fill_file(
         check_finite(block, method.name, first)
         out.flush()
         seconds += time.perf_counter() - started
-        write_json(journal, meta | {"done": first + len(block), "seconds": seconds})
+        write_json(journal, meta | {"done": first + len(block), "seconds": seconds, "threads": threads})
     with open(part, "rb") as file:
         os.fsync(file.fileno())
     return seconds
@@ -176,6 +178,7 @@ def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, 
         return 0, 0.0, ""
     try:
         found = read_json(journal)
+        found.pop("threads", None)  # numbers agree to rounding whatever it is
         done, seconds = int(found.pop("done", 0)), float(found.pop("seconds", 0.0))
         for key in ("sha256", "checksum"):
             found.pop(key, None)

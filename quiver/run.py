@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from quiver import weights
+from quiver import threads, weights
 from quiver.data import Light, Lock, check_ours, open_clips, read_json, replacing, write_bytes, write_json
 from quiver.loss import PRESETS as LOSSES
 from quiver.noise import Mixture, Noise, choose, describe
@@ -77,6 +77,8 @@ class Settings:
     def __post_init__(self) -> None:
         if self.steps is None and self.minutes is None:
             raise ValueError("a run needs an end: give --steps or --minutes")
+        if self.threads is not None and (isinstance(self.threads, bool) or not isinstance(self.threads, int)):
+            raise ValueError(f"--threads must be a whole number, got {self.threads!r}")
         for name in ("steps", "minutes", "batch", "crop", "validate_every", "validation_windows", "learning_rate"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
@@ -128,7 +130,8 @@ _ASKED = ("sensor", "ppp", "bits")
 def settled(settings: Settings, *, force: bool = False) -> tuple[Settings, list[str]]:
     """The settings with the noise of a run, and what there is to say of it; `ValueError` where it cannot be drawn.
 
-    A folder that holds a run keeps its noise, and what is not asked for is what was asked for then.
+    A folder that holds a run keeps its noise and its number of threads, and what is not asked for is what was asked for
+    then.
     """
     if settings.noise is not None:
         return settings, Mixture(settings.noise).lines
@@ -141,7 +144,7 @@ def settled(settings: Settings, *, force: bool = False) -> tuple[Settings, list[
     try:
         asked = {name: getattr(settings, name) or _as_tuple(found.get(name)) for name in _ASKED}
         noise = _recorded(found)
-        told = replace(settings, **asked, noise=noise)
+        told = replace(settings, **asked, noise=noise, threads=settings.threads or threads.recorded(path))
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}; the file is damaged, start again with --force") from None
     files = tuple(name for name in settings.sensors or () if name.endswith(".toml"))
@@ -280,6 +283,9 @@ class Run:
             if not path.exists():
                 write_json(path, self.settings.to_dict())
             self._check_settings()
+            found = read_json(path)
+            if found.get("threads") != self.settings.threads:
+                write_json(path, found | {"threads": self.settings.threads})
             yield
 
     def _check_ours(self, force: bool) -> None:

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from quiver import breakdown, metrics
+from quiver import breakdown, metrics, threads
 from quiver.data import replacing, write_bytes, write_json
 from quiver.evaluate import FORMAT, Plan, Row, json_safe
 from quiver.metrics import Interval, over_scenes
@@ -222,6 +222,7 @@ def as_dict(
             "plan": plan.to_dict(),
             "peak": peak_name(plan),
             "remarks": list(remarks),
+            "threads": threads.current(),
             "methods": [
                 {"name": m.name, "frames": m.window, "future": m.look_ahead, "learned": m.learned, "is": m.description}
                 for m in methods

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Subset
 from tqdm import tqdm
 
-from quiver import metrics
+from quiver import metrics, threads
 from quiver.data import open_clips
 from quiver.loss import PRESETS as LOSSES
 from quiver.loss import training_loss
@@ -267,13 +267,15 @@ def train(
 ) -> State:
     """Train `model` in place until the end that the settings name, or until `should_stop`; returns the state reached.
 
-    Resumes the run in `settings.out` if there is one; `force` begins it again. `note` gets a line or two on the
-    noise that windows are drawn with. Raises ValueError and OSError for settings and folders that do not fit,
-    `Diverged` for NaN or Inf. Denormal numbers count as zero in this process from then on.
+    Resumes the run in `settings.out` if there is one; `force` begins it again. `note` gets a line or two on the noise
+    that windows are drawn with. Raises ValueError and OSError for settings and folders that do not fit, `Diverged` for
+    NaN or Inf. From then on torch has the run's number of threads, and denormal numbers count as zero in this process.
     """
     torch.set_flush_denormal(True)  # gradients through the tails of GELU are such numbers: a step can be twice as slow
     with joined(device) as process, contextlib.ExitStack() as stack:
+        asked = settings.threads
         settings, lines = settled(settings, force=force)
+        settings = replace(settings, threads=threads.use(asked, settings.threads).number)
         windows, fixed = make_windows(settings, int(model.multiple))  # type: ignore[arg-type]
         run = Run(settings)
         if process.leads:
