@@ -7,8 +7,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from qsim import files
-from qsim.console import bar, command, output
+from qsim import checks, files
+from qsim.console import bar, checked, command, note, output, refuse_idle
 
 # tradeoff
 
@@ -18,6 +18,7 @@ def add_tradeoff(sub: Any) -> None:
         sub, "tradeoff", _run_tradeoff, "Bit depth against motion, light, read noise and data rate.",
         "qsim tradeoff --table --size 240x320 --base-fps 10000 --read-noise 0.2 --bits 1,3,5,7,9\n"
         "qsim tradeoff out/fast --ppp 0.65 -o out/bits\n"
+        "qsim tradeoff fan --px 3 --ppp 2 -o out/fan_3px\n"
         "qsim tradeoff fan --speed 0.5:8 --ppp 0.1:30 -o out/sweep\n"
         "qsim tradeoff --paper-figure 1 -o out/figure1",
         threads="of the compiled engine (Dr.Jit)",
@@ -26,63 +27,100 @@ def add_tradeoff(sub: Any) -> None:
     parser.add_argument("--table", action="store_true", help="only print the table of bit depths, from numbers alone")
     parser.add_argument("--paper-figure", type=int, choices=(1, 2), help="draw a figure of the QUIVER paper")
     parser.add_argument("--size", type=size, help="ROWSxCOLUMNS (default 240x320, rendered scenes 96x128)")
-    parser.add_argument("--base-fps", type=float, default=10_000.0, help="planes per second (default 10000)")
-    parser.add_argument("--read-noise", type=float, default=0.2, help="table: e- rms per read (default 0.2)")
-    parser.add_argument("--bits", type=integers, help="with commas (default 1,2,3,4,5; table 1,3,5,7,9)")
-    parser.add_argument("--motion", type=float, default=2500.0, help="table: image speed, px/s (default 2500)")
+    parser.add_argument("--base-fps", type=float, help="planes per second (default 10000; a clip has its own)")
+    parser.add_argument("--read-noise", type=float, help="table: e- rms per read (default 0.2)")
+    bits = "with commas (default 1,2,3,4,5, widened up to 7 where the deepest is best; table 1,3,5,7,9)"
+    parser.add_argument("--bits", type=integers, help=bits)
+    parser.add_argument("--motion", type=float, help="table: image speed, px/s (default 2500)")
     parser.add_argument("--ppp", type=steps, help="photons per pixel and plane: 0.65 or 0.1,1,10 or 0.1:30 (6 steps)")
-    parser.add_argument("--speed", type=steps, default=[1.0], help="factors on the motion, as --ppp (a clip: whole)")
-    parser.add_argument("--sensor", default="quiver-physical", help="of the multi-bit read (default quiver-physical)")
+    moving = parser.add_mutually_exclusive_group()
+    moving.add_argument("--speed", type=steps, help="factors on the motion, as --ppp (default 1; a clip: whole)")
+    px = "motion of what moves, px per 3-bit frame of 7 planes, as --ppp: finds the speed"
+    moving.add_argument("--px", type=steps, help=px)
+    parser.add_argument("--sensor", help="of the multi-bit read (default quiver-physical)")
     parser.add_argument("--plane-sensor", help="of a binary plane (default: a clocked SPAD of the same efficiency)")
-    parser.add_argument("--instants", type=int, default=8, help="frames drawn and scored per depth (default 8)")
+    parser.add_argument("--instants", type=int, help="frames drawn and scored per depth (default 8)")
     parser.add_argument("--frames", type=int, help="of a rendered scene (default: enough for the instants)")
-    parser.add_argument("--seed", type=int, default=0, help="of the noise and of a rendered scene (default 0)")
+    seed = checked(checks.seed)
+    parser.add_argument("--seed", type=seed, help="of the noise and of a rendered scene (default 0)")
     parser.add_argument("--streams", action="store_true", help="write clips and streams of each depth for restorers")
     parser.add_argument("-o", "--output", type=Path, help="folder for numbers, figures, clips")
     parser.add_argument("--force", action="store_true", help="replace existing numbers and figures")
 
 
+TABLE_ONLY = ("read_noise", "motion")
+OF_STUDIES = ("px", "ppp", "bits", "base_fps", "sensor", "plane_sensor", "instants", "frames", "streams")
+OF_FILES = ("seed", "speed", "output", "force")
+
+
 def _run_tradeoff(args: argparse.Namespace) -> int:
     if args.table:
+        if args.source is not None:
+            raise ValueError(f"{args.source}: --table is made from numbers alone; leave the clip or scene out")
+        idle = [name for name in OF_STUDIES if name not in ("bits", "base_fps")]
+        refuse_idle(args, "tradeoff --table", ["paper_figure", *idle, *OF_FILES])
         return _tradeoff_table(args)
     name = "tradeoff" if args.paper_figure is None else f"figure{args.paper_figure}"
-    if args.output is None and (args.streams or args.paper_figure):
-        raise ValueError("give a folder with -o, as in -o out/bits")
-    if args.output is not None and (args.output / f"{name}.json").exists() and not args.force:
-        raise FileExistsError(f"{args.output / name}.json: exists; name another folder with -o, or use --force")
     if args.paper_figure is not None:
-        return _paper_figure(args)
-    if args.source is None:
+        refuse_idle(args, "tradeoff --paper-figure", [*TABLE_ONLY, *OF_STUDIES])
+    elif args.source is None:
         raise ValueError("give a clip or a scene, --table, or --paper-figure; see qsim tradeoff --help")
-    return _tradeoff_study(args)
+    refuse_idle(args, "tradeoff of a clip or scene", TABLE_ONLY)
+    if args.source is not None and (Path(args.source) / "clip.json").is_file():
+        refuse_idle(args, "tradeoff of a clip", ["size", "base_fps", "frames"])
+        if args.paper_figure is not None:
+            refuse_idle(args, "tradeoff --paper-figure of a clip", ["speed"])
+    if args.output is None:
+        if args.streams or args.paper_figure:
+            raise ValueError("give a folder with -o, as in -o out/bits")
+        refuse_idle(args, "tradeoff without --output", ["force"])
+    elif (args.output / f"{name}.json").exists() and not args.force:
+        raise FileExistsError(f"{args.output / name}.json: exists; name another folder with -o, or use --force")
+    args.seed = args.seed or 0
+    return _tradeoff_study(args) if args.paper_figure is None else _paper_figure(args)
 
 
 def _tradeoff_study(args: argparse.Namespace) -> int:
     from qsim import tradeoff_sweep
+    from qsim.tradeoff_answer import WIDEST, answer, widened
     from qsim.tradeoff_study import Question, study
 
-    bits = tuple(args.bits or (1, 2, 3, 4, 5))
-    question = Question(bits, args.sensor, args.plane_sensor, None, 1, args.instants, args.seed)
+    bits, instants = tuple(args.bits or (1, 2, 3, 4, 5)), 8 if args.instants is None else args.instants
+    sensor = args.sensor or "quiver-physical"
+    question = Question(bits, sensor, args.plane_sensor, None, 1, instants, args.seed)
     height, width = args.size or (96, 128)
-    frames = args.frames or max(4 * question.longest, 32)
-    shape = tradeoff_sweep.Shape(frames, height, width, args.base_fps, seed=args.seed)
+    widen = args.bits is None
+    frames = args.frames or (2**WIDEST - 1 if widen else max(4 * question.longest, 32))
+    rate = 10_000.0 if args.base_fps is None else args.base_fps
+    shape = tradeoff_sweep.Shape(frames, height, width, rate, seed=args.seed)
+    speeds, text = _speeds(args, shape)
+    levels = args.ppp or [None]
+    swept = len(speeds) * len(levels) > 1
+    if args.streams and swept:
+        raise ValueError("--streams: writes one speed and one light level; give one --ppp and one --speed or --px")
     with bar("rendering") as progress:
-        clips = list(tradeoff_sweep.clips_for(args.source, args.speed, shape, args.output, progress))
+        clips = list(tradeoff_sweep.clips_for(args.source, speeds, shape, args.output, progress))
     first = clips[0].clip
+    if args.streams and clips[0].step > 1:
+        raise ValueError("--streams: writes a clip at its own speed; leave out --speed and --px, or name a scene")
     if first.camera is None and not args.ppp:
         raise ValueError(f"{first.path}: its radiance is relative; give the light with --ppp, as in --ppp 0.65")
-    levels = args.ppp or [None]
-    swept = len(clips) * len(levels) > 1
     with bar("drawing", "study") as progress:
         if swept:
-            found = tradeoff_sweep.sweep(clips, args.ppp or [first.mean_photons], question, progress=progress)
+            ppps = args.ppp or [first.mean_photons]
+            found = tradeoff_sweep.sweep(clips, ppps, question, widen=widen, progress=progress)
             result, pictures = found.to_dict(), {"best.png": tradeoff_sweep.sweep_figure(found)}
-            text = [line for row in found.studies for one in row for line in tradeoff_sweep.table(one)]
+            text += [line for row in found.studies for one in row for line in tradeoff_sweep.table(one)]
             text.append(tradeoff_sweep.summary(found))
+            answers = found.answers
         else:
-            one = study(first, replace(question, ppp=levels[0], speed=clips[0].step), progress=progress)
+            asked = replace(question, ppp=levels[0], speed=clips[0].step)
+            one = widened(first, asked, note) if widen else study(first, asked, progress=progress)
             result, pictures = tradeoff_sweep.study_dict(one), {"tradeoff.png": tradeoff_sweep.study_figure(one)}
-            text = tradeoff_sweep.table(one)
+            text += tradeoff_sweep.table(one)
+            question, answers = replace(question, bits=one.bits), [answer(one)]
+    if args.px:
+        result["px_asked"], result["speeds_found"] = args.px, speeds
     if args.streams:
         lit = replace(question, ppp=levels[0])
         made = tradeoff_sweep.write_streams(first, args.output / "streams", lit)
@@ -90,8 +128,41 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
         text += [f"streams 'planes' and 'multibit': {path}" for path in made]
     if args.output is not None:
         text += _write_study(args.output, "tradeoff.json", result, pictures)
-    output(args, result, text)
+    output(args, result, text + answers)
     return 0
+
+
+def _speeds(args: argparse.Namespace, shape: Any) -> tuple[list[float], list[str]]:
+    """The factors on the motion, and a line for each motion that was asked for."""
+    from functools import partial
+
+    import scenes
+    from qsim import tradeoff_answer
+    from qsim.clip import Clip
+
+    if not args.px:
+        return args.speed or [1.0], []
+    found: list[tuple[float, float]] = []
+    if (Path(args.source) / "clip.json").is_file():
+        clip = Clip.open(args.source)
+        found = [tradeoff_answer.step_for(px, clip) for px in args.px]
+    elif args.source in scenes.FAMILIES or args.source.endswith(".py"):
+        motion = partial(_motion, args.source, shape)
+        found = [tradeoff_answer.speed_for(px, motion, args.source) for px in args.px]
+    if len({speed for speed, _ in found}) < len(found):
+        raise ValueError(f"{args.source}: several of --px {args.px} need one and the same speed; give fewer")
+    text = [
+        f"--px {px:g}: speed factor {speed:g} gives {reached:.3g} px per 3-bit frame (7 planes), mean of what moves"
+        for px, (speed, reached) in zip(args.px, found, strict=False)
+    ]
+    return [speed for speed, _ in found] or [1.0], text
+
+
+def _motion(name: str, shape: Any, speed: float) -> float:
+    from qsim.tradeoff_answer import scene_motion
+
+    size, rate = (shape.height, shape.width), shape.frame_rate
+    return scene_motion(name, size, frames=shape.frames, frame_rate=rate, seed=shape.seed, speed=speed)
 
 
 def _write_study(folder: Path, name: str, result: dict[str, Any], pictures: dict[str, bytes]) -> list[str]:
@@ -107,7 +178,9 @@ def _paper_figure(args: argparse.Namespace) -> int:
     from qsim.clip import Clip
 
     height, width = args.size or (96, 128)
-    number = args.paper_figure
+    number, speeds = args.paper_figure, args.speed or [1.0]
+    if len(speeds) > 1:
+        raise ValueError(f"--speed {args.speed}: --paper-figure draws one speed; give one")
     rate, frames = (tradeoff_paper.RATE_1, 201) if number == 1 else (10_000.0, 511)
     shape = tradeoff_sweep.Shape(frames, height, width, rate, seed=args.seed)
     names = [args.source] if args.source else ["fan"] if number == 1 else ["fan", "text"]
@@ -118,7 +191,7 @@ def _paper_figure(args: argparse.Namespace) -> int:
         else:
             with bar(name) as progress:
                 path = args.output / "clips" / Path(name).stem
-                clip = tradeoff_sweep.render(name, path, shape, speed=args.speed[0], progress=progress)
+                clip = tradeoff_sweep.render(name, path, shape, speed=speeds[0], progress=progress)
         panels = tradeoff_paper.figure_1(clip, seed=args.seed) if number == 1 else (
             tradeoff_paper.figure_2(clip, ppp, seed=args.seed)
         )  # fmt: skip
@@ -135,16 +208,19 @@ def _tradeoff_table(args: argparse.Namespace) -> int:
     from qsim.tradeoff import depths
 
     height, width = args.size or (240, 320)
+    rate = 10_000.0 if args.base_fps is None else args.base_fps
+    noise = 0.2 if args.read_noise is None else args.read_noise
+    speed = 2500.0 if args.motion is None else args.motion
     rows = depths(
         height=height,
         width=width,
-        base_fps=args.base_fps,
-        read_noise=args.read_noise,
+        base_fps=rate,
+        read_noise=noise,
         bits=args.bits or [1, 3, 5, 7, 9],
-        speed=args.motion,
+        speed=speed,
     )
     text = [
-        f"{height} x {width} px, {args.base_fps:g} planes/s, {args.read_noise:g} e- per read, {args.motion:g} px/s",
+        f"{height} x {width} px, {rate:g} planes/s, {noise:g} e- per read, {speed:g} px/s",
         "bits         fps  px/frame  read noise x fps  in quadrature  data rate",
         "                              [e-/s, linear]   [e- in 1 s]     [MB/s]",
     ]

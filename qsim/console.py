@@ -251,7 +251,8 @@ def checked(check: Callable[[Any], Any]) -> Callable[[str], Any]:
 def refuse_idle(args: argparse.Namespace, where: str, names: Sequence[str]) -> None:
     """A `ValueError` if one of these options is given, which change nothing there; their defaults are None or False."""
     for name in names:
-        if getattr(args, name) not in (None, False):
+        value = getattr(args, name)
+        if value is not None and value is not False:  # 0 is a value that was given
             raise ValueError(f"{where}: --{name.replace('_', '-')} changes nothing here; leave it out")
 
 

@@ -13,7 +13,8 @@ from qsim import defects, flaws, page, pictures
 from qsim.clip import RELATIVE, Clip, Stream
 from qsim.optics import clip_photons
 from qsim.stream import electrons_per_photon
-from qsim.truth import MOVING
+from qsim.tradeoff_study import CODE_BITS, CODE_PLANES, SLOWEST
+from qsim.truth import MOVING, moving_mean
 from qsim.white import stated
 
 FRAMES = 48  # of a player
@@ -79,8 +80,7 @@ def motion(clip: Clip, frames: Sequence[int]) -> tuple[float | None, float]:
     """Mean motion of the pixels that move (None if none does) and the 99.9th percentile of all, in px/frame."""
     speed = np.stack([np.hypot(*clip.flow(t)) for t in frames])
     known = speed[np.isfinite(speed)]
-    moving = known[known > MOVING]
-    return float(moving.mean()) if moving.size else None, float(np.percentile(known, 99.9)) if known.size else 0.0
+    return moving_mean(known), float(np.percentile(known, 99.9)) if known.size else 0.0
 
 
 def clip_section(clip: Clip) -> str:
@@ -154,6 +154,9 @@ def motion_line(clip: Clip, frames: range) -> str:
         if mean is None
         else f"what moves (more than {MOVING:g} px/frame) moves {mean:.3g} px/frame on average"
     )
+    if mean is not None and clip.frame_rate >= SLOWEST:  # frames of a bit-depth study
+        speed = np.stack([np.hypot(*clip.flow(t)) for t in frames])
+        moving += f" ({moving_mean(speed, CODE_PLANES):.3g} px per {CODE_BITS}-bit frame of {CODE_PLANES} planes)"
     return f"Motion: {moving}; 99.9 % of all pixels at most {largest:.3g} px/frame"
 
 

@@ -17,7 +17,7 @@ from numpy import ndarray as Array
 from qsim import devices, keys, optics, pictures
 from qsim.clip import Clip
 from qsim.spad import BinarySPAD
-from qsim.tradeoff_study import Question, Reading, check_clip, expose
+from qsim.tradeoff_study import Question, Reading, check_clip, clip_motion, expose
 
 RATE_1 = 12_000.0  # fps of the clip of figure 1: 200, 50 and 6 of its frames are one at 60, 240 and 2000 fps
 CAMERAS = (("cmos-5.1e", 60.0), ("cmos-5.1e", 240.0), ("cmos-5.1e", 2000.0), ("quiver-paper", 2000.0))
@@ -46,7 +46,7 @@ def figure_1(clip: Clip, *, lux: float = 1.0, seed: int = 0) -> list[Panel]:
     level, middle = optics.light_level(clip, lux=lux), len(clip) // 2
     sharp = optics.clip_photons(clip, middle, level.factor, sharp=True)
     peak = float(np.percentile(sharp, 99.9))
-    speed = _motion(clip, middle)
+    speed = clip_motion(clip, middle)
     panels = [Panel("sharp instant", sharp, {"ppp": level.ppp, "lux": lux, "peak": peak})]
     key = keys.Key(seed=seed, clip=keys.hash_name(clip.name), frame=middle)
     for name, fps in CAMERAS:
@@ -78,7 +78,7 @@ def figure_2(clip: Clip, ppp: float, *, seed: int = 0, bits: Sequence[int] = BIT
     check_clip(clip, question)
     level, middle = optics.light_level(clip, ppp=ppp), len(clip) // 2
     sharp = optics.clip_photons(clip, middle, level.factor, sharp=True)
-    peak, speed = float(np.percentile(sharp, 99.9)), _motion(clip, middle)
+    peak, speed = float(np.percentile(sharp, 99.9)), clip_motion(clip, middle)
     panels = [Panel("sharp instant", sharp, {"ppp": ppp, "peak": peak})]
     plane = BinarySPAD(1.0, 0.0)
     nothing = np.zeros(2 ** question.bits[-1] - 1)
@@ -98,16 +98,6 @@ def figure_2(clip: Clip, ppp: float, *, seed: int = 0, bits: Sequence[int] = BIT
             Panel(f"{b} bit, {clip.frame_rate / m:.4g} fps", image, numbers | {"white": shown.white(1.0) / m})
         )
     return panels
-
-
-def _motion(clip: Clip, t: int) -> float | None:
-    """Mean flow of the pixels that move, px per clip frame."""
-    if not clip.has_truth:
-        return None
-    u, v = clip.flow(t)
-    length = np.hypot(u, v)
-    moving = length[np.isfinite(length) & (length > 1e-3)]
-    return float(moving.mean()) if moving.size else 0.0
 
 
 def _rms(values: Array) -> float:

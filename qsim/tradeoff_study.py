@@ -30,9 +30,12 @@ from qsim.qis import QIS
 from qsim.sensor import Sensor
 from qsim.spad import BinarySPAD
 from qsim.tradeoff import Structure
+from qsim.truth import moving_mean
 
 SLOWEST = 10_000.0  # clip frames per second: below, a "plane" is too long to stand for an instant
 MODELS = ("planes", "multibit")
+CODE_BITS = 3  # motion is stated per frame of 3 bits, whatever depths are compared
+CODE_PLANES = 2**CODE_BITS - 1
 _GRID = 600  # light levels at which estimates are tabled
 
 
@@ -69,7 +72,7 @@ class Row:
     model: str  # "planes" or "multibit"
     bits: int
     fps: float
-    motion_px_per_frame: float | None  # mean length of the flow; None where the clip has none
+    motion_px_per_frame: float | None  # of what moves (clip_motion), in this frame; None where the clip has no flow
     blur_error: float  # exposed mean against the sharp instant
     blur_predicted: float  # the same from the clip's structure function (tradeoff.Structure)
     shot_error: float  # of an ideal photon counter behind the same efficiency and dark rate
@@ -96,6 +99,11 @@ class Study:
     speed: int
     instants: tuple[int, ...]  # clip frames that were scored
     structure: Structure  # of the light, in photons^2 per clip frame
+
+    @property
+    def bits(self) -> tuple[int, ...]:
+        """The depths that were tried."""
+        return tuple(sorted({row.bits for row in self.rows}))
 
     def best(self, model: str) -> Row:
         """The row of highest PSNR."""
@@ -301,7 +309,7 @@ def study(clip: Clip, question: Question, *, progress: Callable[[int, int], None
     for done, centre in enumerate(centres):
         sharp = optics.clip_photons(clip, centre, level.factor, sharp=True)
         peaks.append(np.percentile(sharp, 99.9))
-        motions.append(_motion(clip, centre))
+        motions.append(clip_motion(clip, centre, question.speed))
         for frame in expose(clip, centre, question, level.factor, forms[0].sensor, structure):
             for form in by_planes[frame.planes]:
                 codes = (
@@ -313,7 +321,7 @@ def study(clip: Clip, question: Question, *, progress: Callable[[int, int], None
         if progress is not None:
             progress(done + 1, len(centres))
     law = Structure(structure / len(centres))
-    motion = None if None in motions else question.speed * float(np.mean([m for m in motions if m is not None]))
+    motion = None if None in motions else float(np.mean([m for m in motions if m is not None]))
     peak = float(np.mean(peaks))
     rows = tuple(_row(clip, form, sums[form.model, form.planes], law, motion, peak, level.ppp) for form in forms)
     return Study(clip.name, rows, level.ppp, level.lux, peak, clip.frame_rate, question.speed, centres, law)
@@ -325,12 +333,15 @@ def _read(clip: Clip, form: Reading, frame: Exposed, centre: int, question: Ques
     return form.sensor.sample(frame.photons, form.exposure, key=key)
 
 
-def _motion(clip: Clip, t: int) -> float | None:
-    """Mean length of the flow in px per clip frame; None where the clip has no truth."""
+def clip_motion(clip: Clip, t: int, speed: int = 1) -> float | None:
+    """Motion [px per plane] of what moves more than 0.1 px per 3-bit frame, at a whole `speed`; None without truth.
+
+    0 where nothing moves so far.
+    """
     if not clip.has_truth:
         return None
     u, v = clip.flow(t)
-    return float(np.nanmean(np.hypot(u, v)))
+    return (moving_mean(speed * np.hypot(u, v), CODE_PLANES) or 0.0) / CODE_PLANES
 
 
 def _row(clip: Clip, form: Reading, sums: _Sums, law: Structure, motion: float | None, peak: float, ppp: float) -> Row:

@@ -15,7 +15,8 @@ from numpy import ndarray as Array
 from qsim import keys, optics, stream
 from qsim.clip import Clip, ClipWriter
 from qsim.spad import BinarySPAD
-from qsim.tradeoff_study import MODELS, Question, Study, check_clip, plane_sensor, readings, study
+from qsim.tradeoff_answer import answer, at_edge, code_motion, marked, widened
+from qsim.tradeoff_study import CODE_BITS, MODELS, Question, Study, check_clip, plane_sensor, readings, study
 
 COLOURS = {"planes": "tab:orange", "multibit": "tab:blue"}
 Tell = Callable[[int, int], None]
@@ -88,13 +89,20 @@ class Sweep:
                             "model": model,
                             "best_bits": best.bits,
                             "psnr_db": best.psnr_db,
+                            "edge": at_edge(self.studies[i][j], model),
                             "motion_px_per_plane": _per_plane(best.motion_px_per_frame, best.bits),
+                            "motion_px_per_code_frame": code_motion(best),
                             "best_bits_predicted": int(self.predicted[model][i, j]),
                             "loss_of_prediction_db": float(self.loss[model][i, j]),
                         }
                     )
         studies = [study_dict(s) for row in self.studies for s in row]
-        return {"agreement": self.agreement, "cells": cells, "studies": studies}
+        return {"agreement": self.agreement, "cells": cells, "studies": studies, "answers": self.answers}
+
+    @property
+    def answers(self) -> list[str]:
+        """A sentence for each cell."""
+        return [answer(found) for row in self.studies for found in row]
 
     @property
     def agreement(self) -> dict[str, float]:
@@ -116,11 +124,24 @@ def study_dict(found: Study) -> dict[str, Any]:
     result = {key: value for key, value in vars(found).items() if key not in ("rows", "structure")}
     result["rows"] = [asdict(row) for row in found.rows]
     result["structure_function"] = [float(v) for v in found.structure.values]
+    result["best"] = {
+        model: {"bits": found.best(model).bits, "edge": at_edge(found, model), "psnr_db": found.best(model).psnr_db}
+        for model in MODELS
+    }
+    result["motion_px_per_code_frame"] = code_motion(found.rows[0])
+    result["answer"] = answer(found)
     return result
 
 
-def sweep(clips: Sequence[Moving], ppps: Sequence[float], question: Question, *, progress: Tell | None = None) -> Sweep:
-    """Studies of every clip at every light level.
+def sweep(
+    clips: Sequence[Moving],
+    ppps: Sequence[float],
+    question: Question,
+    *,
+    widen: bool = False,
+    progress: Tell | None = None,
+) -> Sweep:
+    """Studies of every clip at every light level; `widen` tries more bits where the deepest is best, as clips allow.
 
     The law's choice everywhere comes from the **slowest** clip alone, at its middle light level.
     """
@@ -130,7 +151,8 @@ def sweep(clips: Sequence[Moving], ppps: Sequence[float], question: Question, *,
     for i, one in enumerate(clips):
         row = []
         for j, ppp in enumerate(ppps):
-            row.append(study(one.clip, replace(question, speed=one.step, ppp=ppp)))
+            asked = replace(question, speed=one.step, ppp=ppp)
+            row.append(widened(one.clip, asked) if widen else study(one.clip, asked))
             if progress is not None:
                 progress(i * len(ppps) + j + 1, len(clips) * len(ppps))
         studies.append(tuple(row))
@@ -139,7 +161,13 @@ def sweep(clips: Sequence[Moving], ppps: Sequence[float], question: Question, *,
     base, clip = studies[slowest][len(ppps) // 2], clips[slowest].clip
     predicted, loss = {}, {}
     for model in MODELS:
-        table = [[law(base, clip, question, model, v / speeds[slowest], p) for p in ppps] for v in speeds]
+        table = [
+            [
+                law(base, clip, replace(question, bits=studies[i][j].bits), model, v / speeds[slowest], p)
+                for j, p in enumerate(ppps)
+            ]
+            for i, v in enumerate(speeds)
+        ]
         predicted[model] = np.array([[max(cell, key=lambda b: cell[b]) for cell in row] for row in table])
         loss[model] = np.array(
             [
@@ -270,25 +298,25 @@ def sweep_figure(found: Sweep) -> bytes:
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(11, 4.2), dpi=120, layout="constrained")
-    bits = [row.bits for row in found.studies[0][0].rows]
+    bits = [row.bits for line in found.studies for one in line for row in one.rows]
     for axes, model in zip(drawing.subplots(1, 2), MODELS, strict=True):
         table = np.array([[s.best(model).bits for s in row] for row in found.studies])
         axes.imshow(table, origin="lower", aspect="auto", cmap="viridis", vmin=min(bits), vmax=max(bits))
         for (i, j), best in np.ndenumerate(table):
             near = "white" if best < (min(bits) + max(bits)) / 2 else "black"
-            axes.text(j, i, str(best), ha="center", va="bottom", color=near, fontsize=12)
+            axes.text(j, i, marked(found.studies[i][j], model), ha="center", va="bottom", color=near, fontsize=12)
             axes.text(j, i, f"law {found.predicted[model][i, j]}", ha="center", va="top", color=near, fontsize=7)
         axes.set_xticks(range(len(found.ppps)), [f"{p:g}" for p in found.ppps])
         axes.set_yticks(range(len(found.speeds)), [_speed_label(found, i) for i in range(len(found.speeds))])
         axes.set_xlabel("photons per pixel and plane")
-        axes.set_ylabel("speed (px per plane)")
+        axes.set_ylabel(f"speed (px per {CODE_BITS}-bit frame)")
         axes.set_title(f"best bits, {model}")
     return _png(drawing)
 
 
 def _speed_label(found: Sweep, i: int) -> str:
     row = found.studies[i][0].rows[0]
-    motion = _per_plane(row.motion_px_per_frame, row.bits)
+    motion = code_motion(row)
     return f"{found.speeds[i]:g}" + ("" if motion is None else f" ({motion:.2g})")
 
 

@@ -3,23 +3,27 @@
 import numpy as np
 import pytest
 
-from qsim import tradeoff_study
+from qsim import report_clip, tradeoff_answer, tradeoff_study
 from qsim.cli import main
 from qsim.clip import RELATIVE, Clip, ClipWriter
 from qsim.tradeoff import Structure
 from qsim.tradeoff_study import Question, study
+from qsim.truth import moving_mean
 
 SIZE = (48, 64)
 
 
-def write_clip(path, frames: int, speed: int, frame_rate: float = 10_000.0) -> Clip:
-    """A periodic texture that moves to the right by whole pixels: its statistics are the same at all times."""
+def write_clip(path, frames: int, speed: int, frame_rate: float = 10_000.0, *, still: int = 0) -> Clip:
+    """A periodic texture that moves to the right by whole pixels: its statistics are the same at all times.
+
+    `still` rows are said to stand still.
+    """
     y, x = np.mgrid[0 : SIZE[0], 0 : SIZE[1]]
     turn = 2 * np.pi / SIZE[1]
     texture = 1.0 + 0.5 * np.sin(3 * turn * x) + 0.3 * np.cos(7 * turn * x + y / 5) + 0.15 * np.sin(16 * turn * x)
     meta = {"shape": [frames, *SIZE], "frame_rate": frame_rate, "exposure": 1 / frame_rate, "radiance_unit": RELATIVE}
     flow = np.zeros((2, *SIZE), np.float32)
-    flow[0] = speed
+    flow[0, still:] = speed
     truth = {"flow": flow, "flow_back": -flow, "valid": np.ones(SIZE, bool)}
     with ClipWriter(path, meta) as writer:
         for t in range(frames):
@@ -213,3 +217,166 @@ def test_no_source_is_said(capsys, tmp_path):
     assert "give a clip or a scene" in capsys.readouterr().err
     assert main(["tradeoff", "fann", "-o", str(tmp_path)]) == 2
     assert "neither a clip folder nor a scene" in capsys.readouterr().err
+
+
+# Motion that is asked for, edges, and the sentence
+
+
+def test_one_definition_of_motion(tmp_path):
+    """Half of the field stands still: studies, figures and the clip page all say what the moving half does."""
+    clip = write_clip(tmp_path / "half", 32, 2, still=24)
+    rows = study(clip, Question(bits=(1, 3), ppp=0.65, instants=2)).rows
+    assert [row.motion_px_per_frame for row in rows] == pytest.approx([2, 14, 2, 14])
+    assert [tradeoff_answer.code_motion(row) for row in rows] == pytest.approx([14] * 4)
+    assert 7 * tradeoff_study.clip_motion(clip, 3) == pytest.approx(14)
+    line = report_clip.motion_line(clip, range(4))
+    assert "moves 2 px/frame on average (14 px per 3-bit frame of 7 planes)" in line
+
+
+def test_what_moves_is_told_per_frame():
+    """0.02 px per plane is nothing in one plane and 0.14 px in seven."""
+    length = np.array([0.0, 0.02, 0.01, np.nan])
+    assert moving_mean(length) is None
+    assert moving_mean(length, 7) == pytest.approx(0.14)
+    assert moving_mean(length, 11) == pytest.approx((0.22 + 0.11) / 2)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_the_speed_is_found_for_any_scene(seed):
+    """Random fields of flow: the motion reached is within 5 % of what was asked, or the refusal names the nearest."""
+    rng = np.random.default_rng(seed)
+    length = rng.exponential(10 ** rng.uniform(-5, 2), 500) * (rng.random(500) < rng.uniform(0.01, 1))
+    px = 10 ** rng.uniform(-0.5, 1.5)
+    shown = []
+
+    def motion(speed: float) -> float:
+        shown.append(moving_mean(speed * length, 7) or 0.0)
+        return shown[-1]
+
+    reachable = [moving_mean(v * length, 7) or 0.0 for v in np.geomspace(1e-3, 1e3, 400)]
+    nearest = min(reachable, key=lambda found: abs(found - px))
+    if abs(nearest / px - 1) > 0.05:
+        with pytest.raises(ValueError, match="cannot be reached"):
+            tradeoff_answer.speed_for(px, motion, "scene")
+        return
+    speed, reached = tradeoff_answer.speed_for(px, motion, "scene")
+    assert reached == pytest.approx(px, rel=0.05)
+    assert moving_mean(speed * length, 7) == pytest.approx(reached, rel=1e-3)
+    assert len(shown) <= 10
+
+
+def test_still_scenes_and_motions_out_of_reach_are_refused():
+    with pytest.raises(ValueError, match=r"wall: nothing in it moves, so --px 3 cannot be reached; leave --px out"):
+        tradeoff_answer.speed_for(3.0, lambda speed: 0.0, "wall")
+    with pytest.raises(ValueError, match=r"snail: --px 3 cannot be reached; speed factor 1000 gives 0.5 px"):
+        tradeoff_answer.speed_for(3.0, lambda speed: 5e-4 * speed, "snail")
+
+
+def test_a_clip_is_made_faster_by_whole_factors(clip, tmp_path, capsys):
+    assert tradeoff_answer.step_for(14.0, clip) == (2, pytest.approx(14))
+    with pytest.raises(ValueError, match="moves 7 px per 3-bit frame, and a clip can only be made faster"):
+        tradeoff_answer.step_for(3.0, clip)
+    still = write_clip(tmp_path / "still", 8, 0)
+    with pytest.raises(ValueError, match="nothing in it moves"):
+        tradeoff_answer.step_for(3.0, still)
+    assert main(["tradeoff", str(clip.path), "--px", "14", "--ppp", "0.65", "--bits", "1,2"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "--px 14: speed factor 2 gives 14 px per 3-bit frame (7 planes), mean of what moves"
+    assert lines[-1].startswith("at 14 px per 3-bit frame and 0.65 photons per plane: planes ")
+
+
+def test_an_optimum_at_the_edge_is_marked(clip):
+    """Dim and slow wants many bits; the sentence says how much the neighbours lose."""
+    found = study(clip, Question(bits=(1, 2), ppp=0.1, instants=4))
+    assert tradeoff_answer.at_edge(found, "multibit") == ">="
+    assert tradeoff_answer.marked(found, "multibit") == ">= 2"
+    said = tradeoff_answer.answer(found)
+    lost = found.best("multibit").psnr_db - rows_of(found, "multibit")[0].psnr_db
+    assert f"multibit >= 2 bits, 1 bit is {lost:.1f} dB worse (the deepest tried: try --bits 1,...,4)" in said
+    deep = study(clip, Question(bits=(4, 5), ppp=30.0, instants=2))
+    assert tradeoff_answer.at_edge(deep, "multibit") == "<="
+
+
+def test_the_range_is_widened_until_the_best_is_inside(clip):
+    told = []
+    found = tradeoff_answer.widened(clip, Question(bits=(1, 2), ppp=0.65, instants=2), told.append)
+    assert len(told) == len(found.bits) - 2
+    edges = [tradeoff_answer.at_edge(found, model) for model in tradeoff_study.MODELS]
+    assert ">=" not in edges or 2 ** (found.bits[-1] + 1) - 1 > len(clip) or found.bits[-1] == tradeoff_answer.WIDEST
+    assert found.bits == tuple(range(1, found.bits[-1] + 1))
+    assert len(found.bits) > 2
+
+
+def test_bits_that_were_given_are_kept_and_others_widened(clip, capsys):
+    import json
+
+    words = ["tradeoff", str(clip.path), "--ppp", "0.1", "--instants", "2", "--json"]
+    assert main([*words, "--bits", "1,2"]) == 0
+    given = json.loads(capsys.readouterr().out)
+    assert given["best"]["multibit"]["edge"] == ">="
+    assert {row["bits"] for row in given["rows"]} == {1, 2}
+    assert main(words) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert {row["bits"] for row in found["rows"]} >= {1, 2, 3, 4, 5}
+    assert found["answer"].startswith("at 7 px per 3-bit frame and 0.1 photons per plane: ")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--table CLIP", "--table is made from numbers alone; leave the clip or scene out"),
+        ("--table --ppp 1", "tradeoff --table: --ppp changes nothing here"),
+        ("--table --px 1", "tradeoff --table: --px changes nothing here"),
+        ("--table --speed 2", "tradeoff --table: --speed changes nothing here"),
+        ("--table --sensor spad-320x240", "tradeoff --table: --sensor changes nothing here"),
+        ("--table --plane-sensor quiver-paper", "tradeoff --table: --plane-sensor changes nothing here"),
+        ("--table --instants 2", "tradeoff --table: --instants changes nothing here"),
+        ("--table --frames 2", "tradeoff --table: --frames changes nothing here"),
+        ("--table --seed 0", "tradeoff --table: --seed changes nothing here"),
+        ("--table --streams", "tradeoff --table: --streams changes nothing here"),
+        ("--table -o x", "tradeoff --table: --output changes nothing here"),
+        ("--table --force", "tradeoff --table: --force changes nothing here"),
+        ("--table --paper-figure 1", "tradeoff --table: --paper-figure changes nothing here"),
+        ("CLIP --ppp 1 --read-noise 0", "tradeoff of a clip or scene: --read-noise changes nothing here"),
+        ("CLIP --ppp 1 --motion 10", "tradeoff of a clip or scene: --motion changes nothing here"),
+        ("CLIP --ppp 1 --size 8x8", "tradeoff of a clip: --size changes nothing here"),
+        ("CLIP --ppp 1 --base-fps 20000", "tradeoff of a clip: --base-fps changes nothing here"),
+        ("CLIP --ppp 1 --frames 9", "tradeoff of a clip: --frames changes nothing here"),
+        ("CLIP --ppp 1 --force", "tradeoff without --output: --force changes nothing here"),
+        ("CLIP --ppp 1 --px 3 --speed 2", "not allowed with argument"),
+        ("CLIP --ppp 1 --px 13.9,14", "need one and the same speed; give fewer"),
+        ("CLIP --ppp 1,2 --streams -o x", "--streams: writes one speed and one light level"),
+        ("CLIP --ppp 1 --speed 2 --bits 1,2 --streams -o x", "--streams: writes a clip at its own speed"),
+        ("--paper-figure 1 --ppp 1 -o x", "tradeoff --paper-figure: --ppp changes nothing here"),
+        ("--paper-figure 1 --px 1 -o x", "tradeoff --paper-figure: --px changes nothing here"),
+        ("--paper-figure 1 --bits 1 -o x", "tradeoff --paper-figure: --bits changes nothing here"),
+        ("--paper-figure 1 --base-fps 1 -o x", "tradeoff --paper-figure: --base-fps changes nothing here"),
+        ("--paper-figure 1 --sensor a -o x", "tradeoff --paper-figure: --sensor changes nothing here"),
+        ("--paper-figure 1 --instants 1 -o x", "tradeoff --paper-figure: --instants changes nothing here"),
+        ("--paper-figure 1 --frames 1 -o x", "tradeoff --paper-figure: --frames changes nothing here"),
+        ("--paper-figure 1 --streams -o x", "tradeoff --paper-figure: --streams changes nothing here"),
+        ("--paper-figure 1 --motion 1 -o x", "tradeoff --paper-figure: --motion changes nothing here"),
+        ("--paper-figure 1 --speed 1,2 -o x", "--paper-figure draws one speed; give one"),
+        ("--paper-figure 1 CLIP --speed 2 -o x", "tradeoff --paper-figure of a clip: --speed changes nothing here"),
+        ("--paper-figure 1 CLIP --size 8x8 -o x", "tradeoff of a clip: --size changes nothing here"),
+    ],
+)
+def test_options_that_cannot_act_are_refused(clip, capsys, tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    assert main(["tradeoff", *words.replace("CLIP", str(clip.path)).split()]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_the_motion_of_a_scene_is_that_of_its_clip(tmp_path, capsys):
+    """Measured without rendering; the rendered clip then moves so."""
+    import json
+
+    words = ["tradeoff", "fan", "--px", "3", "--ppp", "2", "--bits", "1,2", "--size", "24x32", "--frames", "16"]
+    assert main([*words, "-o", str(tmp_path / "out"), "--json", "-q"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["px_asked"] == [3.0]
+    assert found["motion_px_per_code_frame"] == pytest.approx(3.0, rel=0.1)
