@@ -160,12 +160,19 @@ class Mixture:
     def _weights(self, mean: Array) -> Array:
         """Pois(n; mean) of the table's n: [p] -> [m, p]."""
         n = np.arange(self.first, self._last)
-        if self.first or not len(n) or (mean > _DIM).any():
+        bright = mean > _DIM
+        if self.first or not len(n) or (bright.any() and self._last > _DIM):
             return np.exp(poisson_log_pmf(mean, n[:, None]))
         weights = np.empty((len(n), len(mean)))
         weights[0] = np.exp(-mean)
         for i in n[1:]:
             np.multiply(weights[i - 1], mean / i, out=weights[i])
+        if bright.any():  # then every n is below the mean: from the last one down
+            some = mean[bright]
+            weight = np.exp(poisson_log_pmf(some, n[-1]))
+            for i in n[::-1]:
+                weights[i, bright] = weight
+                weight = weight * (i / some)
         return weights
 
     @property
