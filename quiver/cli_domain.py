@@ -76,5 +76,9 @@ def _question(args: argparse.Namespace) -> Any:
         for bits in args.bits or (3,)
         for ppp in args.ppp or (3.25,)
     )
+    if args.split is not None and all((clips / "clip.json").exists() for clips in args.clips):
+        raise ValueError(
+            f"--split {args.split}: chooses clips of data sets, and only clip folders are named; leave it out"
+        )
     clips = clips_of(args.clips, None if args.split == "all" else args.split or "test")
     return Question(clips, lights, args.methods or CLASSICAL, args.seed or 0)

@@ -76,6 +76,7 @@ __all__ = [
     "follows_light",
     "has_sharp",
     "ideal_counter",
+    "known",
     "light_level",
     "mean_light",
     "note",
@@ -308,6 +309,13 @@ def stored(clip: Clip, name: str) -> tuple[Codes, float]:
 def truth(clip: Clip, factor: float, start: int, stop: int) -> Array:
     """Sharp expected photons [stop - start, H, W] of a clip under a light factor: what a restorer should return."""
     return np.stack([clip_photons(clip, t, factor, sharp=True) for t in range(start, stop)])
+
+
+def known(clip: Clip, start: int, stop: int) -> Array | None:
+    """bool [stop - start, H, W]: where the light of frames is known, not cut off by a saturated camera; None = all."""
+    if not clip.meta.get("saturated_pixels"):
+        return None
+    return ~np.stack([clip.saturated(t) for t in range(start, stop)])
 
 
 def mean_light(clip: Clip, factor: float) -> float:

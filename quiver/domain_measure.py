@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from quiver import metrics
-from quiver.data import Clip, Light, Lock, __version__, mean_light, open_clips, peak_of, sensed, truth
+from quiver.data import Clip, Light, Lock, __version__, known, mean_light, open_clips, peak_of, sensed, truth
 from quiver.domain import KEY, Cell, Domain, merged, place_of, read_scope
 from quiver.evaluate import in_memory
 from quiver.restoring import Options, Restorer, network_restorer, restorers
@@ -140,4 +140,5 @@ def score(method: Restorer, clip: Clip, light: Light, seed: int) -> float:
     drawn, factor = sensed(clip, light, seed)
     peak = peak_of(mean_light(clip, factor))
     restored = method.restore(in_memory(drawn))
-    return metrics.score(restored / peak, truth(clip, factor, 0, len(clip)) / peak).psnr_matched
+    target = truth(clip, factor, 0, len(clip)) / peak
+    return metrics.score(restored / peak, target, valid=known(clip, 0, len(clip))).psnr_matched

@@ -27,6 +27,7 @@ from quiver.data import (
     Codes,
     Light,
     array_codes,
+    known,
     mean_light,
     open_clips,
     peak_of,
@@ -153,7 +154,7 @@ def restore_clip(
     row = Row(method.name, method.description, plan.stream or light.label, clip.name, scene_of(clip))
     frames = scored_frames(len(clip), plan.published)
     white = peak_in_photons(plan, clip, codes, factor)
-    target = truth(clip, factor, frames.start, frames.stop) / white
+    target, valid = truth(clip, factor, frames.start, frames.stop) / white, known(clip, frames.start, frames.stop)
     windows = list(windows_sensed(clip, light, plan.seed, frames)) if plan.published else []
     before, started = reset_peak(), time.perf_counter()
     try:
@@ -164,11 +165,13 @@ def restore_clip(
             restored = method.restore(codes)
         seconds = (time.perf_counter() - started) / len(frames)
         peak = peak_memory() - before
-        score = metrics.score(restored / np.float32(white), target, per_frame_scale=plan.published)
+        score = metrics.score(restored / np.float32(white), target, per_frame_scale=plan.published, valid=valid)
     except Exception as error:  # whatever a method dies of is its result
         return replace(row, failure=f"{type(error).__name__}: {' '.join(str(error).split())}")
     matched = restored * np.float32(score.scale / white)
     speed = breakdown.speeds(clip, frames)
+    if speed is not None and valid is not None:
+        speed = np.where(valid, speed, math.nan)
     pixels, squares = ((), ()) if speed is None else breakdown.by_motion(matched, target, speed)
     if out is not None:
         keep_crops(out, row, clip, codes, frames, {row.method: matched, "truth": target})

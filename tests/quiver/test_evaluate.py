@@ -13,6 +13,7 @@ import pytest
 from clips import ClipMaker
 from numpy import ndarray as Array
 
+from qsim.clip import RELATIVE, ClipWriter
 from quiver import table
 from quiver.data import Codes, Light, array_codes, ideal_counter, open_clips, sensed, truth
 from quiver.evaluate import Plan, Row, append, begin, evaluate, finished, scored_frames, truth_psnr
@@ -207,6 +208,24 @@ def test_the_published_protocol_keeps_its_white(make_clip: ClipMaker):
     assert evaluate(replace(paper, lights=(Light(),)), [restorer("moment")])[0].peak == pytest.approx(2.5 * 3.25)
     assert evaluate(replace(paper, peak=3.0), [restorer("moment")])[0].peak == 3.0
     assert "the sensor's white, as published" in table.peak_name(paper)
+
+
+def test_saturated_pixels_count_nowhere(tmp_path):
+    """Half of a recording is saturated: a method that errs there alone is as good as one that errs nowhere."""
+    mask = np.zeros((24, 30), bool)
+    mask[:, 15:] = True
+    meta = {"shape": [12, 24, 30], "frame_rate": 2000.0, "exposure": 5e-4, "radiance_unit": RELATIVE, "camera": None}
+    rng = np.random.default_rng(14)
+    with ClipWriter(tmp_path / "recorded", meta) as writer:
+        for t in range(12):
+            writer.add(t, rng.uniform(0.5, 1.5, (24, 30)), saturated=mask)
+    clip = open_clips(tmp_path / "recorded")[0]
+    exact = truth(clip, sensed(clip, Light())[1], 0, 12)
+    noise = rng.normal(0, 1, exact.shape)
+    spoilt = method("spoilt", lambda codes: exact + 0.1 * noise + np.where(mask, 5.0, 0.0))
+    rows = evaluate(Plan(str(clip.path), None), [spoilt, method("whole", lambda codes: exact + 0.1 * noise)])
+    assert rows[0].score == rows[1].score
+    assert rows[0].score.psnr > 35
 
 
 def test_scores_near_the_truth_are_marked(make_clip: ClipMaker):
