@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from quiver.ops import deform_conv2d, warp
 from quiver.sweep import aligned, disagreement, paths
+from quiver.tiles import cores, extents
 
 RADIUS = 5  # frames before and after the restored one
 WINDOW = 2 * RADIUS + 1
@@ -315,6 +316,9 @@ class Refinement(nn.Module):
 class Hourglass(nn.Module):
     """Convolutions at full, half and quarter scale, each joined to the next finer one (Ronneberger et al. 2015)."""
 
+    REACH = 36  # px: how far away a pixel of the input can be that an output depends on
+    MULTIPLE = 4  # of height and width
+
     def __init__(self, inputs: int, width: int) -> None:
         super().__init__()
         w = width
@@ -355,6 +359,7 @@ class Baseline(nn.Module):
         weights = [math.exp(-0.5 * ((t - RADIUS) / self.SIGMA) ** 2) for t in range(WINDOW)]
         self.weights = nn.Parameter(torch.tensor([weight / sum(weights) for weight in weights]))
         self.correction = Hourglass(2 * WINDOW + 3 if sweep else WINDOW, width)
+        self.pixels: int | None = None  # most that the hourglass takes at once when not trained; the numbers agree
 
     def forward(self, window: Sequence[Tensor]) -> Tensor:
         """Eleven folded frames [N, f2, h, w] -> [N, f2, h, w]."""
@@ -367,7 +372,22 @@ class Baseline(nn.Module):
             stack = [drawn, frames, velocity / self.sweep, disagreement(drawn).sqrt()]
         mean = (drawn * self.weights.view(1, -1, 1, 1)).sum(1, keepdim=True)
         seen = join(*stack)
-        return F.pixel_unshuffle(mean + (self.correction(seen) if self.training else self._averaged(seen)), fold)
+        return F.pixel_unshuffle(mean + (self.correction(seen) if self.training else self._in_tiles(seen)), fold)
+
+    def _in_tiles(self, stack: Tensor) -> Tensor:
+        """`_averaged`, tile by tile where the frame has more than `pixels` pixels."""
+        height, width = stack.shape[2:]
+        if self.pixels is None or height * width <= self.pixels:
+            return self._averaged(stack)
+        reach = Hourglass.REACH
+        tall, wide = cores(height, width, self.pixels, reach, Hourglass.MULTIPLE)
+        picture = stack.new_empty(stack.shape[0], 1, height, width)
+        for y, (top, bottom) in zip(range(0, height, tall), extents(height, tall, reach), strict=True):
+            for x, (left, right) in zip(range(0, width, wide), extents(width, wide, reach), strict=True):
+                part = self._averaged(stack[:, :, top:bottom, left:right])
+                inner = part[:, :, y - top : y - top + tall, x - left : x - left + wide]
+                picture[:, :, y : y + tall, x : x + wide] = inner
+        return picture
 
     def _averaged(self, stack: Tensor) -> Tensor:
         """The hourglass's mean answer to the eight flips and quarter turns of what it sees."""

@@ -62,7 +62,7 @@ def restore_to_file(
             "quiver": __version__,
             "method": method.name,
             "description": method.description,
-            "identity": dict(method.identity),
+            "identity": dict(method.identity) | {"cut": method.cut(*codes.shape[1:])},
             "unit": "photons",
             "white": codes.white,
             "shape": list(codes.shape),

@@ -3,13 +3,14 @@
     codes [T, H, W] -> restored photons [T, H, W], float32
 
 Edges are padded inside: time by reflection, so that every frame is restored; space by repetition up to the multiple the
-network needs. A frame too large for the memory bound is cut into overlapping tiles whose results are blended. No ground
+network needs. Where a frame takes more than the memory bound, less of it is computed at a time (pieces.py). No ground
 truth is needed. `restorer(NAME)` finds a classical method, shipped weights, a weights file or a training folder.
 """
 
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,7 +24,7 @@ from numpy import ndarray as Array
 from quiver.baselines import METHODS
 from quiver.baselines.windows import look_ahead, reflect
 from quiver.data import Codes, suggest
-from quiver.tiles import plan_tiles
+from quiver.pieces import FAR_APART, Disagreement, plan_pieces
 
 if TYPE_CHECKING:
     import torch
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
 
 PRETRAINED = Path(__file__).parent / "pretrained"  # weights that ship with the package
 DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory beside the weights
-CLASSICAL_BYTES = 200  # per pixel and frame held at once, about, of the hungriest classical method
+FRAME_BYTES = 16  # per pixel and frame that a classical method holds: codes and video
+BLOCK_FRAMES = 32  # that a classical method restores between two reports of progress, at most
 BLOCK_PIXELS = 1 << 22  # codes read at a time: 4 MB
 CONTEXT = 5  # frames that a network needs before and after the one it restores
 MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/reuse.py
@@ -44,7 +46,10 @@ Fill = Callable[[Codes, Array, int, Progress | None], None]  # adds photons of f
 
 @dataclass(frozen=True)
 class Options:
-    """How to run, not what to compute: apart from `mode` and `precision` the numbers agree to rounding."""
+    """How to run, not what to compute: apart from `mode` and `precision` the numbers agree to rounding.
+
+    A memory that holds no whole frame of a QUIVER network is the exception: a warning then says what it changed.
+    """
 
     memory: int = DEFAULT_MEMORY  # bytes
     mode: str = "exact"  # exact = the published windows; streaming = state carried on, faster; windows = recomputed
@@ -72,6 +77,7 @@ class Restorer:
     fill: Fill
     seamless: bool = True  # a range of frames restored alone equals that part of the whole
     identity: Mapping[str, object] = field(default_factory=dict)  # settings and weights that change the answer
+    cut: Callable[[int, int], str] = lambda height, width: ""  # of a frame, where it changes the answer
     scope: Scope | None = None  # of a network: what it was measured for or trained on; None: not known
 
     def restore(self, codes: Codes, first: int = 0, last: int | None = None, progress: Progress | None = None) -> Array:
@@ -98,7 +104,13 @@ def restorer(name: str, options: Options | None = None) -> Restorer:
     run = partial(method.restore, window=frames) if window else method.restore
 
     def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
-        fill_classical(run, frames, codes, out, first, options.memory, progress)
+        taken = method.bytes_per_pixel * codes.shape[1] * codes.shape[2]
+        if taken > options.memory:
+            size = f"{codes.shape[1]} x {codes.shape[2]} px"
+            warnings.warn(
+                f"{name} takes about {taken / 1e6:.0f} MB for a frame of {size}, above --memory", stacklevel=2
+            )
+        fill_classical(run, frames, codes, out, first, options.memory - taken, progress)
 
     identity = {"method": base, "window": frames}
     return Restorer(name, frames, look_ahead(frames), False, method.description, fill, identity=identity)
@@ -192,7 +204,11 @@ def wrap_network(
         fill_network(model, codes, out, first, options, progress)
 
     identity = {"weights_sha256": weights_sha256, "mode": mode, "precision": options.precision}
-    return Restorer(name, WINDOW, RADIUS, True, description, fill, mode != "streaming", identity)
+
+    def cut(height: int, width: int) -> str:
+        return plan_pieces(model, height, width, options.memory, options.mode).text
+
+    return Restorer(name, WINDOW, RADIUS, True, description, fill, mode != "streaming", identity, cut)
 
 
 def pick_device(wanted: str) -> str:
@@ -212,18 +228,22 @@ def fill_classical(
     codes: Codes,
     out: Array,
     first: int,
-    memory: int,
+    free: int,
     progress: Progress | None,
 ) -> None:
-    """Run a classical method over blocks of frames with `window` frames of context on both sides."""
+    """Run a classical method over blocks of frames that `free` bytes hold, with the frames around them that it needs.
+
+    Frames are taken whole: what memory there is changes no answer.
+    """
     length, height, width = codes.shape
     last = first + len(out)
-    block = max(1, memory // (CLASSICAL_BYTES * height * width) - 2 * window)
+    block = min(BLOCK_FRAMES, max(1, free // (FRAME_BYTES * height * width)))
     for start in range(first, last, block):
         stop = min(start + block, last)
         before, after = max(0, start - window), min(length, stop + window)
-        restored = restore(codes.read(before, after), codes.sensor, codes.exposure)
-        out[start - first : stop - first] = restored[start - before : stop - before]
+        wanted = range(start - before, stop - before)
+        read = codes.read(before, after)
+        out[start - first : stop - first] = restore(read, codes.sensor, codes.exposure, frames=wanted)
         if progress is not None:
             progress(stop - first, len(out))
 
@@ -231,15 +251,23 @@ def fill_classical(
 def fill_network(
     model: nn.Module, codes: Codes, out: Array, first: int, options: Options, progress: Progress | None
 ) -> None:
-    """Restore tile by tile, frame by frame; `out` must be zero and collects the weighted tiles."""
+    """Restore tile by tile, frame by frame; `out` must be zero and collects the weighted tiles.
+
+    A warning says by how much tiles differ where a frame is cut in a way that changes the answer (see pieces.py).
+    """
     import torch
+
+    from quiver.model import QUIVER
 
     device = next(model.parameters()).device
     dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
-    tiles = plan_tiles(*codes.shape[1:], options.memory // bytes_per_pixel(model, options.mode))
+    height, width = codes.shape[1:]
+    pieces = plan_pieces(model, height, width, options.memory, options.mode)
+    if isinstance(model, QUIVER) and model.baseline is not None:
+        model.baseline.pixels = pieces.hourglass
     multiple = int(model.multiple)  # type: ignore[arg-type]
-    done = 0
-    for tile in tiles:
+    apart, done = Disagreement.nothing(height, width), 0
+    for tile in pieces.tiles:
         rows, columns = tile.weight.shape
         part = (slice(tile.y, tile.y + rows), slice(tile.x, tile.x + columns))
         frames = (pad_space(frame, multiple).to(device) for frame in padded_frames(codes, part, first, len(out)))
@@ -247,9 +275,20 @@ def fill_network(
             for t, picture in enumerate(pictures(model, frames, options.mode)):
                 restored = picture[0, 0, :rows, :columns].float().cpu().numpy()
                 out[(t, *part)] += tile.weight * restored * np.float32(codes.white)
+                if t == 0 and not pieces.exact:
+                    apart.add(tile, restored)
                 done += 1
                 if progress is not None:
-                    progress(done, len(out) * len(tiles))
+                    progress(done, len(out) * len(pieces.tiles))
+    rms, most = apart.measured()
+    if most > FAR_APART:
+        more = f"; --memory {-(-pieces.needed // 10**6)}MB restores it whole" if pieces.needed else ""
+        warnings.warn(
+            f"{codes.name}: {options.memory / 1e6:.0f} MB hold no frame of {height} x {width} px; cut into "
+            f"{pieces.text}, which differ where they overlap by {100 * rms:.2g} % of white rms, {100 * most:.2g} % at "
+            f"most{more}",
+            stacklevel=2,
+        )
 
 
 def padded_frames(codes: Codes, part: tuple[slice, slice], first: int, count: int) -> Iterator[Tensor]:
@@ -292,17 +331,6 @@ def pictures(model: nn.Module, frames: Iterable[Tensor], mode: str) -> Iterator[
         window.append(frame)
         if len(window) == WINDOW:
             yield model(torch.stack(list(window), dim=1)).scale1[:, 0]
-
-
-def bytes_per_pixel(model: nn.Module, mode: str) -> int:
-    """Working memory of a network per pixel of the tile, float32, about 1.5 times of what `quiver bench` measured."""
-    from quiver.model import QUIVER
-
-    if not isinstance(model, QUIVER):
-        return 4_000
-    held = 2 if mode == "windows" else 1  # windows of eleven frames at once
-    baseline = 64 * model.config.baseline if model.config.baseline else 0  # at full size
-    return int(held * (4000 + 1200 * model.config.channels) / model.config.fold**2) + baseline
 
 
 def check_finite(restored: Array, name: str, first: int = 0) -> None:

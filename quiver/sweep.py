@@ -97,22 +97,28 @@ def _coarse(frames: Tensor, weights: Tensor, largest: float) -> Tensor:
     edge = math.ceil(reach * n * STEP)
     padded = F.pad(frames, (edge,) * 4, mode="replicate")
     columns = [
-        torch.stack([padded[:, t, :, edge + s : edge + s + width] for s in along]) for t, along in enumerate(shifts)
+        torch.stack([padded[:, t, :, edge + s : edge + s + width] for s in shift]) for t, shift in enumerate(shifts)
     ]
-    pooled = []
+    along = (torch.arange(2 * n + 1, device=frames.device, dtype=frames.dtype) - n) * STEP
+    best, lowest = None, None  # velocity [2, N, h, w] and what it costs, of the rows so far
     for row in range(2 * n + 1):  # vy
         total = frames.new_zeros(2 * n + 1, count, height, width)  # by vx
         squares = torch.zeros_like(total)
-        for t, along in enumerate(shifts):
-            moved = columns[t][:, :, edge + along[row] : edge + along[row] + height]
+        for t, shift in enumerate(shifts):
+            moved = columns[t][:, :, edge + shift[row] : edge + shift[row] + height]
             total.add_(moved, alpha=float(weights[t]))
             squares.addcmul_(moved, moved, value=float(weights[t]))
         variance = squares.addcmul_(total, total, value=-1)
-        pooled.append(_means(variance, SIDE + 1, 2))
-    one = (torch.arange(2 * n + 1, device=frames.device, dtype=frames.dtype) - n) * STEP
-    grid = torch.stack([one.repeat(2 * n + 1), one.repeat_interleave(2 * n + 1)])  # x, y
-    paid = torch.cat(pooled).clamp(min=0).add_(FLOOR) * (1 + PREFERENCE * torch.hypot(*grid))[:, None, None, None]
-    return F.interpolate(grid[:, paid.argmin(0)].transpose(0, 1), size=(height, width), mode="nearest")
+        grid = torch.stack([along, along[row].expand_as(along)])  # x, y
+        unlikely = (1 + PREFERENCE * torch.hypot(*grid))[:, None, None, None]
+        price, at = (_means(variance, SIDE + 1, 2).clamp_(min=0).add_(FLOOR) * unlikely).min(0)
+        found = grid[:, at]
+        if best is None or lowest is None:
+            best, lowest = found, price
+        else:
+            best, lowest = torch.where(price < lowest, found, best), torch.minimum(price, lowest)
+    assert best is not None
+    return F.interpolate(best.transpose(0, 1), size=(height, width), mode="nearest")
 
 
 def _corrected(frames: Tensor, path: Tensor) -> Tensor:

@@ -1,4 +1,11 @@
-"""Cutting a large frame into overlapping tiles, and the weights that blend their results without a seam."""
+"""Cutting a large frame into tiles: exactly, where a result depends on near pixels only, or with blended seams.
+
+    cores that cover the frame, each grown by `reach` on its inner sides  ->  tiles that are computed
+
+Where a pixel depends on nothing farther than `reach`, a core is what the whole frame gives. Tiles begin at multiples of
+the network's stride, so that its pooling sees the same cells. Of all cuts whose tiles fit, the one with the smallest
+total area is taken.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy import ndarray as Array
-
-OVERLAP = 32  # px that neighbouring tiles share
 
 
 @dataclass(frozen=True)
@@ -19,41 +24,64 @@ class Tile:
     weight: Array
 
 
-def spans(length: int, side: int, overlap: int) -> list[tuple[int, Array]]:
-    """Starts and weights of spans of `side` that cover `length` with at least `overlap` shared; weights sum to 1."""
-    if length <= side:
-        return [(0, np.ones(length, np.float32))]
-    count = -(-(length - overlap) // (side - overlap))
-    starts = [round(i * (length - side) / (count - 1)) for i in range(count)]
-    ramp = np.minimum(1.0, np.arange(1, side + 1) / (overlap + 1))
-    total = np.zeros(length)
-    shapes = []
-    for i, start in enumerate(starts):
-        rise = ramp if i > 0 else np.ones(side)
-        fall = ramp[::-1] if i < count - 1 else np.ones(side)
-        shapes.append(rise * fall)
-        total[start : start + side] += shapes[-1]
-    return [
-        (start, (shape / total[start : start + side]).astype(np.float32))
-        for start, shape in zip(starts, shapes, strict=True)
-    ]
+def extents(length: int, core: int, reach: int) -> list[tuple[int, int]]:
+    """First and last + 1 pixel of the spans that `core` pixels each, grown by `reach`, take of `length`."""
+    return [(max(0, start - reach), min(length, start + core + reach)) for start in range(0, length, core)]
 
 
-def plan_tiles(height: int, width: int, pixels: int, overlap: int = OVERLAP) -> list[Tile]:
-    """Tiles of at most `pixels` pixels, near-square unless the frame is flat. ValueError if less than a tile fits."""
+def cores(height: int, width: int, pixels: int, reach: int, multiple: int) -> tuple[int, int]:
+    """Height and width of the cores whose tiles have at most `pixels` pixels each and the smallest area together.
+
+    `multiple` divides reach and cores. `ValueError` if not even the smallest tile fits.
+    """
     if height * width <= pixels:
-        return [Tile(0, 0, np.ones((height, width), np.float32))]
-    least = 2 * overlap + 16
-    side = int(pixels**0.5)
-    tall = height if height <= side else max(min(side, height), min(least, height))
-    wide = min(width, pixels // tall)
-    tall = min(height, pixels // wide) if wide else 0
-    if (tall < least and tall < height) or (wide < least and wide < width):
+        return height, width
+    found = []
+    for length in (height, width):
+        tried = np.arange(multiple, length + multiple, multiple)
+        ends = [extents(length, int(core), reach) for core in tried]
+        found.append((tried, *(np.array([kind(b - a for a, b in spans) for spans in ends]) for kind in (max, sum))))
+    (tall, most_y, all_y), (wide, most_x, all_x) = found
+    area = np.where(most_y[:, None] * most_x <= pixels, all_y[:, None] * all_x, np.iinfo(np.int64).max)
+    y, x = np.unravel_index(np.argmin(area), area.shape)
+    if most_y[y] * most_x[x] > pixels:
         raise ValueError(
-            f"the memory bound holds {pixels} pixels at a time; a tile needs at least {least} x {least}; raise --memory"
+            f"the memory bound holds {pixels} pixels at a time; a tile needs at least {most_y.min()} x {most_x.min()}; "
+            "raise --memory"
         )
+    return int(tall[y]), int(wide[x])
+
+
+def spans(length: int, core: int, reach: int, blend: bool) -> list[tuple[int, Array]]:
+    """Starts and weights [n] of spans that cover `length`; the weights sum to 1.
+
+    A weight is 1 in the core and 0 beyond; with `blend` it rises and falls over what neighbours share.
+    """
+    shapes = []
+    total = np.zeros(length)
+    for start, (first, last) in zip(range(0, length, core), extents(length, core, reach), strict=True):
+        at = np.arange(first, last)
+        shape = ((at >= start) & (at < start + core)).astype(float)
+        if blend:
+            rise = (at - start + reach + 1) / (2 * reach + 1) if start else np.ones(len(at))
+            fall = (start + core + reach - at) / (2 * reach + 1) if start + core < length else np.ones(len(at))
+            shape = np.clip(rise, 0, 1) * np.clip(fall, 0, 1)
+        shapes.append((first, shape))
+        total[first:last] += shape
+    return [(first, (shape / total[first : first + len(shape)]).astype(np.float32)) for first, shape in shapes]
+
+
+def plan_tiles(
+    height: int, width: int, pixels: int, reach: int, multiple: int = 1, *, blend: bool = False
+) -> list[Tile]:
+    """Tiles of at most `pixels` pixels that start at multiples of `multiple`; the whole frame, if that fits.
+
+    `ValueError` if less than a tile fits.
+    """
+    reach = -(-reach // multiple) * multiple
+    tall, wide = cores(height, width, pixels, reach, multiple)
     return [
         Tile(y, x, rows[:, None] * columns[None, :])
-        for y, rows in spans(height, tall, overlap)
-        for x, columns in spans(width, wide, overlap)
+        for y, rows in spans(height, tall, reach, blend)
+        for x, columns in spans(width, wide, reach, blend)
     ]

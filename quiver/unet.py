@@ -37,7 +37,8 @@ class UNetConfig:
 class UNet(nn.Module):
     """The same call as QUIVER; its output has scale 1 only."""
 
-    multiple = 4
+    multiple = Hourglass.MULTIPLE
+    reach = Hourglass.REACH  # px: what is farther away does not change a pixel
 
     def __init__(self, config: UNetConfig | None = None) -> None:
         super().__init__()

@@ -1,9 +1,11 @@
 """Classical restorers, one file per method, one signature.
 
-    restore(codes [T, H, W], sensor, exposure, *, window=..., photons_per_unit=1) -> restored [T, H, W], float32
+    restore(codes [T, H, W], sensor, exposure, *, window=..., photons_per_unit=1, frames=None)
+        -> restored [T, H, W], float32
 
-Any number of frames and any size; a clip is continued by reflection at both ends. METHODS is the whole list: import
-the module of a method for its other settings.
+With `frames`, a range, these alone are restored, from the frames around them all the same. Any number of frames and any
+size; a clip is continued by reflection at both ends. METHODS is the whole list: import the module of a method for its
+other settings.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ class Method:
     restore: Callable[..., Array]  # restore(codes, sensor, exposure, *, window=..., photons_per_unit=1) -> [T, H, W]
     window: int  # frames used for one restored frame, when not told otherwise
     description: str
+    bytes_per_pixel: int  # working memory, about, beside the codes and the video
 
     @property
     def look_ahead(self) -> int:
@@ -36,23 +39,27 @@ class Method:
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        Method("naive", mean.restore, 11, "mean of the codes, taken as linear in light"),
-        Method("moment", moment.restore, 11, "mean of the codes through the exact inverse response"),
-        Method("likelihood", likelihood.restore, 11, "most likely light given the codes of one pixel"),
-        Method("transform-denoise", transform_denoise.restore, 3, "variance stabilised, BM3D, exact unbiased inverse"),
-        Method("qbp", qbp.restore, 11, "align, Wiener merge, exact inverse response"),
-        Method("qbp-bm3d", qbp_bm3d.restore, 11, "align, Wiener merge, stabilise, BM3D, exact unbiased inverse"),
+        Method("naive", mean.restore, 11, "mean of the codes, taken as linear in light", 50),
+        Method("moment", moment.restore, 11, "mean of the codes through the exact inverse response", 50),
+        Method("likelihood", likelihood.restore, 11, "most likely light given the codes of one pixel", 300),
+        Method(
+            "transform-denoise", transform_denoise.restore, 3, "variance stabilised, BM3D, exact unbiased inverse", 1800
+        ),
+        Method("qbp", qbp.restore, 11, "align, Wiener merge, exact inverse response", 600),
+        Method("qbp-bm3d", qbp_bm3d.restore, 11, "align, Wiener merge, stabilise, BM3D, exact unbiased inverse", 1800),
         Method(
             "transform-denoise-published",
             partial(transform_denoise.restore, kind="binomial"),
             3,
             "Transform Denoise with the arcsine for sums of binary samples",
+            1800,
         ),
         Method(
             "qbp-published",
             partial(qbp.restore, settings=qbp.AS_PUBLISHED),
             11,
             "QBP with the article's noise estimate and whole-pixel shifts",
+            600,
         ),
     )
 }

@@ -22,7 +22,15 @@ from quiver.baselines.windows import check_codes, check_window, in_units, window
 CHUNK = 1 << 22  # entries of the histograms solved at a time
 
 
-def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11, photons_per_unit: float = 1.0) -> Array:
+def restore(
+    codes: Array,
+    sensor: Sensor,
+    exposure: float,
+    *,
+    window: int = 11,
+    photons_per_unit: float = 1.0,
+    frames: range | None = None,
+) -> Array:
     """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
 
     Quick up to about 4 bits; with more, nearly every pixel has an outcome of its own. Raises ValueError for codes the
@@ -33,8 +41,9 @@ def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11, 
     cap = response_table(sensor, exposure).cap(window)
     names = outcome_names(sensor.levels, window)
     known, answers = np.empty(0, np.uint64), np.empty(0, np.float32)
-    restored = np.empty(codes.shape, np.float32)
-    for frame in range(len(codes)):
+    frames = range(len(codes)) if frames is None else frames
+    restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
+    for i, frame in enumerate(frames):
         seen = codes[window_frames(frame, window, len(codes))].reshape(window, -1)
         outcome = sum((names[one] for one in seen), np.zeros(seen.shape[1], np.uint64))
         distinct, example, where = np.unique(outcome, return_index=True, return_inverse=True)
@@ -42,7 +51,7 @@ def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11, 
         place = np.searchsorted(known, distinct[new])
         known = np.insert(known, place, distinct[new])
         answers = np.insert(answers, place, solve(seen[:, example[new]], sensor, exposure, cap))
-        restored[frame] = answers[np.searchsorted(known, distinct)][where].reshape(codes.shape[1:])
+        restored[i] = answers[np.searchsorted(known, distinct)][where].reshape(codes.shape[1:])
     return in_units(restored, photons_per_unit)
 
 

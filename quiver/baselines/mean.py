@@ -24,7 +24,15 @@ def dark_codes(sensor: Sensor, exposure: float) -> float:
     return slope * sensor.dark_rate * exposure / sensor.efficiency + offset
 
 
-def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11, photons_per_unit: float = 1.0) -> Array:
+def restore(
+    codes: Array,
+    sensor: Sensor,
+    exposure: float,
+    *,
+    window: int = 11,
+    photons_per_unit: float = 1.0,
+    frames: range | None = None,
+) -> Array:
     """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
 
     Raises ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
@@ -34,4 +42,4 @@ def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11, 
     def photons_of(mean_code: Array) -> Array:
         return np.maximum(0, mean_code - dark) * step
 
-    return restore_by_mean(codes, sensor, window, photons_of, photons_per_unit)
+    return restore_by_mean(codes, sensor, window, photons_of, photons_per_unit, frames)

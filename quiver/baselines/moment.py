@@ -15,10 +15,22 @@ from quiver.baselines.tables import response_table
 from quiver.baselines.windows import restore_by_mean
 
 
-def restore(codes: Array, sensor: Sensor, exposure: float, *, window: int = 11, photons_per_unit: float = 1.0) -> Array:
+def restore(
+    codes: Array,
+    sensor: Sensor,
+    exposure: float,
+    *,
+    window: int = 11,
+    photons_per_unit: float = 1.0,
+    frames: range | None = None,
+) -> Array:
     """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
 
     Raises ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
     """
     table = response_table(sensor, exposure)
-    return restore_by_mean(codes, sensor, window, lambda mean_code: table.invert(mean_code, window), photons_per_unit)
+
+    def photons_of(mean_code: Array) -> Array:
+        return table.invert(mean_code, window)
+
+    return restore_by_mean(codes, sensor, window, photons_of, photons_per_unit, frames)

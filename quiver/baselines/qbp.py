@@ -58,6 +58,7 @@ def restore(
     window: int = 11,
     photons_per_unit: float = 1.0,
     settings: Settings = CALIBRATED,
+    frames: range | None = None,
 ) -> Array:
     """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
 
@@ -65,10 +66,11 @@ def restore(
     """
     check_codes(codes, sensor)
     table = response_table(sensor, exposure)
-    restored = np.empty(codes.shape, np.float32)
-    for frame in range(len(codes)):
+    frames = range(len(codes)) if frames is None else frames
+    restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
+    for i, frame in enumerate(frames):
         merged = merge(codes, frame, table, window, settings)
-        restored[frame] = table.invert(merged, window)
+        restored[i] = table.invert(merged, window)
     return in_units(restored, photons_per_unit)
 
 

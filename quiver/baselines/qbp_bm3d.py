@@ -30,6 +30,7 @@ def restore(
     photons_per_unit: float = 1.0,
     settings: qbp.Settings = qbp.CALIBRATED,
     excess: float = EXCESS,
+    frames: range | None = None,
 ) -> Array:
     """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
 
@@ -38,9 +39,10 @@ def restore(
     check_codes(codes, sensor)
     check_window(window)
     table, transform = response_table(sensor, exposure), stabiliser(sensor, exposure, window)
-    restored = np.empty(codes.shape, np.float32)
-    for frame in range(len(codes)):
+    frames = range(len(codes)) if frames is None else frames
+    restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
+    for i, frame in enumerate(frames):
         stable = transform.forward(qbp.merge(codes, frame, table, window, settings))
         clean = bm3d.denoise(stable, excess * transform.deviation, peak=transform.peak)
-        restored[frame] = transform.inverse(clean)
+        restored[i] = transform.inverse(clean)
     return in_units(restored, photons_per_unit)

@@ -27,6 +27,7 @@ def restore(
     window: int = 3,
     photons_per_unit: float = 1.0,
     kind: Kind = "table",
+    frames: range | None = None,
 ) -> Array:
     """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
 
@@ -37,8 +38,10 @@ def restore(
     top = sensor.levels - 1
     transform = stabiliser(sensor, exposure, window, kind)
     table = transform.forward(np.arange(window * top + 1) / window)
-    restored = np.empty(codes.shape, np.float32)
+    frames = range(len(codes)) if frames is None else frames
+    restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
     for frame, total in enumerate(window_sums(codes, window, top)):
-        clean = bm3d.denoise(table[total], transform.deviation, peak=transform.peak)
-        restored[frame] = transform.inverse(clean)
+        if frame in frames:
+            clean = bm3d.denoise(table[total], transform.deviation, peak=transform.peak)
+            restored[frame - frames.start] = transform.inverse(clean)
     return in_units(restored, photons_per_unit)

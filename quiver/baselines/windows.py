@@ -71,9 +71,14 @@ def window_sums(codes: Array, window: int, top: int) -> Iterator[Array]:
 
 
 def restore_by_mean(
-    codes: Array, sensor: Sensor, window: int, photons_of: Callable[[Array], Array], photons_per_unit: float
+    codes: Array,
+    sensor: Sensor,
+    window: int,
+    photons_of: Callable[[Array], Array],
+    photons_per_unit: float,
+    frames: range | None = None,
 ) -> Array:
-    """Restored frames [T, H, W], float32, where a frame depends on the mean code of its window only.
+    """Restored frames [T, H, W], all or those in `frames`, where a frame depends on its window's mean code only.
 
     A sum of codes has few values, so the whole method is one table, `photons_of` every possible mean code, and a
     running sum. ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
@@ -82,9 +87,11 @@ def restore_by_mean(
     check_window(window)
     top = sensor.levels - 1
     table = photons_of(np.arange(window * top + 1) / window).astype(np.float32)
-    restored = np.empty(codes.shape, np.float32)
+    frames = range(len(codes)) if frames is None else frames
+    restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
     for frame, total in enumerate(window_sums(codes, window, top)):
-        np.take(table, total, out=restored[frame], mode="clip")  # clip never happens, but is the unbuffered mode
+        if frame in frames:  # clip never happens, but is the unbuffered mode
+            np.take(table, total, out=restored[frame - frames.start], mode="clip")
     return in_units(restored, photons_per_unit)
 
 

@@ -25,7 +25,6 @@ from quiver.restored_file import restore_to_file
 from quiver.restoring import (
     Options,
     Restorer,
-    bytes_per_pixel,
     fill_network,
     method_names,
     network_restorer,
@@ -33,7 +32,6 @@ from quiver.restoring import (
     restorers,
     weights_path,
 )
-from quiver.tiles import plan_tiles, spans
 from quiver.unet import UNet, UNetConfig
 from quiver.weights import save
 
@@ -105,49 +103,6 @@ def test_a_range_of_frames_equals_that_part_of_the_whole():
     np.testing.assert_array_equal(moment.restore(codes, 4, 7), moment.restore(codes)[4:7])
 
 
-@pytest.mark.parametrize("length", [1, 79, 80, 81, 100, 333])
-def test_weights_of_overlapping_spans_sum_to_one(length):
-    total = np.zeros(length)
-    for start, weight in spans(length, 80, 32):
-        assert len(weight) == min(80, length)
-        total[start : start + len(weight)] += weight
-    np.testing.assert_allclose(total, 1, atol=1e-6)
-
-
-@pytest.mark.parametrize(("height", "width"), [(100, 300), (512, 1024), (20, 2000), (2000, 20)])
-def test_tiles_cover_the_frame_within_the_bound(height, width):
-    tiles = plan_tiles(height, width, 10_000)
-    total = np.zeros((height, width))
-    for tile in tiles:
-        rows, columns = tile.weight.shape
-        assert rows * columns <= 10_000
-        total[tile.y : tile.y + rows, tile.x : tile.x + columns] += tile.weight
-    assert len(tiles) > 1
-    np.testing.assert_allclose(total, 1, atol=1e-5)
-
-
-def test_tiles_are_blended_to_what_one_frame_gives():
-    codes, model = random_codes(2, 100, 130), CentreFrame()
-    small = Options(memory=bytes_per_pixel(model, "exact") * 7000)
-    np.testing.assert_allclose(run(model, codes, small), run(model, codes), rtol=1e-5)
-    assert max(seen[3] * seen[4] for seen in model.seen[: len(model.seen) // 2]) < 100 * 130
-
-
-def test_a_bound_below_one_tile_is_refused():
-    with pytest.raises(ValueError, match=r"tile needs at least 80 x 80; raise --memory"):
-        plan_tiles(200, 200, 1000)
-
-
-def test_a_convolutional_network_does_not_see_the_tiles():
-    """The U-Net reaches less than half the overlap in places of full weight: tiles change nothing there."""
-    torch.manual_seed(0)
-    codes, model = random_codes(1, 120, 96), UNet(UNetConfig(2)).eval()
-    tiled = run(model, codes, Options(memory=bytes_per_pixel(model, "exact") * 96 * 100))
-    whole = run(model, codes)
-    assert np.abs(tiled - whole).max() < 0.05 * np.abs(whole).max()
-    np.testing.assert_allclose(tiled[:, :20], whole[:, :20], atol=1e-4)
-
-
 def test_modes_of_the_network():
     """Exact equals windows recomputed; streaming is another schedule; bfloat16 stays near float32."""
     torch.manual_seed(0)
@@ -175,16 +130,6 @@ def test_a_window_after_the_colon():
     np.testing.assert_array_equal(three.restore(codes), expected)
     with pytest.raises(ValueError, match="as in moment:5"):
         restorer("moment:many")
-
-
-def test_blocks_of_frames_do_not_show():
-    """A memory bound that holds 30 frames at a time: same result as all at once."""
-    codes = random_codes(70, 6, 7)
-    whole = restorer("moment").restore(codes)
-    calls: list[int] = []
-    blocks = restorer("moment", Options(memory=200 * 6 * 7 * 30))
-    np.testing.assert_array_equal(blocks.restore(codes, progress=lambda done, total: calls.append(done)), whole)
-    assert len(calls) > 3
 
 
 def test_methods_of_one_table_have_names_of_their_own(tmp_path):
