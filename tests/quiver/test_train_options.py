@@ -11,6 +11,7 @@ from safetensors.torch import load_file
 
 from quiver.bench import checked_cases
 from quiver.cli import main
+from quiver.run import alone_in
 
 FAST = ("--steps", "2", "--crop", "16", "--batch", "1", "--preset", "unet", "--protocol", "control")
 
@@ -108,3 +109,14 @@ def test_bench_replaces_only_with_a_folder(capsys, tmp_path):
     (tmp_path / "b/bench.json").write_text(json.dumps({}))
     said = told(capsys, "bench", "--methods", "naive", "-o", tmp_path / "b")
     assert "exists; name another with -o, or use --force" in said
+
+
+def test_one_ablation_and_one_measurement_at_a_time(capsys, tiny_dataset, tmp_path):
+    (tmp_path / "a").mkdir()
+    with alone_in(tmp_path / "a", "works"):
+        words = ("ablate", tiny_dataset, "-o", tmp_path / "a", "--steps", 1, "--crop", 16, "--batch", 1, "-q")
+        assert f"{tmp_path / 'a'}: another process works here; wait" in told(capsys, *words)
+        words = ("bench", "--methods", "naive", "--size", "16x16", "-o", tmp_path / "a", "-q")
+        assert f"{tmp_path / 'a'}: another process measures here; wait" in told(capsys, *words)
+        assert [path.name for path in (tmp_path / "a").iterdir()] == ["lock"]
+    assert list((tmp_path / "a").iterdir()) == []
