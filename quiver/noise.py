@@ -92,7 +92,7 @@ class Noise(Light):
 
     @classmethod
     def from_dict(cls, values: Any) -> Noise:
-        """Inverse of `to_dict`; strict, `ValueError`."""
+        """Inverse of `to_dict`; strict, `ValueError`. Maps of defects may be elsewhere: they are read when drawn."""
         if not isinstance(values, dict) or set(values) != {field.name for field in fields(cls)}:
             raise ValueError(f"noise has {', '.join(field.name for field in fields(cls))}; got {repr(values)[:100]}")
         for name, kinds in _KINDS.items():
@@ -102,9 +102,8 @@ class Noise(Light):
             raise ValueError(f"noise: a sensor of {len(values['sensor'])} characters")
         texts = {name: None if values[name] is None else _text(values[name]) for name in ("record", "defects")}
         found = cls(**(values | texts))
-        for text, read in ((found.record, _sensor), (found.defects, _flaws)):
-            if text is not None:
-                read(text)
+        if found.record is not None:
+            _sensor(found.record)
         return found
 
     def to_dict(self) -> dict[str, Any]:

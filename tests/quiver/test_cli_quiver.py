@@ -186,7 +186,7 @@ def test_restored_video_is_not_taken_for_a_stream(capsys, tmp_path):
 def test_unreadable_files_are_named(capsys, tmp_path):
     (tmp_path / "a.npy").write_text("not an array")
     words = ["--sensor", "quiver-paper", "--method", "moment"]
-    assert "a.npy: not readable as an array" in mistake(
+    assert "a.npy: not readable as .npy" in mistake(
         capsys, "restore", tmp_path / "a.npy", "-o", tmp_path / "v.npy", *words
     )
     (tmp_path / "w.safetensors").write_text("not weights")

@@ -25,6 +25,7 @@ from qsim.stream import Sensing, sense
 from quiver.cli import main
 from quiver.data import Light, draw_codes, open_clips
 from quiver.noise import Noise, choose, describe, window_codes
+from quiver.restoring import restorer
 from quiver.run import Settings, settled
 from quiver.samples import TRAINING, Place, Windows, WindowSettings, turned
 from quiver.train import train
@@ -331,6 +332,7 @@ def test_weights_tell_their_noise_without_folders(data, tmp_path):
     told = json.loads(text)
     assert (told["sensor"], told["ppp"], told["bits"]) == ("spad-320x240", [1.0, 10.0], [1])
     assert str(tmp_path) not in text
+    assert restorer(str(tmp_path / "r")).learned, "the map is not there under its bare name, and is not needed"
 
 
 def test_a_run_of_an_earlier_version_is_resumed(data, tmp_path):
