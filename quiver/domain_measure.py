@@ -122,17 +122,24 @@ def _measures(cell: Cell, light: Light) -> bool:
 
 def measure_cell(network: Restorer, methods: Sequence[Restorer], question: Question, light: Light) -> Cell:
     """The network and the best of the methods at one light; ValueError where a clip has no score."""
-    scores = [[score(method, clip, light, question.seed) for clip in question.clips] for method in (network, *methods)]
-    means = [float(np.mean(row)) for row in scores]
-    if not all(map(math.isfinite, means)):
-        raise ValueError(f"{light.label}: a clip has no finite score; is its light all above the peak?")
-    best = int(np.argmax(means[1:]))
+    own, *others = (_mean_score(method, question, light) for method in (network, *methods))
+    if not (math.isfinite(own) and any(map(math.isfinite, others))):
+        raise ValueError(f"{light.label}: the network, or every classical method, fails or has no score on these clips")
+    best = int(np.nanargmax(others))
     clip = question.clips[0]
     assert light.ppp is not None
     place = place_of(light.device(clip.exposure), clip.exposure, light.ppp)
-    return Cell(
-        Path(light.sensor).name, light.ppp, place, round(means[0], 3), methods[best].name, round(means[1 + best], 3)
-    )
+    return Cell(Path(light.sensor).name, light.ppp, place, round(own, 3), methods[best].name, round(others[best], 3))
+
+
+def _mean_score(method: Restorer, question: Question, light: Light) -> float:
+    """Mean over clips; NaN for a classical method that cannot restore such codes, which then does not compete."""
+    try:
+        return float(np.mean([score(method, clip, light, question.seed) for clip in question.clips]))
+    except ValueError:
+        if method.learned:
+            raise
+        return math.nan
 
 
 def score(method: Restorer, clip: Clip, light: Light, seed: int) -> float:

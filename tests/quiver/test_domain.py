@@ -233,6 +233,23 @@ def test_cells_are_measured_stored_and_kept(tiny_dataset, tmp_path, monkeypatch)
         domain_measure.clips_of([tiny_dataset], "none")
 
 
+def test_a_classical_method_that_fails_does_not_compete(tiny_dataset, tmp_path):
+    network = network_restorer(weights(tmp_path), Options(device="cpu"))
+
+    def fails(*_: object) -> None:
+        raise ValueError("no road leads there")
+
+    broken = replace(restorer("naive"), name="broken", fill=fails)
+    question = domain_measure.Question(domain_measure.clips_of([tiny_dataset], "test"), (Light(),))
+    assert (
+        domain_measure.measure_cell(network, [broken, restorer("moment:3")], question, Light()).classical == "moment:3"
+    )
+    with pytest.raises(ValueError, match=r"3\.25 PPP, 3 bit: the network, or every classical method, fails"):
+        domain_measure.measure_cell(network, [broken], question, Light())
+    with pytest.raises(ValueError, match="no road leads there"):
+        domain_measure.measure_cell(replace(network, fill=fails), [restorer("naive")], question, Light())
+
+
 # ---- Commands and the call in Python
 
 
@@ -344,6 +361,20 @@ def test_the_shipped_weights_are_those_that_were_trained():
     assert tensors_digest(path) == NANO_TENSORS
     assert path.stat().st_size < 5_000_000
     assert network_title(load(path)) == "nano (U-Net on aligned frames)"
+
+
+def test_the_shipped_weights_know_their_domain():
+    """Measured cells, not typed ones: the page shows what the file holds, and light it fails at is named."""
+    path = PRETRAINED / "nano.safetensors"
+    scope = domain.read_scope(path, metadata_of(path))
+    page = (Path(__file__).parents[2] / "docs/results/domain.md").read_text(encoding="utf-8")
+    assert "\n".join(domain.table(scope.domain)) in page
+    assert domain.remark("nano", scope, stream()) is None
+    assert "nano is worse than qbp-bm3d on quiver-physical, 3 bit, 0.5 PPP" in str(
+        domain.remark("nano", scope, stream(ppp=0.5))
+    )
+    assert "is worse than" in str(domain.remark("nano", scope, stream(bits=1)))
+    assert "never measured near" in str(domain.remark("nano", scope, stream(bits=4)))
 
 
 def test_places_of_one_gain_are_alike():
