@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 BLENDED = 32  # px: half of what neighbouring tiles share where no overlap makes them exact
 STARTING = 60_000_000  # bytes that torch takes for its kernels when it is used first
 HOURGLASS_BYTES = 1_200  # per pixel of the baseline's hourglass of width 32; 930 measured
-FAR_APART = 1e-5  # of white: tiles that differ by more are warned of
+COUNTS = 0.1  # weight from which a tile's answer is compared with its neighbours'
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,9 @@ class Disagreement:
         return cls(np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32), np.zeros(shape, np.uint8))
 
     def add(self, tile: Tile, restored: Array) -> None:
-        """Take note of what a tile gave, [h, w], where its weight is at least a quarter."""
+        """Take note of what a tile gave, [h, w], where its weight is at least COUNTS."""
         part = (slice(tile.y, tile.y + restored.shape[0]), slice(tile.x, tile.x + restored.shape[1]))
-        counts = tile.weight >= 0.25
+        counts = tile.weight >= COUNTS
         np.minimum(self.low[part], restored, out=self.low[part], where=counts)
         np.maximum(self.high[part], restored, out=self.high[part], where=counts)
         self.times[part] += counts

@@ -24,7 +24,7 @@ from numpy import ndarray as Array
 from quiver.baselines import METHODS
 from quiver.baselines.windows import look_ahead, reflect
 from quiver.data import Codes, suggest
-from quiver.pieces import FAR_APART, Disagreement, plan_pieces
+from quiver.pieces import Disagreement, plan_pieces
 
 if TYPE_CHECKING:
     import torch
@@ -280,8 +280,8 @@ def fill_network(
                 done += 1
                 if progress is not None:
                     progress(done, len(out) * len(pieces.tiles))
-    rms, most = apart.measured()
-    if most > FAR_APART:
+    if not pieces.exact:  # tiles that agree may still differ from the whole frame
+        rms, most = apart.measured()
         more = f"; --memory {-(-pieces.needed // 10**6)}MB restores it whole" if pieces.needed else ""
         warnings.warn(
             f"{codes.name}: {options.memory / 1e6:.0f} MB hold no frame of {height} x {width} px; cut into "
