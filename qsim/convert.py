@@ -8,7 +8,7 @@ from typing import Any
 
 from qsim import checks, export, files, formats
 from qsim.clip import Clip
-from qsim.console import bar, command, output
+from qsim.console import bar, command, output, refuse_idle
 from qsim.dataset import Dataset
 from qsim.footage import TRANSFERS, Hints
 from qsim.recipe import SPLITS
@@ -75,11 +75,28 @@ def _is_stream(path: Path) -> bool:
     return path.suffix == ".json" and path.is_file() and "ppp_factor" in files.read_json(path)
 
 
+_READING = ("layout", "frame_rate", "exposure", "height", "width", "bits", "stretched", "channel", "columns",
+            "variable", "sensor", "ppp", "split")  # fmt: skip
+
+
+def _refuse_what_cannot_act(args: argparse.Namespace, kind: str, light: bool) -> None:
+    """A `ValueError` for options of writing that this kind of output has no use for."""
+    where = f"{args.output}, a {kind} of {'light' if light else 'codes'}"
+    if not (light and kind in ("mp4", "png")):
+        refuse_idle(args, where, ["transfer"])
+    if kind != "mp4":
+        refuse_idle(args, where, ["lossy"])
+
+
 def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
+    refuse_idle(args, f"{args.input} is ours and says it itself", _READING)
+    if args.flip != "none":
+        raise ValueError(f"{args.input} is ours and says it itself: --flip changes nothing here; leave it out")
     kind = args.to or _SUFFIXES.get(args.output.suffix)
     if kind is None:
         known = ", ".join(sorted(export.EXPORTS))
         raise ValueError(f"{args.output}: say what to write with --to: {known}")
+    _refuse_what_cannot_act(args, kind, args.input.suffix != ".json")
     wanted = export.Export(kind, args.transfer or "gamma 2.2", args.white, not args.lossy)
     if args.white is not None and (kind not in ("mp4", "png") or args.input.suffix == ".json"):
         raise ValueError("--white: is of light written as mp4 or png; leave it out")
@@ -100,6 +117,7 @@ def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
 
 
 def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
+    refuse_idle(args, f"{args.input} is read, not written for others", ["to", "lossy"])
     if args.frame_rate is None:
         raise ValueError(f"{args.input}: files do not say how fast the capture was; add --frame-rate, as in 2000")
     hints = Hints(args.layout, args.height, args.width, args.bits, args.transfer, args.channel, args.flip, args.columns,
@@ -115,8 +133,6 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
                 clip = formats.to_clip(footage, target, capture, force=args.force, progress=progress)
                 made.append((clip.path, f"{_size(clip)}, light of {footage.source}; {formats.saturation_line(clip)}"))
                 continue
-            if args.white is not None:
-                raise ValueError(f"{source}: --white is of light, this holds {footage.bits}-bit codes; leave it out")
             stream = formats.to_stream(footage, target, capture, force=args.force, progress=progress)
             made.append((stream.path, f"{_size(stream)}, codes of {stream.bits} bits, {footage.source}"))
     return made

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy import ndarray as Array
@@ -103,12 +103,27 @@ def read(path: Path, hints: Hints | None = None) -> Footage:
         raise ValueError(f"layout {layout!r}: known are {', '.join(LAYOUTS)}")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file")
-    if hints.variable is not None and layout != "mat":
-        raise ValueError(f"{path}: --variable names an array of a .mat file, and this is {layout}; leave it out")
-    footage = LAYOUTS[layout](path, hints)
+    asked: set[str] = set()
+    footage = LAYOUTS[layout](path, cast(Hints, _Watched(hints, asked)))
+    for field in fields(Hints):
+        given = getattr(hints, field.name) != field.default and field.name not in ("layout", "flip", "columns")
+        if given and field.name not in asked:
+            raise ValueError(f"{path}: --{field.name} changes nothing for {footage.source}; leave it out")
     if layout in ASSUMED:
         footage = stated(footage, *ASSUMED[layout])
     return turned(footage, hints)
+
+
+@dataclass(frozen=True)
+class _Watched:
+    """Hints that note which of them a reader asks for: one that no reader asks for cannot act."""
+
+    hints: Hints
+    asked: set[str]
+
+    def __getattr__(self, name: str) -> Any:
+        self.asked.add(name)
+        return getattr(self.hints, name)
 
 
 @dataclass(frozen=True)
@@ -142,6 +157,9 @@ def to_clip(
         raise ValueError(
             f"{path}: {footage.source} holds codes, not light; name a stream to make, as in out/capture.npy"
         )
+    if capture.sensor is not None or capture.ppp is not None:
+        name = "sensor" if capture.sensor is not None else "ppp"
+        raise ValueError(f"{path}: {footage.source} holds light, which no sensor made; leave --{name} out")
     frames, height, width = footage.shape
     meta: dict[str, Any] = {
         "shape": [frames, height, width],
@@ -193,6 +211,10 @@ def to_stream(
     """Codes as a stream beside no clip: PATH.npy and PATH.json. The sensor is the given one, else an ideal counter."""
     if footage.bits is None:
         raise ValueError(f"{path}: {footage.source} holds light, not codes; name a clip folder to make, as in out/clip")
+    if capture.split is not None:
+        raise ValueError(f"{path}: --split is stored in clips, and {footage.source} becomes a stream; leave it out")
+    if capture.ppp is not None and capture.sensor is None:
+        raise ValueError(f"{path}: --ppp sets the gain of a named sensor; name it with --sensor, or leave --ppp out")
     from qsim import codes, devices
 
     stem = path.with_suffix("") if path.suffix in (".npy", ".json") else path

@@ -119,16 +119,17 @@ def picture(path: Path, shape: tuple[int, int, int], raw: Any, dtype: np.dtype, 
 
     `ValueError` if codes seem to be stretched to 0 ... 255 and the user did not say so: the counts would be lost.
     """
-    one_bit = dtype.kind == "b"
+    one_bit = dtype.kind == "b"  # then --bits and --stretched have nothing to say
     if one_bit or hints.bits is not None:
         bits = 1 if one_bit else int(hints.bits or 0)
+        stretched = not one_bit and hints.stretched
         top = 2**bits - 1
 
         def read_codes(start: int, stop: int) -> Array:
             values = raw(start, stop)
             if values.ndim == 4:
                 raise ValueError(f"{path}: colour pictures hold no codes")
-            if hints.stretched and not one_bit:
+            if stretched:
                 return _unstretch(path, values, top, start)
             return checked_codes(path, values, bits, start)
 
