@@ -201,7 +201,7 @@ def _add_sense(sub: Any) -> None:
     )  # fmt: skip
     parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="clips or data sets")
     parser.add_argument(
-        "--sensor", default="quiver-physical", help="a name of `qsim doctor --devices`, or a .toml file"
+        "--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default: quiver-physical)"
     )
     parser.add_argument("--bits", type=checked(checks.bits), help="bits per code (default: the sensor's own)")
     parser.add_argument("--ppp", type=_numbers, help="photons per pixel and code over the whole clip; several: 3.25,26")
@@ -234,7 +234,7 @@ def _run_sense(args: argparse.Namespace) -> int:
     if args.name and len(levels) > 1:
         raise ValueError(f"--name {args.name}: one name for {len(levels)} light levels; leave it out")
     wanted = [
-        stream.Sensing(args.sensor, args.bits, seed=args.seed, name=args.name, group=args.group,
+        stream.Sensing(args.sensor or "quiver-physical", args.bits, seed=args.seed, name=args.name, group=args.group,
                        diffraction=args.diffraction, defects=args.defects, slices=args.slices, **level)
         for level in levels
     ]  # fmt: skip
@@ -273,6 +273,9 @@ def _light(meta: dict[str, Any]) -> dict[str, Any]:
 def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
     from qsim import stream
 
+    refuse_idle(args, "--replay draws what is stored", ["group", "diffraction", "defects", "force"])
+    if args.slices != 1:
+        raise ValueError("--replay draws what is stored: --slices changes nothing here; leave it out")
     name, _, number = args.replay.rpartition(":")
     if not number.isdigit() or (not name and len(clips) != 1):
         raise ValueError(f"--replay {args.replay}: expected CLIP:FRAME, as in fan_0003:7")
@@ -281,7 +284,8 @@ def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
         raise ValueError(f"--replay {args.replay}: no clip {name} among {', '.join(clip.name for clip in clips)}")
     clip = chosen[0]
     known = clip.streams
-    stored = clip.stream(known[0] if len(known) == 1 and not args.name else args.name or sensing.stream_name)
+    named = args.sensor or args.bits or args.ppp or args.lux or args.seed  # each is part of a stream's name
+    stored = clip.stream(known[0] if len(known) == 1 and not args.name and not named else sensing.stream_name)
     drawn, kept = stream.replay(clip, stored, int(number))
     differ = int((drawn != kept).sum())
     found = {"clip": clip.name, "stream": stored.name, "frame": int(number), "pixels": drawn.size, "differ": differ}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,8 @@ def _cluster(args: argparse.Namespace) -> Any:
                 f"--{option}: changes nothing with --cluster: number, memory and lifetime of its workers are set where "
                 f"they are started; leave it out and use `dask worker --{instead}` there"
             )
+    if not re.fullmatch(r"(\w+://)?[^/\s]+:\d+", args.cluster):
+        raise ValueError(f"--cluster {args.cluster}: is not the address of a scheduler, as tcp://10.0.0.1:8786 is")
     from qsim.cluster import Cluster
 
     if not args.cluster.startswith("tls://"):
