@@ -41,7 +41,7 @@ def check(path: Path, progress: Progress | None = None) -> Verdict:
 
     `FileNotFoundError` or `ValueError` if there is no such thing. `progress` is called with (done, total).
     """
-    if (path / "dataset.json").is_file():
+    if (path / "dataset.json").is_file() or (path / "jobs").is_dir():
         dataset = Dataset.open(path)
         return Verdict(dataset.verify(progress), dataset.unsealed())
     if (path / "clip.json").is_file() or not path.with_suffix(".json").is_file():

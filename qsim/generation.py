@@ -252,16 +252,20 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
         if job.name not in old:
             raise ValueError(f"{folder}: was made from another recipe, without the clip {job.name}; use another folder")
         if old[job.name]["digest"] == job.digest_with():
-            raise ValueError(
-                f"{folder}: was begun by an earlier version, whose psnr meant dB below the 99.9th percentile; now it "
-                "is dB below white, and one data set holds one kind: finish it with that version, or use another folder"
-            )
+            raise ValueError(_of_earlier_version(folder))
         if old[job.name]["digest"] != job.digest:
             raise ValueError(f"{folder}: its clip {job.name} was asked for with other settings; use another folder")
     extra = sorted(set(old) - {job.name for job in recipe.jobs})
     if extra:
         raise ValueError(f"{folder}: holds the clip {extra[0]}, which is not in this recipe; use another folder")
     return ()
+
+
+def _of_earlier_version(folder: Path) -> str:
+    return (
+        f"{folder}: was begun by an earlier version, whose psnr meant dB below the 99.9th percentile; now it "
+        "is dB below white, and one data set holds one kind: finish it with that version, or use another folder"
+    )
 
 
 def _check_reads(recipe: Recipe, folder: Path) -> None:
@@ -293,13 +297,15 @@ def _check_reads(recipe: Recipe, folder: Path) -> None:
 
 def _check_records(recipe: Recipe, folder: Path) -> None:
     """Without a manifest the records say whose folder this is: `ValueError` if there are some and none is of ours."""
-    digests = {job.name: job.digest for job in recipe.jobs}
-    found = []
-    for path in sorted((folder / "jobs").glob("*.json")):
+    digests = {}
+    for path in (folder / "jobs").glob("*.json"):
         with contextlib.suppress(ValueError):
-            found.append(files.read_json(path).get("digest") == digests.get(path.stem))
-    if found and not any(found):
-        raise ValueError(f"{folder}: none of its {len(found)} finished clips is of this recipe; use another folder")
+            digests[path.stem] = files.read_json(path).get("digest")
+    asked = [job for job in recipe.jobs if job.name in digests]
+    if any(digests[job.name] == job.digest_with() for job in asked):
+        raise ValueError(_of_earlier_version(folder))
+    if digests and not any(digests[job.name] == job.digest for job in asked):
+        raise ValueError(f"{folder}: none of its {len(digests)} finished clips is of this recipe; use another folder")
 
 
 @contextlib.contextmanager

@@ -56,19 +56,20 @@ def redraw(path: Path, progress: Progress | None = None) -> list[Redrawn]:
     if not found:
         raise ValueError(f"{path}: holds no stream to draw again")
     results = []
-    for done, (clip, json_path, cure) in enumerate(found, 1):
-        results.append(_redrawn(clip, json_path, cure))
+    for done, (clip, json_path, again) in enumerate(found, 1):
+        results.append(_redrawn(clip, json_path, again))
         if progress is not None:
             progress(done, len(found))
     return results
 
 
-def _redrawn(clip: Clip, json_path: Path, cure: str) -> Redrawn:
+def _redrawn(place: Path, json_path: Path, dataset: Path | None) -> Redrawn:
+    """One stream of the clip at `place` drawn again; `dataset` is whose recipe made it, if one did."""
     path = json_path.with_suffix(".npy")
     try:
-        stream = Stream.open(json_path)
+        clip, stream = Clip.open(place), Stream.open(json_path)
         frames, height, width = stream.shape
-        found = Redrawn(path, frames * height * width, cure=cure)
+        found = Redrawn(path, frames * height * width, cure=_cure(stream, dataset))
         draw = dataclasses.replace(stored(stream), engine="reference")
         step = max(1, _BLOCK_PIXELS // (height * width * draw.planes))
         start = 0
@@ -83,23 +84,34 @@ def _redrawn(clip: Clip, json_path: Path, cure: str) -> Redrawn:
     return found
 
 
-def _streams(path: Path) -> list[tuple[Clip, Path, str]]:
-    """Clip, description and cure of every stream below a path."""
+def _cure(stream: Stream, dataset: Path | None) -> str:
+    """What to do about wrong codes, so that afterwards `check` is content."""
+    if dataset is None:
+        return "sense it again with --force"
+    if "drawn_by" in stream.meta:
+        return f"delete the file and run `qsim generate RECIPE -o {dataset} --repair`"
+    # `generate` continues no data set of the versions whose psnr was another
+    return f"the right one: `qsim sense {dataset} --name NEW` with its settings, or generate all in another folder"
+
+
+def _streams(path: Path) -> list[tuple[Path, Path, Path | None]]:
+    """Clip, description and, where its recipe made it, data set of every stream below a path."""
     if (path / "dataset.json").is_file():
         names = Dataset.open(path).names()
         return [each for name in names for each in _of_clip(path / "clips" / name, record_path(path, name), path)]
     if (path / "clip.json").is_file() or not path.with_suffix(".json").is_file():
+        if not (path / "clip.json").is_file():
+            Clip.open(path)  # says what is missing
         return _of_clip(path)
     return [each for each in _of_clip(path.parent.parent) if each[1] == path.with_suffix(".json")]
 
 
-def _of_clip(path: Path, record: Path | None = None, dataset: Path | None = None) -> list[tuple[Clip, Path, str]]:
-    clip = Clip.open(path)
+def _of_clip(
+    path: Path, record: Path | None = None, dataset: Path | None = None
+) -> list[tuple[Path, Path, Path | None]]:
     made = set() if record is None else _made_by_recipe(record)
-    again = "sense it again with --force"
-    repair = f"delete the file and run `qsim generate RECIPE -o {dataset} --repair`"
     return [
-        (clip, json_path, repair if json_path.stem in made else again)
+        (path, json_path, dataset if json_path.stem in made else None)
         for json_path in sorted((path / "streams").glob("*.json"))
     ]
 
@@ -119,5 +131,6 @@ def lines(found: list[Redrawn]) -> list[str]:
     drawn = [one for one in found if one.why is None]
     wrong = sum(one.wrong for one in drawn)
     total = sum(one.codes for one in drawn)
-    verdict = f"{wrong} hold wrong codes" if wrong else "all hold the reference's codes"
+    right = "all hold the reference's codes" if drawn else "so nothing is known of them"
+    verdict = f"{wrong} hold wrong codes" if wrong else right
     return [*said, f"drawn again: {len(drawn)} of {len(found)} streams, {total} codes; {verdict}"]

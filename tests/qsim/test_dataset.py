@@ -21,6 +21,7 @@ from fakes import RECIPE, die_on_tumble, fail_on_tumble, hoard_on_tumble, make, 
 from forks import forked, killed_at
 
 from qsim import files, jobs, recipe, stream, textures
+from qsim.checking import check
 from qsim.dataset import Dataset
 from qsim.generation import Options, Summary, generate, watching
 from qsim.jobs import Make
@@ -439,6 +440,8 @@ def test_a_damaged_manifest_is_made_again(tmp_path: Path, undisturbed: dict[str,
     with pytest.raises(ValueError, match=r"dataset\.json: not readable as JSON"):
         Dataset.open(tmp_path / "d")
     manifest.unlink()
+    with pytest.raises(FileNotFoundError, match=r"dataset\.json: missing; `qsim generate"):
+        check(tmp_path / "d")
     generate(SMALL, tmp_path / "d", HERE, make=make)
     assert tree(tmp_path / "d") == undisturbed
 

@@ -9,7 +9,7 @@ import pytest
 from clips import write_clip, write_dataset
 from scipy.special import gammaln
 
-from qsim import cli, redraw
+from qsim import cli, files, redraw
 from qsim.clip import Clip
 from qsim.drawing import prepare, stored
 from qsim.generation import Options, generate
@@ -166,7 +166,7 @@ def test_streams_of_other_origin_and_damaged_ones_are_said_not_passed(clip, tmp_
     assert cli.main(["check", str(own.path), "--redraw"]) == 0
     out = capsys.readouterr().out
     assert "imported.npy: not drawn again: its description holds no seed: it was not drawn from a clip of ours" in out
-    assert "drawn again: 0 of 1 streams, 0 codes" in out
+    assert "drawn again: 0 of 1 streams, 0 codes; so nothing is known of them" in out
     stream, _ = sense(own, Sensing("quiver-physical", ppp=3.0, name="cut"))
     stream.path.write_bytes(stream.path.read_bytes()[:-20])
     assert cli.main(["check", str(own.path), "--redraw"]) == 1
@@ -199,6 +199,24 @@ def test_a_data_set_is_drawn_again_clip_by_clip(tmp_path, capsys):
     assert "3 of 3 streams" in out
 
 
+def test_a_damaged_clip_is_named_and_the_others_are_drawn_again(tmp_path, capsys):
+    """The damage of one clip ended the command, and what `check` had found in others was lost."""
+    path = write_dataset(tmp_path / "set", {"train": 3})
+    assert cli.main(["sense", str(path), "--bits", "3", "--ppp", "3.25", "-o", "s"]) == 0
+    about = path / "clips" / "train_1" / "clip.json"
+    about.write_text(about.read_text() + "x")
+    (path / "clips" / "train_2" / "streams" / "s.npy").unlink()
+    capsys.readouterr()
+    assert cli.main(["check", str(path), "--redraw"]) == 1
+    out = capsys.readouterr().out
+    assert f"{about}: not readable as JSON" in out
+    assert f"{path / 'clips' / 'train_2' / 'streams' / 's.npy'}: missing" in out
+    assert "train_1/streams/s.npy: not drawn again" in out
+    assert "drawn again: 1 of 3 streams" in out
+    assert cli.main(["check", str(about.parent), "--redraw"]) == 1
+    assert "drawn again: 0 of 1 streams, 0 codes; so nothing is known of them" in capsys.readouterr().out
+
+
 def test_what_is_said_of_a_recipes_streams_mends_them(tmp_path, capsys):
     """Every file vouches for the wrong codes; with the file gone, `generate --repair` draws them again."""
     settings = Settings(frames=14, height=36, width=44, frame_rate=2000.0)
@@ -221,3 +239,26 @@ def test_what_is_said_of_a_recipes_streams_mends_them(tmp_path, capsys):
     generate(recipe, path, Options(workers=0, repair=True), make=lambda job, target: make(job, target, False))
     assert stream.is_file()
     assert cli.main(["check", str(path), "--redraw"]) == 0
+
+
+def test_what_is_said_of_a_recipes_streams_of_an_earlier_version_can_be_done(tmp_path, capsys):
+    """`generate --repair` refuses data sets of earlier versions: there the right codes get another name."""
+    path = write_dataset(tmp_path / "set", {"train": 1})
+    assert cli.main(["sense", str(path), "--bits", "3", "--ppp", "3.25", "-o", "s"]) == 0
+    clip = Clip.open(path / "clips" / "train_0")
+    stored_again(clip, clip.stream("s"), clip.stream("s").codes() ^ 1, drawn_by=None)
+    record = path / "jobs" / "train_0.json"
+    described = json.loads(record.read_text())
+    described["streams"] = {"s": files.sha256(clip.path / "streams" / "s.json")}
+    digest = files.write_json(record, described)
+    manifest = json.loads((path / "dataset.json").read_text())
+    manifest["jobs"]["train_0"]["record"] = digest
+    files.write_description(path / "dataset.json", manifest)
+    capsys.readouterr()
+    assert cli.main(["check", str(path), "--redraw"]) == 1
+    out = capsys.readouterr().out
+    assert "--repair" not in out
+    assert f"the right one: `qsim sense {path} --name NEW` with its settings, or generate all in another folder" in out
+    assert cli.main(["sense", str(path), "--bits", "3", "--ppp", "3.25", "--name", "right"]) == 0
+    assert cli.main(["check", str(path)]) == 0
+    assert cli.main(["check", str(clip.path / "streams" / "right.json"), "--redraw"]) == 0
