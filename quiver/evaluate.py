@@ -9,6 +9,7 @@ static object: static.py.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -212,7 +213,7 @@ def evaluate(
     for clip in clips:
         if not scored_frames(len(clip), plan.published):
             raise ValueError(f"clip {clip.name}: {len(clip)} frames are too few, the published windows have 11")
-    known = {row.key: row for row in begin(plan, out)} if out is not None else {}
+    known = {row.key: row for row in begin(plan, out, clips)} if out is not None else {}
     rows: list[Row] = []
     total = len(plan.lights) * len(clips) * len(methods)
     for light in plan.lights:
@@ -247,17 +248,26 @@ def in_memory(codes: Codes) -> Codes:
     return replace(codes, read=array_codes(codes.read(0, codes.shape[0]), codes.sensor, codes.exposure).read)
 
 
-def begin(plan: Plan, out: Path) -> list[Row]:
-    """Make the folder of an evaluation, or take the finished rows of an interrupted one."""
+def content_digest(plan: Plan, clips: Sequence[Clip]) -> str:
+    """SHA-256 of what is scored: the descriptions of the clips, which hold checksums, and of the stored stream."""
+    described = [[clip.meta, None if plan.stream is None else clip.stream(plan.stream).meta] for clip in clips]
+    return hashlib.sha256(json.dumps(described, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def begin(plan: Plan, out: Path, clips: Sequence[Clip]) -> list[Row]:
+    """Make the folder of an evaluation, or take the finished rows of an interrupted one of the same content."""
     path = out / "plan.json"
-    wanted = {"format": PLAN_FORMAT} | plan.to_dict()
+    wanted = {"format": PLAN_FORMAT} | plan.to_dict() | {"content_sha256": content_digest(plan, clips)}
     if not path.exists():
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise FileExistsError(f"{out} exists and is no evaluation; choose another -o")
         out.mkdir(parents=True, exist_ok=True)
         write_json(path, wanted)
-    elif read_json(path) != wanted:
-        raise FileExistsError(f"{out} holds another evaluation; choose another -o, or start anew with --force")
+    elif (found := read_json(path)) != wanted:
+        same = {key: value for key, value in found.items() if key != "content_sha256"}
+        changed = {"content_sha256": wanted["content_sha256"]} | same == wanted
+        what = "rows of clips or streams that were changed since" if changed else "another evaluation"
+        raise FileExistsError(f"{out} holds {what}; choose another -o, or start again with --force")
     rows = out / "rows.jsonl"
     if not rows.exists():
         return []

@@ -13,7 +13,9 @@ import pytest
 from clips import ClipMaker
 from numpy import ndarray as Array
 
+from qsim import files
 from qsim.clip import RELATIVE, ClipWriter
+from qsim.stream import Sensing, sense
 from quiver import table
 from quiver.data import Codes, Light, array_codes, ideal_counter, open_clips, sensed, truth
 from quiver.evaluate import Plan, Row, append, begin, evaluate, finished, scored_frames, truth_psnr
@@ -101,7 +103,27 @@ def test_an_interrupted_evaluation_goes_on(tiny_dataset, tmp_path):
     with pytest.raises(FileExistsError, match="holds another evaluation"):
         evaluate(replace(plan, seed=1), [method("slow", count)], out)
     with pytest.raises(FileExistsError, match="is no evaluation"):
-        begin(plan, tmp_path)
+        begin(plan, tmp_path, open_clips(str(tiny_dataset), "test"))
+
+
+@pytest.mark.parametrize("changed", ["codes", "light"])
+def test_an_evaluation_of_other_codes_or_another_truth_is_not_continued(make_clip, tmp_path, changed):
+    """Rows of a stream that was sensed again, or of a clip that was made again, are not mixed with new ones."""
+    clip = make_clip(frames=4, height=12, width=16)
+    sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25, name="s"))
+    plan, methods = Plan(str(clip.path), stream="s"), [method("ones", lambda codes: np.ones(codes.shape))]
+    evaluate(plan, methods, tmp_path / "t")
+    before = (tmp_path / "t" / "rows.jsonl").read_bytes()
+    evaluate(plan, methods, tmp_path / "t")
+    if changed == "codes":
+        sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25, seed=5, name="s"), force=True)
+    else:
+        description = clip.path / "clip.json"
+        meta = json.loads(description.read_text()) | {"scene": {"family": "sliding", "seed": 9}}
+        files.write_description(description, meta)
+    with pytest.raises((FileExistsError, ValueError), match="changed since"):
+        evaluate(plan, methods, tmp_path / "t")
+    assert (tmp_path / "t" / "rows.jsonl").read_bytes() == before
 
 
 def test_a_failure_keeps_its_row_and_reason(tiny_dataset, tmp_path):
