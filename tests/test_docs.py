@@ -203,7 +203,7 @@ def test_every_recipe_of_the_library_is_read(path):
     """Those that no page runs because they are too large included."""
     from qsim import recipe
 
-    assert len(recipe.load(path).jobs) >= 4
+    assert recipe.load(path).jobs
 
 
 # Links, trees, the site
