@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _DECADES, _PER_DECADE = 8, 128  # of the grid: linear interpolation between its points is good to 4e-5
 _FLAT = 1e-14  # change of the cdf per doubling of light at which a sensor is taken as saturated
+_DOUBLINGS = 44  # of light above white in which a sensor must saturate
 _NEVER = -1e290  # stands for log 0 where it may be multiplied by 0
 _STEPS = 100  # of root finding; 10 are usual
 _CHUNK = 1 << 12  # different histograms at a time
@@ -71,8 +72,16 @@ def _grid(sensor: Sensor, exposure: float) -> _Grid:
     end, brightest = sensor.white(exposure), sensor.brightest(exposure)
     if brightest <= 0:
         raise ValueError(f"{type(sensor).__name__}: dark counts alone exceed the light above which the mean code falls")
-    while 2 * end < brightest and np.ptp(sensor.cdf(np.array([end, 2 * end]), exposure), axis=0).max() > _FLAT:
+    dark = sensor.cdf(np.array([0.0]), exposure)
+    for _ in range(_DOUBLINGS):
+        if 2 * end >= brightest:
+            break
+        here, there = sensor.cdf(np.array([end, 2 * end]), exposure)
+        if np.ptp([here, there], axis=0).max() <= _FLAT < np.abs(here - dark).max():  # a high threshold starts flat
+            break
         end *= 2
+    else:
+        end = sensor.white(exposure)  # no light changes its codes
     saturates = 2 * end < brightest
     end = end if saturates else brightest
     photons = np.append(0.0, np.geomspace(end * 10.0**-_DECADES, end, _DECADES * _PER_DECADE + 1))

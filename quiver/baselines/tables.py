@@ -18,6 +18,7 @@ from qsim.sensor import Sensor
 
 POINTS = 4096  # of a table; linear interpolation then errs by less than 1e-6 of the full scale
 TOGETHER = 1 << 22  # probabilities held at a time
+DOUBLINGS = 44  # of light in which a response must end
 FLAT = 1e-7  # a response this close to its top (relative to the full scale) has ended
 
 
@@ -29,23 +30,55 @@ class ResponseTable:
     mean: Array  # [G], codes, strictly rising
     variance: Array  # [G], codes^2
     top: int  # the largest code of the sensor
+    sensor: str  # in words
 
     def cap(self, samples: int) -> float:
-        """The largest estimate [photons] from the mean of `samples` codes: half a count below saturation."""
+        """The largest estimate [photons] from the mean of `samples` codes: half a count below saturation.
+
+        `ValueError` where that is no light at all.
+        """
+        if self.mean[-1] - 0.5 / samples <= self.mean[0]:
+            raise ValueError(
+                f"{self.sensor}: its mean code rises from {self.mean[0]:.4g} in the dark to {self.mean[-1]:.4g} at "
+                f"{self.photons[-1]:.4g} photons, which the mean of {samples} codes does not resolve; use a longer "
+                "window, or the method naive"
+            )
         return float(np.interp(self.mean[-1] - 0.5 / samples, self.mean, self.photons))
 
     def invert(self, mean_code: Array, samples: int) -> Array:
-        """Photons whose mean code is this; 0 below the mean of a dark pixel, cap(samples) at saturation. Any shape."""
+        """Photons whose mean code is this; 0 below the mean of a dark pixel, cap(samples) at saturation. Any shape.
+
+        `ValueError` as for `cap`.
+        """
+        self.cap(samples)
         return np.interp(np.minimum(mean_code, self.mean[-1] - 0.5 / samples), self.mean, self.photons)
 
 
 def brightest(sensor: Sensor, exposure: float) -> float:
-    """Photons at which the mean code stops rising: at the top code, or before (full well, dead time)."""
-    top = sensor.levels - 1
-    photons = sensor.white(exposure) * 2.0 ** np.arange(-4, 40)
-    mean = sensor.mean(photons, exposure)
-    ended = (top - mean < FLAT * top) | (np.diff(mean, append=mean[-1]) < FLAT * top)
-    return float(photons[np.argmax(ended)])
+    """Photons at which the mean code stops rising: at the top code, or before (full well, dead time).
+
+    `ValueError` for a sensor whose mean code does not rise from darkness.
+    """
+    top, limit = sensor.levels - 1, sensor.brightest(exposure)
+
+    def mean_at(photons: float) -> float:
+        return float(sensor.mean(np.array([photons]), exposure)[0])
+
+    dark, photons = mean_at(0.0), sensor.white(exposure) / 16
+    here = mean_at(photons) if photons < limit else dark
+    for _ in range(DOUBLINGS):  # one by one: the brightest light takes the longest tables
+        if 2 * photons >= limit:
+            if mean_at(max(limit, 0.0)) > dark:
+                return limit
+            break
+        there = mean_at(2 * photons)
+        risen = here - dark > FLAT * top  # a high threshold keeps codes dark for long
+        if top - here < FLAT * top or (risen and there - here < FLAT * top):
+            if here > dark:
+                return photons
+            break
+        photons, here = 2 * photons, there
+    raise ValueError(f"{sensor}: its mean code is {dark:.4g} in the dark and does not rise with light")
 
 
 def pieces(photons: Array, values: int) -> list[Array]:
@@ -56,11 +89,12 @@ def pieces(photons: Array, values: int) -> list[Array]:
 def response_table(sensor: Sensor, exposure: float, points: int = POINTS) -> ResponseTable:
     """Tabulate a sensor's response from darkness to the end of its rise.
 
-    Where the response falls again (a paralyzable counter) the table holds its rising branch only.
+    Where the response falls again (a paralyzable counter) the table holds its rising branch only. `ValueError` for a
+    sensor whose mean code does not rise.
     """
     photons = np.linspace(0, np.sqrt(brightest(sensor, exposure)), points) ** 2
     parts = pieces(photons, sensor.levels)
     mean = np.concatenate([sensor.mean(part, exposure) for part in parts])
     variance = np.concatenate([sensor.variance(part, exposure) for part in parts])
     rising = np.concatenate([[True], mean[1:] > np.maximum.accumulate(mean)[:-1]])
-    return ResponseTable(photons[rising], mean[rising], variance[rising], sensor.levels - 1)
+    return ResponseTable(photons[rising], mean[rising], variance[rising], sensor.levels - 1, str(sensor))
