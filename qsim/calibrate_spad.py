@@ -55,7 +55,7 @@ def calibrate_spad(
             values["dark_count_rate"] = Value(0.0, 0.0, 3.688879454113936 / time, "1/s", "no dark count: upper bound")
             warnings.append("no dark count at all: the dark-count rate has an upper bound only")
     else:
-        warnings.append("no dark frames: dark counts are taken as 0 and end up in the efficiency")
+        warnings.append("no dark frames: dark counts are taken as 0 and end up in the efficiency and in PRNU")
     if flats:
         warnings += _saturation(flats)
         values |= _efficiency(flats, darks, response, 0.0 if fano is None else fano.variance)

@@ -10,7 +10,7 @@ import contextlib
 import errno
 import os
 import threading
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -210,13 +210,13 @@ def write_manifest(recipe: Recipe, folder: Path) -> None:
     lock.acquire(wait=True)
     with lock:
         files.sweep(folder / "dataset.json")
-        jobs = {}
+        jobs, failures = {}, _failures(folder, recipe.jobs)
         for job in recipe.jobs:
             entry: dict[str, Any] = {"split": job.split, "scene": job.scene, "digest": job.digest, "state": "missing"}
             if record_path(folder, job.name).is_file():
                 entry |= {"state": "done", "record": files.sha256(record_path(folder, job.name))}
-            elif (folder / "failed" / f"{job.name}.json").is_file():
-                entry |= {"state": "failed", "error": files.read_json(folder / "failed" / f"{job.name}.json")["error"]}
+            elif job.name in failures:
+                entry |= {"state": "failed", "error": failures[job.name]}
             jobs[job.name] = entry
         manifest = {
             "format_version": FORMAT_VERSION,
@@ -334,12 +334,16 @@ def _is_data_set(folder: Path) -> bool:
     return all(item.name in FOLDERS and item.is_dir() for item in folder.iterdir())
 
 
-def _failures(folder: Path, jobs: list[Job]) -> dict[str, str]:
+def _failures(folder: Path, jobs: Sequence[Job]) -> dict[str, str]:
+    """Why jobs failed before; a note that cannot be read counts as one, and --retry makes the job again."""
     found = {}
     for job in jobs:
         path = failure_path(folder, job.name)
         if path.is_file():
-            found[job.name] = str(files.read_json(path).get("error"))
+            try:
+                found[job.name] = str(files.read_json(path).get("error", f"{path}: does not say why"))
+            except ValueError as error:
+                found[job.name] = files.wording(error)
     return found
 
 

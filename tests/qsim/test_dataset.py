@@ -304,6 +304,22 @@ def test_a_failing_job_is_listed_and_retried(tmp_path: Path, undisturbed: dict[s
     assert tree(tmp_path / "d") == undisturbed
 
 
+@pytest.mark.parametrize(
+    "note", ["{}", "[]", "x", "", '{"error": [1, {}]}', '{"error": null}', '{"why": "?"}', "[" * 999]
+)
+def test_a_note_of_failure_that_cannot_be_read_stops_nothing(tmp_path: Path, undisturbed: dict[str, bytes], note: str):
+    """An empty object ended `generate` in a KeyError, other damage in one line for good, with --retry too or not."""
+    folder = tmp_path / "d"
+    generate(SMALL, folder, HERE, make=make)
+    (folder / "jobs" / "fan_0001.json").unlink()
+    (folder / "failed" / "fan_0001.json").write_text(note)
+    summary = generate(SMALL, folder, HERE, make=make)
+    assert (summary.done, list(summary.failed)) == (2, ["fan_0001"])
+    assert Dataset.open(folder).missing == ["fan_0001"]
+    assert generate(SMALL, folder, Options(workers=0, retry=True), make=make).made == 1
+    assert tree(folder) == undisturbed
+
+
 def test_clips_that_were_made_somewhere_else_are_named(tmp_path: Path):
     """Workers whose folder of that name is another one say "done" and mean it."""
     generate(SMALL, tmp_path / "there", HERE, make=make)
