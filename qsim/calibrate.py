@@ -22,7 +22,7 @@ from numpy import ndarray as Array
 
 from qsim.calibrate_flats import qis_flats
 from qsim.calibrate_pattern import measure_pattern
-from qsim.calibrate_values import Calibration, Value, log_interval, normal_interval, root_interval
+from qsim.calibrate_values import Calibration, Value, log_interval, normal_interval, odd_efficiency, root_interval
 from qsim.qis import QIS
 from qsim.stacks import Stack
 
@@ -328,6 +328,8 @@ def calibrate_qis(darks: Sequence[Stack], flats: Sequence[Stack], *, bits: int) 
     p_value, residuals = goodness([*darks, *flats], fit.fitted, fit.parameters.size)
     if p_value < 1e-3:
         warnings.append(f"the fitted histograms do not describe the data (p = {p_value:.1g}): the model is wrong here")
+    if "quantum_efficiency" in values:
+        warnings += odd_efficiency(values["quantum_efficiency"])
     return Calibration("QIS", bits, values, p_value, tuple(warnings), residuals)
 
 

@@ -21,7 +21,7 @@ from numpy import ndarray as Array
 from qsim.calibrate import NODES, WEIGHTS, check_stacks, goodness
 from qsim.calibrate_flats import Response, dark_rates, spad_flats
 from qsim.calibrate_pattern import BY_FLAT, HOT, measure_pattern
-from qsim.calibrate_values import Z95, Calibration, Value, normal_interval
+from qsim.calibrate_values import Z95, Calibration, Value, normal_interval, odd_efficiency
 from qsim.spad import CountingSPAD
 from qsim.stacks import Stack
 
@@ -59,6 +59,8 @@ def calibrate_spad(
     if flats:
         warnings += _saturation(flats)
         values |= _efficiency(flats, darks, response, 0.0 if fano is None else fano.variance)
+        if "pde_fill" in values:
+            warnings += odd_efficiency(values["pde_fill"])
         levels, hot = spad_flats(flats, darks, response)
         pattern = measure_pattern(levels, hot)
         if pattern is not None:

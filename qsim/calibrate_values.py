@@ -56,3 +56,18 @@ def root_interval(square: float, variance: float, unit: str, method: str) -> Val
     reach = Z95 * sqrt(variance)
     low, middle, high = (sqrt(max(x, 0.0)) for x in (square - reach, square, square + reach))
     return Value(middle, low, high, unit, method)
+
+
+def odd_efficiency(found: Value) -> list[str]:
+    """A warning if an efficiency is surely above 1, which the sensor file cannot hold; `ValueError` if it is 0."""
+    if found.value <= 0:
+        raise ValueError(
+            "calibrate: the flats of known light hold no more counts than the dark frames; are --dark and --flat "
+            "swapped, or are the flats without light?"
+        )
+    if found.low <= 1:
+        return []
+    return [
+        f"the efficiency is {found.value:.4g}, above 1, and the sensor file holds 1: are photons per pixel and the "
+        "exposure right?"
+    ]

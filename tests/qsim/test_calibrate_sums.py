@@ -209,3 +209,15 @@ def test_values_that_are_no_counts_are_refused(tmp_path):
         savemat(tmp_path / f"{name}.mat", {"x": np.full((3, 4), value)})
         with pytest.raises(ValueError, match="expected whole numbers from 0 up"):
             mat_array(tmp_path / f"{name}.mat")
+
+
+def test_an_efficiency_that_cannot_be_is_not_written_without_a_word(folder, capsys):
+    """Photons too few by 100 gave a sensor of efficiency 1 in silence; swapped files spoke of BinarySPAD.pde."""
+    line = "--planes 50 --dark {} 1e-5 --flat {} 1e-5 {} -o e.toml --force"
+    for photons, odd in ((0.9, False), (0.006, True)):
+        assert main(["calibrate", *line.format("dark.npy", "flat.npy", photons).split()]) == 0
+        assert ("above 1, and the sensor file holds 1: are photons" in capsys.readouterr().out) == odd
+    (folder / "e.toml").unlink()
+    assert main(["calibrate", *line.format("flat.npy", "dark.npy", 0.9).split()]) == 2
+    assert "hold no more counts than the dark frames; are --dark and --flat swapped" in capsys.readouterr().err
+    assert not (folder / "e.toml").exists()
