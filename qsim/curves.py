@@ -43,10 +43,13 @@ def falling(cdf: Steps, slope: Steps, count: int) -> Curves | None:
     return _fitted(cdf, slope, start, stop, np.inf)
 
 
-def below(cdf: Steps, slope: Steps, count: int, brightest: float) -> Curves | None:
-    """Curves of any steps for at most `brightest` arrivals, all on one grid; None if no grid is fine enough."""
+def below(cdf: Steps, slope: Steps, count: int, brightest: float, settled: bool = False) -> Curves | None:
+    """Curves of any steps for at most `brightest` arrivals, all on one grid; None if no grid is fine enough.
+
+    `settled`: more light changes nothing, and the curves hold for all light.
+    """
     x = float(np.sqrt(brightest))
-    return _fitted(cdf, slope, np.zeros((count, 1)), np.full((count, 1), x), x)
+    return _fitted(cdf, slope, np.zeros((count, 1)), np.full((count, 1), x), np.inf if settled else x)
 
 
 def _fitted(cdf: Steps, slope: Steps, start: Array, stop: Array, brightest: float) -> Curves | None:

@@ -29,6 +29,7 @@ from math import floor, gamma
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.contours import LEAST
 from qsim.mixture import Mixture
 
 _BEYOND_TOP = 64  # codes above the top one that are summed term by term
@@ -72,9 +73,17 @@ class Paralyzable:
             )
         return result
 
+    @property
+    def by_steps(self) -> bool:
+        """Whether so many dead times fit into the exposure that steps come one by one (contours.py), at any light."""
+        return self.ratio >= LEAST
+
     def _tables(self, mean: Array) -> Iterator[tuple[Array, Mixture | None]]:
         """Light levels in groups, each with a table just long enough (the Poisson tail left out is below 1e-30)."""
         length = np.exp2(np.ceil(np.log2(mean + 12 * np.sqrt(mean) + 60)))
+        if self.ratio < LEAST:  # few moments, which are quicker than a long table
+            expected = mean * np.exp(-mean / self.ratio) * (1 - 1 / self.ratio)
+            length[(mean > self.ratio) & (expected <= _SPARSE)] = np.inf
         for last in np.unique(length):
             table = arrival_table(self.ratio, self.possible, int(last)) if last <= _LONGEST else None
             yield np.flatnonzero(length == last), table

@@ -8,10 +8,10 @@ float32 could not decide (about 40 in a million) is flagged by the kernel and dr
 (pixels.py), so the codes are the reference's on every kind of machine; tails, where a second word is drawn, come out
 right for the same reason.
 
-Above 8 bits, or where a block is tiny, the reference itself draws; so it does single paralyzable pixels in light beyond
-their curves. Peak memory: the output, one frame, and what launches hold. They have at most four million pixels, where
-the cost of starting one has faded, and hold, per pixel, 4 bytes of converted light, 2 of places for each of two shapes,
-and 2.5 that each of two launches writes: at most 55 MB.
+Above 8 bits, or where a block is tiny, the reference itself draws; so it does single paralyzable pixels beyond 1000
+arrivals, where many dead times fit into an exposure. Peak memory: the output, one frame, and what launches hold. They
+have at most four million pixels, where the cost of starting one has faded, and hold, per pixel, 4 bytes of converted
+light, 2 of places for each of two shapes, and 2.5 that each of two launches writes: at most 55 MB.
 """
 
 from __future__ import annotations

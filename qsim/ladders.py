@@ -25,6 +25,7 @@ from math import ceil, e, lgamma, log, log2, sqrt
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import contours
 from qsim.curves import Curves, below, falling
 from qsim.qis import QIS, electron_table, table_length, thresholds
 from qsim.sensor import Sensor
@@ -35,7 +36,8 @@ _LIVE_BITS = 4  # of counters whose steps are added up
 _MAX_WORK = 260  # terms of all sums of one kernel together; looking up curves is quicker than more
 _TERMS = 75  # electrons up to which float32 has the range, halved: exp(165 / 2)
 _LONGEST_TABLE = 2048  # electrons in a table that is looked through for short sums
-_PARALYSED = (85.0, 250.0)  # arrivals up to which paralyzable pixels have curves: few bits, more; tables of 256, 512
+_PARALYSED = 45.0  # arrivals per dead time, at least one of which then comes in each: the code is 1 to 1e-16
+_BRIGHT = 1000.0  # arrivals up to which those of many dead times have curves
 _EXPONENT = 85.0  # exp of more overflows
 _NEGLIGIBLE = 1e-12  # a coefficient that small moves no step by more than float64's rounding of the reference
 
@@ -107,11 +109,20 @@ def _curves(sensor: Sensor, exposure: float) -> Curves | None:
         if paralyzable is None:
             cdf, slope = sensor.steps(exposure)
             return falling(pairs(cdf), pairs(slope), count)
+        ratio = paralyzable.ratio
+        if paralyzable.by_steps:
+            return below(
+                lambda mean: contours.steps(ratio, count, mean[0])[0],
+                lambda mean: contours.steps(ratio, count, mean[0])[1],
+                count,
+                _BRIGHT,
+            )
         return below(
             lambda mean: paralyzable.cdf(mean[0])[:, :-1].T,
             lambda mean: paralyzable.slope(mean[0])[:, :-1].T,
             count,
-            _PARALYSED[sensor.bits > _LIVE_BITS],
+            _PARALYSED * max(ratio, 1.0),
+            settled=True,
         )
     return None
 

@@ -220,8 +220,11 @@ class Sensor(ABC):
 
     def _draw(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
         """The reference draw of one frame [H, W], some rows at a time."""
+        return self._draw_rows(photons, exposure, key, origin, _CHUNK // self.levels)
+
+    def _draw_rows(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int], pixels: int) -> Array:
         codes = np.empty(photons.shape, self.dtype)
-        rows = max(1, _CHUNK // (self.levels * max(photons.shape[1], 1)))
+        rows = max(1, pixels // max(photons.shape[1], 1))
         for y in range(0, photons.shape[0], rows):
             block = np.asarray(photons[y : y + rows], np.float64)
             place = (origin[0] + y, origin[1])

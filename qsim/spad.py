@@ -14,6 +14,7 @@ from typing import ClassVar
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import contours
 from qsim.deadtime import Paralyzable, most_counts
 from qsim.keys import Key, uniform, uniform_pair, words
 from qsim.mixture import poisson_log_pmf
@@ -22,6 +23,7 @@ from qsim.thresholds import decide, search
 
 _PLANES_BITS = 8  # of a sum of planes; above, the sum is drawn at once
 _BATCH = 1 << 17  # words of a batch of planes
+_ROWS = 1 << 14  # pixels of a block that is drawn step by step
 _UNDERFLOW = 1e-290  # below, sums in floating point may have lost terms
 
 
@@ -262,25 +264,45 @@ class CountingSPAD(SPAD):
         return result
 
     def _draw(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
+        law = self.dead_time_law(exposure)
+        if law is not None and law.by_steps:
+            return self._draw_rows(photons, exposure, key, origin, _ROWS)
         if self.bits <= 8:
             return super()._draw(photons, exposure, key, origin)
-        if self.paralyzable and self.dead_time:
+        if law is not None:
             enough = min(self.bits, most_counts(exposure / self.dead_time).bit_length())
             draw = super()._draw if enough == self.bits else replace(self, bits=enough)._draw
             return draw(photons, exposure, key, origin).astype(self.dtype)
         return self._draw_by_bisection(photons, exposure, key, origin)
 
     def decide(self, u: Array, photons: Array, exposure: float) -> tuple[Array, Array]:
-        """As every sensor; the steps around the code alone, but for few bits or paralyzable pixels."""
+        """As every sensor; the steps around the code alone, but for few bits or few paralyzable dead times."""
         from scipy.special import ndtri
 
-        if self.bits <= 3 or self.dead_time_law(exposure) is not None:
+        law = self.dead_time_law(exposure)
+        if law is not None and law.by_steps:
+            codes, near = self._paralyzable_codes(law.ratio, u.ravel(), 1 - u.ravel(), photons, exposure)
+            return codes.reshape(u.shape), near.reshape(u.shape) <= 2.0**-32
+        if self.bits <= 3 or law is not None:
             return super().decide(u, photons, exposure)
         cdf, _ = self.steps(exposure)
         mean = self.arrivals(photons, exposure).ravel()
         guess = self._guess(mean, exposure, ndtri(u.ravel()))
         codes, near = decide(cdf, self.levels - 1, u.ravel(), mean, guess)
         return codes.reshape(u.shape), near.reshape(u.shape) <= 2.0**-32
+
+    def codes_at(self, first: Array, second: Array, photons: Array, exposure: float) -> Array:
+        """As every sensor; paralyzable pixels of many dead times to 1e-11 in any probability."""
+        law = self.dead_time_law(exposure)
+        if law is None or not law.by_steps:
+            return super().codes_at(first, second, photons, exposure)
+        return self._paralyzable_codes(law.ratio, *uniform_pair(first, second), photons, exposure)[0]
+
+    def _paralyzable_codes(
+        self, ratio: float, below: Array, above: Array, photons: Array, exposure: float
+    ) -> tuple[Array, Array]:
+        top = min(self.levels - 1, most_counts(ratio))
+        return contours.decide(ratio, top, below, above, self.arrivals(photons, exposure).ravel())
 
     def _guess(self, arrivals: Array, exposure: float, z: Array) -> Array:
         """About the code at z standard deviations: of a renewal count, gaps a dead time and a wait."""

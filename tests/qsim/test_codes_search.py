@@ -24,7 +24,6 @@ EXPOSURE = 5e-4  # s
 SHAPE = (2, 128, 162)  # 41 472 pixels: a frame of uniform light, one below 20 electrons
 ORIGINS = ((0, 0), (5, 8), (3, 7))
 BATCHES, SENSORS = 20, 375  # of random sensors, and 5 for every number of terms: 10 000
-PARALYSED = 240.0  # arrivals; in more light the reference itself takes too long
 needs_engine = pytest.mark.skipif(not lanes.available(), reason="no usable LLVM or CUDA on this machine")
 
 
@@ -72,8 +71,6 @@ def terms_of(sensor: QIS) -> int:
 def random_light(rng: np.random.Generator, sensor: Sensor) -> np.ndarray:
     """Photons [2, H, W], float32 or float64: uniform to beyond white or to 1e6, and below 20 arrivals."""
     top = min(1.5 * sensor.white(EXPOSURE), 1e6) if rng.random() < 0.75 else 10 ** rng.uniform(0, 6)
-    if isinstance(sensor, CountingSPAD) and sensor.paralyzable:
-        top = min(top, PARALYSED / sensor.efficiency)
     dark = min(rng.uniform(0, 20) / sensor.efficiency, 1e6)
     low = np.full(SHAPE[1:], dark) if rng.random() < 0.5 else rng.uniform(0, 20 / sensor.efficiency, SHAPE[1:])
     photons = np.stack([rng.uniform(0, top, SHAPE[1:]), low])
