@@ -61,7 +61,7 @@ def _blocks(path: Path, bits: int, width: int | None, variable: str | None) -> I
         if width is not None:
             raise ValueError(f"{path}: --width is of packed planes, and a .mat holds one value per pixel; leave it out")
         return _array_blocks(mat_array(path, variable))
-    footage = formats.read(path, Hints(bits=min(bits, 16), width=width, variable=variable))
+    footage = formats.read(path, Hints(bits=min(bits, 16), width=width, variable=variable), compared=("bits",))
     if footage.is_light or footage.bits != bits:
         raise ValueError(f"{path}: holds {footage.source}, not values of {bits} bits")
     return (block for _, block in formats.blocks(footage))

@@ -95,18 +95,21 @@ def recordings(folder: Path, layout: str | None) -> list[Path]:
     return sorted(place for place in places if not any(place.glob("*.npy")))
 
 
-def read(path: Path, hints: Hints | None = None) -> Footage:
-    """Open a foreign file or folder; frames are read when asked for."""
+def read(path: Path, hints: Hints | None = None, *, compared: tuple[str, ...] = ()) -> Footage:
+    """Open a foreign file or folder; frames are read when asked for.
+
+    `ValueError` for a hint that the file has no use for, but for those that the caller has `compared` with it.
+    """
     hints = hints or Hints()
     layout = hints.layout or detect(path)
     if layout not in LAYOUTS:
         raise ValueError(f"layout {layout!r}: known are {', '.join(LAYOUTS)}")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file")
-    asked: set[str] = set()
+    asked = {"layout", "flip", "columns", *compared}
     footage = LAYOUTS[layout](path, cast(Hints, _Watched(hints, asked)))
     for field in fields(Hints):
-        given = getattr(hints, field.name) != field.default and field.name not in ("layout", "flip", "columns")
+        given = getattr(hints, field.name) != field.default
         if given and field.name not in asked:
             raise ValueError(f"{path}: --{field.name} changes nothing for {footage.source}; leave it out")
     if layout in ASSUMED:
