@@ -77,10 +77,10 @@ def crop_file(out: Path, light: str, clip: str, method: str) -> Path:
 
 
 def save_crop(path: Path, picture: Array) -> None:
-    """A float16 picture in units of the peak."""
+    """A float16 picture in units of the peak, what lies above 2 cut off: a sheet shows white there."""
     path.parent.mkdir(exist_ok=True)
     with replacing(path) as file:
-        np.save(file, picture.astype(np.float16))
+        np.save(file, np.minimum(picture, 2).astype(np.float16))
 
 
 def sheet(out: Path, light: str, clips: Sequence[str], methods: Sequence[str], target: Path) -> bool:

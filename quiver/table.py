@@ -255,7 +255,8 @@ def figure(rows: Sequence[Row], path: Path) -> None:
         axes.bar(places, [x.mean for x in own.values()], width, yerr=error, capsize=3, label=method, **look)
     axes.set_xticks(range(len(lights)), lights)
     axes.set_ylabel("PSNR after the best factor [dB]")
-    canvas.figure.legend(fontsize="small", loc="outside right upper")
+    if methods:
+        canvas.figure.legend(fontsize="small", loc="outside right upper")
     with replacing(path) as file:
         canvas.figure.savefig(file, format="png", dpi=120)
 

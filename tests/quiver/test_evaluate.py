@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -208,6 +209,20 @@ def test_a_one_bit_sensor_in_much_light_is_not_perfect(make_clip: ClipMaker):
     assert "peak = 1 photons per pixel" in text
     assert "Warning: 100.0 % of the pixels of sliding_0 at 10 PPP, 1 bit lie above the peak" in text
     assert " inf " not in text
+
+
+@pytest.mark.parametrize("peak", [1e-6, 1e9])
+def test_an_extreme_peak_has_a_table_and_no_foreign_warning(peak, tiny_dataset, tmp_path):
+    plan = Plan(str(tiny_dataset), peak=peak)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        methods = [restorer("naive")]
+        rows = evaluate(plan, methods, tmp_path / "out")
+        table.write(tmp_path / "out", plan, methods, rows)
+    assert all(row.failure is None for row in rows)
+    crops = list((tmp_path / "out/crops").glob("*.npy"))
+    assert crops
+    assert all(np.isfinite(np.load(crop)).all() for crop in crops)
 
 
 def test_another_peak_moves_scores_by_its_ratio(make_clip: ClipMaker):
