@@ -160,3 +160,73 @@ def test_thousands_of_random_sensors_have_the_references_codes(seed, monkeypatch
 @pytest.mark.parametrize("first", range(1, 501, 50))
 def test_every_number_of_terms_five_times(first, monkeypatch):
     batch_of_terms([n for n in range(first, first + 50) for _ in range(5)], first, monkeypatch)
+
+
+def corner_sensor(rng: np.random.Generator, bits: int) -> Sensor:
+    """A QIS whose thresholds lie on electrons or next to them; a third of them any sensor, a third paralyzable."""
+    kind = rng.integers(3)
+    if kind == 0:
+        return random_sensor(rng, bits)
+    if kind == 1:
+        dead = EXPOSURE / float(rng.choice([10 ** rng.uniform(-0.5, 6), rng.integers(1, 60)]))
+        return CountingSPAD(float(rng.uniform(0.02, 1)), float(10 ** rng.uniform(-1, 6)), dead, bits, True)
+    return QIS(
+        float(rng.choice([1.0, 0.5, 0.3])),
+        float(rng.choice([0.0, 1e-300, 2000.0])),
+        float(rng.choice([0.0, 1e-9, 1e-3, 0.5])),
+        bits,
+        gain=float(rng.choice([1.0, 0.5, 2.0, 1 / 3, 2.0**-6])),
+        offset=float(rng.choice([0.0, 0.5, -0.5, 1e-9, 0.49999999])),
+        full_well=rng.choice([None, 1.0, 0.5, 3.0, 1e-3]),
+    )
+
+
+def corner_light(rng: np.random.Generator, sensor: Sensor, shape: tuple[int, ...]) -> np.ndarray:
+    """All orders of magnitude; none, denormal and much; usual; float64 that is no float32; next to whole photons."""
+    kind = rng.integers(5)
+    if kind == 0:
+        return 10 ** rng.uniform(-2, 6, shape)
+    if kind == 1:
+        return np.resize([0.0, 5e-324, 1e-310, 1e-45, 1e-40, 1e-38, 1e-30, 1e-9, 1.0, 1e6], shape)
+    if kind == 2:
+        return rng.uniform(0, 1.5 * min(sensor.white(EXPOSURE), 1e6), shape)
+    if kind == 3:
+        return rng.uniform(0, 3, shape) * (1 + 2.0**-25)
+    return np.nextafter(rng.integers(0, 60, shape).astype(float), rng.choice([-1, 1e9])).clip(0)
+
+
+def corner_batch(seed: int, sensors: int) -> None:
+    """Frames of any width at any origin, both ways to write codes, and a crop: 5 pixels per million may differ."""
+    rng, pixels, differ = np.random.default_rng([20, seed]), 0, 0
+    for n in range(sensors):
+        sensor = corner_sensor(rng, 1 + n % 8)
+        width = int(rng.choice([1, 2, 3, 5, 7, 8, 9, 63, 130, 257]))
+        rows = max(1, 20_000 // width)
+        shape = (1, rows, width) if rng.random() < 0.5 else (max(1, rows // 16), 16, width)
+        photons = corner_light(rng, sensor, shape)
+        photons = photons.astype(np.float32) if rng.random() < 0.3 else photons
+        y, x = (int(i) for i in rng.integers(0, 1000, 2))
+        key = Key(int(rng.integers(1 << 31)), 3, int(rng.integers(100)))
+        expected = sensor.sample(photons, EXPOSURE, key=key, origin=(y, x), engine="reference")
+        whole = kernels.sample(sensor, photons, EXPOSURE, key=key, origin=(y, x), smallest=1)
+        packed = kernels.sample_packed(sensor, photons, EXPOSURE, key=key, origin=(y, x), smallest=1)
+        np.testing.assert_array_equal(packed, pack(whole, sensor.bits), err_msg=repr(sensor))
+        top, left = int(rng.integers(shape[1])), int(rng.integers(width))
+        part, place = photons[:, top:, left:], (y + top, x + left)
+        crop = kernels.sample(sensor, part, EXPOSURE, key=key, origin=place, smallest=1)
+        found = np.count_nonzero(whole != expected), np.count_nonzero(crop != expected[:, top:, left:])
+        assert max(found) <= 2, f"{found} pixels differ, key {key}, {shape} at {(y, x)}: {sensor!r}"
+        pixels, differ = pixels + whole.size + crop.size, differ + sum(found)
+    assert differ <= max(5e-6 * pixels, 2)
+
+
+@needs_engine
+def test_corners_of_light_places_and_thresholds_have_the_references_codes():
+    corner_batch(0, 25)
+
+
+@needs_engine
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1, 11))
+def test_many_corners_have_the_references_codes(seed):
+    corner_batch(seed, 200)
