@@ -177,11 +177,14 @@ def place_of(sensor: Sensor, exposure: float, ppp: float) -> Place:
 
 
 def light_of(codes: Codes) -> float:
-    """Photons per pixel and code of a stream: as it says, else by the moment inverse of its first frames."""
+    """Photons per pixel and code of a stream: as it says, else by the moment inverse or mean of its first frames."""
     if codes.ppp is not None and codes.ppp > 0:
         return float(codes.ppp)
     some = codes.read(0, min(LIGHT_FRAMES, codes.shape[0]))
-    found = float(METHODS["moment"].restore(some, codes.sensor, codes.exposure).mean())
+    try:
+        found = float(METHODS["moment"].restore(some, codes.sensor, codes.exposure).mean())
+    except ValueError:  # its codes tell no light
+        found = float(METHODS["naive"].restore(some, codes.sensor, codes.exposure).mean())
     return max(found, 1e-9 * codes.white)
 
 

@@ -15,7 +15,9 @@ from safetensors import safe_open
 
 import quiver
 from qsim import devices
+from qsim.qis import QIS
 from quiver import domain, domain_measure
+from quiver.baselines import METHODS
 from quiver.cli import main
 from quiver.data import Codes, Light, array_codes, open_clips
 from quiver.domain import Cell, Domain, Place, Scope
@@ -384,3 +386,12 @@ def test_places_of_one_gain_are_alike():
     assert not one.like(Place("QIS", 3, 1.0, 10.0))
     assert not one.like(Place("QIS", 2, 2.6, 6.5))
     assert not one.like(Place("BinarySPAD", 3, 2.6, 6.5))
+
+
+def test_a_sensor_whose_codes_tell_no_light_still_has_a_remark():
+    """A full well of a hundredth of an electron: the moment inverse refuses, the warning must not."""
+    sensor = QIS(0.8, 1.6, 0.2, 3, gain=0.5, full_well=0.01)
+    codes = array_codes(np.zeros((3, 8, 8), np.uint8), sensor, 5e-4)
+    with pytest.raises(ValueError, match="does not"):
+        METHODS["moment"].restore(codes.read(0, 3), sensor, 5e-4)
+    assert domain.light_of(codes) > 0
