@@ -48,7 +48,7 @@ class Paralyzable:
     def cdf(self, mean: Array) -> Array:
         """P(code <= k): [p] -> [p, levels]."""
         result = np.ones((len(mean), self.levels))
-        for rows, table in self._tables(mean):
+        for rows, table in self._tables(mean, brief=True):
             result[rows, : self.possible] = (
                 table.evaluate_cdf(mean[rows]) if table else self._paralysed(mean[rows]).cdf()
             )
@@ -78,10 +78,13 @@ class Paralyzable:
         """Whether so many dead times fit into the exposure that steps come one by one (contours.py), at any light."""
         return self.ratio >= LEAST
 
-    def _tables(self, mean: Array) -> Iterator[tuple[Array, Mixture | None]]:
-        """Light levels in groups, each with a table just long enough (the Poisson tail left out is below 1e-30)."""
+    def _tables(self, mean: Array, brief: bool = False) -> Iterator[tuple[Array, Mixture | None]]:
+        """Light levels in groups, each with a table just long enough (the Poisson tail left out is below 1e-30).
+
+        `brief`: the series where it is as good as the table in the cdf, though not in far tails.
+        """
         length = np.exp2(np.ceil(np.log2(mean + 12 * np.sqrt(mean) + 60)))
-        if self.ratio < LEAST:  # few moments, which are quicker than a long table
+        if brief and self.ratio < LEAST:  # few moments, which are quicker than a long table
             expected = mean * np.exp(-mean / self.ratio) * (1 - 1 / self.ratio)
             length[(mean > self.ratio) & (expected <= _SPARSE)] = np.inf
         for last in np.unique(length):

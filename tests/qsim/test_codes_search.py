@@ -56,6 +56,8 @@ def sensor_of_terms(rng: np.random.Generator, terms: int) -> QIS:
         bits = int(rng.integers(1, 9))
         noise = 0.0 if rng.random() < 0.4 or attempt > 50 else rng.uniform(0, min(10, terms / 8))
         threshold = terms - 0.5 - 7.0 * noise
+        if threshold <= 0:
+            continue
         gain = ((1 << bits) - 1.5) / threshold
         sensor = QIS(float(rng.uniform(0.2, 1)), 1.6, float(noise), bits, gain=float(gain))
         if 1e-3 < gain < 1e3 and terms_of(sensor) == terms:
