@@ -6,10 +6,19 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from quiver.options import add_running, command, numbers, running_options, size, whole_numbers, words
+from quiver.options import (
+    add_running,
+    command,
+    numbers,
+    running_options,
+    size,
+    use_threads,
+    whole_numbers,
+    words,
+)
 
 MEMORY = "2GB"  # as other commands
-MEASURING = ("split", "sensor", "bits", "ppp", "methods", "seed", "memory", "mode", "device", "precision")
+MEASURING = ("split", "sensor", "bits", "ppp", "methods", "seed", "memory", "mode", "device", "precision", "threads")
 
 
 def add_domain(sub: Any) -> None:
@@ -36,10 +45,11 @@ def add_domain(sub: Any) -> None:
 
 
 def _run_domain(args: argparse.Namespace) -> int:
+    from quiver import threads
     from quiver.data import bar, output
     from quiver.domain import Domain, read_scope, table
-    from quiver.restoring import weights_path
-    from quiver.sources import refuse
+    from quiver.restoring import network_restorer, weights_path
+    from quiver.sources import refuse, refuse_idle
     from quiver.weights import metadata_of
 
     path = weights_path(args.weights)
@@ -47,8 +57,12 @@ def _run_domain(args: argparse.Namespace) -> int:
         from quiver.domain_measure import measure
 
         args.memory = args.memory or size(MEMORY)
+        threads.check(args.threads)
+        options, question = running_options(args), _question(args)
+        refuse_idle(vars(args), [network_restorer(path, options)])
+        use_threads(args)
         with bar("cells", "cell") as progress:
-            found: Domain | None = measure(path, _question(args), running_options(args), progress, force=args.force)
+            found: Domain | None = measure(path, question, options, progress, force=args.force)
     else:
         refuse(args, MEASURING, "is of measuring, and no clips are named")
         if args.force:

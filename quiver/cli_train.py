@@ -66,7 +66,7 @@ def _run_train(args: argparse.Namespace) -> int:
     import torch
 
     from quiver import threads
-    from quiver.data import note, output
+    from quiver.data import note, open_clips, output
     from quiver.model import build
     from quiver.restoring import pick_device
     from quiver.run import PROTOCOLS, draw_curve
@@ -76,6 +76,11 @@ def _run_train(args: argparse.Namespace) -> int:
         raise ValueError("--validate-every: counts steps of a run with --steps; one that --minutes ends is validated "
                          "after every tenth of its time; leave it out")  # fmt: skip
     settings = _settings(args)
+    if args.validation_split is not None and not open_clips(settings.data, args.validation_split):
+        raise ValueError(
+            f"--validation-split {args.validation_split}: {settings.data} has no clip in that split; leave it out, and "
+            "without clips in `val` training clips serve"
+        )
     folder, leads = Path(settings.out), os.environ.get("RANK", "0") == "0"
     earlier = None if args.force else threads.recorded(folder / "settings.json")
     settings = replace(settings, threads=use_threads(args, earlier))
