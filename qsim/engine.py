@@ -112,6 +112,8 @@ def limit_threads() -> None:
     """Give Dr.Jit the number of threads that QSIM_THREADS names, if any; processes that are started inherit it."""
     wanted = os.environ.get("QSIM_THREADS")
     if wanted:
+        if not (wanted.isdigit() and int(wanted)):
+            raise ValueError(f"QSIM_THREADS={wanted}: expected a number of threads, at least 1")
         import drjit as dr
 
         if dr.thread_count() != int(wanted):
