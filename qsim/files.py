@@ -380,13 +380,6 @@ class Lock:
             self.path.unlink(missing_ok=True)
         self.release()
 
-    def is_current(self) -> bool:
-        """Whether the locked file still has its name: a holder before us may have deleted it while we opened it."""
-        try:
-            return self._file is not None and os.path.samestat(os.fstat(self._file.fileno()), os.stat(self.path))
-        except FileNotFoundError:
-            return False
-
     def release(self) -> None:
         """Give the lock back; harmless if it is not held."""
         if self._file is not None:

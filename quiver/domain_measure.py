@@ -107,13 +107,11 @@ def _known(weights: Path, shared: Mapping[str, object], light: Light) -> bool:
 def _one_at_a_time(weights: Path) -> Iterator[None]:
     """Keep other processes from rewriting the file between our reading and our writing of it."""
     lock = Lock(weights.with_name(f"{weights.name}.lock"))
-    while lock.acquire(wait=True) and not lock.is_current():
-        lock.release()  # its holder deleted it while we waited
+    lock.acquire(wait=True)
     try:
         yield
     finally:
-        lock.path.unlink(missing_ok=True)
-        lock.release()
+        lock.delete()
 
 
 def _measures(cell: Cell, light: Light) -> bool:

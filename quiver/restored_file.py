@@ -95,17 +95,12 @@ def restore_to_file(
 def _only_writer(path: Path) -> Iterator[None]:
     """Hold PATH.npy.lock, which is deleted at the end; `ValueError` if another process holds it."""
     lock = Lock(path.with_name(path.name + ".lock"))
-    while True:
-        if not lock.acquire():
-            raise ValueError(f"{path}: another process is writing this video; wait for it, or name another with -o")
-        if lock.is_current():
-            break
-        lock.release()  # its holder deleted the file between our opening and our locking it
+    if not lock.acquire():
+        raise ValueError(f"{path}: another process is writing this video; wait for it, or name another with -o")
     try:
         yield
     finally:
-        lock.path.unlink(missing_ok=True)
-        lock.release()
+        lock.delete()
 
 
 def _finish_naming(path: Path, part: Path, journal: Path) -> None:

@@ -231,17 +231,12 @@ def _load_weights(model: nn.Module, stored: Any) -> None:
 def alone_in(folder: Path, doing: str) -> Iterator[None]:
     """Hold the lock of a folder of results; `ValueError` if another process holds it."""
     lock = Lock(folder / LOCK)
-    while True:
-        if not lock.acquire():
-            raise ValueError(f"{folder}: another process {doing} here; wait for it to end, or choose another -o")
-        if lock.is_current():
-            break
-        lock.release()  # its holder deleted the file between our opening and our locking it
+    if not lock.acquire():
+        raise ValueError(f"{folder}: another process {doing} here; wait for it to end, or choose another -o")
     try:
         yield
     finally:
-        lock.path.unlink(missing_ok=True)
-        lock.release()
+        lock.delete()
 
 
 def empty(folder: Path) -> None:
