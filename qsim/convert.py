@@ -130,6 +130,8 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
         for source, target in pairs or [(args.input, args.output)]:
             footage = formats.read(source, hints)
             if footage.is_light:
+                if target.suffix in _SUFFIXES:
+                    raise ValueError(f"{target}: light is read into a clip, a folder; name it without {target.suffix}")
                 clip = formats.to_clip(footage, target, capture, force=args.force, progress=progress)
                 made.append((clip.path, f"{_size(clip)}, light of {footage.source}; {formats.saturation_line(clip)}"))
                 continue

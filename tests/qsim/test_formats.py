@@ -986,6 +986,15 @@ def test_a_white_that_cannot_act_is_refused(tmp_path: Path, capsys: pytest.Captu
         assert not (tmp_path / "o").exists()
 
 
+@pytest.mark.parametrize("suffix", [".npy", ".mp4", ".zarr"])
+def test_light_is_not_read_into_a_folder_that_is_named_like_a_file(tmp_path: Path, capsys, suffix: str):
+    np.save(tmp_path / "light.npy", np.zeros((2, 6, 8), np.uint16))
+    words = ["convert", str(tmp_path / "light.npy"), str(tmp_path / f"o{suffix}"), "--transfer", "linear"]
+    assert main([*words, "--frame-rate", "9"]) == 2
+    assert f"without {suffix}" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["light.npy"]
+
+
 def test_what_was_written_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     clip = write_clip(tmp_path / "clip", frames=2, height=6, width=8)
     for kind, words in [
