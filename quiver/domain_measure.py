@@ -69,15 +69,22 @@ def measure(
 ) -> Domain:
     """Measure what is missing of the cells of a weights file, and store each in its metadata as soon as it is there.
 
-    Several processes may measure one file. Cells that were measured otherwise (other clips, methods, seed or version)
-    go, and those that are asked for are measured again with `force`. The tensors of the file stay as they are.
-    `ValueError` for classical methods that are none.
+    Several processes may measure one file. With `force` the cells that are asked for are measured again, and cells that
+    were measured otherwise (other clips, methods, seed or version) go. The tensors of the file stay as they are.
+    `ValueError` for classical methods that are none, and for cells measured otherwise without `force`.
     """
     methods = restorers(question.methods, options)
     network = network_restorer(weights, options)
     if any(method.learned for method in methods):
         raise ValueError(f"a network is measured against classical methods, got {', '.join(question.methods)}")
     shared = question.to_dict()
+    before = read_scope(weights, metadata_of(weights)).domain
+    if before is not None and dict(before.measured) != shared and not force:
+        changed = ", ".join(key for key, value in shared.items() if before.measured.get(key) != value)
+        raise ValueError(
+            f"{weights}: holds {len(before.cells)} cells that were measured otherwise (not the same: {changed}); "
+            "measure into a copy of the file, or use --force to replace them"
+        )
     todo = [light for light in question.lights if force or not _known(weights, shared, light)]
     for done, light in enumerate(todo):
         if progress is not None:

@@ -226,7 +226,10 @@ def test_cells_are_measured_stored_and_kept(tiny_dataset, tmp_path, monkeypatch)
     assert len(asked) == 2
     domain_measure.measure(path, replace(question, lights=lights[:1]), Options(device="cpu"), force=True)
     assert len(asked) == 3
-    other = domain_measure.measure(path, replace(question, seed=1, lights=lights[:1]), Options(device="cpu"))
+    other_seed = replace(question, seed=1, lights=lights[:1])
+    with pytest.raises(ValueError, match=r"measured otherwise \(not the same: seed"):
+        domain_measure.measure(path, other_seed, Options(device="cpu"))
+    other = domain_measure.measure(path, other_seed, Options(device="cpu"), force=True)
     assert len(other.cells) == 1  # cells of another noise do not stand beside these
     assert not list(tmp_path.glob("*.lock"))
     with pytest.raises(ValueError, match="measured against classical methods, got nano"):
