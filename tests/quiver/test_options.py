@@ -481,7 +481,7 @@ def tiny(name: str) -> torch.nn.Module:
     return UNet(UNetConfig(8)) if name == "unet" else model.QUIVER(PRESETS[name])
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # of this module alone: what it replaces is back for the next one
 def scale() -> Iterator[None]:
     """Small networks, one of the six ablations, benches in this process, no CUDA; and what is written down of a run."""
     measure_cell, score = domain_measure.measure_cell, domain_measure.score
@@ -526,10 +526,11 @@ def scale() -> Iterator[None]:
         patch.setattr(threads, "cores", lambda: 4)
         patch.setattr(torch, "set_num_threads", lambda number: see("threads", number))  # two on busy cores are slow
         yield
+    threads.measured.cache_clear()
     torch.set_num_threads(number)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def work(scale: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the rows name."""
     folder, rng = tmp_path_factory.mktemp("work"), np.random.default_rng(0)
