@@ -71,7 +71,7 @@ def steps(out: Path) -> None:
     if not ball.exists():
         frames = np.load(DATA / "ball_12bit.npz")["frames"]
         np.save(out / "ball_12bit.npy", frames)
-        camera = ["--frame-rate", "30000", "--exposure", "20e-6", "--transfer", "linear"]
+        camera = ["--frame-rate", "30000", "--exposure", "20e-6", "--transfer", "linear", "--white", "4095"]
         run("Real video at 30 000 fps becomes a clip", "qsim", "convert", out / "ball_12bit.npy", ball, *camera)
     run("... and goes through the sensor", "qsim", "sense", ball, *light)
     restore(ball, out / "real_ball.npy", str(trained))
