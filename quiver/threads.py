@@ -1,4 +1,4 @@
-"""Chooses how many threads torch uses: measured once per process, since two on busy cores can be thirty times slower.
+"""Chooses how many threads torch uses: measured once per process, since two on busy cores can be many times slower.
 
     --threads N, else what the resumed run had, else the faster of one thread and of all, by a small convolution
 
