@@ -17,7 +17,7 @@ from statistics import median
 import numpy as np
 
 from qsim import QIS, BinarySPAD, CountingSPAD, Key
-from qsim.sensor import Sensor
+from qsim.sensor.sensor import Sensor
 
 EXPOSURE = 5e-4  # s
 BOUND = 20.0  # microseconds per pixel

@@ -2,7 +2,7 @@
 
     python docs/coverage.py [RUNS]      # 1000 calibrations of each synthetic sensor: 25 minutes on one core
 
-The sensors and the draw are those of the tests (tests/synthetic.py): codes drawn by NumPy from the definition.
+The sensors and the draw are those of the tests (tests/support/synthetic.py): codes drawn by NumPy from the definition.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path.insert(0, str(ROOT / "tests" / "support"))
 
 
 def main(runs: int) -> None:
@@ -31,7 +31,7 @@ def main(runs: int) -> None:
     lines = [
         "# Do the intervals of `qsim calibrate` hold what they promise?",
         "",
-        f"{runs} calibrations of each of {len(CASES)} synthetic sensors (tests/synthetic.py), in percent of the 95 %",
+        f"{runs} calibrations of each of {len(CASES)} synthetic sensors (tests/support/synthetic.py), in percent of the 95 %",
         f"intervals that hold the truth. Made by `python docs/coverage.py {runs}`; one number of one sensor is known",
         f"to +- {100 * sqrt(0.95 * 0.05 / runs):.1f} (one standard deviation).",
         "",

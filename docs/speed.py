@@ -14,8 +14,8 @@ import time
 import numpy as np
 from skimage import data
 
-from qsim.devices import quiver_physical
 from qsim.keys import Key
+from qsim.sensor.devices import quiver_physical
 from quiver.baselines import METHODS
 
 EXPOSURE = 5e-4  # s

@@ -8,31 +8,31 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from qsim.clip import Clip, ClipWriter
-    from qsim.dataset import Dataset
+    from qsim.clip.clip import Clip, ClipWriter
+    from qsim.clip.stream import Sensing, Stream, sense
+    from qsim.dataset.dataset import Dataset
     from qsim.keys import Key
-    from qsim.qis import QIS
-    from qsim.scene import Camera, Scene
-    from qsim.sensor import Sensor
-    from qsim.spad import BinarySPAD, CountingSPAD
-    from qsim.stream import Sensing, Stream, sense
+    from qsim.scene.scene import Camera, Scene
+    from qsim.sensor.qis import QIS
+    from qsim.sensor.sensor import Sensor
+    from qsim.sensor.spad import BinarySPAD, CountingSPAD
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "BinarySPAD": "spad",
-    "Camera": "scene",
-    "Clip": "clip",
-    "ClipWriter": "clip",
-    "CountingSPAD": "spad",
-    "Dataset": "dataset",
+    "BinarySPAD": "sensor.spad",
+    "Camera": "scene.scene",
+    "Clip": "clip.clip",
+    "ClipWriter": "clip.writer",
+    "CountingSPAD": "sensor.spad",
+    "Dataset": "dataset.dataset",
     "Key": "keys",
-    "QIS": "qis",
-    "Scene": "scene",
-    "Sensing": "stream",
-    "Sensor": "sensor",
-    "Stream": "stream",
-    "sense": "stream",
+    "QIS": "sensor.qis",
+    "Scene": "scene.scene",
+    "Sensing": "clip.stream",
+    "Sensor": "sensor.sensor",
+    "Stream": "clip.stream",
+    "sense": "clip.stream",
 }
 
 __all__ = [

@@ -2,7 +2,7 @@
 
 import sys
 
-from qsim.cli import main
+from qsim.cli.program import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from quiver.notebook import restore
+    from quiver.restoration.api import restore
 
 __all__ = ["restore"]
 
@@ -16,9 +16,9 @@ __all__ = ["restore"]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'quiver' has no attribute {name!r}")
-    from quiver import notebook
+    from quiver.restoration import api
 
-    return getattr(notebook, name)
+    return getattr(api, name)
 
 
 def __dir__() -> list[str]:

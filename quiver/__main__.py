@@ -2,6 +2,6 @@
 
 import sys
 
-from quiver.cli import main
+from quiver.cli.program import main
 
 sys.exit(main())

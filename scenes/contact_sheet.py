@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 import scenes
-from qsim.budget import Budget
-from qsim.pictures import tone
-from qsim.render import Renderer
+from qsim.colour import tone
+from qsim.rendering.fidelity import Budget
+from qsim.rendering.renderer import Renderer
 from scenes.stage import FRAME_RATE, HEIGHT
 
 FRAME = 8  # of the clip

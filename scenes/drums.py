@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim import textures
-from qsim.motion import Oscillation, Spin, Still
-from qsim.rotation import vector
-from qsim.scene import Body, Diffuse, Scene, Texture
-from qsim.shapes import ball, cylinder
-from qsim.textures import Picture
+from qsim.scene import textures
+from qsim.scene.motion import Oscillation, Spin, Still
+from qsim.scene.rotation import vector
+from qsim.scene.scene import Body, Diffuse, Scene, Texture
+from qsim.scene.shapes import ball, cylinder
+from qsim.scene.textures import Picture
 from scenes import stage
 from scenes.stage import between, pick, sign
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.motion import Spin, Still
-from qsim.parts import rotor
-from qsim.rotation import exponential, pose_matrix
-from qsim.scene import Body, Conductor, Constant, Diffuse, Mesh, RoughPlastic, Scene, Texture
-from qsim.shapes import ball, cylinder, merged, moved, wire
+from qsim.scene.motion import Spin, Still
+from qsim.scene.props import rotor
+from qsim.scene.rotation import exponential, pose_matrix
+from qsim.scene.scene import Body, Conductor, Constant, Diffuse, Mesh, RoughPlastic, Scene, Texture
+from qsim.scene.shapes import ball, cylinder, merged, moved, wire
 from scenes import stage
 from scenes.stage import any_angle, between, sign
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim import textures
-from qsim.motion import Spin, Translation
-from qsim.rotation import exponential, pose_matrix, vector
-from qsim.scene import Body, Diffuse, Mesh, Scene, Texture
-from qsim.shapes import blob, box, merged, moved
+from qsim.scene import textures
+from qsim.scene.motion import Spin, Translation
+from qsim.scene.rotation import exponential, pose_matrix, vector
+from qsim.scene.scene import Body, Diffuse, Mesh, Scene, Texture
+from qsim.scene.shapes import blob, box, merged, moved
 from scenes import stage
 from scenes.stage import any_angle, between, sign
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim import textures
-from qsim.motion import Spin, Still
-from qsim.parts import gear
-from qsim.rotation import exponential, pose_matrix
-from qsim.scene import Body, Conductor, Diffuse, Material, RoughPlastic, Scene, Texture
-from qsim.shapes import cylinder, moved
+from qsim.scene import textures
+from qsim.scene.motion import Spin, Still
+from qsim.scene.props import gear
+from qsim.scene.rotation import exponential, pose_matrix
+from qsim.scene.scene import Body, Conductor, Diffuse, Material, RoughPlastic, Scene, Texture
+from qsim.scene.shapes import cylinder, moved
 from scenes import stage
 from scenes.stage import between, sign
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from qsim.scene import Body, Diffuse, EnvironmentImage, Light, Material, Mesh, RoughPlastic, Scene, Texture
-from qsim.shapes import MESH_SUFFIXES, mesh_file
-from qsim.textures import PICTURE_SUFFIXES
+from qsim.scene.scene import Body, Diffuse, EnvironmentImage, Light, Material, Mesh, RoughPlastic, Scene, Texture
+from qsim.scene.shapes import MESH_SUFFIXES, mesh_file
+from qsim.scene.textures import PICTURE_SUFFIXES
 from scenes import stage, tumble
 from scenes.stage import any_angle, between, pick
 

@@ -8,12 +8,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from qsim import textures
-from qsim.motion import Motion
-from qsim.rotation import UP, exponential, pose_matrix, unit, vector
-from qsim.scene import AreaLamp, Body, Camera, Diffuse, EnvironmentImage, Material, RoughPlastic, SunSky, Texture
-from qsim.shapes import moved, sheet
-from qsim.textures import Picture
+from qsim.scene import textures
+from qsim.scene.motion import Motion
+from qsim.scene.rotation import UP, exponential, pose_matrix, unit, vector
+from qsim.scene.scene import AreaLamp, Body, Camera, Diffuse, EnvironmentImage, Material, RoughPlastic, SunSky, Texture
+from qsim.scene.shapes import moved, sheet
+from qsim.scene.textures import Picture
 
 HEIGHT, WIDTH = 512, 1024  # pixels; other sizes by Scene.resized, which keeps the height of the view
 FRAME_RATE = 2000.0  # Hz, for which speed = 1 is meant

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim import textures
-from qsim.motion import Motion, Oscillation, Pendulum, Still, Translation
-from qsim.parts import letters
-from qsim.rotation import pose_matrix, vector
-from qsim.scene import Body, Diffuse, RoughPlastic, Scene, Texture
-from qsim.shapes import box, moved, sheet
+from qsim.scene import textures
+from qsim.scene.motion import Motion, Oscillation, Pendulum, Still, Translation
+from qsim.scene.props import letters
+from qsim.scene.rotation import pose_matrix, vector
+from qsim.scene.scene import Body, Diffuse, RoughPlastic, Scene, Texture
+from qsim.scene.shapes import box, moved, sheet
 from scenes import stage
 from scenes.stage import any_angle, between, pick
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.motion import Ballistic
-from qsim.parts import gear
-from qsim.rotation import vector
-from qsim.scene import Body, Diffuse, Mesh, Scene
-from qsim.shapes import ball, blob, box, cylinder, polyhedron, torus
+from qsim.scene.motion import Ballistic
+from qsim.scene.props import gear
+from qsim.scene.rotation import vector
+from qsim.scene.scene import Body, Diffuse, Mesh, Scene
+from qsim.scene.shapes import ball, blob, box, cylinder, polyhedron, torus
 from scenes import stage
 from scenes.stage import any_angle, between, pick
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.motion import Motion, Oscillation, Spin, Still
-from qsim.parts import spring
-from qsim.rotation import exponential, pose_matrix, vector
-from qsim.scene import Body, Conductor, Diffuse, Material, Mesh, RoughPlastic, Scene
-from qsim.shapes import merged, moved, torus, wire
+from qsim.scene.motion import Motion, Oscillation, Spin, Still
+from qsim.scene.props import spring
+from qsim.scene.rotation import exponential, pose_matrix, vector
+from qsim.scene.scene import Body, Conductor, Diffuse, Material, Mesh, RoughPlastic, Scene
+from qsim.scene.shapes import merged, moved, torus, wire
 from scenes import stage
 from scenes.stage import any_angle, between, pick, sign
 

@@ -16,8 +16,8 @@ from functools import partial
 
 from numpy import ndarray as Array
 
-from quiver.baselines import likelihood, mean, moment, qbp, qbp_bm3d, transform_denoise
-from quiver.baselines.windows import look_ahead
+from quiver.baselines import likelihood, moment, naive_mean, qbp, qbp_bm3d, transform_denoise
+from quiver.baselines.sliding_window import look_ahead
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Method:
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        Method("naive", mean.restore, 11, "mean of the codes, taken as linear in light", 50),
+        Method("naive", naive_mean.restore, 11, "mean of the codes, taken as linear in light", 50),
         Method("moment", moment.restore, 11, "mean of the codes through the exact inverse response", 50),
         Method("likelihood", likelihood.restore, 11, "most likely light given the codes of one pixel", 300),
         Method(

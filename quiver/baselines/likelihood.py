@@ -15,9 +15,9 @@ from __future__ import annotations
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.sensor import Sensor
-from quiver.baselines.tables import response_table
-from quiver.baselines.windows import check_codes, check_window, in_units, window_frames
+from qsim.sensor.sensor import Sensor
+from quiver.baselines.response_table import response_table
+from quiver.baselines.sliding_window import check_codes, check_window, in_units, window_frames
 
 CHUNK = 1 << 22  # entries of the histograms solved at a time
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from numpy import ndarray as Array
 
-from qsim.sensor import Sensor
-from quiver.baselines.tables import response_table
-from quiver.baselines.windows import restore_by_mean
+from qsim.sensor.sensor import Sensor
+from quiver.baselines.response_table import response_table
+from quiver.baselines.sliding_window import restore_by_mean
 
 
 def restore(

@@ -23,10 +23,10 @@ import torch
 from numpy import ndarray as Array
 from torch import Tensor
 
-from qsim.sensor import Sensor
-from quiver.baselines import align
-from quiver.baselines.tables import ResponseTable, response_table
-from quiver.baselines.windows import check_codes, check_window, in_units, window_frames
+from qsim.sensor.sensor import Sensor
+from quiver.baselines import patch_alignment
+from quiver.baselines.response_table import ResponseTable, response_table
+from quiver.baselines.sliding_window import check_codes, check_window, in_units, window_frames
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def merge(codes: Array, frame: int, table: ResponseTable, window: int, settings:
     height, width = codes.shape[1:]
     stack = codes[window_frames(frame, window, len(codes))].astype(np.float32) / table.top
     frames = torch.from_numpy(stack).unflatten(0, (-1, settings.block))  # [blocks, frames of a block, H, W]
-    frames = torch.stack([torch.stack([align.pad_image(image) for image in block]) for block in frames])
+    frames = torch.stack([torch.stack([patch_alignment.pad_image(image) for image in block]) for block in frames])
     with torch.no_grad():
         merged = _merge_patches(frames, frame_shifts(frames, settings), table, settings)
     return (table.top * merged[:height, :width]).numpy()
@@ -98,10 +98,12 @@ def frame_shifts(frames: Tensor, settings: Settings = CALIBRATED) -> Tensor:
     width = settings.prefilter if len(frames) >= 3 * settings.prefilter else 1
     half = width // 2
     matched = [i for i in range(half, len(frames) - half) if i == middle or abs(i - middle) >= width]
-    pyramids = {i: align.pyramid(blocks[i - half : i + half + 1].mean(0)) for i in matched}
-    still = torch.zeros(align.grid(blocks.shape[1:], align.LEVELS[0])[0].shape)
+    pyramids = {i: patch_alignment.pyramid(blocks[i - half : i + half + 1].mean(0)) for i in matched}
+    still = torch.zeros(patch_alignment.grid(blocks.shape[1:], patch_alignment.LEVELS[0])[0].shape)
     found = [
-        still if i == middle else align.align(pyramids[middle], pyramids[i], refine_finest=settings.refine_finest)
+        still
+        if i == middle
+        else patch_alignment.align(pyramids[middle], pyramids[i], refine_finest=settings.refine_finest)
         for i in matched
     ]
     place = (torch.arange(blocks.shape[0] * frames.shape[1]) + 0.5) / frames.shape[1] - 0.5  # of a frame, in blocks
@@ -125,20 +127,24 @@ def _warp_block(frames: Tensor, shifts: Tensor, corner: Tensor, smooth: bool) ->
 
     Pixels from outside the image are left out; where no frame has any, the border repeats.
     """
-    size = align.LEVELS[0].patch
+    size = patch_alignment.LEVELS[0].patch
     total, count, edge = torch.zeros(3, size, size, corner.shape[1]).unbind()
     for image, shift in zip(frames, shifts, strict=True):
         position = corner + (shift if smooth else shift.round())
-        patch = align.sample_linear(image, position, size) if smooth else align.gather(image, position.long(), size)
-        valid = align.inside(image.shape, position, size)
+        patch = (
+            patch_alignment.sample_linear(image, position, size)
+            if smooth
+            else patch_alignment.gather(image, position.long(), size)
+        )
+        valid = patch_alignment.inside(image.shape, position, size)
         total, count, edge = total + patch * valid, count + valid, edge + patch
     return torch.where(count > 0, total / count.clamp(min=1), edge / len(frames))
 
 
 def _merge_patches(frames: Tensor, shifts: Tensor, table: ResponseTable, settings: Settings) -> Tensor:
     """Steps from aligned patches to the merged image: spectra, Wiener weights, overlap-add."""
-    corner = align.grid(frames.shape[2:], align.LEVELS[0])[0]
-    size, count = align.LEVELS[0].patch, len(frames)
+    corner = patch_alignment.grid(frames.shape[2:], patch_alignment.LEVELS[0])[0]
+    size, count = patch_alignment.LEVELS[0].patch, len(frames)
     smooth = settings.refine_finest
     reference = _warp_block(frames[count // 2], shifts[count // 2], corner, smooth)
     noise = 2 * size * size * settings.wiener * _noise(reference, table, settings)

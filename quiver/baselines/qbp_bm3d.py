@@ -12,11 +12,11 @@ from __future__ import annotations
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.sensor import Sensor
+from qsim.sensor.sensor import Sensor
 from quiver.baselines import bm3d, qbp
-from quiver.baselines.tables import response_table
+from quiver.baselines.response_table import response_table
+from quiver.baselines.sliding_window import check_codes, check_window, in_units
 from quiver.baselines.vst import stabiliser
-from quiver.baselines.windows import check_codes, check_window, in_units
 
 EXCESS = 1.0  # best of 0.8, 1, 1.25, 1.5, 2 on the clips on which qbp.py was calibrated
 

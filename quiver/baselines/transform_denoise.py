@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.sensor import Sensor
+from qsim.sensor.sensor import Sensor
 from quiver.baselines import bm3d
+from quiver.baselines.sliding_window import check_codes, check_window, in_units, window_sums
 from quiver.baselines.vst import Kind, stabiliser
-from quiver.baselines.windows import check_codes, check_window, in_units, window_sums
 
 
 def restore(

@@ -20,8 +20,8 @@ from typing import Literal
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.sensor import Sensor
-from quiver.baselines.tables import pieces, response_table
+from qsim.sensor.sensor import Sensor
+from quiver.baselines.response_table import pieces, response_table
 
 Kind = Literal["table", "binomial", "poisson"]
 

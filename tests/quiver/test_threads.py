@@ -14,12 +14,13 @@ import pytest
 import torch
 from clips import ClipMaker, write_clip
 
-import qsim.cli
-from qsim import stream
-from quiver import cli, threads
-from quiver.run import Settings
-from quiver.train import train
-from quiver.unet import UNet, UNetConfig
+import qsim.cli.program
+from qsim.clip import stream
+from quiver import threads
+from quiver.cli import program
+from quiver.model.unet import UNet, UNetConfig
+from quiver.training.loop import train
+from quiver.training.run_folder import Settings
 
 ROOT = Path(__file__).parents[2]
 two_cores = pytest.mark.skipif(threads.cores() < 2, reason="needs two cores")
@@ -83,9 +84,9 @@ COMPARE = """
 import sys
 import numpy as np
 import torch
-from quiver.data import Key, Light, array_codes, draw_codes
-from quiver.model import build
-from quiver.restoring import Options, method_names, restorer, wrap_network
+from quiver.data.codes import Key, Light, array_codes, draw_codes
+from quiver.model.quiver import build
+from quiver.restoration.restorers import Options, method_names, restorer, wrap_network
 
 torch.manual_seed(0)
 sensor = Light().device(5e-4)
@@ -145,7 +146,7 @@ def test_restored_video_notes_its_number(make_clip: ClipMaker, tmp_path, capsys)
     words = ["restore", make_clip().path, "-o", tmp_path / "v.npy", "--method", "moment", "--ppp", 3.25, "--force"]
 
     def noted(*more: object) -> int:
-        assert cli.main([str(word) for word in [*words, *more]]) == 0
+        assert program.main([str(word) for word in [*words, *more]]) == 0
         capsys.readouterr()
         return json.loads((tmp_path / "v.json").read_text())["threads"]
 
@@ -157,16 +158,16 @@ def test_restored_video_notes_its_number(make_clip: ClipMaker, tmp_path, capsys)
 
 def test_verbose_says_the_number_and_a_wrong_one_is_one_line(make_clip: ClipMaker, tmp_path, capsys):
     words = ["restore", str(make_clip().path), "-o", str(tmp_path / "v.npy"), "--method", "moment", "--ppp", "3"]
-    assert cli.main([*words, "--threads", "1000"]) == 2
+    assert program.main([*words, "--threads", "1000"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
-    assert cli.main([*words, "--threads", "1", "-v"]) == 0
+    assert program.main([*words, "--threads", "1", "-v"]) == 0
     assert f"threads: 1 of {threads.cores()} (as asked for)" in capsys.readouterr().err
 
 
 def test_every_command_that_computes_has_the_option(capsys):
     quiver_commands = ("train", "restore", "evaluate", "ablate", "bench")
     qsim_commands = ("render", "sense", "generate", "plan", "tradeoff", "validate")
-    for main, names in ((cli.main, quiver_commands), (qsim.cli.main, qsim_commands)):
+    for main, names in ((program.main, quiver_commands), (qsim.cli.program.main, qsim_commands)):
         for name in names:
             main([name, "--help"])
             assert "--threads" in capsys.readouterr().out, name
@@ -185,12 +186,12 @@ def test_the_compiled_engine_has_as_many_and_the_next_command_all(tmp_path, monk
     monkeypatch.setattr(stream, "sense", watched)
     clip = write_clip(tmp_path / "c", frames=3, height=96, width=96)
     for name, more in (("one", ["--threads", "1"]), ("all", [])):
-        assert qsim.cli.main(["sense", str(clip.path), "--ppp", "3", "--bits", "3", "-o", name, *more]) == 0
+        assert qsim.cli.program.main(["sense", str(clip.path), "--ppp", "3", "--bits", "3", "-o", name, *more]) == 0
     assert seen[0] == ("1", 1)
     assert seen[1][1] == drjit.thread_count() == max(before, os.cpu_count() or 1)
     one, both = (np.load(tmp_path / f"c/streams/{name}.npy") for name in ("one", "all"))
     np.testing.assert_array_equal(one, both)
     for wrong in ("0", "-3", "100000"):
-        assert qsim.cli.main(["sense", str(clip.path), "--ppp", "3", "--threads", wrong]) == 2
+        assert qsim.cli.program.main(["sense", str(clip.path), "--ppp", "3", "--threads", wrong]) == 2
         assert f"--threads {wrong}: this machine has" in capsys.readouterr().err
     assert "QSIM_THREADS" not in os.environ

@@ -1,0 +1,1 @@
+"""From measured frames to sensor parameters with confidence intervals."""

@@ -1,0 +1,233 @@
+"""PRNU of the good pixels: what the light's shading, noise, dark counts and hot pixels leave of the spread of a flat.
+
+    mean code of every pixel - its own dark level  --smooth surface (shading of the light)-->  residuals
+    residuals^2 - noise = spread that a PRNU s would cause, by the sensor's own curve of mean code against light -> s
+
+Model: pixel p gets the light L_p (1 + s x_p); L is smooth over the field, x_p is normal with variance 1. The interval
+is that of a difference of two variances (Ting et al., J. Stat. Comput. Simul. 35, 1990, without the cross term).
+
+Hot pixels do not take part. With dark frames they are told by their dark level (`hot_by_rate`, `hot_by_level`), without
+by a flat level above `OUTLIER` robust standard deviations. What varies more slowly over the field than a polynomial of
+fourth degree counts as light, not as PRNU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, isfinite, sqrt
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.calibration.results import Value
+
+HOT = 10.0  # times the median dark rate
+OUTLIER = 6.0  # robust standard deviations (1.4826 times the median absolute deviation)
+CERTAIN = 5.0  # standard errors by which a hot pixel exceeds the median at least
+WIDEST = 3.5  # the response is tabled up to so many times the brightest light of a flat
+STEEPEST = 1.0  # largest PRNU that is looked for
+BY_DARK = "by the dark frames"
+BY_FLAT = f"by the flat: {OUTLIER:g} robust sigmas above its smooth surface"
+NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
+WEIGHTS = WEIGHTS / WEIGHTS.sum()
+
+
+@dataclass(frozen=True, eq=False)
+class Flat:
+    """One flat field, dark levels taken off: per pixel the mean code, the variance of that mean, and the response."""
+
+    mean: Array  # [H, W] codes; the mean dark level of the good pixels is left in
+    noise: Array  # [H, W] codes^2, variance of `mean` by noise, of flat and dark
+    light: Array  # [G] rising light, in electrons or avalanches per exposure, from 0
+    codes: Array  # [G] mean code of a pixel of average dark level at that light
+    raw: Array  # [H, W] codes, the mean before its dark level was taken off
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """PRNU of the good pixels, of all pixels, and which pixels were left out."""
+
+    prnu: Value
+    with_hot: Value
+    left_out: Array  # bool [H, W]
+    rule: str  # by which pixels were left out
+    shading: float  # rms of the smooth part of the light, relative
+
+    def values(self) -> dict[str, Value]:
+        """As values of a calibration; the PRNU of all pixels only where some were left out."""
+        count = float(self.left_out.sum())
+        found = {"prnu": self.prnu}
+        if count:
+            found["prnu_with_hot_pixels"] = self.with_hot
+        unit = f"of {self.left_out.size} pixels"
+        return found | {
+            "prnu_left_out": Value(count, count, count, unit, f"hot {self.rule}"),
+            "shading": Value(self.shading, self.shading, self.shading, "rms, relative", "smooth surface, not in PRNU"),
+        }
+
+
+def robust_sigma(values: Array) -> float:
+    """1.4826 times the median absolute deviation: the standard deviation of a normal sample with outliers."""
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+
+
+def hot_by_rate(counts: Array) -> Array:
+    """Hot pixels of dark counts [H, W] (expected counts over all dark frames): above 10 medians, and surely so."""
+    median = float(np.median(counts))
+    return np.asarray(counts > np.maximum(HOT * median, median + CERTAIN * sqrt(median + 1)))
+
+
+def hot_by_level(level: Array, error: float) -> Array:
+    """Hot pixels of dark levels [H, W] with an offset: above the median by 6 robust sigmas and 5 standard errors."""
+    median = float(np.median(level))
+    return np.asarray(level > median + max(OUTLIER * robust_sigma(level), CERTAIN * error))
+
+
+def surface(shape: tuple[int, int], pixels: int) -> Array:
+    """Polynomials over the field [H * W, terms]: fourth degree, second below 100 pixels, a constant below 20."""
+    degree = 4 if pixels >= 100 else 2 if pixels >= 20 else 0
+    y, x = (np.linspace(-1, 1, n) if n > 1 else np.zeros(1) for n in shape)
+    terms = [
+        np.outer(np.polynomial.legendre.legval(y, np.eye(j + 1)[j]), np.polynomial.legendre.legval(x, np.eye(i + 1)[i]))
+        for j in range(min(degree, shape[0] - 1) + 1)
+        for i in range(min(degree - j, shape[1] - 1) + 1)
+    ]
+    return np.stack([term.ravel() for term in terms], axis=1)
+
+
+def outliers(flat: Flat) -> Array:
+    """Pixels of a flat [H, W] that exceed its smooth surface by 6 robust sigmas: hot ones, if no darks tell."""
+    values = flat.mean.ravel()
+    basis = surface(flat.mean.shape, values.size)
+    good = np.abs(values - np.median(values)) <= OUTLIER * robust_sigma(values)
+    for _ in range(20):
+        if good.sum() <= 2 * basis.shape[1]:
+            return np.zeros(flat.mean.shape, bool)
+        fitted = basis @ np.linalg.lstsq(basis[good], values[good], rcond=None)[0]
+        residual = (values - fitted) / np.maximum(fitted - flat.codes[0], 1e-12)
+        now = residual <= np.median(residual) + OUTLIER * robust_sigma(residual)
+        if np.array_equal(now, good):
+            break
+        good = now
+    return ~good.reshape(flat.mean.shape)
+
+
+def relative_noise(flat: Flat, good: Array) -> float:
+    """Variance of a pixel's mean over the square of what a relative change of the light moves: small is best."""
+    level = float(flat.mean[good].mean())
+    light = float(np.interp(level, flat.codes, flat.light))
+    slope = float(np.interp(light, flat.light, np.gradient(flat.codes, flat.light)))
+    lever = slope * light
+    return float(flat.noise[good].mean()) / lever**2 if lever > 0 else inf
+
+
+def measure_pattern(flats: Sequence[Flat], hot: Array | None) -> Pattern | None:
+    """PRNU from the flat that tells it best (all share one pattern); None where no flat tells anything.
+
+    `hot` [H, W] is by the dark frames; None: the outliers of the flat.
+    """
+    best: tuple[float, Flat, Array] | None = None
+    for flat in flats:
+        out = outliers(flat) if hot is None else hot
+        if (~out).sum() < 3:
+            continue
+        score = relative_noise(flat, ~out)
+        if isfinite(score) and (best is None or score < best[0]):
+            best = (score, flat, out)
+    if best is None:
+        return None
+    _, flat, out = best
+    prnu, shading = _of_good(flat, ~out)
+    return Pattern(prnu, _of_all(flat, ~out), out, BY_FLAT if hot is None else BY_DARK, shading)
+
+
+def _of_all(flat: Flat, good: Array) -> Value:
+    """Spread of all pixels about the smooth surface of the good ones, in the light of the good ones."""
+    basis = surface(flat.raw.shape, int(good.sum()))
+    fitted = basis @ np.linalg.lstsq(basis[good.ravel()], flat.raw[good], rcond=None)[0]
+    residual = flat.raw.ravel() - fitted
+    square, noise = float(residual.var(ddof=basis.shape[1])), float(flat.noise.mean())
+    of_square = float(np.var((residual - residual.mean()) ** 2)) / residual.size
+    lever = noise / relative_noise(flat, good) if noise > 0 else float(np.mean(fitted - flat.codes[0])) ** 2
+    low, high = (max(v, 0.0) / lever for v in difference_interval(square, of_square, noise, 0.0))
+    found = max(square - noise, 0.0) / lever
+    return Value(sqrt(found), sqrt(low), sqrt(high), "of the signal", "spread of all pixels' means, hot ones included")
+
+
+def _of_good(flat: Flat, good: Array) -> tuple[Value, float]:
+    """PRNU of the good pixels with its interval, and the rms of the shading."""
+    basis = surface(flat.mean.shape, int(good.sum()))[good.ravel()]
+    level, noise = flat.mean[good], flat.noise[good]
+    model = _Model(flat)
+    weights, s = np.ones_like(level), 0.1
+    for _ in range(4):
+        root = np.sqrt(weights)
+        orthonormal, _ = np.linalg.qr(basis * root[:, None])
+        leverage = np.minimum((orthonormal**2).sum(axis=1), 0.99)
+        fitted = (orthonormal @ (orthonormal.T @ (root * level))) / root
+        squares = (level - fitted) ** 2 / (1 - leverage)
+        share = np.maximum(fitted - flat.codes[0], 1e-12)
+        even = float(noise.mean()) * share / float(share.mean())  # smooth: a pixel's own noise estimate would bias
+        shape = np.maximum(model.variance(fitted, max(s, 0.01)), 1e-30)
+        total = shape + even
+        gain = shape / total**2
+        observed, explained = float(gain @ squares), float(gain @ noise)
+        s = model.inverse(fitted, gain, observed - explained)
+        weights = 1 / (np.maximum(model.variance(fitted, max(s, 0.01)), 1e-30) + even)
+        weights /= weights.mean()
+    n, terms = basis.shape
+    kurtosis = float(np.mean((squares / total) ** 2) / np.mean(squares / total) ** 2) - 3
+    excess = kurtosis if kurtosis > 2 * sqrt(24 / n) else 0.0
+    of_observed = (2 + excess) * float(gain**2 @ total**2) * (observed / float(gain @ total)) ** 2 * n / (n - terms)
+    of_explained = float(gain**2 @ even**2) * float(np.var(noise / even)) if explained > 0 else 0.0
+    low, high = difference_interval(observed, of_observed, explained, of_explained)
+    ends = [model.inverse(fitted, gain, value) for value in (low, high)]
+    light = np.interp(fitted, flat.codes, flat.light)
+    shading = float(light.std() / max(float(light.mean()), 1e-12))
+    return Value(s, ends[0], max(ends[1], s), "of the signal", "spread of pixel means"), shading
+
+
+def difference_interval(first: float, of_first: float, second: float, of_second: float) -> tuple[float, float]:
+    """95 % interval of the difference of two variance estimates with the variances `of_first` and `of_second`."""
+    from scipy.stats import chi2
+
+    def reach(value: float, variance: float) -> tuple[float, float]:
+        """How far chi-square lets the true value lie below and above, relative."""
+        if variance <= 0 or value <= 0:
+            return 0.0, 0.0
+        freedom = max(2 * value**2 / variance, 1.0)
+        below, above = chi2.ppf((0.975, 0.025), freedom)
+        return 1 - freedom / float(below), freedom / float(above) - 1
+
+    (down, up), (down_noise, up_noise) = reach(first, of_first), reach(second, of_second)
+    low = first - second - sqrt((down * first) ** 2 + (up_noise * second) ** 2)
+    most = max(first, second)  # the upper end is never below what data without any pattern would leave open
+    return low, most - second + sqrt((up * most) ** 2 + (down_noise * second) ** 2)
+
+
+class _Model:
+    """Variance between pixels of one expected code that a PRNU causes, by the response curve."""
+
+    def __init__(self, flat: Flat) -> None:
+        self.light, self.codes = flat.light, flat.codes
+        self.grid = np.linspace(0, np.sqrt(flat.light[-1] / WIDEST), 400) ** 2
+
+    def variance(self, expected: Array, s: float) -> Array:
+        """At expected codes [N]: variance between pixels [N], codes^2."""
+        light = self.grid[:, None] * np.maximum(1 + s * NODES, 0)
+        codes = np.interp(light, self.light, self.codes)
+        mean = codes @ WEIGHTS
+        return np.interp(expected, mean, np.maximum(codes**2 @ WEIGHTS - mean**2, 0))
+
+    def inverse(self, expected: Array, gain: Array, wanted: float) -> float:
+        """The PRNU at which sum gain x variance is `wanted`, 0 ... STEEPEST."""
+        if wanted <= 0:
+            return 0.0
+        edges = np.linspace(float(expected.min()), float(expected.max()), 65)
+        place = np.clip(np.searchsorted(edges, expected) - 1, 0, 63)
+        middles, sums = (edges[1:] + edges[:-1]) / 2, np.bincount(place, gain, 64)
+        steps = np.linspace(0, sqrt(STEEPEST), 41) ** 2
+        table = np.array([float(sums @ self.variance(middles, s)) for s in steps])
+        end = int(np.argmax(table)) + 1
+        return float(np.sqrt(np.interp(wanted, table[:end], steps[:end] ** 2)))

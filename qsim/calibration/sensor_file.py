@@ -1,0 +1,176 @@
+"""A calibration in files: frames in; a sensor file with its sources, all values, a residual plot and maps out.
+
+SENSOR.toml         a device that `--sensor SENSOR.toml` takes
+SENSOR.json         every value with its interval, the warnings and the goodness of the fit
+SENSOR.png          residuals of the histograms, in sigmas
+SENSOR_dark.npy     DCR map [1/s], float32 [H, W] (SPAD)
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import files
+from qsim.calibration.frame_statistics import Stack, measure, measure_sums
+from qsim.calibration.results import Calibration
+from qsim.formats import importing
+from qsim.formats.array_files import load_npy, mat_array
+from qsim.formats.recording import Hints
+from qsim.sensor.qis import QIS
+from qsim.sensor.sensor import Sensor
+from qsim.sensor.spad import BinarySPAD, CountingSPAD
+
+_BLOCK_BYTES = 1 << 25
+
+
+def read_stack(
+    path: Path,
+    *,
+    bits: int,
+    exposure: float,
+    photons: float | None,
+    width: int | None = None,
+    planes: int | None = None,
+    variable: str | None = None,
+) -> Stack:
+    """Statistics of frames: `.npy` of codes (floats too, if they are whole), TIFF, or any capture of `convert`.
+
+    `width` says that an `.npy` is a photon cube of packed planes, `planes` that every value is the sum of so many
+    binary planes, `variable` which array of a `.mat` to take. `ValueError` or `FileNotFoundError` naming the file.
+    """
+    if planes is None:
+        blocks = _blocks(path, bits, width, variable)
+        return measure(blocks, bits=bits, exposure=exposure, photons=photons, name=str(path))
+    blocks = _blocks(path, planes.bit_length(), width, variable)
+    return measure_sums(blocks, planes=planes, exposure=exposure, photons=photons, name=str(path))
+
+
+def _blocks(path: Path, bits: int, width: int | None, variable: str | None) -> Iterator[Array]:
+    if variable is not None and path.suffix != ".mat" and not path.is_dir():
+        raise ValueError(f"{path}: --variable names an array of a .mat file; leave it out")
+    if path.suffix == ".npy" and width is None:
+        return _array_blocks(read_counts(path))
+    if path.suffix == ".mat":
+        if width is not None:
+            raise ValueError(f"{path}: --width is of packed planes, and a .mat holds one value per pixel; leave it out")
+        return _array_blocks(mat_array(path, variable))
+    footage = importing.read(path, Hints(bits=min(bits, 16), width=width, variable=variable), compared=("bits",))
+    if footage.is_light or footage.bits != bits:
+        raise ValueError(f"{path}: holds {footage.source}, not values of {bits} bits")
+    return (block for _, block in importing.blocks(footage))
+
+
+def read_counts(path: Path, variable: str | None = None) -> Array:
+    """Frames [T, H, W] of an `.npy`, mapped, or of a `.mat`; `ValueError` or `FileNotFoundError` naming the file."""
+    if path.suffix == ".mat":
+        return mat_array(path, variable)
+    if variable is not None:
+        raise ValueError(f"{path}: --variable names an array of a .mat file; leave it out")
+    array = load_npy(path)
+    array = array[None] if array.ndim == 2 else array
+    if array.ndim != 3 or array.size == 0:
+        raise ValueError(f"{path}: expected frames [T, H, W], found shape {list(array.shape)}")
+    return array
+
+
+def _array_blocks(array: Array) -> Iterator[Array]:
+    step = max(1, _BLOCK_BYTES // (8 * array.shape[1] * array.shape[2]))
+    for start in range(0, len(array), step):
+        yield np.asarray(array[start : start + step])
+
+
+def sensor_of(found: Calibration) -> Sensor:
+    """The sensor that a calibration describes; an efficiency that was not measured is 1 (light in detected photons)."""
+    value = {name: v.value for name, v in found.values.items()}
+    if found.model == "QIS":
+        efficiency = min(value.get("quantum_efficiency", 1.0), 1.0)
+        return QIS(
+            efficiency, value["dark_current"], value["read_noise"], found.bits, value["gain"], offset=value["offset"]
+        )
+    efficiency, dark = min(value.get("pde_fill", 1.0), 1.0), value.get("dark_count_rate", 0.0)
+    if found.model == "BinarySPAD":
+        return BinarySPAD(efficiency, dark, found.bits)
+    return CountingSPAD(efficiency, dark, value.get("dead_time", 0.0), found.bits, found.paralyzable)
+
+
+_FIELDS = {"quantum_efficiency": ("quantum_efficiency",), "pde": ("pde_fill",)}
+
+
+def to_toml(found: Calibration, title: str, dark_map: str | None = None) -> str:
+    """The sensor as a device file, each number with its interval and method as its source.
+
+    The map of dark counts is offered in a comment: it fits frames that are no larger than it.
+    """
+    lines = [f"# {title}", "[sensor]"]
+    described = sensor_of(found).to_dict()
+    lines += [f"{key} = {_toml(value)}" for key, value in described.items() if value is not None]
+    lines += ["", "[sources]"]
+    for key in described:
+        for name in _FIELDS.get(key, (key,)):
+            if name in found.values:
+                v = found.values[name]
+                lines.append(f'{key} = "{v.value:.6g}, 95 % interval {v.low:.6g} to {v.high:.6g} {v.unit}; {v.method}"')
+            elif key in _FIELDS:
+                lines.append(f'{key} = "1, not measured: give light in detected photons"')
+    if dark_map is not None:
+        lines += ["", "# [defects]  # uncomment to give every pixel its own dark counts", f'# dark_map = "{dark_map}"']
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def as_dict(found: Calibration) -> dict[str, Any]:
+    """Values, warnings and goodness for programs; NaN becomes null."""
+    return {
+        "model": found.model,
+        "bits": found.bits,
+        "values": {name: asdict(value) for name, value in found.values.items()},
+        "p_value": None if math.isnan(found.p_value) else found.p_value,
+        "warnings": list(found.warnings),
+    }
+
+
+def figure(found: Calibration) -> bytes:
+    """Residuals of every stack's histogram in sigmas, as PNG; a good fit scatters between -2 and 2."""
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(7, 3.2), dpi=120, layout="constrained")
+    axes = drawing.subplots()
+    for i, residual in enumerate(found.residuals):
+        axes.plot(np.flatnonzero(residual), residual[residual != 0], ".", markersize=3, label=f"stack {i}")
+    axes.axhspan(-2, 2, color="tab:green", alpha=0.12)
+    axes.set_xlabel("code")
+    axes.set_ylabel("(observed - fitted) / sigma")
+    p = "not tested" if math.isnan(found.p_value) else f"p = {found.p_value:.3g}"
+    axes.set_title(f"{found.model}: histograms against the fitted model, {p}", fontsize=10)
+    if found.residuals:
+        axes.legend(fontsize=7, ncols=3)
+    buffer = io.BytesIO()
+    drawing.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def write(found: Calibration, path: Path, title: str) -> list[Path]:
+    """All files of a calibration; the sensor file comes last. Returns their paths."""
+    written = [path.with_suffix(".json"), path.with_suffix(".png")]
+    dark_map = path.with_name(f"{path.stem}_dark.npy") if "dark_count_rate" in found.maps else None
+    files.write_json(written[0], as_dict(found))
+    files.write_bytes(written[1], figure(found))
+    if dark_map is not None:
+        written.append(dark_map)
+        with files.replacing(dark_map) as file:
+            np.save(file, found.maps["dark_count_rate"].astype(np.float32))
+    files.write_bytes(path, to_toml(found, title, dark_map.name if dark_map else None).encode())
+    return [*written, path]

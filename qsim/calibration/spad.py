@@ -1,0 +1,314 @@
+"""Dark and flat counts of a SPAD array -> dark-count map, detection efficiency, PRNU, dead time, afterpulsing.
+
+    1-bit planes:  arrivals of a pixel = -ln(1 - ones/frames)          counts: arrivals = counts, dead time corrected
+
+Every number describes this array: DCR and PDE are means over its pixels, so their intervals hold shot noise alone.
+Detection efficiency times fill factor is found up to the light standard that gave the photons of the flats.
+Dead time comes from the Fano factor against flux: counts spread less than Poisson where avalanches block their
+followers. Afterpulsing comes from the correlation of neighbouring frames. Left out: a spread of dead time between
+pixels, crosstalk, afterpulses within one frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, isfinite, nan, sqrt
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.calibration.flat_fields import Response, dark_rates, spad_flats
+from qsim.calibration.frame_statistics import Stack
+from qsim.calibration.prnu import BY_FLAT, HOT, measure_pattern
+from qsim.calibration.qis import NODES, WEIGHTS, check_stacks, goodness
+from qsim.calibration.results import Z95, Calibration, Value, normal_interval, odd_efficiency
+from qsim.sensor.spad import CountingSPAD
+
+PERCENTILES = (1, 10, 25, 75, 90, 99, 99.9)  # of the DCR map, beside the median
+
+
+def calibrate_spad(
+    darks: Sequence[Stack], flats: Sequence[Stack], *, bits: int, dead_time: bool = True, paralyzable: bool = False
+) -> Calibration:
+    """DCR (and its map), PDE x fill, PRNU, afterpulsing and, for counts of more than one bit, dead time.
+
+    `dead_time=False` takes the counts as Poisson; the p-value tells whether that holds. `darks` may be missing (DCR is
+    then taken as 0 and said so), and so may `flats`. `ValueError` if both are.
+    """
+    check_stacks(darks, flats)
+    warnings = _dispersed([*darks, *flats])
+    values: dict[str, Value] = {}
+    maps: dict[str, Array] = {}
+    fano = fitted_dead_time(flats, bits, paralyzable) if bits > 1 and flats and dead_time else None
+    ratio = 0.0 if fano is None else fano.value
+    response = Response(bits, ratio, paralyzable)
+    if darks:
+        dcr_map, of_map = dark_rates(darks, response)
+        maps["dark_count_rate"] = dcr_map
+        values["dark_count_rate"] = normal_interval(
+            float(dcr_map.mean()), float(of_map.sum()) / dcr_map.size**2, "1/s", "array mean", floor=0.0
+        )
+        values |= _distribution(dcr_map)
+        if all(stack.total.sum() == 0 for stack in darks):
+            time = sum(stack.frames * stack.exposure * stack.pixels for stack in darks)
+            values["dark_count_rate"] = Value(0.0, 0.0, 3.688879454113936 / time, "1/s", "no dark count: upper bound")
+            warnings.append("no dark count at all: the dark-count rate has an upper bound only")
+    else:
+        warnings.append("no dark frames: dark counts are taken as 0 and end up in the efficiency and in PRNU")
+    if flats:
+        warnings += _saturation(flats)
+        values |= _efficiency(flats, darks, response, 0.0 if fano is None else fano.variance)
+        if "pde_fill" in values:
+            warnings += odd_efficiency(values["pde_fill"])
+        levels, hot = spad_flats(flats, darks, response)
+        pattern = measure_pattern(levels, hot)
+        if pattern is not None:
+            values |= pattern.values()
+            if not darks and pattern.left_out.any():
+                warnings.append(f"{pattern.left_out.sum()} pixels left out of PRNU as hot {BY_FLAT}")
+        else:
+            warnings.append("PRNU: one frame, or no light above the dark counts, tells nothing of it")
+    if fano is not None:
+        exposure = flats[0].exposure
+        method = "Fano factor against flux" + (", paralyzable" if paralyzable else "")
+        values["dead_time"] = normal_interval(ratio * exposure, fano.variance * exposure**2, "s", method, floor=0.0)
+    values |= _afterpulsing([*darks, *flats], bits)
+    spread = _spread(flats, darks, response)
+    p_value, residuals = _goodness(flats, bits, ratio, spread, paralyzable, len(flats) + (fano is not None))
+    if p_value < 1e-3:
+        warnings.append(
+            f"the fitted histograms do not describe the counts (p = {p_value:.1g}): the model is wrong here"
+        )
+    model = "BinarySPAD" if bits == 1 else "CountingSPAD"
+    return Calibration(model, bits, values, p_value, tuple(warnings), residuals, maps, paralyzable)
+
+
+# The dark-count map and the efficiency
+
+
+def _distribution(rates: Array) -> dict[str, Value]:
+    """Median and percentiles of the DCR map (order statistics), and the share of hot pixels (Wilson's interval)."""
+    ordered = np.sort(rates.ravel())
+    n = ordered.size
+    reach = Z95 * sqrt(n) / 2
+    low, high = (int(np.clip(round(n / 2 + sign * reach), 0, n - 1)) for sign in (-1, 1))
+    median = float(np.median(ordered))
+    found = {
+        "dark_count_rate_median": Value(median, float(ordered[low]), float(ordered[high]), "1/s", "order statistics")
+    }
+    for percent in PERCENTILES:
+        share = percent / 100
+        reach = Z95 * sqrt(n * share * (1 - share))
+        low, high = (int(np.clip(round(n * share + sign * reach), 0, n - 1)) for sign in (-1, 1))
+        value = float(np.percentile(ordered, percent))
+        name = f"dark_count_rate_p{percent:g}"
+        found[name] = Value(
+            value, min(float(ordered[low]), value), max(float(ordered[high]), value), "1/s", "order statistics"
+        )
+    if median > 0:
+        hot = float(np.mean(ordered > HOT * median))
+        centre = (hot + Z95**2 / (2 * n)) / (1 + Z95**2 / n)
+        half = Z95 / (1 + Z95**2 / n) * sqrt(hot * (1 - hot) / n + Z95**2 / (4 * n * n))
+        found["hot_pixels"] = Value(hot, max(centre - half, 0.0), centre + half, f"above {HOT:g} medians", "counting")
+    return found
+
+
+def _efficiency(
+    flats: Sequence[Stack], darks: Sequence[Stack], response: Response, ratio_variance: float
+) -> dict[str, Value]:
+    """PDE x fill: avalanches per photon of the light standard, flats weighed by their certainty.
+
+    The dead time's own uncertainty moves all flats together.
+    """
+    known = [(flat, flat.photons) for flat in flats if flat.photons]
+    if not known:
+        return {}
+
+    def slopes(used: Response) -> tuple[Array, Array]:
+        rate, of_rate = dark_rates(darks, used) if darks else (np.zeros(1), np.zeros(1))
+        rate_variance = float(of_rate.sum()) / rate.size**2
+        values, variances = [], []
+        for flat, photons in known:
+            arrivals, of_map, _ = used.of_stack(flat)
+            values.append(float(arrivals.mean() - rate.mean() * flat.exposure) / photons)
+            variances.append((float(of_map.sum()) / flat.pixels**2 + rate_variance * flat.exposure**2) / photons**2)
+        return np.array(values), np.maximum(variances, 1e-300)
+
+    values, variances = slopes(response)
+    moved = np.zeros_like(values)
+    if ratio_variance > 0:
+        step = max(1e-4 * response.ratio, 1e-7)
+        moved = (slopes(Response(response.bits, response.ratio + step, response.paralyzable))[0] - values) / step
+    covariance = np.diag(variances) + ratio_variance * np.outer(moved, moved)
+    weights = np.linalg.solve(covariance, np.ones(len(known)))
+    weights /= weights.sum()
+    variance = float(weights @ covariance @ weights)
+    return {
+        "pde_fill": normal_interval(float(weights @ values), variance, "counts/photon", "light standard", floor=0.0)
+    }
+
+
+def _spread(flats: Sequence[Stack], darks: Sequence[Stack], response: Response) -> float:
+    """Relative spread of the light over **all** pixels, shading and hot ones included: widens the histograms."""
+    rate = dark_rates(darks, response)[0] if darks else np.zeros(1)
+    dark_spread = sum(max(s.fixed_pattern, 0.0) / s.exposure**2 for s in darks if s.frames > 1) / max(len(darks), 1)
+    best = (0.0, inf)
+    for flat in flats:
+        if flat.frames < 2 or flat.pixels < 3:
+            continue
+        arrivals, _, slope = response.of_stack(flat)
+        signal = slope * float(arrivals.mean() - rate.mean() * flat.exposure)
+        if signal <= 0:
+            continue
+        variance = float((flat.total / flat.frames).var(ddof=1)) / signal**2
+        if variance < best[1]:
+            best = ((flat.fixed_pattern - dark_spread * (slope * flat.exposure) ** 2) / signal**2, variance)
+    return sqrt(max(best[0], 0.0))
+
+
+def _dispersed(stacks: Sequence[Stack]) -> list[str]:
+    """Sums of planes that scatter in time more or less than a binomial: wrong number of planes, or unsteady light."""
+    words = []
+    for i, stack in enumerate(stacks):
+        error = sqrt(2 / (stack.pixels * max(stack.sums - 1, 1)))
+        if isfinite(stack.dispersion) and abs(stack.dispersion - 1) > max(5 * error, 0.02):
+            words.append(
+                f"stack {i}: its sums scatter {stack.dispersion:.2f} times as much in time as so many planes would: "
+                "another number of planes, light that is not steady, or afterpulses"
+            )
+    if stacks and all(stack.sums or (stack.frames and not isfinite(stack.lag_covariance)) for stack in stacks):
+        words.append("sums of planes do not keep their order: afterpulsing is not measured")
+    return words
+
+
+def _saturation(flats: Sequence[Stack]) -> list[str]:
+    """Flats in which some pixels never leave the top code."""
+    words = []
+    for i, flat in enumerate(flats):
+        full = float((flat.total >= flat.frames * (flat.histogram.size - 1)).mean())
+        if full > 0:
+            words.append(f"flat {i}: {full:.1%} of the pixels are saturated in every frame; use less light")
+    return words
+
+
+# Dead time
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """Dead time in exposures, and its variance."""
+
+    value: float
+    variance: float
+
+
+def fitted_dead_time(flats: Sequence[Stack], bits: int, paralyzable: bool) -> Ratio | None:
+    """tau/T from the time variance of every flat against its mean: weighted least squares on exact moments."""
+    from scipy.optimize import minimize_scalar
+
+    usable = [flat for flat in flats if flat.frames > 1 and flat.mean > 0]
+    if not usable:
+        return None
+    if len({flat.exposure for flat in usable}) > 1:
+        raise ValueError("calibrate: the flats have different exposures; give dead-time flats of one exposure")
+
+    def misfit(ratio: float) -> float:
+        return float(sum(r * r for r in _fano_residuals(usable, bits, ratio, paralyzable)))
+
+    # A pixel counts at most about T/tau, or T/(e tau) if every arrival blocks it: the largest mean bounds the ratio.
+    ceiling = min((0.45 if paralyzable else 0.9) / max(flat.mean for flat in usable), 2.0)
+    found = minimize_scalar(misfit, bounds=(0.0, ceiling), method="bounded", options={"xatol": 1e-9})
+    ratio = float(found.x) if misfit(float(found.x)) < misfit(0.0) else 0.0
+    step = max(ratio * 1e-3, 1e-7)
+    slope = [
+        (a - b) / step
+        for a, b in zip(
+            _fano_residuals(usable, bits, ratio + step, paralyzable),
+            _fano_residuals(usable, bits, ratio, paralyzable),
+            strict=True,
+        )
+    ]
+    return Ratio(ratio, 1 / max(float(np.dot(slope, slope)), 1e-300))
+
+
+def _fano_residuals(flats: Sequence[Stack], bits: int, ratio: float, paralyzable: bool) -> list[float]:
+    """(observed variance - that of a dead-time pixel of the same mean) / sigma, per flat.
+
+    Sigma comes from the model's moments: those of the data would count the pattern of the pixels as noise.
+    """
+    residuals = []
+    codes = np.arange(1 << bits, dtype=float)
+    sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
+    for flat in flats:
+        arrivals, expected, slope = matched_variance(flat.mean, bits, ratio, paralyzable)
+        pmf = np.exp(sensor.log_pmf(np.array(arrivals), 1.0))
+        centred = codes - pmf @ codes
+        third, fourth = float(pmf @ centred**3), float(pmf @ centred**4)
+        v = max(expected, 1e-12)
+        n = flat.pixels * (flat.frames - 1)
+        spread = max(fourth - v**2 + slope**2 * v - 2 * slope * third, 1e-12) / n
+        residuals.append((flat.variance - expected) / sqrt(spread))
+    return residuals
+
+
+def matched_variance(mean: float, bits: int, ratio: float, paralyzable: bool) -> tuple[float, float, float]:
+    """(arrivals, variance, d variance / d mean) of a counting pixel of this mean code; tau/T = `ratio`.
+
+    Newton on the rising branch; where no light gives this mean the variance is 0, which no data match.
+    """
+    sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
+    arrivals = mean
+    for _ in range(40):
+        at = np.array(arrivals)
+        slope = -float(np.sum(sensor.dcdf(at, 1.0)[:-1]))
+        excess = float(sensor.mean(at, 1.0)) - mean
+        if slope < 0.02:  # the mean hardly rises or falls again: no light gives it with this dead time
+            return arrivals, 0.0, 0.0
+        step = float(np.clip(excess / slope, -0.5 * arrivals - 0.1, 0.5 * arrivals))
+        arrivals -= step
+        if abs(step) < 1e-9 * max(arrivals, 1e-6):
+            break
+    h = 1e-4 * max(arrivals, 1e-3)
+    at = np.array([arrivals - h, arrivals, arrivals + h])
+    variance, means = sensor.variance(at, 1.0), sensor.mean(at, 1.0)
+    return arrivals, float(variance[1]), float((variance[2] - variance[0]) / (means[2] - means[0]))
+
+
+# Afterpulsing, and the test of the model
+
+
+def _afterpulsing(stacks: Sequence[Stack], bits: int) -> dict[str, Value]:
+    """Chance that a count is followed by an extra one in the next frame, from neighbouring frames, all stacks together.
+
+    Counts: Cov(x_t, x_t+1) = a Var(x). Planes: P(1 | 1 before) - P(1 | 0 before) = a (1 - P(1 | 0 before)).
+    """
+    estimates, variances = [], []
+    for stack in stacks:
+        if not (stack.variance > 0 and isfinite(stack.lag_covariance)):
+            continue
+        correlation = stack.lag_covariance / stack.variance
+        room = 1 - stack.mean * (1 - correlation) if bits == 1 else 1.0
+        estimates.append(correlation / room)
+        variances.append(1 / (stack.pixels * (stack.frames - 1)) / room**2)
+    if not estimates:
+        return {}
+    weights = 1 / np.array(variances)
+    value = float(np.average(estimates, weights=weights))
+    found = normal_interval(value, 1 / float(weights.sum()), "per count, next frame", "lag-1 correlation", floor=0.0)
+    return {"afterpulsing": found}
+
+
+def _goodness(
+    flats: Sequence[Stack], bits: int, ratio: float, s: float, paralyzable: bool, fitted: int
+) -> tuple[float, tuple[Array, ...]]:
+    """Flats' histograms against the model at each flat's own mean and PRNU `s`; NaN for 1-bit planes."""
+    if bits == 1 or not flats:
+        return nan, ()
+    sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
+    shares = []
+    for flat in flats:
+        arrivals, _, _ = matched_variance(flat.mean, bits, ratio, paralyzable)
+        pmf = np.exp(sensor.log_pmf(np.maximum(arrivals * (1 + s * NODES), 0.0), 1.0))
+        shares.append(WEIGHTS @ pmf)
+    return goodness(flats, shares, fitted)

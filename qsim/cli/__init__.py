@@ -1,0 +1,17 @@
+"""The command `qsim`: arguments in, exit codes out."""
+
+from typing import TYPE_CHECKING
+
+from qsim.files import lazy_names
+
+if TYPE_CHECKING:
+    from qsim.cli.program import main
+
+__all__ = ["main"]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "main": "program",
+    },
+)

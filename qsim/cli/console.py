@@ -1,0 +1,290 @@
+"""What every command shares: a parser that suggests, a bar that waits two seconds, and errors of one line.
+
+Exit codes: 0 well, 1 done but something is wrong with what was found (a damaged file, a failed job), 2 the user's
+mistake, 130 interrupted. `--verbose` or `QSIM_DEBUG=1` shows the traceback of a mistake.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import errno
+import json
+import os
+import re
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any, NoReturn
+
+from qsim.checks import suggest
+from qsim.clip import stream
+from qsim.files import FULL, wording
+
+GOES_ON = "the same command goes on where it stopped"
+STARTS_AGAIN = "nothing half-written is left; run the same command again"
+_MAKE_SPACE = "nothing half-written is left; make space and run the same command again"
+
+# Options as other programs call them -> ours, suggested where a command has ours.
+_ALSO_CALLED = {
+    "--fps": "--frame-rate",
+    "--framerate": "--frame-rate",
+    "--resolution": "--height",
+    "--overwrite": "--force",
+    "--yes": "--force",
+    "--jobs": "--workers",
+    "--processes": "--workers",
+    "--gpu": "--device",
+    "--cuda": "--device",
+    "--epochs": "--steps",
+    "--lr": "--learning-rate",
+    "--photons": "--ppp",
+    "--light": "--ppp",
+    "--model": "--method",
+    "--weights": "--method",
+    "--debug": "--verbose",
+    "--silent": "--quiet",
+}
+
+# Packages that are extras of this one: module -> extra.
+EXTRAS = {"av": "video", "zarr": "formats", "h5py": "formats", "distributed": "cluster", "pyoidn": "denoise"}
+EXTRAS |= dict.fromkeys(("torch", "safetensors", "tensorboard"), "train")
+
+_quiet: ContextVar[bool] = ContextVar("quiet", default=False)  # of the command that runs now
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse with one-line errors that suggest the option or command that was meant."""
+
+    def __init__(self, prog: str | None = None, description: str | None = None, epilog: str | None = None) -> None:
+        style = argparse.RawDescriptionHelpFormatter
+        super().__init__(prog=prog, description=description, epilog=epilog, formatter_class=style, allow_abbrev=False)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        words = list(sys.argv[1:] if args is None else args)
+        self._refuse_unknown(words)  # before argparse complains of what is missing because a name is misspelt
+        found, extra = super().parse_known_args(words, namespace)
+        if extra:
+            self.error(f"unexpected argument {extra[0]}")
+        return found, extra
+
+    def _refuse_unknown(self, words: list[str]) -> None:
+        known = self._option_string_actions
+        for word in words:
+            if word == "--" or (self._subparsers is not None and not word.startswith("-")):
+                return  # values from here on, or the words of a command
+            option = word.split("=")[0]
+            short = re.match(r"-[A-Za-z]", word)
+            if (short and word[:2] not in known) or (word.startswith("--") and option not in known):
+                meant = _ALSO_CALLED.get(option, "")
+                self.error(f"unknown option {option}{suggest(meant if meant in known else option, known)}")
+
+    def error(self, message: str) -> NoReturn:
+        choice = re.search(r"invalid choice: '?([^']*?)'? \(choose from (.*)\)", message)
+        number = re.match(r"argument (.*): invalid (int|float) value: (.*)", message)
+        if choice:
+            known = [word.strip(" '") for word in choice[2].split(",")]
+            what = "command" if "COMMAND" in message else message.split(":")[0]
+            message = f"unknown {what} '{choice[1]}'{suggest(choice[1], known)}; there are: {', '.join(known)}"
+        elif number:
+            kind = "a whole number, as in 3" if number[2] == "int" else "a number, as in 3.25 or 20e-6"
+            message = f"argument {number[1]}: expected {kind}, got {number[3]}"
+        print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
+        raise SystemExit(2)
+
+
+def command(
+    sub: Any,
+    name: str,
+    run: Callable[[argparse.Namespace], int],
+    what: str,
+    example: str,
+    after_interrupt: str = STARTS_AGAIN,
+    *,
+    threads: str | None = None,
+) -> argparse.ArgumentParser:
+    """A command's parser with its example and what all have; `run(args)` does it and returns the exit code.
+
+    With `threads`, which says of what, it has the option --threads.
+    """
+    parser: argparse.ArgumentParser = sub.add_parser(
+        name, help=what, description=what, epilog="example:\n" + "".join(f"  {line}\n" for line in example.split("\n"))
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, for programs")
+    loudness = parser.add_mutually_exclusive_group()
+    loudness.add_argument("-q", "--quiet", action="store_true", help="no progress and no warnings, only the result")
+    loudness.add_argument("-v", "--verbose", action="store_true", help="time and memory; the traceback of a mistake")
+    if threads is not None:
+        run = _with_threads(run)
+        parser.add_argument("--threads", type=int, help=f"{threads} (default: all cores)")
+    parser.set_defaults(run=run, after_interrupt=after_interrupt)
+    return parser
+
+
+def _with_threads(run: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
+    """The command with as many threads of the compiled engine as --threads asks for, in its worker processes too."""
+
+    def limited(args: argparse.Namespace) -> int:
+        if args.threads is None:
+            return run(args)
+        cores = os.cpu_count() or 1
+        if not 1 <= args.threads <= cores:
+            raise ValueError(f"--threads {args.threads}: this machine has {cores} cores; give 1 to {cores}")
+        before = os.environ.get("QSIM_THREADS")
+        try:
+            _limit(str(args.threads))
+            return run(args)
+        finally:  # later commands of this process are not limited
+            _limit(before or str(cores))
+            if before is None:
+                del os.environ["QSIM_THREADS"]
+
+    return limited
+
+
+def _limit(threads: str) -> None:
+    """Threads of the compiled engine, if it is loaded already, and of processes that are started from now on."""
+    os.environ["QSIM_THREADS"] = threads
+    if "drjit" in sys.modules:
+        from qsim.backend import limit_threads
+
+        limit_threads()
+
+
+def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
+    """Parse and do a command; mistakes become one line on stderr and exit code 2, Ctrl-C becomes 130."""
+    try:
+        args = parser.parse_args(argv)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    token = _quiet.set(args.quiet)
+    started = time.perf_counter()
+    try:
+        with _warnings_as_lines(parser.prog):
+            return int(args.run(args))
+    except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
+        if isinstance(error, BrokenPipeError):  # the reader of our output has gone, as in `| head`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        unknown_module = isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in EXTRAS
+        if os.environ.get("QSIM_DEBUG") or args.verbose or unknown_module:
+            raise
+        print(f"{parser.prog}: {one_line(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\n{parser.prog}: interrupted; {args.after_interrupt}", file=sys.stderr)
+        return 130
+    finally:
+        _quiet.reset(token)
+        if args.verbose:
+            print(f"{parser.prog}: {time.perf_counter() - started:.1f} s, {_peak_memory()}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def _warnings_as_lines(prog: str) -> Iterator[None]:
+    """Warnings become one line each on stderr, without the place in our source; none with --quiet."""
+
+    def show(message: Warning | str, *_: object, **__: object) -> None:
+        note(f"{prog}: warning: {' '.join(str(message).split())}")
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
+def _peak_memory() -> str:
+    import resource
+
+    scale = 2**30 if sys.platform == "darwin" else 2**20  # bytes there, KiB elsewhere
+    return f"at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale:.2f} GiB of memory"
+
+
+def note(text: str) -> None:
+    """A line for people on stderr, unless the command runs with --quiet."""
+    if not _quiet.get():
+        print(text, file=sys.stderr)
+
+
+def one_line(error: BaseException) -> str:
+    """The message of an error in one line; an `OSError` of the system names its file and the reason."""
+    if isinstance(error, OSError) and error.filename and error.errno in (errno.ENOTDIR, errno.EEXIST):
+        path = Path(os.fsdecode(error.filename))
+        for in_the_way in filter(Path.is_file, (path, *path.parents)):
+            return f"{in_the_way}: is a file where a folder is needed; name another with -o"
+    if isinstance(error, OSError) and error.errno in FULL and error.strerror:
+        return f"{wording(error)}; {_MAKE_SPACE}"
+    if isinstance(error, ModuleNotFoundError):
+        package = (error.name or "").split(".")[0]
+        return f"needs the package {package}, which is not installed: pip install 'qsim[{EXTRAS[package]}]'"
+    if isinstance(error, MemoryError):
+        return f"not enough memory ({' '.join(str(error).split()) or 'no more to have'}); try fewer or smaller frames"
+    return wording(error)
+
+
+def output(args: argparse.Namespace, found: dict[str, Any], text: str | Sequence[str]) -> None:
+    """The result of a command: JSON where asked for, else text."""
+    if args.json:
+        print(json.dumps(found, sort_keys=True))
+    else:
+        print(text if isinstance(text, str) else "\n".join(text))
+
+
+def checked(check: Callable[[Any], Any]) -> Callable[[str], Any]:
+    """An argparse type from a check of recipe values (checks.py), so that files and options obey the same rules."""
+
+    def parse(text: str) -> Any:
+        value: int | float | str = text
+        for kind in (float, int):  # the last that fits
+            with contextlib.suppress(ValueError):
+                value = kind(text)
+        try:
+            return check(value)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return parse
+
+
+def refuse_idle(args: argparse.Namespace, where: str, names: Sequence[str]) -> None:
+    """A `ValueError` if one of these options is given, which change nothing there; their defaults are None or False."""
+    for name in names:
+        value = getattr(args, name)
+        if value is not None and value is not False:  # 0 is a value that was given
+            raise ValueError(f"{where}: --{name.replace('_', '-')} changes nothing here; leave it out")
+
+
+def refuse_existing(path: Path, force: bool) -> None:
+    """An `OSError` with the cure if a file cannot be written, or is there already and `force` is not set.
+
+    Called before the work, so that nothing is computed that has no place to go.
+    """
+    if path.is_dir():
+        raise FileExistsError(f"{path}: is a folder; name a file with -o")
+    if path.exists() and not force:
+        raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
+    folder = next(parent for parent in path.parents if parent.exists())
+    if not folder.is_dir():
+        raise NotADirectoryError(f"{folder}: is a file where a folder is needed; name another with -o")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(f"{path}: nothing may be written into {folder}; name another with -o")
+
+
+@contextlib.contextmanager
+def bar(label: str, unit: str = "frame") -> Iterator[stream.Progress]:
+    """A progress bar with rate and time left on stderr, shown after two seconds; call it with (done, total)."""
+    from tqdm import tqdm
+
+    interval = 0.2 if sys.stderr.isatty() else 10.0
+    silent = _quiet.get()
+    with tqdm(
+        desc=label, unit=unit, delay=2, mininterval=interval, dynamic_ncols=True, file=sys.stderr, disable=silent
+    ) as shown:
+
+        def update(done: int, total: int) -> None:
+            shown.total = total
+            shown.update(done - shown.n)
+
+        yield update

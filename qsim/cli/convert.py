@@ -1,0 +1,153 @@
+"""The command `qsim convert`: foreign files into clips and streams, ours into files for others."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from qsim import checks, files
+from qsim.cli.console import bar, command, output, refuse_idle
+from qsim.clip.clip import Clip
+from qsim.clip.stream import Stream
+from qsim.dataset.dataset import Dataset
+from qsim.dataset.recipe import SPLITS
+from qsim.formats import exporting, importing
+from qsim.formats.recording import TRANSFERS, Hints
+
+_SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr"}
+
+
+def add_convert(sub: Any) -> None:
+    """The options of `qsim convert`."""
+    parser = command(
+        sub, "convert", _run_convert, "Read foreign recordings as clips or streams; write ours for others.",
+        "qsim convert ball.npy out/ball --frame-rate 30000 --exposure 20e-6 --transfer linear\n"
+        "qsim convert camera.tif out/camera --frame-rate 1000 --transfer linear --white 4095\n"
+        "qsim convert I2-2000FPS/test out/i2_test --frame-rate 2000 --transfer 'gamma 2.2' --split test\n"
+        "qsim convert capture.bin out/capture --layout swissspad2-half --frame-rate 96800\n"
+        "qsim convert out/starter out/starter_mp4 --to mp4\n"
+        "qsim convert out/fan/streams/spad.json out/fan_cube.npy",
+    )  # fmt: skip
+    parser.add_argument("input", type=Path, help="a file, a folder, a clip, a stream (its .npy or .json), a data set")
+    parser.add_argument(
+        "output", type=Path, help="clip folder, stream name, .npy, .mp4 or .zarr, or a folder with --to"
+    )
+    reading = parser.add_argument_group("what a foreign file may not say")
+    reading.add_argument("--layout", help=f"kind of the input: {', '.join(importing.LAYOUTS)}")
+    reading.add_argument("--frame-rate", type=float, help="frames per second of the capture (not of a video file)")
+    reading.add_argument("--exposure", type=float, help="seconds of light per frame (default: the whole frame)")
+    reading.add_argument("--transfer", help=f"how pictures code light: {', '.join(TRANSFERS)} (also for writing)")
+    reading.add_argument("--height", type=int, help="pixels")
+    reading.add_argument("--width", type=int, help="pixels, before packing")
+    reading.add_argument("--bits", type=int, help="the input holds codes of so many bits")
+    reading.add_argument("--stretched", action="store_true", help="codes were stretched to 0..255")
+    reading.add_argument("--channel", type=int, help="of a colour cube: 0, 1 or 2")
+    reading.add_argument("--flip", choices=("none", "lr", "ud", "both"), default="none", help="turn the frames")
+    reading.add_argument("--columns", type=int, help="keep only the first columns (Vidar dumps: 400 of 416)")
+    reading.add_argument("--variable", help="array of a .mat file (default: OUTPUT, or the only one)")
+    reading.add_argument("--sensor", help="that made the codes, by name or file (default: an ideal binary counter)")
+    reading.add_argument("--ppp", type=float, help="light level the sensor's gain was set for")
+    reading.add_argument("--split", choices=SPLITS, help="stored in the clips")
+    writing = parser.add_argument_group("writing for others")
+    writing.add_argument("--to", choices=sorted(exporting.EXPORTS), help="kind of the output, if its name does not say")
+    writing.add_argument(
+        "--lossy", action="store_true", help="mp4 with FFmpeg's ordinary settings: noise does not survive"
+    )
+    parser.add_argument(
+        "--white", type=float,
+        help="reading: pixel value at which the camera saturates, as in 4095 (default: the largest that whole numbers "
+        "hold); writing mp4 and png: light that becomes full scale (default: the 99.9th percentile)",
+    )  # fmt: skip
+    parser.add_argument("--force", action="store_true", help="replace what is there")
+
+
+def _run_convert(args: argparse.Namespace) -> int:
+    source = args.input
+    if source.suffix == ".npy" and _is_stream(source.with_suffix(".json")):  # its codes name a stream as well
+        source = args.input = source.with_suffix(".json")
+    ours = source.is_dir() and any((source / name).is_file() for name in ("clip.json", "dataset.json"))
+    made = _export(args) if ours or _is_stream(source) else _import(args)
+    output(args, {"made": [str(path) for path, _ in made]}, [f"{path}: {about}" for path, about in made])
+    return 0
+
+
+def _is_stream(path: Path) -> bool:
+    return path.suffix == ".json" and path.is_file() and "ppp_factor" in files.read_json(path)
+
+
+_READING = ("layout", "frame_rate", "exposure", "height", "width", "bits", "stretched", "channel", "columns",
+            "variable", "sensor", "ppp", "split")  # fmt: skip
+
+
+def _refuse_what_cannot_act(args: argparse.Namespace, kind: str, light: bool) -> None:
+    """A `ValueError` for options of writing that this kind of output has no use for."""
+    where = f"{args.output}, a {kind} of {'light' if light else 'codes'}"
+    if not (light and kind in ("mp4", "png")):
+        refuse_idle(args, where, ["transfer"])
+    if kind != "mp4":
+        refuse_idle(args, where, ["lossy"])
+
+
+def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
+    refuse_idle(args, f"{args.input} is ours and says it itself", _READING)
+    if args.flip != "none":
+        raise ValueError(f"{args.input} is ours and says it itself: --flip changes nothing here; leave it out")
+    kind = args.to or _SUFFIXES.get(args.output.suffix)
+    if kind is None:
+        known = ", ".join(sorted(exporting.EXPORTS))
+        raise ValueError(f"{args.output}: say what to write with --to: {known}")
+    _refuse_what_cannot_act(args, kind, args.input.suffix != ".json")
+    wanted = exporting.Export(kind, args.transfer or "gamma 2.2", args.white, not args.lossy)
+    if args.white is not None and (kind not in ("mp4", "png") or args.input.suffix == ".json"):
+        raise ValueError("--white: is of light written as mp4 or png; leave it out")
+    if not (args.input / "dataset.json").is_file():
+        opened = Stream.open(args.input) if args.input.suffix == ".json" else Clip.open(args.input)
+        return [exporting.described(opened, args.output, wanted, force=args.force)]
+    suffix = {"cube": ".npy", "mp4": ".mp4", "zarr": ".zarr"}.get(kind, "")
+    made = []
+    clips = Dataset.open(args.input).clips()
+    with bar("converting", "clip") as progress:
+        for n, clip in enumerate(clips, 1):
+            split = clip.meta.get("split")  # it becomes a folder, and the name a file
+            folder = args.output / ("all" if split is None else checks.split(split))
+            target = folder / f"{checks.check_name(clip.name)}{suffix}"
+            made.append(exporting.described(clip, target, wanted, force=args.force))
+            progress(n, len(clips))
+    return made
+
+
+def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
+    refuse_idle(args, f"{args.input} is read, not written for others", ["to", "lossy"])
+    if args.frame_rate is None:
+        raise ValueError(f"{args.input}: files do not say how fast the capture was; add --frame-rate, as in 2000")
+    hints = Hints(args.layout, args.height, args.width, args.bits, args.transfer, args.channel, args.flip, args.columns,
+                  args.stretched, args.variable, args.white)  # fmt: skip
+    capture = importing.Capture(args.frame_rate, args.exposure, args.sensor, args.ppp, args.split)
+    found = importing.recordings(args.input, args.layout)
+    pairs = [(source, args.output / checks.check_name(_flat_name(source, args.input))) for source in found]
+    made = []
+    with bar("converting") as progress:
+        for source, target in pairs or [(args.input, args.output)]:
+            footage = importing.read(source, hints)
+            if footage.is_light:
+                if target.suffix in _SUFFIXES:
+                    raise ValueError(f"{target}: light is read into a clip, a folder; name it without {target.suffix}")
+                clip = importing.to_clip(footage, target, capture, force=args.force, progress=progress)
+                made.append((clip.path, f"{_size(clip)}, light of {footage.source}; {importing.saturation_line(clip)}"))
+                continue
+            stream = importing.to_stream(footage, target, capture, force=args.force, progress=progress)
+            made.append((stream.path, f"{_size(stream)}, codes of {stream.bits} bits, {footage.source}"))
+    return made
+
+
+def _size(made: Clip | Stream) -> str:
+    frames, height, width = made.shape
+    rate, exposure = float(made.meta["frame_rate"]), made.exposure
+    return f"{frames} frames of {height} x {width} pixels at {rate:g} per second, exposure {exposure * 1e6:.4g} us"
+
+
+def _flat_name(file: Path, folder: Path) -> str:
+    """`scene/clip.mp4` (or the folder `scene/clip`) below `folder` as `scene_clip`."""
+    inside = file.relative_to(folder)
+    return "_".join((inside if file.is_dir() else inside.with_suffix("")).parts).replace(" ", "_")

@@ -1,0 +1,175 @@
+"""Commands of data sets: `generate`, `plan` and `check`; pairs as in cli.py."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+from qsim import checks, files
+from qsim.cli.console import GOES_ON, bar, checked, command, note, output
+from qsim.dataset.recipe import Job
+
+# generate
+
+
+def add_generate(sub: Any) -> None:
+    parser = command(
+        sub, "generate", _run_generate, "Make a data set from a recipe; whatever is done already is kept.",
+        "qsim generate scenes/starter.toml -o out/starter --workers 2\n"
+        "qsim generate scenes/i2_2000fps.toml -o /data/i2 --shard 7/100", GOES_ON,
+        threads="of the renderer (Dr.Jit) in each worker",
+    )  # fmt: skip
+    parser.add_argument("recipe", type=Path, help="a .toml file; its format is described in qsim/dataset/recipe.py")
+    parser.add_argument("-o", "--output", type=Path, help="data set folder (default out/NAME of the recipe)")
+    parser.add_argument("--workers", type=int, help="processes, each with its own renderer (default 1)")
+    parser.add_argument("--shard", type=_part, metavar="I/N", help="only the I-th of N parts, as in 7/100")
+    memory = checked(checks.positive)
+    parser.add_argument("--memory", type=memory, help="GiB per process before it gives up (default 4)")
+    parser.add_argument("--retry", action="store_true", help="try failed jobs again")
+    parser.add_argument("--repair", action="store_true", help="check all files and make the damaged ones again")
+    parser.add_argument("--wait", action="store_true", help="wait while another generator is at work in the folder")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask scheduler, as in tcp://10.0.0.1:8786")
+    parser.add_argument(
+        "--gpus", type=float, default=0, help="GPU resource that each job takes on the cluster (default 0)"
+    )
+
+
+def _run_generate(args: argparse.Namespace) -> int:
+    if args.threads is not None and args.cluster is not None:
+        raise ValueError("--threads: is of processes of this machine; start Dask workers with QSIM_THREADS=N instead")
+    from qsim.dataset import generation, recipe
+    from qsim.dataset.worker_pool import Limits
+
+    wanted = recipe.load(args.recipe)
+    folder = args.output or Path("out") / wanted.name
+    # None: not given, which --cluster must tell from given (`_cluster`).
+    count = generation.Options.workers if args.workers is None else args.workers
+    limits = Limits() if args.memory is None else Limits(memory=args.memory)
+    if count == 0 and args.memory is not None:
+        raise ValueError("--memory: bounds worker processes, and --workers 0 has none; leave one of them out")
+    if count < 0:
+        raise ValueError(f"--workers: expected 0 (in this process) or more, got {count}")
+    options = generation.Options(count, args.shard, args.retry, args.repair, args.wait, limits)
+    chosen = generation.shard(wanted.jobs, args.shard)
+    with bar(wanted.name) as progress, generation.watching(folder, chosen, progress):
+        summary = generation.generate(wanted, folder, options, run=_cluster(args))
+    lines = [f"{folder}: {summary.done} of {summary.jobs} clips done, {summary.made} made now"]
+    lines += [f"repaired {problem}" for problem in summary.repaired]
+    lines += [f"FAILED {name}: {why}" for name, why in sorted(summary.failed.items())]
+    lines += [f"SHARED {problem}" for problem in summary.shared]
+    lines += [f"NOISY {line}" for line in _noisy(folder, chosen)]
+    if summary.failed:
+        lines.append("run again with --retry after mending the cause")
+    output(args, {"dataset": str(folder)} | dataclasses.asdict(summary), lines)
+    return 0 if summary.done == summary.jobs and not summary.shared else 1
+
+
+def _noisy(folder: Path, jobs: list[Job]) -> list[str]:
+    """The finished clips whose radiance misses the error that the recipe asks for."""
+    from qsim.clip.clamped_error import stated
+    from qsim.rendering.fidelity import shortfall
+
+    described = {job.name: folder / "clips" / job.name / "clip.json" for job in jobs}
+    found = {name: stated(files.read_json(path)) for name, path in described.items() if path.is_file()}
+    missed = {job.name: shortfall(found.get(job.name), job.settings.psnr) for job in jobs}
+    return [f"{name}: {why}" for name, why in missed.items() if why]
+
+
+def _cluster(args: argparse.Namespace) -> Any:
+    """The cluster asked for or None; `ValueError` if options for processes of this machine are given with it."""
+    if not 0 <= args.gpus < float("inf"):
+        raise ValueError(f"--gpus: expected 0 or more, got {args.gpus}")
+    if args.cluster is None:
+        if args.gpus:
+            raise ValueError("--gpus: needs --cluster, whose workers say how many they have; leave it out here")
+        return None
+    for option, given, instead in (("workers", args.workers, "nworkers"), ("memory", args.memory, "memory-limit")):
+        if given is not None:
+            raise ValueError(
+                f"--{option}: changes nothing with --cluster: number, memory and lifetime of its workers are set where "
+                f"they are started; leave it out and use `dask worker --{instead}` there"
+            )
+    if not re.fullmatch(r"(\w+://)?[^/\s]+:\d+", args.cluster):
+        raise ValueError(f"--cluster {args.cluster}: is not the address of a scheduler, as tcp://10.0.0.1:8786 is")
+    from qsim.dataset.dask_cluster import Cluster
+
+    if not args.cluster.startswith("tls://"):
+        note(f"{args.cluster}: without TLS, so whoever reaches this port can run any program as its workers' user")
+    return Cluster(args.cluster, gpus=args.gpus)
+
+
+def _part(text: str) -> tuple[int, int]:
+    first, _, last = text.partition("/")
+    if not (first.isdigit() and last.isdigit() and 1 <= int(first) <= int(last)):
+        raise argparse.ArgumentTypeError(f"expected I/N with 1 <= I <= N, as in 7/100, got {text!r}")
+    return int(first), int(last)
+
+
+# plan
+
+
+def add_plan(sub: Any) -> None:
+    parser = command(
+        sub, "plan", _run_plan, "Render one tiny job of each kind and say what the recipe will cost.",
+        "qsim plan scenes/i2_2000fps.toml --machines 10",
+        threads="of the renderer (Dr.Jit)",
+    )  # fmt: skip
+    parser.add_argument("recipe", type=Path, help="a .toml file")
+    parser.add_argument("--machines", type=int, default=10, help="to spread the work over (default 10)")
+    parser.add_argument("--frames", type=int, default=5, help="frames rendered per kind (default 5)")
+
+
+def _run_plan(args: argparse.Namespace) -> int:
+    from qsim.dataset import forecast, recipe
+
+    if args.machines < 1:
+        raise ValueError(f"--machines: expected at least 1, got {args.machines}")
+    wanted = recipe.load(args.recipe)
+    with bar("planning", "kind") as progress:
+        found = forecast.plan(wanted, frames=args.frames, progress=progress)
+    facts = {"recipe": wanted.name, "machines": args.machines, "hours_each": found.hours / args.machines}
+    output(args, facts | found.to_dict(), found.lines(args.machines))
+    return 0
+
+
+# check
+
+
+def add_check(sub: Any) -> None:
+    parser = command(
+        sub, "check", _run_check, "Compare what was made with its checksums; exit code 1 if a file is damaged.",
+        "qsim check out/starter out/fan out/fan_restored.npy\n"
+        "qsim check out/starter --redraw",
+    )  # fmt: skip
+    parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="data sets, clips, streams, restored video")
+    parser.add_argument(
+        "--redraw", action="store_true", help="draw streams again by the reference engine, name those that differ; slow"
+    )
+
+
+def _run_check(args: argparse.Namespace) -> int:
+    from qsim.dataset import checking, redraw
+
+    problems: list[str] = []
+    unsealed: list[Path] = []
+    again: list[redraw.Redrawn] = []
+    for path in args.paths:
+        with bar(str(path), "clip" if (path / "dataset.json").is_file() else "file") as progress:
+            found = checking.check(path, progress)
+        problems += found.problems
+        unsealed += found.unsealed
+        if args.redraw:
+            with bar(f"{path} again", "stream") as progress:
+                again += redraw.redraw(path, progress)
+    names = ", ".join(str(path) for path in args.paths)
+    facts: dict[str, Any] = {"paths": [str(path) for path in args.paths], "problems": problems}
+    facts["without_checksum"] = [str(path) for path in unsealed]
+    lines = checking.Verdict(problems, unsealed).lines(names)
+    if args.redraw:
+        facts["redrawn"] = [dataclasses.asdict(one) | {"path": str(one.path), "wrong": one.wrong} for one in again]
+        lines += redraw.lines(again)
+    output(args, facts, lines)
+    return 1 if problems or any(one.wrong for one in again) else 0

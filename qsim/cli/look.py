@@ -1,0 +1,149 @@
+"""Commands to look: `preview` (one picture, a film, the terminal) and `report` (a page); pairs as in cli.py."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from qsim import files
+from qsim.cli.console import bar, command, output, refuse_existing, refuse_idle
+
+PREVIEWS = (".mp4", ".gif", ".png")
+
+
+# preview
+
+
+def add_preview(sub: Any) -> None:
+    parser = command(
+        sub, "preview", _run_preview, "A quick look at a clip, stream or array: in the terminal, as film or picture.",
+        "qsim preview out/fan\n"
+        "qsim preview out/fan --what flow --frame 3\n"
+        "qsim preview out/fan -o out/fan.mp4 --fps 25\n"
+        "qsim preview out/fan.npy -o out/fan.png --frame 10",
+    )  # fmt: skip
+    parser.add_argument("path", type=Path, help="clip folder, stream (.npy or .json), or array [T, H, W] (.npy)")
+    parser.add_argument("-o", "--output", type=Path, help=".mp4, .gif or .png to write (default: show it here)")
+    parser.add_argument("--what", type=_kinds, help="of sharp,radiance,codes,average,flow,depth; with commas")
+    parser.add_argument("--stream", help="which stream of a clip (default: the first)")
+    parser.add_argument("--frame", type=int, help="one frame (default: the middle one, or all in a film)")
+    parser.add_argument("--fps", type=float, help="frames of a film shown per second (default 12)")
+    parser.add_argument("--scale", type=int, help="pixels per pixel (default: so that captions can be read)")
+    parser.add_argument("--bits", type=int, help="a bare array holds codes of so many bits")
+    parser.add_argument("--width", type=int, help="a bare array holds packed binary planes of so many columns")
+    parser.add_argument("--play", action="store_true", help="in the terminal: all frames, one after the other")
+    parser.add_argument("--force", action="store_true", help="replace an existing file")
+
+
+def _kinds(text: str) -> list[str]:
+    from qsim.report.preview import KINDS
+
+    kinds = [word.strip() for word in text.split(",")]
+    for kind in kinds:
+        if kind not in (*KINDS, "values"):
+            raise argparse.ArgumentTypeError(f"unknown picture {kind!r}; there are: {', '.join(KINDS)}")
+    return kinds
+
+
+def _run_preview(args: argparse.Namespace) -> int:
+    from qsim.report import preview
+
+    target: Path | None = args.output
+    if target is not None:
+        if target.suffix not in PREVIEWS:
+            raise ValueError(f"{target}: a preview is a {', '.join(PREVIEWS)} file, as in -o {target.stem}.mp4")
+        refuse_existing(target, args.force)
+    if args.fps is not None and not 0 < args.fps <= 1000:
+        raise ValueError(f"--fps: expected frames per second between 0 and 1000, got {args.fps:g}")
+    if args.scale is not None and not 1 <= args.scale <= 64:
+        raise ValueError(f"--scale: expected a whole factor of 1 to 64, got {args.scale}")
+    if args.play and target is not None:
+        raise ValueError("--play: shows frames in the terminal; leave it out with --output, which writes all of them")
+    if target is None:
+        refuse_idle(args, "preview in the terminal", ["force", "scale"])
+    if args.fps is not None and (not args.play if target is None else target.suffix == ".png"):
+        raise ValueError("--fps: one picture has no rate; leave it out, or ask for a film (.mp4, .gif) or --play")
+    if args.frame is not None and (args.play or args.fps is not None):
+        raise ValueError("--frame: shows one frame; leave out --play and --fps, or leave it out for a film of all")
+    args.fps = 12.0 if args.fps is None else args.fps
+    source = preview.open_source(args.path, bits=args.bits, width=args.width, stream=args.stream)
+    if args.frame is not None and not 0 <= args.frame < source.length:
+        raise ValueError(f"--frame {args.frame}: {source.name} has frames 0..{source.length - 1}")
+    views = preview.choose(source, args.what, several=target is not None)
+    if args.stream is not None and not any(view.kind in ("codes", "average") for view in views):
+        raise ValueError(f"--stream {args.stream}: no picture of codes is shown; add --what codes, or leave it out")
+    film = args.frame is None and (args.play if target is None else target.suffix != ".png")
+    first = source.length // 2 if args.frame is None else args.frame
+    frames = range(source.length) if film else range(first, first + 1)
+    if target is None:
+        return _show(args, source, views, frames)
+    shown = f"{frames.start}..{frames.stop - 1}" if film else str(first)
+    about = {"source": str(args.path), "frames": [frames.start, frames.stop], "frame_rate": source.frame_rate}
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with bar(target.name) as progress:
+        page = preview.sheet(views, args.scale)
+        preview.write(target, page, frames, args.fps, about | {"shown_fps": args.fps}, progress)
+    lines = [f"{target}: frame {shown} of {source.name}" + (f" at {args.fps:g} fps" if film else "")]
+    found = about | {"preview": str(target), "views": [preview.declaration(view) for view in views]}
+    output(args, found, lines + [view.declared for view in views])
+    return 0
+
+
+def _show(args: argparse.Namespace, source: Any, views: list[Any], frames: range) -> int:
+    """Pictures on stdout: colour if it is a terminal (and NO_COLOR is not set), else shades of text."""
+    from qsim.report import preview, terminal
+
+    found = {"source": str(args.path), "frames": [frames.start, frames.stop]}
+    if args.json:
+        output(args, found | {"views": [preview.declaration(view) for view in views]}, "")
+        return 0
+    coloured = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
+    window = shutil.get_terminal_size()
+    draw = terminal.blocks if coloured else terminal.shades
+    for view in views:
+        for t in frames:
+            text = draw(terminal.fit(view.picture(t), window.columns, max(window.lines - 4, 8)))
+            print(text, flush=True)
+            if t + 1 < frames.stop:
+                time.sleep(1 / args.fps)
+                print(terminal.up(text) if coloured else "")
+        if view.legend is not None:
+            print(draw(terminal.fit(view.legend, 24, 12)))
+        print(f"frame {frames[-1]} of {source.name}, {view.declared}")
+    return 0
+
+
+# report
+
+
+def add_report(sub: Any) -> None:
+    parser = command(
+        sub, "report", _run_report, "Draw one self-contained page of clips, data sets, runs, restored video, scores.",
+        "qsim report out/fan\nqsim report out/demo -o out/demo/index.html --title 'My run'",
+    )  # fmt: skip
+    parser.add_argument("path", type=Path, help="clip, data set, or any folder with such things in it")
+    parser.add_argument("-o", "--output", type=Path, help=".html file to write (default: NAME.html here)")
+    parser.add_argument("--title", help="of the page")
+    parser.add_argument("--note", action="append", default=[], help="a line for the top of the page; may be repeated")
+    parser.add_argument("--force", action="store_true", help="replace an existing page")
+
+
+def _run_report(args: argparse.Namespace) -> int:
+    from qsim.report import report
+
+    target: Path = args.output or Path(f"{args.path.resolve().stem or 'report'}.html")
+    if target.suffix not in (".html", ".htm"):
+        raise ValueError(f"{target}: a page is a .html file, as in -o {target.stem}.html")
+    refuse_existing(target, args.force)
+    with bar("drawing", "thing") as progress:
+        page = report.build(args.path, title=args.title, notes=args.note, progress=progress).encode()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    files.write_bytes(target, page)
+    found = {"page": str(target), "bytes": len(page)}
+    output(args, found, f"{target}: {len(page) / 1e6:.1f} MB, loads nothing from elsewhere; open it in a browser")
+    return 0

@@ -1,0 +1,276 @@
+"""The command `tradeoff`: `add_X`, `_run_X` as in cli.py."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from qsim import checks, files
+from qsim.cli.console import bar, checked, command, note, output, refuse_idle
+
+# tradeoff
+
+
+def add_tradeoff(sub: Any) -> None:
+    parser = command(
+        sub, "tradeoff", _run_tradeoff, "Bit depth against motion, light, read noise and data rate.",
+        "qsim tradeoff --table --size 240x320 --base-fps 10000 --read-noise 0.2 --bits 1,3,5,7,9\n"
+        "qsim tradeoff out/fast --ppp 0.65 -o out/bits\n"
+        "qsim tradeoff fan --px 3 --ppp 2 -o out/fan_3px\n"
+        "qsim tradeoff fan --speed 0.5:8 --ppp 0.1:30 -o out/sweep\n"
+        "qsim tradeoff --paper-figure 1 -o out/figure1",
+        threads="of the compiled engine (Dr.Jit)",
+    )  # fmt: skip
+    parser.add_argument("source", nargs="?", help="a clip of at least 10000 fps, or a scene (rendered into -o)")
+    parser.add_argument("--table", action="store_true", help="only print the table of bit depths, from numbers alone")
+    parser.add_argument("--paper-figure", type=int, choices=(1, 2), help="draw a figure of the QUIVER paper")
+    parser.add_argument("--size", type=size, help="ROWSxCOLUMNS (default 240x320, rendered scenes 96x128)")
+    parser.add_argument("--base-fps", type=float, help="planes per second (default 10000; a clip has its own)")
+    parser.add_argument("--read-noise", type=float, help="table: e- rms per read (default 0.2)")
+    bits = "with commas (default 1,2,3,4,5, widened up to 7 where the deepest is best; table 1,3,5,7,9)"
+    parser.add_argument("--bits", type=integers, help=bits)
+    parser.add_argument("--motion", type=float, help="table: image speed, px/s (default 2500)")
+    parser.add_argument("--ppp", type=steps, help="photons per pixel and plane: 0.65 or 0.1,1,10 or 0.1:30 (6 steps)")
+    moving = parser.add_mutually_exclusive_group()
+    moving.add_argument("--speed", type=steps, help="factors on the motion, as --ppp (default 1; a clip: whole)")
+    px = "motion of what moves, px per 3-bit frame of 7 planes, as --ppp: finds the speed"
+    moving.add_argument("--px", type=steps, help=px)
+    parser.add_argument("--sensor", help="of the multi-bit read (default quiver-physical)")
+    parser.add_argument("--plane-sensor", help="of a binary plane (default: a clocked SPAD of the same efficiency)")
+    parser.add_argument("--instants", type=int, help="frames drawn and scored per depth (default 8)")
+    parser.add_argument("--frames", type=int, help="of a rendered scene (default: enough for the instants)")
+    seed = checked(checks.seed)
+    parser.add_argument("--seed", type=seed, help="of the noise and of a rendered scene (default 0)")
+    parser.add_argument("--streams", action="store_true", help="write clips and streams of each depth for restorers")
+    parser.add_argument("-o", "--output", type=Path, help="folder for numbers, figures, clips")
+    parser.add_argument("--force", action="store_true", help="replace existing numbers and figures")
+
+
+TABLE_ONLY = ("read_noise", "motion")
+OF_STUDIES = ("px", "ppp", "bits", "base_fps", "sensor", "plane_sensor", "instants", "frames", "streams")
+OF_FILES = ("seed", "speed", "output", "force")
+
+
+def _run_tradeoff(args: argparse.Namespace) -> int:
+    if args.table:
+        if args.source is not None:
+            raise ValueError(f"{args.source}: --table is made from numbers alone; leave the clip or scene out")
+        idle = [name for name in OF_STUDIES if name not in ("bits", "base_fps")]
+        refuse_idle(args, "tradeoff --table", ["paper_figure", *idle, *OF_FILES])
+        return _tradeoff_table(args)
+    name = "tradeoff" if args.paper_figure is None else f"figure{args.paper_figure}"
+    if args.paper_figure is not None:
+        refuse_idle(args, "tradeoff --paper-figure", [*TABLE_ONLY, *OF_STUDIES])
+    elif args.source is None:
+        raise ValueError("give a clip or a scene, --table, or --paper-figure; see qsim tradeoff --help")
+    refuse_idle(args, "tradeoff of a clip or scene", TABLE_ONLY)
+    if args.source is not None and (Path(args.source) / "clip.json").is_file():
+        refuse_idle(args, "tradeoff of a clip", ["size", "base_fps", "frames"])
+        if args.paper_figure is not None:
+            refuse_idle(args, "tradeoff --paper-figure of a clip", ["speed"])
+    if args.output is None:
+        if args.streams or args.paper_figure:
+            raise ValueError("give a folder with -o, as in -o out/bits")
+        refuse_idle(args, "tradeoff without --output", ["force"])
+    elif (args.output / f"{name}.json").exists() and not args.force:
+        raise FileExistsError(f"{args.output / name}.json: exists; name another folder with -o, or use --force")
+    args.seed = args.seed or 0
+    return _tradeoff_study(args) if args.paper_figure is None else _paper_figure(args)
+
+
+def _tradeoff_study(args: argparse.Namespace) -> int:
+    from qsim.studies.bit_depth import speed_sweep
+    from qsim.studies.bit_depth.answer import WIDEST, answer, widened
+    from qsim.studies.bit_depth.clip_study import Question, study
+
+    bits, instants = tuple(args.bits or (1, 2, 3, 4, 5)), 8 if args.instants is None else args.instants
+    sensor = args.sensor or "quiver-physical"
+    question = Question(bits, sensor, args.plane_sensor, None, 1, instants, args.seed)
+    height, width = args.size or (96, 128)
+    widen = args.bits is None
+    frames = args.frames or (2**WIDEST - 1 if widen else max(4 * question.longest, 32))
+    rate = 10_000.0 if args.base_fps is None else args.base_fps
+    shape = speed_sweep.Shape(frames, height, width, rate, seed=args.seed)
+    speeds, text = _speeds(args, shape)
+    levels = args.ppp or [None]
+    swept = len(speeds) * len(levels) > 1
+    if args.streams and swept:
+        raise ValueError("--streams: writes one speed and one light level; give one --ppp and one --speed or --px")
+    with bar("rendering") as progress:
+        clips = list(speed_sweep.clips_for(args.source, speeds, shape, args.output, progress))
+    first = clips[0].clip
+    if args.streams and clips[0].step > 1:
+        raise ValueError("--streams: writes a clip at its own speed; leave out --speed and --px, or name a scene")
+    if first.camera is None and not args.ppp:
+        raise ValueError(f"{first.path}: its radiance is relative; give the light with --ppp, as in --ppp 0.65")
+    with bar("drawing", "study") as progress:
+        if swept:
+            ppps = args.ppp or [first.mean_photons]
+            found = speed_sweep.sweep(clips, ppps, question, widen=widen, progress=progress)
+            result, pictures = found.to_dict(), {"best.png": speed_sweep.sweep_figure(found)}
+            text += [line for row in found.studies for one in row for line in speed_sweep.table(one)]
+            text.append(speed_sweep.summary(found))
+            answers = found.answers
+        else:
+            asked = replace(question, ppp=levels[0], speed=clips[0].step)
+            one = widened(first, asked, note) if widen else study(first, asked, progress=progress)
+            result, pictures = speed_sweep.study_dict(one), {"tradeoff.png": speed_sweep.study_figure(one)}
+            text += speed_sweep.table(one)
+            question, answers = replace(question, bits=one.bits), [answer(one)]
+    if args.px:
+        result["px_asked"], result["speeds_found"] = args.px, speeds
+    if args.streams:
+        lit = replace(question, ppp=levels[0])
+        made = speed_sweep.write_streams(first, args.output / "streams", lit)
+        result["streams"] = [str(path) for path in made]
+        text += [f"streams 'planes' and 'multibit': {path}" for path in made]
+    if args.output is not None:
+        text += _write_study(args.output, "tradeoff.json", result, pictures)
+    output(args, result, text + answers)
+    return 0
+
+
+def _speeds(args: argparse.Namespace, shape: Any) -> tuple[list[float], list[str]]:
+    """The factors on the motion, and a line for each motion that was asked for."""
+    from functools import partial
+
+    import scenes
+    from qsim.clip.clip import Clip
+    from qsim.studies.bit_depth import answer as tradeoff_answer
+
+    if not args.px:
+        return args.speed or [1.0], []
+    found: list[tuple[float, float]] = []
+    if (Path(args.source) / "clip.json").is_file():
+        clip = Clip.open(args.source)
+        found = [tradeoff_answer.step_for(px, clip) for px in args.px]
+    elif args.source in scenes.FAMILIES or args.source.endswith(".py"):
+        motion = partial(_motion, args.source, shape)
+        found = [tradeoff_answer.speed_for(px, motion, args.source) for px in args.px]
+    if len({speed for speed, _ in found}) < len(found):
+        raise ValueError(f"{args.source}: several of --px {args.px} need one and the same speed; give fewer")
+    text = [
+        f"--px {px:g}: speed factor {speed:g} gives {reached:.3g} px per 3-bit frame (7 planes), mean of what moves"
+        for px, (speed, reached) in zip(args.px, found, strict=False)
+    ]
+    return [speed for speed, _ in found] or [1.0], text
+
+
+def _motion(name: str, shape: Any, speed: float) -> float:
+    from qsim.studies.bit_depth.answer import scene_motion
+
+    size, rate = (shape.height, shape.width), shape.frame_rate
+    return scene_motion(name, size, frames=shape.frames, frame_rate=rate, seed=shape.seed, speed=speed)
+
+
+def _write_study(folder: Path, name: str, result: dict[str, Any], pictures: dict[str, bytes]) -> list[str]:
+    folder.mkdir(parents=True, exist_ok=True)
+    for picture, content in pictures.items():
+        files.write_bytes(folder / picture, content)
+    files.write_json(folder / name, result)
+    return ["written: " + ", ".join(str(folder / written) for written in [*pictures, name])]
+
+
+def _paper_figure(args: argparse.Namespace) -> int:
+    from qsim.clip.clip import Clip
+    from qsim.studies.bit_depth import paper_figures, speed_sweep
+
+    height, width = args.size or (96, 128)
+    number, speeds = args.paper_figure, args.speed or [1.0]
+    if len(speeds) > 1:
+        raise ValueError(f"--speed {args.speed}: --paper-figure draws one speed; give one")
+    rate, frames = (paper_figures.RATE_1, 201) if number == 1 else (10_000.0, 511)
+    shape = speed_sweep.Shape(frames, height, width, rate, seed=args.seed)
+    names = [args.source] if args.source else ["fan"] if number == 1 else ["fan", "text"]
+    rows, result = [], []
+    for name, ppp in zip(names * (2 // len(names) if number == 2 else 1), (0.51, 0.40), strict=False):
+        if (Path(name) / "clip.json").is_file():
+            clip = Clip.open(name)
+        else:
+            with bar(name) as progress:
+                path = args.output / "clips" / Path(name).stem
+                clip = speed_sweep.render(name, path, shape, speed=speeds[0], progress=progress)
+        panels = paper_figures.figure_1(clip, seed=args.seed) if number == 1 else (
+            paper_figures.figure_2(clip, ppp, seed=args.seed)
+        )  # fmt: skip
+        rows.append(panels)
+        result.append({"clip": clip.name, "panels": [{"label": p.label, **p.numbers} for p in panels]})
+    found = {"figure": number, "rows": result}
+    text = [f"{row['clip']}: {panel}" for row in result for panel in row["panels"]]
+    text += _write_study(args.output, f"figure{number}.json", found, {f"figure{number}.png": paper_figures.draw(rows)})
+    output(args, found, text)
+    return 0
+
+
+def _tradeoff_table(args: argparse.Namespace) -> int:
+    from qsim.studies.bit_depth.laws import depths
+
+    height, width = args.size or (240, 320)
+    rate = 10_000.0 if args.base_fps is None else args.base_fps
+    noise = 0.2 if args.read_noise is None else args.read_noise
+    speed = 2500.0 if args.motion is None else args.motion
+    rows = depths(
+        height=height,
+        width=width,
+        base_fps=rate,
+        read_noise=noise,
+        bits=args.bits or [1, 3, 5, 7, 9],
+        speed=speed,
+    )
+    text = [
+        f"{height} x {width} px, {rate:g} planes/s, {noise:g} e- per read, {speed:g} px/s",
+        "bits         fps  px/frame  read noise x fps  in quadrature  data rate",
+        "                              [e-/s, linear]   [e- in 1 s]     [MB/s]",
+    ]
+    text += [
+        f"{r.bits:4d}  {r.fps:10.2f}  {r.motion_px_per_frame:8.2f}  {r.read_noise_per_second:16.2f}"
+        f"  {r.read_noise_quadrature:13.2f}  {r.data_rate_megabytes_per_second:9.3f}"
+        for r in rows
+    ]
+    output(args, {"rows": [asdict(r) for r in rows]}, text)
+    return 0
+
+
+def size(text: str) -> tuple[int, int]:
+    """`240x320` -> (240, 320): rows, columns."""
+    height, _, width = text.partition("x")
+    if not (height.isdecimal() and width.isdecimal() and int(height) > 0 and int(width) > 0):
+        raise argparse.ArgumentTypeError(f"a size is ROWSxCOLUMNS, as in 240x320; got {text!r}")
+    return int(height), int(width)
+
+
+def integers(text: str) -> list[int]:
+    """`1,3,5` -> [1, 3, 5]."""
+    words = text.split(",")
+    if not all(word.strip().isdecimal() for word in words):
+        raise argparse.ArgumentTypeError(f"whole numbers with commas, as in 1,3,5; got {text!r}")
+    return [int(word) for word in words]
+
+
+def steps(text: str) -> list[float]:
+    """`3.25`, `0.5,3,26`, `0.1:30` (six geometric steps) or `0.5:8:5` (five of them) -> numbers above 0."""
+    import numpy as np
+
+    words = text.split(":")
+    try:
+        if len(words) == 1:
+            found = [float(word) for word in text.split(",")]
+        else:
+            low, high = float(words[0]), float(words[1])
+            count = int(words[2]) if len(words) == 3 else _doublings(low, high)
+            found = [float(f"{v:.4g}") for v in np.geomspace(low, high, count)]
+    except (ValueError, IndexError):
+        found = []
+    if not found or len(words) > 3 or not all(0 < v < float("inf") for v in found):
+        raise argparse.ArgumentTypeError(f"numbers above 0, as in 0.65 or 0.1,1,10 or 0.1:30 or 0.5:8:5; got {text!r}")
+    return found
+
+
+def _doublings(low: float, high: float) -> int:
+    """Steps of 2 if the range is so many times 2 (up to 32), else six steps."""
+    from math import isclose, log2
+
+    octaves = log2(high / low)
+    return round(octaves) + 1 if 0 < octaves < 5.5 and isclose(octaves, round(octaves)) else 6

@@ -1,0 +1,264 @@
+"""A clip: a folder with the radiance of a moving scene, its ground truth, and the streams sensed from it.
+
+    clip.json            what it is: shape, rates, units, camera, scene, render choices, errors, checksums; written last
+    radiance/000000.exr  Y, half, uncompressed: what a sensor integrates
+    sharp/000000.exr     the same at mid-exposure, only where it differs
+    truth/000000.exr     u v bu bv valid Z id: flow to the next and the previous frame, validity, depth, body; zipped
+    saturated/000000.exr 1 where the camera of an imported video was saturated, only of frames in which it was; zipped
+    streams/NAME.npy     codes, and NAME.json (stream.py)
+
+A clip grows in NAME.part and gets its name when it is whole; an interrupted one goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import files, structure
+from qsim.clip import exr
+from qsim.clip.stream import Progress, Stream, check_crop, write_stream
+from qsim.clip.writer import FORMAT_VERSION, PHYSICAL, RELATIVE, TRUTH, ClipWriter, camera_of
+from qsim.optics import radiometry
+
+if TYPE_CHECKING:
+    from qsim.scene.scene import Camera
+
+__all__ = ["FORMAT_VERSION", "PHYSICAL", "RELATIVE", "Clip", "ClipWriter", "Stream", "write_stream"]
+
+_DAMAGED = "the file is damaged; make the clip again, or take clip.json from a copy"
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """A finished clip folder; frames are read when asked for."""
+
+    path: Path
+    meta: dict[str, Any]  # clip.json
+
+    @staticmethod
+    def open(path: str | os.PathLike[str]) -> Clip:
+        """`FileNotFoundError` or `ValueError`, naming file and key, if this is not a whole clip of our version."""
+        path = Path(path)
+        manifest = path / "clip.json"
+        if not manifest.is_file():
+            raise FileNotFoundError(_why_not(path))
+        meta = files.read_json(manifest)
+        files.check_version(manifest, meta.get("format_version"), FORMAT_VERSION)
+        structure.structure(manifest, meta, structure.CLIP, _DAMAGED)
+        if meta["radiance_unit"] not in (PHYSICAL, RELATIVE):
+            raise ValueError(
+                f"{manifest}: radiance_unit {meta['radiance_unit']!r}; known are '{PHYSICAL}' and '{RELATIVE}'"
+            )
+        if (meta.get("camera") is None) != (meta["radiance_unit"] == RELATIVE):
+            raise ValueError(
+                f"{manifest}: a clip in {PHYSICAL} needs a camera, and a relative one has none; {_DAMAGED}"
+            )
+        for t in range(meta["shape"][0]):
+            if f"radiance/{t:06d}.exr" not in meta["checksums"]:
+                raise ValueError(f"{manifest}: checksums lack radiance/{t:06d}.exr of frame {t}; {_DAMAGED}")
+        files.check_own(manifest, meta, _DAMAGED)
+        return Clip(path, meta)
+
+    def __len__(self) -> int:
+        return int(self.meta["shape"][0])
+
+    def __repr__(self) -> str:
+        frames, height, width = self.shape
+        unit = "(relative)" if self.meta["radiance_unit"] == RELATIVE else "W/m2/sr"
+        streams = ", ".join(self.streams) or "none"
+        return (
+            f"<Clip {self.name}: {frames} frames of {height} x {width} px at {self.frame_rate:g} fps, exposure "
+            f"{self.exposure * 1e6:.4g} us, mean radiance {self.mean_radiance:.4g} {unit}, streams: {streams}>"
+        )
+
+    @property
+    def name(self) -> str:
+        return str(self.meta.get("name") or self.path.name)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(frames, height, width)"""
+        frames, height, width = self.meta["shape"]
+        return frames, height, width
+
+    @property
+    def frame_rate(self) -> float:
+        """Frames per second of the scene's time."""
+        return float(self.meta["frame_rate"])
+
+    @property
+    def exposure(self) -> float:
+        """Seconds of light per frame."""
+        return float(self.meta["exposure"])
+
+    @property
+    def origin(self) -> tuple[int, int]:
+        """(y, x) of the first pixel in the camera's frame: not (0, 0) if only a crop was rendered."""
+        y, x = self.meta.get("origin") or (0, 0)
+        return int(y), int(x)
+
+    @property
+    def mean_radiance(self) -> float:
+        """Mean over all frames and pixels, in `meta["radiance_unit"]`."""
+        return float(self.meta["mean_radiance"])
+
+    @property
+    def mean_photons(self) -> float:
+        """Mean expected photons per pixel and exposure of the light as it is; `ValueError` for relative radiance."""
+        value = self.meta.get("mean_photons")
+        if value is None:
+            raise ValueError(f"{self.path}: its radiance is relative and has no photons; give a target in PPP")
+        return float(value)
+
+    @cached_property
+    def camera(self) -> Camera | None:
+        """The camera without its motion; None for relative radiance."""
+        return camera_of(self.meta, self.path / "clip.json")
+
+    def radiance(self, t: int, crop: radiometry.Crop | None = None) -> Array:
+        """What the sensor integrates in frame t, float32 [H, W]; crop = (y, x, height, width)."""
+        return self._half("radiance", t, crop)
+
+    def sharp(self, t: int, crop: radiometry.Crop | None = None) -> Array:
+        """The scene at mid-exposure, float32 [H, W], which a restorer should return; `radiance` where not stored."""
+        return self._half("sharp" if f"sharp/{t:06d}.exr" in self.meta["checksums"] else "radiance", t, crop)
+
+    def flow(self, t: int) -> Array:
+        """float32 [2, H, W] (u right, v down) in pixels: pixel p of frame t is at p + flow(p) in frame t + 1."""
+        return np.stack([self._truth(t, "u"), self._truth(t, "v")])
+
+    def flow_back(self, t: int) -> Array:
+        """float32 [2, H, W] (u right, v down) in pixels: pixel p of frame t was at p + flow_back(p) in frame t - 1."""
+        return np.stack([self._truth(t, "bu"), self._truth(t, "bv")])
+
+    def valid(self, t: int) -> Array:
+        """bool [H, W]: False where the point of frame t is hidden in, or outside of, frame t + 1."""
+        return self._truth(t, "valid") != 0
+
+    def depth(self, t: int) -> Array:
+        """float32 [H, W], metres along the optical axis; inf where nothing is."""
+        return self._truth(t, "Z")
+
+    def body_id(self, t: int) -> Array:
+        """int32 [H, W]: number of the body seen, -1 where nothing is."""
+        return self._truth(t, "id").view(np.int32)
+
+    def saturated(self, t: int, crop: radiometry.Crop | None = None) -> Array:
+        """bool [H, W]: True where the light of frame t is a lower bound, because the camera saturated.
+
+        `meta["saturated_pixels"]` counts them over all frames; `meta["saturation"]` says at which pixel value.
+        """
+        self._check_frame(t)
+        _, height, width = self.shape
+        y, x, h, w = (0, 0, height, width) if crop is None else check_crop(crop, height, width, str(self.path))
+        if f"saturated/{t:06d}.exr" not in self.meta["checksums"]:
+            return np.zeros((h, w), bool)
+        return self._channel("saturated", t, "saturated")[y : y + h, x : x + w] != 0
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether flow, validity, depth and ids were stored."""
+        return "truth/000000.exr" in self.meta["checksums"]
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """Names of the streams sensed from this clip."""
+        return tuple(sorted(path.stem for path in (self.path / "streams").glob("*.json")))
+
+    def stream(self, name: str) -> Stream:
+        """`FileNotFoundError` that lists the streams there are."""
+        path = self.path / "streams" / f"{name}.json"
+        if not path.is_file():
+            known = ", ".join(self.streams) or "none yet; make one with `qsim sense`"
+            raise FileNotFoundError(f"{self.path}: no stream {name!r}; there are: {known}")
+        return Stream.open(path)
+
+    def verify(self, progress: Progress | None = None) -> list[str]:
+        """Problems of the folder in words, one per file; empty if every file is what was written.
+
+        `progress` hears (files checked, files in all), a stream counting as one.
+        """
+        problems = []
+        stored, streams = sorted(self.meta["checksums"].items()), sorted((self.path / "streams").glob("*.json"))
+        report, total = progress or (lambda done, total: None), len(stored) + len(streams)
+        for done, (relative, expected) in enumerate(stored, 1):
+            problems += files.differs(self.path / relative, expected)
+            report(done, total)
+        for done, path in enumerate(streams, len(stored) + 1):
+            try:
+                problems += Stream.open(path).verify()
+            except (ValueError, OSError) as error:
+                problems.append(files.wording(error))
+            report(done, total)
+        return problems
+
+    def unsealed(self) -> list[Path]:
+        """Descriptions of the clip and its streams without a checksum of their own: an earlier version made them."""
+        found = [] if "checksum" in self.meta else [self.path / "clip.json"]
+        for path in sorted((self.path / "streams").glob("*.json")):
+            try:
+                found += [] if "checksum" in files.read_json(path) else [path]
+            except (ValueError, OSError):  # a problem that `verify` names
+                continue
+        return found
+
+    def _half(self, folder: str, t: int, crop: radiometry.Crop | None) -> Array:
+        self._check_frame(t)
+        _, height, width = self.shape
+        if crop is not None:
+            check_crop(crop, height, width, str(self.path))
+        path = self.path / folder / f"{t:06d}.exr"
+        try:
+            return exr.read_half(path, height, width, crop)
+        except FileNotFoundError:
+            raise FileNotFoundError(
+                f"{path}: no such file; the clip is damaged, run `qsim check {self.path}`"
+            ) from None
+
+    def _truth(self, t: int, channel: str) -> Array:
+        return self._channel("truth", t, channel)
+
+    def _channel(self, folder: str, t: int, channel: str) -> Array:
+        self._check_frame(t)
+        path = self.path / folder / f"{t:06d}.exr"
+        if not path.is_file():
+            kept = f"{folder}/{t:06d}.exr" in self.meta["checksums"]
+            why = f"the clip is damaged, run `qsim check {self.path}`" if kept else f"frame {t} has no ground truth"
+            raise FileNotFoundError(f"{path}: no such file; {why}")
+        status = path.stat()
+        channels = _read_truth(path, *self.shape[1:], status.st_mtime_ns, status.st_size)
+        if channel not in channels:
+            raise ValueError(f"{path}: has no channel '{channel}' ({TRUTH.get(channel, channel)})")
+        return channels[channel]
+
+    def _check_frame(self, t: int) -> None:
+        if not 0 <= t < len(self):
+            raise ValueError(f"{self.path}: frame {t} asked for, the clip has frames 0..{len(self) - 1}")
+
+
+def _why_not(path: Path) -> str:
+    if path.with_name(path.name + ".part").is_dir():
+        return f"{path}: unfinished (only {path.name}.part is there); run the command that made it again, it goes on"
+    if not path.exists():
+        return f"{path}: no such clip"
+    if (path / "dataset.json").is_file():
+        return f"{path}: is a data set, not a clip; its clips are in {path / 'clips'}"
+    return f"{path}: not a clip folder (it has no clip.json)"
+
+
+@functools.lru_cache(maxsize=2)
+def _read_truth(path: Path, height: int, width: int, modified: int, size: int) -> dict[str, Array]:
+    channels = exr.read(path, (height, width))
+    for name, array in channels.items():
+        if array.dtype != (np.uint32 if name in ("valid", "id", "saturated") else np.float32):
+            raise ValueError(f"{path}: channel '{name}' is {array.dtype}; the file is damaged, run `qsim check`")
+        array.setflags(write=False)
+    return channels

@@ -1,0 +1,151 @@
+"""OpenEXR images: written from memory, read by the row.
+
+Files are ordinary single-part scan-line OpenEXR 2.0 that any program opens. Two things are why they are not written
+and cropped with the OpenEXR library: bytes made in memory go through one atomic, checksummed writer (files.py) and do
+not depend on a library's version; and a crop of an uncompressed image reads only the rows it needs.
+
+Layout (openexr.com, "OpenEXR File Layout"): magic, version, attributes, offset table, then per chunk
+(int32 y, int32 size, data); inside a chunk every row holds its channels one after the other, in alphabetical order.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.formats.recording import reading
+
+MAGIC = bytes((0x76, 0x2F, 0x31, 0x01)) + struct.pack("<i", 2)
+_PIXEL_TYPES = {np.dtype("<u4"): 0, np.dtype("<f2"): 1, np.dtype("<f4"): 2}
+_ZIP_ROWS = 16  # rows per chunk of the ZIP method
+HALF_MAX = 65504.0
+
+Crop = tuple[int, int, int, int]  # y, x, height, width
+
+
+def encode(channels: dict[str, Array], *, compress: bool = False) -> bytes:
+    """An EXR file with the given channels [H, W] of float16, float32 or uint32, uncompressed or losslessly zipped."""
+    names = sorted(channels)
+    height, width = channels[names[0]].shape
+    arrays = [np.ascontiguousarray(channels[name]) for name in names]
+    header = _header({name: array.dtype for name, array in zip(names, arrays, strict=True)}, height, width, compress)
+    rows = np.concatenate([array.view(np.uint8).reshape(height, -1) for array in arrays], axis=1)
+    step = _ZIP_ROWS if compress else 1
+    chunks = []
+    for y in range(0, height, step):
+        raw = rows[y : y + step].tobytes()
+        packed = _zip(raw) if compress else raw
+        body = packed if len(packed) < len(raw) else raw
+        chunks.append(struct.pack("<ii", y, len(body)) + body)
+    first = len(header) + 8 * len(chunks)
+    offsets = first + np.concatenate([[0], np.cumsum([len(chunk) for chunk in chunks])[:-1]])
+    return b"".join([header, offsets.astype("<u8").tobytes(), *chunks])
+
+
+def to_half(image: Array) -> tuple[Array, int]:
+    """Half-precision copy and the number of pixels that were clipped to the largest half, 65504."""
+    clipped = int(np.count_nonzero(image > HALF_MAX))
+    return np.minimum(image, HALF_MAX).astype("<f2"), clipped
+
+
+def read_half(path: Path, height: int, width: int, crop: Crop | None = None) -> Array:
+    """float32 [h, w] of an uncompressed one-channel half image; reads only the rows of the crop (y, x, h, w).
+
+    `ValueError` if the file has another size or layout (it is truncated, or from another program).
+    """
+    y, x, rows, columns = crop if crop is not None else (0, 0, height, width)
+    header = _half_header(height, width)
+    start = len(header) + 8 * height
+    stride = 8 + 2 * width
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        size = os.fstat(descriptor).st_size
+        if size != start + stride * height or os.pread(descriptor, len(header), 0) != header:
+            raise ValueError(
+                f"{path}: {size} bytes are not an uncompressed half EXR of {height} x {width} pixels "
+                f"({start + stride * height} bytes); the file is truncated or damaged, run `qsim check`"
+            )
+        raw = os.pread(descriptor, rows * stride, start + y * stride)
+    finally:
+        os.close(descriptor)
+    table = np.frombuffer(raw, dtype=np.uint8).reshape(rows, stride)
+    if int.from_bytes(raw[:4], "little") != y:
+        raise ValueError(f"{path}: row {y} is not where an uncompressed EXR keeps it; the file is damaged")
+    pixels = table[:, 8 + 2 * x : 8 + 2 * (x + columns)]
+    return np.ascontiguousarray(pixels).view("<f2").astype(np.float32)
+
+
+def read(path: Path, size: tuple[int, int] | None = None) -> dict[str, Array]:
+    """The channels [H, W] of a scan-line EXR file, by the OpenEXR library; `size` = (height, width), if it is known.
+
+    `ValueError` if it cannot be read, has another size, or promises more than its bytes can hold.
+    """
+    import OpenEXR
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; the clip is damaged, run `qsim check`")
+    with reading(path, "OpenEXR; the file is damaged, run `qsim check`"):
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            header = dict(file.header())  # a copy: closing empties it
+            names = [channel.name for channel in header["channels"]]
+        first, last = (np.asarray(corner) for corner in header["dataWindow"])
+        found = [int(n) for n in (last - first + 1)[::-1]]
+        height, width = size or found
+        if found != [height, width] or header["type"] != OpenEXR.scanlineimage:
+            raise ValueError(f"{path}: holds {header['type']} {found}, expected scan lines {[height, width]}")
+        if 2 * height * width * len(names) > 1032 * path.stat().st_size:  # the most that deflate can shrink
+            raise ValueError(f"{path}: {path.stat().st_size} bytes cannot hold {len(names)} channels of {found}")
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+        for name, array in channels.items():
+            if array.shape != (height, width):
+                raise ValueError(
+                    f"{path}: channel {name!r} is {array.dtype} {list(array.shape)}, not {[height, width]}"
+                )
+    return channels
+
+
+def _attribute(name: str, kind: str, value: bytes) -> bytes:
+    return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
+
+
+def _header(types: dict[str, np.dtype], height: int, width: int, compress: bool) -> bytes:
+    channels = b"".join(
+        name.encode() + b"\0" + struct.pack("<iiii", _PIXEL_TYPES[kind.newbyteorder("<")], 0, 1, 1)
+        for name, kind in types.items()
+    )
+    window = struct.pack("<iiii", 0, 0, width - 1, height - 1)
+    return b"".join(
+        [
+            MAGIC,
+            _attribute("channels", "chlist", channels + b"\0"),
+            _attribute("compression", "compression", bytes([3 if compress else 0])),
+            _attribute("dataWindow", "box2i", window),
+            _attribute("displayWindow", "box2i", window),
+            _attribute("lineOrder", "lineOrder", b"\0"),
+            _attribute("pixelAspectRatio", "float", struct.pack("<f", 1.0)),
+            _attribute("screenWindowCenter", "v2f", struct.pack("<ff", 0.0, 0.0)),
+            _attribute("screenWindowWidth", "float", struct.pack("<f", 1.0)),
+            b"\0",
+        ]
+    )
+
+
+@functools.lru_cache(maxsize=16)
+def _half_header(height: int, width: int) -> bytes:
+    return _header({"Y": np.dtype("<f2")}, height, width, compress=False)
+
+
+def _zip(raw: bytes) -> bytes:
+    """EXR's ZIP method: even bytes before odd bytes, then differences to the byte before (offset 128), then deflate."""
+    data = np.frombuffer(raw, np.uint8)
+    split = np.concatenate([data[0::2], data[1::2]])
+    delta = split.copy()
+    delta[1:] = split[1:] - split[:-1] + np.uint8(128)
+    return zlib.compress(delta.tobytes(), 4)

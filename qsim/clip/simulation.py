@@ -1,0 +1,281 @@
+"""A sensor's draw of one clip: light of clip frames in, codes of stream frames out, block by block.
+
+    prepare(clip, sensing) -> Draw --packed--> bytes of a stream      --frames--> codes of some frames, for replay
+
+A code sees one clip frame, or several: as binary planes that are summed (clocked pixels), or as slices of one exposure
+in which the light changes (counting pixels).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.optics import radiometry
+from qsim.sensor import packing
+
+if TYPE_CHECKING:
+    from qsim.clip.clip import Clip
+    from qsim.clip.stream import Progress, Sensing, Stream
+    from qsim.keys import Key
+    from qsim.sensor.defects.defect_table import Flawed, Flaws, Light
+    from qsim.sensor.defects.event_simulation import Effects
+    from qsim.sensor.sensor import Sensor
+
+LAWS = ("table", "process", "planes", "closed form", "events")  # of `Draw.law`
+_BLOCK_PIXELS = 1 << 22  # photons held in memory at a time while sensing: 32 MiB of float64
+
+
+@dataclass(frozen=True)
+class Draw:
+    """A `Sensing` applied to one clip: everything that decides its codes."""
+
+    sensor: Sensor
+    plane: Sensor  # draws one clip frame; the same as `sensor` unless planes are summed
+    level: radiometry.LightLevel  # per clip frame
+    key: Key
+    planes: int  # clip frames per code
+    diffraction: bool
+    flaws: Flaws | None = None
+    followed: Effects | None = None  # counting pixels: what the closed form misses, where photons have to be followed
+    engine: str = "auto"
+
+    @property
+    def law(self) -> str:
+        """How its codes come from random numbers, `drawn_by` of a stream; another law draws other codes.
+
+        "table": one number against the cdf. "process": step by step, or the sum of all planes at once. "planes": one by
+        one. "closed form" and "events": counting pixels, by their cdf and photon by photon.
+        """
+        from qsim.sensor.qis import QIS
+        from qsim.sensor.spad import BinarySPAD, PlaneByPlane
+
+        if self.followed is not None:
+            return "events"
+        few = self.sensor.bits <= 8
+        if isinstance(self.sensor, QIS):
+            pattern = None if self.flaws is None else self.flaws.pattern
+            maps = {} if self.flaws is None else self.flaws.maps
+            read_out = pattern is not None and (pattern.offset or pattern.read_noise)
+            return "process" if not few or read_out or {"offset_map", "read_noise_map"} & set(maps) else "table"
+        if not isinstance(self.sensor, BinarySPAD):
+            return "closed form"
+        disturbed = self.flaws is not None and (self.flaws.afterpulse or self.flaws.crosstalk)
+        return "planes" if few or self.sums or disturbed or isinstance(self.sensor, PlaneByPlane) else "process"
+
+    def light(self, clip: Clip, start: int, stop: int) -> Array:
+        """Photons [stop - start, H, W] of clip frames."""
+        return np.stack(
+            [
+                radiometry.clip_photons(clip, t, self.level.factor, diffraction=self.diffraction)
+                for t in range(start, stop)
+            ]
+        )
+
+    def frames(self, clip: Clip, start: int, stop: int) -> Array:
+        """Codes of stream frames start ... stop - 1, [stop - start, H, W]; a memory is followed from the first one."""
+        flawed = self._flawed(clip)
+        if self.followed is not None:
+            return self._follow(clip, stop)[start:]
+        first = 0 if flawed is not None and flawed.memory else start
+        blocks = self.blocks(clip, first, stop, stop - first if first == start else 1)
+        return np.concatenate([block for n, block in enumerate(blocks, first) if n >= start])
+
+    def blocks(self, clip: Clip, start: int, stop: int, step: int) -> Iterator[Array]:
+        """Codes of stream frames start ... stop - 1, `step` at a time; all at once where photons are followed."""
+        if self.followed is not None:
+            yield self._follow(clip, stop)[start:]
+            return
+        places = [(t * self.planes, min(t + step, stop) * self.planes) for t in range(start, stop, step)]
+        light = (self._exposed(self.light(clip, *place)) for place in places)
+        flawed = self._flawed(clip)
+        if flawed is not None:
+            drawn: Iterator[Array] = flawed.blocks(
+                light, self._exposure(clip), self.key.at(self._number(start)), engine=self.engine
+            )
+        else:
+            keys = (self.key.at(self._number(t)) for t in range(start, stop, step))
+            exposure, engine = self._exposure(clip), self.engine
+            each = zip(light, keys, strict=True)
+            drawn = (self.plane.sample(p, exposure, key=key, engine=engine) for p, key in each)
+        for block in drawn:
+            yield self._summed(block)
+
+    def packed(self, clip: Clip, frames: int, progress: Progress | None = None) -> Iterator[Array]:
+        """All codes of a stream, packed row by row, some frames at a time."""
+        step = max(1, _BLOCK_PIXELS // (clip.shape[1] * clip.shape[2] * self.planes))
+        if self.followed is not None or self.flaws is not None or self.planes > 1:
+            blocks: Iterator[Array] = (
+                packing.pack(block, self.sensor.bits) for block in self.blocks(clip, 0, frames, step)
+            )
+        else:
+            blocks = (
+                self.plane.sample_packed(
+                    self.light(clip, t, min(t + step, frames)), clip.exposure, key=self.key.at(t), engine=self.engine
+                )
+                for t in range(0, frames, step)
+            )
+        done = 0
+        for block in blocks:
+            yield block
+            done += len(block)
+            if progress is not None:
+                progress(done, frames)
+
+    @property
+    def sums(self) -> bool:
+        """Whether a code sums binary planes; otherwise several clip frames are the light of one exposure."""
+        return self.plane is not self.sensor
+
+    def _exposed(self, light: Array) -> Array:
+        """Light of clip frames -> of the exposures that `plane` draws."""
+        return light if self.sums or self.planes == 1 else light.reshape(-1, self.planes, *light.shape[1:]).sum(axis=1)
+
+    def _exposure(self, clip: Clip) -> float:
+        return clip.exposure if self.sums else clip.exposure * self.planes
+
+    def _number(self, frame: int) -> int:
+        """Of a stream's frame in the key: planes are numbered one by one."""
+        return frame * self.planes if self.sums else frame
+
+    def _summed(self, drawn: Array) -> Array:
+        if not self.sums:
+            return drawn
+        grouped = drawn.reshape(-1, self.planes, *drawn.shape[1:])
+        return grouped.sum(axis=1).astype(packing.code_dtype(self.sensor.bits))
+
+    def _flawed(self, clip: Clip) -> Flawed | None:
+        from qsim.sensor.defects import defect_table as flaws
+
+        counts = self.followed is not None
+        if self.flaws is None and not counts:
+            return None
+        return flaws.of_sensor(self.flaws or flaws.Flaws(), self.plane, *clip.shape[1:])
+
+    def _slices(self, clip: Clip) -> Light:
+        """Light [slices, rows, W] of a stream's frame and some of its rows."""
+
+        def read(frame: int, row: int, rows: int) -> Array:
+            crop = (row, 0, rows, clip.shape[2])
+            first = frame * self.planes
+            each = (
+                radiometry.clip_photons(clip, t, self.level.factor, crop, diffraction=self.diffraction)
+                for t in range(first, first + self.planes)
+            )
+            return np.stack(list(each))
+
+        return read
+
+    def missed(self, clip: Clip) -> Effects | None:
+        """What the closed form of counting pixels misses in this clip; None where nothing can be missed."""
+        from qsim.sensor.defects import defect_table as flaws
+        from qsim.sensor.spad import CountingSPAD
+
+        if not isinstance(self.plane, CountingSPAD):
+            return None
+        memory = flaws.memory_of(self.flaws)
+        if self.planes == 1 and not (memory.carry or memory.afterpulse):
+            return None
+        flawed = flaws.of_sensor(self.flaws or flaws.Flaws(), self.plane, *clip.shape[1:])
+        shape = (len(clip) // self.planes, *clip.shape[1:])
+        return flaws.effects(flawed, self._slices(clip), shape, self._exposure(clip), self.planes / clip.frame_rate)
+
+    def _follow(self, clip: Clip, frames: int) -> Array:
+        from qsim.sensor.defects import defect_table as flaws
+
+        flawed = self._flawed(clip)
+        assert flawed is not None
+        shape = (frames, *clip.shape[1:])
+        exposure, frame_time = self._exposure(clip), self.planes / clip.frame_rate
+        return flaws.follow(flawed, self._slices(clip), shape, exposure, frame_time, self.key)
+
+
+def prepare(clip: Clip, sensing: Sensing) -> Draw:
+    """The sensor, light factor and key for one clip; `ValueError` if they do not fit it."""
+    from qsim.sensor.defects import defect_table as flaws
+
+    source = sensing.defects or (sensing.sensor if sensing.sensor.endswith(".toml") else None)
+    return assemble(clip, sensing, None if source is None else flaws.from_toml(source))
+
+
+def assemble(clip: Clip, sensing: Sensing, found: Flaws | None, own: Sensor | None = None) -> Draw:
+    """As `prepare`, with these defects, and with this sensor in place of the one that `sensing` names."""
+    from qsim import keys
+    from qsim.sensor import devices
+    from qsim.sensor.defects import defect_table as flaws
+
+    planes = sensing.slices
+    if sensing.group:
+        if sensing.bits is None:
+            raise ValueError(f"{clip.name}: summing planes needs the bits of a code, as in --bits 3")
+        if sensing.slices != 1:
+            raise ValueError(f"{clip.name}: --group sums planes, --slices are of counting pixels; give one of them")
+        planes = 2**sensing.bits - 1
+    if not 1 <= planes <= len(clip):
+        what = f"one code of {planes} planes" if sensing.group else f"one exposure of {planes} slices"
+        raise ValueError(f"{clip.name}: {len(clip)} frames are too few for {what}")
+    target = None if sensing.ppp is None else sensing.ppp / planes
+    level = radiometry.light_level(clip, ppp=target, lux=sensing.lux)
+    sensor = own or devices.load(
+        sensing.sensor, ppp=level.ppp * planes, bits=sensing.bits, exposure=clip.exposure * planes
+    )
+    if found is not None:  # measured dark counts take the place of the sensor's
+        sensor = flaws.of_sensor(found, sensor, *clip.shape[1:]).sensor
+    _check_planes(sensor, sensing, clip)
+    key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
+    return Draw(sensor, plane_of(sensor, planes), level, key, planes, sensing.diffraction, found)
+
+
+def stored(stream: Stream) -> Draw:
+    """What drew a stream, from its json alone, by the law of its time; `ValueError` if it was not drawn here."""
+    from qsim.keys import Key
+    from qsim.sensor.defects import defect_table as flaws
+    from qsim.sensor.defects import event_simulation
+    from qsim.sensor.spad import BinarySPAD, PlaneByPlane
+
+    meta = stream.meta
+    for name in ("seed", "clip_key", "ppp", "mean_photons_before", "ppp_factor"):
+        if meta.get(name) is None:
+            raise ValueError(f"{stream.path}: its description holds no {name}: it was not drawn from a clip of ours")
+    planes, law = int(meta.get("planes_per_code") or 1), meta.get("drawn_by")
+    if law not in (None, *LAWS):
+        raise ValueError(
+            f"{stream.path}: drawn by {law!r}, which this version does not know; there are {', '.join(LAWS)}"
+        )
+    sensor = stream.sensor
+    if law in (None, "planes") and isinstance(sensor, BinarySPAD):
+        sensor = PlaneByPlane(**vars(sensor))
+    level = radiometry.LightLevel(
+        stream.photons_factor, meta["ppp"] / planes, meta["mean_photons_before"] / planes, None
+    )
+    key = Key(seed=meta["seed"], clip=meta["clip_key"])
+    where = f"{stream.path.with_suffix('.json')}: defects"
+    found = flaws.from_dict(meta["defects"], where) if "defects" in meta else None
+    followed = event_simulation.Effects(**meta["dead_time_effects"]) if law == "events" else None
+    diffraction = bool(meta.get("diffraction", False))
+    return Draw(sensor, plane_of(sensor, planes), level, key, planes, diffraction, found, followed)
+
+
+def plane_of(sensor: Sensor, planes: int) -> Sensor:
+    """What draws the clip frames of a code: one plane of a clocked SPAD, any other sensor as it is."""
+    from qsim.sensor.spad import BinarySPAD
+
+    return dataclasses.replace(sensor, bits=1) if planes > 1 and isinstance(sensor, BinarySPAD) else sensor
+
+
+def _check_planes(sensor: Sensor, sensing: Sensing, clip: Clip) -> None:
+    """`ValueError` for sums of planes and for slices of exposures that this sensor or this clip does not have."""
+    from qsim.sensor.spad import BinarySPAD, CountingSPAD
+
+    kind = type(sensor).__name__
+    if sensing.group and not isinstance(sensor, BinarySPAD):
+        raise ValueError(f"{sensing.sensor}: only a clocked SPAD (BinarySPAD) sums planes, this is a {kind}")
+    if sensing.slices > 1 and not isinstance(sensor, CountingSPAD):
+        raise ValueError(f"{sensing.sensor}: slices of an exposure are for a CountingSPAD, this is a {kind}")
+    if sensing.slices > 1 and clip.exposure < 0.999 / clip.frame_rate:
+        raise ValueError(f"{clip.name}: slices of one exposure need a clip whose shutter is open all the time")

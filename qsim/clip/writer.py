@@ -1,0 +1,351 @@
+"""Writing clips: frame by frame into NAME.part, which gets its name when it is whole."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib.metadata
+import json
+import math
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import __version__, files
+from qsim.checks import check_name
+from qsim.clip import clamped_error, exr
+from qsim.optics import radiometry
+
+if TYPE_CHECKING:
+    from qsim.scene.scene import Camera
+
+FORMAT_VERSION = 1
+PHYSICAL = "W m^-2 sr^-1"
+RELATIVE = "relative"
+MEASURED = (  # in clip.json, beyond what was asked for
+    *("mean_radiance", "mean_photons", "clipped_pixels", "saturated_pixels", "checksums", "software", "checksum"),
+    *("error_per_frame", "error_at_white_per_frame", "white", "psnr_of_truth", "psnr_unclamped", "fireflies_per_frame"),
+)
+OURS = r"clip\.json|(radiance|sharp|truth|saturated)/[0-9]{6,}\.exr|streams/lock|streams/[A-Za-z0-9._-]+\.(npy|json)"
+TRUTH = {  # channel of the EXR file -> quantity
+    "u": "flow",
+    "v": "flow",
+    "bu": "flow_back",
+    "bv": "flow_back",
+    "valid": "valid",
+    "Z": "depth",
+    "id": "body_id",
+}
+
+
+class ClipWriter:
+    """Writes a clip frame by frame into PATH.part and gives it its name when all frames are there.
+
+    `meta` is clip.json without what the writer measures (means, errors, checksums); it must hold shape, frame_rate,
+    exposure and radiance_unit, and camera (a dict) unless the unit is relative. A writer with the same meta goes on
+    where an interrupted one stopped: `has(t)` tells. `FileExistsError` if the clip exists and `force` is not set, or
+    if it is no clip; `ValueError` if PATH.part holds what no writer left there, or, without `force`, frames of a clip
+    with other meta.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], meta: dict[str, Any], *, force: bool = False) -> None:
+        self.path = Path(path)
+        self.force = force
+        self.name = check_name(self.path.name)
+        if self.path.is_symlink():  # the link stays; the clip is written where it points to
+            self.path = self.path.resolve()
+        if self.path.exists() and not force:
+            raise FileExistsError(f"{self.path}: exists; name another with -o, or use --force to replace it")
+        if self.path.exists() and not (self.path / "clip.json").is_file():
+            raise FileExistsError(
+                f"{self.path}: exists and is no clip, which is all that --force replaces; use another -o"
+            )
+        if self.path.exists():
+            files.check_ours(self.path, OURS)
+        self.meta = json.loads(files.to_json({"format_version": FORMAT_VERSION, "name": self.name} | meta))
+        _check_new(self.path, self.meta)
+        self.part = self.path.with_name(self.path.name + ".part")
+        self._camera = camera_of(self.meta, self.path)
+        self._frames: dict[int, dict[str, Any]] = {}
+        self._whole = False  # all frames and clip.json are there
+        self._lock = files.Lock(self.part / "lock")
+
+    def __enter__(self) -> ClipWriter:
+        identity = files.to_json(self.meta)
+        self.part.mkdir(parents=True, exist_ok=True)
+        if not self._lock.acquire():
+            raise ValueError(f"{self.part}: another process is writing this clip; wait for it, or name another with -o")
+        try:
+            begun = self.part / "begun.json"
+            if not begun.is_file():  # before anything goes: a clearing cut short is still a writer's
+                files.write_bytes(begun, self._asked_before())
+            self._whole = self._is_whole()
+            if begun.read_bytes() != identity:
+                done = self._left()["shape"][0] if self._whole else len(_read_journal(self.part))
+                if done and not self.force:
+                    raise ValueError(
+                        f"{self.part}: {done} frames are there, asked for with other settings; ask for the same to go "
+                        "on, name another with -o, or use --force to begin anew"
+                    )
+                self._clear()
+                self._whole = False
+                files.write_bytes(begun, identity)
+            files.sweep_below(self.part)
+            files.sweep(self.path)  # a replacement cut short
+            self._frames = _read_journal(self.part)
+        except BaseException:
+            self._lock.release()
+            raise
+        return self
+
+    def has(self, t: int) -> bool:
+        """Whether an earlier, interrupted writer already finished frame t."""
+        return self._whole or t in self._frames
+
+    def add(
+        self,
+        t: int,
+        radiance: Array,
+        sharp: Array | None = None,
+        truth: dict[str, Array] | None = None,
+        error: float | None = None,
+        fireflies: int | None = None,
+        errors_at: Sequence[Sequence[float]] = (),
+        saturated: Array | None = None,
+    ) -> None:
+        """Store frame t: radiance [H, W], optionally the sharp instant, ground truth and the rms error of the radiance.
+
+        `fireflies` counts the pixels that the renderer does not trust; clip.json keeps it beside the error. `errors_at`
+        are pairs (white, rms error of radiance and truth clamped there), from which clip.json gets that at its white.
+
+        `saturated` [H, W] is True where a camera could not count further: the radiance there is a lower bound. It is
+        stored where any pixel is, together with what the largest half cuts off, and counted in clip.json.
+
+        `truth` may hold flow [2, H, W], flow_back [2, H, W], valid, depth, body_id [H, W]. `ValueError` for radiance
+        that is negative or not finite, naming frame and pixel.
+        """
+        if not 0 <= t < self.meta["shape"][0]:
+            raise ValueError(f"{self.path}: frame {t} does not belong to a clip of {self.meta['shape'][0]} frames")
+        contents: dict[str, bytes] = {}
+        half, clipped = self._encode(t, "radiance", radiance, contents)
+        if sharp is not None:
+            self._encode(t, "sharp", sharp, contents)
+        if truth:
+            contents[f"truth/{t:06d}.exr"] = exr.encode(_truth_channels(truth), compress=True)
+        if saturated is not None and saturated.any():
+            mask = saturated | (radiance > exr.HALF_MAX)
+            clipped = int(np.count_nonzero(mask))
+            contents[f"saturated/{t:06d}.exr"] = exr.encode({"saturated": mask.astype("<u4")}, compress=True)
+        checksums = {}
+        for relative, content in contents.items():
+            target = self.part / relative
+            target.parent.mkdir(exist_ok=True)
+            checksums[relative] = files.write_bytes(target, content)
+        stored = half.astype(np.float64)
+        entry: dict[str, Any] = {
+            "t": t,
+            "checksums": checksums,
+            "mean_radiance": float(stored.mean()),
+            "clipped": clipped,
+        }
+        if saturated is not None:
+            entry["saturated"] = int(np.count_nonzero(saturated))
+        if error is not None:
+            entry["error"] = float(error)
+            entry["errors_at"] = [[float(value) for value in pair] for pair in errors_at]
+        if fireflies is not None:
+            entry["fireflies"] = int(fireflies)
+        if self._camera is not None:
+            origin = tuple(self.meta.get("origin", (0, 0)))
+            photons = radiometry.expected_photons(stored, self._camera, self.meta["exposure"], origin=origin)
+            entry["mean_photons"] = float(photons.mean())
+        self._frames[t] = entry
+        self._whole = False
+        files.append_line(self.part / "journal.jsonl", json.dumps(entry, sort_keys=True).encode())
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                self._finish()
+            elif not (self._frames or self._whole):
+                self._clear()
+                shutil.rmtree(self.part)
+        finally:
+            self._lock.release()
+
+    def _left(self) -> dict[str, Any]:
+        """This clip's clip.json in .part: the writer was killed while giving the folder its name. Else empty."""
+        with contextlib.suppress(OSError, ValueError):
+            left = files.read_json(self.part / "clip.json")
+            return left if left.get("name") == self.name else {}
+        return {}
+
+    def _asked_before(self) -> bytes:
+        """begun.json anew, of a .part without: killed before it began, or while it gave the folder its name."""
+        if left := self._left():
+            return files.to_json({key: value for key, value in left.items() if key not in MEASURED})
+        if all(item.name.startswith(("lock", "begun.json.tmp-")) for item in self.part.iterdir()):
+            return b""
+        raise ValueError(f"{self.part}: holds files of somebody else; move them away, or name another with -o")
+
+    def _is_whole(self) -> bool:
+        """Whether all is there but the clip's name."""
+        checksums = self._left().get("checksums", {})
+        return bool(checksums) and not any(files.differs(self.part / name, d) for name, d in checksums.items())
+
+    def _clear(self) -> None:
+        """Delete what a writer left; begun.json, which says that it was one, stays."""
+        for item in self.part.iterdir():
+            if item.name not in ("lock", "begun.json"):
+                shutil.rmtree(item) if item.is_dir() else item.unlink()
+
+    def _encode(self, t: int, folder: str, image: Array, contents: dict[str, bytes]) -> tuple[Array, int]:
+        _, height, width = self.meta["shape"]
+        if image.shape != (height, width):
+            raise ValueError(f"{self.path}: {folder} of frame {t} is {image.shape}, expected {(height, width)}")
+        bad = ~(np.isfinite(image) & (image >= 0))
+        if bad.any():
+            y, x = (int(i) for i in np.argwhere(bad)[0])
+            raise ValueError(
+                f"{self.path}: {folder} of frame {t} is {float(image[y, x])!r} at (y, x) = ({y}, {x}); "
+                "radiance is finite and not negative"
+            )
+        half, clipped = exr.to_half(image)
+        contents[f"{folder}/{t:06d}.exr"] = exr.encode({"Y": half})
+        return half, clipped
+
+    def _finish(self) -> None:
+        frames = self.meta["shape"][0]
+        missing = [t for t in range(frames) if not self.has(t)]
+        if missing:
+            raise ValueError(
+                f"{self.path}: frame {missing[0]} was never written ({len(missing)} of {frames} are missing)"
+            )
+        if not self._whole:
+            self._write_meta(frames)
+        for name in ("begun.json", "journal.jsonl", "lock"):
+            (self.part / name).unlink(missing_ok=True)
+        if self.path.exists():
+            files.remove_folder(self.path)
+        os.replace(self.part, self.path)
+        files.sync_folder(self.path.parent)
+
+    def _write_meta(self, frames: int) -> None:
+        """clip.json: what was asked for and what was measured (MEASURED)."""
+        entries = [self._frames[t] for t in range(frames)]
+        meta = dict(self.meta)
+        meta["mean_radiance"] = math.fsum(e["mean_radiance"] for e in entries) / frames
+        if self._camera is not None:
+            meta["mean_photons"] = math.fsum(e["mean_photons"] for e in entries) / frames
+        meta["clipped_pixels"] = sum(e["clipped"] for e in entries)
+        if any("saturated" in e for e in entries):
+            meta["saturated_pixels"] = sum(e.get("saturated", 0) for e in entries)
+        meta["checksums"] = {name: digest for e in entries for name, digest in e["checksums"].items()}
+        meta["software"] = _software()
+        if all("error" in e for e in entries):
+            errors, errors_at = [e["error"] for e in entries], [e.get("errors_at", []) for e in entries]
+            meta |= clamped_error.measured(meta["mean_radiance"], self._high(), errors, errors_at)
+        if all("fireflies" in e for e in entries):
+            meta["fireflies_per_frame"] = [e["fireflies"] for e in entries]
+        files.write_description(self.part / "clip.json", meta)
+
+    def _high(self) -> float:
+        """The 99.9th percentile of the radiance, over at most 4 million even samples."""
+        frames, height, width = self.meta["shape"]
+        step = max(1, math.isqrt(frames * height * width // 4_000_000))
+        samples = [
+            exr.read_half(self.part / "radiance" / f"{t:06d}.exr", height, width)[::step, ::step] for t in range(frames)
+        ]
+        return float(np.percentile(np.stack(samples), 99.9))
+
+
+def camera_of(meta: dict[str, Any], where: Path) -> Camera | None:
+    """The camera that clip.json describes, without its motion; None for relative radiance."""
+    described = meta.get("camera")
+    if described is None:
+        return None
+    from qsim.scene.scene import Camera
+
+    values = {key: value for key, value in described.items() if key not in ("kind", "motion")}
+    for key in ("origin", "target", "up"):
+        if values.get(key) is None:
+            values.pop(key, None)
+        else:
+            values[key] = tuple(values[key])
+    try:
+        return Camera(**values)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: camera: {error}") from None
+
+
+def _check_new(path: Path, meta: dict[str, Any]) -> None:
+    shape = meta.get("shape")
+    if not (isinstance(shape, list) and len(shape) == 3 and all(isinstance(n, int) for n in shape)):
+        raise ValueError(f"{path}: shape must be [frames, height, width], got {shape!r}")
+    if min(shape) < 1:
+        raise ValueError(
+            f"{path}: a clip needs at least one frame of one pixel, got {shape[0]} of {shape[1]} x {shape[2]}"
+        )
+    for key in ("frame_rate", "exposure"):
+        value = meta.get(key)
+        if not (isinstance(value, int | float) and value > 0):
+            raise ValueError(f"{path}: {key} must be a number above 0, got {value!r}")
+    if meta.get("radiance_unit") not in (PHYSICAL, RELATIVE):
+        raise ValueError(
+            f"{path}: radiance_unit must be '{PHYSICAL}' or '{RELATIVE}', got {meta.get('radiance_unit')!r}"
+        )
+    if (meta.get("camera") is None) != (meta["radiance_unit"] == RELATIVE):
+        raise ValueError(f"{path}: a clip in {PHYSICAL} needs a camera, and a relative one has none")
+
+
+def _truth_channels(truth: dict[str, Array]) -> dict[str, Array]:
+    unknown = set(truth) - set(TRUTH.values())
+    if unknown:
+        raise ValueError(
+            f"truth: unknown key {sorted(unknown)[0]!r}; known are {', '.join(sorted(set(TRUTH.values())))}"
+        )
+    channels: dict[str, Array] = {}
+    for key, names in (("flow", ("u", "v")), ("flow_back", ("bu", "bv"))):
+        if key in truth:
+            for name, plane in zip(names, truth[key], strict=True):
+                channels[name] = plane.astype("<f4")
+    if "valid" in truth:
+        channels["valid"] = truth["valid"].astype("<u4")
+    if "depth" in truth:
+        channels["Z"] = truth["depth"].astype("<f4")
+    if "body_id" in truth:
+        channels["id"] = truth["body_id"].astype("<i4").view("<u4")
+    return channels
+
+
+def _read_journal(part: Path) -> dict[int, dict[str, Any]]:
+    """Frames that an earlier writer finished; a line or file cut short by its death is dropped."""
+    path = part / "journal.jsonl"
+    if not path.is_file():
+        return {}
+    frames = {}
+    kept = []
+    for line in path.read_bytes().split(b"\n"):
+        try:
+            entry = json.loads(line)
+        except ValueError:
+            continue
+        if all((part / name).is_file() and files.sha256(part / name) == d for name, d in entry["checksums"].items()):
+            frames[int(entry["t"])] = entry
+            kept.append(line)
+    files.write_bytes(path, b"".join(line + b"\n" for line in kept))
+    return frames
+
+
+@functools.cache
+def _software() -> dict[str, str]:
+    versions = {name: importlib.metadata.version(name) for name in ("numpy", "mitsuba", "drjit")}
+    return {"qsim": __version__} | versions

@@ -1,0 +1,19 @@
+"""From a recipe to a data set: jobs, workers, resuming, provenance, and a forecast of the cost."""
+
+from typing import TYPE_CHECKING
+
+from qsim.files import lazy_names
+
+if TYPE_CHECKING:
+    from qsim.dataset.dataset import Dataset
+    from qsim.dataset.generation import generate
+
+__all__ = ["Dataset", "generate"]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "Dataset": "dataset",
+        "generate": "generation",
+    },
+)

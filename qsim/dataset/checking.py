@@ -1,0 +1,101 @@
+"""Checks what `qsim` and `quiver` made against its checksums: data sets, clips, streams and restored video.
+
+A description holds the checksum of its own keys, those of its frames or codes, or both. One made by an earlier version
+holds none of its own: what has no other voucher is counted, so that nobody takes it for checked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from numpy import ndarray as Array
+
+from qsim import files, structure
+from qsim.clip.clip import Clip
+from qsim.clip.stream import Progress, Stream
+from qsim.dataset.dataset import Dataset
+from qsim.formats.array_files import load_npy
+from qsim.formats.recording import check_shape
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is wrong below a path, and which descriptions nothing vouches for."""
+
+    problems: list[str]
+    unsealed: list[Path]
+
+    def lines(self, names: str) -> list[str]:
+        """One line per problem, or one that says that there is none; and one for what could not be checked."""
+        lines = self.problems or [f"{names}: every file is what was written"]
+        if self.unsealed:
+            count = f"{len(self.unsealed)} description{'s' if len(self.unsealed) > 1 else ''}"
+            lines = [*lines, f"not checked: {count} without a checksum, of an earlier version, as {self.unsealed[0]}"]
+        return lines
+
+
+def check(path: Path, progress: Progress | None = None) -> Verdict:
+    """Compare everything below a data set, a clip, a stream or a restored video with its checksums.
+
+    `FileNotFoundError` or `ValueError` if there is no such thing. `progress` is called with (done, total).
+    """
+    if (path / "dataset.json").is_file() or (path / "jobs").is_dir():
+        dataset = Dataset.open(path)
+        return Verdict(dataset.verify(progress), dataset.unsealed())
+    if (path / "clip.json").is_file() or not path.with_suffix(".json").is_file():
+        return _checked(lambda: Clip.open(path), path / "clip.json", progress)
+    description = path.with_suffix(".json")
+    found = files.read_json(description)
+    if "ppp_factor" in found:
+        return _checked(lambda: Stream.open(description), description, progress)
+    if "seconds_per_frame" in found:
+        return _checked(lambda: Restored.open(description), description, progress)
+    raise ValueError(f"{path}: expected a data set, a clip, a stream or a restored video")
+
+
+@dataclass(frozen=True)
+class Restored:
+    """Restored video: NAME.npy, float32 photons [T, H, W], and NAME.json."""
+
+    path: Path  # NAME.npy
+    meta: dict[str, Any]  # NAME.json
+
+    @staticmethod
+    def open(description: Path) -> Restored:
+        """`ValueError` if the description is damaged."""
+        cure = "restore the video again"
+        meta = files.read_json(description)
+        structure.structure(description, meta, structure.RESTORED, cure)
+        files.check_own(description, meta, cure)
+        return Restored(description.with_suffix(".npy"), meta)
+
+    def frames(self) -> Array:
+        """The video as a memory map; `ValueError` if the file does not fit its description."""
+        array = load_npy(self.path)
+        check_shape(self.path, array.shape)
+        if array.dtype.kind != "f" or self.meta.get("shape", list(array.shape)) != list(array.shape):
+            raise ValueError(f"{self.path}: {array.dtype} {list(array.shape)} is not what its .json describes")
+        return array
+
+    def verify(self, progress: Progress | None = None) -> list[str]:
+        """Problems of the two files; a video of an earlier version without a checksum has to be there, no more."""
+        if "sha256" in self.meta or not self.path.is_file():
+            return files.differs(self.path, self.meta.get("sha256"))
+        return []
+
+    def unsealed(self) -> list[Path]:
+        """The description, if it holds no checksum of its own or none of its video."""
+        return [] if {"checksum", "sha256"} <= self.meta.keys() else [self.path.with_suffix(".json")]
+
+
+def _checked(open_it: Any, description: Path, progress: Progress | None) -> Verdict:
+    """The verdict on one thing; a damaged description is a problem, one that is missing an error."""
+    try:
+        opened = open_it()
+    except ValueError as error:
+        if not description.is_file():
+            raise
+        return Verdict([str(error)], [])
+    return Verdict(opened.verify(progress), opened.unsealed())

@@ -1,0 +1,96 @@
+"""The same jobs on a Dask cluster: a scheduler somewhere, workers that see the data set's folder.
+
+    dask scheduler                                      # prints tcp://HOST:8786
+    dask worker tcp://HOST:8786 --nthreads 1 LIMITS     # on every machine; LIMITS as below
+    dask worker tcp://HOST:8786 --nthreads 1 LIMITS --resources GPU=1
+    qsim generate scenes/i2_2000fps.toml -o /shared/i2 --cluster tcp://HOST:8786
+
+On SLURM let dask-jobqueue start the workers and hand its address over:
+
+    from dask_jobqueue import SLURMCluster
+    cluster = SLURMCluster(cores=1, memory="4GB", walltime="04:00:00"); cluster.scale(40)
+    print(cluster.scheduler_address)                    # for --cluster
+
+The folder must have the same path on all machines; a scene file or a sensor file likewise. A worker that dies gives its
+job back to the others, who go on with the frames it had finished. The files are those of a local run.
+
+Renderers grow, and `workers.Limits` is for local processes only, so a worker gets its LIMITS where it is started:
+`--memory-limit 4GiB --lifetime 1h --lifetime-stagger 10m --lifetime-restart`; docs/cluster.md says what they do.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+from qsim import files
+from qsim.dataset.job_runner import Make, Result, mark_failed, run_job
+from qsim.dataset.recipe import Job
+
+RETRIES = 3  # of a job whose worker raised; deaths of workers are counted by the scheduler (its allowed-failures)
+
+
+class Cluster:
+    """A running scheduler, as something that runs jobs: `generate(..., run=Cluster("tcp://..."))`.
+
+    `gpus` of the resource GPU are asked for per job, if above 0. `ValueError` if nobody answers at the address.
+    """
+
+    def __init__(self, address: str, *, gpus: float = 0, timeout: float = 10.0) -> None:
+        self.address, self.gpus, self.timeout = address, gpus, timeout
+
+    def __call__(self, jobs: list[Job], folder: Path, make: Make) -> Generator[Result]:
+        distributed = _distributed()
+        resources = {"GPU": self.gpus} if self.gpus > 0 else None
+        try:
+            client = distributed.Client(self.address, timeout=self.timeout)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise ValueError(f"{self.address}: no Dask scheduler answers there ({_short(error)})") from None
+        with client:
+            # One future per job; pure=False because a job's result is files, not its return value.
+            futures = {
+                client.submit(run_job, job, folder, make, key=task_key(folder, job), pure=False,
+                              retries=RETRIES, resources=resources): job
+                for job in jobs
+            }  # fmt: skip
+            try:
+                for future in distributed.as_completed(list(futures)):
+                    yield _result(future, futures[future], folder)
+                    future.release()
+            finally:
+                client.cancel(list(futures))
+
+
+def task_key(folder: Path, job: Job) -> str:
+    """The name of a job at the scheduler: `FOLDER-JOB-HASH`.
+
+    Dask hands the result of a key that it knows to whoever asks for it, another client with another folder included.
+    The hash is of the whole resolved path and of all that decides the job's files.
+    """
+    whole = os.fsencode(folder.resolve()) + b"\0" + job.digest.encode()
+    return f"{folder.name}-{job.name}-{files.sha256(whole)[:32]}"
+
+
+def _result(future: Any, job: Job, folder: Path) -> Result:
+    try:
+        found = future.result()
+    except Exception as error:  # the worker's: whatever it may be, it belongs to this job
+        message = f"on the cluster: {type(error).__name__}: {_short(error)}"
+        mark_failed(folder, job, message)
+        return Result(job.name, "died", message)
+    assert isinstance(found, Result)
+    return found
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ImportError:
+        raise ValueError("a cluster needs the package 'distributed': pip install 'qsim[cluster]'") from None
+    return distributed
+
+
+def _short(error: BaseException) -> str:
+    return files.wording(error)[:200]

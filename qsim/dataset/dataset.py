@@ -1,0 +1,201 @@
+"""Data sets: a folder of clips made from one recipe, whole, resumable, checkable.
+
+    dataset.json   recipe, splits by scene, state of every job, its own checksum; rewritten when a generation ends
+    clips/NAME     clip folders with their streams                       (clip.py)
+    jobs/NAME.json records with checksums; a clip counts from the moment its record is there (jobs.py)
+
+Here a data set is read and checked; generation.py makes it.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from qsim import files, structure
+from qsim.clip.clip import Clip
+from qsim.clip.stream import Progress
+from qsim.dataset.job_runner import make_record, record_path
+from qsim.dataset.recipe import SPLITS, Job
+
+FORMAT_VERSION = 1
+
+
+class Damaged(ValueError):
+    """dataset.json is there but is not what was written; `qsim generate --repair` writes it again."""
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A data set folder; only clips whose record is there are seen."""
+
+    path: Path
+    meta: dict[str, Any]  # dataset.json
+
+    @staticmethod
+    def open(path: str | os.PathLike[str]) -> Dataset:
+        """`FileNotFoundError` or `ValueError` if this is not a data set of our version."""
+        path = Path(path)
+        manifest = path / "dataset.json"
+        remedy = f"`qsim generate RECIPE -o {path} --repair` writes it again"
+        if not manifest.is_file():
+            if (path / "jobs").is_dir():
+                raise FileNotFoundError(f"{manifest}: missing; {remedy}")
+            what = "not a data set folder (it has no dataset.json)" if path.exists() else "no such data set"
+            raise FileNotFoundError(f"{path}: {what}")
+        try:
+            meta = files.read_json(manifest)
+        except ValueError as error:
+            raise Damaged(f"{error}; {remedy}") from None
+        files.check_version(manifest, meta.get("format_version"), FORMAT_VERSION)
+        try:
+            structure.structure(manifest, meta, structure.DATASET, remedy)
+            if odd := [name for name in meta["jobs"] if not structure.is_name(name)]:
+                raise ValueError(f"{manifest}: jobs holds {odd[0]!r:.60}, which is not the name of a clip; {remedy}")
+            structure.structure(manifest, meta["jobs"], dict.fromkeys(meta["jobs"], structure.JOB), remedy, "jobs.")
+            files.check_own(manifest, meta, remedy)
+        except ValueError as error:
+            raise Damaged(str(error)) from None
+        return Dataset(path, meta)
+
+    def __repr__(self) -> str:
+        splits = ", ".join(f"{len(self.names(split))} {split}" for split in SPLITS)
+        recipe = self.recipe.get("recipe", {})
+        size = " x ".join(str(recipe.get(key, "?")) for key in ("frames", "height", "width"))
+        rate = recipe.get("frame_rate", "?")
+        missing = f", {len(self.missing)} not made yet" if self.missing else ""
+        return f"<Dataset {self.name}: clips {splits}{missing}; {size} frames, rows, columns at {rate} fps>"
+
+    @property
+    def name(self) -> str:
+        return str(self.meta["name"])
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """The recipe as it was written."""
+        return dict(self.meta["recipe"])
+
+    def names(self, split: str | None = None) -> list[str]:
+        """Names of the finished clips of one split, or of all. `ValueError` for an unknown split."""
+        if split is not None and split not in SPLITS:
+            raise ValueError(f"{self.path}: unknown split {split!r}; there are {', '.join(SPLITS)}")
+        chosen = [name for name, job in self.meta["jobs"].items() if split in (None, job["split"])]
+        return [name for name in chosen if record_path(self.path, name).is_file()]
+
+    def clips(self, split: str | None = None) -> list[Clip]:
+        """The finished clips of one split, or of all."""
+        return [Clip.open(self.path / "clips" / name) for name in self.names(split)]
+
+    @property
+    def missing(self) -> list[str]:
+        """Names of the clips that the recipe asks for and that are not finished."""
+        return [name for name in self.meta["jobs"] if not record_path(self.path, name).is_file()]
+
+    def verify(self, progress: Progress | None = None) -> list[str]:
+        """Problems of all files in words, one per file; clips not made yet are problems too.
+
+        `progress` hears (clips checked, clips in all).
+        """
+        problems = [f"{self.path / 'clips' / name}: not made yet; run `qsim generate` again" for name in self.missing]
+        if "checksum" not in self.meta:
+            problems.append(
+                f"{self.path / 'dataset.json'}: holds no checksum; `qsim generate --repair` writes it again"
+            )
+        names = self.names()
+        for done, name in enumerate(names, 1):
+            problems += verify_job(self.path, name, self.meta["jobs"][name])
+            if progress is not None:
+                progress(done, len(names))
+        return problems + self.shared_between_splits()
+
+    def unsealed(self) -> list[Path]:
+        """Descriptions of clips and streams that hold no checksum of their own and that no record vouches for."""
+        found = []
+        for name in self.names():
+            try:
+                clip = Clip.open(self.path / "clips" / name)
+                record = _read_record(record_path(self.path, name))
+            except (ValueError, OSError):  # a problem that `verify` names
+                continue
+            vouched = {clip.path / "streams" / f"{stream}.json" for stream in record["streams"]}
+            found += [path for path in clip.unsealed() if path not in vouched | {clip.path / "clip.json"}]
+        return found
+
+    def shared_between_splits(self) -> list[str]:
+        """Scenes, meshes and textures of the test split that another split has too, in words; empty if it is honest.
+
+        By content: a mesh is its vertices, a texture its pixels or its file.
+        """
+        elsewhere: dict[str, str] = {}
+        for name in self.names("train") + self.names("val"):
+            elsewhere |= dict.fromkeys(_seen_in(self.path / "clips" / name), name)
+        return [
+            f"{self.path / 'clips' / name}: its {asset} is also in {elsewhere[asset]}, which is not a test clip"
+            for name in self.names("test")
+            for asset in _seen_in(self.path / "clips" / name)
+            if asset in elsewhere
+        ]
+
+
+def _seen_in(path: Path) -> list[str]:
+    """Scene, meshes and textures of a clip; nothing if it cannot be read."""
+    try:
+        meta = Clip.open(path).meta
+        return [f"scene {meta['scene']['family']}:{meta['scene']['seed']}", *meta.get("assets", [])]
+    except (ValueError, OSError, KeyError):
+        return []
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    record = files.read_json(path)
+    cure = "`qsim generate RECIPE -o FOLDER --repair` makes it again"
+    structure.structure(path, record, structure.RECORD, cure)
+    return record
+
+
+def verify_job(folder: Path, name: str, expected: dict[str, Any]) -> list[str]:
+    """Problems of one finished job's files in words; `expected` is its entry in the manifest.
+
+    Each file vouches for the next: manifest, record, clip.json and the streams' json, frames and codes.
+    """
+    path = record_path(folder, name)
+    problems = files.differs(path, expected["record"]) if "record" in expected else []
+    about = folder / "clips" / name / "clip.json"
+    if not about.is_file():
+        return [*problems, f"{about}: missing"]
+    try:
+        record = {} if problems else _read_record(path)
+        clip = Clip.open(about.parent)
+    except (ValueError, OSError) as error:
+        return [*problems, files.wording(error)]
+    if not problems and any(record.get(key) != expected[key] for key in ("digest", "split")):
+        problems = [f"{path}: is the record of another job"]
+    if problems:  # then nothing that it says can be used
+        return problems + clip.verify()
+    problems = clip.verify() + files.differs(about, record.get("clip"))
+    for stream, digest in record.get("streams", {}).items():
+        problems += files.differs(clip.path / "streams" / f"{stream}.json", digest)
+    return list(dict.fromkeys(problems))
+
+
+def unproven(folder: Path, job: Job) -> str | None:
+    """Why a job that a worker calls done is not done, or None.
+
+    The record must be that of this job and vouch for clip.json and the json of each stream as they are; every file that
+    they name must be there, and the codes must have the size that their json says. Contents are left to `verify_job`.
+    """
+    path, place = record_path(folder, job.name), folder / "clips" / job.name
+    try:
+        clip = Clip.open(place)
+        if files.read_json(path) != make_record(job, place) or clip.meta.get("job") != job.digest:
+            return f"{path}: is not the record of this job and its clip"
+        for name in clip.meta["checksums"]:
+            if not (place / name).is_file() or (place / name).stat().st_size == 0:
+                return f"{place / name}: missing or empty"
+        for sensing in job.streams:
+            _ = clip.stream(sensing.stream_name).packed
+    except (ValueError, OSError) as error:
+        return files.wording(error)
+    return None

@@ -1,0 +1,385 @@
+"""Jobs to data set: `generate` does what is missing of a recipe, atomically, resumably.
+
+After a kill, in shards, on a cluster, or with nothing left to do: the finished folder (dataset.py) has the same bytes
+in all these cases (logs/ apart), on machines of one kind.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from qsim import __version__, files
+from qsim.clip.stream import Progress
+from qsim.dataset.dataset import FORMAT_VERSION, Damaged, Dataset, unproven, verify_job
+from qsim.dataset.job_runner import (
+    FOLDERS,
+    Make,
+    Result,
+    failure_path,
+    make_record,
+    mark_failed,
+    record_path,
+    render_job,
+)
+from qsim.dataset.recipe import Job, Recipe
+from qsim.dataset.worker_pool import Limits, run_here, run_local
+
+Run = Callable[[list[Job], Path, Make], Generator[Result]]
+
+
+_ELSEWHERE = "a worker says that it is done, but it is not here; does every worker have this folder at this path?"
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to generate; nothing here changes a byte of the result."""
+
+    workers: int = 1  # processes; 0: in this one
+    shard: tuple[int, int] | None = None  # (i, n): the i-th of n parts, i = 1 ... n
+    retry: bool = False  # try failed jobs again
+    repair: bool = False  # check all files first and make damaged ones again
+    wait: bool = False  # wait for another generator on the folder instead of refusing
+    limits: Limits = field(default_factory=Limits)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a generation did."""
+
+    jobs: int  # of this shard
+    done: int  # finished now or before
+    made: int  # finished now
+    failed: dict[str, str]  # name -> why, now or before
+    repaired: tuple[str, ...]  # problems that led to jobs done again
+    shared: tuple[str, ...] = ()  # what training sees of the test split, in words
+
+
+def generate(
+    recipe: Recipe,
+    path: str | os.PathLike[str],
+    options: Options | None = None,
+    *,
+    make: Make = render_job,
+    run: Run | None = None,
+    on_result: Callable[[Result], None] | None = None,
+) -> Summary:
+    """Make what is missing of a recipe's data set in folder `path`.
+
+    `run` does the jobs (default: local processes; cluster.py has another), `make` renders one clip. `ValueError` if
+    the folder belongs to another recipe or another generator is at work, `OSError` if the disk is full.
+    """
+    options = options or Options()
+    folder = Path(path).resolve()
+    jobs = shard(recipe.jobs, options.shard)
+    try:
+        with _locked(folder, options):
+            repaired = _begin(recipe, folder, options.repair)
+            repaired += repair(folder, jobs) if options.repair else ()
+            failed = {} if options.retry else _failures(folder, jobs)
+            todo = [job for job in jobs if not record_path(folder, job.name).is_file() and job.name not in failed]
+            made: list[str] = []
+            with contextlib.closing((run or _runner(options))(todo, folder, make)) as results:
+                for result in results:
+                    if result.state == "full":
+                        raise OSError(errno.ENOSPC, result.message)
+                    if result.state == "gone":
+                        raise FileNotFoundError(result.message)
+                    if result.state == "done":
+                        made.append(result.name)
+                    else:
+                        failed[result.name] = result.message
+                    if on_result is not None:
+                        on_result(result)
+            failed |= _unproven(folder, todo, made)
+            write_manifest(recipe, folder)
+            done = sum(record_path(folder, job.name).is_file() for job in jobs)
+            shared = tuple(Dataset.open(folder).shared_between_splits())
+    except OSError as error:
+        if error.errno not in files.FULL:
+            raise
+        message = f"{folder}: {error.strerror}; nothing is lost: make space and run the same command again"
+        raise OSError(message) from None
+    made = [name for name in made if name not in failed]
+    return Summary(len(jobs), done, len(made), failed, repaired, shared)
+
+
+def _unproven(folder: Path, jobs: list[Job], made: list[str]) -> dict[str, str]:
+    """The jobs that a worker calls done and that are not, with the reason; their records go: no reader sees them."""
+    by_name, failed = {job.name: job for job in jobs}, {}
+    for name in made:
+        if name not in by_name:
+            failed[name] = "a worker says that it is done, but it was given to none"
+        elif not record_path(folder, name).is_file():
+            failed[name] = _ELSEWHERE
+        elif problem := unproven(folder, by_name[name]):
+            failed[name] = f"a worker says that it is done, but {problem}"
+            mark_failed(folder, by_name[name], failed[name])
+            record_path(folder, name).unlink()
+    return failed
+
+
+def shard(jobs: tuple[Job, ...], part: tuple[int, int] | None) -> list[Job]:
+    """Every n-th job from the i-th on, so that expensive families spread over the shards."""
+    if part is None:
+        return list(jobs)
+    i, n = part
+    if not 1 <= i <= n:
+        raise ValueError(f"shard {i}/{n}: expected i/n with 1 <= i <= n, as in --shard 7/100")
+    return list(jobs[i - 1 :: n])
+
+
+def repair(folder: Path, jobs: list[Job]) -> tuple[str, ...]:
+    """Check the finished jobs and take back those with damage, so that they are made again; returns the problems.
+
+    A damaged stream is drawn again, a damaged record written again, without rendering; anything else is rendered again.
+    What `qsim sense` added to a clip that goes, goes with it, and is named.
+    """
+    entries = Dataset.open(folder).meta["jobs"]
+    checked = [_damage(folder, job, entries[job.name]) for job in jobs if record_path(folder, job.name).is_file()]
+    taken = [damage for damage in checked if damage.problems]
+    for damage in taken:  # before anything is deleted
+        clip = folder / "clips" / damage.job.name
+        if clip.is_symlink() and not damage.light:
+            raise ValueError(
+                f"{damage.problems[0]}; {clip} is a symbolic link to {os.readlink(clip)}, and --repair replaces no "
+                "links: move the folder back, or delete the link to have the clip made here"
+            )
+    return tuple(line for damage in taken for line in _take_back(folder, damage))
+
+
+@dataclass(frozen=True)
+class _Damage:
+    """What is wrong with a finished job."""
+
+    job: Job
+    problems: list[str]
+    paths: set[Path]  # the damaged files
+    light: bool  # mended without rendering: only streams, or only the record
+
+
+def _damage(folder: Path, job: Job, entry: dict[str, Any]) -> _Damage:
+    expected = entry | {"digest": job.digest, "split": job.split}
+    problems = verify_job(folder, job.name, expected)
+    record, clip = record_path(folder, job.name), folder / "clips" / job.name
+    damaged = {Path(problem.split(": ")[0]) for problem in problems}
+    if record in damaged:
+        light = damaged == {record} and _vouched_for(job, clip, expected.get("record"))
+    else:
+        light = all(path.parent == clip / "streams" for path in damaged)
+    return _Damage(job, problems, damaged, light)
+
+
+def _take_back(folder: Path, damage: _Damage) -> list[str]:
+    """Delete the record and what is damaged; returns the problems and what else is gone."""
+    record, clip = record_path(folder, damage.job.name), folder / "clips" / damage.job.name
+    streams, wanted = clip / "streams", {sensing.stream_name for sensing in damage.job.streams}
+    record.unlink()
+    lost = damage.paths if damage.light else set(streams.glob("*.json"))
+    added = sorted({path.stem for path in lost if path.parent == streams} - wanted)
+    if damage.light:
+        for path in damage.paths - {record}:
+            path.with_suffix(".json").unlink(missing_ok=True)
+            path.with_suffix(".npy").unlink(missing_ok=True)
+    elif clip.exists():
+        files.remove_folder(clip)
+    gone = [f"{streams / name}.npy: was added by `qsim sense` and is gone; sense it again" for name in added]
+    return damage.problems + gone
+
+
+def _vouched_for(job: Job, clip: Path, digest: str | None) -> bool:
+    """Whether a clip would get the record that the manifest knows."""
+    try:
+        return files.sha256(files.to_json(make_record(job, clip))) == digest
+    except FileNotFoundError:
+        return False
+
+
+def frames_done(folder: Path, jobs: list[Job]) -> int:
+    """Frames rendered so far, whoever renders them: finished clips and the journals of those at work."""
+    total = 0
+    for job in jobs:
+        if (folder / "clips" / job.name).is_dir():
+            total += job.settings.frames
+        else:
+            with contextlib.suppress(OSError):
+                total += (folder / "work" / f"{job.name}.part" / "journal.jsonl").read_bytes().count(b"\n")
+    return total
+
+
+def write_manifest(recipe: Recipe, folder: Path) -> None:
+    """dataset.json from the recipe and the records that are there now."""
+    lock = files.Lock(folder / "locks" / "manifest")
+    lock.acquire(wait=True)
+    with lock:
+        files.sweep(folder / "dataset.json")
+        jobs, failures = {}, _failures(folder, recipe.jobs)
+        for job in recipe.jobs:
+            entry: dict[str, Any] = {"split": job.split, "scene": job.scene, "digest": job.digest, "state": "missing"}
+            if record_path(folder, job.name).is_file():
+                entry |= {"state": "done", "record": files.sha256(record_path(folder, job.name))}
+            elif job.name in failures:
+                entry |= {"state": "failed", "error": failures[job.name]}
+            jobs[job.name] = entry
+        manifest = {
+            "format_version": FORMAT_VERSION,
+            "name": recipe.name,
+            "recipe": recipe.source,
+            "splits": recipe.splits,
+            "jobs": jobs,
+            "complete": all(entry["state"] == "done" for entry in jobs.values()),
+            "software": {"qsim": __version__},
+        }
+        files.write_description(folder / "dataset.json", manifest)
+
+
+def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
+    """Folders and manifest; what had to be repaired of the manifest. `ValueError` if it is another recipe's."""
+    for name in FOLDERS:
+        (folder / name).mkdir(exist_ok=True)
+    if not (folder / "dataset.json").is_file():
+        _check_records(recipe, folder)
+        _check_reads(recipe, folder)
+        write_manifest(recipe, folder)
+        return ()
+    try:
+        old = Dataset.open(folder).meta["jobs"]
+    except Damaged as error:
+        if not repair:
+            raise
+        _check_records(recipe, folder)
+        write_manifest(recipe, folder)
+        return (str(error),)
+    _check_reads(recipe, folder)
+    for job in recipe.jobs:
+        if job.name not in old:
+            raise ValueError(f"{folder}: was made from another recipe, without the clip {job.name}; use another folder")
+        if old[job.name]["digest"] == job.digest_with():
+            raise ValueError(_of_earlier_version(folder))
+        if old[job.name]["digest"] != job.digest:
+            raise ValueError(f"{folder}: its clip {job.name} was asked for with other settings; use another folder")
+    extra = sorted(set(old) - {job.name for job in recipe.jobs})
+    if extra:
+        raise ValueError(f"{folder}: holds the clip {extra[0]}, which is not in this recipe; use another folder")
+    return ()
+
+
+def _of_earlier_version(folder: Path) -> str:
+    return (
+        f"{folder}: was begun by an earlier version, whose psnr meant dB below the 99.9th percentile; now it "
+        "is dB below white, and one data set holds one kind: finish it with that version, or use another folder"
+    )
+
+
+def _check_reads(recipe: Recipe, folder: Path) -> None:
+    """`ValueError` if a file that an own scene reads is not what it was when a clip was rendered.
+
+    Clips of earlier versions do not say what they read: for these the scene's own file decides, by the job's digest.
+    """
+    from qsim.dataset import scene_files
+
+    seen: set[tuple[str, str, str]] = set()
+    for job in recipe.jobs:
+        if not Path(job.family).is_absolute():
+            continue
+        for about in (folder / "clips" / job.name / "clip.json", folder / "work" / job.name / "clip.json"):
+            read = None
+            with contextlib.suppress(OSError, ValueError):  # none, or damaged: a check finds it
+                read = files.read_json(about).get("reads")
+            entries = read.items() if isinstance(read, dict) else ()
+            for name, digest in sorted(entries, key=lambda entry: "*" in entry[0]):  # single files first
+                key = (job.family, name, str(digest))
+                problem = None if key in seen else scene_files.change(*key)
+                seen.add(key)
+                if problem:
+                    raise ValueError(
+                        f"{folder}: {problem} since its clip {job.name} was made, whose scene reads it; put back what "
+                        "was there, or use another folder"
+                    )
+
+
+def _check_records(recipe: Recipe, folder: Path) -> None:
+    """Without a manifest the records say whose folder this is: `ValueError` if there are some and none is of ours."""
+    digests = {}
+    for path in (folder / "jobs").glob("*.json"):
+        with contextlib.suppress(ValueError):
+            digests[path.stem] = files.read_json(path).get("digest")
+    asked = [job for job in recipe.jobs if job.name in digests]
+    if any(digests[job.name] == job.digest_with() for job in asked):
+        raise ValueError(_of_earlier_version(folder))
+    if digests and not any(digests[job.name] == job.digest for job in asked):
+        raise ValueError(f"{folder}: none of its {len(digests)} finished clips is of this recipe; use another folder")
+
+
+@contextlib.contextmanager
+def _locked(folder: Path, options: Options) -> Iterator[None]:
+    """One generator per folder, or any number of different shards."""
+    if folder.exists() and not _is_data_set(folder):
+        raise ValueError(f"{folder}: is not empty and not a data set; use another folder")
+    (folder / "locks").mkdir(parents=True, exist_ok=True)
+    locks = [files.Lock(folder / "locks" / "generate", shared=options.shard is not None)]
+    if options.shard is not None:
+        locks.append(files.Lock(folder / "locks" / "shard-{}-of-{}".format(*options.shard)))
+    try:
+        for lock in locks:
+            if not lock.acquire(wait=options.wait):
+                raise ValueError(f"{folder}: another generator is at work here; let it finish, or add --wait")
+        yield
+    finally:
+        for lock in locks:
+            lock.release()
+
+
+def _is_data_set(folder: Path) -> bool:
+    """Whether a folder is a data set, what is left of one, or empty."""
+    if (folder / "locks").is_dir() or (folder / "dataset.json").is_file():
+        return True
+    return all(item.name in FOLDERS and item.is_dir() for item in folder.iterdir())
+
+
+def _failures(folder: Path, jobs: Sequence[Job]) -> dict[str, str]:
+    """Why jobs failed before; a note that cannot be read counts as one, and --retry makes the job again."""
+    found = {}
+    for job in jobs:
+        path = failure_path(folder, job.name)
+        if path.is_file():
+            try:
+                found[job.name] = str(files.read_json(path).get("error", f"{path}: does not say why"))
+            except ValueError as error:
+                found[job.name] = files.wording(error)
+    return found
+
+
+def _runner(options: Options) -> Run:
+    if options.workers == 0:
+        return run_here
+
+    def run(jobs: list[Job], folder: Path, make: Make) -> Generator[Result]:
+        return run_local(jobs, folder, make, options.workers, options.limits)
+
+    return run
+
+
+@contextlib.contextmanager
+def watching(folder: Path, jobs: list[Job], report: Progress, every: float = 0.5) -> Iterator[None]:
+    """Report (frames done, frames in all), whatever process or machine does them, while the block runs."""
+    total = sum(job.settings.frames for job in jobs)
+    stop = threading.Event()
+
+    def watch() -> None:
+        while not stop.wait(every):
+            report(frames_done(folder, jobs), total)
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()

@@ -1,0 +1,273 @@
+"""One job of a data set: render a clip, sense its streams, write its record.
+
+    work/NAME[.part]   the clip while it is rendered          (resumable, never read)
+    clips/NAME         the finished clip with its streams
+    jobs/NAME.json     the record: checksums of clip.json and of every stream's json; written last
+    failed/NAME.json   why the job failed; gone when it succeeds
+    logs/NAME.log      when, where, how long, how much memory; the only files that differ between two runs
+
+A job is done when its record is there. Everything before can be killed at any moment and done again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import os
+import platform
+import resource
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from qsim import files
+from qsim.clip import stream
+from qsim.clip.clip import Clip
+from qsim.dataset.recipe import Job
+
+if TYPE_CHECKING:
+    from qsim.rendering.fidelity import Budget
+    from qsim.scene.scene import Scene
+
+Make = Callable[[Job, Path], object]  # renders a job's clip to a path; tests hand in a quick one
+
+FOLDERS = ("clips", "jobs", "failed", "logs", "locks", "work")  # of a data set
+
+_ASSETS = {  # record of scene.py -> its array or file, and what it is
+    "Texture": ("image", "texture"),
+    "NormalMap": ("image", "texture"),
+    "EnvironmentImage": ("image", "texture"),
+    "Mesh": ("vertices", "mesh"),
+}
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of one job."""
+
+    name: str
+    # "done", "failed", "full" (no space left), "gone" (the data set's folder) or "died" (the worker process)
+    state: str
+    message: str = ""
+
+
+def provenance(job: Job, read: dict[str, str] | None = None) -> dict[str, Any]:
+    """What a job's clip.json says beside what the renderer knows: which job it is, its scene and split.
+
+    `read` are the files of the user's that the scene was made from (reads.py).
+    """
+    scene = {"family": Path(job.family).stem, "seed": job.scene_seed, "speed": job.speed}
+    return {"name": job.name, "job": job.digest, "split": job.split, "scene": scene} | ({"reads": read} if read else {})
+
+
+def render_job(job: Job, path: Path) -> object:
+    """Render a job's clip with the budget that its wanted error and its brightest stream ask for."""
+    from qsim.rendering import renderer
+
+    settings = job.settings
+    scene, read = load_traced(job)
+    return renderer.render_clip(
+        scene,
+        path,
+        frames=settings.frames,
+        frame_rate=settings.frame_rate,
+        shutter=settings.shutter,
+        seed=render_seed(job),
+        budget=choose_budget(job, scene),
+        extra=provenance(job, read) | {"assets": sorted(assets(scene.to_dict()) + photographs(scene))},
+        force=True,  # what an earlier version of the program began is nobody's
+    )
+
+
+def load_scene(job: Job) -> Scene:
+    """The job's scene at its size."""
+    return load_traced(job)[0]
+
+
+def load_traced(job: Job) -> tuple[Scene, dict[str, str]]:
+    """The job's scene at its size, and the SHA-256 of each file of the user's that it read."""
+    from qsim.dataset import scene_files
+
+    scene, read = scene_files.load(job.family, seed=job.scene_seed, speed=job.speed)
+    return scene.resized(job.settings.height, job.settings.width), read
+
+
+def render_seed(job: Job) -> int:
+    """Seed of the job's samples: no two clips share theirs."""
+    from qsim import keys
+
+    return (keys.hash_name(job.name) ^ job.seed) & 0x7FFFFFFF
+
+
+def choose_budget(job: Job, scene: Scene) -> Budget:
+    """What the scene needs for the wanted error, and for the noise of the stream that collects most electrons.
+
+    Streams whose light is given in lux or as it is do not count: their photons are known only after rendering.
+    """
+    from qsim.rendering import fidelity
+    from qsim.sensor import devices
+
+    settings = job.settings
+    electrons, ppp = 0.0, None
+    for sensing in job.streams:
+        if sensing.ppp is not None:
+            sensor = devices.load(sensing.sensor, ppp=sensing.ppp, bits=sensing.bits, exposure=1 / settings.frame_rate)
+            share = stream.electrons_per_photon(sensor)
+            if sensing.ppp * share > electrons:
+                electrons, ppp = sensing.ppp * share, sensing.ppp
+    return fidelity.choose(
+        scene,
+        frame_rate=settings.frame_rate,
+        shutter=settings.shutter,
+        frames=settings.frames,
+        psnr=settings.psnr,
+        ppp=ppp,
+        quantum_efficiency=1.0 if ppp is None else electrons / ppp,
+        seed=render_seed(job),
+    )
+
+
+def assets(described: Any) -> list[str]:
+    """The pictures and meshes in a scene's description, as `texture SHA-256`, `texture FILE` or `mesh SHA-256`."""
+    found: set[str] = set()
+    waiting = [described]
+    while waiting:
+        item = waiting.pop()
+        if isinstance(item, list):
+            waiting += item
+        elif isinstance(item, dict):
+            waiting += item.values()
+            key, kind = _ASSETS.get(str(item.get("kind")), ("", ""))
+            value = item.get(key)
+            if isinstance(value, dict):
+                found.add(f"{kind} {value['sha256']}")
+            elif isinstance(value, str):
+                found.add(f"{kind} {value}")
+    return sorted(found)
+
+
+def photographs(scene: Any) -> list[str]:
+    """`photograph NAME` for every photograph of textures.py in a scene: in whatever range, it is the same."""
+    from qsim.scene.scene import Texture
+    from qsim.scene.textures import photograph_in
+
+    found: set[str] = set()
+    waiting = [scene]
+    while waiting:
+        item = waiting.pop()
+        if isinstance(item, Texture):
+            found |= {f"photograph {name}" for name in [photograph_in(item.pixels())] if name is not None}
+        elif isinstance(item, list | tuple):
+            waiting += item
+        elif isinstance(item, dict):
+            waiting += item.values()
+        elif dataclasses.is_dataclass(item):
+            waiting += [getattr(item, part.name) for part in dataclasses.fields(item)]
+    return sorted(found)
+
+
+def record_path(folder: Path, name: str) -> Path:
+    """The record whose presence means that the job is done."""
+    return folder / "jobs" / f"{name}.json"
+
+
+def failure_path(folder: Path, name: str) -> Path:
+    """Why the job failed, if it did."""
+    return folder / "failed" / f"{name}.json"
+
+
+def removed(folder: Path) -> str:
+    """Which part of a data set's folder is no longer there, and what to do; empty if all are."""
+    gone = [place for place in (folder, *(folder / name for name in FOLDERS)) if not place.is_dir()]
+    return f"{gone[0]}: was removed while the data set was being made; run the same command again" if gone else ""
+
+
+def run_job(job: Job, folder: Path, make: Make = render_job) -> Result:
+    """Do whatever of a job is not done yet. Failures are written to failed/ and returned, not raised."""
+    lock = files.Lock(folder / "locks" / job.name)
+    try:
+        lock.acquire(wait=True)  # another process may still be dying over this job
+        if record_path(folder, job.name).is_file():
+            return Result(job.name, "done")
+        try:
+            return _do(job, folder, make)
+        except Exception as error:
+            if isinstance(error, OSError) and (error.errno in files.FULL or removed(folder)):
+                raise
+            _log(folder, job.name, traceback.format_exc())
+            message = files.wording(error)
+            if not isinstance(error, ValueError | OSError):
+                message = f"{type(error).__name__}: {message}"
+            mark_failed(folder, job, message)
+            return Result(job.name, "failed", message)
+    except OSError as error:
+        if error.errno in files.FULL:
+            return Result(job.name, "full", f"{error.strerror} while making {job.name}")
+        if lost := removed(folder):
+            return Result(job.name, "gone", lost)
+        raise
+    finally:
+        lock.release()
+
+
+def _do(job: Job, folder: Path, make: Make) -> Result:
+    """Clip, streams, record: each whole before the next begins."""
+    started, worked = time.monotonic(), time.process_time()
+    for path in (record_path(folder, job.name), failure_path(folder, job.name), folder / "clips" / job.name):
+        files.sweep(path)
+    clip = _clip(job, folder, make)
+    rendered = time.monotonic()
+    for sensing in job.streams:
+        _, line = stream.sense(clip, sensing)
+        _log(folder, job.name, line)
+    files.write_json(record_path(folder, job.name), make_record(job, clip.path))
+    failure_path(folder, job.name).unlink(missing_ok=True)
+    seconds = (rendered - started, time.monotonic() - rendered)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    spent = f"clip {seconds[0]:.2f} s, streams {seconds[1]:.2f} s, "
+    spent += f"processor {time.process_time() - worked:.2f} s, peak {peak >> 20} MiB"
+    _log(folder, job.name, f"done on {platform.node()}, process {os.getpid()}: {spent}")
+    return Result(job.name, "done")
+
+
+def make_record(job: Job, clip: Path) -> dict[str, Any]:
+    """What vouches for a clip and the job's streams; `FileNotFoundError` if one is missing."""
+    streams = {
+        sensing.stream_name: files.sha256(clip / "streams" / f"{sensing.stream_name}.json") for sensing in job.streams
+    }
+    record = {"name": job.name, "digest": job.digest, "split": job.split, "streams": streams}
+    return record | {"clip": files.sha256(clip / "clip.json")}
+
+
+def mark_failed(folder: Path, job: Job, message: str) -> None:
+    """Remember a failure; `generate` lists it until it is retried."""
+    files.write_json(failure_path(folder, job.name), {"name": job.name, "digest": job.digest, "error": message})
+
+
+def _clip(job: Job, folder: Path, make: Make) -> Clip:
+    """The job's finished clip, rendered if it is not there."""
+    path, work = folder / "clips" / job.name, folder / "work" / job.name
+    if path.is_symlink() and not path.is_dir():
+        raise ValueError(
+            f"{path}: is a symbolic link to {os.readlink(path)}, which is not there; mount or move it back, or delete "
+            "the link"
+        )
+    if not path.is_dir():
+        if not work.is_dir():
+            _log(folder, job.name, f"rendering on {platform.node()}, process {os.getpid()}")
+            make(job, work)
+        os.replace(work, path)
+        files.sync_folder(path.parent)
+    clip = Clip.open(path)
+    if clip.meta.get("job") != job.digest:
+        raise ValueError(f"{path}: was made by another recipe; use another folder")
+    return clip
+
+
+def _log(folder: Path, name: str, text: str) -> None:
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    with open(folder / "logs" / f"{name}.log", "a", encoding="utf-8") as log:
+        log.write(f"{now} {text}\n")

@@ -1,0 +1,376 @@
+"""Recipes: one TOML file -> the jobs of a data set. Strict: every mistake is named with file, line and key.
+
+    [recipe]
+    name = "starter"           # letters, digits, '.', '_', '-'
+    frames = 21                # per clip
+    height = 128               # pixels
+    width = 128
+    frame_rate = 2000.0        # frames per second of the scene's time; default 2000
+    shutter = 0.0              # open share of a frame, 0..1; 0: a sharp instant with the light of a whole frame
+    psnr = 40.0                # wanted error of the radiance, dB below white, clamped there (white.py)
+    seed = 0                   # of the samples and of the noise
+
+    [[scenes]]                 # one clip per family, seed and speed
+    family = "fan"             # a family of scenes/; or beside the recipe a .py or .xml file, or a folder ("./things")
+    seeds = [0, 1, 2]          # or: count = 3 (seeds first ... first + count - 1; first = 0)
+    speed = [1.0, 2.0]         # factor on all motions, a number or a list; default 1
+    split = "train"            # train, val or test
+    # frames, height, width, frame_rate, shutter, psnr: as above, for these scenes only
+
+    [[streams]]                # optional; one stream per bits and light level, in every clip
+    sensor = "quiver-physical" # a name of `qsim doctor --devices`, or a .toml file beside the recipe
+    bits = 3                   # or a list
+    ppp = [3.25, 26.0]         # photons per pixel and code over the whole clip; or lux = ...; or absolute = true
+    # seed = 1, name = "...", group = true (codes sum clip frames as binary planes), diffraction = true
+
+Splits are by scene: a (family, seed) belongs to one split, whatever its speed, and a family of the test split occurs in
+no other split.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from qsim import checks, files
+from qsim.clip.stream import Sensing, check_name
+from qsim.dataset.recipe_toml import Section, Text
+from qsim.files import to_json
+from qsim.formats.recording import MAX_PIXELS
+
+SPLITS = checks.SPLITS
+MAX_STEM = 180  # characters of a scene's name: with seed, speed and a temporary ending it must be a file's name
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a clip is rendered."""
+
+    frames: int
+    height: int  # pixels
+    width: int  # pixels
+    frame_rate: float  # Hz
+    shutter: float = 0.0  # open share of a frame
+    psnr: float = 40.0  # dB below white, wanted error of the radiance
+
+
+@dataclass(frozen=True)
+class Job:
+    """One clip with its streams: a pure description; the same job gives the same files."""
+
+    name: str
+    family: str
+    scene_seed: int
+    speed: float
+    split: str
+    settings: Settings
+    seed: int
+    streams: tuple[Sensing, ...]
+
+    @property
+    def stem(self) -> str:
+        """The family's name without folder and ending."""
+        return Path(self.family).stem
+
+    @property
+    def scene(self) -> str:
+        """What splits are made by: family and seed."""
+        return f"{self.stem}:{self.scene_seed}"
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of everything that decides the job's files."""
+        return self.digest_with(psnr_unit="below white")
+
+    def digest_with(self, **more: str) -> str:
+        """The same with what else decides; without any, that of versions whose psnr was below the 99.9th percentile."""
+        described = dataclasses.asdict(self) | {"family": Path(self.family).stem}
+        described["streams"] = [stream | {"sensor": Path(stream["sensor"]).name} for stream in described["streams"]]
+        for stream in described["streams"]:  # what is off stays out, so that data sets of earlier versions go on
+            for key, off in (("defects", None), ("slices", 1)):
+                if stream[key] == off:
+                    del stream[key]
+        own = [path for path in (self.family, *(stream.sensor for stream in self.streams)) if Path(path).is_absolute()]
+        if own:  # by content: what a file says decides, not what it is called
+            described["own"] = [_contents(path) for path in own]
+        return hashlib.sha256(to_json(described | more)).hexdigest()
+
+
+def _contents(path: str) -> str:
+    """SHA-256 of a scene or sensor file, or of all files in a folder with their names."""
+    root = Path(path)
+    parts = sorted(part for part in root.rglob("*") if part.is_file()) if root.is_dir() else [root]
+    # With the time of the last change of the inode, which nobody can set back.
+    states = [(str(part.relative_to(root)), part.stat()) for part in parts]
+    state = tuple((name, (of.st_mtime_ns, of.st_ctime_ns, of.st_ino, of.st_size)) for name, of in states)
+    return _read_contents(path, state)
+
+
+@functools.lru_cache(maxsize=64)
+def _read_contents(path: str, state: tuple[tuple[str, tuple[int, ...]], ...]) -> str:
+    """The same, read once as long as no file changes."""
+    listed = [(name, files.sha256(Path(path) / name)) for name, _ in state]
+    return files.sha256(to_json(listed))
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A data set to be made."""
+
+    name: str
+    jobs: tuple[Job, ...]
+    source: dict[str, Any]  # the TOML file's content, as written
+
+    @property
+    def splits(self) -> dict[str, list[str]]:
+        """Split -> names of its clips."""
+        return {split: [job.name for job in self.jobs if job.split == split] for split in SPLITS}
+
+
+def load(path: str | Path) -> Recipe:
+    """`FileNotFoundError`, or `ValueError` as `FILE:LINE: what is wrong, what to do`."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such recipe")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: not a text file; a recipe is TOML in UTF-8") from None
+    return parse(text, path)
+
+
+def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
+    """A recipe from the text of a TOML file; `path` names it in errors and is where relative files are looked for."""
+    written = Text(path, text)
+    whole = Section(written, None, 0, written.content())
+    whole.check_keys(("recipe", "scenes", "streams"))
+    if not isinstance(whole.table.get("recipe"), dict):
+        raise ValueError(f"{path}: the section [recipe] is missing")
+    head = Section(written, "recipe", 0, whole.table["recipe"])
+    head.check_keys(("name", "seed", *_SETTINGS), needed=("name", "frames", "height", "width"))
+    name = head.value("name", _name)
+    seed = head.value("seed", checks.seed, 0)
+    defaults = {"frame_rate": 2000.0} | _settings(head)
+    streams: list[Sensing] = []
+    taken: set[str] = set()
+    for section in whole.sections("streams"):
+        streams += _streams(section, seed, taken)
+    jobs: list[tuple[Job, Section]] = []
+    for section in whole.sections("scenes"):
+        jobs += [(job, section) for job in _jobs(section, defaults, seed, tuple(streams))]
+    if not jobs:
+        raise ValueError(f"{path}: no [[scenes]], nothing to render")
+    _check_jobs(jobs)
+    return Recipe(name, tuple(job for job, _ in jobs), whole.table)
+
+
+def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
+    """No clip twice, no scene in two splits, no family of the test split in another one, frames for every sum."""
+    seen: set[str] = set()
+    split_of: dict[str, str] = {}
+    tested = {job.stem for job, _ in jobs if job.split == "test"}
+    for job, section in jobs:
+        if job.name in seen:
+            raise ValueError(f"{section.where()}: the clip {job.name} is asked for twice; give one of them other seeds")
+        seen.add(job.name)
+        same = job.family.endswith(".xml")  # whatever the seed, which draws other samples of it
+        scene = job.stem if same else job.scene
+        if split_of.setdefault(scene, job.split) != job.split:
+            cure = "an .xml scene is one scene whatever the seed: leave one of them out"
+            raise ValueError(
+                f"{section.where()}: scene {scene} is in the splits '{split_of[scene]}' and '{job.split}'; "
+                + (cure if same else "splits are by scene, whatever the speed: give one of them other seeds")
+            )
+        if job.split != "test" and job.stem in tested:
+            raise ValueError(
+                f"{section.where()}: family {job.stem} is in the splits '{job.split}' and 'test'; the test split holds "
+                "families that training never sees: move its scenes"
+            )
+        for sensing in job.streams:
+            if sensing.group and job.settings.frames < 2 ** (sensing.bits or 1) - 1:
+                raise ValueError(
+                    f"{section.where()}: {job.settings.frames} frames are too few for {sensing.stream_name}, whose "
+                    f"codes sum {2 ** (sensing.bits or 1) - 1} of them"
+                )
+
+
+# ---- [[scenes]]
+
+
+def _jobs(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[Sensing, ...]) -> list[Job]:
+    """One job per seed and speed."""
+    keys = ("family", "seeds", "count", "first", "speed", "split", *_SETTINGS)
+    section.check_keys(keys, needed=("family",))
+    family = _family(section)
+    seeds = _seeds(section)
+    speeds = section.value("speed", checks.list_of(checks.speed), [1.0])
+    if family.endswith(".xml") and speeds != [1.0]:
+        raise ValueError(
+            f"{section.where('speed')}: an .xml scene stands still, its speed changes nothing; leave it out"
+        )
+    split = section.value("split", checks.split, "train")
+    settings = Settings(**(defaults | _settings(section)))
+    if settings.height * settings.width > MAX_PIXELS:
+        raise ValueError(
+            f"{section.where()}: frames of {settings.height} x {settings.width} pixels; at most "
+            f"{MAX_PIXELS} pixels are rendered"
+        )
+    stem = Path(family).stem
+    try:
+        check_name(f"{stem}_{seeds[0]:04d}")
+    except ValueError as error:
+        raise ValueError(f"{section.where('family')}: clips are named after the scene: {error}") from None
+    if len(stem) > MAX_STEM:
+        raise ValueError(
+            f"{section.where('family')}: clips are named after the scene, whose name has {len(stem)} characters; "
+            f"at most {MAX_STEM}"
+        )
+    return [
+        Job(
+            name=f"{stem}_{s:04d}" + ("" if speed == 1 else f"_x{speed:g}"),
+            family=family,
+            scene_seed=s,
+            speed=speed,
+            split=split,
+            settings=settings,
+            seed=seed,
+            streams=streams,
+        )
+        for s in seeds
+        for speed in speeds
+    ]
+
+
+def _settings(section: Section) -> dict[str, Any]:
+    """The fields of `Settings` that the section gives."""
+    return {key: section.value(key, check) for key, check in _SETTINGS.items() if key in section}
+
+
+def _family(section: Section) -> str:
+    """A family of the library, or the path of a scene file or folder that is there."""
+    family: str = section.value("family", checks.text)
+    file = (section.text.path.parent / family).resolve()
+    if "/" in family and file.is_dir():
+        return str(file)
+    if family.endswith((".py", ".xml")):
+        if not file.is_file():
+            raise ValueError(f"{section.where('family')}: no such scene file {file}")
+        return str(file)
+    from scenes import FAMILIES
+
+    if family not in FAMILIES:
+        known = ", ".join(sorted(FAMILIES))
+        raise ValueError(
+            f"{section.where('family')}: unknown family {family!r}{checks.suggest(family, FAMILIES)}; "
+            f"there are: {known}"
+        )
+    return family
+
+
+def _seeds(section: Section) -> list[int]:
+    if "seeds" in section:
+        for key in ("count", "first"):
+            if key in section:
+                raise ValueError(f"{section.where(key)}: give either seeds or count, not both")
+        return list(section.value("seeds", checks.list_of(checks.seed)))
+    first = section.value("first", checks.seed, 0)
+    count = section.value("count", checks.whole, 1)
+    if first + count > 2**31:
+        key = "count" if "count" in section else "first"
+        raise ValueError(f"{section.where(key)}: seeds {first} to {first + count - 1}; the largest is 2^31 - 1")
+    return list(range(first, first + count))
+
+
+# ---- [[streams]]
+
+
+def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
+    """One stream per bits and light level, under names that are not taken; they are added to `taken`."""
+    keys = ("sensor", "bits", "ppp", "lux", "absolute", "seed", "name", "group", "diffraction")
+    section.check_keys(keys, needed=("sensor",))
+    unit, levels = _light(section)
+    bits = section.value("bits", checks.list_of(checks.bits), [None])
+    group, diffraction = (section.value(key, checks.flag, False) for key in ("group", "diffraction"))
+    sensor = _sensor(section, bits, group)
+    own = section.value("seed", checks.seed, seed)
+    name = section.value("name", _name, None)
+    if name is not None and len(bits) * len(levels) > 1:
+        raise ValueError(f"{section.where('name')}: one name for {len(bits) * len(levels)} streams")
+    found = [
+        Sensing(
+            sensor,
+            bits=b,
+            ppp=level if unit == "ppp" else None,
+            lux=level if unit == "lux" else None,
+            seed=own,
+            name=name,
+            group=group,
+            diffraction=diffraction,
+        )
+        for b in bits
+        for level in levels
+    ]
+    for sensing in found:
+        try:
+            stream = sensing.stream_name
+        except ValueError as error:
+            raise ValueError(f"{section.where('sensor')}: streams are named after the sensor: {error}") from None
+        if stream in taken:
+            raise ValueError(f"{section.where()}: two [[streams]] are called '{stream}'; give one of them a name")
+        taken.add(stream)
+    return found
+
+
+def _light(section: Section) -> tuple[str, list[float | None]]:
+    """("ppp" | "lux" | "absolute", levels); absolute light has one level, as it is."""
+    given = [key for key in ("ppp", "lux", "absolute") if key in section]
+    if len(given) != 1:
+        raise ValueError(
+            f"{section.where()}: give one light level, ppp = ..., lux = ... or absolute = true; "
+            f"{' and '.join(given) or 'none'} given"
+        )
+    unit = given[0]
+    if unit != "absolute":
+        return unit, section.value(unit, checks.list_of(checks.light))
+    if not section.value("absolute", checks.flag):
+        raise ValueError(f"{section.where('absolute')}: absolute can only be true; or give a ppp")
+    return unit, [None]
+
+
+def _sensor(section: Section, bits: list[int | None], group: bool) -> str:
+    """The sensor's name or file, if it exists with all these bits, and its planes can be summed where asked."""
+    from qsim.sensor import devices
+    from qsim.sensor.spad import BinarySPAD
+
+    sensor: str = section.value("sensor", checks.text)
+    if sensor.endswith(".toml"):
+        sensor = str((section.text.path.parent / sensor).resolve())
+    for depth in bits:
+        try:
+            found = devices.load(sensor, ppp=3.25, bits=depth, exposure=5e-4)
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{section.where('sensor')}: {error}") from None
+        if group and not (depth and isinstance(found, BinarySPAD)):
+            what = f"this is a {type(found).__name__}" if depth else "the bits of a code are needed, as in bits = 3"
+            raise ValueError(f"{section.where('group')}: group sums planes of a clocked SPAD; {what}")
+    return sensor
+
+
+def _name(value: Any) -> str:
+    """A text that can name a file."""
+    return check_name(checks.text(value))
+
+
+_SETTINGS: dict[str, Callable[[Any], Any]] = {
+    "frames": checks.whole,
+    "height": checks.whole,
+    "width": checks.whole,
+    "frame_rate": checks.frame_rate,
+    "shutter": checks.shutter,
+    "psnr": checks.psnr,
+}

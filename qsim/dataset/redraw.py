@@ -1,0 +1,136 @@
+"""`qsim check --redraw`: stored streams drawn again by the reference engine, from their description and clip alone.
+
+A checksum says that codes are those that were written. Whether they are the right ones only another draw says.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+from qsim.clip.clip import Clip
+from qsim.clip.simulation import stored
+from qsim.clip.stream import Progress, Stream
+from qsim.dataset.dataset import Dataset
+from qsim.dataset.job_runner import record_path
+
+PROMISED = 5e-6  # share of codes in which the compiled engine may differ from the reference
+_BLOCK_PIXELS = 1 << 20
+
+
+@dataclass(frozen=True)
+class Redrawn:
+    """What a second draw of one stream found; `why` it could not be drawn, else None."""
+
+    path: Path  # streams/NAME.npy
+    codes: int
+    differ: int = 0
+    first: int | None = None  # frame with a difference
+    why: str | None = None
+    cure: str = ""
+
+    @property
+    def wrong(self) -> bool:
+        """More codes differ than the compiled engine may."""
+        return self.differ > PROMISED * self.codes
+
+    def line(self) -> str | None:
+        """What to say of this stream; None where every code is the reference's."""
+        if self.why is not None:
+            return f"{self.path}: not drawn again: {self.why}"
+        if not self.differ:
+            return None
+        found = f"{self.path}: {self.differ} of {self.codes} codes differ from the reference's"
+        if not self.wrong:
+            return f"{found}, as many as the compiled engine may"
+        return f"{found}, first in frame {self.first}; {self.cure}"
+
+
+def redraw(path: Path, progress: Progress | None = None) -> list[Redrawn]:
+    """Every stream of a data set or a clip, or one stream, drawn again; damaged ones are named by `check`.
+
+    `progress` hears (streams drawn, streams in all). `FileNotFoundError` or `ValueError` if there is nothing to draw.
+    """
+    found = _streams(path)
+    if not found:
+        raise ValueError(f"{path}: holds no stream to draw again")
+    results = []
+    for done, (clip, json_path, again) in enumerate(found, 1):
+        results.append(_redrawn(clip, json_path, again))
+        if progress is not None:
+            progress(done, len(found))
+    return results
+
+
+def _redrawn(place: Path, json_path: Path, dataset: Path | None) -> Redrawn:
+    """One stream of the clip at `place` drawn again; `dataset` is whose recipe made it, if one did."""
+    path = json_path.with_suffix(".npy")
+    try:
+        clip, stream = Clip.open(place), Stream.open(json_path)
+        frames, height, width = stream.shape
+        found = Redrawn(path, frames * height * width, cure=_cure(stream, dataset))
+        draw = dataclasses.replace(stored(stream), engine="reference")
+        step = max(1, _BLOCK_PIXELS // (height * width * draw.planes))
+        start = 0
+        for block in draw.blocks(clip, 0, frames, step):
+            wrong = block != stream.codes(start, start + len(block))
+            if wrong.any():
+                first = start + int(wrong.any(axis=(1, 2)).argmax()) if found.first is None else found.first
+                found = dataclasses.replace(found, differ=found.differ + int(wrong.sum()), first=first)
+            start += len(block)
+    except (ValueError, OSError) as error:
+        return Redrawn(path, 0, why=str(error).removeprefix(f"{path}: "))
+    return found
+
+
+def _cure(stream: Stream, dataset: Path | None) -> str:
+    """What to do about wrong codes, so that afterwards `check` is content."""
+    if dataset is None:
+        return "sense it again with --force"
+    if "drawn_by" in stream.meta:
+        return f"delete the file and run `qsim generate RECIPE -o {dataset} --repair`"
+    # `generate` continues no data set of the versions whose psnr was another
+    return f"the right one: `qsim sense {dataset} --name NEW` with its settings, or generate all in another folder"
+
+
+def _streams(path: Path) -> list[tuple[Path, Path, Path | None]]:
+    """Clip, description and, where its recipe made it, data set of every stream below a path."""
+    if (path / "dataset.json").is_file():
+        names = Dataset.open(path).names()
+        return [each for name in names for each in _of_clip(path / "clips" / name, record_path(path, name), path)]
+    if (path / "clip.json").is_file() or not path.with_suffix(".json").is_file():
+        if not (path / "clip.json").is_file():
+            Clip.open(path)  # says what is missing
+        return _of_clip(path)
+    return [each for each in _of_clip(path.parent.parent) if each[1] == path.with_suffix(".json")]
+
+
+def _of_clip(
+    path: Path, record: Path | None = None, dataset: Path | None = None
+) -> list[tuple[Path, Path, Path | None]]:
+    made = set() if record is None else _made_by_recipe(record)
+    return [
+        (path, json_path, dataset if json_path.stem in made else None)
+        for json_path in sorted((path / "streams").glob("*.json"))
+    ]
+
+
+def _made_by_recipe(record: Path) -> set[str]:
+    from qsim import files
+
+    try:
+        return set(files.read_json(record).get("streams", {}))
+    except (ValueError, OSError):  # `check` names it
+        return set()
+
+
+def lines(found: list[Redrawn]) -> list[str]:
+    """A line per stream of which there is something to say, and one that counts them."""
+    said = [line for one in found if (line := one.line()) is not None]
+    drawn = [one for one in found if one.why is None]
+    wrong = sum(one.wrong for one in drawn)
+    total = sum(one.codes for one in drawn)
+    right = "all hold the reference's codes" if drawn else "so nothing is known of them"
+    verdict = f"{wrong} hold wrong codes" if wrong else right
+    return [*said, f"drawn again: {len(drawn)} of {len(found)} streams, {total} codes; {verdict}"]

@@ -1,0 +1,151 @@
+"""Processes that do jobs: each has its own renderer, is replaced before it has grown, and ends when its parent does."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import multiprocessing
+import multiprocessing.connection
+import multiprocessing.resource_tracker
+import os
+import resource
+import signal
+import threading
+import time
+from collections.abc import Generator
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from qsim.dataset.job_runner import Make, Result, mark_failed, run_job
+from qsim.dataset.recipe import Job
+
+MAX_DEATHS = 2  # of worker processes, before a job counts as failed
+MEMORY_EXIT, ORPHAN_EXIT = 70, 71  # exit codes of worker processes
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a worker process may use."""
+
+    memory: float = 4.0  # GiB of resident memory, then the process gives up its job
+    jobs: int = 8  # per process: a fresh one replaces it, because renderers grow
+
+
+def run_here(jobs: list[Job], folder: Path, make: Make) -> Generator[Result]:
+    """The jobs one after the other in this process."""
+    for job in jobs:
+        yield run_job(job, folder, make)
+
+
+def run_local(jobs: list[Job], folder: Path, make: Make, workers: int, limits: Limits) -> Generator[Result]:
+    """The jobs in `workers` fresh processes, each with its own renderer; one that dies takes down only its job."""
+    queue = collections.deque(jobs)
+    deaths: collections.Counter[str] = collections.Counter()
+    crew: list[_Worker] = []
+    try:
+        while queue or any(worker.job for worker in crew):
+            while queue and len([w for w in crew if w.job]) < workers:
+                worker = next((w for w in crew if w.job is None), None)
+                if worker is None:
+                    worker = _Worker(folder, make, limits.memory)
+                    crew.append(worker)
+                worker.give(queue.popleft())
+            for connection in multiprocessing.connection.wait([w.pipe for w in crew if w.job]):
+                worker = next(w for w in crew if w.pipe is connection)
+                job, result = worker.take()
+                if result is None:  # the process died
+                    crew.remove(worker)
+                    deaths[job.name] += 1
+                    if deaths[job.name] < MAX_DEATHS:
+                        queue.append(job)
+                        continue
+                    result = Result(
+                        job.name, "died", f"its worker process died {MAX_DEATHS} times ({worker.last_words})"
+                    )
+                    mark_failed(folder, job, result.message)
+                elif worker.jobs >= limits.jobs:
+                    crew.remove(worker)
+                    worker.dismiss()
+                yield result
+    finally:
+        for worker in crew:
+            worker.dismiss(at_once=worker.job is not None)
+
+
+class _Worker:
+    """A process of its own that does one job after the other; it ends when the parent does."""
+
+    def __init__(self, folder: Path, make: Make, memory: float) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(target=_work, args=(theirs, folder, make, memory, os.getpid()), daemon=True)
+        # The child inherits the mask: Ctrl-C in a terminal reaches all of its processes, and is the parent's business.
+        # The first start of a child starts the tracker too, which unblocks SIGINT again: have it running before.
+        multiprocessing.resource_tracker.ensure_running()
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self.process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        theirs.close()
+        self.job: Job | None = None
+        self.jobs = 0
+
+    def give(self, job: Job) -> None:
+        self.job = job
+        self.jobs += 1
+        with contextlib.suppress(BrokenPipeError):  # it died idle: `take` will see it
+            self.pipe.send(job)
+
+    def take(self) -> tuple[Job, Result | None]:
+        """The job and its result; None if the process died over it."""
+        assert self.job is not None
+        job, self.job = self.job, None
+        try:
+            return job, self.pipe.recv()
+        except (EOFError, ConnectionResetError):
+            self.process.join()
+            return job, None
+
+    @property
+    def last_words(self) -> str:
+        """Why the process is gone, in words."""
+        code = self.process.exitcode
+        if code == MEMORY_EXIT:
+            return "it needed more memory than --memory allows"
+        if code is not None and code < 0:
+            return f"signal {signal.Signals(-code).name}; SIGKILL is often a lack of memory"
+        return f"exit code {code}"
+
+    def dismiss(self, at_once: bool = False) -> None:
+        if at_once:
+            self.process.terminate()
+        self.pipe.close()
+        self.process.join()
+
+
+def _work(pipe: Connection, folder: Path, make: Make, memory: float, parent: int) -> None:
+    """A worker process: jobs in, results out, until the pipe closes."""
+    threading.Thread(target=_watch, args=(parent, memory), daemon=True).start()
+    with contextlib.suppress(EOFError):
+        while True:
+            pipe.send(run_job(pipe.recv(), folder, make))
+
+
+def _watch(parent: int, memory: float) -> None:
+    """End this process when its parent is gone, or when it has grown beyond `memory` GiB."""
+    while os.getppid() == parent:
+        if resident_memory() > memory * 2**30:
+            os._exit(MEMORY_EXIT)
+        time.sleep(0.5)
+    os._exit(ORPHAN_EXIT)
+
+
+def resident_memory() -> int:
+    """Bytes of memory that this process holds now (its peak, where the system does not say)."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

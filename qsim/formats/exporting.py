@@ -1,0 +1,192 @@
+"""Ours for others: a clip's light or a stream's codes as photon cube, mp4, PNG, EXR or zarr, with a .json beside it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import __version__, files
+from qsim.clip.clip import Clip
+from qsim.clip.stream import Stream, orientation
+from qsim.formats import video
+
+
+@dataclass(frozen=True)
+class Export:
+    """How to write ours for others."""
+
+    kind: str  # cube, mp4, png, exr, zarr
+    transfer: str = "gamma 2.2"  # of pictures of light
+    white: float | None = None  # light that becomes full scale; None: the 99.9th percentile
+    lossless: bool = True  # of mp4
+    playback: float = 30.0  # frames per second of an mp4; the capture rate stands in its .json
+
+
+def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = False) -> Path:
+    """Write a clip's light or a stream's codes for other programs, with PATH.json (or PATH/meta.json) beside it.
+
+    `ValueError` if the kind cannot hold it: a photon cube holds one bit, an EXR holds light.
+    """
+    if wanted.kind not in EXPORTS:
+        raise ValueError(f"{path}: unknown kind {wanted.kind!r}; there are {', '.join(EXPORTS)}")
+    if (path.exists() or path.is_symlink()) and not force:
+        raise FileExistsError(f"{path}: exists; name another, or use --force to replace it")
+    meta = _export_meta(source, wanted)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    single = wanted.kind in ("cube", "mp4")
+    side, part = path.with_name(path.name + ".json"), path.with_name(path.name + ".part")
+    for place in [path, *([side] if single else [part])]:
+        _check_ours(place, side if single else place / "meta.json", single)
+    if single:
+        EXPORTS[wanted.kind](source, path, wanted, meta)
+        files.write_json(side, meta)
+        return path
+    if part.exists():  # of an export that was interrupted
+        files.remove_folder(part)
+    part.mkdir()
+    try:
+        files.write_json(part / "meta.json", _MARK)
+        EXPORTS[wanted.kind](source, part, wanted, meta)
+        files.write_json(part / "meta.json", meta)
+    except BaseException:
+        shutil.rmtree(part)
+        raise
+    if path.exists():
+        files.remove_folder(path)
+    part.rename(path)
+    files.sync_folder(path.parent)
+    return path
+
+
+def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = False) -> tuple[Path, str]:
+    """Export, and say in one line what was written: kind, frames, size, rates, white."""
+    made = export(source, path, wanted, force=force)
+    side = made / "meta.json" if made.is_dir() else made.with_name(made.name + ".json")
+    meta, (frames, height, width) = files.read_json(side), source.shape
+    shown = f", played at {wanted.playback:g}" if wanted.kind == "mp4" else ""
+    if isinstance(source, Stream):
+        about = f"codes of {source.bits} bits" + (", stretched to 0..255" if meta.get("stretched") else "")
+    elif "white" in meta:
+        about = f"light by {meta['transfer']}, white {meta['white']:.4g} {source.meta['radiance_unit']}"
+    else:
+        about = f"linear light in {source.meta['radiance_unit']}"
+    rate = float(source.meta["frame_rate"])
+    return made, f"{wanted.kind}, {frames} frames of {height} x {width} pixels at {rate:g} per second{shown}, {about}"
+
+
+_MARK = {"software": {"qsim": __version__}}  # of every description of an export: we made what it describes
+_NAMES = r"meta\.json|[0-9]{6,}\.(png|exr)|zarr\.json|frames/zarr\.json|frames/c/[0-9]+/[0-9]+/[0-9]+"
+
+
+def _check_ours(place: Path, description: Path, single: bool) -> None:
+    """`FileExistsError` if something is at `place` that no export made: it is replaced only beside its description."""
+    if not place.exists() and not place.is_symlink():
+        return
+    foreign = FileExistsError(
+        f"{place}: was not made by `qsim convert`, which replaces only what it made; move it away, or name another"
+    )
+    if place.is_symlink() or place.is_dir() == single or not description.is_file():
+        raise foreign
+    try:
+        software = files.read_json(description).get("software")
+    except ValueError:
+        raise foreign from None
+    if not isinstance(software, dict) or "qsim" not in software:
+        raise foreign
+    if not single:
+        files.check_ours(place, _NAMES)
+
+
+def _cube(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+    if isinstance(source, Clip) or source.bits != 1:
+        what = "a clip holds light" if isinstance(source, Clip) else f"this stream has {source.bits}"
+        raise ValueError(f"{source.path}: a photon cube holds one bit per pixel, {what}; sense it with --bits 1")
+    video.write_cube(path, _code_blocks(source), source.shape)
+
+
+def _mp4(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+    if isinstance(source, Stream) and source.bits > 8:
+        raise ValueError(
+            f"{source.path}: a video holds 8 bits per pixel, this stream has {source.bits}; use png or zarr"
+        )
+    video.write_video(path, _grey(source, wanted, meta), wanted.playback, lossless=wanted.lossless)
+
+
+def _png(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+    if isinstance(source, Clip):
+        video.write_png(path, _grey(source, wanted, meta))
+    else:
+        images = (image for block in _code_blocks(source) for image in block)
+        video.write_png(path, (image.astype(bool) if source.bits == 1 else image for image in images))
+
+
+def _exr(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+    if not isinstance(source, Clip):
+        raise ValueError(f"{source.path}: EXR holds light, this is a stream of codes; use png, zarr or mp4")
+    video.write_exr(path, (source.radiance(t) for t in range(len(source))))
+
+
+def _zarr(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+    frames, height, width = source.shape
+    rate = float(meta["frame_rate"])
+    # quanta-spad-sim calls the length of the whole recording T_exp.
+    attributes = {"fps": rate, "T_exp": frames / rate, "T": frames, "H": height, "W": width, "shape": [*source.shape]}
+    blocks = _light_blocks(source) if isinstance(source, Clip) else _code_blocks(source)
+    video.write_zarr(path, blocks, source.shape, attributes | {"qsim": meta})
+
+
+EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
+    "cube": _cube,
+    "mp4": _mp4,
+    "png": _png,
+    "exr": _exr,
+    "zarr": _zarr,
+}
+
+
+def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
+    meta = source.meta
+    keys = ("shape", "frame_rate", "exposure", "radiance_unit", "scene", "split", "bits", "code_model", "sensor",
+            "seed", "ppp_target", "ppp_factor", "width", "planes_per_code")  # fmt: skip
+    found = {key: meta[key] for key in keys if key in meta}
+    found |= {"format_version": 1, "bit_order": "msb", "software": {"qsim": __version__}}
+    found["orientation"] = orientation(meta)
+    if isinstance(source, Clip):
+        found["transfer"] = "linear" if wanted.kind in ("exr", "zarr") else wanted.transfer
+        if wanted.kind in ("mp4", "png"):
+            found["white"] = wanted.white if wanted.white is not None else _white(source)
+    elif wanted.kind == "mp4":
+        found["stretched"] = True
+    return found | ({"lossless": wanted.lossless} if wanted.kind == "mp4" else {})
+
+
+def _grey(source: Clip | Stream, wanted: Export, meta: dict[str, Any]) -> Iterator[Array]:
+    if isinstance(source, Clip):
+        for block in _light_blocks(source):
+            yield from video.grey(block, meta["white"], wanted.transfer)
+    else:
+        for block in _code_blocks(source):
+            yield from video.stretch(block, source.bits)
+
+
+def _white(clip: Clip) -> float:
+    step = max(1, len(clip) // 32)
+    samples = np.stack([clip.radiance(t)[::2, ::2] for t in range(0, len(clip), step)])
+    white = float(np.percentile(samples, 99.9))
+    return white if white > 0 else 1.0
+
+
+def _light_blocks(clip: Clip) -> Iterator[Array]:
+    for start in range(0, len(clip), video.BLOCK):
+        yield np.stack([clip.radiance(t) for t in range(start, min(start + video.BLOCK, len(clip)))])
+
+
+def _code_blocks(stream: Stream) -> Iterator[Array]:
+    for start in range(0, len(stream), video.BLOCK):
+        yield stream.codes(start, min(start + video.BLOCK, len(stream)))

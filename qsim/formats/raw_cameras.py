@@ -1,0 +1,125 @@
+"""Raw files of photon counting cameras: binary planes as streams of bits, in every layout of the field that we know.
+
+Each reader takes a path and the user's hints and returns a `Footage` of codes; bits come first or last in a byte,
+rows are in order or not, halves are upside down or not, as its docstring and its `meta` say: these files say nothing
+of it themselves. Files that say their shape: arrays.py.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.formats.recording import Footage, Hints, check_shape, check_size
+
+HALF, FULL = (256, 512), (512, 512)  # pixels of SwissSPAD2's half and full array
+RAW_FRAME = 512 * 512 // 8  # bytes of one full-array plane
+
+
+def read_swissspad2_half(path: Path, hints: Hints) -> Footage:
+    """SwissSPAD2 half array: raw planes of 256 x 512, one bit stream, least significant bit first; file or folder."""
+    files = raw_files(path)
+    counts = [check_size(file, file.stat().st_size, RAW_FRAME // 2, "SwissSPAD2 half-array") for file in files]
+
+    def decode(raw: Array) -> Array:
+        return np.unpackbits(raw, bitorder="little").reshape(-1, *HALF)
+
+    # Two independent readers (python-spad, quanta_SL) take bits and rows so; how the camera hung is not in a file.
+    meta = {"bit_order": "lsb", "orientation": "as stored"}
+    return _raw(files, counts, RAW_FRAME // 2, HALF, decode, "SwissSPAD2 half array", meta)
+
+
+def read_swissspad2_full(path: Path, hints: Hints) -> Footage:
+    """SwissSPAD2 full array: 512 x 512 in eight zones of 128 columns, bottom half upside down, LSB first."""
+    files = raw_files(path)
+    counts = [check_size(file, file.stat().st_size, RAW_FRAME, "SwissSPAD2 full-array") for file in files]
+
+    def decode(raw: Array) -> Array:
+        # Rows of 1024 bits: top quarter 0, bottom quarter 0, top quarter 1, ...; the bottom's first row is row 511.
+        zones = np.unpackbits(raw, bitorder="little").reshape(-1, 256, 4, 2, 128)
+        top = zones[:, :, :, 0].reshape(-1, *HALF)
+        bottom = zones[:, ::-1, :, 1].reshape(-1, *HALF)
+        return np.concatenate([top, bottom], axis=1)
+
+    # photoncube takes bits and halves so, each half from its outer row inwards; how the camera hung is not in a file.
+    meta = {"bit_order": "lsb", "orientation": "as stored, the bottom half turned: it is stored upside down"}
+    return _raw(files, counts, RAW_FRAME, FULL, decode, "SwissSPAD2 full array", meta)
+
+
+def read_spad512s(path: Path, hints: Hints) -> Footage:
+    """SPAD512S: raw planes of 512 x 512, row by row, most significant bit first; some files end with 4 more bytes.
+
+    Public readers disagree about left and right: the file is read as it lies, `orientation` says so, and `flip_lr` is
+    stored as unknown.
+    """
+    files = raw_files(path)
+    counts = [check_size(file, file.stat().st_size, RAW_FRAME, "SPAD512S", footer=(0, 4)) for file in files]
+
+    def decode(raw: Array) -> Array:
+        return np.unpackbits(raw).reshape(-1, *FULL)
+
+    # Both public readers take bits and rows so, one of them mirrored; nothing in a file tells which of them is right.
+    meta = {"bit_order": "msb", "orientation": "as stored, left and right are disputed", "flip_lr": "unknown"}
+    return _raw(files, counts, RAW_FRAME, FULL, decode, "SPAD512S", meta)
+
+
+def read_spike(path: Path, hints: Hints) -> Footage:
+    """Spike camera: one bit stream, least significant bit first, frames upside down; size by hints or config.yaml."""
+    height, width = hints.height, hints.width
+    config = path.parent / "config.yaml"
+    if height is None and width is None and config.is_file():
+        found = dict(re.findall(r"^\s*(spike_h|spike_w)\s*:\s*(\d{1,9})\b", config.read_text("utf-8", "replace"), re.M))
+        height, width = int(found.get("spike_h", 0)) or None, int(found.get("spike_w", 0)) or None
+    if height is None or width is None:
+        raise ValueError(f"{path}: a spike file does not hold its size; add --height and --width, as in 250 and 400")
+    check_shape(path, (1, height, width))
+    if height * width % 8:
+        raise ValueError(f"{path}: spike frames fill whole bytes, {height} x {width} pixels do not")
+    frame = height * width // 8
+    count = check_size(path, path.stat().st_size, frame, f"spike ({height} x {width})")
+
+    def decode(raw: Array) -> Array:
+        return np.unpackbits(raw, bitorder="little").reshape(-1, height, width)[:, ::-1]
+
+    # On published streams this bit order is the smoother one, and turned frames agree with their ground truth.
+    meta = {"bit_order": "lsb", "orientation": "stored upside down, turned upright"}
+    return _raw([path], [count], frame, (height, width), decode, "spike camera", meta)
+
+
+def roughness(planes: Array) -> float:
+    """Roughness of the mean plane over its shot noise, about 1 for smooth scenes read rightly; evidence, no proof."""
+    mean = planes.mean(axis=0, dtype=np.float64)
+    steps = np.mean(np.diff(mean, axis=1) ** 2) + np.mean(np.diff(mean, axis=0) ** 2)
+    floor = 4 * np.mean(mean * (1 - mean) / len(planes))
+    return float(steps / floor) if floor > 0 else float("inf")
+
+
+def raw_files(path: Path) -> list[Path]:
+    """One file, or the .bin files in a folder tree, in the order of their numbers."""
+    if path.is_file():
+        return [path]
+    found = list(path.rglob("*.bin"))
+    if not found:
+        raise FileNotFoundError(f"{path}: no such file, or a folder without .bin files")
+    return sorted(found, key=lambda file: [int(n) for n in re.findall(r"\d+", str(file.relative_to(path)))])
+
+
+def _raw(
+    files: list[Path], counts: list[int], frame_bytes: int, size: tuple[int, int], decode: Any, source: str, meta: Any
+) -> Footage:
+    ends = np.cumsum(counts)
+
+    def read(start: int, stop: int) -> Array:
+        parts = []
+        for file, count, end in zip(files, counts, ends, strict=True):
+            low, high = max(start - (end - count), 0), min(stop - (end - count), count)
+            if low < high:
+                raw = np.fromfile(file, np.uint8, (high - low) * frame_bytes, offset=low * frame_bytes)
+                parts.append(decode(raw))
+        return np.concatenate(parts)
+
+    return Footage((int(ends[-1]), *size), read, source, 1, meta=meta)

@@ -1,0 +1,21 @@
+"""From radiance to expected photons: camera, lens, exposure, light level, diffraction. Nothing is random."""
+
+from typing import TYPE_CHECKING
+
+from qsim.files import lazy_names
+
+if TYPE_CHECKING:
+    from qsim.optics.radiometry import WHITE_PER_MEAN, LightLevel, diffract, expected_photons, photons_per_lux
+
+__all__ = ["WHITE_PER_MEAN", "LightLevel", "diffract", "expected_photons", "photons_per_lux"]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "LightLevel": "radiometry",
+        "WHITE_PER_MEAN": "radiometry",
+        "diffract": "radiometry",
+        "expected_photons": "radiometry",
+        "photons_per_lux": "radiometry",
+    },
+)

@@ -1,0 +1,384 @@
+"""How much work a scene needs: bounces, instants per exposure and samples, from the error that is asked for.
+
+    choose(scene, ..., psnr=40, ppp=26) -> Budget;  explain(budget) -> what is modelled, left out, and how large it is
+
+A pilot (pilot.py) looks at every n-th pixel in its true size. Two limits are kept, the stricter one counts:
+
+    target:  white * 10^(-psnr / 20), rms of picture and truth clamped at white (white.py), blurred as it will be
+    sensor:  Monte-Carlo variance in electrons^2 at most 1 % of the shot variance: mean * sqrt(0.01 / (QE * PPP)), rms
+
+What is allowed is shared: bounces and blur may each take 30 % of it (rms), the samples get all that those leave.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.clip.clamped_error import Errors, Stated, decibels, white_in
+from qsim.optics.radiometry import WHITE_PER_MEAN
+from qsim.rendering.ground_truth import MOVING
+
+if TYPE_CHECKING:
+    from qsim.scene.scene import Camera, Scene
+
+SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
+SENSOR_SHARE = 0.01  # of the shot variance that Monte-Carlo noise may add
+DEPTHS = (2, 4, 6, 9, 12, 16, 24)  # bounces tried, against (each depth is a kernel to compile)
+DEEPEST = 32
+COUNTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
+MOST_SAMPLES = 16384
+PEAK_INSTANTS = 25  # whose mean tells how bright the exposure of a frame is
+MOST_INSTANTS = 3 + 6 * 85
+MOST_TRIED = 15  # instants up to which more are tried against them
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a clip models or leaves out, and how large the rest is."""
+
+    effect: str
+    chosen: str
+    size: str
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a frame costs, and why; the same record is stored in clip.json."""
+
+    samples: int = 32  # per pixel and frame, all instants and both halves together
+    bounces: int = 6  # scatterings along a path
+    sub_frames: int = 9  # instants per exposure when the shutter is open; their error is measured if 3, 6, 9 ...
+    sharp: bool = True  # also render the instant at mid-exposure when the shutter is open
+    denoise: bool = False  # Open Image Denoise; its error is measured against raw halves
+    left_out: float = 0.0  # W m^-2 sr^-1, rms of later bounces by the pilot; part of the error that a frame states
+    left_out_at_white: float = 0.0  # the same of pictures clamped at white
+    white: float = 0.0  # W m^-2 sr^-1, by the pilot; 0: not known, each frame takes its own
+    dimmed: float = 0.0  # share of the mean light that later bounces would add, by the pilot
+    dimmed_error: float = 0.0  # standard error of that share
+    findings: tuple[Finding, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        for name in ("samples", "bounces", "sub_frames"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"Budget.{name}: at least 1, got {getattr(self, name)!r}")
+
+    def grid(self, instants: int) -> int:
+        """Samples per pixel of each half at each of these instants."""
+        return grid_samples(math.ceil(self.samples / instants / 2))
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """The errors that a frame may have, rms in W m^-2 sr^-1."""
+
+    white: float
+    target: float  # of picture and truth clamped at white
+    sensor: float = math.inf  # without a clamp
+
+    def part(self, errors: Errors) -> float:
+        """How much of what is allowed these errors take, 1 being all."""
+        return max(errors.at_white / self.target, errors.plain / self.sensor)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The errors of pilots with COUNTS samples, and between and beyond them by powers of the samples."""
+
+    at_white: tuple[float, ...]
+    plain: tuple[float, ...]
+
+    @classmethod
+    def of(cls, pilots: list[Array], white: float) -> Noise:
+        """From halves [2, times, H, W], one per count."""
+        errors = [Errors.of_halves(halves, white) for halves in pilots]
+        return cls(_falling([e.at_white for e in errors]), _falling([e.plain for e in errors]))
+
+    def at(self, samples: float, instants: int = 1) -> Errors:
+        """Of the mean of so many instants with so many samples each."""
+        return Errors(*(_error(errors, samples) / math.sqrt(instants) for errors in (self.at_white, self.plain)))
+
+
+def choose(
+    scene: Scene,
+    *,
+    frame_rate: float = 2000.0,
+    shutter: float = 0.0,
+    frames: int = 21,
+    psnr: float = 40.0,
+    ppp: float | None = None,
+    quantum_efficiency: float = 1.0,
+    denoise: bool | None = None,
+    seed: int = 0,
+) -> Budget:
+    """The smallest budget that keeps the error below `psnr` [dB] and, at `ppp` photons, below the sensor's noise.
+
+    `ppp` is the highest light level that the clip will be sensed at (None: only `psnr` counts). `denoise` None means:
+    where it is installed and, at the same measured error, cheaper. Depends on nothing but its arguments and on what is
+    installed, so that an interrupted clip is continued with the same budget.
+    """
+    if not 10 <= psnr <= 80:
+        raise ValueError(f"psnr: 10 to 80 dB can be asked for, got {psnr!r}")
+    from qsim.rendering.pilot import Pilot, denoised_samples, rests  # which renders budgets
+
+    pilot = Pilot.of(scene, frame_rate, shutter, frames, seed)
+    full = pilot.mean(COUNTS[1], DEEPEST)
+    if not full.mean() > 0:
+        raise ValueError(
+            f"scene {scene.name}: the pilot saw no light in frames {list(pilot.times)}; is a lamp behind a wall?"
+        )
+    # Noise lifts the percentile of few samples: the white that counts is that of the pilot with the most. Blur lowers
+    # it where what is bright is small: with an open shutter it is that of the blurred pilot.
+    blurs = shutter > 0 and not rests(scene)
+    exposed = np.stack([pilot.blurred(t, PEAK_INSTANTS, DEEPEST).mean(axis=0) for t in pilot.times]) if blurs else full
+    rough, _ = allowed_in(exposed, psnr, ppp, quantum_efficiency)
+    bounces, cut, about_bounces = fewest_bounces(lambda depth: pilot.mean(COUNTS[1], depth), full, rough)
+    left_out, dimmed = Errors.between(cut, full, rough.white), dimming(full, cut)
+    halves = [pilot.halves(count, bounces) for count in COUNTS]
+    bright = halves[-1].mean(axis=0)
+    allowed, limit = allowed_in(exposed if blurs else bright, psnr, ppp, quantum_efficiency)
+    why = "nothing moves" if shutter else "the shutter is 0"
+    instants, blurred, about_blur = 1, 0.0, Finding("motion blur", "none, one instant", why)
+    if blurs:
+        low, high = (float(np.percentile(bright, share)) for share in (0.1, 99.9))
+        contrast = allowed.part(Errors(min(high, allowed.white) - low, high - low))
+        instants, blurred, about_blur = fewest_instants(
+            pilot.travel, contrast, lambda k: allowed.part(pilot.changes(k, bounces, allowed.white))
+        )
+    share = math.sqrt(1 - min(allowed.part(left_out), SHARE) ** 2 - min(blurred, SHARE) ** 2)
+    noise = Noise.of(halves, allowed.white)
+    samples, about_samples = fewest_samples(noise, instants, allowed, share)
+    fewer, about_denoiser = None, Finding("denoiser", "off", "not asked for")
+    if denoise is not False:
+        fewer, about_denoiser = denoised_samples(
+            pilot, instants, bounces, allowed, share, samples, denoise, lambda n: noise.at(n / instants, instants)
+        )
+    if fewer is not None:
+        samples = fewer
+        about_samples = Finding("samples", f"{samples} per pixel, denoised", f"without: {about_samples.chosen}")
+    lens = _left_out(scene.camera, pilot.truths())
+    pixels = scene.camera.height * scene.camera.width
+    noisy = noise.at(samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
+    about_light, about_motion = _light(dimmed, noisy, fewer is not None), moving(pilot.travel, shutter)
+    findings = (limit, about_samples, about_denoiser, about_bounces, about_light, about_motion, about_blur, *lens)
+    return Budget(
+        samples,
+        bounces,
+        instants,
+        instants > 1,
+        fewer is not None,
+        left_out.plain,
+        left_out.at_white,
+        allowed.white,
+        *dimmed,
+        findings,
+    )
+
+
+def explain(budget: Budget) -> str:
+    """What was modelled, what was left out, and how large it would have been; one line each."""
+    width = max((len(finding.effect) for finding in budget.findings), default=0)
+    return "\n".join(f"{f.effect:{width}}  {f.chosen}; {f.size}" for f in budget.findings)
+
+
+def shortfall(reached: Stated | None, asked: float) -> str:
+    """What to say of a clip whose measured PSNR misses the one asked for by more than chance, 0.5 dB; else nothing.
+
+    Clips of earlier versions state another PSNR, which cannot be held against the one asked for: nothing either.
+    """
+    if reached is None or reached.unclamped is None or reached.psnr >= asked - 0.5:
+        return ""
+    why = "the pilot foresaw less error or more light; a higher psnr takes more samples"
+    return f"{reached.line}, where {asked:g} were asked for: {why}"
+
+
+def grid_samples(samples: int) -> int:
+    """The next size of an even number of cells, nearly square: 4, 6, 8, 12, 16, 20, 24, 30, 36, 42, 48, 56, 64, ...
+
+    Multijitter does worse on squares of odd numbers: measured under sun and sky, error * samples^0.7 is 0.012 to 0.015
+    at 4, 16, ... 144, but 0.018 to 0.028 at 9, 25, ... 121. On all others it is alike: at 4, 6, 8, 12, 16, 20 and 24
+    samples it stays within 5 % of its mean (fan, tumble, gears, flag, crowd).
+    """
+    size = max(4, samples)
+    while not _is_grid(size):
+        size += 1
+    return size
+
+
+def _is_grid(size: int) -> bool:
+    """Whether multijitter, whose grid is isqrt(size) high, holds just that many, evenly and nearly square."""
+    high = math.isqrt(size)
+    return size % 2 == 0 and size % high == 0 and size // high - high <= 2
+
+
+def blur_error(travel: float, instants: int) -> float:
+    """Largest error of the mean of K instants at a moving edge, as a share of its contrast.
+
+    An edge that travels m px in the exposure steps by d = m / K. While d < 1 px, a pixel's coverage is piecewise linear
+    in time and the midpoint rule errs by at most d^2 / (8 m) per kink; coarser steps leave separate ghosts of 1 / K.
+    """
+    step = travel / instants
+    return step**2 / (8 * travel) if 0 < step <= 1 else 1 / instants if step > 1 else 0.0
+
+
+def allowed_in(image: Array, psnr: float, ppp: float | None, efficiency: float) -> tuple[Allowed, Finding]:
+    """The two limits for a clip that looks like this picture, or these."""
+    mean, white = float(image.mean()), white_in(image)
+    target = white * 10 ** (-psnr / 20)
+    rule = f"{WHITE_PER_MEAN:g} x the mean" if white == WHITE_PER_MEAN * mean else "the 99.9th percentile"
+    brighter = float((image > white).mean())
+    text = f"{psnr:g} dB below white, {white:.3g} ({rule}): rms {target:.3g} = {100 * target / white:.2g} % of white"
+    text += f"; {_percent(brighter)} of the pixels are brighter, picture and truth are clamped there, as in scores"
+    sensor = math.inf
+    if ppp is not None:
+        sensor = mean * math.sqrt(SENSOR_SHARE / (efficiency * ppp))
+        text += f"; the sensor at {ppp:g} photons per pixel allows {sensor:.3g} without a clamp"
+    allowed = Allowed(white, target, sensor)
+    return allowed, Finding("error", f"rms {min(target, sensor):.3g} W/m2/sr", text)
+
+
+def fewest_bounces(cut_at: Callable[[int], Array], full: Array, allowed: Allowed) -> tuple[int, Array, Finding]:
+    """The smallest depth whose radiance differs from that of DEEPEST by at most SHARE of what is allowed; and that.
+
+    `cut_at(depth)` and `full` are the pilot's radiance from the same paths, W m^-2 sr^-1.
+    """
+    for bounces in DEPTHS:
+        cut = cut_at(bounces)
+        left_out = Errors.between(cut, full, allowed.white)
+        if allowed.part(left_out) <= SHARE:
+            break
+    else:
+        # What lies beyond is not known; it is less than what the last step added, which takes its place.
+        size = f"the last {DEEPEST - bounces} added rms {left_out.plain:.2g}, more than allowed; "
+        return DEEPEST, cut, Finding("bounces", f"{DEEPEST}", size + "deeper ones were not tried")
+    size = f"later bounces up to {DEEPEST} would add rms {left_out.at_white:.2g}, {left_out.plain:.2g} without a clamp"
+    return bounces, cut, Finding("bounces", f"{bounces}", size)
+
+
+def dimming(full: Array, cut: Array) -> tuple[float, float]:
+    """The share of the mean light that is missing in `cut`, from the same paths as `full`, and its standard error."""
+    missing = full - cut
+    return float(missing.mean() / full.mean()), float(missing.std() / math.sqrt(missing.size) / full.mean())
+
+
+def _light(dimmed: tuple[float, float], noisy: float, denoises: bool) -> Finding:
+    """How far the mean light of a frame will be from that of a converged one; `noisy` is by chance, as a share."""
+    low, error = (100 * share for share in dimmed)
+    size = (
+        f"the bounces left out, known to +- {error:.2g} %; beside that the noise of a frame's mean, {100 * noisy:.2g} %"
+    )
+    kept = ", that of its raw samples, which denoising keeps" if denoises else ""
+    return Finding("mean light", f"{low:.2g} % too low" if low else "all of it", size + kept)
+
+
+def moving(travel: Array, shutter: float) -> Finding:
+    """Which share of the pixels moves, how far on average and at most; `travel` as in `Pilot`."""
+    speed = travel / (shutter or 1.0)
+    fast = speed[speed > MOVING]
+    size = f"more than {MOVING:g} px/frame"
+    if fast.size:
+        fastest = float(np.percentile(speed, 99.9, axis=(1, 2)).max())
+        size += f"; those by {fast.mean():.3g} on average, 99.9 % of all pixels by at most {fastest:.3g}"
+    return Finding("motion", f"{_percent(fast.size / speed.size)} of the pixels move", size)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"
+
+
+def fewest_instants(travel: Array, contrast: float, changes: Callable[[int], float]) -> tuple[int, float, Finding]:
+    """Instants (3, 9, 15 ...), the part of the error allowed that their blur takes, and the finding.
+
+    First from the travel of what is seen, px [frames, H, W], in the frame where most of it moves farthest; then, since
+    shadows, lamps and reflections move on surfaces at rest, more until `changes(K)`, what the means of K and of more
+    instants differ by, is at most SHARE. `changes` and `contrast`, that of the picture, are parts of the error allowed.
+    """
+    fastest = float(np.percentile(travel, 99.9, axis=(1, 2)).max())
+    runs = float((travel > 0.1).mean(axis=(1, 2)).max())
+    edge = SHARE / max(contrast * math.sqrt(runs), 1e-300)
+    count = 3
+    while blur_error(fastest, count) > edge and count < MOST_INSTANTS:
+        count += 6  # 3, 9, 15 ...: one instant lies at mid-exposure, and every third shows what more would change
+    by_motion, tried = count, {}
+    while count <= MOST_TRIED:
+        tried[count] = changes(count)
+        if tried[count] <= SHARE:
+            break
+        count += 6
+    found, power = tried.get(count, 0.0), 1.0
+    if tried and count not in tried:  # beyond the last trial the difference falls as it did before, or as ghosts do
+        few, most = min(tried), max(tried)
+        if few < most:
+            power = min(max(math.log(tried[few] / tried[most]) / math.log(most / few), 0.5), 2.0)
+        wanted = min(most * (tried[most] / SHARE) ** (1 / power), MOST_INSTANTS)
+        count = max(count, 3 + 6 * math.ceil((wanted - 3) / 6))
+        found = tried[most] * (most / count) ** power
+    blurred = max(blur_error(fastest, count) * math.sqrt(runs) * contrast, found)
+    size = f"motion up to {fastest:.2f} px in the exposure in 99.9 % of the pilot's pixels"
+    size += f"; an edge so fast errs by {100 * blur_error(fastest, count):.2g} %"
+    if count > by_motion:
+        size += f"; {by_motion} for what is seen moving, the rest for light and shadow that move on it"
+    if tried:
+        size += f"; more than {max(tried)} would change {_percent(tried[max(tried)])} of the error allowed"
+    if count >= MOST_INSTANTS:
+        size += f", the limit of {MOST_INSTANTS} instants is reached"
+    return count, blurred, Finding("motion blur", f"mean of {count} instants", size)
+
+
+def _falling(errors: list[float]) -> tuple[float, ...]:
+    """The rms errors of pilots with COUNTS samples, as they must be at least.
+
+    Paths that are rare and bright are missed by small pilots: fewer samples err at least as 1 / sqrt(n) makes it.
+    """
+    for i in (1, 0):
+        errors[i] = max(errors[i], errors[i + 1] * math.sqrt(COUNTS[i + 1] / COUNTS[i]))
+    return tuple(errors)
+
+
+def fewest_samples(noise: Noise, instants: int, allowed: Allowed, share: float) -> tuple[int, Finding]:
+    """Samples per pixel and frame whose noise takes at most this share of what is allowed."""
+    each = 2 * grid_samples(COUNTS[0] // 2)
+    if min(noise.plain) <= 0:
+        return each * instants, Finding("samples", f"{each * instants} per pixel", "the pilot found no noise")
+    while allowed.part(noise.at(each, instants)) > share and each * instants < MOST_SAMPLES:
+        each = 2 * grid_samples(each // 2 + 1)
+    expected = noise.at(each, instants)
+    size = f"expected rms {expected.at_white:.2g} = {decibels(allowed.white, expected.at_white) or math.inf:.1f} dB"
+    size += f", without a clamp {decibels(allowed.white, expected.plain):.1f} dB"
+    if allowed.part(expected) > share:
+        size += f", the limit of {MOST_SAMPLES} samples is reached"
+    return each * instants, Finding("samples", f"{each * instants} per pixel", size)
+
+
+def _error(errors: tuple[float, ...], samples: float) -> float:
+    """Error at a number of samples: a power law through the two nearest pilots, beyond them 0.5 to 0.75."""
+    if min(errors) <= 0:
+        return 0.0
+    i = 0 if samples <= COUNTS[1] else 1
+    power = math.log(errors[i] / errors[i + 1]) / math.log(COUNTS[i + 1] / COUNTS[i])
+    if samples > COUNTS[-1]:
+        power = min(max(power, 0.5), 0.75)
+    return float(errors[i + 1] * (samples / COUNTS[i + 1]) ** -power)
+
+
+def _left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, ...]:
+    """Effects that the renderer does not draw, with their size where the pilot knows it."""
+    from qsim.optics import radiometry
+
+    depths = np.concatenate([truth["depth"].ravel() for truth in truths])
+    depths = depths[np.isfinite(depths) & (depths > camera.focal_length)]
+    focus = camera.focus
+    # Circle of confusion of a thin lens: (f^2 / N) / (s - f) * |z - s| / z.
+    circle = camera.focal_length**2 / camera.f_number / abs(focus - camera.focal_length)
+    blur = float(np.max(circle * np.abs(depths - focus) / depths, initial=0.0)) / camera.pixel_pitch
+    how = "thin lens" if camera.aperture_blur else "left out, pinhole"
+    return (
+        Finding("depth of field", how, f"largest blur circle {blur:.2g} px at f/{camera.f_number:g}"),
+        Finding("diffraction", "left out here", radiometry.diffraction_line(camera)),
+        Finding("lens aberrations, polarisation, spectra", "not modelled", "size unknown"),
+    )

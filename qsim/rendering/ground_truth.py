@@ -1,0 +1,121 @@
+"""Ground truth from known motion: where the point behind each pixel centre was, is and will be.
+
+    hits at time t + poses -> flow to t' [px], validity, depth [m], body number
+
+A hit belongs to a body; the body's poses (or its deformed triangle) carry it to any other time, the camera's pose of
+that time projects it. Nothing is estimated from images. Points of the surroundings lie infinitely far away and move
+with the camera's turn only. Through glass and in mirrors the surface itself is followed, not what is seen in it.
+
+Points are rays [3, N] in the camera's axes together with how many lengths of its ray each lies away. A rigid motion
+(R, T) makes of the ray r of a point, d lengths away, the ray R r + T / d, along which it again lies d lengths away:
+nearby points and those at infinity (d = inf) obey one rule, and what does not move keeps its ray to the last bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.scene.scene import Body, Camera, Scene
+
+MOVING = 0.1  # px per frame; what moves farther counts as moving
+OCCLUSION_TOLERANCE = 1e-4  # relative distance by which a surface may lie before the point that it is itself
+
+
+def moving_mean(length: Array, frames: int = 1) -> float | None:
+    """Mean motion [px] of the pixels that move more than `MOVING` in so many clip frames; None if none does.
+
+    `length` is that of the flow in px per clip frame, of any shape, NaN where unknown. The answer is for `frames` clip
+    frames. Clip pages and studies use this definition.
+    """
+    travel = length[np.isfinite(length)] * frames
+    moving = travel[travel > MOVING]
+    return float(moving.mean()) if moving.size else None
+
+
+@dataclass(frozen=True)
+class Hits:
+    """First surfaces along rays, one entry per ray [N]."""
+
+    distance: Array  # float64, in lengths of the ray (z of the camera's axes where the ray's z is 1); inf: nothing hit
+    number: Array  # int32, body number; lamps follow the bodies; -1 where nothing is
+    triangle: Array  # int64, index into the mesh's faces
+    weights: Array  # float64 [N, 2], barycentric weights of the triangle's second and third vertex
+
+
+def pixel_rays(camera: Camera, crop: tuple[int, int, int, int], thinned: int = 1) -> Array:
+    """Rays [3, N] through the pixel centres of a window, row by row, in the camera's axes and with unit z."""
+    y, x, height, width = crop
+    rays = camera.directions()[y : y + height : thinned, x : x + width : thinned]
+    return np.ascontiguousarray(rays.reshape(-1, 3).T)
+
+
+def flow_between(scene: Scene, rays: Array, hits: Hits, t: float, later: float) -> tuple[Array, Array, Array]:
+    """Flow [2, N] in pixels from time t to `later`, whether it ends inside the frame [N], and the rays then [3, N].
+
+    `rays` [3, N] are those of the hits at time t; a ray then is in the camera's axes of then, and its point lies
+    `hits.distance` of it away. Where a point is behind the camera then, flow is 0 and not inside.
+    """
+    camera = scene.camera
+    start, end = seen_again(scene, rays, hits, t, later)
+    ahead = end[2] > 0
+    place = end[:2] / np.where(ahead, end[2], 1.0)
+    inside = ahead
+    for along, size in zip(place, (camera.width, camera.height), strict=True):
+        inside = inside & (np.abs(along) <= size / 2 / camera.focal_pixels)
+    flow = np.where(ahead, place - start[:2] / start[2], 0.0) * camera.focal_pixels
+    return flow, inside, end
+
+
+def seen_again(scene: Scene, rays: Array, hits: Hits, t: float, later: float) -> tuple[Array, Array]:
+    """The rays [3, N] of the hits at time t and those of the same points at time `later`.
+
+    The first answer differs from `rays` only for deforming bodies, whose points are rebuilt from their triangles so
+    that both times round alike.
+    """
+    before, after = scene.camera.pose(t), scene.camera.pose(later)
+    inverse = 1 / hits.distance
+    start, end = rays, _moved(rays, inverse, before, np.eye(4), after)
+    for number in np.flatnonzero(np.bincount(hits.number + 1)[1:]).tolist():
+        body = scene.bodies[number] if number < len(scene.bodies) else None
+        if body is not None and body.deforms:
+            chosen = np.flatnonzero(hits.number == number)
+            start = start.copy() if start is rays else start
+            for ends, moment, view in ((start, t, before), (end, later, after)):
+                points = _points(body, hits, chosen, moment) - view[:3, 3]
+                ends[:, chosen] = view[:3, :3].T @ points.T * inverse[chosen]
+            continue
+        here, there = _pose(scene, number, t), _pose(scene, number, later)
+        if not np.array_equal(here, there):
+            chosen = np.flatnonzero(hits.number == number)
+            motion = there @ np.linalg.inv(here)
+            end[:, chosen] = _moved(rays[:, chosen], inverse[chosen], before, motion, after)
+    return start, end
+
+
+def visible(distance: Array, hits: Hits) -> Array:
+    """Whether points at `distance` [N] are the first thing along the rays of `hits`; inf is the surroundings."""
+    return hits.distance >= distance * (1 - OCCLUSION_TOLERANCE)
+
+
+def _moved(rays: Array, inverse: Array, before: Array, motion: Array, after: Array) -> Array:
+    """Rays [3, N] of points at 1 / `inverse` [N], seen from `before`, once `motion` moved them, from `after`."""
+    if np.array_equal(motion @ before, after):
+        return rays.copy()
+    whole = np.linalg.inv(after) @ motion @ before
+    return whole[:3, :3] @ rays + whole[:3, 3:] * inverse
+
+
+def _pose(scene: Scene, number: int, t: float) -> Array:
+    motion = getattr((*scene.bodies, *scene.lights, *scene.parts)[number], "motion", None)
+    return np.eye(4) if motion is None else np.asarray(motion.pose(t), np.float64)
+
+
+def _points(body: Body, hits: Hits, chosen: Array, t: float) -> Array:
+    """World points [n, 3] of the chosen hits at time t [s], rebuilt from their triangles."""
+    corners = body.vertices(t)[body.mesh.faces[hits.triangle[chosen]]]
+    weights = hits.weights[chosen]
+    pose, first = body.pose(t), 1 - weights.sum(axis=1)
+    return np.einsum("nij,ni->nj", corners, np.column_stack([first, weights])) @ pose[:3, :3].T + pose[:3, 3]

@@ -1,0 +1,316 @@
+"""Our records in Mitsuba's words: one scene object, and the few parameters that move.
+
+    Scene -> mi.Scene (loaded once) + `place(t)`, which moves bodies, lamps and points to their poses at time t
+
+How a body moves decides how it is held: at rest, its mesh lies in world coordinates; rigid and large, it is an instance
+whose `to_world` changes (the acceleration structure of its mesh stays); small, deforming or glowing, its vertices are
+rewritten. Mitsuba traces the code of every instance into the kernel of every pass: 87 small bodies took 13 s a frame as
+instances, 0.7 s rewritten.
+`mi` is the Mitsuba module, handed in by render.py, which alone imports it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.backend import errors_only, opaque
+from qsim.rendering import mitsuba_xml
+from qsim.scene import scene as records
+from qsim.scene.environment import environment_map, sky_map, sun_direction, sun_radiance
+from qsim.scene.scene import Body, Scene
+
+LARGE = 20_000  # triangles from which a rigid body becomes an instance
+# How often smooth surroundings (constant, clear sky) are drawn as a bounce's emitter, against 1 for any other light.
+# Rays that a surface scatters find them anyway; drawing them takes samples from the sun or the lamp. Tried once, at
+# equal samples on fan, tumble and flag: 1.3 to 1.7 times less error than with 1 (tests/qsim/rendering/test_renderer.py asks 1.25).
+SMOOTH_WEIGHT = 1 / 1024
+SUN_DISTANCE = 1000.0  # in units of the scene's reach from the camera: parallax of the sun under 1 mrad
+
+
+class Stage:
+    """A loaded scene that can be moved to any time; the only mutable thing of the renderer."""
+
+    def __init__(self, mi: Any, scene: Scene, smooth_weight: float = SMOOTH_WEIGHT) -> None:
+        """`smooth_weight` is 1 in Mitsuba unless told otherwise."""
+        self.mi, self.scene = mi, scene
+        self.loaded = (
+            mi.load_dict(_scene_dict(mi, scene, smooth_weight))
+            if scene.file is None
+            else mitsuba_xml.load(mi, scene.file.path)
+        )
+        self._parameters = mi.traverse(self.loaded)
+        self._rest = {part.name: self._rest_of(part) for part in scene.parts if part.motion is not None}
+        self._placed: dict[str, bytes] = {}
+        self._normals: dict[str, Array] = {}  # of smooth bodies that moved, set after Mitsuba has made its own
+        self._rest_normals: dict[str, Array] = {}
+
+    def place(self, t: float) -> None:
+        """Move everything to time t [s]; what did not change since the last call is left alone."""
+        for i, body in enumerate(self.scene.bodies):
+            if body.motion is not None:
+                self._place_body(f"body{i}", body, t)
+        for i, light in enumerate(self.scene.lights):
+            motion = getattr(light, "motion", None)
+            if motion is not None:
+                self._place_light(f"light{i}", light, motion.pose(t))
+        for part in self.scene.parts:
+            if part.motion is not None:
+                self._place_part(part.name, part.pose(t), self._rest[part.name])
+        with errors_only(self.mi):  # the scalar engine warns of normals that it cannot make; ours replace them
+            self._parameters.update()
+        if self._normals:
+            for key, normals in self._normals.items():
+                self._parameters[key] = normals.ravel()
+            self._normals.clear()
+            self._parameters.update()
+
+    def shape_numbers(self) -> dict[str, int]:
+        """Shape id -> body number; lamps follow the bodies; the sun's disk is -1 (surroundings)."""
+        numbers = {f"body{i}": i for i in range(len(self.scene.bodies))}
+        numbers |= {f"light{i}": len(self.scene.bodies) + i for i in range(len(self.scene.lights))}
+        numbers |= {part.name: i for i, part in enumerate(self.scene.parts)}
+        return numbers | {"sun": -1}
+
+    def _place_body(self, name: str, body: Body, t: float) -> None:
+        pose = body.pose(t)
+        if _is_instance(body):
+            self._set(f"{name}.to_world", pose, lambda: self._transform(pose))
+        else:
+            world = _to_world(pose, body.vertices(t)).astype(np.float32)
+            moved = self._set(f"{name}.vertex_positions", world, lambda: world.ravel())
+            if moved and body.mesh.smooth:
+                self._normals[f"{name}.vertex_normals"] = self._normals_of(name, body, pose, world)
+
+    def _normals_of(self, name: str, body: Body, pose: Array, world: Array) -> Array:
+        """Unit normals of a smooth body's vertices, float32 [V, 3]; those of a rigid one are made once and turned."""
+        if body.deforms:
+            return vertex_normals(world, body.mesh.faces)
+        if name not in self._rest_normals:
+            self._rest_normals[name] = vertex_normals(body.mesh.vertices, body.mesh.faces)
+        return (self._rest_normals[name] @ pose[:3, :3].T).astype(np.float32)
+
+    def _place_light(self, name: str, light: records.Light, pose: Array) -> None:
+        if isinstance(light, records.AreaLamp):
+            placed = pose @ lamp_pose(light)
+            self._set(f"{name}.to_world", placed, lambda: self._transform(placed))
+        elif isinstance(light, records.PointLight):
+            position = _to_world(pose, np.array([light.position]))[0]
+            self._set(f"{name}.position", position, lambda: self._opaque(self.mi.Point3f(position.tolist())))
+
+    def _rest_of(self, part: records.Part) -> tuple[Array, ...]:
+        """Where a shape of a file stands: its 4x4 placement, or its vertices [V, 3] and normals [V, 3] or [0, 3]."""
+        if f"{part.name}.to_world" in self._parameters:
+            return (np.array(self._parameters[f"{part.name}.to_world"].matrix, np.float64).reshape(4, 4),)
+        arrays = (f"{part.name}.vertex_positions", f"{part.name}.vertex_normals")
+        return tuple(
+            np.array(self._parameters[key], np.float64).reshape(-1, 3) if key in self._parameters else np.zeros((0, 3))
+            for key in arrays
+        )
+
+    def _place_part(self, name: str, pose: Array, rest: tuple[Array, ...]) -> None:
+        if len(rest) == 1:
+            placed = pose @ rest[0]
+            self._set(f"{name}.to_world", placed, lambda: self._transform(placed))
+            return
+        world = _to_world(pose, rest[0]).astype(np.float32)
+        if self._set(f"{name}.vertex_positions", world, lambda: world.ravel()) and len(rest[1]):
+            self._normals[f"{name}.vertex_normals"] = (rest[1] @ pose[:3, :3].T).astype(np.float32)
+
+    def _set(self, key: str, value: Array, make: Any) -> bool:
+        stamp = value.tobytes()
+        if self._placed.get(key) == stamp:
+            return False
+        self._parameters[key] = make()
+        self._placed[key] = stamp
+        return True
+
+    def _transform(self, matrix: Array) -> Any:
+        kind = self.mi.ScalarTransform4f if self.mi.variant().startswith("scalar") else self.mi.Transform4f
+        return self._opaque(kind(matrix.tolist()))
+
+    def _opaque(self, value: Any) -> Any:
+        return value if self.mi.variant().startswith("scalar") else opaque(value)
+
+
+def lamp_pose(lamp: records.AreaLamp) -> Array:
+    """Matrix that takes the square -1..1 in x, y (facing +z) to the lamp at its place, float64 [4, 4]."""
+    forward = np.subtract(lamp.target, lamp.origin)
+    forward = forward / np.linalg.norm(forward)
+    helper = (0.0, 1.0, 0.0) if abs(forward[1]) < 0.99 else (1.0, 0.0, 0.0)
+    side = np.cross(helper, forward)
+    side /= np.linalg.norm(side)
+    pose = np.eye(4)
+    pose[:3, :4] = np.column_stack(
+        [side * lamp.width / 2, np.cross(forward, side) * lamp.height / 2, forward, lamp.origin]
+    )
+    return pose
+
+
+def _is_instance(body: Body) -> bool:
+    """Whether a body is held as an instance of a mesh in its own coordinates."""
+    rigid = body.motion is not None and not body.deforms
+    return rigid and len(body.mesh.faces) >= LARGE and not isinstance(body.material, records.Glow)
+
+
+def _scene_dict(mi: Any, scene: Scene, smooth_weight: float) -> dict[str, Any]:
+    parts: dict[str, Any] = {"type": "scene"}
+    for i, light in enumerate(scene.lights):
+        parts |= _light(mi, scene, light, f"light{i}", smooth_weight)
+    for i, body in enumerate(scene.bodies):
+        name = f"body{i}"
+        if _is_instance(body):
+            parts[f"group{i}"] = {"type": "shapegroup", "mesh": _mesh(mi, body, "mesh", body.mesh.vertices)}
+            first = mi.ScalarTransform4f(body.pose(0.0).tolist())
+            parts[name] = {"type": "instance", "to_world": first, "group": {"type": "ref", "id": f"group{i}"}}
+        else:
+            parts[name] = _mesh(mi, body, name, _to_world(body.pose(0.0), body.vertices(0.0)))
+    return parts
+
+
+def _mesh(mi: Any, body: Body, name: str, vertices: Array) -> Any:
+    properties = mi.Properties()
+    if isinstance(body.material, records.Glow):
+        properties["emitter"] = mi.load_dict({"type": "area", "radiance": _grey(mi, body.material.radiance)})
+        properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": _grey(mi, 0.0)})
+    else:
+        properties["bsdf"] = mi.load_dict(_bsdf(mi, body.material))
+    properties["face_normals"] = not body.mesh.smooth
+    uv = body.mesh.uv
+    mesh = mi.Mesh(
+        name,
+        len(vertices),
+        len(body.mesh.faces),
+        has_vertex_normals=body.mesh.smooth,
+        has_vertex_texcoords=uv is not None,
+        props=properties,
+    )
+    mesh.set_id(name)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = vertices.astype(np.float32).ravel()
+    parameters["faces"] = body.mesh.faces.astype(np.uint32).ravel()
+    if uv is not None:
+        parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
+    with errors_only(mi):  # as in `place`
+        parameters.update()
+    if body.mesh.smooth:
+        # Mitsuba sums normals over faces in parallel, in an order that changes from run to run.
+        parameters["vertex_normals"] = vertex_normals(vertices, body.mesh.faces).ravel()
+        parameters.update()
+    return mesh
+
+
+def vertex_normals(vertices: Array, faces: Array) -> Array:
+    """Unit normals, float32 [V, 3]: face normals weighted by the corner's angle, always summed in the same order."""
+    corners = np.asarray(vertices, np.float64)[faces]  # [F, 3, 3]
+    edges = np.roll(corners, -1, axis=1) - corners
+    face = np.cross(edges[:, 0], -edges[:, 2])
+    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-300)
+    unit = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
+    angles = np.arccos(np.clip(-np.einsum("fik,fik->fi", unit, np.roll(unit, 1, axis=1)), -1, 1))
+    summed = np.zeros((len(vertices), 3))
+    np.add.at(summed, faces, angles[..., None] * face[:, None])
+    length = np.linalg.norm(summed, axis=1, keepdims=True)
+    return np.where(length > 0, summed / np.maximum(length, 1e-300), (0.0, 0.0, 1.0)).astype(np.float32)
+
+
+def _light(mi: Any, scene: Scene, light: records.Light, name: str, smooth_weight: float) -> dict[str, Any]:
+    match light:
+        case records.Constant(radiance):
+            return {name: {"type": "constant", "radiance": _grey(mi, radiance), "sampling_weight": smooth_weight}}
+        case records.SunSky():
+            sky = {"type": "envmap", "bitmap": _rgb_bitmap(mi, sky_map(light)), "sampling_weight": smooth_weight}
+            return {name: sky} | ({"sun": _sun(mi, scene, light)} if light.sun_irradiance > 0 else {})
+        case records.EnvironmentImage(rotation=rotation):
+            turn = mi.ScalarTransform4f().rotate([0, 1, 0], math.degrees(rotation))
+            bitmap = _rgb_bitmap(mi, environment_map(light))
+            return {name: {"type": "envmap", "bitmap": bitmap, "to_world": turn}}
+        case records.AreaLamp(radiance=radiance):
+            place = mi.ScalarTransform4f(lamp_pose(light).tolist())
+            black = {"type": "diffuse", "reflectance": _grey(mi, 0.0)}
+            emitter = {"type": "area", "radiance": _grey(mi, radiance)}
+            return {name: {"type": "rectangle", "to_world": place, "bsdf": black, "emitter": emitter}}
+        case records.PointLight(position, intensity):
+            return {name: {"type": "point", "position": list(position), "intensity": _grey(mi, intensity)}}
+    raise ValueError(f"{light!r} is not one of the lights of qsim.scene")
+
+
+def _sun(mi: Any, scene: Scene, light: records.SunSky) -> dict[str, Any]:
+    """A far disk that shines on the scene; its angular radius and irradiance are those of the record."""
+    centre = np.asarray(scene.camera.origin)
+    points = [_to_world(body.pose(0.0), body.vertices(0.0)) for body in scene.bodies] or [centre[None]]
+    reach = max(1.0, *(float(np.max(np.linalg.norm(p - centre, axis=1))) for p in points))
+    distance = SUN_DISTANCE * reach
+    towards = sun_direction(light)
+    origin = (centre + distance * towards).tolist()
+    up = [0, 1, 0] if abs(towards[1]) < 0.99 else [1, 0, 0]
+    place = mi.ScalarTransform4f().look_at(origin=origin, target=centre.tolist(), up=up)
+    place = place @ mi.ScalarTransform4f().scale(distance * math.tan(light.sun_radius))
+    emitter = {"type": "area", "radiance": _grey(mi, sun_radiance(light))}
+    return {"type": "disk", "to_world": place, "emitter": emitter}
+
+
+def _bsdf(mi: Any, material: records.Material) -> dict[str, Any]:
+    match material:
+        case records.Diffuse(reflectance, relief):
+            inner = {"type": "diffuse", "reflectance": _reflectance(mi, reflectance)}
+        case records.RoughPlastic(reflectance, roughness, ior, relief):
+            inner = {"type": "roughplastic", "diffuse_reflectance": _reflectance(mi, reflectance), "alpha": roughness}
+            inner |= {"int_ior": ior, "distribution": "ggx", "nonlinear": True}
+        case records.Conductor(eta, k, roughness, relief):
+            inner = {"type": "conductor", "eta": _grey(mi, eta), "k": _grey(mi, k)}
+            if roughness > 0:
+                inner |= {"type": "roughconductor", "alpha": roughness, "distribution": "ggx"}
+        case records.Dielectric(ior, roughness, thin):
+            kind = "thindielectric" if thin else "roughdielectric" if roughness > 0 else "dielectric"
+            rough = {"alpha": roughness, "distribution": "ggx"} if kind == "roughdielectric" else {}
+            return {"type": kind, "int_ior": ior} | rough
+        case _:
+            raise ValueError(f"{material!r} is not one of the materials of qsim.scene")
+    match relief:
+        case records.Bump(texture, height):
+            inner = {"type": "bumpmap", "relief": _texture(mi, texture), "scale": height, "inner": inner}
+        case records.NormalMap(image, repeat):
+            picture = _bitmap(mi, np.asarray(image, np.float32), repeat)
+            inner = {"type": "normalmap", "normalmap": picture, "inner": inner}
+    return {"type": "twosided", "inner": inner}
+
+
+def _reflectance(mi: Any, value: float | records.Texture) -> Any:
+    if isinstance(value, records.Texture):
+        pixels = value.pixels()
+        if pixels.min() < 0 or pixels.max() > 1:
+            raise ValueError(f"Texture of a reflectance: 0..1 expected, found {pixels.min()}..{pixels.max()}")
+        return _texture(mi, value)
+    if not 0 <= value <= 1:
+        raise ValueError(f"reflectance: 0..1 expected, got {value!r}")
+    return _grey(mi, value)
+
+
+def _texture(mi: Any, texture: records.Texture) -> dict[str, Any]:
+    return _bitmap(mi, texture.pixels()[..., None], texture.repeat, "nearest" if texture.nearest else "bilinear")
+
+
+def _bitmap(mi: Any, pixels: Array, repeat: tuple[float, float], kind: str = "bilinear") -> dict[str, Any]:
+    """Mitsuba has row 0 at v = 0, our textures have it at v = 1."""
+    data = mi.TensorXf(np.ascontiguousarray(pixels[::-1], np.float32))
+    scale = mi.ScalarTransform4f().scale([repeat[0], repeat[1], 1])
+    return {"type": "bitmap", "data": data, "raw": True, "filter_type": kind, "to_uv": scale}
+
+
+def _rgb_bitmap(mi: Any, grey: Array) -> Any:
+    return mi.Bitmap(np.repeat(grey[..., None], 3, axis=2))
+
+
+def _grey(mi: Any, value: float) -> Any:
+    """A number that is the same for every colour, so that the RGB variant computes what the mono variant does."""
+    if mi.variant().startswith("scalar_rgb"):
+        return {"type": "rgb", "value": [value] * 3} if 0 <= value <= 1 else {"type": "spectrum", "value": float(value)}
+    return float(value)
+
+
+def _to_world(pose: Array, points: Array) -> Array:
+    return points @ pose[:3, :3].T + pose[:3, 3]

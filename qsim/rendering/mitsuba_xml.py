@@ -1,0 +1,96 @@
+"""A scene in Mitsuba's own XML: read by Mitsuba, looked at by our camera, moved by our motions.
+
+    scene.xml + {shape id: motion} -> Scene(file, parts)
+
+Mitsuba keeps shapes, materials and lights; we need the names of the shapes, which of them can move, and a camera.
+`mi` is the Mitsuba module, handed in by render.py, which alone imports it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qsim import files
+from qsim.backend import errors_only
+from qsim.checks import suggest
+from qsim.scene.scene import Camera, MitsubaFile, Motion, Part, Scene, Vector
+
+F_NUMBER, PITCH = 2.8, 1.1e-6  # of the camera that is made from the file's, which has no pixels in metres
+MOVABLE = ("to_world", "vertex_positions")
+
+
+def read(mi: Any, path: Path, motions: Mapping[str, Motion], camera: Camera | None = None) -> Scene:
+    """The scene of an XML file; errors as in `Scene.from_mitsuba`."""
+    loaded = load(mi, str(path))
+    if not loaded.emitters():
+        raise ValueError(f"{path}: no emitter, every pixel would be black; add one")
+    for shape in loaded.shapes():
+        if shape.interior_medium() is not None or shape.exterior_medium() is not None:
+            raise ValueError(f"{path}: shape {shape.id()!r} holds a participating medium, which is not rendered here")
+    names = [shape.id() for shape in loaded.shapes()]
+    parameters = mi.traverse(loaded)
+    for name in motions:
+        if name not in names:
+            meant = suggest(name, names) or f"; there are {', '.join(map(repr, names)) or 'none'}"
+            raise ValueError(f"{path}: no shape has the id {name!r}{meant}")
+        if not any(f"{name}.{key}" in parameters for key in MOVABLE):
+            raise ValueError(f"{path}: shape {name!r} has neither vertices nor a placement to move; use a mesh")
+    parts = tuple(Part(name, motions.get(name)) for name in names)
+    camera = camera or _camera(mi, loaded, path)
+    return Scene(path.stem, 0, camera, (), (), file=MitsubaFile(str(path), files.sha256(path)), parts=parts)
+
+
+def load(mi: Any, path: str) -> Any:
+    """Mitsuba's scene object, every shape with an id: those that the file left unnamed are numbered."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        with errors_only(mi):  # it warns that a colour film becomes grey, and we use no film
+            loaded = mi.load_file(path, optimize=False)  # optimising would merge shapes and lose their names
+    except RuntimeError as error:
+        raise ValueError(f"{path}: Mitsuba cannot load it: {' '.join(str(error).split())}") from None
+    if not isinstance(loaded, mi.Scene):
+        raise ValueError(f"{path}: its root is no <scene>")
+    for i, shape in enumerate(loaded.shapes()):
+        if not shape.id():
+            shape.set_id(f"shape {i}")
+    return loaded
+
+
+def _camera(mi: Any, loaded: Any, path: Path) -> Camera:
+    """The file's first sensor as a pinhole behind an f/2.8 lens."""
+    ask = "give a camera of your own: Scene.from_mitsuba(..., camera=Camera(...))"
+    if not loaded.sensors():
+        raise ValueError(f"{path}: no sensor; {ask}")
+    sensor = loaded.sensors()[0]
+    values = mi.traverse(sensor)
+    if sensor.class_name() != "PerspectiveCamera":
+        raise ValueError(f"{path}: its sensor is a {sensor.class_name()}, only 'perspective' is taken over; {ask}")
+    if any(abs(float(np.ravel(values[f"principal_point_offset_{axis}"])[0])) > 1e-9 for axis in "xy"):
+        raise ValueError(f"{path}: its sensor's principal point is off the middle; {ask}")
+    pose = np.array(values["to_world"].matrix, np.float64).reshape(4, 4)
+    _, up, forward = pose[:3, :3].T  # Mitsuba's camera axes: left, up, forward
+    if np.linalg.det(pose[:3, :3]) <= 0:
+        raise ValueError(f"{path}: its sensor's to_world mirrors the picture; {ask}")
+    width, height = (int(n) for n in sensor.film().size())
+    field = math.radians(float(np.ravel(values["x_fov"])[0]))
+    focal_length = PITCH * width / 2 / math.tan(field / 2)
+    return Camera(
+        focal_length=focal_length,
+        f_number=F_NUMBER,
+        pixel_pitch=PITCH,
+        height=height,
+        width=width,
+        origin=_vector(pose[:3, 3]),
+        target=_vector(pose[:3, 3] + forward),
+        up=_vector(up),
+    )
+
+
+def _vector(values: np.ndarray) -> Vector:
+    return float(values[0]), float(values[1]), float(values[2])

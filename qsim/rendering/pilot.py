@@ -1,0 +1,207 @@
+"""What a pilot of a scene measures, for budget.py to decide on: every n-th pixel, in its true size.
+
+Motion and bodies are looked at in every frame (of more than MOST_LOOKS, in so many), by rays alone. Light is rendered
+in a few frames: the first, the middle and the last; those that show what these do not; with an open shutter, those in
+which things move fastest. Noise is told from what is not by two independent halves. Equal frames draw equal paths,
+whatever the depth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.clip.clamped_error import Errors
+from qsim.rendering.denoiser import AROUND, DENOISE_COST, available, cleaned_mean
+from qsim.rendering.fidelity import COUNTS, Allowed, Budget, Finding, grid_samples
+from qsim.rendering.renderer import Renderer, instants
+from qsim.scene.motion import Still
+from qsim.scene.scene import Camera, Motion, Scene
+
+PIXELS = 3000
+MOST_MORE = 3  # frames beyond the first, the middle and the last for what these do not show, and for what moves
+WINDOW = 96  # px, side of the windows in which the denoiser is tried, one in the middle of each quarter of the frame
+MOST_LOOKS = 256  # frames of a clip in which motion and bodies are looked at
+STAGE = 18  # of the random keys
+LUCK = 3.0  # times less raw noise than the pilot's: chance
+CAREFUL = 2.0  # standard errors added to the error of a trial: a lucky one would hold for the whole clip
+MOST_DENOISED = 256  # samples per instant up to which the error of denoised pictures is foretold
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """A loaded scene seen in some of its pixels, what moves there, and the frames in which light is looked at."""
+
+    renderer: Renderer
+    travel: Array  # [frames looked at, H, W], px in the exposure, in a whole frame time if the shutter is 0
+    middle: int  # frame
+    times: tuple[int, ...]  # frames in which light is looked at
+
+    @classmethod
+    def of(cls, scene: Scene, frame_rate: float, shutter: float, frames: int, seed: int) -> Pilot:
+        """About PIXELS pixels of a scene."""
+        thinned = max(1, math.isqrt(scene.camera.height * scene.camera.width // PIXELS))
+        renderer = Renderer(scene, frame_rate=frame_rate, shutter=shutter, seed=seed, budget=Budget(), thinned=thinned)
+        looks = np.unique(np.linspace(0, frames - 1, min(frames, MOST_LOOKS)).round().astype(int)).tolist()
+        travel, bodies = (np.stack(each) for each in zip(*map(renderer.travel, looks), strict=True))
+        times = {0, frames // 2, frames - 1}
+        known = set(np.unique([renderer.travel(t)[1] for t in times]).tolist())
+        for _ in range(MOST_MORE):
+            hidden = ~np.isin(bodies, list(known))
+            if not hidden.any():
+                break
+            most = int(np.argmax(hidden.sum(axis=(1, 2))))
+            known |= set(np.unique(bodies[most]).tolist())
+            times.add(looks[most])
+        if shutter > 0:
+            times.add(looks[int(np.argmax(np.percentile(travel, 99.9, axis=(1, 2))))])
+            times |= _fastest(scene, {t: renderer.time(t) for t in {*looks, *times}}, times)
+        return cls(renderer, travel, frames // 2, tuple(sorted(times)))
+
+    def halves(self, samples: int, bounces: int) -> Array:
+        """Two independent estimates of the sharp radiance, float64 [2, times, H, W], W m^-2 sr^-1."""
+        return np.stack([self._drawn(t, self.renderer.time(t), Budget(samples, bounces)) for t in self.times], axis=1)
+
+    def mean(self, samples: int, bounces: int) -> Array:
+        """The mean of the two [times, H, W]."""
+        return self.halves(samples, bounces).mean(axis=0)
+
+    def truths(self) -> list[dict[str, Array]]:
+        """Flow, depth and the rest at each time."""
+        return [self.renderer.truth(t) for t in self.times]
+
+    def changes(self, count: int, bounces: int, white: float) -> Errors:
+        """The differences between the means of K and of 3 K or 5 K instants, the larger ones.
+
+        Two, because what returns after a third of a step looks like rest among 3 K. The K are among both, and all
+        instants draw the same paths, so that what rests adds nothing. The square is the product of the differences of
+        two independent halves, which noise changes by nothing on average.
+        """
+        squares = np.zeros((2, 2))
+        for t in self.times:
+            means = [self.blurred(t, count * times, bounces) for times in (1, 3, 5)]
+            for i, (few, *more) in enumerate((np.minimum(means, white), means)):
+                squares[i] += [float(np.mean(np.prod(few - many, axis=0))) / len(self.times) for many in more]
+        return Errors(*np.sqrt(np.maximum(squares.max(axis=1), 0)).tolist())
+
+    def blurred(self, t: int, count: int, bounces: int) -> Array:
+        """Two independent estimates of frame t's mean over so many instants, [2, H, W], with the same paths in each."""
+        budget = Budget(COUNTS[0], bounces)
+        return np.mean([self._drawn(t, instant, budget) for instant in self.exposed(t, count)], axis=0)
+
+    def exposed(self, t: int, count: int) -> list[float]:
+        """So many instants of the exposure of frame t [s]."""
+        return instants(self.renderer.time(t), self.renderer.shutter / self.renderer.frame_rate, count)
+
+    def _drawn(self, t: int, instant: float, budget: Budget) -> Array:
+        return self.renderer.halves([instant], budget, self.renderer.key(t, STAGE))
+
+
+def rests(scene: Scene) -> bool:
+    """Whether nothing in a scene moves, seen or not."""
+    return not _moving(scene)
+
+
+def _moving(scene: Scene) -> list[Motion]:
+    things = (scene.camera, *scene.bodies, *scene.lights, *scene.parts)
+    motions = (getattr(thing, "motion", None) for thing in things)
+    return [motion for motion in motions if motion is not None and not isinstance(motion, Still)]
+
+
+def _fastest(scene: Scene, moments: dict[int, float], known: set[int]) -> set[int]:
+    """Frames, at most MOST_MORE, in which things go that are slow in the known ones: below half of their fastest.
+
+    `moments` are the times [s] of the frames that come into question, the known ones among them.
+    """
+    frames = sorted(moments)
+    speeds = np.array([[sum(map(np.linalg.norm, m.velocity(moments[t]))) for t in frames] for m in _moving(scene)])
+    found: set[int] = set()
+    while len(speeds) and len(found) < MOST_MORE:
+        slow = speeds[:, [t in known | found for t in frames]].max(axis=1) < 0.5 * speeds.max(axis=1)
+        if not slow.any():
+            break
+        speeds = speeds[slow]
+        found.add(frames[int(np.argmax((speeds / speeds.max(axis=1, keepdims=True)).sum(axis=0)))])
+    return found
+
+
+def denoised_samples(
+    pilot: Pilot,
+    count: int,
+    bounces: int,
+    allowed: Allowed,
+    share: float,
+    raw: int,
+    wanted: bool | None,
+    expected: Callable[[int], Errors],
+) -> tuple[int | None, Finding]:
+    """Samples of a frame with which denoised windows have the error asked for, or None where `raw` ones cost less.
+
+    Windows of the clip's middle frame, every pixel of them, with `count` instants. `wanted` None means: where it costs
+    less. `expected(samples)` are the errors of raw ones: a trial far below has missed rare paths and is not believed.
+    The error asked for is this share of what is allowed.
+    """
+    renderer, t = pilot.renderer, pilot.middle
+    camera = renderer.scene.camera
+    if renderer.engine.backend == "scalar" or not available():
+        return None, Finding("denoiser", "off", "not installed" if not available() else "needs LLVM or CUDA")
+    if wanted is None and camera.height * camera.width < AROUND**2:
+        return None, Finding("denoiser", "off", f"its error is not known well in fewer than {AROUND**2} pixels")
+    cheap = Finding("denoiser", "off", f"{raw} raw samples cost no more")
+    tried = [n for n in (count * each for each in COUNTS) if wanted or n + DENOISE_COST < raw]
+    if not tried:
+        return None, cheap
+    windows = [renderer.window(crop) for crop in _windows(camera)]
+    times, key = pilot.exposed(t, count), renderer.key(t, STAGE)
+    surfaces = [window.surfaces(times, key) for window in windows]
+    errors: list[float] = []
+    for samples in tried:
+        squares = np.zeros(3)  # of the raw halves, and of what is made of them, at white and without a clamp
+        for window, (albedo, normal) in zip(windows, surfaces, strict=True):
+            halves = window.halves(times, Budget(samples, bounces), key)
+            mixed = cleaned_mean(halves, albedo, normal, allowed.white)
+            found = (Errors.of_halves(halves, allowed.white).plain, mixed.error_at(allowed.white, CAREFUL), mixed.error)
+            squares += np.square(found) / len(windows)
+        noisy, *cleaned = np.sqrt(squares).tolist()
+        missed = LUCK * noisy < expected(samples).plain
+        errors.append(allowed.part(expected(samples) if missed else Errors(*cleaned)))
+        if errors[-1] <= share:
+            break
+    where = f"{'' if len(windows) == 1 else 'four windows of '}frame {t}"
+    needed, size = _needed(tried, errors, share), f"tried in {where}"
+    most = MOST_DENOISED * count
+    if needed > most:
+        if not wanted:
+            return None, cheap
+        needed, size = most, f"{errors[-1]:.2g} times the error allowed with {samples} samples"
+    chosen = 2 * count * grid_samples(math.ceil(needed / count / 2))
+    if not wanted and chosen + DENOISE_COST >= raw:
+        return None, cheap
+    return chosen, Finding("denoiser", "on", size)
+
+
+def _windows(camera: Camera) -> list[tuple[int, int, int, int]]:
+    """Where the denoiser is tried, (y, x, height, width): all of a small frame, else four places that stand for it."""
+    height, width = camera.height, camera.width
+    if height * width <= 4 * WINDOW**2:
+        return [(0, 0, height, width)]
+    rows, columns = (max(1, min(side // 2, WINDOW)) for side in (height, width))
+    return [(height * i // 4 - rows // 2, width * j // 4 - columns // 2, rows, columns) for i in (1, 3) for j in (1, 3)]
+
+
+def _needed(tried: list[int], errors: list[float], target: float) -> float:
+    """Samples with which a falling error reaches the target: a power of them between the last two trials and beyond.
+
+    `errors` are those of the first so many counts; inf where they do not fall.
+    """
+    if errors[0] <= target:
+        return tried[0]
+    if len(errors) < 2 or errors[-1] >= errors[-2]:
+        return math.inf
+    before, last = tried[len(errors) - 2 : len(errors)]
+    share = math.log(errors[-2] / target) / math.log(errors[-2] / errors[-1])
+    return before * math.exp(min(share * math.log(last / before), 100.0))  # where samples hardly help, no overflow

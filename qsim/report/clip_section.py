@@ -1,0 +1,275 @@
+"""A clip on a report page: its moving pictures, its light, its motion, its codes, what was modelled and its error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qsim import colour
+from qsim.clip.clamped_error import stated
+from qsim.clip.clip import RELATIVE, Clip, Stream
+from qsim.clip.stream import electrons_per_photon
+from qsim.optics.radiometry import clip_photons
+from qsim.rendering.ground_truth import MOVING, moving_mean
+from qsim.report import html as page
+from qsim.sensor.defects import defect_table, fixed_pattern
+from qsim.studies.bit_depth.clip_study import CODE_BITS, CODE_PLANES, SLOWEST
+
+FRAMES = 48  # of a player
+WIDTH = 512  # columns of a panel; wider pictures are shown smaller by a whole factor
+_PIXELS = 4096  # of a frame, at most, for the expected histogram of codes
+
+
+def chosen_frames(count: int) -> range:
+    """At most FRAMES frames from the start, without gaps: gaps would show another motion."""
+    return range(min(count, FRAMES))
+
+
+def fit(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Every n-th row and column so that a panel stays within WIDTH."""
+    step = -(-frames.shape[2] // WIDTH)
+    return frames[:, ::step, ::step]
+
+
+def light_name(clip: Clip) -> str:
+    """What a clip's light is called: rendered light is the truth, an imported video has its camera's errors."""
+    return "recorded video" if clip.meta["radiance_unit"] == RELATIVE else "truth"
+
+
+def truth_stack(clip: Clip, frames: range) -> NDArray[np.float32]:
+    """Sharp radiance [T, H, W] of these frames."""
+    return np.stack([clip.sharp(t) for t in frames])
+
+
+def stream_panels(stream: Stream, frames: range) -> list[page.Panel]:
+    """Codes as they are, and the plain average of up to 11 frames around each."""
+    reach = colour.AVERAGE // 2
+    first, last = max(frames.start - reach, 0), min(frames.stop + reach, len(stream))
+    codes = stream.codes(first, last)
+    bits = int(stream.meta["bits"])
+    averages = np.stack(
+        [codes[max(t - reach - first, 0) : t + reach + 1 - first].mean(axis=0) / (2**bits - 1) for t in frames]
+    )
+    shown = codes[frames.start - first : frames.stop - first]
+    shown_average = colour.tone(averages, colour.peak(averages))
+    return [
+        page.Panel(f"codes, {bits} bit ({stream.name})", fit(colour.code_levels(shown, bits))),
+        page.Panel(f"plain average of {colour.AVERAGE} frames, white at its own peak", fit(shown_average)),
+    ]
+
+
+def flow_panel(clip: Clip, frames: range) -> tuple[page.Panel, float, NDArray[np.floating]]:
+    """Flow in colour, the motion [px/frame] of the full colour, and the length of the flow [T, H, W]."""
+    flow = np.stack([clip.flow(t) for t in frames])
+    speed = np.hypot(flow[:, 0], flow[:, 1])
+    known = speed[np.isfinite(speed)]
+    largest = max(float(np.percentile(known, 99.9)) if known.size else 0.0, 0.5)
+    panel = page.Panel(f"flow, full colour at {largest:.1f} px/frame", fit(colour.flow_colours(flow, largest)))
+    return panel, largest, speed
+
+
+def legend(largest: float) -> str:
+    """The colour wheel of the flow."""
+    words = f"direction and length of the flow: rim = {largest:.2g} px/frame, white = still, grey = unknown"
+    return page.picture(colour.flow_legend(72), words)
+
+
+def motion(clip: Clip, frames: Sequence[int]) -> tuple[float | None, float]:
+    """Mean motion of the pixels that move (None if none does) and the 99.9th percentile of all, in px/frame."""
+    speed = np.stack([np.hypot(*clip.flow(t)) for t in frames])
+    known = speed[np.isfinite(speed)]
+    return moving_mean(known), float(np.percentile(known, 99.9)) if known.size else 0.0
+
+
+def clip_section(clip: Clip) -> str:
+    """Truth, streams and flow of a clip, its light, its motion, what was modelled, and the error of its frames."""
+    frames = chosen_frames(len(clip))
+    truth = truth_stack(clip, frames)
+    white = colour.peak(truth)
+    panels = [page.Panel(light_name(clip), fit(colour.tone(truth, white)))]
+    figures: list[str] = []
+    lines = [light_line(clip)]
+    for name in clip.streams:
+        stream = clip.stream(name)
+        lines.append(stream_line(stream))
+        if len(stream) >= len(frames):
+            panels += stream_panels(stream, frames)
+        figures.append(code_histogram(clip, stream))
+    wheel = ""
+    if clip.has_truth:
+        panel, largest, speed = flow_panel(clip, frames)
+        panels.append(panel)
+        wheel = legend(largest)
+        lines.append(motion_line(clip, frames))
+        figures.insert(0, _motion_histogram(speed))
+    figures.insert(0, _light_histogram(truth, clip))
+    lines += error_lines(clip.meta)
+    if clip.meta.get("error_per_frame"):
+        figures.append(error_curve(clip.meta["error_per_frame"]))
+    left = 2 if len(panels) > 3 else len(panels) - 1  # the average of the first stream, else the last panel
+    parts = [page.player(panels, left=left), wheel, page.bullets(lines), modelled(clip.meta), page.grid(figures)]
+    return page.section(f"Clip {clip.name}", *parts)
+
+
+def light_line(clip: Clip) -> str:
+    """Size, rate and light of a clip in one sentence."""
+    frames, height, width = clip.shape
+    unit = "(relative)" if clip.camera is None else "W m⁻² sr⁻¹"
+    photons = "" if clip.camera is None else f", {clip.mean_photons:.4g} photons per pixel and exposure as it is"
+    return (
+        f"{frames} frames of {height} × {width} at {clip.frame_rate:g} fps, exposure {clip.exposure * 1e6:.4g} µs, "
+        f"mean radiance {clip.mean_radiance:.4g} {unit}{photons}"
+    )
+
+
+def stream_line(stream: Stream) -> str:
+    """Sensor and light level of a stream in one sentence."""
+    meta = stream.meta
+    ppp, lux = meta.get("ppp"), meta.get("equivalent_lux_555nm")
+    light = "" if ppp is None else f": {ppp:.4g} photons per pixel (the clip's light × {stream.photons_factor:.4g})"
+    light += "" if lux is None else f", as much as {lux:.4g} lx at 555 nm"
+    light += "" if ppp is None else f", {ppp * electrons_per_photon(stream.sensor):.3g} e⁻ per pixel"
+    return f"Stream {stream.name}{light}; {stream.bits} bit, {stream.sensor}{defects_words(stream)}"
+
+
+def defects_words(stream: Stream) -> str:
+    """`; defects: prnu 0.01, dark_map my_dark.npy`; empty without any."""
+    words = []
+    for name, value in stream.meta.get("defects", {}).items():
+        text = f"{value:g}" if isinstance(value, float) else str(value)
+        if isinstance(value, dict):
+            parts = (f"{key} {v:g}" for key, v in value.items() if isinstance(v, int | float))
+            text = Path(str(value["file"])).name if "file" in value else f"({', '.join(parts)})"
+        words.append(f"{name} {text}")
+    return f"; defects: {', '.join(words)}" if words else ""
+
+
+def motion_line(clip: Clip, frames: range) -> str:
+    """Motion in one sentence."""
+    mean, largest = motion(clip, frames)
+    moving = (
+        "nothing moves"
+        if mean is None
+        else f"what moves (more than {MOVING:g} px/frame) moves {mean:.3g} px/frame on average"
+    )
+    if mean is not None and clip.frame_rate >= SLOWEST:  # frames of a bit-depth study
+        speed = np.stack([np.hypot(*clip.flow(t)) for t in frames])
+        moving += f" ({moving_mean(speed, CODE_PLANES):.3g} px per {CODE_BITS}-bit frame of {CODE_PLANES} planes)"
+    return f"Motion: {moving}; 99.9 % of all pixels at most {largest:.3g} px/frame"
+
+
+def error_lines(meta: dict[str, Any]) -> list[str]:
+    """The stated error of the frames, as lines."""
+    lines = []
+    errors = meta.get("error_per_frame")
+    if errors:
+        rms = float(np.sqrt(np.mean(np.square(errors))))
+        lines.append(
+            f"Error of a frame (noise, blur, bounces left out): {rms:.3g} rms in the unit of the radiance, "
+            f"worst {max(errors):.3g}"
+        )
+    found = stated(meta)
+    if found is not None:
+        lines.append(f"PSNR of the radiance itself: {found.line}")
+    return lines
+
+
+def modelled(meta: dict[str, Any]) -> str:
+    """What a renderer says it modelled and left out, and how large that is, as a table; empty for other clips."""
+    findings = meta.get("render", {}).get("findings", [])
+    if not findings:
+        return ""
+    rows = [[found["effect"], found["chosen"], found["size"]] for found in findings]
+    return page.table(
+        page.Table("What was modelled, what was left out, and how large it is", ["effect", "chosen", "size"], rows)
+    )
+
+
+def code_histogram(clip: Clip, stream: Stream) -> str:
+    """How often each code was drawn in up to FRAMES frames, and what the exact distribution expects from the light."""
+    count = min(len(stream), FRAMES)
+    levels = 2**stream.bits
+    drawn = np.bincount(stream.codes(0, count).ravel(), minlength=levels) / (count * stream.shape[1] * stream.shape[2])
+    axes, save = page.axes("code", "share of pixels")
+    few = levels <= 64
+    axes.bar(np.arange(levels), drawn, width=0.8 if few else 1.0, color="tab:blue", label="drawn")
+    words = f"codes of {stream.name}: drawn"
+    missing = unexpected(clip, stream)
+    if missing is None:
+        try:
+            expected = expected_codes(clip, stream, count)
+        except (ValueError, OSError) as error:  # a measured map that has gone or changed
+            missing = str(error)
+        else:
+            axes.plot(np.arange(levels), expected, "k_", markersize=14, label="expected")
+            mixed = " and its map of defects" if "defects" in stream.meta else ""
+            words += f", and expected from the light by the sensor's exact distribution{mixed}"
+    if missing is not None:
+        words += f"; no expectation is shown: {missing}"
+    axes.legend()
+    return page.figure(save(), words)
+
+
+def unexpected(clip: Clip, stream: Stream) -> str | None:
+    """Why nothing can be expected of a stream's codes; None if it can."""
+    own = stream.meta.get("defects", {})
+    if 2**stream.bits > 64:
+        return "more than 64 codes"
+    if int(stream.meta.get("planes_per_code", 1)) > 1 or len(stream) != len(clip):
+        return "a code sums planes of several frames of the clip"
+    if stream.meta["ppp_factor"] is None:
+        return "its light is not known"
+    if own.get("crosstalk") or own.get("afterpulse"):
+        return "crosstalk and afterpulses make a code depend on its neighbours or on the frame before"
+    if stream.meta.get("drawn_by") == "events":
+        return "dead time inside and between exposures was followed photon by photon"
+    return None
+
+
+def expected_codes(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64]:
+    """Mean probability of each code over the light of some frames (every n-th pixel of a few of them).
+
+    Mixed over the stream's maps of defects; `ValueError` or `OSError` where a measured map has changed or gone.
+    """
+    chosen = np.unique(np.linspace(0, count - 1, min(count, 6)).astype(int))
+    height, width = clip.shape[1:]
+    step = max(1, int(np.sqrt(height * width / _PIXELS)))
+    blurred = bool(stream.meta.get("diffraction", False))
+    light = [clip_photons(clip, int(t), stream.photons_factor, diffraction=blurred)[::step, ::step] for t in chosen]
+    sensor, maps = stream.sensor, fixed_pattern.PERFECT
+    if "defects" in stream.meta:
+        found = defect_table.from_dict(stream.meta["defects"], f"{stream.name}: defects")
+        device = defect_table.of_sensor(found, sensor, height, width)
+        thinned = {name: None if m is None else m[::step, ::step] for name, m in vars(device.maps).items()}
+        sensor, maps = device.sensor, fixed_pattern.Maps(**thinned)
+    probabilities = fixed_pattern.pmf(sensor, np.stack(light), stream.exposure, maps)
+    mean: NDArray[np.float64] = probabilities.reshape(-1, probabilities.shape[-1]).mean(axis=0)
+    return mean
+
+
+def _motion_histogram(speed: NDArray[np.floating]) -> str:
+    axes, save = page.axes("motion [px/frame]", "share of pixels")
+    known = speed[np.isfinite(speed)]
+    axes.hist(known, bins=48, weights=np.full(known.size, 1 / max(known.size, 1)), color="tab:blue")
+    axes.set_yscale("log")
+    return page.figure(save(), "motion between neighbouring frames, all pixels")
+
+
+def _light_histogram(truth: NDArray[np.floating], clip: Clip) -> str:
+    unit = "relative" if clip.camera is None else "W m⁻² sr⁻¹"
+    axes, save = page.axes(f"radiance [{unit}]", "share of pixels")
+    axes.hist(truth.ravel(), bins=64, weights=np.full(truth.size, 1 / truth.size), color="tab:blue")
+    axes.set_yscale("log")
+    return page.figure(save(), f"light of the {light_name(clip)}, all pixels")
+
+
+def error_curve(errors: Sequence[float]) -> str:
+    """The measured error of every frame."""
+    axes, save = page.axes("frame", "rms error of the radiance")
+    axes.plot(errors, ".-")
+    axes.set_ylim(0, 1.15 * max(max(errors), 1e-30))
+    return page.figure(save(), "error of every frame: noise from independent halves, blur, bounces left out")

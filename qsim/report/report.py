@@ -1,0 +1,190 @@
+"""One self-contained HTML page for whatever lies under a path: clips, data sets, training runs, restored video, scores.
+
+    clip.json            -> truth, codes, plain average, flow as moving pictures; light, motion, error (report_clip.py)
+    dataset.json         -> a table of the clips, and one of each split as a clip
+    restored .json       -> restored video beside its codes and, where the clip is at hand, its truth and flow
+    runs, scores, studies, validations -> tables and curves (report_tables.py)
+
+Nothing is computed here that is not in the files. A player shows at most `report_clip.FRAMES` frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qsim import colour, files
+from qsim.clip.clamped_error import stated
+from qsim.clip.clip import Clip, Stream
+from qsim.clip.stream import Progress
+from qsim.dataset.checking import Restored
+from qsim.dataset.dataset import Dataset
+from qsim.optics.radiometry import clip_photons
+from qsim.rendering.ground_truth import MOVING
+from qsim.report import html as page
+from qsim.report import table_sections
+from qsim.report.clip_section import (
+    chosen_frames,
+    clip_section,
+    fit,
+    flow_panel,
+    legend,
+    light_name,
+    motion,
+    stream_panels,
+)
+
+INSIDE_CLIPS = {"streams", "truth", "radiance", "sharp", "jobs", "failed", "logs", "locks", "work"}
+
+
+def build(
+    path: Path, *, title: str | None = None, notes: list[str] | None = None, progress: Progress | None = None
+) -> str:
+    """The page for `path` as HTML text, with `notes` on top. `ValueError` if nothing under it is ours.
+
+    `progress` is told how many of the things there are were drawn; a clip of a data set is one of them.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    kinds = {file: _kind(file) for file in _known_files(path)}
+    found = [(kind, file) for kind in _DRAW for file in kinds if kinds[file] == kind]
+    total = sum(_steps(kind, file) for kind, file in found)
+    done = 0
+    drawn = []
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    for kind, file in found:
+        drawn.append(dataset_section(file, step) if kind == "dataset" else _DRAW[kind](file))
+        if kind != "dataset":
+            step()
+    if not drawn:
+        raise ValueError(f"{path}: nothing to report; expected a clip, a data set, a restored video or an evaluation")
+    words = [page.section("About this page", page.bullets(notes))] if notes else []
+    return page.page(
+        title or f"qsim report: {path.name}",
+        f"{len(drawn)} section{'s' if len(drawn) > 1 else ''} from {path}",
+        [*words, *drawn],
+    )
+
+
+def _known_files(path: Path) -> list[Path]:
+    """JSON files at or below `path` that may be ours: not the insides of clips, not the clips of a data set."""
+    if path.is_file():
+        return [path]
+    candidates = [p for p in sorted(path.rglob("*.json")) if not INSIDE_CLIPS & set(p.relative_to(path).parts[:-1])]
+    sets = [p.parent / "clips" for p in candidates if p.name == "dataset.json"]
+    return [p for p in candidates if not any(folder in p.parents for folder in sets)]
+
+
+def _kind(path: Path) -> str | None:
+    """What a JSON file describes: its name tells for folders, its contents for single files; None if it is not ours."""
+    names = {"clip.json": "clip", "dataset.json": "dataset", "history.json": "training"}
+    if path.name in names:
+        return names[path.name]
+    try:
+        found = files.read_json(path)
+    except ValueError:
+        return None
+    for kind in ("evaluation", "static", "restored"):
+        if str(found.get("format", "")).startswith(f"quiver-{kind}-"):
+            return kind
+    return next((kind for kind, keys in _KEYS if keys <= found.keys()), None)
+
+
+# Kinds of files without a format of their own -> keys that they have
+_KEYS = (
+    ("bench", {"setting", "costs"}),
+    ("validation", {"rows", "ok"}),
+    ("reading", {"clip_processor", "mp4_processor"}),
+    ("study", {"rows", "structure_function"}),
+    ("study", {"cells", "studies"}),
+    ("study", {"figure", "rows"}),
+)
+
+
+def _steps(kind: str, file: Path) -> int:
+    """Things to draw for one file: the clips of a data set, otherwise one."""
+    return len(Dataset.open(file.parent).names()) if kind == "dataset" else 1
+
+
+def dataset_section(path: Path, step: Callable[[], None] = lambda: None) -> str:
+    """A table of the clips of a data set, `step` after each, and the first clip of each split in pictures."""
+    data = Dataset.open(path.parent)
+    rows, below = [], set()
+    for name in data.names():
+        clip = Clip.open(data.path / "clips" / name)
+        split = data.meta["jobs"][name]["split"]
+        frames, height, width = clip.shape
+        mean, largest = motion(clip, [len(clip) // 2]) if clip.has_truth else (None, None)
+        size, found = f"{frames} × {height} × {width}", stated(clip.meta)
+        rows.append([name, split, size, clip.mean_radiance, clip.meta.get("mean_photons"), mean, largest,
+                     None if found is None else found.psnr])  # fmt: skip
+        below |= set() if found is None else {found.below.split(" (")[0]}
+        step()
+    unit = " or ".join(sorted(below)) or "white"
+    headers = [
+        "clip", "split", "frames × rows × columns", "mean radiance", "photons per pixel",
+        "motion of what moves [px/frame]", "largest", f"radiance's PSNR [dB below {unit}]",
+    ]  # fmt: skip
+    missing = f"; not made yet: {', '.join(data.missing)}" if data.missing else ""
+    caption = f"{len(rows)} clips{missing}; motion in the middle frame, of pixels that move more than {MOVING:g} px"
+    overview = page.section(f"Data set {data.name}", page.table(page.Table(caption, headers, rows)))
+    shown = [clip for split in ("test", "train", "val") for clip in data.clips(split)[:1]]
+    return overview + "".join(clip_section(clip) for clip in shown)
+
+
+def restored_section(path: Path) -> str:
+    """Restored video beside its codes and truth, all at one white."""
+    video = Restored.open(path)
+    meta, restored = video.meta, video.frames()
+    frames = chosen_frames(len(restored))
+    shown = np.asarray(restored[: len(frames)])
+    clip, stream = _source(meta)
+    panels: list[page.Panel] = []
+    white = colour.peak(shown)
+    if clip is not None and stream is not None and len(clip) >= len(frames):
+        photons = np.stack([clip_photons(clip, t, stream.photons_factor, sharp=True) for t in frames])
+        white = colour.peak(photons)
+        panels = [page.Panel(light_name(clip), fit(colour.tone(photons, white))), *stream_panels(stream, frames)]
+    place = len(panels)
+    panels.append(page.Panel(f"restored by {meta['method']}", fit(colour.tone(shown, white))))
+    wheel = ""
+    if clip is not None and len(panels) > 1 and clip.has_truth:
+        panel, largest, _ = flow_panel(clip, frames)
+        panels.append(panel)
+        wheel = legend(largest)
+    line = (
+        f"{meta['description']}; {meta['seconds_per_frame']:.3g} s per frame; pictures are white at {white:.3g} photons"
+    )
+    return page.section(f"Restored: {path.stem}", page.text(line), page.player(panels, left=place), wheel)
+
+
+def _source(meta: dict[str, Any]) -> tuple[Clip | None, Stream | None]:
+    """The clip and stream that a restored video came from, where they are still at hand."""
+    stream = Path(str(meta.get("source", "")))
+    try:
+        return Clip.open(stream.parents[1]), Stream.open(stream.with_suffix(".json"))
+    except (IndexError, ValueError, OSError):
+        return None, None
+
+
+_DRAW: dict[str, Callable[[Path], str]] = {
+    "restored": restored_section,  # moving pictures first
+    "evaluation": table_sections.evaluation_section,
+    "static": table_sections.static_section,
+    "training": table_sections.training_section,
+    "study": table_sections.study_section,
+    "bench": table_sections.bench_section,
+    "validation": table_sections.validation_section,
+    "reading": table_sections.reading_section,
+    "dataset": dataset_section,
+    "clip": lambda path: clip_section(Clip.open(path.parent)),
+}

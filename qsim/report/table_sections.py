@@ -1,0 +1,210 @@
+"""Sections of a report page that hold numbers: training runs, evaluations, studies, validations.
+
+    history.json     -> the learning curve of a training run
+    evaluation.json  -> the table of methods; a measured static object likewise; speed against error
+    tradeoff.json    -> bit depth against motion; figureN.json -> a figure of the paper; with the pictures beside them
+    bench.json       -> what a restored frame costs
+    the JSON of `qsim validate` -> speed against error of sensors and rendering; windows read per second
+
+Nothing is computed here that is not in the files.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from qsim import files
+from qsim.report import html as page
+
+
+def training_section(path: Path) -> str:
+    """The learning curve: PSNR of the validation clips against minutes."""
+    history = files.read_json(path)["history"]
+    axes, save = page.axes("minutes of training", "validation PSNR, matched [dB]")
+    axes.plot([entry["elapsed"] / 60 for entry in history], [entry["psnr_matched"] for entry in history], ".-")
+    last = history[-1]
+    words = f"{last['step']} steps in {last['elapsed'] / 60:.1f} minutes; last {last['psnr_matched']:.2f} dB"
+    return page.section(f"Training: {path.parent.name}", page.figure(save(), words))
+
+
+def evaluation_section(path: Path) -> str:
+    """Methods on held-out clips: means and 95 % intervals over scenes, best matched PSNR of each light level bold."""
+    found = files.read_json(path)
+    rows = [
+        [
+            line["method"],
+            line["light"],
+            _pm(line["scores"]["psnr"], 2) + _near(line, "psnr"),
+            _pm(line["scores"]["psnr_matched"], 2) + _near(line, "psnr_matched"),
+            _pm(line["scores"]["ssim_matched"], 3),
+            line["seconds_per_frame"],
+            _percent(line.get("above_peak")),
+            line["truth_psnr"],
+        ]
+        for line in found["table"]
+    ]
+    scores = [line["scores"]["psnr_matched"]["mean"] for line in found["table"]]
+    lights = [line["light"] for line in found["table"]]
+    best = {max((i for i, own in enumerate(lights) if own == light), key=lambda i: scores[i] or -1) for light in lights}
+    headers = [
+        "method",
+        "light",
+        "PSNR [dB]",
+        "PSNR matched [dB]",
+        "SSIM matched",
+        "s/frame",
+        "truth above the peak",
+        "truth's own PSNR [dB]",
+    ]
+    caption = f"mean ± half of the 95 % interval over scenes; {_definition(found)}"
+    if any(line.get("near_truth") for line in found["table"]):
+        caption += (
+            "; † in one clip or more within 3 dB of the truth's own PSNR, whose error is a large part of this score"
+        )
+    missing = f"Not built yet: {', '.join(found['not_built_yet'])}." if found.get("not_built_yet") else ""
+    table = page.table(page.Table(caption, headers, rows, frozenset(best)))
+    remarks = [page.text(remark) for remark in (*found.get("remarks", []), missing)]
+    return page.section(f"Methods compared: {path.parent.name}", table, *remarks, _speed_against_error(found))
+
+
+def _definition(found: dict[str, Any]) -> str:
+    """What the scores of an evaluation mean; before format 2 they were others."""
+    if "peak" not in found:
+        return (
+            "scores as they were defined before (peak = the sensor's white, matched = after the factor of least "
+            "squares without the clamp); they do not compare with later ones"
+        )
+    return f"peak = {found['peak']}; matched = after the one factor that is best behind the clamp at the peak"
+
+
+def _near(line: dict[str, Any], name: str) -> str:
+    return " †" if name in line.get("near_truth", ()) else ""
+
+
+def _percent(share: object) -> str | None:
+    return f"{100 * share:.1f} %" if isinstance(share, int | float) else None
+
+
+def _pm(interval: dict[str, Any], digits: int) -> str:
+    """`23.45 ± 0.67`, without the half-width where there is one scene."""
+    mean, half = interval["mean"], interval["half_width"]
+    if not isinstance(mean, int | float):
+        return "n/a" if interval.get("scenes") else "failed"
+    return f"{mean:.{digits}f}" + (f" ± {half:.{digits}f}" if isinstance(half, int | float) else "")
+
+
+def static_section(path: Path) -> str:
+    """Measured photons of a static object: restored from some frames, scored against the others."""
+    found = files.read_json(path)
+    headers = ["method", "PSNR [dB]", "PSNR matched [dB]", "spread over splits [dB]", "with the reference's noise [dB]"]
+    keys = ("method", "psnr", "psnr_matched", "psnr_matched_spread", "psnr_as_measured")
+    rows = [[score[key] for key in keys] for score in found["scores"]]
+    caption = (
+        f"{Path(found['counts']).name}: real photons clipped to {found['bits']} bits, restored from {found['frames']} "
+        "frames, scored against the others; the reference's own variance is taken off; "
+        + (f"peak = {found['peak']:.4g} photons" if "peak" in found else "peak = the largest code, as it was before")
+    )
+    return page.section("Real photons", page.table(page.Table(caption, headers, rows)))
+
+
+def _speed_against_error(found: dict[str, Any]) -> str:
+    """PSNR against seconds per frame, one mark per method and light level; nothing if there is no time."""
+    axes, save = page.axes("seconds per frame", "PSNR matched [dB]")
+    lights = list(dict.fromkeys(line["light"] for line in found["table"]))
+    drawn = 0
+    for mark, light in zip("os^vD*Pxd<>" * len(lights), lights, strict=False):
+        own = [line for line in found["table"] if line["light"] == light]
+        points = [
+            (line["seconds_per_frame"], line["scores"]["psnr_matched"]["mean"], line["method"])
+            for line in own
+            if _is_number(line["seconds_per_frame"]) and _is_number(line["scores"]["psnr_matched"]["mean"])
+        ]
+        axes.plot([p[0] for p in points], [p[1] for p in points], mark, label=light)
+        for seconds, psnr, method in points:
+            axes.annotate(method, (seconds, psnr), textcoords="offset points", xytext=(4, 4), fontsize=7)
+        drawn += len(points)
+    if not drawn:
+        return ""
+    axes.set_xscale("log")
+    axes.margins(0.15)  # for the names
+    axes.legend(fontsize=7)
+    return page.figure(save(), "speed against error: up and to the left is better")
+
+
+def study_section(path: Path) -> str:
+    """Bit depth against motion: the rows of a study or the cells of a sweep, with the figure that was drawn of them."""
+    found = files.read_json(path)
+    rows = found.get("rows") or found.get("cells") or []
+    if path.stem.startswith("figure"):
+        rows = [{"clip": row["clip"]} | panel for row in rows for panel in row["panels"]]
+    words = {key: value for key, value in found.items() if isinstance(value, int | float | str)}
+    keys = list(dict.fromkeys(key for row in rows for key in row if not isinstance(row[key], list | dict)))
+    table = page.table(page.Table(f"{len(rows)} rows", [key.replace("_", " ") for key in keys],
+                                  [[row.get(key) for key in keys] for row in rows]))  # fmt: skip
+    lines = [f"{key.replace('_', ' ')}: {page.number_text(value)}" for key, value in words.items()]
+    pictures = [
+        folder_picture for name in (path.stem, "best") if (folder_picture := path.with_name(f"{name}.png")).is_file()
+    ]
+    figures = [page.figure(picture.read_bytes(), f"{path.parent.name}/{picture.name}") for picture in pictures]
+    return page.section(f"Study: {path.parent.name}", page.bullets(lines), *figures, table)
+
+
+def bench_section(path: Path) -> str:
+    """What a restored frame costs, beside its PSNR."""
+    found = files.read_json(path)
+    keys = list(dict.fromkeys(key for cost in found["costs"] for key in cost if not isinstance(cost[key], list | dict)))
+    rows = [[cost.get(key) for key in keys] for cost in found["costs"]]
+    setting = ", ".join(f"{key} {value}" for key, value in found["setting"].items() if value is not None)
+    picture = path.with_name("bench.png")
+    figure = page.figure(picture.read_bytes(), "seconds per frame against PSNR") if picture.is_file() else ""
+    table = page.table(page.Table(setting, [key.replace("_", " ") for key in keys], rows))
+    return page.section(f"Cost of a frame: {path.parent.name}", figure, table)
+
+
+def validation_section(path: Path) -> str:
+    """Speed against error of sensor models or of rendering, as `qsim validate --json` printed it."""
+    found = files.read_json(path)
+    verdict = "everything is within its bounds" if found["ok"] else "something is OUTSIDE its bounds"
+    if "median_ratio" in found:
+        axes, save = page.axes("seconds per frame", "PSNR against the reference [dB]")
+        for x, y, label in (("seconds", "psnr", "ours"), ("obvious_seconds", "obvious_psnr", "the obvious loop")):
+            axes.plot([row[x] for row in found["rows"]], [row[y] for row in found["rows"]], "o", label=label)
+        keys = ["scene", "level", "psnr", "stated_psnr", "samples", "bounces", "seconds", "obvious_seconds", "ratio"]
+        what = f"rendering, frames of {found['height']} × {found['width']}, {found['engine']}"
+    else:
+        axes, save = page.axes("million pixels per second", "error of the cdf")
+        rows = [row for row in found["rows"] if row["cdf_error"]]
+        for engine in dict.fromkeys(row["engine"] for row in rows):
+            own = [row for row in rows if row["engine"] == engine]
+            speeds, errors = [row["megapixels_per_second"] for row in own], [row["cdf_error"] for row in own]
+            axes.plot(speeds, errors, "o", label=engine)
+        axes.set_yscale("log")
+        keys = ["model", "engine", "megapixels_per_second", "times_numpy", "cdf_error"]
+        keys += ["p_value", "z_mean", "z_variance", "mismatches_per_million"]
+        what = f"sensors, {found['pixels']} pixels a draw"
+    axes.set_xscale("log")
+    axes.legend()
+    rows = [[row[key] for key in keys] for row in found["rows"]]
+    table = page.table(page.Table(f"{what}: {verdict}", [key.replace("_", " ") for key in keys], rows))
+    cases = [[case["name"], case["found"], "right" if case["ok"] else "wrong"] for case in found.get("cases", [])]
+    hard = page.table(page.Table("hard cases", ["case", "found", ""], cases)) if cases else ""
+    return page.section("Validation", page.figure(save(), "speed against error"), table, hard)
+
+
+def reading_section(path: Path) -> str:
+    """Windows read per second, from a clip and from video, as `qsim validate reading --json` printed it."""
+    found = files.read_json(path)
+    window, clip = (" × ".join(map(str, found[key])) for key in ("window_shape", "clip_shape"))
+    verdict = "as quick as wanted" if found["ok"] else "NOT as quick as wanted"
+    what = (
+        f"windows of {window} in a clip of {clip}: {verdict} ({found['wanted']:g}/s, {found['wanted_ratio']:g} times)"
+    )
+    sides = (("clip folder", "clip"), ("mp4", "mp4"))
+    rows = [[name, found[side], found[f"{side}_processor"]] for name, side in sides]
+    table = page.table(page.Table(what, ["from", "windows per second", "per second of processor time"], rows))
+    return page.section("Reading", table)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float)

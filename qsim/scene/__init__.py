@@ -1,0 +1,19 @@
+"""What is in front of the camera: bodies, materials, lights and motions as frozen records, without a renderer."""
+
+from typing import TYPE_CHECKING
+
+from qsim.files import lazy_names
+
+if TYPE_CHECKING:
+    from qsim.scene.scene import Body, Camera, Scene
+
+__all__ = ["Body", "Camera", "Scene"]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "Body": "scene",
+        "Camera": "scene",
+        "Scene": "scene",
+    },
+)

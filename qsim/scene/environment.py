@@ -1,0 +1,124 @@
+"""Radiance from all around: the clear sky with its sun, and pictures of environments, as equirectangular maps.
+
+    SunSky, EnvironmentImage -> float32 [H, W] radiance [W m^-2 sr^-1], row 0 at the zenith
+
+Column u (0..1 from left to right) looks to azimuth pi - 2 pi u, so that +z is in the middle and +x left of it, as seen
+from inside. Mitsuba's own sun and sky refuse monochrome; the CIE model needs no table and keeps both irradiances.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.scene.scene import EnvironmentImage, SunSky
+
+SKY_ROWS = 128  # of the upper and lower half together; the sky is smooth, the sun is a disk of its own
+
+# CIE S 011/E:2003, standard general sky, type 12 "CIE standard clear sky, low luminance turbidity".
+_A, _B, _C, _D, _E = -1.0, -0.32, 10.0, -3.0, 0.45
+
+
+def sun_direction(light: SunSky) -> Array:
+    """Unit vector towards the sun, world axes, float64 [3]."""
+    horizontal = math.cos(light.elevation)
+    return np.array(
+        [horizontal * math.sin(light.azimuth), math.sin(light.elevation), horizontal * math.cos(light.azimuth)]
+    )
+
+
+def sun_radiance(light: SunSky) -> float:
+    """Radiance of the disk [W m^-2 sr^-1]: irradiance / (pi sin^2 radius)."""
+    return light.sun_irradiance / (math.pi * math.sin(light.sun_radius) ** 2)
+
+
+def sky_map(light: SunSky, rows: int = SKY_ROWS) -> Array:
+    """Sky above, ground below, without the sun's disk: float32 [rows, 2 rows] (rows even).
+
+    Relative sky radiance = phi(Z) f(chi), phi(Z) = 1 + a exp(b / cos Z), f(chi) = 1 + c (exp(d chi) - exp(d pi/2))
+    + e cos^2 chi, with zenith distance Z and angle chi from the sun; scaled to the irradiance asked for.
+    """
+    zenith = (np.arange(rows) + 0.5)[:, None] / rows * np.pi
+    azimuth = np.pi - 2 * np.pi * (np.arange(2 * rows) + 0.5)[None, :] / (2 * rows)
+    up = np.cos(zenith) + 0 * azimuth
+    direction = np.stack([np.sin(zenith) * np.sin(azimuth), up, np.sin(zenith) * np.cos(azimuth)], -1)
+    chi = np.arccos(np.clip(direction @ sun_direction(light), -1, 1))
+    phi = 1 + _A * np.exp(_B / np.maximum(up, 1e-3))
+    sky = phi * (1 + _C * (np.exp(_D * chi) - math.exp(_D * np.pi / 2)) + _E * np.cos(chi) ** 2)
+    above = up > 0
+    solid_angle = np.sin(zenith) * (np.pi / rows) ** 2
+    irradiance = float(np.sum((sky * up * solid_angle)[above]))
+    sunlit = light.sun_irradiance * max(math.sin(light.elevation), 0.0)
+    ground = light.ground_reflectance * (sunlit + light.sky_irradiance) / np.pi
+    return np.where(above, sky * light.sky_irradiance / irradiance, ground).astype(np.float32)
+
+
+def environment_map(light: EnvironmentImage) -> Array:
+    """The picture in radiance, float32 [H, W]; `ValueError` or FileNotFoundError naming the file."""
+    picture = _read_hdr(Path(light.image)) if isinstance(light.image, str) else np.asarray(light.image, np.float32)
+    if picture.ndim == 3:
+        picture = picture[..., :3] @ np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709 luminance
+    if picture.ndim != 2 or picture.size == 0 or not np.isfinite(picture).all() or picture.min() < 0:
+        where = light.image if isinstance(light.image, str) else "EnvironmentImage.image"
+        raise ValueError(f"{where}: expected finite radiance [H, W] of at least 0, found shape {picture.shape}")
+    return (picture * light.scale).astype(np.float32)
+
+
+def _read_hdr(path: Path) -> Array:
+    """Linear picture [H, W] or [H, W, 3] of an .exr (OpenEXR) or Radiance .hdr file."""
+    if not path.is_file():
+        raise FileNotFoundError(f"environment {path}: no such file")
+    if path.suffix.lower() == ".hdr":
+        return _read_radiance(path)
+    import OpenEXR
+
+    try:
+        channels = OpenEXR.File(str(path)).channels()
+    except Exception as error:  # the binding raises several kinds for a bad file
+        raise ValueError(f"environment {path}: not a readable OpenEXR file ({error})") from error
+    for name in ("RGB", "RGBA", "Y"):
+        if name in channels:
+            return np.asarray(channels[name].pixels, np.float32)
+    raise ValueError(f"environment {path}: has channels {sorted(channels)}, expected RGB or Y")
+
+
+def _read_radiance(path: Path) -> Array:
+    """Radiance RGBE (Ward, "Real pixels", Graphics Gems II, 1991), flat or new-style run lengths."""
+    content = path.read_bytes()
+    head, _, rest = content.partition(b"\n\n")
+    size, _, body = rest.partition(b"\n")
+    words = size.split()
+    if not head.startswith(b"#?") or len(words) != 4 or (words[0], words[2]) != (b"-Y", b"+X"):
+        raise ValueError(f"environment {path}: not a Radiance .hdr file with rows from top to bottom")
+    height, width = int(words[1]), int(words[3])
+    rgbe = np.empty((height, width, 4), np.uint8)
+    at = 0
+    try:
+        for y in range(height):
+            at = _read_row(body, at, rgbe[y])
+    except (IndexError, ValueError) as error:
+        raise ValueError(f"environment {path}: damaged at byte {len(content) - len(body) + at}") from error
+    scale = np.ldexp(1.0, rgbe[..., 3].astype(np.int32) - 136)
+    return (rgbe[..., :3] * np.where(rgbe[..., 3:] > 0, scale[..., None], 0)).astype(np.float32)
+
+
+def _read_row(body: bytes, at: int, row: Array) -> int:
+    width = len(row)
+    if body[at : at + 2] != b"\x02\x02" or not 8 <= width < 32768:
+        row[:] = np.frombuffer(body, np.uint8, 4 * width, at).reshape(width, 4)
+        return at + 4 * width
+    at += 4
+    for channel in range(4):
+        x = 0
+        while x < width:
+            count = body[at]
+            if count > 128:
+                row[x : x + count - 128, channel] = body[at + 1]
+                x, at = x + count - 128, at + 2
+            else:
+                row[x : x + count, channel] = np.frombuffer(body, np.uint8, count, at + 1)
+                x, at = x + count, at + 1 + count
+    return at

@@ -1,0 +1,315 @@
+"""Motions: where a body is, and how fast it goes, as a function of time.
+
+    t [s] -> pose (4x4, body to world) and velocity (linear [m/s] of the body's origin, angular [rad/s], world's axes)
+
+Every motion is a frozen record and a closed form in t: any time can be asked for, in any order, and two times give the
+exact motion between them. Nothing here is random. What deforms is in `cloth.py`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from qsim.scene.rotation import (
+    ORIGIN,
+    UP,
+    Array,
+    Vector,
+    about,
+    exponential,
+    left_jacobian,
+    logarithm,
+    pose_matrix,
+    rotation_matrix,
+    unit,
+    vector,
+)
+
+GRAVITY: Vector = (0.0, -9.80665, 0.0)  # m s^-2, standard acceleration (CGPM 1901); y is up
+
+
+class Motion(ABC):
+    """A rigid motion: `pose(t)` and `velocity(t)` are all that a renderer needs.
+
+    `ValueError` for parameters that are not finite, vectors without three components, and axes of length zero.
+    """
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+
+    @abstractmethod
+    def pose(self, t: float) -> Array:
+        """Body-to-world 4x4 at time `t` [s]."""
+
+    @abstractmethod
+    def velocity(self, t: float) -> tuple[Array, Array]:
+        """(velocity of the body's origin [m/s], angular velocity [rad/s]), in the world's axes, at time `t` [s]."""
+
+    def __matmul__(self, inner: Motion) -> Composition:
+        """`outer @ inner`: the inner motion happens in the frame which the outer one carries."""
+        return Composition(self, inner)
+
+
+@dataclass(frozen=True)
+class Still(Motion):
+    """At rest at `position` [m], turned by the rotation vector `turn` (axis times angle) [rad]."""
+
+    position: Vector = ORIGIN
+    turn: Vector = ORIGIN
+
+    def pose(self, t: float) -> Array:
+        return pose_matrix(exponential(np.asarray(self.turn)), self.position)
+
+    def velocity(self, t: float) -> tuple[Array, Array]:
+        return np.zeros(3), np.zeros(3)
+
+    @classmethod
+    def turned(cls, rotation: Array, position: ArrayLike = ORIGIN) -> Still:
+        """At rest in the attitude of a 3x3 rotation matrix."""
+        return cls(vector(position), vector(logarithm(rotation)))
+
+
+@dataclass(frozen=True)
+class Translation(Motion):
+    """Straight and even: position + speed * t."""
+
+    speed: Vector  # m/s
+    position: Vector = ORIGIN  # m, at t = 0
+
+    def pose(self, t: float) -> Array:
+        return pose_matrix(None, np.asarray(self.position) + np.asarray(self.speed) * t)
+
+    def velocity(self, t: float) -> tuple[Array, Array]:
+        return np.asarray(self.speed, dtype=np.float64), np.zeros(3)
+
+
+@dataclass(frozen=True)
+class Spin(Motion):
+    """Even rotation about the axis through `center`; a pan is a spin of the camera about its own place."""
+
+    axis: Vector
+    rate: float  # rad/s
+    phase: float = 0.0  # rad, angle at t = 0
+    center: Vector = ORIGIN  # m
+
+    def pose(self, t: float) -> Array:
+        return about(rotation_matrix(self.axis, self.phase + self.rate * t), self.center)
+
+    def velocity(self, t: float) -> tuple[Array, Array]:
+        return _swing(self.pose(t), self.rate * unit(self.axis), self.center)
+
+
+@dataclass(frozen=True)
+class Ballistic(Motion):
+    """Thrown: free fall of the centre while the body spins evenly about an axis through it."""
+
+    position: Vector  # m, at t = 0
+    speed: Vector  # m/s, at t = 0
+    axis: Vector = UP
+    rate: float = 0.0  # rad/s
+    phase: float = 0.0  # rad
+    gravity: Vector = GRAVITY  # m/s^2
+
+    def pose(self, t: float) -> Array:
+        place = np.asarray(self.position) + np.asarray(self.speed) * t + np.asarray(self.gravity) * (t * t / 2)
+        return pose_matrix(rotation_matrix(self.axis, self.phase + self.rate * t), place)
+
+    def velocity(self, t: float) -> tuple[Array, Array]:
+        return np.asarray(self.speed) + np.asarray(self.gravity) * t, self.rate * unit(self.axis)
+
+
+@dataclass(frozen=True)
+class Pendulum(Motion):
+    """Swings about a horizontal or any axis through `pivot`: angle = amplitude * sin(2 pi frequency t + phase)."""
+
+    pivot: Vector  # m
+    axis: Vector
+    amplitude: float  # rad
+    frequency: float  # Hz
+    phase: float = 0.0  # rad
+
+    def pose(self, t: float) -> Array:
+        angle = self.amplitude * np.sin(2 * np.pi * self.frequency * t + self.phase)
+        return about(rotation_matrix(self.axis, float(angle)), self.pivot)
+
+    def velocity(self, t: float) -> tuple[Array, Array]:
+        omega = 2 * np.pi * self.frequency
+        return _swing(
+            self.pose(t), self.amplitude * omega * np.cos(omega * t + self.phase) * unit(self.axis), self.pivot
+        )
+
+
+@dataclass(frozen=True)
+class Oscillation(Motion):
+    """To and fro: position + amplitude * sin(2 pi frequency t + phase)."""
+
+    amplitude: Vector  # m
+    frequency: float  # Hz
+    phase: float = 0.0  # rad
+    position: Vector = ORIGIN  # m
+
+    def pose(self, t: float) -> Array:
+        wave = np.sin(2 * np.pi * self.frequency * t + self.phase)
+        return pose_matrix(None, np.asarray(self.position) + np.asarray(self.amplitude) * wave)
+
+    def velocity(self, t: float) -> tuple[Array, Array]:
+        omega = 2 * np.pi * self.frequency
+        return np.asarray(self.amplitude) * (omega * np.cos(omega * t + self.phase)), np.zeros(3)
+
+
+@dataclass(frozen=True)
+class Wave:
+    """One sinusoid of a shake: amplitude * sin(2 pi frequency t + phase), [rad] if it turns and [m] if it shifts."""
+
+    amplitude: Vector
+    frequency: float  # Hz
+    phase: float = 0.0  # rad
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+
+
+@dataclass(frozen=True)
+class Shake(Motion):
+    """A hand-held or vibrating mount: sums of waves turn it about `center` (as a rotation vector) and shift it."""
+
+    turns: tuple[Wave, ...] = ()
+    shifts: tuple[Wave, ...] = ()
+    center: Vector = ORIGIN  # m
+
+    def pose(self, t: float) -> Array:
+        pose = about(exponential(_sum(self.turns, t)), self.center)
+        pose[:3, 3] += _sum(self.shifts, t)
+        return pose
+
+    def velocity(self, t: float) -> tuple[Array, Array]:
+        angle = _sum(self.turns, t)
+        angular = left_jacobian(angle) @ _sum_rate(self.turns, t)
+        linear, _ = _swing(about(exponential(angle), self.center), angular, self.center)
+        return linear + _sum_rate(self.shifts, t), angular
+
+
+@dataclass(frozen=True)
+class Keyframes(Motion):
+    """Through given places at given times: cubic Hermite positions with finite-difference slopes, even turns between.
+
+    Before the first and after the last key the body rests there. `turns` are rotation vectors [rad], one per key, or
+    empty for none; the angular velocity jumps at keys, the linear velocity does not (except at the ends).
+    """
+
+    times: tuple[float, ...]  # s, increasing
+    positions: tuple[Vector, ...]  # m
+    turns: tuple[Vector, ...] = ()
+
+    def __post_init__(self) -> None:
+        n = len(self.times)
+        if n < 2 or len(self.positions) != n or len(self.turns) not in (0, n):
+            raise ValueError(
+                f"Keyframes needs two or more times and as many positions (and turns, or none), "
+                f"got {n} times, {len(self.positions)} positions, {len(self.turns)} turns"
+            )
+        if not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
+            raise ValueError(f"Keyframes.times must be finite and increase, got {self.times}")
+        for place in (*self.positions, *self.turns):
+            vector(place)
+
+    def pose(self, t: float) -> Array:
+        i, s, length = self._locate(t)
+        p, m = np.asarray(self.positions), self._slopes() * length
+        place = (
+            (2 * s**3 - 3 * s**2 + 1) * p[i] + (s**3 - 2 * s**2 + s) * m[i]
+            + (3 * s**2 - 2 * s**3) * p[i + 1] + (s**3 - s**2) * m[i + 1]
+        )  # fmt: skip
+        if not self.turns:
+            return pose_matrix(None, place)
+        start, step = self._turn(i)
+        return pose_matrix(exponential(s * step) @ start, place)
+
+    def velocity(self, t: float) -> tuple[Array, Array]:
+        if not self.times[0] <= t <= self.times[-1]:
+            return np.zeros(3), np.zeros(3)
+        i, s, length = self._locate(t)
+        p, m = np.asarray(self.positions), self._slopes() * length
+        rate = (
+            6 * (s**2 - s) * (p[i] - p[i + 1]) + (3 * s**2 - 4 * s + 1) * m[i] + (3 * s**2 - 2 * s) * m[i + 1]
+        ) / length
+        return rate, self._turn(i)[1] / length if self.turns else np.zeros(3)
+
+    def _locate(self, t: float) -> tuple[int, float, float]:
+        """(interval, place 0..1 in it, its length [s]); times outside stay at the ends."""
+        i = int(np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.times) - 2))
+        length = self.times[i + 1] - self.times[i]
+        return i, float(np.clip((t - self.times[i]) / length, 0.0, 1.0)), length
+
+    def _slopes(self) -> Array:
+        """m/s at every key: the chord of the two neighbours, one-sided at the ends."""
+        return (
+            np.gradient(np.asarray(self.positions, dtype=np.float64), axis=0, edge_order=1)
+            / (np.gradient(np.asarray(self.times, dtype=np.float64))[:, None])
+        )
+
+    def _turn(self, i: int) -> tuple[Array, Array]:
+        """Attitude at key i and the rotation vector, in the world's axes, to key i + 1."""
+        start, end = (exponential(np.asarray(self.turns[j])) for j in (i, i + 1))
+        return start, logarithm(end @ start.T)
+
+
+@dataclass(frozen=True)
+class Composition(Motion):
+    """`outer` carries the frame in which `inner` happens: pose = outer.pose @ inner.pose."""
+
+    outer: Motion
+    inner: Motion
+
+    def pose(self, t: float) -> Array:
+        return self.outer.pose(t) @ self.inner.pose(t)
+
+    def velocity(self, t: float) -> tuple[Array, Array]:
+        turn = self.outer.pose(t)[:3, :3]
+        linear, angular = self.outer.velocity(t)
+        inner_linear, inner_angular = self.inner.velocity(t)
+        arm = turn @ self.inner.pose(t)[:3, 3]
+        return linear + np.cross(angular, arm) + turn @ inner_linear, angular + turn @ inner_angular
+
+
+def check_numbers(record: Any) -> None:
+    """`ValueError` naming the first number or vector of a record that cannot be; axes must have a direction."""
+    for field in fields(record):
+        value = getattr(record, field.name)
+        try:
+            if field.name == "axis":
+                unit(value)
+            elif field.type == "Vector":
+                vector(value)
+            elif field.type == "float" and not np.isfinite(value):
+                raise ValueError(f"expected a finite number, got {value!r}")
+        except ValueError as error:
+            raise ValueError(f"{type(record).__name__}.{field.name}: {error}") from None
+
+
+# Shared arithmetic -------------------------------------------------------------------------------------------------
+
+
+def _swing(pose: Array, angular: Array, center: ArrayLike) -> tuple[Array, Array]:
+    """Velocity of a body's origin that turns about `center`, with its angular velocity."""
+    return np.cross(angular, pose[:3, 3] - np.asarray(center)), angular
+
+
+def _sum(waves: tuple[Wave, ...], t: float) -> Array:
+    total = np.zeros(3)
+    for w in waves:
+        total += np.asarray(w.amplitude) * np.sin(2 * np.pi * w.frequency * t + w.phase)
+    return total
+
+
+def _sum_rate(waves: tuple[Wave, ...], t: float) -> Array:
+    total = np.zeros(3)
+    for w in waves:
+        omega = 2 * np.pi * w.frequency
+        total += np.asarray(w.amplitude) * (omega * np.cos(omega * t + w.phase))
+    return total

@@ -1,0 +1,255 @@
+"""Shapes: meshes in metres, as `scene.Mesh`, made from primitives, outlines, paths and noise, or read from files.
+
+Every shape is centred on its own origin unless it says otherwise and carries texture coordinates. Solids of flat faces
+are mapped face by face (a texture keeps its size in metres), round ones around and along their axis.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qsim.scene.scene import Mesh
+
+Array = NDArray[np.float64]
+MESH_SUFFIXES = frozenset({".obj", ".ply", ".stl", ".off", ".glb", ".gltf"})
+
+# Working with meshes -----------------------------------------------------------------------------------------------
+
+
+def moved(mesh: Mesh, pose: Array) -> Mesh:
+    """The mesh after a 4x4 matrix (turn, shift, scale), winding kept outward."""
+    vertices = mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+    faces = mesh.faces if np.linalg.det(pose[:3, :3]) > 0 else mesh.faces[:, ::-1]
+    return Mesh(vertices, faces, mesh.uv, mesh.smooth)
+
+
+def merged(meshes: Sequence[Mesh]) -> Mesh:
+    """Several meshes as one; smooth if all are. Those without texture coordinates get zeros."""
+    starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
+    faces = np.concatenate([m.faces + start for m, start in zip(meshes, starts, strict=False)])
+    uv = np.concatenate([np.zeros((len(m.vertices), 2)) if m.uv is None else m.uv for m in meshes])
+    return Mesh(np.concatenate([m.vertices for m in meshes]), faces, uv, all(m.smooth for m in meshes))
+
+
+def box_mapped(vertices: ArrayLike, faces: ArrayLike, size: float = 1.0) -> Mesh:
+    """Flat faces of their own: each gets the texture along the axis it looks to most, one picture per `size` metres."""
+    corners = np.asarray(vertices, np.float64)[np.asarray(faces)]  # [F, 3, 3]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    axis = np.argmax(np.abs(normal), axis=1)
+    pair = np.array([[2, 1], [0, 2], [0, 1]])[axis]  # which coordinates become u, v
+    uv = np.take_along_axis(corners, np.repeat(pair[:, None, :], 3, axis=1), axis=2) / size
+    flip = np.sign(normal[np.arange(len(axis)), axis]) * np.where(axis == 2, 1, -1)
+    uv[..., 0] *= np.where(flip == 0, 1, flip)[:, None]  # readable from outside
+    return Mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), uv.reshape(-1, 2) + 0.5)
+
+
+# Sheets and primitives ---------------------------------------------------------------------------------------------
+
+
+def sheet(width: float, height: float, columns: int = 1, rows: int = 1) -> Mesh:
+    """A rectangle in the plane z = 0 that looks to +z, u to the right and v up, cut into `columns` x `rows`."""
+    v, u = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
+    vertices = np.stack([(u - 0.5) * width, (v - 0.5) * height, np.zeros_like(u)], -1).reshape(-1, 3)
+    return Mesh(
+        vertices, _grid_faces(rows + 1, columns + 1), np.stack([u, v], -1).reshape(-1, 2), smooth=rows * columns > 1
+    )
+
+
+def box(width: float, height: float, depth: float, texture_size: float = 1.0) -> Mesh:
+    """A cuboid."""
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))]
+    return box_mapped(corners * (width, height, depth), faces, texture_size)
+
+
+def ball(radius: float, segments: int = 48) -> Mesh:
+    """A sphere of `segments` meridians and half as many parallels, smooth."""
+    return revolved(
+        [(radius * np.sin(a), -radius * np.cos(a)) for a in np.linspace(0, np.pi, segments // 2 + 1)], segments
+    )
+
+
+def torus(radius: float, tube: float, segments: int = 64) -> Mesh:
+    """A ring around the y axis: `radius` to the middle of the `tube`, whose own radius is `tube`; smooth."""
+    angles = np.linspace(-np.pi, np.pi, segments // 2 + 1)
+    return revolved([(radius + tube * np.cos(a), tube * np.sin(a)) for a in angles], segments)
+
+
+def cylinder(radius: float, height: float, segments: int = 48, taper: float = 1.0) -> Mesh:
+    """A cylinder around y, or a cone for `taper` 0 (the top's radius over the bottom's); flat caps, flat facets."""
+    h, top = height / 2, max(radius * taper, 0.0)
+    side = revolved([(radius, -h), (top, h)], segments)
+    caps = [revolved([(0, -h), (radius, -h)], segments)]
+    if top > 0:
+        caps.append(revolved([(top, h), (0, h)], segments))
+    return merged([Mesh(m.vertices, m.faces, m.uv, smooth=False) for m in (side, *caps)])
+
+
+def polyhedron(rng: np.random.Generator, radius: float, corners: int = 12, texture_size: float = 1.0) -> Mesh:
+    """A random convex stone: the hull of `corners` points spread over a ball."""
+    import trimesh
+
+    points = rng.standard_normal((corners, 3))
+    for _ in range(20):  # points repel one another: a rounder stone
+        away = points[:, None] - points[None]
+        points = points + 0.3 * (away / (np.sum(away**2, -1, keepdims=True) + 0.1)).sum(1) / corners
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+    hull = trimesh.convex.convex_hull(points * radius * rng.uniform(0.85, 1.1, (corners, 1)))
+    return box_mapped(hull.vertices, hull.faces, texture_size)
+
+
+def blob(rng: np.random.Generator, radius: float, roughness: float = 0.25, segments: int = 96) -> Mesh:
+    """A ball pushed in and out by smooth noise: sums of plane waves in space, `roughness` in radii."""
+    mesh = ball(1.0, segments)
+    push = np.zeros(len(mesh.vertices))
+    for scale in (1.5, 2.5, 4.0, 6.5):
+        waves = rng.standard_normal((6, 3)) * scale
+        push += np.sin(mesh.vertices @ waves.T + rng.uniform(0, 2 * np.pi, 6)).sum(1) / (np.sqrt(3) * scale)
+    return Mesh(mesh.vertices * radius * (1 + roughness * push)[:, None], mesh.faces, mesh.uv, smooth=True)
+
+
+def revolved(profile: Sequence[tuple[float, float]], segments: int = 48) -> Mesh:
+    """A profile of (radius, y) turned around the y axis, smooth: u goes around, v along the profile.
+
+    The profile runs so that the outside is on its right: upwards for a cylinder's side.
+    """
+    line = np.asarray(profile, np.float64)
+    u = np.linspace(0, 1, segments + 1)
+    steps = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    angle = 2 * np.pi * u[None, :]
+    r, y = line[:, :1], np.repeat(line[:, 1:], segments + 1, axis=1)
+    vertices = np.stack([r * np.sin(angle), y, r * np.cos(angle)], -1).reshape(-1, 3)
+    uv = np.stack(np.broadcast_arrays(u[None, :], (steps / steps[-1])[:, None]), -1).reshape(-1, 2)
+    return Mesh(vertices, _grid_faces(len(line), segments + 1), uv, smooth=True)
+
+
+# Outlines and paths ------------------------------------------------------------------------------------------------
+
+
+def extruded(outlines: Sequence[ArrayLike], depth: float, texture_size: float = 1.0) -> Mesh:
+    """A plate of closed outlines [N, 2] (x, y), z from -depth/2 to depth/2; outlines inside outlines are holes."""
+    loops = [_without_repeats(np.asarray(loop, np.float64)) for loop in outlines]
+    flat, triangles = filled(loops)
+    front = np.column_stack([flat, np.full(len(flat), depth / 2)])
+    back = front * (1, 1, -1)
+    vertices, faces = [front, back], [triangles, triangles[:, ::-1] + len(flat)]
+    start = 2 * len(flat)
+    for loop in loops:
+        n = len(loop)
+        ring = np.column_stack([loop, np.full(n, depth / 2)])
+        i, j = np.arange(n), (np.arange(n) + 1) % n
+        wall = np.concatenate([np.stack([i, i + n, j + n], 1), np.stack([i, j + n, j], 1)])
+        if not _outside_is_right(loop, loops):
+            wall = wall[:, ::-1]
+        vertices += [ring, ring * (1, 1, -1)]
+        faces.append(wall + start)
+        start += 2 * n
+    return box_mapped(np.concatenate(vertices), np.concatenate(faces), texture_size)
+
+
+def filled(loops: Sequence[Array]) -> tuple[Array, NDArray[np.int64]]:
+    """The inside (even-odd) of closed loops [N, 2] as points [P, 2] and counter-clockwise triangles [T, 3].
+
+    Trapezoids between all neighbouring heights: in a band between two vertices no edge ends, and every second gap
+    between the edges sorted along x is inside. Loops must not cross one another.
+    """
+    start = np.concatenate(loops)
+    end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
+    heights = np.unique(start[:, 1])
+    points: list[Array] = []
+    for low, high in itertools.pairwise(heights):
+        a, b = np.minimum(start[:, 1], end[:, 1]), np.maximum(start[:, 1], end[:, 1])
+        crossing = (a <= low) & (b >= high) & (b > a)
+        p, q = start[crossing], end[crossing]
+        slope = (q[:, 0] - p[:, 0]) / (q[:, 1] - p[:, 1])
+        x = np.stack([p[:, 0] + slope * (y - p[:, 1]) for y in (low, high)], 1)
+        x = x[np.argsort(x.sum(1), kind="stable")]
+        for left, right in zip(x[0::2], x[1::2], strict=True):
+            points.append(np.array([[left[0], low], [right[0], low], [right[1], high], [left[1], high]]))
+    if not points:
+        raise ValueError("an outline needs an inside: all its points lie on one line")
+    quads = 4 * np.arange(len(points))[:, None]
+    return np.concatenate(points), np.concatenate([quads + np.array(t) for t in ((0, 1, 2), (0, 2, 3))])
+
+
+def wire(path: ArrayLike, radius: float, sides: int = 8, closed: bool = False) -> Mesh:
+    """A tube of `radius` along a path [N, 3]: open ends, or closed from the last point to the first.
+
+    Frames are carried along without twist (parallel transport); what a closed path turns them by is spread over it.
+    """
+    points = np.asarray(path, np.float64)
+    tangent = np.gradient(np.concatenate([points[-1:], points, points[:1]]), axis=0)[1:-1] if closed else None
+    tangent = np.gradient(points, axis=0) if tangent is None else tangent
+    tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
+    side = np.cross(tangent[0], np.eye(3)[int(np.argmin(np.abs(tangent[0])))])
+    sides_along = []
+    for along in [*tangent, tangent[0]]:
+        side = side - along * (side @ along)
+        side = side / np.linalg.norm(side)
+        sides_along.append(side)
+    first, last = sides_along[0], sides_along[-1]
+    gained = float(np.arctan2(np.cross(first, last) @ tangent[0], first @ last)) if closed else 0.0
+    rings = []
+    around = np.linspace(0, 2 * np.pi, sides + 1)
+    for i, (place, along) in enumerate(zip(points, tangent, strict=True)):
+        angle = (around - gained * i / len(points))[:, None]
+        across = np.cross(along, sides_along[i])
+        rings.append(place + radius * (np.cos(angle) * sides_along[i] + np.sin(angle) * across))
+    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    if closed:
+        rings, length = [*rings, rings[0]], np.append(length, length[-1] + np.linalg.norm(points[0] - points[-1]))
+    uv = np.stack(np.broadcast_arrays(around[None, :] / (2 * np.pi), (length / length[-1])[:, None]), -1)
+    return Mesh(np.concatenate(rings), _grid_faces(len(rings), sides + 1), uv.reshape(-1, 2), smooth=True)
+
+
+def mesh_file(path: str | Path, size: float | None = None) -> Mesh:
+    """A mesh from a file, everything in it as one; `size` [m] scales its longest side. Centred on its bounding box."""
+    import trimesh
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"mesh {path}: no such file")
+    try:
+        loaded: Any = trimesh.load(path, force="mesh")
+    except Exception as error:  # trimesh raises many kinds for a broken file
+        raise ValueError(f"mesh {path}: not readable ({error})") from error
+    vertices = np.asarray(loaded.vertices, np.float64)
+    if len(vertices) == 0 or len(loaded.faces) == 0:
+        raise ValueError(f"mesh {path}: it holds no triangles")
+    low, high = vertices.min(0), vertices.max(0)
+    scale = 1.0 if size is None else size / float((high - low).max())
+    return box_mapped((vertices - (low + high) / 2) * scale, loaded.faces, size or float((high - low).max()))
+
+
+def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
+    """Two triangles per cell of a grid of vertices, counter-clockwise with rows going up and columns to the right."""
+    i = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (corner.reshape(-1) for corner in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
+    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+def _without_repeats(loop: Array) -> Array:
+    """A closed loop without points that repeat their predecessor (the last is followed by the first)."""
+    keep = np.any(np.abs(loop - np.roll(loop, 1, axis=0)) > 1e-12, axis=1)
+    return loop[keep]
+
+
+def _outside_is_right(loop: Array, loops: Sequence[Array]) -> bool:
+    """Whether walking along the loop has the inside of the whole figure on the left."""
+    area = 0.5 * np.sum(loop[:, 0] * np.roll(loop[:, 1], -1) - loop[:, 1] * np.roll(loop[:, 0], -1))
+    depth = sum(_contains(other, loop[0]) for other in loops if other is not loop)
+    return bool((area > 0) == (depth % 2 == 0))
+
+
+def _contains(loop: Array, point: Array) -> bool:
+    """Even-odd test of a point against one closed loop."""
+    (x, y), p, q = point, loop, np.roll(loop, -1, axis=0)
+    straddles = (p[:, 1] > y) != (q[:, 1] > y)
+    p, q = p[straddles], q[straddles]
+    return bool(np.sum(x < p[:, 0] + (y - p[:, 1]) / (q[:, 1] - p[:, 1]) * (q[:, 0] - p[:, 0])) % 2)

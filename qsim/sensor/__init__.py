@@ -1,0 +1,29 @@
+"""From expected photons to codes: exact laws, keyed draws, pixel defects, named devices, bit packing."""
+
+from typing import TYPE_CHECKING
+
+from qsim.files import lazy_names
+
+if TYPE_CHECKING:
+    from qsim.sensor.devices import load
+    from qsim.sensor.estimation import Response
+    from qsim.sensor.packing import pack, unpack
+    from qsim.sensor.qis import QIS
+    from qsim.sensor.sensor import Sensor
+    from qsim.sensor.spad import BinarySPAD, CountingSPAD
+
+__all__ = ["QIS", "BinarySPAD", "CountingSPAD", "Response", "Sensor", "load", "pack", "unpack"]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "BinarySPAD": "spad",
+        "CountingSPAD": "spad",
+        "QIS": "qis",
+        "Response": "estimation",
+        "Sensor": "sensor",
+        "load": "devices",
+        "pack": "packing",
+        "unpack": "packing",
+    },
+)

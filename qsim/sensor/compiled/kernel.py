@@ -1,0 +1,306 @@
+"""What one lane of a compiled kernel computes, in Dr.Jit: two neighbouring pixels of one frame.
+
+    photons of 2 pixels + where they are -> 2 words of Philox -> their steps F_k (ladders.py) -> 2 codes, and a doubt
+
+`launch` starts a kernel over a block; it is traced once per plan and replayed after that. kernels.py has the clips.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, lru_cache
+from math import log
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.keys import ROUNDS, Key
+from qsim.sensor.compiled import lookup
+from qsim.sensor.compiled.curves import Curves
+from qsim.sensor.compiled.jit import available, backend, no_light, smaller, uniform32, whole_packets
+from qsim.sensor.compiled.plan import Electrons, Live, Plan, plan
+from qsim.sensor.sensor import Sensor
+
+_MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # of Philox4x32; see keys.py
+_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
+_CERTAIN = 80.0  # arrivals that are sure to bring 15: P(N < 15) = 1e-19
+_CONSTANT_PLANS = 32  # sensors of a process that get kernels of their own
+
+
+def steps(sensor: Sensor, photons: Array, exposure: float) -> Array:
+    """The steps F_0 ... as the kernel has them, for validation: photons [p] -> float64 [p, steps] of one plane.
+
+    `ValueError` if no kernel serves this sensor.
+    """
+    chosen = plan(sensor, exposure) if available() else None
+    if chosen is None:
+        raise ValueError(f"no compiled kernel serves {sensor}")
+    import drjit as dr
+
+    jit = backend()
+    light = jit.Float(np.asarray(photons, np.float32))
+    if isinstance(chosen.steps, Curves):
+        efficiency, dark, _, _, *curves = lookup.arguments(chosen.efficiency, chosen.dark, chosen.margin, chosen.steps)
+        x = dr.sqrt(dr.fma(jit.Float64(light), efficiency, dark))
+        each = [lookup.curve(curves, jit.UInt32(k), x).numpy().astype(float) for k in range(len(chosen.steps.rate))]
+        return np.stack(np.broadcast_arrays(*each, photons)[:-1], axis=1)
+    efficiency, dark, _, *scalars = [jit.Float(number) for number in _numbers(chosen)]
+    mean = dr.fma(light, efficiency, dark)
+    values, unit = _steps(_sums(chosen), mean, scalars)
+    columns = [(value / unit).numpy().astype(float) for value in values]
+    return np.stack(np.broadcast_arrays(*columns, photons)[:-1], axis=1)
+
+
+def fixed_scalars(key: Key, origin: tuple[int, int]) -> list[Any]:
+    """What every launch of a clip shares: first block, the generator's key."""
+    import drjit as dr
+
+    numbers = (origin[1] >> 2, key.philox_key >> 32, key.philox_key)
+    return [dr.opaque(backend().UInt32, number & 0xFFFFFFFF) for number in numbers]
+
+
+@lru_cache(maxsize=2)  # of one clip: whole parts, and the last one
+def _places(shape: tuple[int, int, int]) -> list[Any]:
+    """Where each lane of [frames, rows, lanes] is: t, y and x in the bits of one number, and how to take them apart.
+
+    Reading it is cheaper than the two divisions that would find it.
+    """
+    import drjit as dr
+
+    u32 = backend().UInt32
+    t, y, x = np.ogrid[: shape[0], : shape[1], : shape[2]]
+    below_y = (shape[2] - 1).bit_length()
+    below_t = below_y + (shape[1] - 1).bit_length()
+    number = (t << below_t | y << below_y | x).astype(np.uint32)
+    masks = (1 << below_y) - 1, (1 << below_t) - 1
+    return [u32(whole_packets(number.reshape(-1))), *(dr.opaque(u32, n) for n in (below_y, below_t, *masks))]
+
+
+def launch(
+    plan: Plan,
+    light: Array,
+    shape: tuple[int, int, int],
+    first: tuple[int, int],
+    fixed: list[Any],
+    bits: int | None,
+) -> list[Any]:
+    """Start a kernel: pairs of float32 photons as uint64 [n] -> what each lane writes, and 1 where it is doubtful.
+
+    `shape` = frames, rows, lanes; `first` = frame and row. Without `bits` a lane writes a byte per code, the first one
+    lowest; with `bits` the codes follow each other bit by bit, the first one highest.
+    """
+    import drjit as dr
+
+    jit = backend()
+    numbers = [dr.opaque(jit.UInt32, number) for number in first]
+    if isinstance(plan.steps, Curves):
+        kernel = _curve_kernel(len(plan.steps.rate), bits)
+    else:
+        kernel = _kernel(plan, bits)
+    return list(kernel(jit.UInt64(light), *numbers, _arguments(plan), _places(shape), *fixed))
+
+
+@lru_cache(maxsize=64)
+def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
+    """The kernel of a plan, traced once and replayed after that (`drjit.freeze`)."""
+    real = backend().Float
+    return _traced(
+        lambda photons, words, given: _count(plan, photons, words, given or [real(n) for n in _numbers(plan)]),
+        plan.planes,
+        bits,
+    )
+
+
+@cache
+def _curve_kernel(steps: int, bits: int | None) -> Callable[..., tuple[Any, Any]]:
+    """The one kernel of all sensors with so many steps whose sums are too long."""
+    return _traced(lambda photons, words, given: lookup.count(steps, photons, words, given), 1, bits)
+
+
+def _traced(
+    count: Callable[[list[Any], Callable[[Any], list[Any]], list[Any]], tuple[list[Any], Any]],
+    planes: int,
+    bits: int | None,
+) -> Callable[..., tuple[Any, Any]]:
+    """A kernel that draws with `count`: photons, words and arguments of a lane -> its codes and a doubt."""
+    import drjit as dr
+
+    jit = backend()
+
+    def draw(
+        pair: Any, frame: Any, row: Any, arguments: list[Any], places: list[Any], block: Any, high: Any, low: Any
+    ) -> tuple[Any, Any]:
+        place, below_y, below_t, mask_x, mask_y = places
+        t, y, x = place >> below_t, (place & mask_y) >> below_y, place & mask_x
+        first_plane = (frame + t) * planes
+        photons = [dr.reinterpret_array(jit.Float, jit.UInt32(half)) for half in (pair, pair >> 32)]
+
+        def words(plane: Any) -> list[Any]:
+            """Two neighbouring lanes share a block of four words."""
+            w = _philox(x // 2 + block, y + row, first_plane + plane, high, low)
+            right = (x & 1) == 1
+            return [dr.select(right, w[2], w[0]), dr.select(right, w[3], w[1])]
+
+        codes, doubt = count(photons, words, arguments)
+        if bits is None:
+            out = codes[0] | (codes[1] << 8)
+        else:
+            out = (codes[0] << bits) | codes[1]
+            out = jit.UInt8(out) if bits <= 4 else out
+        return out, jit.UInt8(dr.select(doubt, jit.UInt32(1), jit.UInt32(0)))
+
+    return dr.freeze(draw, warn_after=1000)
+
+
+def _philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
+    """Four words of one block; the compiled twin of keys.philox4x32 at redraw 0."""
+    import drjit as dr
+
+    u32 = type(x)
+    c0, c1, c2, c3 = x, y, frame, u32(0)
+    for _ in range(ROUNDS):
+        a, b = u32(_MULTIPLIERS[0]), u32(_MULTIPLIERS[1])
+        c0, c1, c2, c3 = dr.mul_hi(b, c2) ^ c1 ^ high, b * c2, dr.mul_hi(a, c0) ^ c3 ^ low, a * c0
+        high, low = high + _KEY_STEPS[0], low + _KEY_STEPS[1]
+    return [c0, c1, c2, c3]
+
+
+def _count(
+    plan: Plan, photons: list[Any], words: Callable[[Any], list[Any]], scalars: list[Any]
+) -> tuple[list[Any], Any]:
+    """Codes of the pixels of a lane, and whether one of them is doubtful."""
+    import drjit as dr
+
+    jit, real = backend(), backend().Float
+    sums = _sums(plan)
+    efficiency, dark, margin, *scalars = scalars
+    doubt = no_light(photons)
+    arrivals = [dr.fma(theta, efficiency, dark) for theta in photons]
+
+    if plan.planes == 1:
+        codes = []
+        for mean, word in zip(arrivals, words(jit.UInt32(0)), strict=True):
+            steps, unit = _steps(sums, mean, scalars)
+            code, near = _search(steps, uniform32(word) * unit)
+            codes.append(code)
+            doubt |= ~(near >= margin * unit)
+        return codes, doubt
+    nothing = [_steps(sums, mean, scalars)[0][0] for mean in arrivals]
+
+    def add_plane(plane: Any, near: Any, *counts: Any) -> tuple[Any, ...]:
+        sums = []
+        for count, word, step in zip(counts, words(plane), nothing, strict=True):
+            code, distance = _search([step], uniform32(word))
+            sums.append(count + code)
+            near = smaller(near, distance)
+        return (plane + 1, near, *sums)
+
+    state = (jit.UInt32(0), real(1), *(jit.UInt32(0) for _ in photons))
+    _, near, *codes = dr.while_loop(state, lambda plane, *_: plane < plan.planes, add_plane)
+    return codes, doubt | ~(near >= margin)
+
+
+def _search(steps: list[Any], u: Any) -> tuple[Any, Any]:
+    """How many of 2^b - 1 ascending steps are at or under u, by bisection, and the distance to the nearest step.
+
+    The step before u and the one behind it are both on the way, so nothing else need be looked at.
+    """
+    import drjit as dr
+
+    count = backend().UInt32
+    code, near = count(0), type(u)(dr.inf)
+    while steps:
+        half = len(steps) // 2
+        distance = u - steps[half]
+        passed = distance >= 0
+        near = smaller(near, dr.abs(distance))
+        code += dr.select(passed, count(half + 1), count(0))
+        steps = [dr.select(passed, steps[half + 1 + i], steps[i]) for i in range(half)]
+    return code, near
+
+
+def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list[Any], Any]:
+    """The steps F_k of one pixel, in a unit of its own."""
+    import drjit as dr
+
+    real = type(mean)
+    if isinstance(steps, Live):
+        result = []
+        for k in range(len(steps.shares)):
+            live = smaller(mean * scalars[k], real(_CERTAIN))
+            total = real(1)
+            for n in range(k, 0, -1):
+                total = dr.fma(total, live * (1 / n), 1)
+            result.append(total * _exp_below_zero(-live))
+        return result + [real(2)] * (steps.levels - 1 - len(result)), real(1)  # no live time: never passed
+    n = len(steps.full)
+    highest, scale = scalars[:2]
+    full, bands = scalars[2 : 2 + n], iter(scalars[2 + n :])
+    mean = smaller(mean, highest)
+    unit, grow = dr.exp(mean * 0.5 if steps.halved else mean), mean * scale
+    terms = [1 / unit if steps.halved else real(1)]
+    for _ in range(1, n):
+        terms.append(terms[-1] * grow)
+    result, total, summed = [], real(0), 0
+    for prefix, band, floor in zip(steps.prefix, steps.band, steps.floor, strict=True):
+        for m in range(summed, prefix):
+            total = dr.fma(terms[m], full[m], total)
+        summed = max(summed, prefix)
+        step = total if prefix else real(0)
+        for m in range(len(band)):
+            step = dr.fma(terms[prefix + m], next(bands), step)
+        result.append(dr.fma(unit, next(bands), step) if floor else step)
+    return result, unit
+
+
+def _exp_below_zero(x: Any) -> Any:
+    """exp(x) of float32 -87 <= x <= 0 within 1.2e-7 of its value: `drjit.exp` also minds everything that is not there.
+
+    2^n exp(r) with |r| <= log(2)/2; adding 1.5 2^23 rounds n to its last bits, where the exponent takes it from. The
+    polynomial is that of Cephes (Moshier, expf).
+    """
+    import drjit as dr
+
+    real, bits = backend().Float, backend().UInt32
+    magic = real(1.5 * 2.0**23)
+    shifted = dr.fma(x, real(1 / log(2)), magic)
+    n = shifted - magic
+    r = dr.fma(n, real(-0.693359375), x)  # log(2) in two parts, the first one short
+    r = dr.fma(n, real(2.12194440e-4), r)
+    series = real(1.9875691500e-4)
+    for c in (1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1):
+        series = dr.fma(series, r, real(c))
+    value: Any = dr.reinterpret_array(bits, dr.fma(series, r * r, r) + 1)
+    exponent: Any = dr.reinterpret_array(bits, shifted)
+    return dr.reinterpret_array(real, value + (exponent << 23))
+
+
+def _numbers(plan: Plan) -> list[float]:
+    """The numbers of a plan, in the order in which `_count` and `_steps` take them."""
+    values, steps = [plan.efficiency, plan.dark, plan.margin], _sums(plan)
+    if isinstance(steps, Live):
+        return [*values, *steps.shares]
+    values += [steps.highest, 1 / steps.scale, *steps.full]
+    for band, floor in zip(steps.band, steps.floor, strict=True):
+        values += [*band, floor] if floor else [*band]
+    return [float(value) for value in values]
+
+
+@lru_cache(maxsize=32)
+def _arguments(plan: Plan) -> list[Any]:
+    """Nothing for the first sensors of a process, whose numbers are constants of kernels of their own; for the rest the
+    numbers, as arguments of a shared (about 20 % slower) kernel: a training that varies its sensors compiles once.
+    """
+    import drjit as dr
+
+    if isinstance(plan.steps, Curves):
+        return lookup.arguments(plan.efficiency, plan.dark, plan.margin, plan.steps)
+    if _arguments.cache_info().misses <= _CONSTANT_PLANS:
+        return []
+    return [dr.opaque(backend().Float, number) for number in _numbers(plan)]
+
+
+def _sums(plan: Plan) -> Electrons | Live:
+    assert not isinstance(plan.steps, Curves)
+    return plan.steps

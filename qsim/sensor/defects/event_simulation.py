@@ -1,0 +1,177 @@
+"""Photon by photon: the slow and obvious simulator of counting pixels, and the oracle of `spad.CountingSPAD`.
+
+    flux inside each exposure -> arrival times -> avalanches that find the pixel live -> counts -> codes
+
+It covers what the closed forms leave out: light that varies inside an exposure, dead time carried into the next
+frame, and afterpulses. `effects` says how large each of them is for a given scene, and `sample` follows the photons
+only where one of them exceeds the tolerance; otherwise the closed form draws.
+
+The pixel is gated: it sees nothing between the exposures, while dead times and trapped carriers go on in real time.
+Afterpulses: a counted avalanche leaves, with probability `afterpulse`, one trapped carrier that is released after an
+exponential delay of mean `afterpulse_delay`. Released while the pixel is dead, or between exposures, it is lost
+(though it restarts the dead time of a paralyzable pixel); released while the pixel is live, it is a count like any
+other and may leave its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from heapq import heapify, heappop, heappush
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.keys import Key
+from qsim.sensor.spad import CountingSPAD
+
+TOLERANCE = 1e-3  # relative change of the mean count that a closed form may miss
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What a pixel remembers; without any of it, it is the memoryless `CountingSPAD`."""
+
+    carry: bool = False  # dead times and trapped carriers go on from one frame to the next
+    afterpulse: float = 0.0  # probability that a counted avalanche leaves a trapped carrier
+    afterpulse_delay: float = 0.0  # s, mean of the exponential delay from avalanche to release
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.afterpulse < 1:
+            raise ValueError(f"Memory.afterpulse is a probability below 1, got {self.afterpulse!r}")
+        if self.afterpulse > 0 and not self.afterpulse_delay > 0:
+            raise ValueError(f"Memory.afterpulse_delay is in seconds and above 0, got {self.afterpulse_delay!r}")
+
+
+@dataclass(frozen=True)
+class State:
+    """A pixel between two exposures."""
+
+    dead_until: float = -np.inf  # s
+    trapped: tuple[float, ...] = ()  # s, when carriers will be released
+
+
+@dataclass(frozen=True)
+class Effects:
+    """Relative change of the mean count that the closed form misses, each to leading order, for the worst pixel."""
+
+    varying_flux: float
+    carried_dead_time: float
+    afterpulses: float
+
+    @property
+    def largest(self) -> float:
+        return max(self.varying_flux, self.carried_dead_time, self.afterpulses)
+
+    def __str__(self) -> str:
+        return (
+            f"varying flux {self.varying_flux:.2g}, carried dead time {self.carried_dead_time:.2g}, "
+            f"afterpulses {self.afterpulses:.2g} of the mean count"
+        )
+
+
+def sample(
+    sensor: CountingSPAD,
+    photons: Array,
+    exposure: float,
+    *,
+    frame_time: float,
+    key: Key,
+    memory: Memory = Memory(),
+    origin: tuple[int, int] = (0, 0),
+    tolerance: float = TOLERANCE,
+) -> tuple[Array, Effects, str]:
+    """Codes [T, H, W] for photons [T, S, H, W] in S equal slices of each exposure, the effects, and who drew the codes.
+
+    "closed form" draws where no effect exceeds `tolerance`; else "events", photon by photon. Each pixel has a stream of
+    its own, so crops agree with the whole; frames do not, unless they start with the clip: a memory is replayed.
+    """
+    if photons.ndim != 4 or not photons.size:
+        raise ValueError(f"photons have the shape [T, slices, H, W], got {list(photons.shape)}")
+    if not frame_time >= exposure > 0:
+        raise ValueError(f"frame_time {frame_time!r} s is at least the exposure {exposure!r} s, both above 0")
+    sensor.arrivals(photons, exposure)  # refuses what is no light level
+    found = effects(sensor, photons, exposure, frame_time, memory)
+    if found.largest <= tolerance:
+        return sensor.sample(photons.sum(axis=1), exposure, key=key, origin=origin), found, "closed form"
+    frames, _, height, width = photons.shape
+    codes = np.empty((frames, height, width), sensor.dtype)
+    for y in range(height):
+        for x in range(width):
+            rng = pixel_stream(key, y + origin[0], x + origin[1])
+            counts = simulate(sensor, photons[:, :, y, x], exposure, frame_time, memory, rng)
+            codes[:, y, x] = np.minimum(counts, sensor.levels - 1)
+    return codes, found, "events"
+
+
+def effects(sensor: CountingSPAD, photons: Array, exposure: float, frame_time: float, memory: Memory) -> Effects:
+    """How much of the mean count each effect changes, for photons [T, S, ...]: the largest of all pixels and frames.
+
+    With r arrivals per second a dead time tau loses about r^2 tau counts per second. If r varies with the coefficient
+    of variation c that grows by the factor 1 + c^2; a pixel is dead at the start of a frame with probability r tau, for
+    tau / 2 on average, if no longer gap than tau lies before it; an afterpulse adds its probability (at most).
+    """
+    slices = photons.shape[1]
+    rates = sensor.efficiency * np.asarray(photons, float) + sensor.dark_rate * exposure / slices
+    arrivals = rates.sum(axis=1)
+    share = sensor.dead_time / exposure
+    spread = slices * (rates**2).sum(axis=1) - arrivals**2  # c^2 lambda^2
+    varying = share * np.divide(spread, arrivals, out=np.zeros_like(arrivals), where=arrivals > 0)
+    reach = max(0.0, sensor.dead_time - (frame_time - exposure))
+    carried = arrivals.max() * (reach / exposure) ** 2 / 2 if memory.carry else 0.0
+    return Effects(float(varying.max()), float(carried), memory.afterpulse)
+
+
+def simulate(
+    sensor: CountingSPAD,
+    photons: Array,
+    exposure: float,
+    frame_time: float,
+    memory: Memory,
+    rng: np.random.Generator,
+) -> Array:
+    """Counts [T], not clipped, of one pixel for expected photons [T, S] in S equal slices of each exposure."""
+    rates = sensor.efficiency * photons + sensor.dark_rate * exposure / photons.shape[1]
+    counts = np.zeros(len(photons), np.int64)
+    state = State()
+    for t, row in enumerate(rates):
+        start = t * frame_time
+        counts[t], state = expose(sensor, arrival_times(row, start, exposure, rng), start, exposure, memory, state, rng)
+        if not memory.carry:
+            state = State()
+    return counts
+
+
+def arrival_times(rates: Array, start: float, exposure: float, rng: np.random.Generator) -> list[float]:
+    """Times [s] of a Poisson process with `rates` [S] expected arrivals in equal slices of the exposure."""
+    slices = np.repeat(np.arange(len(rates)), rng.poisson(rates))
+    return list(start + (slices + rng.random(slices.size)) * (exposure / len(rates)))
+
+
+def expose(
+    sensor: CountingSPAD,
+    arrivals: list[float],
+    start: float,
+    exposure: float,
+    memory: Memory,
+    state: State,
+    rng: np.random.Generator,
+) -> tuple[int, State]:
+    """One exposure: every arrival and every released carrier in the order of time -> counts, state afterwards."""
+    waiting = [*arrivals, *(time for time in state.trapped if time >= start)]
+    heapify(waiting)
+    count, dead_until = 0, state.dead_until
+    while waiting and waiting[0] < start + exposure:
+        time = heappop(waiting)
+        live = time >= dead_until
+        if live:
+            count += 1
+            if memory.afterpulse and rng.random() < memory.afterpulse:
+                heappush(waiting, time + rng.exponential(memory.afterpulse_delay))
+        if live or sensor.paralyzable:
+            dead_until = time + sensor.dead_time
+    return count, State(dead_until, tuple(waiting))
+
+
+def pixel_stream(key: Key, row: int, column: int) -> np.random.Generator:
+    """The generator of one pixel of the full frame; events take as many numbers as they need."""
+    return np.random.Generator(np.random.Philox(key=[key.philox_key, row << 32 | column], counter=[0, 0, 0, key.frame]))

@@ -1,0 +1,295 @@
+"""Named sensors, every number with its source, and sensors from a user's TOML file.
+
+A number that its maker or authors did not publish is left out: a detection efficiency of 1 with the note "detected
+photons" means that light has to be given as photons that this sensor detects. A fill factor belongs to the camera
+(`scene.Camera.fill_factor`), never to the sensor, so that it enters once.
+
+    load("quiver-physical", ppp=3.25)     load("spad-320x240", bits=3)     load("my_sensor.toml")
+
+    # my_sensor.toml: the fields and units of the sensor classes, nothing else
+    [sensor]
+    model = "QIS"                # QIS, BinarySPAD or CountingSPAD
+    quantum_efficiency = 0.8     # electrons per photon
+    dark_current = 1.6           # e-/s
+    read_noise = 0.2             # e- rms
+    bits = 3
+    [sources]                    # optional: one sentence per field
+    read_noise = "photon transfer of 2026-05-03, 25 C"
+    [defects]                    # optional: hot and dead pixels, PRNU, afterpulses, crosstalk ...: see flaws.py
+    prnu = 0.01
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, fields
+from pathlib import Path
+from types import MappingProxyType
+
+from qsim import files
+from qsim.checks import suggest
+from qsim.sensor.qis import QIS
+from qsim.sensor.sensor import Sensor
+from qsim.sensor.spad import BinarySPAD, CountingSPAD
+
+MODELS: Mapping[str, type[Sensor]] = MappingProxyType(
+    {"QIS": QIS, "BinarySPAD": BinarySPAD, "CountingSPAD": CountingSPAD}
+)
+
+_QUIVER_QE = 0.8  # e- per photon; Chennuri et al., "Quanta Video Restoration", ECCV 2024, simulation settings
+_QUIVER_READ_NOISE = 0.2  # e- rms; same
+_QUIVER_DARK = 1.6  # e-/pixel/s in the text of the same paper, e-/pixel/FRAME in its authors' program
+
+
+def quiver_paper(bits: int = 3) -> QIS:
+    """The QUIVER paper's text: gain 1, dark current per second; two thirds of a flat field saturate at 9.75 PPP."""
+    return QIS(_QUIVER_QE, _QUIVER_DARK, _QUIVER_READ_NOISE, bits)
+
+
+def quiver_published(ppp: float, bits: int = 3, exposure: float = 5e-4) -> QIS:
+    """The QUIVER authors' program: 1.6 e- dark per frame of `exposure` [s], gain 0.5 (2^b - 1) / PPP."""
+    if not exposure > 0:
+        raise ValueError(f"quiver-published: the exposure is in seconds and above 0, got {exposure!r}")
+    return QIS(_QUIVER_QE, _QUIVER_DARK / exposure, _QUIVER_READ_NOISE, bits, gain=_gain("quiver-published", ppp, bits))
+
+
+def quiver_physical(ppp: float, bits: int = 3) -> QIS:
+    """Our default: dark current per second as in the paper's text, the program's gain rule 0.5 (2^b - 1) / PPP."""
+    return QIS(_QUIVER_QE, _QUIVER_DARK, _QUIVER_READ_NOISE, bits, gain=_gain("quiver-physical", ppp, bits))
+
+
+def _gain(name: str, ppp: float, bits: int) -> float:
+    """Codes per electron of the rule 0.5 (2^b - 1) / PPP: the mean light level falls on half of the code range."""
+    if not 0 < ppp < float("inf"):
+        raise ValueError(f"{name}: the gain follows the light level; give the photons per pixel above 0, got {ppp!r}")
+    return 0.5 * (2**bits - 1) / ppp
+
+
+@dataclass(frozen=True)
+class Device:
+    """One named sensor: how it is made, and where each number comes from."""
+
+    name: str
+    what: str  # one line
+    bits: int  # where the caller does not say
+    make: Callable[[float | None, int, float], Sensor]  # (ppp, bits, exposure [s]) -> Sensor
+    sources: Mapping[str, str]  # field -> source, condition
+    follows_light: bool = False  # the gain is set from the PPP
+
+
+_QUIVER_SOURCES = {
+    "quantum_efficiency": "0.8; Chennuri et al., Quanta Video Restoration, ECCV 2024, simulation settings",
+    "read_noise": "0.2 e- rms; same paper (also its figure 1)",
+}
+_RULE = "0.5 (2^bits - 1) / PPP; the rule behind the default of the authors' program, 1.0769 at 3.25 PPP and 3 bits"
+
+
+def _need(name: str, ppp: float | None) -> float:
+    if ppp is None:
+        raise ValueError(f"{name}: the gain follows the light level; say the photons per pixel (--ppp)")
+    return ppp
+
+
+DEVICES: Mapping[str, Device] = MappingProxyType(
+    {
+        device.name: device
+        for device in (
+            Device(
+                "quiver-physical",
+                "QUIVER's sensor with the text's dark current and the program's gain rule (default)",
+                3,
+                lambda ppp, bits, exposure: quiver_physical(_need("quiver-physical", ppp), bits),
+                {**_QUIVER_SOURCES, "dark_current": "1.6 e-/s; same paper, text", "gain": _RULE},
+                follows_light=True,
+            ),
+            Device(
+                "quiver-paper",
+                "QUIVER's sensor as its paper's text has it: gain 1",
+                3,
+                lambda ppp, bits, exposure: quiver_paper(bits),
+                {**_QUIVER_SOURCES, "dark_current": "1.6 e-/s; same paper, text", "gain": "1; the text names no gain"},
+            ),
+            Device(
+                "quiver-published",
+                "QUIVER's sensor as its authors' program has it: dark electrons per frame",
+                3,
+                lambda ppp, bits, exposure: quiver_published(_need("quiver-published", ppp), bits, exposure),
+                {
+                    **_QUIVER_SOURCES,
+                    "dark_current": "1.6 e- per frame (so 1.6/exposure); the authors' published program",
+                    "gain": _RULE,
+                },
+                follows_light=True,
+            ),
+            Device(
+                "cmos-5.1e",
+                "conventional CMOS pixel for comparison, 10 to 12 bits",
+                10,
+                lambda ppp, bits, exposure: QIS(_QUIVER_QE, _QUIVER_DARK, 5.1, bits, gain=1.0, offset=32.0),
+                {
+                    "read_noise": "5.1 e- rms; QUIVER paper, figure 1",
+                    "quantum_efficiency": "0.8; set equal to the QIS, so that a comparison shows the read noise alone",
+                    "dark_current": "1.6 e-/s; set equal to the QIS",
+                    "gain": "1 code per electron; our choice",
+                    "offset": "32 codes, six sigma of the read noise, so that black is not clipped; our choice",
+                },
+            ),
+            Device(
+                "spad-320x240",
+                "the QUIVER paper's real camera: 320 x 240 clocked SPADs, 10 000 planes/s; a b-bit code sums 2^b - 1",
+                1,
+                lambda ppp, bits, exposure: BinarySPAD(1.0, 0.0, bits),
+                {
+                    "pde": "1, not published: give light in detected photons (the paper's 4.9 PPP per 7 planes)",
+                    "dark_count_rate": "0, not published: dark counts are part of the detected photons",
+                },
+            ),
+            Device(
+                "qis-ma2017",
+                "1 Mpixel stacked BSI quanta image sensor, 1.1 um pixels, up to 1040 fps",
+                1,
+                lambda ppp, bits, exposure: QIS(1.0, 0.2, 0.21, bits),
+                {
+                    "read_noise": "0.21 e- rms, array average, room temperature; Ma et al., Optica 4, 1474 (2017)",
+                    "dark_current": "0.2 e-/s, an upper bound ('less than'), room temperature; same paper, abstract",
+                    "quantum_efficiency": "1, left out: give light in generated electrons",
+                    "gain": "1 code per electron; thresholds at half electrons",
+                },
+            ),
+            Device(
+                "megax-a",
+                "1 Mpixel clocked SPAD array, pixel type A (7 transistors), 9.4 um, 24 000 planes/s",
+                1,
+                lambda ppp, bits, exposure: BinarySPAD(0.105, 0.4, bits),
+                {
+                    "pde": "0.105, peak probability on the active area (fill factor 0.070 goes to the camera), 3.3 V "
+                    "excess bias; Morimoto et al., Optica 7, 346 (2020), arXiv:1912.12910",
+                    "dark_count_rate": "0.4 /s, median, 3.3 V excess bias; same paper",
+                },
+            ),
+            Device(
+                "megax-b",
+                "the same array, pixel type B (5.75 transistors)",
+                1,
+                lambda ppp, bits, exposure: BinarySPAD(0.267, 2.0, bits),
+                {
+                    "pde": "0.267, peak probability on the active area (fill factor 0.134 goes to the camera), 3.3 V "
+                    "excess bias; Morimoto et al., Optica 7, 346 (2020), arXiv:1912.12910",
+                    "dark_count_rate": "2.0 /s, median, 3.3 V excess bias; same paper",
+                },
+            ),
+            Device(
+                "spad512s",
+                "512 x 512 clocked SPAD camera, up to 100 000 planes/s; deeper codes are sums of planes",
+                1,
+                lambda ppp, bits, exposure: BinarySPAD(0.5, 25.0, bits),
+                {
+                    "pde": "0.5 at 520 nm, on the active area; maker's product page (Pi Imaging SPAD512S)",
+                    "dark_count_rate": "25 /s, upper bound of the typical pixel; same page",
+                },
+            ),
+            Device(
+                "spcm20a",
+                "single counting SPAD module, 20 um active diameter",
+                8,
+                lambda ppp, bits, exposure: CountingSPAD(0.35, 25.0, 35e-9, bits),
+                {
+                    "pde": "0.35 at 500 nm, typical; maker's product page (Thorlabs SPCM20A)",
+                    "dark_count_rate": "25 /s typical, 60 /s at most; same page",
+                    "dead_time": "35 ns, from the page's 'a photon every 35 ns' (28 MHz at most); active quenching",
+                    "paralyzable": "False; actively quenched",
+                },
+            ),
+        )
+    }
+)
+
+
+def load(name: str | Path, *, ppp: float | None = None, bits: int | None = None, exposure: float = 5e-4) -> Sensor:
+    """The sensor of a name in `DEVICES` or of a TOML file.
+
+    `ppp` [photons/pixel] sets the gain where it follows the light, `bits` replaces the device's own depth (a TOML file
+    states its own), `exposure` [s] matters for dark electrons given per frame. `ValueError` names what is wrong.
+    """
+    if str(name) in DEVICES:
+        device = DEVICES[str(name)]
+        return device.make(ppp, device.bits if bits is None else bits, exposure)
+    path = Path(name)
+    if path.suffix != ".toml":
+        raise ValueError(
+            f"unknown sensor {str(name)!r}{suggest(str(name), DEVICES)}; `qsim doctor --devices` lists all"
+        )
+    sensor = from_toml(path)
+    if bits is not None and bits != sensor.bits:
+        raise ValueError(f"{path}: the file says bits = {sensor.bits}, asked for {bits}; change one of them")
+    return sensor
+
+
+def from_toml(path: str | Path) -> Sensor:
+    """The sensor of a TOML file with a table [sensor] and, optionally, [sources] and [defects] (flaws.py); strict."""
+    path = Path(path)
+    tables = files.read_toml(path, "sensor file")
+    for key in tables:
+        if key not in ("sensor", "sources", "defects"):  # [defects] is read by flaws.py
+            raise ValueError(f"{path}: unknown table [{key}]{suggest(key, ('sensor', 'sources', 'defects'))}")
+    if not isinstance(tables.get("sensor"), dict):
+        raise ValueError(f"{path}: a table [sensor] with model, bits and the model's fields is missing")
+    sensor = from_dict(tables["sensor"], where=f"{path}: [sensor]")
+    known = [field.name for field in fields(sensor)]  # type: ignore[arg-type]  # every model is a dataclass
+    for key in tables.get("sources", {}):
+        if key not in known:
+            raise ValueError(f"{path}: unknown key {key!r} in [sources]{suggest(key, known)}")
+    return sensor
+
+
+def from_dict(settings: Mapping[str, object], where: str = "sensor") -> Sensor:
+    """The sensor that `Sensor.to_dict` described: {"model": "QIS", field: value, ...}; strict, `ValueError`."""
+    name = settings.get("model")
+    if not isinstance(name, str) or name not in MODELS:
+        raise ValueError(f"{where}: model is one of {', '.join(MODELS)}, got {name!r}{suggest(str(name), MODELS)}")
+    model = MODELS[name]
+    wanted = {field.name: field for field in fields(model)}  # type: ignore[arg-type]  # every model is a dataclass
+    values = {key: value for key, value in settings.items() if key != "model"}
+    for key, value in values.items():
+        if key not in wanted:
+            raise ValueError(f"{where}: unknown key {key!r} for {name}{suggest(key, wanted)}")
+        values[key] = _typed(where, key, value, str(wanted[key].type))
+    missing = [key for key, field in wanted.items() if key not in values and field.default is MISSING]
+    if missing:
+        raise ValueError(f"{where}: {name} needs {', '.join(missing)}")
+    try:
+        return model(**values)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def listing() -> list[dict[str, object]]:
+    """All named sensors for people and programs: name, what, model, settings at 3.25 PPP, sources."""
+    rows: list[dict[str, object]] = []
+    for device in DEVICES.values():
+        settings = device.make(3.25, device.bits, 5e-4).to_dict()
+        rows.append(
+            {
+                "name": device.name,
+                "what": device.what,
+                "settings": settings,
+                "settings_at": "3.25 PPP, 0.5 ms" if device.follows_light else "any light level",
+                "sources": dict(device.sources),
+            }
+        )
+    return rows
+
+
+def _typed(where: str, key: str, value: object, annotation: str) -> object:
+    """`value` as the type of its field: whole numbers may stand for real ones, truth values for nothing else."""
+    if "None" in annotation and value is None:
+        return None
+    if annotation == "bool":
+        good, kind = isinstance(value, bool), "true or false"
+    elif annotation == "int":
+        good, kind = isinstance(value, int) and not isinstance(value, bool), "a whole number"
+    else:
+        good, kind = isinstance(value, int | float) and not isinstance(value, bool), "a number"
+    if not good:
+        raise ValueError(f"{where}: {key} is {kind}, got {value!r}")
+    return float(value) if annotation.startswith("float") else value  # type: ignore[arg-type]

@@ -1,0 +1,228 @@
+"""From codes back to light: response curves, variance stabilisation and maximum likelihood, for any sensor.
+
+Everything here reads a sensor only through `log_pmf` and `dcdf`. A grid of light levels from 0 to where the sensor has
+nothing more to say brackets every answer; exact evaluations refine it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from math import log
+from statistics import NormalDist
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy import ndarray as Array
+
+if TYPE_CHECKING:
+    from qsim.sensor.sensor import Sensor
+
+_DECADES, _PER_DECADE = 8, 128  # of the grid: linear interpolation between its points is good to 4e-5
+_FLAT = 1e-14  # change of the cdf per doubling of light at which a sensor is taken as saturated
+_DOUBLINGS = 44  # of light above white in which a sensor must saturate
+_NEVER = -1e290  # stands for log 0 where it may be multiplied by 0
+_STEPS = 100  # of root finding; 10 are usual
+_CHUNK = 1 << 12  # different histograms at a time
+
+
+@dataclass(frozen=True)
+class Response:
+    """A sensor's answer to light, as a table; all arrays [G], photons ascending from 0."""
+
+    photons: Array
+    mean: Array  # of the code
+    variance: Array  # of the code
+    stabilised: Array  # s(mean) = integral of dmean / sqrt(variance): codes mapped by s have a variance near 1
+    expected: Array  # E[s(code)], for the exact unbiased inverse
+
+    def stabilise(self, codes: Array) -> Array:
+        """s(code): codes, or means of codes -> float64 of the same shape."""
+        return np.interp(codes, self.mean, self.stabilised)
+
+    def invert(self, stabilised: Array) -> Array:
+        """Photons whose expected stabilised code is this: exact for noiseless input, clamped to the table's ends."""
+        return np.interp(stabilised, self.expected, self.photons)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Light from codes; arrays [...] in photons.
+
+    Two ends are special. A histogram that is likeliest in the dark has photons = lower = 0 and a one-sided `upper`.
+    One that gets ever likelier with light (all codes saturated) has `upper` infinite, a one-sided `lower`, and as
+    `photons` the light at which it has half of its final likelihood: for n saturated codes, P(saturated)^n = 1/2.
+    """
+
+    photons: Array
+    lower: Array
+    upper: Array
+
+
+@dataclass(frozen=True)
+class _Grid:
+    photons: Array  # [G]
+    log_pmf: Array  # [G, levels]
+    saturates: bool  # at the end of the grid the code has its final distribution
+
+
+@lru_cache(maxsize=32)
+def _grid(sensor: Sensor, exposure: float) -> _Grid:
+    end, brightest = sensor.white(exposure), sensor.brightest(exposure)
+    if brightest <= 0:
+        raise ValueError(f"{type(sensor).__name__}: dark counts alone exceed the light above which the mean code falls")
+    dark = sensor.cdf(np.array([0.0]), exposure)
+    for _ in range(_DOUBLINGS):
+        if 2 * end >= brightest:
+            break
+        here, there = sensor.cdf(np.array([end, 2 * end]), exposure)
+        if np.ptp([here, there], axis=0).max() <= _FLAT < np.abs(here - dark).max():  # a high threshold starts flat
+            break
+        end *= 2
+    else:
+        end = sensor.white(exposure)  # no light changes its codes
+    saturates = 2 * end < brightest
+    end = end if saturates else brightest
+    photons = np.append(0.0, np.geomspace(end * 10.0**-_DECADES, end, _DECADES * _PER_DECADE + 1))
+    return _Grid(photons, np.maximum(sensor.log_pmf(photons, exposure), _NEVER), saturates)
+
+
+def response(sensor: Sensor, exposure: float) -> Response:
+    """The tables of `Response` from no light to saturation (or to where the mean code begins to fall)."""
+    grid = _grid(sensor, exposure)
+    codes, pmf = np.arange(sensor.levels, dtype=float), np.exp(grid.log_pmf)
+    mean = np.maximum.accumulate(pmf @ codes)
+    variance = (pmf * (codes - (pmf @ codes)[:, None]) ** 2).sum(axis=1)
+    deviation = np.sqrt(variance)
+    # A step is 2 (change of the mean) / (sigma + next sigma): exact where the variance is linear in the mean
+    width = deviation[1:] + deviation[:-1]
+    steps = np.divide(2 * np.diff(mean), width, out=np.zeros_like(width), where=width > 0)
+    stabilised = np.append(0.0, np.cumsum(steps))
+    expected = np.maximum.accumulate(pmf @ np.interp(codes, mean, stabilised))
+    return Response(grid.photons, mean, variance, stabilised, expected)
+
+
+def maximum_likelihood(sensor: Sensor, histogram: Array, exposure: float, confidence: float = 0.95) -> Estimate:
+    """See `Sensor.maximum_likelihood`."""
+    counts = _checked(sensor, histogram)
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence is a probability above 0 and below 1, got {confidence!r}")
+    _refuse_impossible(sensor, exposure, counts)
+    distinct, where = np.unique(counts.reshape(-1, sensor.levels), axis=0, return_inverse=True)
+    grid, parts = _grid(sensor, exposure), []
+    for start in range(0, len(distinct), _CHUNK):
+        likelihood = _Likelihood(sensor, exposure, distinct[start : start + _CHUNK])
+        parts.append(_estimate(likelihood, grid, confidence))
+    found = np.concatenate(parts, axis=1)[:, where.ravel()] if parts else np.zeros((3, 0))
+    return Estimate(*found.reshape(3, *counts.shape[:-1]))
+
+
+def _checked(sensor: Sensor, histogram: Array) -> Array:
+    counts = np.asarray(histogram, np.float64)
+    if counts.ndim == 0 or counts.shape[-1] != sensor.levels:
+        raise ValueError(f"histogram has the shape [..., {sensor.levels}], one bin per code; got {list(counts.shape)}")
+    wrong = ~np.all(np.isfinite(counts) & (counts >= 0), axis=-1) | (counts.sum(axis=-1) <= 0)
+    if wrong.any():
+        where = [int(i) for i in np.argwhere(wrong)[0]]
+        raise ValueError(
+            f"histogram{where or ''} counts codes: finite, not negative, at least one; got {counts[wrong][0]}"
+        )
+    return counts
+
+
+def _refuse_impossible(sensor: Sensor, exposure: float, counts: Array) -> None:
+    impossible = (counts > 0) & (_grid(sensor, exposure).log_pmf <= _NEVER).all(axis=0)
+    if impossible.any():
+        *where, code = (int(i) for i in np.argwhere(impossible)[0])
+        raise ValueError(f"histogram{where or ''} holds code {code}, which no light gives with this {sensor!r}")
+
+
+@dataclass(frozen=True)
+class _Likelihood:
+    """Histograms [h, levels] as functions of light: for some rows at one light level each, [p], [p] -> [p]."""
+
+    sensor: Sensor
+    exposure: float
+    counts: Array
+
+    def value(self, photons: Array, rows: Array) -> Array:
+        """Log-likelihood."""
+        return (self.counts[rows] * self._log_pmf(photons, rows)).sum(axis=1)
+
+    def score(self, photons: Array, rows: Array) -> Array:
+        """Its derivative by photons."""
+        slope = np.diff(self.sensor.dcdf(photons, self.exposure), axis=-1, prepend=0.0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            ratio = slope * np.exp(-self._log_pmf(photons, rows))
+        ratio[(slope == 0) | (self.counts[rows] == 0)] = 0.0
+        return (self.counts[rows] * ratio).sum(axis=1)
+
+    def _log_pmf(self, photons: Array, rows: Array) -> Array:
+        return np.maximum(self.sensor.log_pmf(photons, self.exposure, self.counts[rows] > 0), _NEVER)
+
+
+def _estimate(likelihood: _Likelihood, grid: _Grid, confidence: float) -> Array:
+    """photons, lower, upper of every histogram: [3, h]."""
+    table = likelihood.counts @ grid.log_pmf.T
+    best, end, everything = table.argmax(axis=1), len(grid.photons) - 1, np.arange(len(table))
+    if grid.saturates:
+        bright = table[:, end] >= table.max(axis=1) - 1e-6
+    else:
+        bright = best == end
+        bright[bright] = likelihood.score(np.full(bright.sum(), grid.photons[end]), everything[bright]) >= 0
+    dark = (best == 0) & ~bright
+    dark[dark] = likelihood.score(np.zeros(dark.sum()), everything[dark]) <= 0
+    inner = everything[~dark & ~bright]
+    left, right = (grid.photons[np.clip(best[inner] + step, 0, end)] for step in (-1, 1))
+    photons = np.where(bright, grid.photons[end], 0.0)
+    photons[inner] = _root(likelihood.score, left, right, inner)
+    peak = np.where(bright, table[:, end], likelihood.value(photons, everything))
+    two_sided = -(NormalDist().inv_cdf((1 + confidence) / 2) ** 2) / 2
+    level = peak + np.where(dark | bright, log(1 - confidence), two_sided)
+    lower = _crossing(likelihood, grid, table, photons, level, -1)
+    upper = _crossing(likelihood, grid, table, photons, level, +1)
+    half = _crossing(likelihood, grid, table, photons, peak - log(2), -1)
+    return np.stack([np.where(bright, half, photons), np.where(dark, 0.0, lower), np.where(bright, np.inf, upper)])
+
+
+def _crossing(likelihood: _Likelihood, grid: _Grid, table: Array, start: Array, target: Array, direction: int) -> Array:
+    """Where the log-likelihood first falls to `target` on the way down (-1) or up (+1) from `start`; else 0 or inf."""
+    photons, size = grid.photons, len(grid.photons)
+    low_enough = table < target[:, None]
+    if direction < 0:
+        there = low_enough & (photons <= start[:, None])
+        outer = size - 1 - there[:, ::-1].argmax(axis=1)
+        inner = np.minimum(photons[np.minimum(outer + 1, size - 1)], start)
+    else:
+        there = low_enough & (photons >= start[:, None])
+        outer = there.argmax(axis=1)
+        inner = np.maximum(photons[np.maximum(outer - 1, 0)], start)
+    result = np.full(len(start), 0.0 if direction < 0 else np.inf)
+    rows = np.flatnonzero(there.any(axis=1))
+    ends = np.sort(np.stack([inner[rows], photons[outer[rows]]]), axis=0)
+    result[rows] = _root(lambda x, r: direction * (likelihood.value(x, r) - target[r]), ends[0], ends[1], rows)
+    return result
+
+
+def _root(function: Callable[[Array, Array], Array], low: Array, high: Array, rows: Array) -> Array:
+    """Where a function that falls from low to high is 0, each row in its own bracket: false position (Illinois)."""
+    low, high = low.copy(), high.copy()
+    f_low, f_high = function(low, rows), function(high, rows)
+    low, high = np.where(f_high >= 0, high, low), np.where(f_low <= 0, low, high)
+    for step in range(_STEPS):
+        todo = np.flatnonzero(high - low > 1e-13 * high)
+        if todo.size == 0:
+            break
+        a, b, fa, fb = low[todo], high[todo], f_low[todo], f_high[todo]
+        with np.errstate(invalid="ignore"):
+            x = b - fb * (b - a) / (fb - fa)
+        x = np.where((x > a) & (x < b) & (step % 4 < 3), x, (a + b) / 2)
+        f = function(x, rows[todo])
+        rises = f > 0
+        low[todo], high[todo] = np.where(rises, x, a), np.where(rises, b, x)
+        # The end that stays counts half next time, so that it does not stay for ever
+        f_low[todo], f_high[todo] = np.where(rises, f, fa / 2), np.where(rises, fb / 2, f)
+        exact = todo[f == 0]
+        low[exact] = high[exact]
+    return (low + high) / 2

@@ -1,0 +1,253 @@
+"""The paralyzable counter: how many of n arrivals are counted.
+
+An arrival is counted if none came in the dead time before it, so the code is 1 + the number of gaps between successive
+arrivals that reach the dead time (the pixel is live at the start). Let n arrivals fall on an exposure that is R dead
+times long. Choose which k - 1 of the n - 1 gaps are long and take one dead time out of each: what remains are
+n uniform points on a line l = R - k + 1 dead times long whose m = n - k chosen gaps are all shorter than one,
+
+    P(k counted | n) = C(n-1, k-1) (l / R)^n H(m, k; l),
+
+H being the probability of the latter. The textbook sums this by inclusion and exclusion, which cancels. Here H comes
+from a recursion of positive terms. With A = E[(l - S)+^k] / k! = H l^(m+k) / (m+k)!, S the sum of m uniform numbers
+on [0, 1): integration by parts of E[(l - S) (l - S)+^(k-1)] gives
+
+    (m + k) A(m, k; l) = l A(m, k-1; l) + m A(m-1, k; l-1),
+
+which starts at the density of S (k = -1), itself a B-spline with the positive recursion of de Boor and Cox:
+(m - 1) A(m, -1; l) = l A(m-1, -1; l) + (m - l) A(m-1, -1; l-1).
+
+Light so bright that the table would be too long paralyses the pixel, if the dead time is not far below the exposure:
+the few counts after the first then follow from the series of binomial moments, which no longer cancels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from math import floor, gamma
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.sensor.paralyzable_steps import LEAST
+from qsim.sensor.poisson import Mixture
+
+_BEYOND_TOP = 64  # codes above the top one that are summed term by term
+_LONGEST = 1 << 14  # arrivals in the longest table
+_MOST = 120  # counts that the alternating series looks at; 120 of 3 expected have a probability of 1e-142
+_SPARSE = 3.0  # expected counts after the first up to which the alternating series keeps 13 digits
+
+
+class Paralyzable:
+    """cdf, log_pmf and slope of the clipped count for Poisson means [p]; `ratio` = exposure / dead time."""
+
+    def __init__(self, ratio: float, levels: int) -> None:
+        self.ratio, self.levels = ratio, levels
+        self.possible = min(levels, most_counts(ratio) + 1)  # levels that can occur
+
+    def cdf(self, mean: Array) -> Array:
+        """P(code <= k): [p] -> [p, levels]."""
+        result = np.ones((len(mean), self.levels))
+        for rows, table in self._tables(mean, brief=True):
+            result[rows, : self.possible] = (
+                table.evaluate_cdf(mean[rows]) if table else self._paralysed(mean[rows]).cdf()
+            )
+        return result
+
+    def log_pmf(self, mean: Array, wanted: Array | None = None) -> Array:
+        """log P(code = k): [p] -> [p, levels]; `wanted` as in Mixture."""
+        result = np.full((len(mean), self.levels), -np.inf)
+        for rows, table in self._tables(mean):
+            some = None if wanted is None else wanted[rows, : self.possible]
+            part = table.evaluate_log_pmf(mean[rows], some) if table else self._paralysed(mean[rows]).log_pmf()
+            result[rows, : self.possible] = part
+        result[:, 0] = -mean
+        return result
+
+    def slope(self, mean: Array) -> Array:
+        """dcdf/dmean: [p] -> [p, levels]."""
+        result = np.zeros((len(mean), self.levels))
+        for rows, table in self._tables(mean):
+            result[rows, : self.possible] = (
+                table.evaluate_slope(mean[rows]) if table else self._paralysed(mean[rows]).slope()
+            )
+        return result
+
+    @property
+    def by_steps(self) -> bool:
+        """Whether so many dead times fit into the exposure that steps come one by one (contours.py), at any light."""
+        return self.ratio >= LEAST
+
+    def _tables(self, mean: Array, brief: bool = False) -> Iterator[tuple[Array, Mixture | None]]:
+        """Light levels in groups, each with a table just long enough (the Poisson tail left out is below 1e-30).
+
+        `brief`: the series where it is as good as the table in the cdf, though not in far tails.
+        """
+        length = np.exp2(np.ceil(np.log2(mean + 12 * np.sqrt(mean) + 60)))
+        if brief and self.ratio < LEAST:  # few moments, which are quicker than a long table
+            expected = mean * np.exp(-mean / self.ratio) * (1 - 1 / self.ratio)
+            length[(mean > self.ratio) & (expected <= _SPARSE)] = np.inf
+        for last in np.unique(length):
+            table = arrival_table(self.ratio, self.possible, int(last)) if last <= _LONGEST else None
+            yield np.flatnonzero(length == last), table
+
+    def _paralysed(self, mean: Array) -> _Paralysed:
+        return _Paralysed(mean, self.ratio, self.possible)
+
+
+def most_counts(ratio: float) -> int:
+    """The most counts that fit into an exposure of `ratio` dead times, the pixel being live at its start."""
+    return floor(ratio) + 1
+
+
+@lru_cache(maxsize=16)
+def arrival_table(ratio: float, levels: int, last: int) -> Mixture:
+    """P(code | n arrivals) for n < `last`; `ratio` = exposure / dead time; codes clip at levels - 1."""
+    most = most_counts(ratio)
+    counted = min(most, levels - 1 + _BEYOND_TOP, last - 1)
+    log_pmf = _log_counts(ratio, counted, last)
+    pmf = np.exp(log_pmf)
+    top = levels - 1
+    codes = np.zeros((last, levels))
+    width = min(top, counted + 1)
+    codes[:, :width] = pmf[:, :width]
+    at_least_top = pmf[:, top:].sum(axis=1)
+    below_top = codes[:, :top].sum(axis=1)
+    codes[:, top] = np.where((below_top < 0.5) & (counted < most), 1 - below_top, at_least_top)
+    cdf = np.minimum(np.cumsum(codes, axis=1), 1.0)
+    cdf[:, -1] = 1.0
+    survival = np.pad(np.cumsum(codes[:, :0:-1], axis=1)[:, ::-1], ((0, 0), (0, 1)))
+    # A difference of whichever side of the distribution is small
+    slope = np.where(cdf[:-1] < 0.5, np.diff(cdf, axis=0), -np.diff(survival, axis=0))
+    with np.errstate(divide="ignore"):
+        log_codes = np.log(codes)
+    log_codes[:, :width] = log_pmf[:, :width]
+    return Mixture(0, cdf[:-1], log_codes[:-1], slope, cdf[-1], log_codes[-1])
+
+
+def _log_counts(ratio: float, counted: int, last: int) -> Array:
+    """log P(k counted | n), n = 0 ... last - 1 and k = 0 ... `counted`: [last, counted + 1]."""
+    from scipy.special import gammaln
+
+    log_shares = _log_shares(ratio, counted, last)
+    n, k = np.arange(last)[:, None], np.arange(counted + 1)[None, :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_choices = gammaln(n) - gammaln(k) - gammaln(n - k + 1)
+        log_length = np.log1p(-np.minimum((k - 1) / ratio, 1.0))
+        result = np.where((k >= 1) & (n >= k), log_choices + n * log_length + log_shares, -np.inf)
+    result[0, 0] = 0.0
+    return result
+
+
+def _log_shares(ratio: float, counted: int, last: int) -> Array:
+    """log H(n - k, k; ratio - k + 1) at [n, k]; zeros where n < k or k = 0."""
+    lengths = ratio - np.arange(min(floor(ratio), counted + last) + 1)  # l of each column
+    shorter = np.append(lengths[1:], -1.0)
+    fits = shorter >= 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shrink = np.where(fits, shorter / lengths, 0.0)  # (l - 1) / l
+        per_length = np.where(lengths > 0, 1 / lengths, 0.0)
+    powers = shrink ** np.arange(counted + 1)[:, None]  # shrink^k
+    result = np.zeros((last, counted + 1))
+    k = np.arange(1, counted + 1)
+    columns = np.minimum(k - 1, len(lengths) - 1)
+    h = np.ones((counted + 1, len(lengths)))  # m = 0
+    density = ((lengths >= 0) & (lengths < 1)).astype(float)  # m = 1
+    scale = np.ones(len(lengths))  # shrink^(m - 1)
+    for m in range(1, last):
+        if m > 1:
+            growth = np.where(fits, (m - lengths) * per_length * scale, 0.0)
+            density = np.where(lengths < m, density + growth * _next(density), 0.0)
+            scale = scale * shrink
+        added = m * per_length * scale * powers * _next(h)
+        h = density + np.cumsum(np.where(fits, added, 0.0), axis=0)
+        fitting = k[k + m < last]
+        with np.errstate(divide="ignore"):
+            result[fitting + m, fitting] = np.log(h[fitting, columns[fitting - 1]])
+    return result
+
+
+def _next(values: Array) -> Array:
+    """The values at l - 1, one column on."""
+    return np.concatenate([values[..., 1:], np.zeros_like(values[..., :1])], axis=-1)
+
+
+class _Paralysed:
+    """Light in which hardly a gap is long: the distribution from the binomial moments B_j = E[C(N, j)].
+
+    With a = 1 / ratio and rate = mean exp(-mean a), a count at x has the density mean exp(-mean min(x, a)) if it is the
+    first and `rate` if it comes a or more after the one before, so
+
+        B_j = rate^(j-1) [J(j-1, c) + rate (c - a)+^j / j!],   c = 1 - (j - 1) a,
+        J(r, c) = integral from 0 to min(a, c) of mean exp(-mean x) (c - x)^r / r! dx;
+        P(N = k) = sum_j (-1)^(j-k) C(j, k) B_j,   P(N > k) = sum_j (-1)^(j-k-1) C(j-1, k) B_j.
+
+    `moments` holds B_j / rate^(j-1), j = 1, 2, ...: [p, j].
+    """
+
+    def __init__(self, mean: Array, ratio: float, levels: int) -> None:
+        self.mean, self.levels, a = mean, levels, 1 / ratio
+        self.log_rate = np.log(mean) - mean * a
+        self.rate = np.exp(self.log_rate)
+        if (self.rate * (1 - a) > _SPARSE).any():
+            worst = float(mean[np.argmax(self.rate)])
+            raise ValueError(
+                f"CountingSPAD: {worst:.4g} arrivals in an exposure of {ratio:.6g} paralyzable dead times have no "
+                "closed form here; shorten the exposure or lower the light"
+            )
+        self.j = np.arange(1, min(most_counts(ratio), _MOST) + 1)
+        self.moments, change = _moments(mean, a, len(self.j))
+        self.changes = change + self.moments * (self.j - 1) * (1 / mean - a)[:, None]  # of B_j / rate^(j-1) by the mean
+
+    def log_pmf(self) -> Array:
+        """[p, levels]; the last code is this count or more."""
+        from scipy.special import binom
+
+        result = np.full((len(self.mean), self.levels), -np.inf)
+        result[:, 0] = -self.mean
+        for k in range(1, min(self.levels, len(self.j) + 1)):
+            ways = binom(self.j, k) if k < self.levels - 1 else binom(self.j - 1, k - 1)
+            signed = np.where(self.j >= k, (-1.0) ** (self.j - k) * ways, 0.0)
+            total = (signed * self.moments * self.rate[:, None] ** np.maximum(self.j - k, 0)).sum(axis=1)
+            with np.errstate(divide="ignore"):
+                result[:, k] = np.log(np.maximum(total, 0.0)) + (k - 1) * self.log_rate
+        return result
+
+    def cdf(self) -> Array:
+        """[p, levels]"""
+        cdf = 1 - self._beyond(self.moments)
+        cdf[:, 0] = np.exp(-self.mean)
+        return cdf
+
+    def slope(self) -> Array:
+        """dcdf/dmean, [p, levels]"""
+        slope = -self._beyond(self.changes)
+        slope[:, 0] = -np.exp(-self.mean)
+        return slope
+
+    def _beyond(self, moments: Array) -> Array:
+        """The series of P(N > k), or of its derivative, for every code below the last: [p, levels]."""
+        from scipy.special import binom
+
+        terms, result = moments * self.rate[:, None] ** (self.j - 1), np.zeros((len(self.mean), self.levels))
+        for k in range(min(self.levels - 1, len(self.j))):
+            result[:, k] = terms @ np.where(self.j > k, (-1.0) ** (self.j - k - 1) * binom(self.j - 1, k), 0.0)
+        return result
+
+
+def _moments(mean: Array, a: float, last: int) -> tuple[Array, Array]:
+    """B_j / rate^(j-1) and the part of its derivative in which rate^(j-1) is kept: [p, last] each, j = 1 ... last."""
+    moments, slopes = np.empty((len(mean), last)), np.empty((len(mean), last))
+    factor = np.exp(-mean * a)
+    for j in range(1, last + 1):
+        c = 1 - (j - 1) * a
+        end = min(a, c)
+        rest, fade = c - end, np.exp(-mean * end)
+        before, integral = np.zeros_like(mean), -np.expm1(-mean * end)  # J(r - 1), J(r), here r = 0
+        for r in range(1, j):
+            before, integral = integral, (c**r - fade * rest**r) / gamma(r + 1) - integral / mean
+        open_end = rest**j / gamma(j + 1)
+        moments[:, j - 1] = integral + mean * factor * open_end
+        slopes[:, j - 1] = (c * before - (j - 1) * integral) / mean + fade * end * rest ** (j - 1) / gamma(j)
+        slopes[:, j - 1] += factor * (1 - mean * a) * open_end
+    return moments, slopes

@@ -1,0 +1,117 @@
+"""The steps F_k of a QIS one by one: P(code <= k) for pairs of a code and a light level, without the whole table.
+
+Given n electrons, P(code <= k | n) is 1 for few of them, 0 or a constant (full well) for many, and in between only
+where read noise blurs the threshold:
+
+    F_k = P(N < first_k) + sum over the blurred n of Pois(n) weight_k(n) + tail_k P(N >= last_k)
+
+So a step costs the width of the blur, 17 read noises, however many electrons a code holds. `decide` finds the code of a
+uniform number in about three such steps; the compiled engine's curves (curves.py) are made of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.sensor.poisson import poisson_log_pmf
+
+_CHUNK = 1 << 13  # pairs of one block of work: its arrays stay in the cache
+
+
+@dataclass(frozen=True, eq=False)
+class Thresholds:
+    """P(code <= k | n) of K codes below the top one: 1 for n < first, weights [K, W] from there on, then the tail."""
+
+    first: Array  # int [K]
+    weights: Array  # [K, W]
+    tail: Array  # [K]
+
+    def cdf(self, codes: Array, mean: Array) -> Array:
+        """F of pairs: codes int [p], Poisson means [p] -> [p]."""
+        from scipy.special import gammainc, gammaincc
+
+        def block(k: Array, some: Array) -> Array:
+            first, last = self.first[k], self.first[k] + self.weights.shape[1]
+            result = np.where(first > 0, gammaincc(np.maximum(first, 1), some), 0.0) + self._sum(self.weights, k, some)
+            if self.tail[k].any():
+                result += self.tail[k] * np.where(last > 0, gammainc(np.maximum(last, 1), some), 1.0)
+            return np.minimum(result, 1.0)
+
+        return _in_blocks(block, codes, mean)
+
+    def slope(self, codes: Array, mean: Array) -> Array:
+        """dF/dmean of pairs: [p], [p] -> [p]."""
+        ends = np.column_stack([np.ones(len(self.first)), self.weights, self.tail])
+        falls = np.diff(ends, axis=1)  # of P(code <= k | n) from n = first - 1 on
+
+        def block(k: Array, some: Array) -> Array:
+            before = self.first[k] - 1
+            edge = np.where(before >= 0, np.exp(poisson_log_pmf(some, np.maximum(before, 0))) * falls[k, 0], 0.0)
+            return edge + self._sum(falls[:, 1:], k, some)
+
+        return _in_blocks(block, codes, mean)
+
+    def _sum(self, table: Array, k: Array, mean: Array) -> Array:
+        """sum over n of Pois(n; mean) table[k, n - first]; electrons whose weight is below 1e-19 are left out."""
+        width = table.shape[1]
+        reach = 9 * np.sqrt(mean) + 25
+        start = np.clip(np.floor(mean - reach) - self.first[k], 0, width).astype(np.intp)
+        stop = np.clip(np.ceil(mean + reach) - self.first[k], 0, width).astype(np.intp)
+        total, n = np.zeros(len(mean)), (self.first[k] + start).astype(float)
+        steps = int((stop - start).max(initial=0))
+        if not steps:
+            return total
+        flat = np.column_stack([table, np.zeros(len(table))]).ravel()
+        at, end = k * (width + 1) + start, k * (width + 1) + width
+        weight = np.exp(poisson_log_pmf(mean, n))
+        for _ in range(steps):
+            total += weight * flat[at]
+            n += 1
+            weight *= mean / n
+            at = np.minimum(at + 1, end)
+        return total
+
+
+def decide(cdf: Callable[[Array, Array], Array], top: int, u: Array, mean: Array, guess: Array) -> tuple[Array, Array]:
+    """The smallest codes k with u < F_k (`top` at most), and how near u comes to a step: [p], [p] from [p] each."""
+    near = np.full(len(u), np.inf)
+
+    def passed(k: Array, left: Array) -> Array:
+        distance = u[left] - cdf(k, mean[left])
+        near[left] = np.minimum(near[left], np.abs(distance))
+        return distance >= 0
+
+    return search(passed, top, guess), near
+
+
+def search(passed: Callable[[Array, Array], Array], top: int, guess: Array) -> Array:
+    """The smallest codes whose step is not passed, `top` at most: [p]. `passed`: codes of some pixels, which -> bool.
+
+    From the guess on in growing strides, then by bisection; only pixels that are undecided are looked at again.
+    """
+    low, high = np.full(len(guess), -1), np.full(len(guess), top)
+    probe = np.clip(guess, 0, max(top - 1, 0)).astype(np.intp)
+    left, stride = np.flatnonzero(high - low > 1), 1
+    while left.size:
+        k = probe[left]
+        up = passed(k, left)
+        low[left], high[left] = np.where(up, k, low[left]), np.where(up, high[left], k)
+        below, above = low[left], high[left]
+        probe[left] = np.where(
+            up, np.minimum(k + stride, (below + above + 1) // 2), np.maximum(k - stride, (below + above) // 2)
+        )
+        left, stride = left[above - below > 1], 2 * stride
+    return high
+
+
+def _in_blocks(function: Callable[[Array, Array], Array], codes: Array, mean: Array) -> Array:
+    codes, mean = np.asarray(codes, np.intp), np.asarray(mean, float)
+    result = np.empty(len(mean))
+    for start in range(0, len(mean), _CHUNK):
+        some = slice(start, start + _CHUNK)
+        result[some] = function(codes[some], mean[some])
+    return result

@@ -1,0 +1,1 @@
+"""Which bit depth is best at which motion and light."""

@@ -1,0 +1,157 @@
+"""Answers of a bit-depth study: a motion that is asked for, optima at the edge of the tried bits, a sentence.
+
+Words: a **plane** is one clip frame read with one bit; a **frame** of b bits is 2^b - 1 planes; a **code** is the value
+of a pixel in one frame. Motion is the mean over the pixels that move more than 0.1 px per frame of `CODE_BITS` bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from qsim.clip.clip import Clip
+from qsim.rendering.ground_truth import moving_mean
+from qsim.studies.bit_depth.clip_study import CODE_BITS, CODE_PLANES, MODELS, Question, Row, Study, clip_motion, study
+
+WIDEST = 7  # bits up to which the range is widened
+LOOKS = 4  # instants at which the motion of a scene is measured
+SPEEDS = (1e-3, 1e3)  # factors on a scene's motion that are tried
+CLOSE = 0.01  # relative difference to the asked motion that is good enough
+NEAR = 0.05  # relative difference that is accepted at most
+
+
+def scene_motion(name: str, size: tuple[int, int], *, frames: int, frame_rate: float, seed: int, speed: float) -> float:
+    """Motion of a scene in px per frame of 3 bits, from its ground truth at a few instants; 0 where nothing moves.
+
+    Nothing is rendered: rays find the first surfaces.
+    """
+    import scenes
+    from qsim.rendering.renderer import Renderer
+
+    renderer = Renderer(scenes.load(name, seed=seed, speed=speed).resized(*size), frame_rate=frame_rate)
+    found = []
+    for t in np.linspace(0, frames - 1, LOOKS).round():
+        u, v = renderer.truth(int(t))["flow"]
+        found.append(moving_mean(np.hypot(u, v), CODE_PLANES) or 0.0)
+    return float(np.mean(found))
+
+
+def speed_for(px: float, motion: Callable[[float], float], name: str) -> tuple[float, float]:
+    """(speed factor, motion reached) of a scene whose motion [px] at a factor is `motion(factor)`.
+
+    `ValueError` for a still scene, and if no factor comes within 5 %.
+    """
+    low, high = SPEEDS
+    speed, tried = 1.0, {}
+    for _ in range(10):
+        tried[speed] = motion(speed)
+        if abs(tried[speed] / px - 1) < CLOSE:
+            break
+        if tried[speed] > 0:
+            after = float(np.clip(speed * px / tried[speed], low, high))
+        elif max(tried.values()) > 0:
+            after = (speed * max(tried)) ** 0.5  # too slow for the threshold of what moves
+        else:
+            after = high if speed < high else speed
+        if after in tried:
+            break
+        speed = after
+    if max(tried.values()) == 0:
+        raise ValueError(f"{name}: nothing in it moves, so --px {px:g} cannot be reached; leave --px out")
+    best = min(tried, key=lambda v: abs(tried[v] - px))
+    if abs(tried[best] / px - 1) > NEAR:
+        raise ValueError(
+            f"{name}: --px {px:g} cannot be reached; speed factor {best:.4g} gives {tried[best]:.3g} px per "
+            f"{CODE_BITS}-bit frame, the nearest of {low:g} to {high:g}"
+        )
+    return float(f"{best:.4g}"), tried[best]
+
+
+def step_for(px: float, clip: Clip) -> tuple[int, float]:
+    """(whole factor, motion reached) of a clip, of which only every so many-th frame is taken to make it faster.
+
+    `ValueError` without ground truth, for a still clip, and if the clip moves faster already.
+    """
+    if not clip.has_truth:
+        raise ValueError(f"{clip.path}: has no ground truth, so its motion is unknown; give --speed instead of --px")
+    times = np.linspace(0, len(clip) - 1, min(LOOKS, len(clip))).round()
+    motions: dict[int, float] = {}
+
+    def at(step: int) -> float:
+        if step not in motions:
+            found = [clip_motion(clip, int(t), step) or 0.0 for t in times]
+            motions[step] = CODE_PLANES * float(np.mean(found))
+        return motions[step]
+
+    if at(max(1, len(clip))) == 0:
+        raise ValueError(f"{clip.path}: nothing in it moves, so --px {px:g} cannot be reached; leave --px out")
+    if at(1) > 1.5 * px:
+        raise ValueError(
+            f"{clip.path}: moves {at(1):.3g} px per {CODE_BITS}-bit frame, and a clip can only be made faster; --px "
+            f"{px:g} needs a scene, or a clip at a higher frame rate"
+        )
+    guess = max(1, round(px / at(1))) if at(1) > 0 else len(clip)
+    step = min(range(max(1, guess - 3), guess + 4), key=lambda k: abs(at(k) - px))
+    return step, at(step)
+
+
+# The edge of what was tried
+
+
+def at_edge(found: Study, model: str) -> str:
+    """`>=` if the best depth is the deepest tried, `<=` if it is the shallowest above 1 bit, else nothing."""
+    bits = [row.bits for row in found.rows if row.model == model]
+    best = found.best(model).bits
+    if best == max(bits):
+        return ">="
+    return "<=" if best == min(bits) > 1 else ""
+
+
+def marked(found: Study, model: str) -> str:
+    """The best depth with its mark, as `4` or `>= 5`."""
+    return f"{at_edge(found, model)} {found.best(model).bits}".strip()
+
+
+def widened(clip: Clip, question: Question, tell: Callable[[str], None] | None = None) -> Study:
+    """The study, with one more bit after the other while the deepest is best, up to 7 bits and the clip's length."""
+    found = study(clip, question)
+    while any(at_edge(found, model) == ">=" for model in MODELS) and question.bits[-1] < WIDEST:
+        question = replace(question, bits=(*question.bits, question.bits[-1] + 1))
+        if len(clip) < question.longest:
+            break
+        if tell is not None:
+            tell(f"the deepest tried is best: {question.bits[-1]} bits are tried too")
+        found = study(clip, question)
+    return found
+
+
+def code_motion(row: Row) -> float | None:
+    """Motion of a row in px per frame of 3 bits."""
+    return None if row.motion_px_per_frame is None else row.motion_px_per_frame / (2**row.bits - 1) * CODE_PLANES
+
+
+def answer(found: Study) -> str:
+    """One sentence: the best depth of both readouts at this motion and light, and what its neighbours lose."""
+    motion = code_motion(found.rows[0])
+    where = "at unknown motion" if motion is None else f"at {motion:.3g} px per {CODE_BITS}-bit frame"
+    return f"{where} and {found.ppp:.3g} photons per plane: " + "; ".join(_of_model(found, model) for model in MODELS)
+
+
+def _of_model(found: Study, model: str) -> str:
+    best, edge = found.best(model), at_edge(found, model)
+    rows = sorted((row for row in found.rows if row.model == model), key=lambda row: row.bits)
+    place = rows.index(best)
+    beside = [row for row in (rows[place - 1] if place else None, *rows[place + 1 : place + 2]) if row is not None]
+    losses = [f"{best.psnr_db - row.psnr_db:.1f}" for row in beside]
+    bits = " and ".join(str(row.bits) for row in beside)
+    many = "bit is" if bits == "1" else "bits are"
+    worse = f", {bits} {many} {' and '.join(losses)} dB worse" if beside else ""
+    text = f"{model} {marked(found, model)} bit{'s' if best.bits > 1 else ''}{worse}"
+    if edge == ">=":
+        text += " (the deepest tried"
+        text += f": try --bits 1,...,{min(best.bits + 2, 10)})" if best.bits < 10 else ")"
+    if edge == "<=":
+        text += " (the shallowest tried: try --bits 1,...)"
+    return text

@@ -1,0 +1,379 @@
+"""Bit depths of one fast clip: the same photons read as 2^b - 1 binary planes, or once as a number of b bits.
+
+    clip at the plane rate (>= 10 000 fps) -> per bit depth: motion, blur, noise by its causes, PSNR, data rate
+
+A frame of b bits lasts M = 2^b - 1 clip frames. M is odd, so the frames of **all** depths are centred on the same clip
+frames: every depth delivers at the same instants (equal output rate) and is scored against the same sharp image.
+
+* `planes`: M binary planes, each at its own instant of the motion, drawn with the key of its clip frame. A deeper frame
+  contains the very planes of a shallower one, and they are the planes of `qsim sense --group`.
+* `multibit`: the light of the M clip frames, read once; the depths share each pixel's random number.
+
+Beside every simulated error stands its exact expectation: the sum over codes of P(code | light) (estimate - truth)^2,
+with the light that the clip gives. For planes that differ in light the binomial of their mean probability is used, its
+variance times sum p (1 - p) / (M mean p (1 - mean p)): exact to second order in the differences.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import keys
+from qsim.clip.clip import Clip
+from qsim.optics import radiometry
+from qsim.rendering.ground_truth import moving_mean
+from qsim.sensor import devices
+from qsim.sensor.qis import QIS
+from qsim.sensor.sensor import Sensor
+from qsim.sensor.spad import BinarySPAD
+from qsim.studies.bit_depth.laws import Structure
+
+SLOWEST = 10_000.0  # clip frames per second: below, a "plane" is too long to stand for an instant
+MODELS = ("planes", "multibit")
+CODE_BITS = 3  # motion is stated per frame of 3 bits, whatever depths are compared
+CODE_PLANES = 2**CODE_BITS - 1
+_GRID = 600  # light levels at which estimates are tabled
+
+
+@dataclass(frozen=True)
+class Question:
+    """What to compare; the clip is given apart."""
+
+    bits: tuple[int, ...] = (1, 2, 3, 4, 5)
+    sensor: str = "quiver-physical"  # of the multi-bit read
+    plane: str | None = None  # of a binary plane; None: a clocked SPAD of the same efficiency and dark rate
+    ppp: float | None = None  # photons per pixel and clip frame; None: light as it is
+    speed: int = 1  # every so many-th clip frame is a plane: the motion of the clip, so many times faster
+    instants: int = 8  # at most: output frames that are drawn and scored
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.bits or not all(1 <= b <= 10 for b in self.bits):
+            raise ValueError(f"tradeoff: bits are 1 ... 10 here, got {list(self.bits)}")
+        for name in ("speed", "instants"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"tradeoff: {name} is a whole number of at least 1, got {getattr(self, name)}")
+        object.__setattr__(self, "bits", tuple(sorted(set(self.bits))))
+
+    @property
+    def longest(self) -> int:
+        """Clip frames that the deepest frame spans."""
+        return (2 ** self.bits[-1] - 2) * self.speed + 1
+
+
+@dataclass(frozen=True)
+class Row:
+    """One bit depth of one model. Errors are rms over pixels, in photons per pixel and **clip frame** (plane)."""
+
+    model: str  # "planes" or "multibit"
+    bits: int
+    fps: float
+    motion_px_per_frame: float | None  # of what moves (clip_motion), in this frame; None where the clip has no flow
+    blur_error: float  # exposed mean against the sharp instant
+    blur_predicted: float  # the same from the clip's structure function (tradeoff.Structure)
+    shot_error: float  # of an ideal photon counter behind the same efficiency and dark rate
+    quantisation_error: float  # what few levels and saturation add (in squares), without read noise
+    read_error: float  # what read noise adds (in squares); negative where it takes away (it dithers coarse levels)
+    snr_db: float  # exposure-referred, at the mean light: photons sqrt(Fisher information), 20 log10
+    psnr_db: float  # of the maximum-likelihood frame against the sharp instant
+    psnr_predicted_db: float  # its exact expectation
+    psnr_error_db: float  # standard error of the simulated PSNR: draws only
+    sigmas: float  # (simulated - predicted mean square error) / standard error
+    data_rate_megabytes_per_second: float
+
+
+@dataclass(frozen=True)
+class Study:
+    """All rows of one clip at one light level."""
+
+    clip: str
+    rows: tuple[Row, ...]
+    ppp: float  # photons per pixel and clip frame, whole clip
+    lux: float | None
+    peak: float  # photons per clip frame that PSNR refers to: 2.5 x the mean light; nothing is clamped there
+    frame_rate: float
+    speed: int
+    instants: tuple[int, ...]  # clip frames that were scored
+    structure: Structure  # of the light, in photons^2 per clip frame
+
+    @property
+    def bits(self) -> tuple[int, ...]:
+        """The depths that were tried."""
+        return tuple(sorted({row.bits for row in self.rows}))
+
+    def best(self, model: str) -> Row:
+        """The row of highest PSNR."""
+        return max((row for row in self.rows if row.model == model), key=lambda row: row.psnr_db)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One way to form a b-bit frame: estimates of its light for each code, and their exact moments over light."""
+
+    model: str
+    bits: int
+    sensor: Sensor  # one binary plane, or the multi-bit read
+    exposure: float  # s, of one read
+
+    @property
+    def planes(self) -> int:
+        """Clip frames in one frame."""
+        return 2**self.bits - 1
+
+    @cached_property
+    def estimates(self) -> Array:
+        """Maximum-likelihood light of the whole frame for codes 0 ... M, photons."""
+        if self.model == "multibit":
+            some = np.append(0.0, np.geomspace(1e-6, 1e2, 800)) * self.sensor.white(self.exposure)
+            possible = self.sensor.pmf(some, self.exposure).max(axis=0) > 0  # without read noise, some codes never come
+            result = np.zeros(self.planes + 1)
+            result[possible] = self.sensor.maximum_likelihood(np.eye(self.planes + 1)[possible], self.exposure).photons
+            return result
+        k = np.arange(self.planes + 1)
+        return self.planes * self.sensor.maximum_likelihood(np.stack([k[::-1], k], 1), self.exposure).photons
+
+    def pmf(self, photons: Array) -> Array:
+        """P(code) at light of the whole frame: [G] -> [G, M + 1]."""
+        if self.model == "multibit":
+            return self.sensor.pmf(photons, self.exposure)
+        from scipy.stats import binom
+
+        fires = self.sensor.pmf(photons / self.planes, self.exposure)[:, 1]
+        return np.asarray(binom.pmf(np.arange(self.planes + 1), self.planes, fires[:, None]))
+
+    def moments(self, photons: Array) -> tuple[Array, Array]:
+        """Mean and variance of the estimate at light of the whole frame [...], interpolated in a table."""
+        top = float(photons.max())
+        grid = np.append(0.0, np.geomspace(max(float(photons.min()), 1e-5 * top), 1.0001 * top, _GRID))
+        pmf = self.pmf(grid)
+        mean = pmf @ self.estimates
+        variance = (pmf * (self.estimates - mean[:, None]) ** 2).sum(axis=1)
+        return np.interp(photons, grid, mean), np.interp(photons, grid, variance)
+
+    def snr_db(self, photons: float) -> float:
+        """20 log10 of photons sqrt(Fisher information) at light of the whole frame."""
+        if self.model == "multibit":
+            information = float(self.sensor.fisher_information(np.array(photons), self.exposure))
+        else:
+            per_plane = self.sensor.fisher_information(np.array(photons / self.planes), self.exposure)
+            information = float(per_plane) / self.planes
+        return 20 * math.log10(photons * math.sqrt(information)) if information > 0 else -math.inf
+
+    def noiseless(self) -> Reading:
+        """The same without read noise."""
+        return replace(self, sensor=replace(self.sensor, read_noise=0.0)) if isinstance(self.sensor, QIS) else self
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """One frame of M clip frames around an instant, arrays [H, W]."""
+
+    planes: int
+    photons: Array  # sum of the light
+    fired: Array  # planes that fired, of the `planes` model
+    quiet: Array  # sum of the probabilities 1 - p that a plane does not fire
+    spread: Array  # sum of p (1 - p), the variance of `fired`
+
+
+def plane_sensor(question: Question, ppp: float, exposure: float) -> Sensor:
+    """The sensor of one binary plane; `ValueError` if the named one has more than one bit."""
+    if question.plane is not None:
+        return devices.load(question.plane, ppp=ppp, bits=1, exposure=exposure)
+    read = devices.load(question.sensor, ppp=ppp, bits=1, exposure=exposure)
+    return BinarySPAD(read.efficiency, read.dark_rate, 1)
+
+
+def readings(question: Question, ppp: float, exposure: float) -> list[Reading]:
+    """Both models of every bit depth, at `ppp` photons per clip frame of `exposure` seconds."""
+    plane = plane_sensor(question, ppp, exposure)
+    result = [Reading("planes", b, plane, exposure) for b in question.bits]
+    for b in question.bits:
+        m = 2**b - 1
+        sensor = devices.load(question.sensor, ppp=m * ppp, bits=b, exposure=m * exposure)
+        result.append(Reading("multibit", b, sensor, m * exposure))
+    return result
+
+
+def check_clip(clip: Clip, question: Question) -> None:
+    """`ValueError` if the clip is too slow or too short for the question."""
+    if clip.frame_rate < SLOWEST:
+        raise ValueError(
+            f"{clip.path}: {clip.frame_rate:g} fps; this study needs a clip of at least {SLOWEST:g} fps, as in "
+            "`qsim render fan --frame-rate 10000`"
+        )
+    if len(clip) < question.longest:
+        raise ValueError(
+            f"{clip.path}: {len(clip)} frames; {question.bits[-1]} bits at speed {question.speed} need "
+            f"{question.longest}; ask for fewer bits, or render a longer clip"
+        )
+
+
+def instants(frames: int, question: Question) -> tuple[int, ...]:
+    """Centres of frames of the deepest depth that do not overlap, spread over the clip."""
+    span = question.longest
+    count = min(question.instants, frames // span)
+    first, last = span // 2, frames - 1 - span // 2
+    return tuple(int(t) for t in np.linspace(first, last, count).round()) if count > 1 else (frames // 2,)
+
+
+def expose(
+    clip: Clip, centre: int, question: Question, factor: float, plane: Sensor, structure: Array
+) -> Iterator[Exposed]:
+    """Frames of all depths around one clip frame, shallow to deep; adds squared differences of light to `structure`.
+
+    `structure[k]` gets the mean over pixels of (light at two instants, k planes apart, symmetric about the centre)^2.
+    """
+    key = keys.Key(seed=question.seed, clip=keys.hash_name(clip.name))
+    wanted = [2**b - 1 for b in question.bits]
+    photons = radiometry.clip_photons(clip, centre, factor)
+    total, fired, quiet, spread = (np.zeros_like(photons) for _ in range(4))
+    before = photons
+    for reach in range(wanted[-1] // 2 + 1):
+        places = [centre] if reach == 0 else [centre - reach * question.speed, centre + reach * question.speed]
+        pair = [photons] if reach == 0 else [radiometry.clip_photons(clip, t, factor) for t in places]
+        for t, light in zip(places, pair, strict=True):
+            p = plane.pmf(light, clip.exposure)
+            fired += plane.sample(light, clip.exposure, key=key.at(t))
+            total, quiet, spread = total + light, quiet + p[..., 0], spread + p[..., 0] * p[..., 1]
+        if reach:
+            structure[2 * reach - 1] += np.mean((pair[0] - before) ** 2)
+            structure[2 * reach] += np.mean((pair[0] - pair[1]) ** 2)
+            before = pair[1]
+        if 2 * reach + 1 in wanted:
+            yield Exposed(2 * reach + 1, total.copy(), fired.copy(), quiet.copy(), spread.copy())
+
+
+class _Sums:
+    """Running sums over pixels and instants of one reading."""
+
+    def __init__(self) -> None:
+        self.pixels = 0
+        self.parts = np.zeros(6)  # simulated, predicted, their squared difference, blur, shot, noise
+        self.quiet = 0.0  # noise without read noise
+
+    def add(self, reading: Reading, frame: Exposed, codes: Array, sharp: Array) -> None:
+        """All errors in photons per clip frame."""
+        m = frame.planes
+        light = _equivalent(reading, frame)
+        mean, variance = reading.moments(light)
+        if reading.model == "planes":
+            even = frame.quiet * (1 - frame.quiet / m)  # the variance if all planes saw the same light
+            variance = variance * np.minimum(frame.spread / np.maximum(even, 1e-300), 1.0)
+        simulated = (reading.estimates[codes] / m - sharp) ** 2
+        predicted = (mean / m - sharp) ** 2 + variance / m**2
+        sensor = reading.sensor
+        arrivals = sensor.efficiency * frame.photons + sensor.dark_rate * _duration(reading)
+        blur, shot = (frame.photons / m - sharp) ** 2, arrivals / (m * sensor.efficiency) ** 2
+        noise = ((mean - frame.photons) ** 2 + variance) / m**2
+        self.pixels += simulated.size
+        for i, part in enumerate((simulated, predicted, (simulated - predicted) ** 2, blur, shot, noise)):
+            self.parts[i] += part.sum()
+        quiet = reading.noiseless()
+        if quiet is reading:
+            self.quiet += noise.sum()
+        else:
+            mean, variance = quiet.moments(light)
+            self.quiet += (((mean - frame.photons) ** 2 + variance) / m**2).sum()
+
+
+def _duration(reading: Reading) -> float:
+    return reading.exposure * (reading.planes if reading.model == "planes" else 1)
+
+
+def _equivalent(reading: Reading, frame: Exposed) -> Array:
+    """Constant light of the whole frame that gives the same mean code."""
+    if reading.model == "multibit":
+        return frame.photons
+    sensor = reading.sensor
+    mean_quiet = np.maximum(frame.quiet / frame.planes, 1e-290)
+    if isinstance(sensor, BinarySPAD):
+        arrivals = -np.log(mean_quiet) - sensor.dark_rate * reading.exposure
+        return frame.planes * np.maximum(arrivals, 0.0) / sensor.efficiency
+    grid = np.append(0.0, np.geomspace(1e-5, 1.0, 4 * _GRID) * 4 * max(frame.photons.max() / frame.planes, 1e-12))
+    return frame.planes * np.interp(-mean_quiet, -sensor.pmf(grid, reading.exposure)[:, 0], grid)
+
+
+def study(clip: Clip, question: Question, *, progress: Callable[[int, int], None] | None = None) -> Study:
+    """Draw and score every bit depth of a clip; `ValueError` if the clip is too slow, too short or has no light."""
+    check_clip(clip, question)
+    level = radiometry.light_level(clip, ppp=question.ppp)
+    forms = readings(question, level.ppp, clip.exposure)
+    centres = instants(len(clip), question)
+    sums = {(form.model, form.planes): _Sums() for form in forms}
+    by_planes = {m: [form for form in forms if form.planes == m] for m in (2**b - 1 for b in question.bits)}
+    structure, motions = np.zeros(2 ** question.bits[-1] - 1), []
+    for done, centre in enumerate(centres):
+        sharp = radiometry.clip_photons(clip, centre, level.factor, sharp=True)
+        motions.append(clip_motion(clip, centre, question.speed))
+        for frame in expose(clip, centre, question, level.factor, forms[0].sensor, structure):
+            for form in by_planes[frame.planes]:
+                codes = (
+                    frame.fired.astype(np.intp)
+                    if form.model == "planes"
+                    else _read(clip, form, frame, centre, question)
+                )
+                sums[form.model, form.planes].add(form, frame, codes, sharp)
+        if progress is not None:
+            progress(done + 1, len(centres))
+    law = Structure(structure / len(centres))
+    motion = None if None in motions else float(np.mean([m for m in motions if m is not None]))
+    peak = radiometry.WHITE_PER_MEAN * level.ppp
+    rows = tuple(_row(clip, form, sums[form.model, form.planes], law, motion, peak, level.ppp) for form in forms)
+    return Study(clip.name, rows, level.ppp, level.lux, peak, clip.frame_rate, question.speed, centres, law)
+
+
+def _read(clip: Clip, form: Reading, frame: Exposed, centre: int, question: Question) -> Array:
+    """One multi-bit read of the summed light; its key is that of the instant, stage 1 (planes are stage 0)."""
+    key = keys.Key(seed=question.seed, clip=keys.hash_name(clip.name), frame=centre, stage=1)
+    return form.sensor.sample(frame.photons, form.exposure, key=key)
+
+
+def clip_motion(clip: Clip, t: int, speed: int = 1) -> float | None:
+    """Motion [px per plane] of what moves more than 0.1 px per 3-bit frame, at a whole `speed`; None without truth.
+
+    0 where nothing moves so far.
+    """
+    if not clip.has_truth:
+        return None
+    u, v = clip.flow(t)
+    return (moving_mean(speed * np.hypot(u, v), CODE_PLANES) or 0.0) / CODE_PLANES
+
+
+def _row(clip: Clip, form: Reading, sums: _Sums, law: Structure, motion: float | None, peak: float, ppp: float) -> Row:
+    simulated, predicted, squares, blur, shot, noise = sums.parts / sums.pixels
+    quiet = sums.quiet / sums.pixels
+    error = math.sqrt(squares / sums.pixels)
+    _, height, width = clip.shape
+    fps = clip.frame_rate / form.planes
+    return Row(
+        model=form.model,
+        bits=form.bits,
+        fps=fps,
+        motion_px_per_frame=None if motion is None else motion * form.planes,
+        blur_error=math.sqrt(blur),
+        blur_predicted=math.sqrt(law.blur(form.planes)),
+        shot_error=math.sqrt(shot),
+        quantisation_error=signed_root(quiet - shot),
+        read_error=signed_root(noise - quiet),
+        snr_db=form.snr_db(form.planes * ppp),
+        psnr_db=_decibels(peak, simulated),
+        psnr_predicted_db=_decibels(peak, predicted),
+        psnr_error_db=10 / math.log(10) * error / simulated,
+        sigmas=(simulated - predicted) / error if error > 0 else 0.0,
+        data_rate_megabytes_per_second=height * width * form.bits * fps / 8e6,
+    )
+
+
+def signed_root(square: float) -> float:
+    """sqrt(|x|) with the sign of x."""
+    return math.copysign(math.sqrt(abs(square)), square)
+
+
+def _decibels(peak: float, mse: float) -> float:
+    return 10 * math.log10(peak**2 / mse) if mse > 0 else math.inf

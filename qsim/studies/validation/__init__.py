@@ -1,0 +1,1 @@
+"""Sensors, rendering, backends and reading against independent references."""

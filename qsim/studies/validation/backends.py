@@ -1,0 +1,134 @@
+"""Rendering engines beside each other: the same frames by each that works here, their seconds and their means.
+
+    run(families) -> Report: one Row per engine and scene; CUDA beside LLVM beside scalar
+
+A frame is radiance and ground truth. What it takes beside the compiled kernels is our own overhead.
+
+Every engine renders the same scene with the same budget in a process of its own. Two engines that estimate one radiance
+differ in its mean over all pixels and frames by no more than their Monte-Carlo errors explain.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from qsim import backend as engine
+from qsim.rendering.fidelity import Budget
+
+FRAMES = 4  # timed, after a first one that compiles
+BUDGET = Budget(samples=32, bounces=4)
+DEVIATIONS = 5.0  # standard errors by which means may differ: once in two million comparisons by chance
+
+
+@dataclass(frozen=True)
+class Row:
+    """One engine on one scene."""
+
+    engine: str
+    scene: str
+    seconds: float  # per frame, median
+    outside: float | None  # share of the seconds in which no compiled kernel runs; None: the engine has none
+    mean: float  # radiance over all frames and pixels, W m^-2 sr^-1
+    mean_error: float  # its standard error
+
+    def deviation(self, other: Row) -> float:
+        """Difference of the means in standard errors of the difference."""
+        return abs(self.mean - other.mean) / max(math.hypot(self.mean_error, other.mean_error), 1e-12 * self.mean)
+
+
+@dataclass(frozen=True)
+class Report:
+    """All rows, scene by scene, and why the other engines are missing."""
+
+    height: int
+    width: int
+    samples: int
+    rows: tuple[Row, ...]
+    missing: dict[str, str]
+
+    def reference(self, row: Row) -> Row:
+        """The row of the same scene that others are compared with: that of the last of BACKENDS, the plain one."""
+        return next(r for r in reversed(self.rows) if r.scene == row.scene)
+
+    @property
+    def ok(self) -> bool:
+        """Whether all means agree."""
+        return all(row.deviation(self.reference(row)) <= DEVIATIONS for row in self.rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        rows = []
+        for row in self.rows:
+            plain = self.reference(row)
+            rows.append(asdict(row) | {"deviation": row.deviation(plain), "ratio": plain.seconds / row.seconds})
+        return asdict(self) | {"rows": rows, "ok": self.ok}
+
+
+def run(
+    families: Sequence[str], *, height: int, width: int, seed: int, progress: Callable[[str], None] | None = None
+) -> Report:
+    """Render a few frames of each family with every engine that works here; at least scalar does."""
+    rows: list[Row] = []
+    missing: dict[str, str] = {}
+    for backend in engine.BACKENDS:
+        try:
+            engine.choose(backend)
+        except ValueError as error:
+            missing[backend] = str(error)
+            continue
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:  # one variant per process
+            for family in families:
+                if progress is not None:
+                    progress(f"{backend}: {family}")
+                rows.append(pool.submit(_measure, backend, family, height, width, seed).result())
+    rows.sort(key=lambda row: (families.index(row.scene), engine.BACKENDS.index(row.engine)))
+    return Report(height, width, BUDGET.samples, tuple(rows), missing)
+
+
+def _measure(backend: str, family: str, height: int, width: int, seed: int) -> Row:
+    """In a process of its own: the engine is chosen once per process."""
+    os.environ["QSIM_ENGINE"] = backend
+    import scenes
+    from qsim.rendering.renderer import Renderer
+
+    renderer = Renderer(scenes.load(family, seed=seed).resized(height, width), budget=BUDGET)
+    seconds, outside, frames = [], [], []
+    for t in range(FRAMES + 1):
+        with engine.kernels_timed() as inside:
+            started = time.perf_counter()
+            frames.append(renderer.frame(t))
+            seconds.append(time.perf_counter() - started)
+        outside.append(1 - sum(inside) / seconds[-1])
+    radiance = np.stack([frame.radiance for frame in frames]).astype(np.float64)
+    error = math.sqrt(sum(frame.error**2 for frame in frames) / len(frames) / radiance.size)
+    share = None if backend == "scalar" else median(outside[1:])
+    return Row(backend, family, median(seconds[1:]), share, float(radiance.mean()), error)
+
+
+def table(report: Report) -> str:
+    """The rows as text, and why engines are missing."""
+    lines = [f"{report.height} x {report.width} pixels, {report.samples} samples; seconds per frame with ground truth"]
+    head = f"{'scene':10} {'engine':8} {'s/frame':>8} {'faster':>7} {'outside kernels':>15}"
+    lines.append(f"{head} {'mean radiance':>22} {'off by':>14}")
+    for row in report.rows:
+        plain = report.reference(row)
+        off = "" if row is plain else f"{row.deviation(plain):.1f} std. errors"
+        mean = f"{row.mean:.5g} +- {row.mean_error:.1g}"
+        ratio = plain.seconds / row.seconds
+        outside = "" if row.outside is None else f"{row.outside:.1%}"
+        lines.append(
+            f"{row.scene:10} {row.engine:8} {row.seconds:8.3f} {ratio:7.1f} {outside:>15} {mean:>22} {off:>14}"
+        )
+    lines += [f"{backend}: {why}" for backend, why in report.missing.items()]
+    lines.append(f"means agree within {DEVIATIONS:g} standard errors: {'yes' if report.ok else 'NO'}")
+    return "\n".join(lines)

@@ -1,0 +1,161 @@
+"""Rendering: does a budgeted frame err as asked and as stated, and has it the light of a converged one?
+
+    run(scenes) -> Report: one Row per scene and level [dB]
+
+Each scene gets the budget of `budget.choose`; a few of its frames are compared with converged ones, which have many
+samples and the deepest bounces. Errors count at white (white.py), those without a clamp stand beside them; the
+reference's own noise is taken off. The mean light is held against what the budget announces: the bounces left out, and
+nothing else but noise, whose standard error comes from independent halves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.clip.clamped_error import Errors, decibels, error_at, white_in
+from qsim.rendering import fidelity
+from qsim.rendering.fidelity import Budget
+from qsim.rendering.renderer import Renderer
+from qsim.scene.scene import Scene
+
+LEVELS = (36.0,)  # dB below white
+ENOUGH = 4.5  # standard errors; a right program exceeds them in one of 100 000 rows
+MISSED = 0.5  # dB below what was asked for that `budget.shortfall` names, too
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scene at one level."""
+
+    scene: str
+    asked: float  # dB below white
+    reached: float  # dB against the reference, clamped at white
+    stated: float  # dB, by the frames themselves
+    reached_unclamped: float  # dB below the same white
+    stated_unclamped: float
+    samples: int
+    bounces: int
+    denoised: bool
+    light: float  # share by which the mean light is above that of the reference
+    announced: float  # share that the bounces left out would add
+    light_error: float  # standard error of light + announced
+
+    @property
+    def ok(self) -> bool:
+        """The error is as asked, and the light is off by what is announced."""
+        return self.reached > self.asked - MISSED and abs(self.light + self.announced) < ENOUGH * self.light_error
+
+
+@dataclass(frozen=True)
+class Report:
+    """All rows and what they were measured on."""
+
+    height: int
+    width: int
+    engine: str
+    rows: tuple[Row, ...]
+
+    @property
+    def ok(self) -> bool:
+        return all(row.ok for row in self.rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return asdict(self) | {"rows": [asdict(row) | {"ok": row.ok} for row in self.rows], "ok": self.ok}
+
+
+def run(
+    scenes: Sequence[Scene],
+    *,
+    levels: Sequence[float] = LEVELS,
+    reference_samples: int = 1024,
+    frames: Sequence[int] = (2, 9, 16),
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> Report:
+    """Measure every scene at every level; all must have one size. Minutes at 96 x 192."""
+    if not scenes or not levels or not frames:
+        raise ValueError("validate light: needs at least one scene, one level and one frame")
+    rows = []
+    for scene in scenes:
+        deep = Renderer(scene, budget=Budget(reference_samples, fidelity.DEEPEST), seed=seed + 1000)
+        references = np.stack([_halves(deep, t) for t in frames], axis=1)  # [2, frames, H, W]
+        for level in levels:
+            rows.append(_row(scene, level, references, frames, seed))
+            if progress is not None:
+                progress(_line(rows[-1]))
+    camera = scenes[0].camera
+    return Report(camera.height, camera.width, deep.engine.backend, tuple(rows))
+
+
+def _row(scene: Scene, level: float, references: Array, frames: Sequence[int], seed: int) -> Row:
+    chosen = fidelity.choose(scene, psnr=level, seed=seed)
+    ours = Renderer(scene, budget=chosen, seed=seed)
+    drawn = [ours.frame(t, with_truth=False) for t in frames]
+    truth = references.mean(axis=0)
+    white, light = white_in(truth), float(truth.mean())
+    images = np.stack([frame.radiance for frame in drawn])
+    found, own = Errors.between(images, truth, white), Errors.of_halves(references, white)
+    noise = Errors.of_halves(np.stack([_halves(ours, t) for t in frames], axis=1), white).plain
+    stated = [error_at(white, frame.errors_at) for frame in drawn], [frame.error for frame in drawn]
+    error = math.hypot(noise, own.plain) / math.sqrt(images.size) / light
+    return Row(
+        f"{scene.name}/{scene.seed}",
+        level,
+        _decibels(white, _without(found.at_white, own.at_white)),
+        _decibels(white, _mean(stated[0])),
+        _decibels(white, _without(found.plain, own.plain)),
+        _decibels(white, _mean(stated[1])),
+        chosen.samples,
+        chosen.bounces,
+        chosen.denoise,
+        float(images.mean(dtype=np.float64)) / light - 1,
+        chosen.dimmed,
+        math.hypot(error, chosen.dimmed_error),
+    )
+
+
+def _halves(renderer: Renderer, t: int) -> Array:
+    """Two independent estimates of frame t, as `Renderer.frame` draws them."""
+    return renderer.halves(renderer.instants(t), renderer.budget, renderer.key(t))
+
+
+def _without(found: float, own: float) -> float:
+    """An error without the reference's own, of which at least a tenth is left."""
+    return math.sqrt(max(found**2 - own**2, own**2 / 100))
+
+
+def _mean(errors: Sequence[float]) -> float:
+    return math.sqrt(float(np.mean(np.square(errors))))
+
+
+def _decibels(white: float, error: float) -> float:
+    found = decibels(white, error)
+    return math.inf if found is None else found
+
+
+def table(report: Report) -> str:
+    """The rows as text, one line each, and the verdict."""
+    head = f"{'scene':14} {'asked':>6} {'reached':>8} {'stated':>7} | {'unclamped: reached':>18} {'stated':>7} | "
+    head += f"{'samples':>14} {'bounces':>7} | {'light':>8} {'announced':>9} {'+-':>8}"
+    verdict = "every error is as asked, every light as announced"
+    wrong = [row.scene for row in report.rows if not row.ok]
+    if wrong:
+        verdict = f"NOT as asked or announced: {', '.join(wrong)}"
+    size = f"{report.height} x {report.width} pixels, engine {report.engine}; dB below white, light in %"
+    return "\n".join([size, head, *map(_line, report.rows), verdict])
+
+
+def _line(row: Row) -> str:
+    ours = f"{row.samples}{' denoised' if row.denoised else ''}"
+    return (
+        f"{row.scene:14} {row.asked:6g} {row.reached:8.2f} {row.stated:7.2f} | {row.reached_unclamped:18.2f} "
+        f"{row.stated_unclamped:7.2f} | {ours:>14} {row.bounces:7d} | {100 * row.light:+8.3f} "
+        f"{-100 * row.announced:+9.3f} {100 * row.light_error:8.3f}{'' if row.ok else '  NOT OK'}"
+    )

@@ -1,0 +1,138 @@
+"""Speed of reading: random training windows out of a clip, beside decoding the same windows from an mp4.
+
+    run() -> Report: windows of 11 frames of 128 x 128 per second out of 512 x 1024, ours and by FFmpeg, here and now
+
+Each side opens its files anew for every window, as a loader would that forgets them. Ours is one thread; FFmpeg may use
+all cores, seeks to the key frame before the window and decodes from there. The windows are the same and in the same
+order, and they hold the same pictures but for the loss of the video.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.clip.clip import RELATIVE, Clip, ClipWriter
+from qsim.formats import exporting
+
+FRAMES, HEIGHT, WIDTH = 65, 512, 1024
+WINDOW, CROP = 11, 128
+WANTED, RATIO = 100.0, 5.0  # windows per second; times the mp4
+
+Place = tuple[int, int, int]  # first frame, y, x
+
+
+@dataclass(frozen=True)
+class Report:
+    """Windows per second here and now, and per second of processor time, which a busy machine changes less."""
+
+    clip: float
+    mp4: float
+    clip_processor: float
+    mp4_processor: float
+    difference: float  # rms between ours and the video's pictures, in units of white
+
+    @property
+    def ratio(self) -> float:
+        return self.clip / self.mp4
+
+    @property
+    def ok(self) -> bool:
+        return self.clip >= WANTED and self.ratio >= RATIO and self.difference < 0.05
+
+    def to_dict(self) -> dict[str, Any]:
+        """For --json."""
+        sizes = {"window_shape": [WINDOW, CROP, CROP], "clip_shape": [FRAMES, HEIGHT, WIDTH]}
+        return asdict(self) | sizes | {"ratio": self.ratio, "wanted": WANTED, "wanted_ratio": RATIO, "ok": self.ok}
+
+    def lines(self) -> list[str]:
+        """The report as text."""
+        return [
+            f"windows of {WINDOW} x {CROP} x {CROP} at random places in a clip of {FRAMES} x {HEIGHT} x {WIDTH},",
+            "per second, and per second of processor time:",
+            f"  clip folder  {self.clip:8.1f}  {self.clip_processor:8.1f}   (wanted: {WANTED:g} per second)",
+            f"  mp4          {self.mp4:8.1f}  {self.mp4_processor:8.1f}",
+            f"  ratio        {self.ratio:8.1f}  {self.clip_processor / self.mp4_processor:8.1f}   (wanted: {RATIO:g})",
+            f"  the same pictures to {self.difference:.3f} of white, the video's loss",
+        ]
+
+
+def run(seconds: float = 4.0, seed: int = 0) -> Report:
+    """Write a clip and its video to a temporary folder and read both for so many seconds each, in turns."""
+    with tempfile.TemporaryDirectory(prefix="qsim-reading-") as folder:
+        clip = textured_clip(Path(folder) / "clip", seed)
+        video = exporting.export(
+            clip, Path(folder) / "clip.mp4", exporting.Export("mp4", "linear", 1.1, lossless=False)
+        )
+        sides: list[Callable[[Place], Array]] = [lambda at: from_clip(clip.path, at), lambda at: from_mp4(video, at)]
+        rng = np.random.default_rng(seed)
+        places = [_place(rng) for _ in range(8)]
+        difference = np.mean([(sides[0](at) / 1.1 - sides[1](at) / 255.0) ** 2 for at in places])
+        rates = [_rate(side, seconds / 2, seed + turn) for turn in range(2) for side in sides]
+    ours, theirs = max(rates[0::2]), max(rates[1::2])
+    return Report(ours[0], theirs[0], ours[1], theirs[1], float(np.sqrt(difference)))
+
+
+def textured_clip(path: Path, seed: int) -> Clip:
+    """A texture that moves by 3 pixels per frame, with some noise: neither trivial nor impossible to compress."""
+    rng = np.random.default_rng(seed)
+    texture = np.kron(rng.random((HEIGHT // 4, WIDTH // 4)), np.ones((4, 4)))
+    meta = {"shape": [FRAMES, HEIGHT, WIDTH], "frame_rate": 2000.0, "exposure": 5e-4, "radiance_unit": RELATIVE}
+    with ClipWriter(path, meta | {"camera": None}) as writer:
+        for t in range(FRAMES):
+            writer.add(t, np.roll(texture, 3 * t, axis=1) + 0.02 * rng.random((HEIGHT, WIDTH)))
+    return Clip.open(path)
+
+
+def from_clip(path: Path, place: Place) -> Array:
+    """A window [11, 128, 128] by our reader."""
+    first, y, x = place
+    clip = Clip.open(path)
+    return np.stack([clip.radiance(t, (y, x, CROP, CROP)) for t in range(first, first + WINDOW)])
+
+
+def from_mp4(path: Path, place: Place) -> Array:
+    """The same window, uint8, by FFmpeg."""
+    import av
+
+    first, y, x = place
+    found: list[Array] = []
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        tick = stream.average_rate * stream.time_base  # frames per unit of pts
+        container.seek(int(first / tick), stream=stream)
+        for frame in container.decode(stream):
+            if round(frame.pts * tick) >= first:
+                found.append(frame.to_ndarray(format="gray")[y : y + CROP, x : x + CROP])
+            if len(found) == WINDOW:
+                break
+    return np.stack(found)
+
+
+def _place(rng: np.random.Generator) -> Place:
+    return (
+        int(rng.integers(FRAMES - WINDOW + 1)),
+        int(rng.integers(HEIGHT - CROP + 1)),
+        int(rng.integers(WIDTH - CROP + 1)),
+    )
+
+
+def _rate(draw: Callable[[Place], Array], seconds: float, seed: int) -> tuple[float, float]:
+    """Windows per second, and per processor second, over at least so many seconds; the first one does not count."""
+    rng = np.random.default_rng(seed)
+    draw(_place(rng))
+    done, started, worked = 0, time.perf_counter(), time.process_time()
+    while True:
+        draw(_place(rng))
+        done += 1
+        passed = time.perf_counter() - started
+        if passed >= seconds:
+            return done / passed, done / (time.process_time() - worked)

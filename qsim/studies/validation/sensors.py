@@ -1,0 +1,350 @@
+"""Speed against error: every sensor model and engine, measured here and now, beside what it has to reach.
+
+    run() -> Report: rows (speed, error of the cdf, chi-square, mismatches, z-scores), hard cases
+    Report.ok is false when any number is outside its bounds; speeds are outside only if asked for
+
+The bounds are those of a correct program: exact forms to rounding, statistics to a false alarm of 1e-6 for the whole
+report, compiled codes to 5 in a million.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from io import BytesIO
+from math import expm1, log1p, sqrt
+from pathlib import Path
+from statistics import NormalDist, median
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.clip.stream import Progress
+from qsim.keys import Key
+from qsim.sensor.compiled import kernel, launch
+from qsim.sensor.compiled.plan import plan
+from qsim.sensor.devices import quiver_physical
+from qsim.sensor.qis import QIS
+from qsim.sensor.sensor import Sensor
+from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.studies.validation.edge_cases import Case, hard_cases
+
+EXPOSURE = 5e-4  # s, 2000 frames per second
+FALSE_ALARM = 1e-6  # of all statistical checks of one report together
+CDF_BOUND = {"reference": 1e-10, "fast": 1e-5}  # float64; float32, whose near misses the reference decides
+MISMATCH_BOUND = 5.0  # pixels in a million
+FRAME = (512, 1024)  # pixels, of the published data set
+_ROUNDS = 7  # of timing; the medians count
+
+# Name -> sensor, photons of the timing and of the histogram, how many times NumPy it has to reach (0: no target)
+MODELS: dict[str, tuple[Sensor, float, float]] = {
+    "QIS 3 bits, gain 1": (QIS(0.8, 1.6, 0.2, 3), 3.25, 25.0),
+    "QIS 3 bits, gain 1.077": (quiver_physical(3.25), 3.25, 25.0),
+    "QIS 3 bits, gain 0.135": (quiver_physical(26.0), 26.0, 8.0),
+    "QIS 5 bits, gain 1": (QIS(0.8, 1.6, 0.2, 5), 16.0, 0.0),
+    "QIS 3 bits, no read noise": (QIS(0.8, 1.6, 0.0, 3), 3.25, 0.0),
+    "clocked SPAD, 1 bit": (BinarySPAD(0.5, 25.0), 0.7, 0.0),
+    "clocked SPAD, 7 planes": (BinarySPAD(0.5, 25.0, 3), 4.9, 0.0),
+    "counting SPAD, 50 ns": (CountingSPAD(0.5, 25.0, 50e-9, 3), 6.0, 0.0),
+    "counting SPAD, tau = T/4": (CountingSPAD(0.5, 25.0, EXPOSURE / 4, 3), 6.0, 0.0),
+    "paralyzable, tau = T/4": (CountingSPAD(0.5, 25.0, EXPOSURE / 4, 3, paralyzable=True), 6.0, 0.0),
+}
+PACKED_TARGET = 3.0  # times NumPy's `random < p` and packbits, 1 bit
+
+
+@dataclass(frozen=True)
+class Row:
+    """One model on one engine; None where a number does not apply."""
+
+    model: str
+    engine: str
+    megapixels_per_second: float
+    times_numpy: float | None = None  # ratio of the medians of one run
+    target: float | None = None  # what `times_numpy` has to reach
+    cdf_error: float | None = None  # largest, against sums and integrals written out anew
+    p_value: float | None = None  # chi-square of the codes against the closed form
+    z_mean: float | None = None
+    z_variance: float | None = None
+    mismatches_per_million: float | None = None  # against the reference engine
+    wrong: tuple[str, ...] = ()  # columns outside their bounds
+
+
+@dataclass(frozen=True)
+class Report:
+    rows: list[Row]
+    cases: list[Case]
+    pixels: int
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def ok(self) -> bool:
+        return not any(row.wrong for row in self.rows) and all(case.ok for case in self.cases)
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self) | {"ok": self.ok}
+
+
+def run(
+    pixels: int = 1 << 22, seed: int = 0, *, require_speed: bool = False, progress: Progress | None = None
+) -> Report:
+    """Measure everything on clips of about `pixels` pixels, in frames of 512 x 1024 where it is enough; a minute."""
+    if pixels < 1 << 16:
+        raise ValueError(f"pixels: a chi-square and a timing need at least 65536, got {pixels}")
+    frames = pixels // FRAME[0] // FRAME[1]
+    shape = (frames, *FRAME) if frames else (1, pixels // FRAME[0], FRAME[0])
+    checks = 3 * 2 * len(MODELS)
+    rows = []
+    for n, (name, (sensor, photons, target)) in enumerate(MODELS.items(), 1):
+        rows += _measure(name, sensor, photons, target, shape, seed, checks, require_speed)
+        if progress is not None:
+            progress(n, len(MODELS) + 1)
+    rows += _packed(shape, seed, require_speed)
+    settings = {"seed": seed, "exposure": EXPOSURE, "fast_engine": kernel.available(), "rounds": _ROUNDS}
+    return Report(
+        rows, hard_cases({name: model[0] for name, model in MODELS.items()}, EXPOSURE), int(np.prod(shape)), settings
+    )
+
+
+def _measure(
+    name: str,
+    sensor: Sensor,
+    photons: float,
+    target: float,
+    shape: tuple[int, ...],
+    seed: int,
+    checks: int,
+    require_speed: bool,
+) -> list[Row]:
+    """Rows of one model: NumPy's way where there is one, the reference, the compiled engine where it serves."""
+    light = np.full(shape, photons, np.float32)
+    key = Key(seed, 1)
+    engines = ["reference"]
+    if kernel.available() and plan(sensor, EXPOSURE) is not None:
+        engines.append("fast")
+    draws: dict[str, Callable[[], Array]] = {
+        engine: partial(sensor.sample, light, EXPOSURE, key=key, engine=engine) for engine in engines
+    }
+    if isinstance(sensor, QIS):
+        draws["numpy"] = _numpy_way(sensor, light, seed)
+    codes, seconds = _race(draws)
+    speed = {engine: light.size / s / 1e6 for engine, s in seconds.items()}
+    rows = [Row(name, "numpy", speed["numpy"])] if "numpy" in speed else []
+    for engine in engines:
+        p, z_mean, z_variance = _statistics(codes[engine], sensor, photons)
+        ratio = seconds["numpy"] / seconds[engine] if "numpy" in seconds else None
+        row = Row(
+            name,
+            engine,
+            speed[engine],
+            times_numpy=ratio,
+            target=target if engine == "fast" and target else None,
+            cdf_error=_cdf_error(sensor, engine),
+            p_value=p,
+            z_mean=z_mean,
+            z_variance=z_variance,
+            mismatches_per_million=None
+            if engine == "reference"
+            else float(np.mean(codes[engine] != codes["reference"]) * 1e6),
+        )
+        rows.append(_judged(row, checks, require_speed))
+    return rows
+
+
+def _packed(shape: tuple[int, ...], seed: int, require_speed: bool) -> list[Row]:
+    """Packed binary planes against NumPy's `random < p` and packbits."""
+    if not kernel.available():
+        return []
+    sensor, _, _ = MODELS["clocked SPAD, 1 bit"]
+    light = np.full(shape, 0.7, np.float32)
+    share = 1 - sensor.cdf(light, EXPOSURE)[..., 0]
+    rng = np.random.default_rng(seed)
+    draws = {
+        "numpy": lambda: np.packbits(rng.random(shape) < share, axis=-1),
+        "fast": lambda: launch.sample_packed(sensor, light, EXPOSURE, key=Key(seed, 1)),
+    }
+    _, seconds = _race(draws)
+    name = "clocked SPAD, 1 bit, packed"
+    speed = {engine: light.size / s / 1e6 for engine, s in seconds.items()}
+    fast = Row(name, "fast", speed["fast"], seconds["numpy"] / seconds["fast"], PACKED_TARGET)
+    return [Row(name, "numpy", speed["numpy"]), _judged(fast, 1, require_speed)]
+
+
+def _numpy_way(sensor: QIS, light: Array, seed: int) -> Callable[[], Array]:
+    """How the field draws such codes: Poisson, plus a Gaussian, rounded and clipped."""
+    rng = np.random.default_rng(seed)
+
+    def draw() -> Array:
+        electrons = rng.poisson(sensor.arrivals(light, EXPOSURE)) + rng.normal(0, sensor.read_noise, light.shape)
+        return np.clip(np.rint(sensor.gain * electrons + sensor.offset), 0, sensor.levels - 1).astype(sensor.dtype)
+
+    return draw
+
+
+def _race(draws: dict[str, Callable[[], Array]]) -> tuple[dict[str, Array], dict[str, float]]:
+    """Results and median seconds, the competitors taking turns so that all see the same machine."""
+    times: dict[str, list[float]] = {name: [] for name in draws}
+    codes = {}
+    for n in range(_ROUNDS + 1):
+        for name, draw in draws.items():
+            if n == 0 or name != "reference":  # slow, and nothing is asked of its speed: once is enough
+                start = time.perf_counter()
+                codes[name] = draw()
+                times[name].append(time.perf_counter() - start)
+        if n == 0:  # the first round compiled
+            times |= {name: [] for name in draws if name != "reference"}
+    return codes, {name: median(seconds) for name, seconds in times.items()}
+
+
+def _statistics(codes: Array, sensor: Sensor, photons: float) -> tuple[float, float, float]:
+    """Chi-square p-value, z of the mean, z of the variance, against the closed form at constant light."""
+    from scipy.stats import chi2
+
+    pmf = np.exp(sensor.log_pmf(np.array(photons), EXPOSURE))
+    counts, n = np.bincount(codes.ravel(), minlength=pmf.size).astype(float), codes.size
+    frequent = pmf * n >= 5
+    observed = np.append(counts[frequent], counts[~frequent].sum())
+    expected = np.append(pmf[frequent], pmf[~frequent].sum()) * n
+    use = expected >= 5
+    impossible = counts[pmf == 0].any()  # pooling must not hide it
+    p = (
+        0.0
+        if impossible
+        else float(chi2.sf(((observed - expected)[use] ** 2 / expected[use]).sum(), max(use.sum() - 1, 1)))
+    )
+    level = np.arange(pmf.size)
+    mean = pmf @ level
+    variance, fourth = (pmf @ (level - mean) ** power for power in (2, 4))
+    z_mean = _z(counts @ level / n - mean, variance / n)
+    return p, z_mean, _z(counts @ (level - mean) ** 2 / n - variance, (fourth - variance**2) / n)
+
+
+def _z(difference: float, variance: float) -> float:
+    """Standard deviations; a certain number is right or infinitely wrong."""
+    if variance > 0:
+        return float(difference / sqrt(variance))
+    return 0.0 if difference == 0 else float(np.copysign(np.inf, difference))
+
+
+def _cdf_error(sensor: Sensor, engine: str) -> float | None:
+    """Largest error of F over light from 0 to 4 white, against sums written out anew."""
+    photons = np.linspace(0, 4 * sensor.white(EXPOSURE), 401).astype(np.float32).astype(float)
+    expected = _written_out(sensor, photons)
+    if expected is None:
+        return None
+    found = sensor.cdf(photons, EXPOSURE)[:, :-1]
+    if engine == "fast":
+        found = kernel.steps(sensor, photons, EXPOSURE)
+        if isinstance(sensor, BinarySPAD):  # the kernel compares plane by plane
+            expected = np.exp(-sensor.arrivals(photons, EXPOSURE) / sensor.planes)[:, None]
+        found, expected = np.minimum(found, 1), np.minimum(expected, 1)
+    return float(np.abs(found - expected).max())
+
+
+def _written_out(sensor: Sensor, photons: Array) -> Array | None:
+    """F_0 ... by another way than the models': plain sums over electrons, binomial and gamma laws; None if none."""
+    from scipy import stats
+
+    arrivals = sensor.arrivals(photons, EXPOSURE)[:, None]
+    k = np.arange(sensor.levels - 1)
+    if isinstance(sensor, QIS):
+        n = np.arange(int(arrivals.max() + 12 * sqrt(arrivals.max()) + 60))
+        if sensor.read_noise:
+            threshold = (k + 0.5 - sensor.offset) / sensor.gain
+            below = stats.norm.cdf((threshold - n[:, None]) / sensor.read_noise)
+        else:
+            below = (sensor.codes_of(n.astype(float))[:, None] <= k).astype(float)
+        return stats.poisson.pmf(n, arrivals) @ below
+    if isinstance(sensor, BinarySPAD):
+        return stats.binom.cdf(k, sensor.planes, -np.expm1(-arrivals / sensor.planes))
+    if isinstance(sensor, CountingSPAD) and not sensor.paralyzable:
+        live = np.maximum(1 - k * sensor.dead_time / EXPOSURE, 0)
+        return stats.gamma.sf(arrivals * live, k + 1)
+    return None
+
+
+def _judged(row: Row, checks: int, require_speed: bool) -> Row:
+    """The row with the names of its columns that are outside their bounds."""
+    each = -expm1(log1p(-FALSE_ALARM) / checks)
+    limit = NormalDist().inv_cdf(1 - each / 2)
+    faults = {
+        "cdf error": row.cdf_error is not None and row.cdf_error > CDF_BOUND[row.engine],
+        "p": row.p_value is not None and row.p_value < each,
+        "z mean": row.z_mean is not None and abs(row.z_mean) > limit,
+        "z variance": row.z_variance is not None and abs(row.z_variance) > limit,
+        "mismatch": row.mismatches_per_million is not None and row.mismatches_per_million > MISMATCH_BOUND,
+        "speed": require_speed and row.target is not None and (row.times_numpy or 0) < row.target,
+    }
+    return replace(row, wrong=tuple(name for name, wrong in faults.items() if wrong))
+
+
+# ---- What people see
+
+
+def table(report: Report) -> list[str]:
+    """Lines for a terminal."""
+    header = ("model", "engine", "Mpixel/s", "x NumPy", "(target)", "cdf error", "chi2 p", "z mean", "z var", "ppm", "")
+    lines = [header]
+    for row in report.rows:
+        lines.append(
+            (
+                row.model,
+                row.engine,
+                f"{row.megapixels_per_second:.1f}",
+                _number(row.times_numpy, ".1f"),
+                _number(row.target, ".0f"),
+                _number(row.cdf_error, ".1e"),
+                _number(row.p_value, ".3f"),
+                _number(row.z_mean, "+.1f"),
+                _number(row.z_variance, "+.1f"),
+                _number(row.mismatches_per_million, ".1f"),
+                "OUTSIDE: " + ", ".join(row.wrong) if row.wrong else "",
+            )
+        )
+    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    text = ["  ".join(f"{c:<{w}}" if i < 2 else f"{c:>{w}}" for i, (c, w) in enumerate(zip(line, widths, strict=True)))
+            for line in lines]  # fmt: skip
+    width = max(len(case.name) for case in report.cases)
+    text += ["", *(f"{'ok   ' if case.ok else 'WRONG'}  {case.name:<{width}}  {case.found}" for case in report.cases)]
+    verdict = "everything is within its bounds" if report.ok else "OUTSIDE: see the lines marked so"
+    return [line.rstrip() for line in text] + ["", f"{report.pixels} pixels a draw; {verdict}"]
+
+
+def _number(value: float | None, style: str) -> str:
+    return "-" if value is None else format(value, style)
+
+
+def figure(report: Report, path: str | Path) -> None:
+    """Speed against error, one mark per row that has both, written to `path` (.png, .svg or .pdf)."""
+    from matplotlib.figure import Figure
+
+    from qsim import files
+
+    drawn = Figure(figsize=(8, 5), layout="constrained")
+    axes = drawn.add_subplot()
+    for engine, marker, colour in (("reference", "o", "#1f5c99"), ("fast", "s", "#c4501b")):
+        rows = [row for row in report.rows if row.engine == engine and row.cdf_error is not None]
+        x = [row.megapixels_per_second for row in rows]
+        y = [max(row.cdf_error or 0.0, 1e-17) for row in rows]
+        axes.plot(x, y, marker, color=colour, label=f"{engine} (bound {CDF_BOUND[engine]:.0e})")
+        for row, a, b in zip(rows, x, y, strict=True):
+            axes.annotate(row.model, (a, b), xytext=(5, 4), textcoords="offset points", fontsize=7)
+        axes.axhline(CDF_BOUND[engine], color=colour, linewidth=0.8, linestyle=":")
+    axes.set(xscale="log", yscale="log", xlabel="speed [Mpixel/s]", ylabel="largest error of the cdf")
+    axes.set_title("Sensor engines: speed against error; codes near a step are decided in float64", fontsize=10)
+    axes.legend(frameon=False)
+    path = Path(path)
+    buffer = BytesIO()
+    drawn.savefig(buffer, format=check_figure(path), dpi=150)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files.write_bytes(path, buffer.getvalue())
+
+
+def check_figure(path: Path) -> str:
+    """The format that a figure's name asks for; `ValueError` if it is none of ours."""
+    kind = path.suffix.lstrip(".").lower()
+    if kind not in ("png", "svg", "pdf"):
+        raise ValueError(f"{path}: a figure is a .png, .svg or .pdf file")
+    return kind

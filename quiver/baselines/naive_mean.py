@@ -1,0 +1,45 @@
+"""Naive mean: the floor under every table. Averages the codes of a window and believes they are linear in light.
+
+    photons = max(0, mean(codes) - dark) * white / top
+
+Source: textbook. `white / top` is the light of one code step as the settings promise it (1/(gain * efficiency)),
+`dark` the codes which dark counts and offset add in the same linear picture. Clipping and dead time are ignored: at
+3.25 photons per pixel (3 bits, gain 1.077) the estimate is 4 % low, at four times that light 39 %.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.sensor.qis import QIS
+from qsim.sensor.sensor import Sensor
+from quiver.baselines.sliding_window import restore_by_mean
+
+
+def dark_codes(sensor: Sensor, exposure: float) -> float:
+    """What a linear sensor would read in the dark [codes]."""
+    slope = (sensor.levels - 1) / sensor.white(exposure)  # codes per photon
+    offset = sensor.offset if isinstance(sensor, QIS) else 0.0
+    return slope * sensor.dark_rate * exposure / sensor.efficiency + offset
+
+
+def restore(
+    codes: Array,
+    sensor: Sensor,
+    exposure: float,
+    *,
+    window: int = 11,
+    photons_per_unit: float = 1.0,
+    frames: range | None = None,
+) -> Array:
+    """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
+
+    Raises ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
+    """
+    dark, step = dark_codes(sensor, exposure), sensor.white(exposure) / (sensor.levels - 1)
+
+    def photons_of(mean_code: Array) -> Array:
+        return np.maximum(0, mean_code - dark) * step
+
+    return restore_by_mean(codes, sensor, window, photons_of, photons_per_unit, frames)

@@ -1,0 +1,102 @@
+"""Frames of a stream: checking them, reaching over the ends of a clip, sums over a sliding window.
+
+    codes [T, H, W] -> for every frame t the sum of the codes of `window` frames around it
+
+A window of w frames covers t - w//2 ... t + (w-1)//2: centred for odd w, one frame more of the past for even w.
+Frames before the first and after the last are reflections that do not repeat the end frame (-1 is frame 1), over and
+over for short clips.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.sensor.sensor import Sensor
+
+
+def check_codes(codes: Array, sensor: Sensor) -> None:
+    """Raise ValueError unless `codes` is a non-empty integer stack [T, H, W] which this sensor can produce."""
+    if codes.ndim != 3 or codes.size == 0 or not np.issubdtype(codes.dtype, np.integer):
+        raise ValueError(f"codes: expected integers [T, H, W] with at least one frame, got {codes.dtype} {codes.shape}")
+    if codes.max() >= sensor.levels or codes.min() < 0:
+        bad = (codes < 0) | (codes >= sensor.levels)
+        where = tuple(int(i) for i in np.unravel_index(np.argmax(bad), codes.shape))
+        raise ValueError(
+            f"codes: expected 0..{sensor.levels - 1} for a {sensor.bits}-bit sensor, "
+            f"found {codes[where]} at (t, y, x) = {where}"
+        )
+
+
+def check_window(window: int) -> None:
+    """Raise ValueError unless a window holds at least one frame."""
+    if window < 1:
+        raise ValueError(f"window is a number of frames, got {window}; use 1 or more")
+
+
+def look_ahead(window: int) -> int:
+    """Future frames which a window of this many frames needs."""
+    return (window - 1) // 2
+
+
+def reflect(index: Array, length: int) -> Array:
+    """Frame numbers inside 0 ... length-1 for any integers: -1 -> 1, length -> length-2; always 0 for one frame."""
+    if length == 1:
+        return np.zeros_like(index)
+    folded = np.abs(index) % (2 * length - 2)
+    return np.where(folded < length, folded, 2 * length - 2 - folded)
+
+
+def window_frames(frame: int, window: int, length: int) -> Array:
+    """The `window` frame numbers around `frame`, reflected at both ends of a clip of `length` frames."""
+    return reflect(np.arange(frame - window // 2, frame + look_ahead(window) + 1), length)
+
+
+def window_sums(codes: Array, window: int, top: int) -> Iterator[Array]:
+    """Sum of the codes over the window around each frame: T unsigned arrays [H, W], 0 ... window * top.
+
+    A running sum: one frame enters, one leaves. Every yielded array is the caller's own.
+    """
+    dtype = np.uint16 if window * top < 2**16 else np.uint32
+    length = len(codes)
+    total = codes[window_frames(0, window, length)].sum(axis=0, dtype=dtype)
+    yield total
+    for frame in range(1, length):
+        leaves, enters = reflect(np.array([frame - 1 - window // 2, frame + look_ahead(window)]), length)
+        total = np.add(total, codes[enters], dtype=dtype, casting="unsafe")
+        np.subtract(total, codes[leaves], out=total, casting="unsafe")
+        yield total
+
+
+def restore_by_mean(
+    codes: Array,
+    sensor: Sensor,
+    window: int,
+    photons_of: Callable[[Array], Array],
+    photons_per_unit: float,
+    frames: range | None = None,
+) -> Array:
+    """Restored frames [T, H, W], all or those in `frames`, where a frame depends on its window's mean code only.
+
+    A sum of codes has few values, so the whole method is one table, `photons_of` every possible mean code, and a
+    running sum. ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
+    """
+    check_codes(codes, sensor)
+    check_window(window)
+    top = sensor.levels - 1
+    table = photons_of(np.arange(window * top + 1) / window).astype(np.float32)
+    frames = range(len(codes)) if frames is None else frames
+    restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
+    for frame, total in enumerate(window_sums(codes, window, top)):
+        if frame in frames:  # clip never happens, but is the unbuffered mode
+            np.take(table, total, out=restored[frame - frames.start], mode="clip")
+    return in_units(restored, photons_per_unit)
+
+
+def in_units(photons: Array, photons_per_unit: float) -> Array:
+    """Restored photons, float32, in a unit of so many photons. Raise ValueError unless that is finite and above 0."""
+    if not 0 < photons_per_unit < np.inf:
+        raise ValueError(f"photons_per_unit must be a finite number above 0, got {photons_per_unit!r}")
+    return photons if photons_per_unit == 1 else photons / np.float32(photons_per_unit)

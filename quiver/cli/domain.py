@@ -1,0 +1,89 @@
+"""The command `quiver domain`: what weights were measured for, and the measuring; a pair as in cli.py."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from quiver.cli.options import add_running, command, numbers, running_options, size, use_threads, whole_numbers, words
+
+MEMORY = "2GB"  # as other commands
+MEASURING = ("split", "sensor", "bits", "ppp", "methods", "seed", "memory", "mode", "device", "precision", "threads")
+
+
+def add_domain(sub: Any) -> None:
+    parser = command(
+        sub, "domain", _run_domain,
+        "Measure where weights are better than the classical methods, and store it in their file; without clips, show.",
+        "quiver domain nano\n"
+        "quiver domain out/mine out/data --bits 1,3 --ppp 1,3.25,10\n"
+        "quiver domain out/mine out/data --sensor spad-320x240 --bits 1 --ppp 0.3,1,3", goes_on=True,
+    )  # fmt: skip
+    parser.add_argument("weights", help="shipped weights, a .safetensors file, or a folder of `quiver train`")
+    parser.add_argument("clips", nargs="*", type=Path, help="data sets and clip folders that trained and tuned nothing")
+    parser.add_argument("--split", choices=("train", "val", "test", "all"), help="of data sets (default test)")
+    parser.add_argument("--sensor", type=words, help="names or .toml files, with commas (default quiver-physical)")
+    parser.add_argument("--bits", type=whole_numbers, help="with commas (default 3)")
+    parser.add_argument("--ppp", type=numbers, help="mean photons per pixel and code, with commas (default 3.25)")
+    parser.add_argument(
+        "--methods", type=words, help="classical methods, with commas (default all without `likelihood`)"
+    )
+    parser.add_argument("--seed", type=int, help="of the noise (default 0)")
+    add_running(parser)
+    parser.set_defaults(memory=None)  # so that one that was given shows
+    parser.add_argument("--force", action="store_true", help="measure cells again that are there")
+
+
+def _run_domain(args: argparse.Namespace) -> int:
+    from quiver import threads
+    from quiver.data.codes import bar, output
+    from quiver.model.weights import metadata_of
+    from quiver.restoration.domain import Domain, read_scope, table
+    from quiver.restoration.restorers import network_restorer, weights_path
+    from quiver.restoration.sources import refuse, refuse_idle
+
+    path = weights_path(args.weights)
+    if args.clips:
+        from quiver.evaluation.domain_measurement import measure
+
+        args.memory = args.memory or size(MEMORY)
+        threads.check(args.threads)
+        options, question = running_options(args), _question(args)
+        refuse_idle(vars(args), [network_restorer(path, options)])
+        use_threads(args)
+        with bar("cells", "cell") as progress:
+            found: Domain | None = measure(path, question, options, progress, force=args.force)
+    else:
+        refuse(args, MEASURING, "is of measuring, and no clips are named")
+        if args.force:
+            raise ValueError("--force: is of measuring, and no clips are named; leave it out")
+        found = read_scope(path, metadata_of(path)).domain
+    if found is None:
+        raise ValueError(f"{path}: was never measured; name clips that trained and tuned nothing")
+    wins = sum(cell.wins for cell in found.cells)
+    text = [
+        *table(found),
+        "",
+        f"{path.name}: at least as good as the best classical method in {wins} of {len(found.cells)} cells",
+    ]
+    output(args, {"weights": str(path), "domain": found.to_dict()}, text)
+    return 0
+
+
+def _question(args: argparse.Namespace) -> Any:
+    from quiver.data.codes import Light
+    from quiver.evaluation.domain_measurement import CLASSICAL, Question, clips_of
+
+    lights = tuple(
+        Light(sensor, ppp, bits)
+        for sensor in args.sensor or ("quiver-physical",)
+        for bits in args.bits or (3,)
+        for ppp in args.ppp or (3.25,)
+    )
+    if args.split is not None and all((clips / "clip.json").exists() for clips in args.clips):
+        raise ValueError(
+            f"--split {args.split}: chooses clips of data sets, and only clip folders are named; leave it out"
+        )
+    clips = clips_of(args.clips, None if args.split == "all" else args.split or "test")
+    return Question(clips, lights, args.methods or CLASSICAL, args.seed or 0)

@@ -1,0 +1,173 @@
+"""What the commands share: options and what their values mean, folders that start anew, signals.
+
+Every function from text to value raises `argparse.ArgumentTypeError`, which becomes one line that names the option.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+NETWORKS = ("nano", "quiver-s", "quiver", "unet")  # see model.py
+PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see run.py
+DEFAULT_METHOD = "nano"  # of `quiver restore` and `quiver.restore`
+MODES = ("exact", "streaming", "windows")  # see restoring.py
+
+
+def numbers(text: str) -> tuple[float, ...]:
+    """`3.25,9.75` -> (3.25, 9.75)"""
+    return tuple(positive(part) for part in text.split(","))
+
+
+def whole_numbers(text: str) -> tuple[int, ...]:
+    """`1,3` -> (1, 3)"""
+    return tuple(count(part) for part in text.split(","))
+
+
+def positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
+    return value
+
+
+def count(text: str) -> int:
+    if not text.strip().isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
+    return int(text)
+
+
+def nonnegative(text: str) -> int:
+    if not text.strip().isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, got {text!r}")
+    return int(text)
+
+
+def size(text: str) -> int:
+    """Bytes of `2GB`, `500MB`, `1.5GiB` or a bare number."""
+    units = {"kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2**10, "mib": 2**20, "gib": 2**30, "b": 1, "": 1}
+    number = text.rstrip("KMGiBkmgb")
+    unit = text[len(number) :].lower()
+    try:
+        value = float(number) * units[unit]
+    except (ValueError, KeyError):
+        value = float("nan")
+    if not 1 <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"expected a size such as 2GB or 500MB, got {text!r}")
+    return int(value)
+
+
+def height_width(text: str) -> tuple[int, int]:
+    """`128x256` -> (128, 256)"""
+    height, cross, width = text.partition("x")
+    if not cross:
+        raise argparse.ArgumentTypeError(f"expected HEIGHTxWIDTH as in 128x256, got {text!r}")
+    return count(height), count(width)
+
+
+def words(text: str) -> tuple[str, ...]:
+    """`naive,moment:3,out/run` -> its parts; none may be empty."""
+    parts = tuple(part.strip() for part in text.split(","))
+    if not all(parts):
+        raise argparse.ArgumentTypeError(f"expected names with commas between them, got {text!r}")
+    return parts
+
+
+def add_light(parser: argparse.ArgumentParser, several: bool) -> None:
+    kind, many = (numbers, "; several: 3.25,9.75,26") if several else (positive, "")
+    whole = whole_numbers if several else count
+    parser.add_argument("--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default quiver-physical)")
+    parser.add_argument("--ppp", type=kind, help=f"mean photons per pixel and exposure (default 3.25){many}")
+    parser.add_argument("--bits", type=whole, help="bits per code (default 3)")
+
+
+def add_noise(parser: argparse.ArgumentParser) -> None:
+    """Of training: what is not given is taken from the data set's streams."""
+    parser.add_argument(
+        "--sensor",
+        type=words,
+        help="names of `qsim doctor --devices` or .toml files, comma-separated (default: the data set's streams')",
+    )
+    parser.add_argument(
+        "--ppp", type=numbers, help="mean photons per pixel and exposure; several: 1,10 (default: the streams')"
+    )
+    parser.add_argument("--bits", type=whole_numbers, help="bits per code; several: 1,3 (default: the streams')")
+
+
+def add_running(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--memory", type=size, default="2GB", help="working memory, as in 500MB (default 2GB)")
+    parser.add_argument("--mode", choices=MODES, help="networks: how frames share work (default exact)")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="networks: where they run (default auto)")
+    parser.add_argument("--precision", choices=("float32", "bfloat16"), help="networks: default float32")
+    add_threads(parser)
+
+
+def add_threads(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--threads", type=count, help="of torch on the CPU (default: measured at start; work that is resumed keeps its)"
+    )
+
+
+def use_threads(args: argparse.Namespace, earlier: int | None = None) -> int:
+    """Set the number of torch's threads, and say which with --verbose."""
+    from quiver import threads
+    from quiver.data.codes import note
+
+    chosen = threads.use(args.threads, earlier)
+    if args.verbose:
+        note(f"threads: {chosen}")
+    return chosen.number
+
+
+def add_strict(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--strict", action="store_true", help="networks: refuse a stream outside of what they were measured for"
+    )
+
+
+def running_options(args: argparse.Namespace) -> Any:
+    """What `add_running` asked for, as `restoring.Options`."""
+    from quiver.restoration.restorers import Options
+
+    return Options(args.memory, args.mode or "exact", args.device or "auto", args.precision or "float32")
+
+
+def renew(folder: Path, mark: str, ours: str) -> None:
+    """Remove a folder that holds the file `mark`, and files whose names match the pattern `ours` only."""
+    from quiver.data.codes import check_ours
+
+    if (folder / mark).is_file():
+        check_ours(folder, ours)
+        shutil.rmtree(folder)
+    elif folder.exists():
+        raise FileExistsError(f"{folder} holds no {mark}; --force removes only what this command made")
+
+
+def command(
+    sub: Any, name: str, action: Any, what: str, example: str, *, goes_on: bool = False
+) -> argparse.ArgumentParser:
+    """A command's parser, as `qsim.console.command` makes it."""
+    from quiver.data import codes
+
+    return codes.command(sub, name, action, what, example, codes.GOES_ON if goes_on else codes.STARTS_AGAIN)
+
+
+@contextlib.contextmanager
+def handling(handler: Callable[[int, Any], Any], *numbers: signal.Signals) -> Iterator[None]:
+    """Signals go to `handler` inside the block (only the main thread may say so; elsewhere nothing changes)."""
+    main_thread = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, handler) for number in numbers if main_thread}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)

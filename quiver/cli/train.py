@@ -1,0 +1,186 @@
+"""Commands that train: `train` one network, `ablate` six; pairs as in cli.py."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from quiver.cli.options import (
+    NETWORKS,
+    PROTOCOLS,
+    add_noise,
+    add_running,
+    add_threads,
+    command,
+    count,
+    handling,
+    nonnegative,
+    positive,
+    running_options,
+    use_threads,
+)
+
+# train
+
+
+def add_train(sub: Any) -> None:
+    parser = command(
+        sub, "train", _run_train, "Train a network on the clips of a data set; the same command again goes on.",
+        "quiver train out/starter -o out/mine --minutes 20\n"
+        "quiver train out/starter -o out/unet --preset unet --protocol control --minutes 20\n"
+        "torchrun --nproc-per-node 4 -m quiver train out/starter -o out/s --preset quiver-s --protocol published",
+        goes_on=True,
+    )  # fmt: skip
+    parser.add_argument("data", help="data set folder")
+    parser.add_argument("-o", "--output", required=True, help="folder of the run")
+    parser.add_argument("--preset", default="nano", choices=NETWORKS, help="network (default nano)")
+    parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
+    parser.add_argument("--steps", type=count, help="optimiser steps")
+    parser.add_argument("--minutes", type=positive, help="wall-clock limit; the learning rate is planned for it")
+    add_noise(parser)
+    parser.add_argument("--crop", type=count, help="px, side of the training windows")
+    parser.add_argument("--frames", type=count, help="of a training window (default 11, one restored frame; 16: six)")
+    parser.add_argument("--batch", type=count, help="windows per step and process")
+    parser.add_argument("--optimiser", choices=("adam", "muon"), help="see quiver/training/optimiser.py")
+    parser.add_argument("--learning-rate", type=positive, help="at its highest")
+    parser.add_argument("--schedule", choices=("cosine", "plateau"), help="of the learning rate")
+    parser.add_argument("--loss", choices=("published", "paper", "l1", "scales-l1"))
+    parser.add_argument("--validate-every", type=count, help="steps")
+    parser.add_argument("--validation-split", choices=("train", "val", "test"), help="default val")
+    parser.add_argument("--workers", type=nonnegative, help="processes that draw samples (default 0: this one)")
+    add_threads(parser)
+    parser.add_argument("--precision", choices=("auto", "float32", "bfloat16"), help="default auto: bfloat16 on CUDA")
+    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
+    parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
+    parser.add_argument("--force", action="store_true", help="start anew where a run is")
+
+
+def _run_train(args: argparse.Namespace) -> int:
+    import torch
+
+    from quiver import threads
+    from quiver.data.codes import note, open_clips, output
+    from quiver.model.quiver import build
+    from quiver.restoration.restorers import pick_device
+    from quiver.training.loop import Diverged, train
+    from quiver.training.run_folder import PROTOCOLS, draw_curve
+
+    if args.validate_every is not None and args.steps is None and "steps" not in PROTOCOLS[args.protocol]:
+        raise ValueError("--validate-every: counts steps of a run with --steps; one that --minutes ends is validated "
+                         "after every tenth of its time; leave it out")  # fmt: skip
+    settings = _settings(args)
+    if args.validation_split is not None and not open_clips(settings.data, args.validation_split):
+        raise ValueError(
+            f"--validation-split {args.validation_split}: {settings.data} has no clip in that split; leave it out, and "
+            "without clips in `val` training clips serve"
+        )
+    folder, leads = Path(settings.out), os.environ.get("RANK", "0") == "0"
+    earlier = None if args.force else threads.recorded(folder / "settings.json")
+    settings = replace(settings, threads=use_threads(args, earlier))
+    torch.manual_seed(settings.seed)
+    try:
+        with _signals() as interrupted:
+            state = train(
+                build(args.preset),
+                settings,
+                device=pick_device(args.device),
+                should_stop=lambda: bool(interrupted),
+                progress=not (args.json or args.quiet),
+                force=args.force,
+                note=note,
+            )
+    except Diverged as error:
+        print(f"quiver: {error}", file=sys.stderr)
+        return 1
+    if leads:
+        draw_curve(folder, state.history)
+        output(args, *_summary(folder, state))
+    if interrupted:
+        print("quiver: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _settings(args: argparse.Namespace) -> Any:
+    """The protocol's settings, overridden by the options that were given."""
+    from quiver.training.run_folder import PROTOCOLS, Settings
+
+    given = {field.name: getattr(args, field.name, None) for field in fields(Settings)}
+    given |= {"data": args.data, "out": args.output, "network": args.preset}
+    return Settings(**PROTOCOLS[args.protocol] | {name: value for name, value in given.items() if value is not None})
+
+
+@contextlib.contextmanager
+def _signals() -> Iterator[list[int]]:
+    """Collects Ctrl-C and termination instead of dying of them: the loop ends after its step and saves its state."""
+    found: list[int] = []
+    with handling(lambda number, _: found.append(number), signal.SIGINT, signal.SIGTERM):
+        yield found
+
+
+def _summary(folder: Path, state: Any) -> tuple[dict[str, Any], str]:
+    found = {"run": str(folder), "steps": state.step, "seconds": state.elapsed}
+    text = f"{folder}: {state.step} steps in {state.elapsed / 60:.1f} min"
+    if state.history:
+        weights = str(folder / "best.safetensors")
+        found |= {"best_psnr_matched": state.best, "weights": weights, "last_validation": state.history[-1]}
+        text += f", best validation PSNR {state.best:.2f} dB (after the best factor): {weights}"
+    return found, text
+
+
+# ablate
+
+
+def add_ablate(sub: Any) -> None:
+    parser = command(
+        sub, "ablate", _run_ablate, "Train the network without some of its parts, six ways, and compare them.",
+        "quiver ablate out/starter -o out/ablation --minutes 20", goes_on=True,
+    )  # fmt: skip
+    parser.add_argument("data", help="data set folder")
+    parser.add_argument("-o", "--output", required=True, help="folder of the six runs and their table")
+    parser.add_argument("--preset", default="nano", choices=NETWORKS[:-1], help="network (default nano)")
+    parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
+    parser.add_argument("--steps", type=count, help="optimiser steps of each")
+    parser.add_argument("--minutes", type=positive, help="wall-clock limit of each")
+    add_noise(parser)
+    parser.add_argument("--crop", type=count, help="px, side of the training windows")
+    parser.add_argument("--batch", type=count, help="windows per step and process")
+    parser.add_argument("--split", default="test", choices=("train", "val", "test"), help="to score on (default test)")
+    parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
+    add_running(parser)
+
+
+def _run_ablate(args: argparse.Namespace) -> int:
+    from quiver import threads
+    from quiver.data.codes import note, output
+    from quiver.evaluation import summary
+    from quiver.evaluation.comparison import Plan
+    from quiver.model.config import ABLATIONS
+    from quiver.training.ablation import markdown, one_noise, run_ablation
+
+    args.precision, precision = None, args.precision  # of restoring; training keeps its own default
+    settings = _settings(args)
+    args.precision = precision
+    first = Path(args.output) / next(iter(ABLATIONS)) / "settings.json"
+    settings = replace(settings, threads=use_threads(args, threads.recorded(first)))
+    settings, lines = one_noise(settings)
+    for line in lines:
+        note(line)
+    plan = Plan(args.data, args.split, tuple(noise.simple for noise in settings.noise or ()), settings.seed)
+    with _signals() as interrupted:
+        options, show = running_options(args), not (args.json or args.quiet)
+        found = run_ablation(settings, plan, options, should_stop=lambda: bool(interrupted), progress=show)
+    if found is None:
+        print("quiver: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        return 130
+    methods, rows = found
+    summary.write(Path(args.output) / "table", plan, methods, rows)
+    output(args, summary.as_dict(plan, methods, rows), markdown(args.preset, rows))
+    return 1 if any(row.failure for row in rows) else 0

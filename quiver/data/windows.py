@@ -1,0 +1,236 @@
+"""Training windows from the clips of any data set folder: a plain `torch` data set, usable without our loop.
+
+    clip -> photons of a window and its sharp truth -> codes, drawn on the fly -> codes/(2^b - 1), photons/white
+
+Sample n is a function of (seed, n) alone: which clip, where, how turned, at which light level, and every bit of its
+noise; so 0, 1 or 8 workers give the same bytes and a killed run goes on with the sample it would have drawn. Sample
+n + e * len(windows) is sample n of epoch e: count on to get fresh noise. Dr.Jit, which does not survive a fork, is
+never touched. Sensor, light and defects are those of the clips' streams unless the settings name others (noise.py).
+
+    windows = Windows(open_clips("out/starter", "train"), WindowSettings(crop=64))
+    loader = DataLoader(windows, batch_sampler=Batches(8, first=0, last=1000))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy import ndarray as Array
+from torch.utils.data import Dataset, Sampler
+
+from quiver.data.codes import Clip, Draw, Key, Light, Sensor, clip_photons, draw_codes, has_sharp, peak_of
+from quiver.data.noise import Mixture, Noise, check_windows, choose, window_codes
+
+TRAINING, VALIDATION = 1, 2  # stages of the random keys: no two uses share noise (0 is `qsim sense`)
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """What a training sample is."""
+
+    lights: tuple[Light, ...] | None = None  # each sample draws one; None: those of the clips' streams
+    frames: int = 11
+    crop: int = 64  # px, side of the square; validation takes the centre
+    flips: bool = True  # the eight flips and quarter turns
+    reverse: bool = True  # half of the windows run backwards in time
+    drift: int = 0  # px/frame; in half of the windows the crop itself moves, up to so far along each side
+    force_exposure: bool = False  # published: every window is brought to the light level on its own
+    ceiling: float = 2.0  # targets end here, in units of white: 11 codes tell no light above from saturation
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.frames < 1 or self.crop < 1:
+            raise ValueError(f"WindowSettings: frames and crop must be at least 1, got {self.frames} and {self.crop}")
+        if self.lights is not None and not self.lights:
+            raise ValueError("WindowSettings.lights is empty; give at least one light level, or None for the streams'")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where sample n comes from and how it is turned: enough to make it again."""
+
+    clip: int
+    start: int
+    y: int  # of the first frame taken
+    x: int
+    drift: tuple[int, int]  # px/frame along y and x: whole pixels, so that nothing is interpolated
+    light: int
+    turn: int  # quarter turns 0..3, + 4 = mirrored first
+    backwards: bool
+    key: Key
+
+
+class Windows(Dataset[dict[str, Any]]):
+    """Windows of `frames` frames from the clips of a folder, with fresh noise: a map-style `torch` data set.
+
+    item: codes float32 [T, 1, h, w] in [0, 1], target float32 [T, 1, h, w] = sharp photons / white (up to `ceiling`),
+    white [photons], peak [photons] of its scores, ppp, sample (its number), key (text: clip, place, light, random key).
+    Codes and target follow the sensor of their window. `noise` is the mixture that windows draw from, `print(windows)`
+    says it. `ValueError` for a folder without clips, for clips shorter or smaller than a window, and for noise that
+    windows cannot have.
+    """
+
+    def __init__(
+        self, clips: Sequence[Clip], settings: WindowSettings, *, fixed: bool = False, repeats: int = 1
+    ) -> None:
+        """`fixed` is for validation: sample n is the same in every epoch, from the middle of its clip, not turned.
+
+        An epoch holds `repeats` windows of every clip (fixed: one per clip and light level).
+        """
+        check_clips(clips, settings)
+        self.clips, self.settings, self.fixed = tuple(clips), settings, fixed
+        self.noise = choose(clips) if settings.lights is None else Mixture(tuple(map(Noise.of, settings.lights)))
+        for noise in self.noise.noises:
+            check_windows(noise, clips[0])
+        self.length = len(clips) * (len(self.noise.noises) if fixed else repeats)
+        self._draws: dict[tuple[int, int], Draw] = {}
+
+    def __repr__(self) -> str:
+        return f"<Windows of {len(self.clips)} clips; {'; '.join(self.noise.lines)}>"
+
+    def __len__(self) -> int:
+        return self.length
+
+    def place(self, n: int) -> Place:
+        """Where sample n lies, without reading it."""
+        if self.fixed:
+            return self._middle(n % self.length)
+        settings, (epoch, index) = self.settings, divmod(n, self.length)
+        clip = int(np.random.default_rng((settings.seed, epoch)).permutation(self.length)[index]) % len(self.clips)
+        rng = np.random.default_rng((settings.seed, epoch, index))
+        length, height, width = self.clips[clip].shape
+        start = int(rng.integers(length - settings.frames + 1))
+        drift = self._drift(clip, rng)
+        y, x = (
+            int(rng.integers(side - settings.crop - abs(way) + 1)) + max(0, -way)
+            for side, way in zip((height, width), (d * (settings.frames - 1) for d in drift), strict=True)
+        )
+        return Place(
+            clip=clip,
+            start=start,
+            y=y,
+            x=x,
+            drift=drift,
+            light=int(rng.integers(len(self.noise.noises))),
+            turn=int(rng.integers(8)) if settings.flips else 0,
+            backwards=bool(rng.integers(2)) if settings.reverse else False,
+            key=Key(seed=settings.seed, clip=n, stage=TRAINING),
+        )
+
+    def _drift(self, clip: int, rng: np.random.Generator) -> tuple[int, int]:
+        """How the crop moves, as far as the clip has room."""
+        settings = self.settings
+        if not settings.drift or rng.random() < 0.5:
+            return 0, 0
+        room = [(side - settings.crop) // max(1, settings.frames - 1) for side in self.clips[clip].shape[1:]]
+        dy, dx = (int(rng.integers(-most, most + 1)) for most in (min(settings.drift, r) for r in room))
+        return dy, dx
+
+    def _middle(self, index: int) -> Place:
+        settings, clip = self.settings, index % len(self.clips)
+        length, height, width = self.clips[clip].shape
+        start, y, x = (length - settings.frames) // 2, (height - settings.crop) // 2, (width - settings.crop) // 2
+        key = Key(seed=settings.seed, clip=index, stage=VALIDATION)
+        return Place(clip, start, y, x, (0, 0), index // len(self.clips), 0, False, key)
+
+    def __getitem__(self, n: int) -> dict[str, Any]:
+        place = self.place(n)
+        clip, noise, draw = self.clips[place.clip], self.noise.noises[place.light], self._draw(place)
+        photons, sharp = self._photons(place)
+        scale = 1.0
+        if self.settings.force_exposure and noise.ppp is not None:
+            scale = noise.ppp / max(float(photons.mean()), 1e-9)
+        try:
+            if noise.defects is None:
+                codes = draw_codes(draw.sensor, photons * scale, clip.exposure, place.key)
+            else:
+                drawn = window_codes(noise, draw, clip, place, self.settings.frames, self.settings.crop, scale)
+                codes = turned(drawn, replace(place, backwards=False))  # drawn in the order in which they are seen
+        except ValueError as error:
+            raise ValueError(f"{clip.path}: window from frame {place.start}: {error}") from None
+        white = draw.sensor.white(clip.exposure)
+        return {
+            "codes": as_input(codes, draw.sensor),
+            "target": torch.from_numpy(np.minimum(sharp / white, self.settings.ceiling).astype(np.float32))[:, None],
+            "white": white,
+            "peak": white if self.settings.force_exposure else peak_of(draw.level.ppp),
+            "ppp": float((photons * scale).mean()),
+            "sample": n,
+            "key": f"{clip.name} frame {place.start}, (y, x) ({place.y}, {place.x}), turn {place.turn}, "
+            f"{'backwards, ' if place.backwards else ''}{noise.label}, {place.key}",
+        }
+
+    def _photons(self, place: Place) -> tuple[Array, Array]:
+        """Expected photons of the exposed and of the sharp window, [T, h, w], turned."""
+        clip, side = self.clips[place.clip], self.settings.crop
+        (dy, dx), draw = place.drift, self._draw(place)
+
+        def taken(sharp: bool) -> Array:
+            return np.stack(
+                [
+                    clip_photons(
+                        clip,
+                        place.start + i,
+                        draw.level.factor,
+                        (place.y + dy * i, place.x + dx * i, side, side),
+                        sharp=sharp,
+                        diffraction=draw.diffraction and not sharp,
+                    )
+                    for i in range(self.settings.frames)
+                ]
+            )
+
+        exposed = taken(sharp=False)
+        return turned(exposed, place), turned(
+            taken(sharp=True) if has_sharp(clip) or draw.diffraction else exposed, place
+        )
+
+    def _draw(self, place: Place) -> Draw:
+        """Sensor and light factor of a place's clip and noise."""
+        if (place.clip, place.light) not in self._draws:
+            self._draws[place.clip, place.light] = self.noise.noises[place.light].draw(self.clips[place.clip])
+        return self._draws[place.clip, place.light]
+
+
+def turned(window: Array, place: Place) -> Array:
+    """A window [T, h, w] flipped, turned and reversed as its place says."""
+    window = window[:, :, ::-1] if place.turn >= 4 else window
+    window = np.rot90(window, place.turn % 4, axes=(1, 2))
+    return np.ascontiguousarray(window[::-1] if place.backwards else window)
+
+
+def as_input(codes: Array, sensor: Sensor) -> torch.Tensor:
+    """Codes [T, H, W] as networks see them: float32 [T, 1, H, W], codes / (2^b - 1)."""
+    return torch.from_numpy(codes.astype(np.float32) / np.float32(sensor.levels - 1))[:, None]
+
+
+def check_clips(clips: Sequence[Clip], settings: WindowSettings) -> None:
+    """ValueError naming the first clip that holds no window."""
+    if not clips:
+        raise ValueError("no complete clip to draw windows from; is the split right, has `qsim generate` finished?")
+    for clip in clips:
+        length, height, width = clip.shape
+        if length < settings.frames or min(height, width) < settings.crop:
+            raise ValueError(
+                f"clip {clip.name} is {length} x {height} x {width}; a window needs {settings.frames} frames of "
+                f"{settings.crop} x {settings.crop} px; choose a smaller --crop or longer clips"
+            )
+
+
+class Batches(Sampler[list[int]]):
+    """Sample numbers of batch after batch, from batch `first` on; of `world` processes each gets its own share."""
+
+    def __init__(self, batch: int, first: int, last: int, rank: int = 0, world: int = 1) -> None:
+        self.batch, self.first, self.last, self.rank, self.world = batch, first, last, rank, world
+
+    def __iter__(self) -> Iterator[list[int]]:
+        for step in range(self.first, self.last):
+            start = (step * self.world + self.rank) * self.batch
+            yield list(range(start, start + self.batch))
+
+    def __len__(self) -> int:
+        return self.last - self.first

@@ -1,0 +1,110 @@
+"""What a mean score hides: the error of every speed of motion, and pictures of the same place by every method.
+
+restored, truth, |flow| [H, W] -> squared errors and pixels per bin of motion -> PSNR per bin, pooled over clips
+middle frame, where most moves -> crop per method -> one sheet of crops
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray as Array
+
+from quiver.data.codes import Clip, replacing
+from quiver.evaluation import metrics
+
+EDGES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)  # px/frame
+CROP = 96  # px, at most
+SCENES_SHOWN = 6  # rows of a sheet
+
+
+def bin_names() -> list[str]:
+    """`0-0.5`, ..., `8 and more`, in px/frame."""
+    return [f"{low:g} and more" if math.isinf(high) else f"{low:g}-{high:g}" for low, high in pairwise(EDGES)]
+
+
+def speeds(clip: Clip, frames: range) -> Array | None:
+    """Motion [T, H, W] in px/frame from the clip's own flow, NaN where it is not known; None without flow."""
+    if not clip.has_truth:
+        return None
+    return np.stack([np.hypot(*clip.flow(t)) for t in frames])
+
+
+def by_motion(matched: Array, target: Array, speed: Array) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Pixels and summed squared error (clamped, in units of the peak) of every bin of EDGES; all arrays [T, H, W]."""
+    squares = (np.clip(matched, 0, 1) - np.clip(target, 0, 1)) ** 2
+    known = np.isfinite(speed)
+    bins = np.digitize(speed[known], EDGES[1:-1])
+    count = np.bincount(bins, minlength=len(EDGES) - 1)
+    total = np.bincount(bins, squares[known], minlength=len(EDGES) - 1)
+    return tuple(int(n) for n in count), tuple(float(s) for s in total)
+
+
+def pooled(counts: Sequence[Sequence[int]], squares: Sequence[Sequence[float]]) -> list[float]:
+    """PSNR [dB] of every bin over several clips; NaN for a bin without pixels, or whose error the clamp hides."""
+    if not counts:
+        return [math.nan] * (len(EDGES) - 1)
+    pixels, total = np.sum(counts, axis=0), np.sum(squares, axis=0)
+    return [metrics.decibel(s / n) if s > 0 else math.nan for n, s in zip(pixels, total, strict=True)]
+
+
+# Crops
+
+
+def place(clip: Clip, t: int) -> tuple[slice, slice]:
+    """The square of at most CROP px in frame t where most moves, in steps of 8 px; the middle without flow."""
+    height, width = clip.shape[1:]
+    side = min(CROP, height, width)
+    found = speeds(clip, range(t, t + 1))
+    if found is None:
+        y, x = (height - side) // 2, (width - side) // 2
+    else:
+        moving = np.minimum(np.nan_to_num(found[0]), EDGES[-2])  # very fast pixels shall not decide alone
+        corners = [(y, x) for y in range(0, height - side + 1, 8) for x in range(0, width - side + 1, 8)]
+        y, x = max(corners, key=lambda corner: moving[corner[0] : corner[0] + side, corner[1] : corner[1] + side].sum())
+    return slice(y, y + side), slice(x, x + side)
+
+
+def crop_file(out: Path, light: str, clip: str, method: str) -> Path:
+    """Where the crop of one clip by one method at one light level is kept."""
+    words = (re.sub(r"[^A-Za-z0-9.]+", "-", word) for word in (light, clip, method))
+    return out / "crops" / ("_".join(words) + ".npy")
+
+
+def save_crop(path: Path, picture: Array) -> None:
+    """A float16 picture in units of the peak, what lies above 2 cut off: a sheet shows white there."""
+    path.parent.mkdir(exist_ok=True)
+    with replacing(path) as file:
+        np.save(file, np.minimum(picture, 2).astype(np.float16))
+
+
+def sheet(out: Path, light: str, clips: Sequence[str], methods: Sequence[str], target: Path) -> bool:
+    """One row per clip, one column per method, as PNG; False if there is nothing to show. White = white, gamma 2.2."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = [clip for clip in clips if crop_file(out, light, clip, "truth").exists()][:SCENES_SHOWN]
+    if not rows:
+        return False
+    columns = ["truth", "codes", *methods]
+    canvas = FigureCanvasAgg(Figure(figsize=(1.5 * len(columns), 1.55 * len(rows) + 0.4), layout="constrained"))
+    grid = canvas.figure.subplots(len(rows), len(columns), squeeze=False)
+    for clip, line in zip(rows, grid, strict=True):
+        for column, axes in zip(columns, line, strict=True):
+            axes.set_xticks([])
+            axes.set_yticks([])
+            path = crop_file(out, light, clip, column)
+            if path.exists():
+                picture = np.clip(np.load(path).astype(np.float32), 0, 1) ** (1 / 2.2)
+                axes.imshow(picture, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+            if clip == rows[0]:
+                axes.set_title(column, fontsize=8)
+        line[0].set_ylabel(clip, fontsize=7)
+    with replacing(target) as file:
+        canvas.figure.savefig(file, format="png", dpi=110)
+    return True

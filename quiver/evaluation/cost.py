@@ -1,0 +1,265 @@
+"""What a restored frame costs: seconds, memory and multiply-accumulates, beside the PSNR it buys.
+
+    methods x modes x precisions, on one fixed synthetic clip (or a clip of yours) -> table, figure, JSON
+
+Every case runs in a process of its own, so that its peak memory is its own. Multiply-accumulates are those of
+convolutions and matrix products, as torch counts them; sampling and baselines are not counted. Presets whose weights do
+not ship are run with random weights: their cost is real, their PSNR is left out.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from quiver.baselines import METHODS
+from quiver.data.codes import Codes, Key, Light, array_codes, draw_codes, peak_of, replacing, suggest
+from quiver.evaluation import metrics
+from quiver.evaluation.peak_memory import peak_memory, reset_peak
+from quiver.restoration.restorers import (
+    MODES,
+    Options,
+    Restorer,
+    network_restorer,
+    pick_device,
+    restorer,
+    weights_path,
+    wrap_network,
+)
+
+EXPOSURE = 5e-4  # s
+PRESETS = ("nano", "quiver-s", "quiver", "unet")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One method run in one way."""
+
+    method: str
+    mode: str = "exact"
+    precision: str = "float32"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The fixed clip and what is timed on it."""
+
+    height: int = 64
+    width: int = 64
+    frames: int = 26  # of the clip
+    restored: int = 16  # in its middle: all that have five neighbours on both sides
+    ppp: float = 3.25
+    device: str = "auto"
+    threads: int | None = None  # of torch on the CPU; None = torch's own choice
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a case cost; NaN where it could not be measured."""
+
+    method: str
+    mode: str
+    precision: str
+    trained: bool
+    seconds_per_frame: float
+    peak_bytes: int  # above the process before the run (CPU), allocated (CUDA)
+    gmac_per_frame: float
+    psnr_matched: float  # dB; NaN without trained weights
+    threads: int | None = None  # of torch
+    failure: str | None = None
+
+
+def fixed_clip(setting: Setting) -> tuple[Codes, Array]:
+    """Codes of waves and a disk that move 2 px per frame, and their photons; the same for ever."""
+    sensor = Light(ppp=setting.ppp).device(EXPOSURE)
+    y, x = np.mgrid[: setting.height, : setting.width].astype(float)
+    frames = []
+    for t in range(setting.frames):
+        moved = x - 2 * t
+        waves = np.sin(0.31 * moved + 0.2 * y) + np.sin(0.83 * moved - 0.4 * y) + np.sin(0.15 * y + 1)
+        disk = (moved % setting.width - setting.width / 2) ** 2 + (y - setting.height / 2) ** 2
+        frames.append(1 + 0.2 * waves + 0.8 * (disk < (setting.height / 5) ** 2))
+    photons = np.stack(frames)
+    photons *= setting.ppp / photons.mean()
+    codes = draw_codes(sensor, photons, EXPOSURE, Key(seed=0, clip=0))
+    return array_codes(codes, sensor, EXPOSURE, name="fixed clip"), photons
+
+
+def method_of(case: Case, device: str) -> tuple[Restorer, bool]:
+    """The restorer of a case, and whether it has trained weights (or needs none)."""
+    import torch
+
+    from quiver.model.quiver import build
+
+    options = Options(mode=case.mode, precision=case.precision, device=device)
+    if case.method.partition(":")[0] in METHODS:
+        return restorer(case.method, options), True
+    try:
+        path = weights_path(case.method)
+    except ValueError:
+        if case.method not in PRESETS:
+            raise
+        torch.manual_seed(0)
+        return wrap_network(build(case.method), case.method, "random weights", options), False
+    return network_restorer(path, options), True
+
+
+def measure(case: Case, setting: Setting) -> Cost:
+    """Run one case in this process: two frames for its memory, which does not grow with the clip, then all, warm."""
+    import torch
+
+    if setting.threads is not None:
+        torch.set_num_threads(setting.threads)
+    codes, photons = fixed_clip(setting)
+    method, trained = method_of(case, setting.device)
+    first = (setting.frames - setting.restored) // 2
+    last = first + setting.restored
+    cuda = method.learned and pick_device(setting.device) == "cuda"
+    if cuda:
+        torch.cuda.reset_peak_memory_stats()
+    before = reset_peak()
+    method.restore(codes, first, first + 2)
+    peak = torch.cuda.max_memory_allocated() if cuda else peak_memory() - before
+    started = time.perf_counter()
+    restored = method.restore(codes, first, last)
+    seconds = (time.perf_counter() - started) / setting.restored
+    white = peak_of(setting.ppp)
+    score = metrics.score(restored / white, photons[first:last] / white)
+    return Cost(
+        **asdict(case),
+        trained=trained,
+        seconds_per_frame=seconds,
+        peak_bytes=peak,
+        gmac_per_frame=multiply_accumulates(method, codes, first) / 1e9 if method.learned else math.nan,
+        psnr_matched=score.psnr_matched if trained else math.nan,
+        threads=torch.get_num_threads(),
+    )
+
+
+def multiply_accumulates(method: Restorer, codes: Codes, first: int) -> float:
+    """Of one more restored frame: the difference between restoring three frames and two."""
+    from torch.utils.flop_counter import FlopCounterMode
+
+    counts = []
+    for frames in (2, 3):
+        with FlopCounterMode(display=False) as counter:
+            method.restore(codes, first, first + frames)
+        counts.append(counter.get_total_flops() / 2)
+    return counts[1] - counts[0]
+
+
+def bench(cases: Sequence[Case], setting: Setting, progress: Callable[[int, int], None] | None = None) -> list[Cost]:
+    """Every case in a fresh process; a case that dies keeps its row, with the reason."""
+    costs = []
+    for i, case in enumerate(cases):
+        if progress is not None:
+            progress(i, len(cases))
+        costs.append(_in_own_process(case, setting))
+    if progress is not None:
+        progress(len(cases), len(cases))
+    return costs
+
+
+def _in_own_process(case: Case, setting: Setting) -> Cost:
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_child, args=(theirs, case, setting), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        found: Cost | str = ours.recv()
+    except EOFError:
+        process.join()
+        found = f"its process died (exit code {process.exitcode}); too little memory?"
+    process.join()
+    if isinstance(found, Cost):
+        return found
+    return Cost(**asdict(case), trained=False, seconds_per_frame=math.nan, peak_bytes=0, gmac_per_frame=math.nan,
+                psnr_matched=math.nan, failure=found)  # fmt: skip
+
+
+def _child(pipe: Any, case: Case, setting: Setting) -> None:
+    try:
+        pipe.send(measure(case, setting))
+    except Exception as error:  # whatever it dies of is its result
+        pipe.send(f"{type(error).__name__}: {' '.join(str(error).split())}")
+
+
+def cases_of(methods: Sequence[str], modes: Sequence[str], precisions: Sequence[str]) -> list[Case]:
+    """All combinations; modes and precisions make no difference to classical methods, modes none to the U-Net."""
+    cases = []
+    for method in methods:
+        classical = method.partition(":")[0] in METHODS
+        for mode in modes[:1] if classical or method == "unet" else modes:
+            cases += [Case(method, mode, precision) for precision in (precisions[:1] if classical else precisions)]
+    return cases
+
+
+def checked_cases(
+    methods: Sequence[str], modes: Sequence[str] | None, precisions: Sequence[str] | None, device: str | None
+) -> list[Case]:
+    """As `cases_of`, with the defaults for None; `ValueError` for unknown names and for options that cannot act."""
+    networks = [method for method in methods if method.partition(":")[0] not in METHODS]
+    for method in methods:
+        if method not in networks:
+            restorer(method)
+        elif method not in PRESETS:
+            weights_path(method)
+    for option, given, known in (("modes", modes, MODES), ("precisions", precisions, ("float32", "bfloat16"))):
+        for name in given or ():
+            if name not in known:
+                raise ValueError(f"--{option}: no {name!r}{suggest(name, known)}; known are {', '.join(known)}")
+    for option, value in (("modes", modes), ("precisions", precisions), ("device", device)):
+        if value is not None and not networks:
+            raise ValueError(f"--{option}: acts on networks, and {', '.join(methods)} is classical; leave it out")
+    if modes is not None and networks and all(network == "unet" for network in networks):
+        raise ValueError("--modes: unet shares no work between frames, it has one mode; leave it out")
+    if networks:
+        pick_device(device or "auto")
+    return cases_of(methods, modes or ("exact", "streaming"), precisions or ("float32",))
+
+
+def markdown(costs: Sequence[Cost], setting: Setting) -> str:
+    """The result as a table."""
+    text = [
+        f"# Cost of a restored frame: {setting.height} x {setting.width}, {setting.ppp:g} PPP, {setting.device}",
+        "",
+        "| method | mode | precision | s/frame | peak memory | GMAC/frame | PSNR matched |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for c in costs:
+        row = f"| {c.method} | {c.mode} | {c.precision} | "
+        if c.failure is not None:
+            text.append(row + f"failed: {c.failure} | | | |")
+            continue
+        gmac = "-" if math.isnan(c.gmac_per_frame) else f"{c.gmac_per_frame:.3g}"
+        psnr = "untrained" if math.isnan(c.psnr_matched) else f"{c.psnr_matched:.2f} dB"
+        text.append(row + f"{c.seconds_per_frame:.3g} | {c.peak_bytes / 1e6:.0f} MB | {gmac} | {psnr} |")
+    return "\n".join(text) + "\n"
+
+
+def figure(costs: Sequence[Cost], path: Path) -> None:
+    """PSNR against seconds per frame, as PNG; untrained networks are left out."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    canvas = FigureCanvasAgg(Figure(figsize=(6, 4), layout="constrained"))
+    axes = canvas.figure.subplots()
+    for c in costs:
+        if c.failure is None and not math.isnan(c.psnr_matched):
+            axes.plot(c.seconds_per_frame, c.psnr_matched, "o", label=f"{c.method}, {c.mode}, {c.precision}")
+    axes.set_xscale("log")
+    if axes.lines:
+        axes.legend(fontsize=7)
+    axes.set_xlabel("seconds per frame")
+    axes.set_ylabel("PSNR after the best factor [dB]")
+    with replacing(path) as file:
+        canvas.figure.savefig(file, format="png", dpi=120)

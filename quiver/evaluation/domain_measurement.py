@@ -1,0 +1,156 @@
+"""Measuring a domain: one network against the classical methods, cell by cell, on clips that trained and tuned nothing.
+
+    weights, clips, sensors x bits x light -> matched PSNR of the network and of the best classical method -> Domain
+
+Scores are those of `quiver evaluate`: peak 2.5 times the mean light, the best factor behind the clamp, mean over clips.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from quiver.data.codes import Clip, Light, Lock, __version__, known, mean_light, open_clips, peak_of, sensed, truth
+from quiver.evaluation import metrics
+from quiver.evaluation.comparison import in_memory
+from quiver.model.weights import annotate, metadata_of
+from quiver.restoration.domain import KEY, Cell, Domain, merged, place_of, read_scope
+from quiver.restoration.restorers import Options, Restorer, network_restorer, restorers
+
+CLASSICAL = ("naive", "moment:3", "transform-denoise", "qbp", "qbp-bm3d")
+
+Progress = Callable[[int, int], None]  # (cells done, cells in all)
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is measured."""
+
+    clips: tuple[Clip, ...]
+    lights: tuple[Light, ...]
+    methods: tuple[str, ...] = CLASSICAL
+    seed: int = 0
+
+    def to_dict(self) -> dict[str, object]:
+        """What all cells of a domain share; stored with them."""
+        return {
+            "clips": [clip.name for clip in self.clips],
+            "clips_sha256": clips_digest(self.clips),
+            "frames": sum(len(clip) for clip in self.clips),
+            "methods": list(self.methods),
+            "seed": self.seed,
+            "score": "matched PSNR, peak 2.5 x mean light, mean over clips",
+            "quiver": __version__,
+        }
+
+
+def clips_digest(clips: Sequence[Clip]) -> str:
+    """SHA-256 of what the clips say of themselves, which includes the checksums of their files."""
+    return hashlib.sha256(json.dumps([clip.meta for clip in clips], sort_keys=True).encode()).hexdigest()
+
+
+def clips_of(sources: Sequence[Path], split: str | None) -> tuple[Clip, ...]:
+    """The clips of several data sets (of one split) and clip folders; ValueError if there are none."""
+    clips = tuple(clip for source in sources for clip in open_clips(source, split))
+    if not clips:
+        raise ValueError(f"no finished clip in split {split!r} of {', '.join(str(source) for source in sources)}")
+    return clips
+
+
+def measure(
+    weights: Path, question: Question, options: Options, progress: Progress | None = None, *, force: bool = False
+) -> Domain:
+    """Measure what is missing of the cells of a weights file, and store each in its metadata as soon as it is there.
+
+    Several processes may measure one file. With `force` the cells that are asked for are measured again, and cells that
+    were measured otherwise (other clips, methods, seed or version) go. The tensors of the file stay as they are.
+    `ValueError` for classical methods that are none, and for cells measured otherwise without `force`.
+    """
+    methods = restorers(question.methods, options)
+    network = network_restorer(weights, options)
+    if any(method.learned for method in methods):
+        raise ValueError(f"a network is measured against classical methods, got {', '.join(question.methods)}")
+    shared = question.to_dict()
+    before = read_scope(weights, metadata_of(weights)).domain
+    if before is not None and dict(before.measured) != shared and not force:
+        changed = ", ".join(key for key, value in shared.items() if before.measured.get(key) != value)
+        raise ValueError(
+            f"{weights}: holds {len(before.cells)} cells that were measured otherwise (not the same: {changed}); "
+            "measure into a copy of the file, or use --force to replace them"
+        )
+    todo = [light for light in question.lights if force or not _known(weights, shared, light)]
+    for done, light in enumerate(todo):
+        if progress is not None:
+            progress(done, len(todo))
+        if not force and _known(weights, shared, light):  # by another process, meanwhile
+            continue
+        cell = measure_cell(network, methods, question, light)
+        with _one_at_a_time(weights):
+            cells = merged(stored_cells(weights, shared), [cell])
+            annotate(weights, {KEY: Domain(cells, shared).to_json()})
+    if progress is not None:
+        progress(len(todo), max(1, len(todo)))
+    return Domain(stored_cells(weights, shared), shared)
+
+
+def stored_cells(weights: Path, shared: Mapping[str, object]) -> tuple[Cell, ...]:
+    """The cells in a weights file that were measured in this way."""
+    domain = read_scope(weights, metadata_of(weights)).domain
+    return domain.cells if domain is not None and dict(domain.measured) == shared else ()
+
+
+def _known(weights: Path, shared: Mapping[str, object], light: Light) -> bool:
+    return any(_measures(cell, light) for cell in stored_cells(weights, shared))
+
+
+@contextlib.contextmanager
+def _one_at_a_time(weights: Path) -> Iterator[None]:
+    """Keep other processes from rewriting the file between our reading and our writing of it."""
+    lock = Lock(weights.with_name(f"{weights.name}.lock"))
+    lock.acquire(wait=True)
+    try:
+        yield
+    finally:
+        lock.delete()
+
+
+def _measures(cell: Cell, light: Light) -> bool:
+    return (cell.sensor, cell.place.bits, cell.ppp) == (Path(light.sensor).name, light.bits, light.ppp)
+
+
+def measure_cell(network: Restorer, methods: Sequence[Restorer], question: Question, light: Light) -> Cell:
+    """The network and the best of the methods at one light; ValueError where a clip has no score."""
+    own, *others = (_mean_score(method, question, light) for method in (network, *methods))
+    if not (math.isfinite(own) and any(map(math.isfinite, others))):
+        raise ValueError(f"{light.label}: the network, or every classical method, fails or has no score on these clips")
+    best = int(np.nanargmax(others))
+    clip = question.clips[0]
+    assert light.ppp is not None
+    place = place_of(light.device(clip.exposure), clip.exposure, light.ppp)
+    return Cell(Path(light.sensor).name, light.ppp, place, round(own, 3), methods[best].name, round(others[best], 3))
+
+
+def _mean_score(method: Restorer, question: Question, light: Light) -> float:
+    """Mean over clips; NaN for a classical method that cannot restore such codes, which then does not compete."""
+    try:
+        return float(np.mean([score(method, clip, light, question.seed) for clip in question.clips]))
+    except ValueError:
+        if method.learned:
+            raise
+        return math.nan
+
+
+def score(method: Restorer, clip: Clip, light: Light, seed: int) -> float:
+    """Matched PSNR [dB] of one clip restored by one method."""
+    drawn, factor = sensed(clip, light, seed)
+    peak = peak_of(mean_light(clip, factor))
+    restored = method.restore(in_memory(drawn))
+    target = truth(clip, factor, 0, len(clip)) / peak
+    return metrics.score(restored / peak, target, valid=known(clip, 0, len(clip))).psnr_matched

@@ -1,0 +1,222 @@
+"""Real photons of a static object: restore from some frames, score against the rest, take off the rest's own noise.
+
+    counts [N, H, W] -> codes of 11 frames (clipped to b bits) -> restored centre frame; the other N - 11 are the truth
+
+Real light flickers a little from frame to frame: every frame is divided by its own share of the light. The reference is
+a mean of Poisson counts, with a known variance r / sum(shares); what that adds to the squared error is subtracted, with
+the clamp at the peak taken into account (`metrics.clamped_variance`). The peak is 2.5 times the mean count, as for
+clips. The frames are split at random, several times.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import nan
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy import ndarray as Array
+
+from quiver.data.codes import Codes, array_codes, ideal_counter, peak_of, reading
+from quiver.evaluation import metrics
+from quiver.restoration.restorers import Restorer
+
+FORMAT = "quiver-static-2"  # of the JSON that `quiver evaluate --static` prints; 1: peak = the largest code
+
+LARGEST = 1 << 32  # bytes of an array of counts
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Photon counts of a static object."""
+
+    frames: Array  # integers [N, H, W]
+    shares: Array  # [N]; light of each frame relative to the mean frame
+    name: str
+
+    @property
+    def light(self) -> float:
+        """Mean photons per pixel and frame."""
+        return float(self.frames.mean())
+
+
+@dataclass(frozen=True)
+class StaticScore:
+    """One method, mean over the splits; the spread is the standard deviation over them."""
+
+    method: str
+    psnr: float  # dB, raw, the reference's own variance taken off
+    psnr_matched: float  # dB, after the best factor
+    psnr_matched_spread: float  # dB
+    psnr_as_measured: float  # dB, matched, with the reference's noise still in it
+    scale: float
+    above_peak: float = nan  # share of the reference's pixels above the peak
+    failure: str | None = None
+
+
+def read_counts(path: Path) -> Counts:
+    """Counts [N, H, W], or [T, K, H, W] with K time gates, from .npy or a .npz with one array.
+
+    With gates a frame's share is its gate's mean, else its own. `ValueError` for anything else than whole counts, and
+    for a file that is damaged in any way; `FileNotFoundError` without one.
+    """
+    if path.suffix not in (".npy", ".npz"):
+        raise ValueError(f"{path}: photon counts are a .npy, or a .npz with one array")
+    with reading(path, "an array of numbers"):
+        array = _load(path)
+    if array.ndim not in (3, 4) or array.size == 0 or not np.issubdtype(array.dtype, np.integer) or array.min() < 0:
+        raise ValueError(
+            f"{path}: expected whole counts [N, H, W] or [T, K, H, W], got {array.dtype} {list(array.shape)}"
+        )
+    frames = array.reshape(-1, *array.shape[-2:])
+    light = array.mean(axis=(0, 2, 3)) if array.ndim == 4 else array.mean(axis=(1, 2))
+    if not light.min() > 0:
+        raise ValueError(f"{path}: frame or gate {int(np.argmin(light))} holds no photon at all")
+    shares = np.tile(light, len(frames) // len(light)) / light.mean()
+    return Counts(frames, shares, path.name)
+
+
+def _load(path: Path) -> Array:
+    """The one array of a .npy or .npz."""
+    with open(path, "rb") as file:
+        if path.suffix == ".npy":
+            return _array(file, path.stat().st_size)
+        with zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            if len(members) != 1:
+                names = ", ".join(member.filename.removesuffix(".npy") for member in members[:3])
+                raise ValueError(f"holds {len(members)} arrays ({names}); one is read")
+            with archive.open(members[0]) as member:
+                return _array(member, members[0].file_size)
+
+
+def _array(file: IO[bytes], size: int) -> Array:
+    """An array in the .npy format, whose header is believed only as far as its `size` [bytes] reaches."""
+    reader = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    version = np.lib.format.read_magic(file)
+    if version not in reader:
+        raise ValueError(f"version {version} of the format is unknown")
+    shape, _, dtype = reader[version](file)
+    if math.prod(shape) * dtype.itemsize > min(size, LARGEST):
+        raise ValueError(f"{dtype} {list(shape)} needs more than the {size:,} bytes that are there")
+    file.seek(0)
+    return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+
+
+def reference(counts: Counts, chosen: Array) -> tuple[Array, Array]:
+    """Mean photons per frame [H, W] from the chosen frames, and the variance of that estimate."""
+    light = float(counts.shares[chosen].sum())
+    estimate = counts.frames[chosen].sum(axis=0, dtype=np.int64) / light
+    return estimate, estimate / light
+
+
+def counted(counts: Counts, bits: int, given: Array | slice = slice(None)) -> Codes:
+    """The chosen frames as codes of an ideal counter of so many bits."""
+    _check_bits(counts, bits)
+    sensor = ideal_counter(bits)
+    codes = np.minimum(counts.frames[given], sensor.levels - 1).astype(np.uint8)
+    return replace(array_codes(codes, sensor, 1.0, counts.name), ppp=counts.light, sensor_name="ideal counter")
+
+
+def _check_bits(counts: Counts, bits: int) -> None:
+    if not 1 <= bits <= 8:
+        raise ValueError(f"{counts.name}: counts are clipped to codes of 1 to 8 bits, got {bits}")
+
+
+def mean_square(output: Array, target: Array, noise: Array) -> float:
+    """Mean squared error of clamped images, in units of the peak, without what the target's variance adds to it."""
+    squares = (np.clip(output, 0, 1) - np.clip(target, 0, 1)) ** 2
+    return float(squares.mean() - metrics.clamped_variance(target, noise).mean())
+
+
+def _decibel(mse: float) -> float:
+    """NaN where no error is left beside the reference's own noise."""
+    return metrics.decibel(mse) if mse > 0 else nan
+
+
+def score_split(
+    method: Restorer, counts: Counts, given: Array, bits: int, peak: float
+) -> tuple[float, float, float, float, float]:
+    """Raw PSNR, matched PSNR, matched PSNR as measured, the factor and the share above the peak [photons] of one split.
+
+    `given` frames are restored.
+    """
+    centre = len(given) // 2
+    restored = method.restore(counted(counts, bits, given), centre, centre + 1)[0]
+    output = restored / (peak * float(counts.shares[given].mean()))
+    others = np.setdiff1d(np.arange(len(counts.frames)), given)
+    target, variance = reference(counts, others)
+    target, noise = target / peak, variance / peak**2
+    scale = metrics.best_scale(output, target)
+    return (
+        _decibel(mean_square(output, target, noise)),
+        _decibel(mean_square(scale * output, target, noise)),
+        _decibel(mean_square(scale * output, target, np.zeros_like(noise))),
+        scale,
+        metrics.above_peak(target),
+    )
+
+
+def evaluate_static(
+    counts: Counts,
+    methods: Sequence[Restorer],
+    *,
+    frames: int = 11,
+    bits: int = 3,
+    splits: int = 3,
+    seed: int = 0,
+    peak: float | None = None,
+) -> list[StaticScore]:
+    """Every method on the same random splits, scored at `peak` photons (default 2.5 times the mean count).
+
+    ValueError if no frame is left for the reference, and for codes of more than 8 bits.
+    """
+    _check_bits(counts, bits)
+    if not 1 <= frames < len(counts.frames):
+        raise ValueError(
+            f"{counts.name}: {frames} frames to restore from leave none of {len(counts.frames)} for the reference"
+        )
+    rng = np.random.default_rng(seed)
+    chosen = [np.sort(rng.choice(len(counts.frames), frames, replace=False)) for _ in range(splits)]
+    white = peak_of(counts.light, peak)
+    return [_score(method, counts, chosen, bits, white) for method in methods]
+
+
+def _score(method: Restorer, counts: Counts, chosen: Sequence[Array], bits: int, peak: float) -> StaticScore:
+    try:
+        found = np.array([score_split(method, counts, given, bits, peak) for given in chosen])
+    except Exception as error:  # whatever a method dies of is its result
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        return StaticScore(method.name, nan, nan, nan, nan, nan, failure=reason)
+    raw, matched, measured, scale, above = (float(value) for value in found.mean(axis=0))
+    return StaticScore(method.name, raw, matched, float(found[:, 1].std()), measured, scale, above)
+
+
+def markdown(counts: Counts, scores: Sequence[StaticScore], frames: int, bits: int, peak: float | None = None) -> str:
+    """The result as a table."""
+    above = max((s.above_peak for s in scores if s.failure is None), default=nan)
+    text = [
+        f"# Real photons: {counts.name}, restored from {frames} of {len(counts.frames)} frames at {bits} bit",
+        "",
+        f"PSNR in dB, peak = {peak_of(counts.light, peak):.4g} photons per pixel"
+        + ("" if peak is not None else " (2.5 x mean light)")
+        + f", {100 * above:.1f} % of the reference's pixels are above it; the variance of the reference is taken off, "
+        "except where it says as measured. Matched: after the factor that is best behind the clamp. ± is the spread "
+        "over random splits. n/a: no error is left beside the reference's noise.",
+        *([] if not above > metrics.ABOVE_PEAK else ["", metrics.doubtful("the reference", above)]),
+        "",
+        "| method | PSNR | PSNR matched | matched, as measured | factor |",
+        "|---|---|---|---|---|",
+    ]
+    for s in scores:
+        if s.failure is not None:
+            text.append(f"| {s.method} | failed: {s.failure} | | | |")
+            continue
+        matched = f"{s.psnr_matched:.2f} ± {s.psnr_matched_spread:.2f}"
+        cells = [f"{s.psnr:.2f}", matched, f"{s.psnr_as_measured:.2f}", f"{s.scale:.3f}"]
+        text.append(f"| {s.method} | " + " | ".join("n/a" if cell.startswith("nan") else cell for cell in cells) + " |")
+    return "\n".join(text) + "\n"

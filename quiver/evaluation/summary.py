@@ -1,0 +1,273 @@
+"""An evaluation as people read it: means with 95 % intervals over scenes, per scene, as Markdown and as a figure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from quiver import threads
+from quiver.data.codes import replacing, write_bytes, write_json
+from quiver.evaluation import breakdown, metrics
+from quiver.evaluation.comparison import FORMAT, Plan, Row, json_safe
+from quiver.evaluation.metrics import Interval, over_scenes
+from quiver.restoration.restorers import Restorer
+
+PAPER_METHODS = ("Student-Teacher", "RVRT", "EMVD", "FloRNN", "MemDeblur", "Spk2ImgNet", "bit2bit")
+COLUMNS = (
+    "method",
+    "frames (future)",
+    "light",
+    "PSNR",
+    "PSNR matched",
+    "by frames",
+    "SSIM",
+    "SSIM matched",
+    "factor",
+    "s/frame",
+    "memory",
+    "above peak",
+    "truth's own PSNR",
+)
+MEMORY = (
+    "Memory: the most that restoring one clip took beyond what the process held before; what an earlier method left "
+    "free is not counted, `quiver bench` measures each in a process of its own."
+)
+SCORES = ("psnr", "psnr_matched", "ssim", "ssim_matched")
+
+
+@dataclass(frozen=True)
+class Line:
+    """One method at one light level, over all clips."""
+
+    method: str
+    light: str
+    scores: dict[str, Interval]  # over scenes
+    psnr_matched_per_frame: float  # dB, mean over all frames of all clips alike
+    scale: float  # best factor, mean over clips
+    scale_spread: float  # standard deviation over clips, or over windows where every window has its own
+    psnr_by_motion: list[float]  # dB, matched, all pixels of a bin of breakdown.EDGES pooled; NaN = no pixel
+    seconds_per_frame: float
+    peak_bytes: int | None  # of memory, largest over clips
+    above_peak: float  # share of target pixels above the peak, largest over clips
+    truth_psnr: float | None  # dB, mean over clips
+    near_truth: tuple[str, ...]  # PSNR scores that come within metrics.NEAR_TRUTH of the truth's own in some clip
+    failures: tuple[str, ...]  # clip: reason
+
+
+def mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else math.nan
+
+
+def summarise(rows: Sequence[Row]) -> list[Line]:
+    """One line per method and light level, in the order of the rows."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row.light, row.method), []).append(row)
+    return [_line(method, light, group) for (light, method), group in groups.items()]
+
+
+def _line(method: str, light: str, rows: Sequence[Row]) -> Line:
+    good = [(row, row.score) for row in rows if row.score is not None]
+    scales = [score.scale for _, score in good]
+    spread = math.sqrt(mean([(s - mean(scales)) ** 2 for s in scales])) if good else math.nan
+    within = mean([score.scale_spread for _, score in good])
+    frames = sum(score.frames for _, score in good)
+    moved = [row for row, _ in good if row.motion_pixels]
+    by_frames = [(s.psnr_matched, s.frames) for _, s in good if s.frames]
+    truths = [row.truth_psnr for row, _ in good if row.truth_psnr is not None]
+    return Line(
+        method=method,
+        light=light,
+        scores={name: over_scenes([getattr(s, name) for _, s in good], [r.scene for r, _ in good]) for name in SCORES},
+        psnr_matched_per_frame=sum(psnr * n for psnr, n in by_frames) / frames if frames else math.nan,
+        scale=mean(scales),
+        scale_spread=within if within > 0 else spread,
+        psnr_by_motion=breakdown.pooled([row.motion_pixels for row in moved], [row.motion_squares for row in moved]),
+        seconds_per_frame=mean([row.seconds_per_frame for row, _ in good]),
+        peak_bytes=max((row.peak_bytes for row, _ in good if row.peak_bytes is not None), default=None),
+        above_peak=max((score.above_peak for _, score in good), default=math.nan),
+        truth_psnr=mean(truths) if truths else None,
+        near_truth=tuple(name for name in SCORES[:2] if any(near_truth(row, name) for row, _ in good)),
+        failures=tuple(f"{row.clip}: {row.failure}" for row in rows if row.failure is not None),
+    )
+
+
+def near_truth(row: Row, name: str = "psnr_matched") -> bool:
+    """Whether a clip's PSNR comes so near to what its truth is worth that the truth's own error weighs in it."""
+    if row.score is None or row.truth_psnr is None:
+        return False
+    return bool(getattr(row.score, name) > row.truth_psnr - metrics.NEAR_TRUTH)
+
+
+def _number(value: float, digits: int) -> str:
+    return "n/a" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _interval(found: Interval, digits: int) -> str:
+    text = _number(found.mean, digits)
+    return text if math.isnan(found.half_width) else f"{text} ± {found.half_width:.{digits}f}"
+
+
+def markdown(plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row], remarks: Sequence[str] = ()) -> str:
+    """The whole evaluation as Markdown: means, what weakens them, failures, per scene, what was not built.
+
+    `remarks` are lines about networks outside of what they were measured for.
+    """
+    by_name = {method.name: method for method in methods}
+    text = [
+        f"# Evaluation of {plan.source}, split {plan.split or 'all'}",
+        "",
+        f"{_seen_by(plan)}, noise seed {plan.seed}; "
+        + ("published protocol: every window exposed, scaled and scored on its own" if plan.published else "all frames")
+        + "; mean ± half-width of the 95 % interval over scenes (clips of one scene averaged first"
+        + ("; there is only one, hence no interval" if len({row.scene for row in rows}) == 1 else "")
+        + f"). PSNR in dB, peak = {peak_name(plan)}; output and truth end at the peak. Matched = after the one factor "
+        + ("per window" if plan.published else "per clip")
+        + " that is best behind this clamp; by frames = its mean over all frames of all clips alike; above peak = "
+        "share of the truth's pixels; n/a = the clamp hides the whole error, or no window of SSIM fits.",
+        "",
+        "| " + " | ".join(COLUMNS) + " |",
+        "|---" * len(COLUMNS) + "|",
+    ]
+    lines = summarise(rows)
+    text += [_table_row(line, by_name[line.method]) for line in lines]
+    text += ["", *_caveats(lines, rows), *[f"{remark}\n" for remark in remarks]]
+    text += [MEMORY, "", f"The paper also compares with {', '.join(PAPER_METHODS)}: not built yet.", ""]
+    failures = [f"- {line.method}, {line.light}, {reason}" for line in lines for reason in line.failures]
+    text += ["## Failures", "", *failures, ""] if failures else []
+    return "\n".join([*text, *_by_motion(lines), *_per_scene(rows)]) + "\n"
+
+
+def peak_name(plan: Plan) -> str:
+    """What the scores of a plan refer to."""
+    if plan.peak is not None:
+        return f"{plan.peak:g} photons per pixel"
+    return "the sensor's white, as published" if plan.published else "2.5 x the stream's mean light"
+
+
+def _table_row(line: Line, method: Restorer) -> str:
+    cells = [line.method, f"{method.window} ({method.look_ahead})", line.light]
+    if line.failures and line.scores["psnr"].scenes == 0:
+        cells += [f"failed: {line.failures[0]}", *[""] * 9]
+    else:
+        scores = [
+            _interval(line.scores[name], 2 if "psnr" in name else 3) + (" †" if name in line.near_truth else "")
+            for name in SCORES
+        ]
+        cells += [*scores[:2], _number(line.psnr_matched_per_frame, 2), *scores[2:]]
+        cells += [f"{line.scale:.3f} (spread {line.scale_spread:.3f})", f"{line.seconds_per_frame:.3g}"]
+        cells += ["-" if line.peak_bytes is None else f"{line.peak_bytes / 1e6:.0f} MB"]
+        cells += [f"{100 * line.above_peak:.1f} %"]
+        cells += ["not measured" if line.truth_psnr is None else f"{line.truth_psnr:.1f}"]
+    return "| " + " | ".join(cells) + " |"
+
+
+def _caveats(lines: Sequence[Line], rows: Sequence[Row]) -> list[str]:
+    """What weakens the scores: truth above the peak, and truth that is hardly better than the answer."""
+    over: dict[str, tuple[float, str]] = {}
+    for row in rows:
+        if row.score is not None and row.score.above_peak > max(metrics.ABOVE_PEAK, over.get(row.light, (0.0, ""))[0]):
+            over[row.light] = row.score.above_peak, f"{row.clip} at {row.light}"
+    text = [metrics.doubtful(what, share) + "\n" for share, what in over.values()]
+    if any(line.near_truth for line in lines):
+        text.append(
+            f"† In one clip or more within {metrics.NEAR_TRUTH:g} dB of the truth's own PSNR: the error of the truth "
+            "is a large part of this score.\n"
+        )
+    return text
+
+
+def _seen_by(plan: Plan) -> str:
+    sensors = dict.fromkeys(light.sensor for light in plan.lights)
+    return f"Stream {plan.stream}" if plan.stream is not None else f"Sensor {', '.join(sensors)}"
+
+
+def _by_motion(lines: Sequence[Line]) -> list[str]:
+    """PSNR against motion; nothing where no clip has flow."""
+    moving = [line for line in lines if not all(math.isnan(psnr) for psnr in line.psnr_by_motion)]
+    if not moving:
+        return []
+    text = ["## By motion: matched PSNR in dB of all pixels that move so many px/frame", ""]
+    text += ["| method | light | " + " | ".join(breakdown.bin_names()) + " |"]
+    text += ["|---" * (len(breakdown.EDGES) + 1) + "|"]
+    for line in moving:
+        cells = ["-" if math.isnan(psnr) else f"{psnr:.2f}" for psnr in line.psnr_by_motion]
+        text.append(f"| {line.method} | {line.light} | " + " | ".join(cells) + " |")
+    return [*text, ""]
+
+
+def _per_scene(rows: Sequence[Row]) -> list[str]:
+    methods = list(dict.fromkeys(row.method for row in rows))
+    text = ["## Per scene: matched PSNR in dB", "", "| scene | light | " + " | ".join(methods) + " |"]
+    text.append("|---" * (len(methods) + 2) + "|")
+    for scene, light in dict.fromkeys((row.scene, row.light) for row in rows):
+        cells = []
+        for method in methods:
+            chosen = [row for row in rows if (row.scene, row.light, row.method) == (scene, light, method)]
+            found = [row.score.psnr_matched for row in chosen if row.score is not None]
+            cells.append(_number(mean(found), 2) + (" †" if any(near_truth(row) for row in chosen) else ""))
+        text.append(f"| {scene} | {light} | " + " | ".join(cells) + " |")
+    return text
+
+
+def as_dict(
+    plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row], remarks: Sequence[str] = ()
+) -> dict[str, Any]:
+    """The whole evaluation for programs."""
+    found: dict[str, Any] = json_safe(
+        {
+            "format": FORMAT,
+            "plan": plan.to_dict(),
+            "peak": peak_name(plan),
+            "remarks": list(remarks),
+            "threads": threads.current(),
+            "methods": [
+                {"name": m.name, "frames": m.window, "future": m.look_ahead, "learned": m.learned, "is": m.description}
+                for m in methods
+            ],
+            "not_built_yet": list(PAPER_METHODS),
+            "table": [asdict(line) for line in summarise(rows)],
+            "rows": [row.to_dict() for row in rows],
+        }
+    )
+    return found
+
+
+def figure(rows: Sequence[Row], path: Path) -> None:
+    """Matched PSNR of each method with its interval, one group of bars per light level, as PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    lines = [line for line in summarise(rows) if line.scores["psnr"].scenes]
+    lights, methods = list(dict.fromkeys(x.light for x in lines)), list(dict.fromkeys(x.method for x in lines))
+    canvas = FigureCanvasAgg(
+        Figure(figsize=(4 + 1.2 * max(3, len(lights) * len(methods) / 2), 4), layout="constrained")
+    )
+    axes = canvas.figure.subplots()
+    width = 0.8 / max(1, len(methods))
+    for i, method in enumerate(methods):
+        own = {line.light: line.scores["psnr_matched"] for line in lines if line.method == method}
+        places = [lights.index(light) + (i - (len(methods) - 1) / 2) * width for light in own]
+        error = [x.half_width for x in own.values()]  # NaN, of one scene, draws none
+        look = {"color": f"C{i % 10}", "hatch": ("", "///", "...")[i // 10 % 3], "edgecolor": "white"}
+        axes.bar(places, [x.mean for x in own.values()], width, yerr=error, capsize=3, label=method, **look)
+    axes.set_xticks(range(len(lights)), lights)
+    axes.set_ylabel("PSNR after the best factor [dB]")
+    if methods:
+        canvas.figure.legend(fontsize="small", loc="outside right upper")
+    with replacing(path) as file:
+        canvas.figure.savefig(file, format="png", dpi=120)
+
+
+def write(out: Path, plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row], remarks: Sequence[str] = ()) -> None:
+    """evaluation.json, .md, .png and a sheet of crops per light level, crops_LIGHT.png, in an evaluation's folder."""
+    one_per_scene = list({row.scene: row.clip for row in reversed(rows)}.values())[::-1]
+    for light in dict.fromkeys(row.light for row in rows):
+        target = out / f"crops_{light.replace(', ', '_').replace(' ', '')}.png"
+        breakdown.sheet(out, light, one_per_scene, [method.name for method in methods], target)
+    write_bytes(out / "evaluation.md", markdown(plan, methods, rows, remarks).encode())
+    figure(rows, out / "evaluation.png")
+    write_json(out / "evaluation.json", as_dict(plan, methods, rows, remarks))

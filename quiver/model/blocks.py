@@ -1,0 +1,430 @@
+"""The building blocks of QUIVER, in the order in which a frame meets them.
+
+Conventions of the whole network: `conv` = stride 1, zero padding (k-1)/2, with bias; GELU is the exact erf form; no
+normalisation layer, no dropout, no activation on any output. C is the channel unit, f2 the number of channels of a
+folded frame (1 unless frames are folded, see model.Config.fold). Flows are in pixels of their own scale,
+channel 0 = x, 1 = y; they live on the grid of frame t+1 and point into frame t.
+"""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from quiver.model.deformable import deform_conv2d, warp
+from quiver.model.plane_sweep import aligned, disagreement, paths
+from quiver.restoration.tiles import cores, extents
+
+RADIUS = 5  # frames before and after the restored one
+WINDOW = 2 * RADIUS + 1
+NEIGHBOURS = 5  # frames seen by the feature extractors around each frame
+OFFSET_LIMIT = 10.0  # pixels, of the alignment's own offsets on top of the flow
+GREY_MEAN, GREY_DEVIATION = 0.449, 0.226  # standardisation of the flow network's input; kept as float32 buffers
+
+
+def conv(inputs: int, outputs: int, kernel: int, stride: int = 1, bias: bool = True) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2, bias=bias)
+
+
+def upsample(inputs: int, outputs: int) -> nn.ConvTranspose2d:
+    """Transposed convolution that exactly doubles both sides."""
+    return nn.ConvTranspose2d(inputs, outputs, 3, stride=2, padding=1, output_padding=1)
+
+
+def resize(frames: Tensor, height: int, width: int) -> Tensor:
+    """Bilinear, without antialiasing, of the last two axes of [..., C, H, W]."""
+    if frames.shape[-2:] == (height, width):
+        return frames
+    flat = frames.reshape(-1, *frames.shape[-3:])
+    small = F.interpolate(flat, size=(height, width), mode="bilinear", align_corners=False)
+    return small.view(*frames.shape[:-2], height, width)
+
+
+def join(*tensors: Tensor) -> Tensor:
+    """Concatenate along channels, channels innermost in memory: convolutions are up to twice as fast on a CPU."""
+    return torch.cat(tensors, dim=1).contiguous(memory_format=torch.channels_last)
+
+
+class ResidualDenseBlock(nn.Module):
+    """Three dense layers, each adding `growth` channels; then back to `channels`, plus the input."""
+
+    def __init__(self, channels: int, growth: int, activation: type[nn.Module] = nn.GELU) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(conv(channels + i * growth, growth, 3) for i in range(3))
+        self.merge = conv(channels + 3 * growth, channels, 1)
+        self.activation = activation()
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = x
+        for layer in self.layers:
+            y = join(y, self.activation(layer(y)))
+        return self.merge(y) + x
+
+
+class PreDenoiser(nn.Module):
+    """Each frame alone: one residual dense block passed several times, all results fused, added to the frame."""
+
+    def __init__(self, image: int, channels: int, growth: int, passes: int) -> None:
+        super().__init__()
+        self.lift = conv(image, channels, 1)
+        self.enter = conv(channels, channels, 3)
+        self.block = ResidualDenseBlock(channels, growth, nn.ReLU)
+        self.fuse = nn.Sequential(conv(passes * channels, channels, 1), conv(channels, channels, 3))
+        self.leave = conv(channels, image, 3)
+        self.passes = passes
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[N, f2, H, W] -> the same."""
+        shallow = self.lift(join(x))
+        results = [self.enter(shallow)]
+        for _ in range(self.passes):
+            results.append(self.block(results[-1]))
+        return self.leave(self.fuse(join(*results[1:])) + shallow) + x
+
+
+class FlowNetwork(nn.Module):
+    """Coarse-to-fine flow of grey frames (Ranjan & Black 2017, "SpyNet")."""
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, channels: Sequence[int], kernel: int, levels: int = 4) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.full((1, 1, 1, 1), GREY_MEAN, dtype=torch.float32))
+        self.register_buffer("deviation", torch.full((1, 1, 1, 1), GREY_DEVIATION, dtype=torch.float32))
+        self.levels = nn.ModuleList(self._level(channels, kernel) for _ in range(levels))
+
+    @staticmethod
+    def _level(channels: Sequence[int], kernel: int) -> nn.Sequential:
+        layers: list[nn.Module] = []
+        for inputs, outputs in zip((4, *channels), channels, strict=False):
+            layers += [conv(inputs, outputs, kernel), nn.ReLU()]
+        return nn.Sequential(*layers, conv(channels[-1], 2, kernel))
+
+    def forward(self, reference: Tensor, support: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Grey frames [N, 1, H, W] -> flows on the grid of `reference` into `support` at scales 1, 2, 4."""
+        height, width = reference.shape[2:]
+        coarsest = 2 ** len(self.levels)  # pixels per pixel of the zero flow at the start
+        padded = tuple(2 * coarsest * math.ceil(side / (2 * coarsest)) for side in (height, width))
+        pyramid = [torch.cat([(resize(v, *padded) - self.mean) / self.deviation for v in (reference, support)], dim=1)]
+        for _ in range(len(self.levels) - 1):
+            pyramid.insert(0, F.avg_pool2d(pyramid[0], 2))
+        flow = reference.new_zeros(reference.shape[0], 2, padded[0] // coarsest, padded[1] // coarsest)
+        flows = []
+        for level, pair in zip(self.levels, pyramid, strict=True):
+            up = 2 * F.interpolate(flow, scale_factor=2, mode="bilinear", align_corners=True)
+            warped = warp(pair[:, 1:], up, "border")
+            flow = level(join(pair[:, :1], warped.to(up.dtype), up)) + up
+            flows.append(flow)
+        return tuple(self._to_size(flows[-1 - i], height // k, width // k) for i, k in enumerate((1, 2, 4)))  # type: ignore[return-value]
+
+    @staticmethod
+    def _to_size(flow: Tensor, height: int, width: int) -> Tensor:
+        scale = flow.new_tensor((width / flow.shape[3], height / flow.shape[2])).view(1, 2, 1, 1)
+        return resize(flow, height, width) * scale
+
+
+def neighbourhoods(frames: Tensor, before: int = NEIGHBOURS // 2, after: int = NEIGHBOURS // 2) -> Tensor:
+    """Every frame with two neighbours on each side as channels; zeros before the first and after the last.
+
+    [B, T, f2, H, W] -> [B, T + before + after - 4, f2*5, H, W]; channel order (f2, time).
+    """
+    padded = F.pad(frames, (0, 0, 0, 0, 0, 0, before, after))
+    stacks = padded.unfold(1, NEIGHBOURS, 1).permute(0, 1, 2, 5, 3, 4)
+    return stacks.reshape(*stacks.shape[:2], -1, *stacks.shape[4:])
+
+
+class Extractor(nn.Module):
+    """Linear space-time features 5 x 5 x 5 of a stream at scales 1, 2, 4.
+
+    A 3-D convolution over all frames is, per frame, a 2-D convolution over its five neighbours; the latter form lets a
+    frame be computed alone, and is quicker for few channels.
+    """
+
+    def __init__(self, image: int, channels: int) -> None:
+        super().__init__()
+        self.scale1 = nn.Conv3d(image, channels, NEIGHBOURS)
+        self.scale2 = nn.Conv3d(image, channels, NEIGHBOURS)
+        self.scale4 = nn.Conv3d(image, channels, NEIGHBOURS)
+
+    def forward(self, stacks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """[N, f2*5, H, W] (see `neighbourhoods`) -> features [N, C, H/s, W/s] for s = 1, 2, 4."""
+        stacks = join(stacks)
+        half = resize(stacks, stacks.shape[2] // 2, stacks.shape[3] // 2)
+        return (
+            self._convolve(stacks, self.scale1, 1),
+            self._convolve(stacks, self.scale2, 2),
+            self._convolve(half, self.scale4, 2),
+        )
+
+    @staticmethod
+    def _convolve(stacks: Tensor, layer: nn.Conv3d, stride: int) -> Tensor:
+        return F.conv2d(stacks, layer.weight.flatten(1, 2), layer.bias, stride, padding=NEIGHBOURS // 2)
+
+
+class Alignment(nn.Module):
+    """Brings the features of frame t-1 to frame t: deformable convolution guided by the flow; one for all scales."""
+
+    def __init__(self, channels: int, groups: int, kernel: int = 3) -> None:
+        super().__init__()
+        self.pairs = groups * kernel**2  # offsets: one for each tap of each group
+        self.offsets = nn.Sequential(
+            conv(2 * channels + 2, channels, 3),
+            nn.LeakyReLU(0.1),
+            conv(channels, channels, 3),
+            nn.LeakyReLU(0.1),
+            conv(channels, channels, 3),
+            nn.LeakyReLU(0.1),
+            conv(channels, 3 * self.pairs, 3),
+        )
+        self.weight = nn.Parameter(torch.empty(channels, channels, kernel, kernel))
+        self.bias = nn.Parameter(torch.zeros(channels))
+        bound = 1 / math.sqrt(kernel**2 * channels)
+        nn.init.uniform_(self.weight, -bound, bound)
+        last = self.offsets[-1]
+        assert isinstance(last, nn.Conv2d)
+        assert last.bias is not None
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    def forward(self, previous: Tensor, current: Tensor, flow: Tensor) -> Tensor:
+        """Features [N, C, h, w] of frames t-1 and t, flow [N, 2, h, w] -> aligned features [N, C, h, w]."""
+        warped = warp(previous, flow, "zeros")
+        raw = self.offsets(join(warped.to(current.dtype), current, flow))
+        own = OFFSET_LIMIT * torch.tanh(raw[:, : 2 * self.pairs])
+        offset = own + flow.flip(1).repeat(1, self.pairs, 1, 1)
+        mask = torch.sigmoid(raw[:, 2 * self.pairs :])
+        return deform_conv2d(previous, offset, self.weight, self.bias, mask, padding=self.weight.shape[2] // 2)
+
+
+class GatedFusion(nn.Module):
+    """Joins the aligned denoised and noisy streams, pixel by pixel: merge(GELU(gate z) * (value z))."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.gate = nn.Linear(2 * channels, 2 * channels)
+        self.value = nn.Linear(2 * channels, 2 * channels)
+        self.merge = nn.Linear(2 * channels, channels)
+
+    def forward(self, denoised: Tensor, noisy: Tensor) -> Tensor:
+        """Two [N, C, h, w] -> [N, C, h, w]; the linear layers run as 1 x 1 convolutions, without moving the axes."""
+        z = join(denoised, noisy)
+        return self._linear(self.merge, F.gelu(self._linear(self.gate, z)) * self._linear(self.value, z))
+
+    @staticmethod
+    def _linear(layer: nn.Linear, x: Tensor) -> Tensor:
+        return F.conv2d(x, layer.weight[:, :, None, None], layer.bias)
+
+
+class RecurrentCell(nn.Module):
+    """Recurrent multi-scale fusion: features of one frame at three scales and a state at 1/4 scale.
+
+    `encode` is the part without state, `step` the recurrent part at 1/4 scale.
+    """
+
+    def __init__(self, image: int, channels: int, blocks: int, growth: int) -> None:
+        super().__init__()
+        c = channels
+        self.image1 = conv(image, c, 5)
+        self.image2 = conv(image, c, 3)
+        self.image4 = conv(image, c, 3)
+        self.fuse1 = conv(2 * c, 4 * c, 1)
+        self.block1 = ResidualDenseBlock(4 * c, c)
+        self.down1 = conv(4 * c, 4 * c, 5, stride=2)
+        self.block2 = ResidualDenseBlock(6 * c, 3 * c // 2)
+        self.down2 = conv(6 * c, 4 * c, 5, stride=2)
+        self.join = ResidualDenseBlock(8 * c, c)
+        self.shrink = conv(8 * c, 4 * c, 3)
+        self.blocks = nn.ModuleList(ResidualDenseBlock(4 * c, growth) for _ in range(blocks))
+        self.collect = conv(4 * c * blocks, 4 * c, 1)
+        self.smooth = conv(4 * c, 4 * c, 3)
+        self.state = nn.Sequential(conv(4 * c, 2 * c, 3), ResidualDenseBlock(2 * c, 2 * c), conv(2 * c, 2 * c, 3))
+
+    def encode(self, images: Sequence[Tensor], fused: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Images [N, f2, h, w] and fused features [N, C, h, w] at scales 1, 2, 4 -> R1, R2 (4C), entry (6C at 1/4)."""
+        r1 = self.fuse1(join(self.image1(images[0]), fused[0]))
+        r2 = self.down1(self.block1(r1))
+        middle = join(r2, self.image2(images[1]), fused[1])
+        entry = join(self.down2(self.block2(middle)), self.image4(images[2]), fused[2])
+        return r1, r2, entry
+
+    def step(self, entry: Tensor, state: Tensor) -> Tensor:
+        """Entry (6C) and state (2C) at 1/4 scale -> R4 (4C)."""
+        y = self.shrink(self.join(join(entry, state)))
+        results = []
+        for block in self.blocks:
+            y = block(y)
+            results.append(y)
+        return self.smooth(self.collect(join(*results)))
+
+
+class TemporalAttention(nn.Module):
+    """Channel self-attention over the stacked R4 of a window, the centre frame last."""
+
+    def __init__(self, inputs: int, width: int, outputs: int, temperature: float | None) -> None:
+        super().__init__()
+        self.enter = conv(inputs, width, 3, bias=False)
+        self.spread = nn.Conv2d(width, width, 3, padding=1, groups=width, bias=False)
+        self.qkv = conv(width, 3 * width, 1, bias=False)
+        self.project = conv(width, width, 1, bias=False)
+        self.leave = conv(width, outputs, 1, bias=False)
+        self.temperature = None if temperature is None else nn.Parameter(torch.tensor(float(temperature)))
+
+    def forward(self, window: Sequence[Tensor]) -> Tensor:
+        """R4 [N, 4C, h, w] of the frames in time order, an odd number -> [N, 4C, h, w] for the centre frame."""
+        centre = len(window) // 2
+        c = self.enter(join(*window[:centre], *window[centre + 1 :], window[centre]))
+        q, k, v = self.qkv(self.spread(c)).flatten(2).chunk(3, dim=1)
+        logits = F.normalize(q, dim=2) @ F.normalize(k, dim=2).transpose(1, 2)
+        if self.temperature is not None:
+            logits = logits * self.temperature
+        attended = (logits.softmax(dim=2) @ v).view_as(c)
+        return self.leave(self.project(attended) + c)
+
+
+class Refinement(nn.Module):
+    """One scale of the output: channel attention, then an image branch and a hidden branch for the next scale."""
+
+    def __init__(self, image: int, channels: int) -> None:
+        super().__init__()
+        c = channels
+        self.enter = conv(8 * c, 8 * c, 1)
+        self.body = nn.Sequential(conv(8 * c, 8 * c, 1), nn.GELU(), conv(8 * c, 8 * c, 3))
+        self.gate = nn.Sequential(
+            conv(8 * c, c // 2, 1, bias=False), nn.ReLU(), conv(c // 2, 8 * c, 1, bias=False), nn.Sigmoid()
+        )
+        widths = (8 * c, 8 * c, 6 * c, 4 * c)
+        self.hidden = nn.Sequential(*_gelu_chain(widths), nn.GELU(), upsample(4 * c, 4 * c))
+        self.picture = nn.Sequential(*_gelu_chain((8 * c, 6 * c, 4 * c, 2 * c, c)), conv(c, image, 3))
+        self.next_picture = upsample(image, image)
+
+    def forward(self, feature: Tensor, hidden: Tensor, picture: Tensor) -> tuple[Tensor, Tensor]:
+        """feature, hidden [N, 4C, h, w], picture [N, f2, h, w] -> (new picture, the input of `onward`)."""
+        g0 = self.enter(join(feature, hidden))
+        b = self.body(g0)
+        g = self.gate(b.mean(dim=(2, 3), keepdim=True)) * b + g0
+        return self.picture(g) + picture, g
+
+    def onward(self, g: Tensor, picture: Tensor) -> tuple[Tensor, Tensor]:
+        """Hidden feature and picture for the next finer scale, both twice the size."""
+        return self.hidden(g), self.next_picture(picture)
+
+
+class Hourglass(nn.Module):
+    """Convolutions at full, half and quarter scale, each joined to the next finer one (Ronneberger et al. 2015)."""
+
+    REACH = 36  # px: how far away a pixel of the input can be that an output depends on
+    MULTIPLE = 4  # of height and width
+
+    def __init__(self, inputs: int, width: int) -> None:
+        super().__init__()
+        w = width
+        self.down1 = nn.Sequential(*_relu_chain((inputs, w, w)))
+        self.down2 = nn.Sequential(*_relu_chain((w, 2 * w, 2 * w)))
+        self.bottom = nn.Sequential(*_relu_chain((2 * w, *[4 * w] * 5)))
+        self.up2 = nn.ConvTranspose2d(4 * w, 2 * w, 2, stride=2)
+        self.merge2 = nn.Sequential(*_relu_chain((4 * w, 2 * w, 2 * w)))
+        self.up1 = nn.ConvTranspose2d(2 * w, w, 2, stride=2)
+        self.merge1 = nn.Sequential(*_relu_chain((2 * w, w, w)))
+        self.leave = conv(w, 1, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[N, inputs, H, W] -> [N, 1, H, W], H and W multiples of 4."""
+        full = self.down1(x)
+        half = self.down2(F.max_pool2d(full, 2))
+        quarter = self.bottom(F.max_pool2d(half, 2))
+        half = self.merge2(join(self.up2(quarter), half))
+        return self.leave(self.merge1(join(self.up1(half), full)))
+
+
+class Baseline(nn.Module):
+    """Not part of the published design: a first picture straight from the window, for quick learning.
+
+    A learnt mean over time plus an hourglass over the stacked frames, at full size; before training it is about a
+    Gaussian mean. With `sweep` the frames are first drawn along the paths on which they agree (sweep.py, up to about
+    `sweep` px/frame), and the hourglass sees them both ways, beside the velocity as a share of `sweep` and the
+    standard deviation that is left over time. When it is not being trained, its answers to the eight flips and quarter
+    turns of all this are averaged: what it learnt in minutes differs among them (Lim et al. 2017, "EDSR", call it
+    geometric self-ensemble).
+    """
+
+    SIGMA = 1.5  # frames
+
+    def __init__(self, width: int, sweep: float = 0.0) -> None:
+        super().__init__()
+        self.sweep = sweep
+        weights = [math.exp(-0.5 * ((t - RADIUS) / self.SIGMA) ** 2) for t in range(WINDOW)]
+        self.weights = nn.Parameter(torch.tensor([weight / sum(weights) for weight in weights]))
+        self.correction = Hourglass(2 * WINDOW + 3 if sweep else WINDOW, width)
+        self.pixels: int | None = None  # most that the hourglass takes at once when not trained; the numbers agree
+
+    def forward(self, window: Sequence[Tensor]) -> Tensor:
+        """Eleven folded frames [N, f2, h, w] -> [N, f2, h, w]."""
+        fold = math.isqrt(window[0].shape[1])
+        frames = F.pixel_shuffle(torch.stack(list(window), dim=1), fold)[:, :, 0]  # [N, T, H, W]
+        drawn, stack = frames, [frames]
+        if self.sweep:
+            velocity, acceleration = paths(frames, self.sweep)
+            drawn = aligned(frames, velocity, acceleration)
+            stack = [drawn, frames, velocity / self.sweep, disagreement(drawn).sqrt()]
+        mean = (drawn * self.weights.view(1, -1, 1, 1)).sum(1, keepdim=True)
+        seen = join(*stack)
+        return F.pixel_unshuffle(mean + (self.correction(seen) if self.training else self._in_tiles(seen)), fold)
+
+    def _in_tiles(self, stack: Tensor) -> Tensor:
+        """`_averaged`, tile by tile where the frame has more than `pixels` pixels."""
+        height, width = stack.shape[2:]
+        if self.pixels is None or height * width <= self.pixels:
+            return self._averaged(stack)
+        reach = Hourglass.REACH
+        tall, wide = cores(height, width, self.pixels, reach, Hourglass.MULTIPLE)
+        picture = stack.new_empty(stack.shape[0], 1, height, width)
+        for y, (top, bottom) in zip(range(0, height, tall), extents(height, tall, reach), strict=True):
+            for x, (left, right) in zip(range(0, width, wide), extents(width, wide, reach), strict=True):
+                part = self._averaged(stack[:, :, top:bottom, left:right])
+                inner = part[:, :, y - top : y - top + tall, x - left : x - left + wide]
+                picture[:, :, y : y + tall, x : x + wide] = inner
+        return picture
+
+    def _averaged(self, stack: Tensor) -> Tensor:
+        """The hourglass's mean answer to the eight flips and quarter turns of what it sees."""
+        x = 2 * WINDOW if self.sweep else None  # channel of the velocity's x; its y follows
+        total = stack.new_zeros(stack.shape[0], 1, *stack.shape[2:])
+        for turns in range(4):
+            for mirrored in (False, True):
+                answer = self.correction(join(_mirrored(stack, x) if mirrored else stack))
+                total += (answer.flip(3) if mirrored else answer).rot90(-turns, (2, 3))
+            stack = _turned(stack, x)
+        return total / 8
+
+
+def _mirrored(stack: Tensor, x: int | None) -> Tensor:
+    """[N, C, H, W] with left and right exchanged; channels x and x + 1 are components of a vector (None: no vector)."""
+    flipped = stack.flip(3)
+    if x is not None:
+        flipped[:, x] *= -1
+    return flipped
+
+
+def _turned(stack: Tensor, x: int | None) -> Tensor:
+    """The same after a quarter turn: what pointed to the right points up."""
+    turned = stack.rot90(1, (2, 3))
+    if x is None:
+        return turned
+    return torch.cat([turned[:, :x], turned[:, x + 1 : x + 2], -turned[:, x : x + 1], turned[:, x + 2 :]], dim=1)
+
+
+def _relu_chain(widths: Sequence[int]) -> list[nn.Module]:
+    """conv3, ReLU, ..., conv3, ReLU through the given widths."""
+    return [layer for inputs, outputs in pairwise(widths) for layer in (conv(inputs, outputs, 3), nn.ReLU())]
+
+
+def _gelu_chain(widths: Sequence[int]) -> list[nn.Module]:
+    """conv3, GELU, conv3, GELU, ..., conv3 through the given widths."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(widths):
+        layers += [conv(inputs, outputs, 3), nn.GELU()]
+    return layers[:-1]

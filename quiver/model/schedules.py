@@ -1,0 +1,142 @@
+"""Restoring a video without doing the same work for every window.
+
+Two schedules of the network's stages, both in memory that does not grow with the clip:
+
+`exact`   the numbers of windows recomputed from scratch. Pre-denoised frames and flows are computed once. So are the
+          fused features and R1, R2 of the frames at window positions 3 to 8, where the 5-frame extractors do not
+          reach beyond the window. Positions 0, 1, 2, 9, 10 see zeros there, so each window computes its own; and the
+          recurrent state starts at zero in each window.
+`stream`  one pass over the clip: the state is carried on and each frame is encoded once. Not the same numbers: the
+          zeros beyond the window and the zero state then occur at the ends of the clip only.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from quiver.model.blocks import NEIGHBOURS, RADIUS, WINDOW, resize
+
+if TYPE_CHECKING:
+    from quiver.model.quiver import QUIVER, Encoded
+
+REACH = NEIGHBOURS // 2  # frames the extractors see before and after
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a frame contributes wherever it stands in a window."""
+
+    images: tuple[Tensor, ...]  # folded, at scales 1, 2, 4
+    denoised: Tensor  # folded
+    flows: tuple[Tensor, ...] | None  # into the frame before, at scales 1, 2, 4; None for the first frame of a clip
+
+
+@dataclass(frozen=True)
+class Features:
+    """Extractor outputs of a frame at scales 1, 2, 4; they depend on the frames around it."""
+
+    noisy: tuple[Tensor, ...]
+    denoised: tuple[Tensor, ...]
+
+
+def stream(network: "QUIVER", frames: Iterable[Tensor]) -> Iterator[Tensor]:
+    """Frames [B, 1, H, W] one by one -> restored frames 5 .. T-6 [B, 1, H, W]; each seven frames late."""
+    places: deque[Frame | None] = deque([None] * REACH, maxlen=NEIGHBOURS)  # frames around the encoded one
+    images: deque[Tensor] = deque(maxlen=WINDOW)
+    r4: deque[Tensor] = deque(maxlen=WINDOW)
+    finest: deque[tuple[Tensor, Tensor]] = deque(maxlen=RADIUS + 1)
+    before: Features | None = None
+    for frame in _then_nothing(_prepare(network, frames)):
+        places.append(frame)
+        current = places[REACH] if len(places) == NEIGHBOURS else None
+        if current is None:
+            continue
+        features = _extract(network, places)
+        r1, r2, entry = _encode(network, current, before, features)
+        state = network.cell.state(r4[-1]) if r4 else network.first_state(entry)
+        before = features
+        r4.append(network.cell.step(entry, state))
+        finest.append((r1, r2))
+        images.append(current.images[0])
+        if len(r4) == WINDOW:
+            yield _picture(network, list(r4), finest[0], images)
+
+
+def exact(network: "QUIVER", frames: Iterable[Tensor]) -> Iterator[Tensor]:
+    """Frames [B, 1, H, W] one by one -> restored frames 5 .. T-6 [B, 1, H, W], equal to windows from scratch."""
+    window: deque[Frame] = deque(maxlen=WINDOW)
+    inside: deque[Features] = deque(maxlen=WINDOW - 2 * REACH)  # of positions 2 .. 8
+    entries: deque[Tensor] = deque(maxlen=WINDOW - 2 * REACH - 1)  # of positions 3 .. 8
+    finest: deque[tuple[Tensor, Tensor]] = deque(maxlen=RADIUS - REACH + 1)  # R1, R2 of positions 5 .. 8
+    for frame in _prepare(network, frames):
+        window.append(frame)
+        if len(window) < NEIGHBOURS:
+            continue
+        inside.append(_extract(network, list(window)[-NEIGHBOURS:]))
+        if len(inside) > 1:
+            r1, r2, entry = _encode(network, window[-1 - REACH], inside[-2], inside[-1])
+            entries.append(entry)
+            finest.append((r1, r2))
+        if len(window) == WINDOW:
+            start, end = _edges(network, window, inside)
+            yield _picture(network, network.recur([*start, *entries, *end]), finest[0], [f.images[0] for f in window])
+
+
+def _prepare(network: "QUIVER", frames: Iterable[Tensor]) -> Iterator[Frame]:
+    """Fold, resize, pre-denoise, and find the flow into the frame before."""
+    before: Tensor | None = None
+    for raw in frames:
+        image = network.fold(raw)
+        denoised = network.denoise(image)
+        height, width = image.shape[2:]
+        images = (image, *(resize(image, height // k, width // k) for k in (2, 4)))
+        yield Frame(images, denoised, None if before is None else network.flows(denoised, before))
+        before = denoised
+
+
+def _then_nothing(frames: Iterator[Frame]) -> Iterator[Frame | None]:
+    """The frames, then as many empty places as the extractors look ahead."""
+    yield from frames
+    yield from [None] * REACH
+
+
+def _extract(network: "QUIVER", places: Iterable[Frame | None]) -> Features:
+    """Features of the middle of five places; None is beyond the window and counts as zeros."""
+    five = list(places)
+    like = next(frame for frame in five if frame is not None).denoised
+    nothing = torch.zeros_like(like)
+    noisy = torch.stack([nothing if f is None else f.images[0] for f in five], dim=2).flatten(1, 2)
+    denoised = torch.stack([nothing if f is None else f.denoised for f in five], dim=2).flatten(1, 2)
+    return Features(network.noisy_features(noisy), network.denoised_features(denoised))
+
+
+def _encode(network: "QUIVER", frame: Frame, before: Features | None, now: Features) -> "Encoded":
+    """R1, R2 and the cell's entry of a frame; `before` is None for the first of its window."""
+    if before is None:
+        return network.encode_first(frame.images)
+    assert frame.flows is not None
+    noisy = list(zip(before.noisy, now.noisy, strict=True))
+    denoised = list(zip(before.denoised, now.denoised, strict=True))
+    return network.encode_next(frame.images, noisy, denoised, frame.flows)
+
+
+def _edges(network: "QUIVER", window: Sequence[Frame], inside: Sequence[Features]) -> tuple[list[Tensor], list[Tensor]]:
+    """Entries of window positions 0, 1, 2 and 9, 10, where the extractors see zeros or their neighbours do."""
+    outside: list[Frame | None] = [None] * REACH
+    padded = [*outside, *window, *outside]
+    at = {p: _extract(network, padded[p : p + NEIGHBOURS]) for p in (0, 1, WINDOW - 2, WINDOW - 1)}
+    at |= {REACH: inside[0], WINDOW - 1 - REACH: inside[-1]}
+    entries = [_encode(network, window[0], None, at[0])[2]]
+    entries += [_encode(network, window[p], at[p - 1], at[p])[2] for p in (1, 2, WINDOW - 2, WINDOW - 1)]
+    return entries[:3], entries[3:]
+
+
+def _picture(network: "QUIVER", r4: list[Tensor], finest: tuple[Tensor, Tensor], frames: Sequence[Tensor]) -> Tensor:
+    """The full-scale picture [B, 1, H, W] of the centre of eleven frames."""
+    picture = network.restore(r4, *finest)[0]
+    base = network.base(frames)
+    return network.unfold(picture if base is None else picture + base)

@@ -1,0 +1,1 @@
+"""Any method on clips of any size in bounded memory."""

@@ -1,0 +1,77 @@
+"""Restoring in one line, for notebooks: a stream, a clip, a path or an array of codes in, photons out."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray as Array
+
+from quiver.cli.options import DEFAULT_METHOD
+from quiver.data.codes import Clip, Codes, Light, Sensor, Stream, array_codes, open_stream, sensed, stream_codes
+from quiver.restoration.domain import refuse_outside, remarks
+from quiver.restoration.restorers import Options, restorer
+from quiver.restoration.sources import refuse_idle
+
+Source = Stream | Clip | str | os.PathLike[str] | Array
+
+
+def restore(
+    source: Source,
+    method: str = DEFAULT_METHOD,
+    *,
+    sensor: Sensor | None = None,
+    exposure: float | None = None,
+    ppp: float | None = None,
+    device: str | None = None,
+    mode: str | None = None,
+    strict: bool = False,
+) -> Array:
+    """Restored video, float32 [T, H, W], in photons per pixel and exposure (expected, before quantum efficiency).
+
+    `source` is a `Stream`; a `Clip` (its only stream; with `ppp` it is sensed now by the default sensor); the path of
+    either; or integer codes [T, H, W], for which `sensor` and `exposure` [s] must be given. `method` is a classical
+    method (naive, moment, likelihood, transform-denoise, qbp, qbp-bm3d), shipped weights (default nano), a .safetensors
+    file or a folder of `quiver train`; `device` (auto, cpu, cuda) and `mode` (exact, streaming, windows) are for
+    networks. A network outside of what it was measured for warns, and with `strict` it is a `ValueError`. `ValueError`
+    or `FileNotFoundError` where these do not fit together.
+
+        video = quiver.restore("out/fan", "moment")
+    """
+    codes = _codes(source, sensor, exposure, ppp)
+    chosen = restorer(method, Options(device=device or "auto", mode=mode or "exact"))
+    refuse_idle({"device": device, "mode": mode}, [chosen])
+    found = remarks([chosen], codes)
+    if strict:
+        refuse_outside([chosen], found)
+    for text in found:
+        warnings.warn(text, stacklevel=2)
+    return chosen.restore(codes)
+
+
+def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: float | None) -> Codes:
+    if isinstance(source, np.ndarray):
+        if sensor is None or exposure is None:
+            raise ValueError("codes in an array do not say what made them; give sensor= and exposure= in seconds")
+        if ppp is not None:
+            raise ValueError("ppp= senses a clip now; the codes of an array are there already")
+        return array_codes(source, sensor, exposure)
+    if sensor is not None or exposure is not None:
+        raise ValueError("sensor= and exposure= are for arrays; a clip and a stream know theirs")
+    if isinstance(source, str | os.PathLike):
+        path = Path(source)
+        source = Clip.open(path) if path.is_dir() or not path.exists() else open_stream(path)
+    if isinstance(source, Stream):
+        if ppp is not None:
+            raise ValueError("ppp= senses a clip now; a stream knows its light")
+        return stream_codes(source)
+    if ppp is not None:
+        return sensed(source, Light("quiver-physical", ppp, 3))[0]
+    if len(source.streams) != 1:
+        there = ", ".join(source.streams) or "none"
+        raise ValueError(
+            f"{source.path}: give one of its streams ({there}) as clip.stream(NAME), or ppp= to sense it now"
+        )
+    return stream_codes(source.stream(source.streams[0]))

@@ -1,0 +1,265 @@
+"""What a network was measured for: cells of sensor, bits and light, each with its PSNR and the best classical one.
+
+    weights file --`quiver domain`--> cells in its metadata;   stream, cells --`remark`--> nothing, or one line
+
+A stream belongs to the nearest cell in log light among those of the same kind of sensor, the same bits and about the
+same gain. Light is counted in detected photons: sensors of one kind share their cells whatever their efficiency.
+Read noise, dark counts and defects are not compared. Beyond the measured light, by more than NEAR, nothing is known.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quiver.baselines import METHODS
+from quiver.data.codes import Codes, Light, Sensor
+from quiver.data.noise import Noise
+
+if TYPE_CHECKING:
+    from quiver.restoration.restorers import Restorer
+
+FORMAT = "quiver-domain-1"
+KEY = "domain"  # of the metadata of a weights file
+NEAR = 1.25  # light and gain that differ by no larger factor count as the measured ones
+MAX_CELLS = 10_000
+LIGHT_FRAMES = 11  # from which the light of a stream is estimated where it is not known
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a stream lies: what decides how much its codes tell."""
+
+    model: str  # of the sensor: QIS, BinarySPAD, CountingSPAD
+    bits: int
+    light: float  # detected photons per pixel and code
+    white: float  # detected photons at the top code
+
+    def like(self, other: Place) -> bool:
+        """Same kind and bits, and the same gain: either in photons, or in units of the light."""
+        if (self.model, self.bits) != (other.model, other.bits):
+            return False
+        relative = (self.white / self.light) / (other.white / other.light)
+        return any(abs(math.log(ratio)) <= math.log(NEAR) for ratio in (self.white / other.white, relative))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One measurement: matched PSNR [dB], mean over clips."""
+
+    sensor: str  # that it was measured with
+    ppp: float
+    place: Place
+    network: float
+    classical: str  # the best classical method
+    classical_psnr: float
+
+    @property
+    def wins(self) -> bool:
+        """Whether the network is at least as good as the best classical method."""
+        return self.network >= self.classical_psnr
+
+    @property
+    def name(self) -> str:
+        return f"{self.sensor}, {self.place.bits} bit, {self.ppp:g} PPP"
+
+    @property
+    def scores(self) -> str:
+        return f"{self.classical} {self.classical_psnr:.1f} dB, network {self.network:.1f} dB"
+
+
+@dataclass(frozen=True)
+class Domain:
+    """All cells of one weights file, and how they were measured."""
+
+    cells: tuple[Cell, ...]
+    measured: Mapping[str, Any]  # clips, frames, methods, seed, version: the same for all cells
+
+    def nearest(self, place: Place) -> Cell | None:
+        """The cell that speaks for a stream; None where nothing near was measured."""
+        like = [cell for cell in self.cells if cell.place.like(place)]
+        if not like:
+            return None
+        lights = [cell.place.light for cell in like]
+        if not min(lights) / NEAR <= place.light <= max(lights) * NEAR:
+            return None
+        return min(like, key=lambda cell: abs(math.log(cell.place.light / place.light)))
+
+    @property
+    def best_classical(self) -> str:
+        """The classical method that is best in most cells."""
+        names = [cell.classical for cell in self.cells]
+        return max(dict.fromkeys(names), key=names.count)
+
+    def to_json(self) -> str:
+        """As the metadata of a weights file hold it."""
+        return json.dumps(self.to_dict(), sort_keys=True)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return {"format": FORMAT, "measured": dict(self.measured), "cells": [asdict(cell) for cell in self.cells]}
+
+    @classmethod
+    def from_json(cls, text: str) -> Domain:
+        """Inverse of `to_json`; strict, ValueError."""
+        try:
+            found = json.loads(text)
+            if not isinstance(found, dict) or found.get("format") != FORMAT or not isinstance(found["measured"], dict):
+                raise ValueError(f"its format is not {FORMAT!r}")
+            if not isinstance(found["cells"], list) or not 0 < len(found["cells"]) <= MAX_CELLS:
+                raise ValueError(f"it holds 1 to {MAX_CELLS} cells")
+            return cls(tuple(_cell(values) for values in found["cells"]), found["measured"])
+        except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+            raise ValueError(f"{type(error).__name__}: {' '.join(str(error).split())}"[:200]) from None
+
+
+def _cell(values: Mapping[str, Any]) -> Cell:
+    cell = Cell(**{**values, "place": Place(**values["place"])})
+    kinds: dict[str, tuple[type, ...]] = {"str": (str,), "int": (int,), "float": (int, float), "Place": (Place,)}
+    for part in (cell, cell.place):
+        for field in fields(part):
+            value = getattr(part, field.name)
+            good = isinstance(value, kinds[str(field.type)]) and not isinstance(value, bool)
+            if not good or (isinstance(value, int | float) and not math.isfinite(value)):
+                raise ValueError(f"{field.name} = {repr(value)[:60]} cannot be")
+    if not (cell.place.bits >= 1 and min(cell.ppp, cell.place.light, cell.place.white) > 0):
+        raise ValueError(f"a cell of {cell.place.bits} bit at {cell.ppp!r} photons cannot be")
+    return cell
+
+
+@dataclass(frozen=True)
+class Scope:
+    """What is known of a network: the cells that were measured, else what it was trained on."""
+
+    domain: Domain | None = None
+    trained: tuple[Light, ...] = ()
+
+
+def read_scope(path: Path, metadata: Mapping[str, str]) -> Scope:
+    """The scope in the metadata of a weights file; ValueError if the domain in it is damaged."""
+    text = metadata.get(KEY)
+    try:
+        domain = None if text is None else Domain.from_json(text)
+    except ValueError as error:
+        raise ValueError(f"{path}: its domain is damaged ({error}); measure it again with `quiver domain`") from None
+    return Scope(domain, _trained(metadata.get("settings")))
+
+
+def _trained(text: str | None) -> tuple[Light, ...]:
+    """Sensors, bits and light of the settings that training leaves in a weights file; empty where they do not say."""
+    try:
+        settings = json.loads(text or "{}")
+        if settings.get("noise"):
+            return tuple(Noise.from_dict(values) for values in settings["noise"])
+        sensors, bits, ppp = (_listed(settings.get(name)) for name in ("sensor", "bits", "ppp"))
+        return tuple(
+            Light(str(sensor), None if light is None else float(light), None if depth is None else int(depth))
+            for sensor in sensors
+            for depth in bits
+            for light in ppp
+        )
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return ()
+
+
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [] if value is None else [value]
+
+
+def place_of(sensor: Sensor, exposure: float, ppp: float) -> Place:
+    """Where codes of a sensor lie that sees `ppp` photons per pixel and exposure [s]."""
+    efficiency = sensor.efficiency
+    return Place(type(sensor).__name__, sensor.bits, ppp * efficiency, sensor.white(exposure) * efficiency)
+
+
+def light_of(codes: Codes) -> float:
+    """Photons per pixel and code of a stream: as it says, else by the moment inverse or mean of its first frames."""
+    if codes.ppp is not None and codes.ppp > 0:
+        return float(codes.ppp)
+    some = codes.read(0, min(LIGHT_FRAMES, codes.shape[0]))
+    try:
+        found = float(METHODS["moment"].restore(some, codes.sensor, codes.exposure).mean())
+    except ValueError:  # its codes tell no light
+        found = float(METHODS["naive"].restore(some, codes.sensor, codes.exposure).mean())
+    return max(found, 1e-9 * codes.white)
+
+
+def remark(name: str, scope: Scope, codes: Codes) -> str | None:
+    """One line where a network is outside of what it was measured for; None inside."""
+    ppp = light_of(codes)
+    place = place_of(codes.sensor, codes.exposure, ppp)
+    stream = f"{codes.sensor_name or place.model}, {place.bits} bit, {ppp:.3g} PPP"
+    if scope.domain is None:
+        return _unmeasured(name, scope.trained, codes, place, stream)
+    cell = scope.domain.nearest(place)
+    if cell is None:
+        best = scope.domain.best_classical
+        return f"{name} was never measured near {stream}; {best} is mostly the best classical method where it was"
+    return None if cell.wins else f"{name} is worse than {cell.classical} on {stream}: {cell.scores} at {cell.name}"
+
+
+def remarks(methods: Iterable[Restorer], codes: Codes) -> list[str]:
+    """The remarks on all networks among the methods."""
+    found = (None if m.scope is None else remark(m.name, m.scope, codes) for m in methods)
+    return [text for text in found if text is not None]
+
+
+def measured_at(method: Restorer, codes: Codes) -> str | None:
+    """For the curious: the measurement that speaks for a network on a stream; None where nothing does."""
+    if method.scope is None or method.scope.domain is None:
+        return None
+    cell = method.scope.domain.nearest(place_of(codes.sensor, codes.exposure, light_of(codes)))
+    return None if cell is None else f"{method.name} was measured at {cell.name}: {cell.scores}"
+
+
+def refuse_outside(methods: Sequence[Restorer], found: Sequence[str]) -> None:
+    """What `strict` asks for: `ValueError` with the first remark, and where no method is a network."""
+    if not any(method.learned for method in methods):
+        names = ", ".join(method.name for method in methods)
+        raise ValueError(f"strict: acts on networks, and {names} is classical; leave it out")
+    if found:
+        raise ValueError(f"{found[0]}; without strict it runs all the same")
+
+
+def _unmeasured(name: str, trained: Sequence[Light], codes: Codes, place: Place, stream: str) -> str:
+    """Weights without cells: what they were trained on, and whether the stream is like that."""
+    start = f"{name} was never measured against the classical methods"
+    if not trained:
+        return f"{start}, and its file does not say what it was trained on; this stream is {stream}"
+    words = ", ".join(dict.fromkeys(light.sensor for light in trained))
+    depths = ", ".join(str(bits) for bits in sorted({light.bits for light in trained if light.bits is not None}))
+    levels = ", ".join(f"{ppp:g}" for ppp in sorted({light.ppp for light in trained if light.ppp is not None}))
+    if any(_same(light, codes, place) for light in trained):
+        return f"{start}; it was trained on such streams ({stream})"
+    return f"{start}; it was trained on {words}, {depths or 'own'} bit, {levels or 'own'} PPP, this stream is {stream}"
+
+
+def _same(light: Light, codes: Codes, place: Place) -> bool:
+    """Whether a stream lies where training was."""
+    if light.ppp is None:
+        return False
+    try:
+        seen = place_of(light.device(codes.exposure), codes.exposure, light.ppp)
+    except (ValueError, OSError):  # a sensor's file that is not here
+        return False
+    return seen.like(place) and abs(math.log(seen.light / place.light)) <= math.log(NEAR)
+
+
+def table(domain: Domain) -> list[str]:
+    """The cells as a Markdown table, the winner of each in bold."""
+    text = ["| sensor | bits | PPP | network | best classical method |", "|---|---|---|---|---|"]
+    for cell in domain.cells:
+        ours, theirs = f"{cell.network:.2f}", f"{cell.classical_psnr:.2f}"
+        ours, theirs = (f"**{ours}**", theirs) if cell.wins else (ours, f"**{theirs}**")
+        text.append(f"| {cell.sensor} | {cell.place.bits} | {cell.ppp:g} | {ours} | {cell.classical} {theirs} |")
+    return text
+
+
+def merged(old: Iterable[Cell], new: Iterable[Cell]) -> tuple[Cell, ...]:
+    """Cells by sensor, bits and light; a new one takes the place of an old one."""
+    found = {(cell.sensor, cell.place.bits, cell.ppp): cell for cell in (*old, *new)}
+    return tuple(found[key] for key in sorted(found))

@@ -1,0 +1,195 @@
+"""Restored video as a file: made on disk block by block, resumable, whole or absent, by one writer at a time.
+
+PATH.npy.part, PATH.npy.part.json  ->  PATH.npy (float32 photons [T, H, W]) and PATH.json
+PATH.npy.lock                          held while a process writes
+
+The space is taken before the work begins: a full disk is an error then, and the memory map cannot meet it later.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quiver.data.codes import Codes, Lock, __version__, read_json, sealed, sha256, sync_folder, write_json
+from quiver.restoration.restorers import Progress, Restorer, check_finite
+
+FORMAT = "quiver-restored-1"
+BLOCK_FRAMES = 256  # restored between two notes of how far a file has come
+TELL = {  # key of the description -> what it is called where it is why a restoration starts again
+    "codes_sha256": "the codes",
+    "method": "the method",
+    "description": "the method",
+    "identity": "the method's settings or weights",
+    "sensor": "the sensor",
+    "shape": "the shape",
+    "source": "the source",
+    "quiver": "the program's version",
+}
+
+
+def restore_to_file(
+    codes: Codes,
+    method: Restorer,
+    path: Path,
+    progress: Progress | None = None,
+    *,
+    force: bool = True,
+    note: Callable[[str], None] | None = None,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Restore a stream into PATH.npy (float32 photons [T, H, W]) and PATH.json; both appear when whole, the json last.
+
+    Returns what the json says. Works on disk, BLOCK_FRAMES at a time, in PATH.npy.part: an interrupted restoration of
+    the same codes by the same method that has finished a block is resumed; one of others starts again, and `note` is
+    told why. `threads` is noted in the description. A failure leaves nothing behind. A link is followed. `ValueError`
+    while another process writes PATH, `FileExistsError` if a result is there and `force` is not set, or if what is
+    there is no restored video.
+    """
+    path = path.resolve()
+    part, journal = path.with_name(path.name + ".part"), path.with_name(path.name + ".part.json")
+    with _only_writer(path):
+        _finish_naming(path, part, journal)
+        _check_target(path, force)
+        meta = {
+            "format": FORMAT,
+            "quiver": __version__,
+            "method": method.name,
+            "description": method.description,
+            "identity": dict(method.identity) | {"cut": method.cut(*codes.shape[1:])},
+            "unit": "photons",
+            "white": codes.white,
+            "shape": list(codes.shape),
+            "frame_rate": codes.frame_rate,
+            "exposure": codes.exposure,
+            "sensor": codes.sensor.to_dict(),
+            "source": codes.source,
+            "codes_sha256": codes.digest(),
+        }
+        try:
+            seconds = _fill_file(codes, method, part, journal, meta, progress, note, threads)
+            meta |= {"seconds_per_frame": seconds / codes.shape[0], "threads": threads, "sha256": sha256(part)}
+            meta = sealed(meta)
+            write_json(journal, meta)  # takes its space before anything is replaced
+        except BaseException as error:
+            if isinstance(error, Exception) or not journal.exists():
+                part.unlink(missing_ok=True)
+                journal.unlink(missing_ok=True)
+            if isinstance(error, OSError) and error.errno is not None and error.filename in (None, str(part)):
+                error.filename = str(path)
+            raise
+        path.with_suffix(".json").unlink(missing_ok=True)
+        os.replace(part, path)
+        os.replace(journal, path.with_suffix(".json"))
+        sync_folder(path.parent)
+    return meta
+
+
+@contextlib.contextmanager
+def _only_writer(path: Path) -> Iterator[None]:
+    """Hold PATH.npy.lock, which is deleted at the end; `ValueError` if another process holds it."""
+    lock = Lock(path.with_name(path.name + ".lock"))
+    if not lock.acquire():
+        raise ValueError(f"{path}: another process is writing this video; wait for it, or name another with -o")
+    try:
+        yield
+    finally:
+        lock.delete()
+
+
+def _finish_naming(path: Path, part: Path, journal: Path) -> None:
+    """Give the description its name if a writer was killed between naming the video and that."""
+    if journal.exists() and path.exists() and not (part.exists() or path.with_suffix(".json").exists()):
+        with contextlib.suppress(ValueError):
+            if "seconds_per_frame" in read_json(journal):
+                os.replace(journal, path.with_suffix(".json"))
+
+
+def _check_target(path: Path, force: bool) -> None:
+    """`FileExistsError` if a result is there and may not be replaced."""
+    if path.is_dir():
+        raise FileExistsError(f"{path}: is a folder; name a file with -o")
+    for file in (path, path.with_suffix(".json")):
+        if file.exists() and not force:
+            raise FileExistsError(f"{file}: exists; name another with -o, or use --force to replace it")
+    description = path.with_suffix(".json")
+    if description.exists() and read_json(description).get("format") != FORMAT:
+        raise FileExistsError(f"{description}: describes no restored video, which is all that --force replaces")
+
+
+def _fill_file(
+    codes: Codes,
+    method: Restorer,
+    part: Path,
+    journal: Path,
+    meta: dict[str, Any],
+    progress: Progress | None,
+    note: Callable[[str], None] | None,
+    threads: int | None,
+) -> float:
+    """Restore what is missing of PART, block by block, noting each in JOURNAL; the seconds it took, all in all."""
+    length = codes.shape[0]
+    done, seconds, why = _done(part, journal, meta)
+    if why and note is not None:
+        note(f"{part}: holds a restoration that was interrupted, but {why}; starting again")
+    if not done:
+        journal.unlink(missing_ok=True)
+        _reserve(part, codes.shape)
+    out = np.lib.format.open_memmap(part, mode="r+")
+    for first in range(done, length, BLOCK_FRAMES if method.seamless else length):
+        block = out[first : first + BLOCK_FRAMES if method.seamless else length]
+        block[:] = 0  # an interrupted block may have left something
+        started = time.perf_counter()
+        method.fill(codes, block, first, _shifted(progress, first, length, len(block)))
+        check_finite(block, method.name, first)
+        out.flush()
+        seconds += time.perf_counter() - started
+        write_json(journal, meta | {"done": first + len(block), "seconds": seconds, "threads": threads})
+    with open(part, "rb") as file:
+        os.fsync(file.fileno())
+    return seconds
+
+
+def _reserve(part: Path, shape: tuple[int, int, int]) -> None:
+    """A new .npy of float32 [T, H, W] whose space on the disk is taken; `OSError` if there is not enough."""
+    with open(part, "wb") as file:
+        header = {"descr": np.lib.format.dtype_to_descr(np.dtype(np.float32)), "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)
+        file.flush()
+        os.posix_fallocate(file.fileno(), 0, file.tell() + 4 * int(np.prod(shape, dtype=np.int64)))
+
+
+def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, str]:
+    """Frames that an interrupted restoration of the same thing has finished, the seconds they took, and, where there
+    is one that cannot be resumed, why.
+    """
+    if not (part.exists() and journal.exists()):
+        return 0, 0.0, ""
+    try:
+        found = read_json(journal)
+        found.pop("threads", None)  # numbers agree to rounding whatever it is
+        done, seconds = int(found.pop("done", 0)), float(found.pop("seconds", 0.0))
+        for key in ("sha256", "checksum"):
+            found.pop(key, None)
+        if "seconds_per_frame" in found:  # whole: killed before it was given its name
+            done, seconds = meta["shape"][0], meta["shape"][0] * float(found.pop("seconds_per_frame"))
+    except (ValueError, TypeError) as error:
+        return 0, 0.0, f"its notes are damaged ({error})"
+    changed = [key for key in meta if found.get(key) != meta[key]]
+    if not changed and found.keys() == meta.keys():
+        return done, seconds, ""
+    told = dict.fromkeys(TELL[key] for key in TELL if key in changed)
+    return 0, 0.0, f"{' and '.join(told) or 'its description'} changed since"
+
+
+def _shifted(progress: Progress | None, first: int, length: int, block: int) -> Progress | None:
+    """Progress of a block as progress of the whole, in frames."""
+    if progress is None:
+        return None
+    return lambda done, total: progress(first + done * block // total, length)

@@ -1,0 +1,155 @@
+"""What a path and the options of a command mean together: codes to restore, and refusals of options that cannot act.
+
+An option is None until it is given. One that would be ignored for this input is a `ValueError` that says why.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quiver.data.codes import (
+    Clip,
+    Codes,
+    Light,
+    cube_codes,
+    follows_light,
+    open_clips,
+    open_stream,
+    sensed,
+    stream_codes,
+)
+
+if TYPE_CHECKING:
+    from quiver.evaluation.comparison import Plan
+    from quiver.restoration.restorers import Restorer
+
+BARE = ("width", "planes", "frame_rate")  # facts that only a bare array does not know
+LIGHT = ("sensor", "ppp", "bits", "seed")
+FRAME_RATE = 2000.0  # codes per second of a bare array
+
+
+def refuse(args: argparse.Namespace, names: Sequence[str], why: str) -> None:
+    """`ValueError` that names the first of these options that was given, and why it cannot act."""
+    for name in names:
+        if getattr(args, name) is not None:
+            raise ValueError(f"--{name.replace('_', '-')}: {why}; leave it out")
+
+
+def refuse_idle(asked: Mapping[str, Any], methods: Sequence[Restorer]) -> None:
+    """`ValueError` for an asked mode, precision or device that none of the methods runs with."""
+    names = ", ".join(method.name for method in methods)
+    for option in ("mode", "precision", "device"):
+        value = asked.get(option)
+        if value is None:
+            continue
+        if not any(method.learned for method in methods):
+            raise ValueError(f"--{option}: acts on networks, and {names} is classical; leave it out")
+        if option == "mode" and not any(method.identity.get("mode") == value for method in methods):
+            raise ValueError(f"--mode {value}: {names} shares no work between frames, it has one mode; leave it out")
+
+
+def codes_to_restore(args: argparse.Namespace) -> Codes:
+    """The codes of `quiver restore`: a stored stream, a clip that is sensed now, or a bare array."""
+    path: Path = args.source
+    if path.is_dir():
+        return _of_clip(path, args)
+    if path.with_name(f"{path.name}.part").is_dir() and not path.exists():
+        open_clips(path)  # which says that it is unfinished
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    if path.suffix not in (".npy", ".json"):
+        raise ValueError(f"{path}: no stream, clip folder or .npy array; `qsim convert` makes a clip of other files")
+    refuse(args, ["stream"], f"names a stream of a clip, and {path} is a file")
+    if path.with_suffix(".json").is_file():
+        stream = open_stream(path)
+        refuse(args, (*LIGHT, *BARE), f"{path} is a stored stream, which knows its own (see its .json)")
+        return stream_codes(stream)
+    return _of_array(path, args)
+
+
+def _of_clip(path: Path, args: argparse.Namespace) -> Codes:
+    clips = open_clips(path)
+    if not (path / "clip.json").exists():
+        one = f", as in {clips[0].path}" if clips else "; none is finished yet"
+        raise ValueError(f"{path}: is a data set; name one of its clips{one}")
+    clip: Clip = clips[0]
+    refuse(args, BARE, f"describes a bare array, and {path} is a clip")
+    if args.ppp is None and args.stream is None and len(clip.streams) != 1:
+        there = ", ".join(clip.streams) or "none"
+        raise ValueError(f"{path}: choose one of its streams with --stream ({there}), or sense it now with --ppp")
+    if args.stream is not None or args.ppp is None:
+        stream = clip.stream(args.stream or clip.streams[0])
+        now = "" if args.stream else ", or sense the clip now with --ppp"
+        refuse(args, LIGHT, f"{stream.path} is a stored stream, which knows its own{now}")
+        return stream_codes(stream)
+    return sensed(clip, Light(_sensor(args), args.ppp, _bits(args)), args.seed or 0)[0]
+
+
+def _of_array(path: Path, args: argparse.Namespace) -> Codes:
+    sensor = _sensor(args)
+    refuse(args, ["seed"], f"is of noise that is drawn, and {path} holds codes already")
+    if not follows_light(sensor):
+        refuse(args, ["ppp"], f"the codes are there already, and the gain of {sensor} does not follow the light")
+    light = Light(sensor, args.ppp, args.bits if args.width is not None else _bits(args))
+    if args.output.resolve() == path.resolve():
+        raise ValueError(f"{path}: would be replaced by what is made from it; name another with -o")
+    return cube_codes(path, light, args.frame_rate or FRAME_RATE, planes=args.planes, width=args.width)
+
+
+def _sensor(args: argparse.Namespace) -> str:
+    return args.sensor or "quiver-physical"
+
+
+def _bits(args: argparse.Namespace) -> int | None:
+    """Bits per code: as asked, else those that a sensor's file states, else 3."""
+    return args.bits or (None if _sensor(args).endswith(".toml") else 3)
+
+
+def plan_of(args: argparse.Namespace) -> Plan:
+    """What `quiver evaluate` scores on the clips of a data set, or on one clip."""
+    from quiver.evaluation.comparison import Plan
+
+    refuse(args, ("frames", "splits"), "belongs to --static COUNTS")
+    if (Path(args.source) / "clip.json").exists() and args.split not in (None, "all"):
+        raise ValueError(
+            f"--split {args.split}: chooses clips of a data set, and {args.source} is one clip; leave it out"
+        )
+    if args.stream is not None:
+        refuse(args, LIGHT, f"stream {args.stream} is stored and knows its own")
+        if args.published:
+            raise ValueError(f"--published: exposes every window now, and stream {args.stream} is stored; leave it out")
+    sensor = args.sensor or ("quiver-published" if args.published else "quiver-physical")
+    own = sensor.endswith(".toml")  # such a file states its bits
+    lights = tuple(
+        Light(sensor, ppp, bits) for bits in args.bits or ((None,) if own else (3,)) for ppp in args.ppp or (3.25,)
+    )
+    split = None if args.split == "all" else args.split or "test"
+    return Plan(args.source, split, lights, args.seed or 0, args.published, args.stream, args.peak)
+
+
+def refuse_for_counts(args: argparse.Namespace) -> None:
+    """`ValueError` for options of `quiver evaluate` that cannot act on measured counts."""
+    why = "is of clips, and --static scores measured counts"
+    if args.source is not None:
+        raise ValueError(f"{args.source}: {why}; leave one of them out")
+    refuse(args, ("output", "split", "stream", "sensor", "ppp"), why)
+    for name in ("published", "force"):
+        if getattr(args, name):
+            raise ValueError(f"--{name}: {why}; leave it out")
+    if args.bits is not None and len(args.bits) > 1:
+        raise ValueError("--bits: measured counts are clipped to one depth; give one number")
+
+
+def assumed(codes: Codes, method: Restorer) -> str:
+    """One line with everything that a restoration took for granted."""
+    length, height, width = codes.shape
+    sensor = codes.sensor_name or type(codes.sensor).__name__
+    light = "" if codes.ppp is None else f", {codes.ppp:.4g} photons/pixel"
+    return (
+        f"{codes.name}: {length} frames of {height} x {width}, {codes.frame_rate:g} codes/s; "
+        f"sensor {sensor}, {codes.sensor.bits} bit{light}, white = {codes.white:.4g} photons; "
+        f"method {method.name} ({method.description}), {method.window} frames for each"
+    )

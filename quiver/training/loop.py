@@ -1,0 +1,337 @@
+"""One training loop for every learned method: the model is an argument.
+
+    windows (fresh noise) -> model -> loss -> Adam or Muon; now and then: validation, checkpoint, TensorBoard
+
+Sample numbers count on from step to step and from process to process, so a run that was killed and started again draws
+what it would have drawn, and ends with the weights of an uninterrupted one. NaN or Inf stop it with the step and the
+samples at fault. Under `torchrun` every process draws its own share.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Subset
+from tqdm import tqdm
+
+from quiver import threads
+from quiver.data.codes import open_clips
+from quiver.data.windows import Batches, Windows, WindowSettings
+from quiver.evaluation import metrics
+from quiver.model.quiver import RADIUS, WINDOW
+from quiver.training.loss import PRESETS as LOSSES
+from quiver.training.loss import training_loss
+from quiver.training.optimiser import Optimiser
+from quiver.training.run_folder import Run, Settings, State, settled
+
+CHECKPOINT_SECONDS = 120.0
+FOREVER = 10**9  # steps of a run that is limited by time
+WARMUP_SHARE = 0.05  # of a run; no warm-up is longer
+PLATEAU_GAIN = 1e-4  # relative gain of PSNR that counts
+VALIDATION_SIDE = 128  # px, at most
+
+
+class Diverged(RuntimeError):
+    """The loss or a gradient became NaN or Inf; the message names the step, the samples and the saved state."""
+
+
+@dataclass(frozen=True)
+class Process:
+    """This process among those of torchrun, and its device."""
+
+    rank: int
+    world: int
+    device: torch.device
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process writes files and shows progress."""
+        return self.rank == 0
+
+    def wait(self) -> None:
+        """Until all processes are here."""
+        if self.world > 1:
+            torch.distributed.barrier()
+
+    def from_leader(self, number: int) -> int:
+        """The leader's number, in every process."""
+        value = torch.tensor(number, device=self.device)
+        if self.world > 1:
+            torch.distributed.broadcast(value, 0)
+        return int(value)
+
+    def any(self, condition: bool) -> bool:
+        """Whether the condition holds in any process: all go on, or none does."""
+        flag = torch.tensor(float(condition), device=self.device)
+        if self.world > 1:
+            torch.distributed.all_reduce(flag, torch.distributed.ReduceOp.MAX)
+        return bool(flag)
+
+
+@contextlib.contextmanager
+def joined(device: str) -> Iterator[Process]:
+    """Join the other processes if torchrun started us, and leave them at the end."""
+    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    place = torch.device(device, int(os.environ.get("LOCAL_RANK", 0))) if device == "cuda" else torch.device(device)
+    if world > 1:
+        torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo")
+    try:
+        yield Process(rank, world, place)
+    finally:
+        if world > 1:
+            torch.distributed.destroy_process_group()
+
+
+def share_used(settings: Settings, state: State) -> float:
+    """How much of the run is over, 0 to 1, by steps or by time, whichever is further."""
+    steps = state.step / settings.steps if settings.steps else 0.0
+    minutes = state.elapsed / (60 * settings.minutes) if settings.minutes else 0.0
+    return min(1.0, max(steps, minutes))
+
+
+def learning_rate(settings: Settings, state: State) -> float:
+    """The rate of the next step: linear rise, then a cosine over the share of steps or time used up, or halvings.
+
+    The rise ends after `warmup` steps, or after a twentieth of a run so short that this comes first.
+    """
+    share = share_used(settings, state)
+    rise = max((state.step + 1) / max(1, settings.warmup), share / WARMUP_SHARE)
+    rate = settings.learning_rate * min(1.0, rise)
+    if settings.schedule == "plateau":
+        return rate * 0.5**state.halvings
+    return rate * max(0.01, 0.5 * (1 + math.cos(math.pi * share)))
+
+
+def validation_due(settings: Settings, state: State) -> bool:
+    """Every `validate_every` steps; in a run that only time limits, after every tenth of it."""
+    if settings.steps is not None:
+        return state.step % settings.validate_every == 0
+    before, state.tenths = state.tenths, int(10 * share_used(settings, state))
+    return state.tenths > before
+
+
+def time_is_up(settings: Settings, state: State, validation: float) -> bool:
+    """Whether the last validation, as long as the one before, would no longer fit into the time limit."""
+    return settings.minutes is not None and state.elapsed + validation >= 60 * settings.minutes
+
+
+def note_plateau(patience: int, state: State, psnr: float) -> None:
+    """After more than `patience` validations in a row without a relative gain of 1e-4 the rate is halved."""
+    if state.plateau_best == -math.inf or psnr > state.plateau_best * (1 + PLATEAU_GAIN):
+        state.plateau_best, state.plateau_bad = psnr, 0
+        return
+    state.plateau_bad += 1
+    if state.plateau_bad > patience:
+        state.halvings, state.plateau_bad = state.halvings + 1, 0
+
+
+def make_windows(settings: Settings, multiple: int) -> tuple[Windows, Subset[dict[str, Any]]]:
+    """Training and fixed validation windows; without validation clips the training clips serve, with a warning."""
+    if settings.crop % multiple:
+        raise ValueError(f"--crop {settings.crop}: this network needs a multiple of {multiple}")
+    window = WindowSettings(
+        lights=settings.noise,
+        frames=settings.frames,
+        crop=settings.crop,
+        flips=settings.flips,
+        reverse=settings.reverse,
+        drift=settings.drift,
+        force_exposure=settings.force_exposure,
+        seed=settings.seed,
+    )
+    training, split = open_clips(settings.data, "train"), settings.validation_split
+    windows = Windows(training, window)
+    validation = open_clips(settings.data, split)
+    if not validation:
+        warnings.warn(f"{settings.data}: no clip in split '{split}'; validating on training clips", stacklevel=2)
+        validation = training
+    side = min(VALIDATION_SIDE, *(min(clip.shape[1:]) for clip in validation)) // multiple * multiple
+    fixed = Windows(
+        validation, replace(window, drift=0, frames=WINDOW, crop=max(side, multiple), ceiling=math.inf), fixed=True
+    )
+    return windows, Subset(fixed, range(0, len(fixed), -(-len(fixed) // settings.validation_windows)))
+
+
+def batches(windows: Windows, settings: Settings, state: State, process: Process) -> Iterator[dict[str, Any]]:
+    """Batch after batch from the present step on, drawn in this process or in workers: the same bytes."""
+    last = state.step if state.finished else settings.steps or FOREVER
+    numbers = Batches(settings.batch, state.step, last, process.rank, process.world)
+    loader = DataLoader(
+        windows,
+        batch_sampler=numbers,
+        num_workers=settings.workers,
+        multiprocessing_context="spawn" if settings.workers else None,
+        generator=torch.Generator(),  # its own: the loader must not move the model's random state
+        pin_memory=process.device.type == "cuda",
+    )
+    return iter(loader)
+
+
+@torch.no_grad()
+def validate(model: nn.Module, windows: Subset[dict[str, Any]], device: torch.device) -> tuple[metrics.Score, Tensor]:
+    """Mean score of the restored centre frames; and codes, output, target of the first window side by side."""
+    model.eval()
+    scores: list[metrics.Score] = []
+    picture = torch.zeros(1, 1)
+    for i in range(len(windows)):
+        sample = windows[i]
+        output = model(sample["codes"][None].to(device)).scale1[0, :, 0].float().cpu()
+        target = sample["target"][RADIUS : RADIUS + len(output), 0]
+        if not bool(torch.isfinite(output).all()):
+            output = torch.zeros_like(output)  # scored as black; the next training step says why
+        unit = float(sample["white"]) / float(sample["peak"])  # scores have one peak for every sensor
+        scores.append(metrics.score(output.numpy() * unit, target.numpy() * unit))
+        if i == 0:
+            picture = torch.cat([sample["codes"][RADIUS, 0], output[0], target[0]], dim=1).clamp(0, 1)
+    model.train()
+    return metrics.mean_score(scores), picture
+
+
+class Board:
+    """TensorBoard scalars and pictures, and the progress bar: what a person watches."""
+
+    def __init__(self, folder: Path, settings: Settings, state: State, show: bool) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.writer = SummaryWriter(str(folder), purge_step=state.step or None)
+        self.bar = tqdm(total=settings.steps, initial=state.step, unit="step", disable=not show, mininterval=1)
+        self.psnr = ""
+
+    def step(self, state: State, loss: float, norm: float, rate: float) -> None:
+        self.bar.update()
+        if state.step % 20 == 0:
+            self.bar.set_postfix_str(f"loss {loss:.4f}{self.psnr}", refresh=False)
+            for name, value in (("loss", loss), ("gradient norm", norm), ("learning rate", rate)):
+                self.writer.add_scalar(f"train/{name}", value, state.step)
+
+    def validation(self, state: State, score: metrics.Score, picture: Tensor) -> None:
+        self.psnr = f", PSNR {score.psnr_matched:.2f} dB"
+        for name, value in score.to_dict().items():
+            if name != "frames":
+                self.writer.add_scalar(f"validation/{name}", value, state.step)
+        self.writer.add_image("codes, restored, target", picture[None], state.step)
+
+    def close(self) -> None:
+        self.bar.close()
+        self.writer.close()
+
+
+def record(run: Run, model: nn.Module, state: State, score: metrics.Score, loss: float, rate: float) -> None:
+    """Put a validation into the state and its files; keep the weights if they are the best so far."""
+    entry = {"step": state.step, "elapsed": state.elapsed, "loss": loss, "learning_rate": rate} | score.to_dict()
+    state.history.append(entry)
+    note_plateau(run.settings.patience, state, score.psnr_matched)
+    if score.psnr_matched > state.best:
+        state.best = score.psnr_matched
+        run.save_weights("best", model, state)
+    run.save_history(state)
+
+
+def fail(
+    run: Run,
+    model: nn.Module,
+    optimiser: Optimiser,
+    state: State,
+    batch: dict[str, Any],
+    loss: float,
+    norm: float,
+    rank: int,
+) -> NoReturn:
+    """Save the state before the bad step and stop, naming the samples."""
+    path = run.folder / ("failed.pt" if rank == 0 else f"failed-{rank}.pt")
+    run.save(path, model, optimiser, state, samples=batch["sample"].tolist(), keys=list(batch["key"]))
+    raise Diverged(
+        f"step {state.step}: loss {loss:g}, gradient norm {norm:g}; samples {batch['sample'].tolist()} "
+        f"({batch['key'][0]}; ...); state before the step: {path}; lower the learning rate and start anew with --force"
+    )
+
+
+def train(
+    model: nn.Module,
+    settings: Settings,
+    *,
+    device: str = "cpu",
+    should_stop: Callable[[], bool] = lambda: False,
+    progress: bool = True,
+    force: bool = False,
+    note: Callable[[str], None] = lambda line: None,
+) -> State:
+    """Train `model` in place until the end that the settings name, or until `should_stop`; returns the state reached.
+
+    Resumes the run in `settings.out` if there is one; `force` begins it again. `note` gets a line or two on the noise
+    that windows are drawn with. Raises ValueError and OSError for settings and folders that do not fit, `Diverged` for
+    NaN or Inf. From then on torch has the run's number of threads, and denormal numbers count as zero in this process.
+    """
+    torch.set_flush_denormal(True)  # gradients through the tails of GELU are such numbers: a step can be twice as slow
+    with joined(device) as process, contextlib.ExitStack() as stack:
+        asked = settings.threads
+        settings, lines = settled(settings, force=force)
+        settings = replace(settings, threads=threads.use(asked, settings.threads).number)
+        windows, fixed = make_windows(settings, int(model.multiple))  # type: ignore[arg-type]
+        run = Run(settings)
+        if process.leads:
+            stack.enter_context(run.open(force=force))
+        process.wait()
+        model.to(process.device).train()
+        optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)
+        state = run.load(model, optimiser, process.device)
+        for line in lines if process.leads else ():
+            note(line)
+        parallel = (
+            nn.parallel.DistributedDataParallel(model, find_unused_parameters=True) if process.world > 1 else model
+        )
+        has_baseline = getattr(model, "baseline", None) is not None
+        board = Board(run.folder, settings, state, progress) if process.leads else None
+        if board is not None:
+            stack.callback(board.close)
+        low = settings.precision == "bfloat16" or (settings.precision == "auto" and process.device.type == "cuda")
+        started, saved = time.monotonic() - state.elapsed, time.monotonic()
+        validation = 0.0  # s, that the last one took
+
+        for batch in batches(windows, settings, state, process):
+            # Forward, backward, step
+            rate = learning_rate(settings, state)
+            alone = has_baseline and share_used(settings, state) < settings.head_start
+            with torch.autocast(process.device.type, torch.bfloat16, enabled=low):
+                output = parallel(batch["codes"].to(process.device), **({"baseline_only": True} if alone else {}))
+            loss = training_loss(output, batch["target"].to(process.device), LOSSES[settings.loss], first=RADIUS)
+            model.zero_grad(set_to_none=True)
+            loss.backward()
+            norm, value = nn.utils.clip_grad_norm_(model.parameters(), settings.clip_norm).item(), loss.item()
+            if process.any(not math.isfinite(value + norm)):
+                fail(run, model, optimiser, state, batch, value, norm, process.rank)
+            optimiser.step(rate)
+            state.step, state.elapsed = state.step + 1, time.monotonic() - started
+            if board is not None:
+                board.step(state, value, norm, rate)
+
+            # Now and then: validation, files, the end
+            interrupted = process.any(should_stop())
+            out_of_time = process.any(time_is_up(settings, state, validation))
+            ended = state.finished = state.step == settings.steps or out_of_time
+            if process.any(validation_due(settings, state)) or ended:
+                began = time.monotonic()
+                if board is not None:
+                    score, picture = validate(model, fixed, process.device)
+                    board.validation(state, score, picture)
+                    record(run, model, state, score, value, rate)
+                state.halvings = process.from_leader(state.halvings)
+                validation = time.monotonic() - began
+            if process.leads and (ended or interrupted or time.monotonic() - saved > CHECKPOINT_SECONDS):
+                run.save(run.checkpoint, model, optimiser, state)
+                saved = time.monotonic()
+            if ended or interrupted:
+                break
+        if process.leads:
+            run.save_weights("last", model, state)
+        return state

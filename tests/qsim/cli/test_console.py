@@ -1,0 +1,185 @@
+"""What all commands share: completion that knows every option, quiet and loud, warnings in one line, Ctrl-C."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import pytest
+from clips import write_clip
+
+import qsim.cli.program
+import quiver.cli.program
+from qsim.cli import console
+from qsim.cli.program import main
+from qsim.clip.clip import Clip
+
+ROOT = Path(__file__).parents[3]
+
+
+def completion(capsys: pytest.CaptureFixture[str], program: str, shell: str) -> str:
+    assert {"qsim": qsim.cli.program.main, "quiver": quiver.cli.program.main}[program](["completion", shell]) == 0
+    return capsys.readouterr().out
+
+
+def complete(script: str, program: str, *words: str, cwd: Path) -> list[str]:
+    """What a real bash offers for the last word."""
+    code = (
+        f'{script}\nCOMP_WORDS=({program} "$@"); COMP_CWORD=$#; _{program}_complete; printf "%s\\n" "${{COMPREPLY[@]}}"'
+    )
+    done = subprocess.run(["bash", "-c", code, "bash", *words], capture_output=True, text=True, check=True, cwd=cwd)
+    return done.stdout.split()
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
+def test_bash_completes_commands_options_choices_and_files(capsys, tmp_path):
+    script = completion(capsys, "qsim", "bash")
+    (tmp_path / "reading.txt").touch()
+    assert complete(script, "qsim", "re", cwd=tmp_path) == ["render", "report"]
+    assert complete(script, "qsim", "render", "--fr", cwd=tmp_path) == ["--frames", "--frame-rate"]
+    assert complete(script, "qsim", "calibrate", "--model", "", cwd=tmp_path) == ["qis", "spad"]
+    assert complete(script, "qsim", "validate", "s", cwd=tmp_path) == ["sensor"]
+    assert complete(script, "qsim", "check", "read", cwd=tmp_path) == ["reading.txt"]
+    script = completion(capsys, "quiver", "bash")
+    assert complete(script, "quiver", "train", "--preset", "quiver-", cwd=tmp_path) == ["quiver-s"]
+
+
+@pytest.mark.parametrize("program", ["qsim", "quiver"])
+def test_every_help_has_an_example_that_is_understood(capsys, monkeypatch, program):
+    """And --json, --quiet, --verbose; the programs say their version."""
+    import shlex
+
+    import quiver.data.codes
+
+    module, home = {"qsim": (qsim.cli.program, qsim.cli.program), "quiver": (quiver.cli.program, quiver.data.codes)}[
+        program
+    ]
+    assert module.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"{program} {qsim.__version__}\n"
+    module.main(["--help"])
+    commands = re.findall(r"^    ([a-z-]+)(?:  +\S|$)", capsys.readouterr().out, re.MULTILINE)
+    for command in commands:
+        module.main([command, "--help"])
+        text = capsys.readouterr().out
+        assert all(option in text for option in ("--json", "--quiet", "--verbose"))
+        examples = text.split("example:\n")[1].strip().split("\n")
+        for line in examples:
+            words = shlex.split(line.strip())
+            words = words[: next((i for i, word in enumerate(words) if word in (">", ">>")), len(words))]
+            assert words[0] in (program, "torchrun")
+            if words[0] == program:
+                assert words[1] == command
+                with monkeypatch.context() as patch:
+                    patch.setattr(home, "run", lambda parser, argv: parser.parse_args(argv))
+                    assert module.main(words[1:]) is not None
+
+
+@pytest.mark.parametrize("program", ["qsim", "quiver"])
+def test_every_option_is_in_every_script(capsys, program):
+    """The options that the helps show, read from the helps."""
+    cli = {"qsim": qsim.cli.program.main, "quiver": quiver.cli.program.main}[program]
+    scripts = {shell: completion(capsys, program, shell) for shell in ("bash", "zsh", "fish")}
+    cli(["--help"])
+    commands = re.findall(r"^    ([a-z-]+)(?:  +\S|$)", capsys.readouterr().out, re.MULTILINE)
+    assert len(commands) >= 7
+    for command in commands:
+        cli([command, "--help"])
+        for option in re.findall(r"^  (?:-\w, |-\w \S+, )?--([a-z-]+)", capsys.readouterr().out, re.MULTILINE):
+            assert f"--{option}" in scripts["bash"]
+            assert f"--{option}" in scripts["zsh"]
+            assert any(f"from {command}" in line and f"-l {option} " in line for line in scripts["fish"].split("\n"))
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_scripts_are_valid_where_the_shell_is_there(capsys, tmp_path, shell):
+    if shutil.which(shell) is None:
+        pytest.skip(f"no {shell} here")
+    script = tmp_path / "script"
+    script.write_text(completion(capsys, "qsim", shell))
+    subprocess.run([shell, "-n", script], check=True)
+
+
+def test_quiet_and_verbose_exclude_each_other(capsys):
+    assert main(["doctor", "-q", "-v"]) == 2
+    assert "not allowed with argument" in capsys.readouterr().err
+
+
+def test_warnings_are_one_line_and_quiet_has_none(tmp_path, monkeypatch, capsys):
+    def warned(clip: Clip, progress: object) -> list[str]:
+        warnings.simplefilter("always")
+        warnings.warn("the light is\n  dim", RuntimeWarning, stacklevel=1)
+        return []
+
+    clip = str(write_clip(tmp_path / "c", frames=2, height=8, width=10).path)
+    monkeypatch.setattr("qsim.clip.clip.Clip.verify", warned)
+    assert main(["check", clip]) == 0
+    assert capsys.readouterr().err == "qsim: warning: the light is dim\n"
+    assert main(["check", clip, "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_verbose_says_time_and_memory_and_shows_the_traceback(tmp_path, capsys):
+    clip = str(write_clip(tmp_path / "c", frames=2, height=8, width=10).path)
+    assert main(["check", clip, "-v", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["problems"] == []
+    assert " s, at most " in err
+    with pytest.raises(FileNotFoundError):
+        main(["check", "/none", "-v"])
+
+
+def test_a_quiet_bar_shows_nothing(capsys):
+    token = console._quiet.set(True)
+    try:
+        with console.bar("rendering") as progress:
+            progress(1, 2)
+        console.note("working")
+    finally:
+        console._quiet.reset(token)
+    assert capsys.readouterr().err == ""
+
+
+def test_values_of_options_obey_the_rules_of_recipes():
+    from argparse import ArgumentTypeError
+
+    from qsim import checks
+
+    assert console.checked(checks.whole)("12") == 12
+    assert console.checked(checks.psnr)("40") == 40.0
+    assert console.checked(checks.positive)("20e-6") == 20e-6
+    for wrong in ("12.5", "x", "", "nan"):
+        with pytest.raises(ArgumentTypeError, match="expected a whole number"):
+            console.checked(checks.whole)(wrong)
+
+
+def test_ctrl_c_of_a_command_that_starts_again(tmp_path):
+    """A real process, SIGINT while a film is written: code 130, one line that says how to go on, no half file."""
+    import os
+    import signal
+
+    clip = write_clip(tmp_path / "long", frames=1200, height=64, width=64)
+    target = tmp_path / "film.gif"
+    command = [sys.executable, "-m", "qsim", "preview", str(clip.path), "-o", str(target)]
+    child = subprocess.Popen(
+        command,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells ignore it in what they put behind
+    )
+    maps = Path(f"/proc/{child.pid}/maps")
+    end = time.monotonic() + 60
+    while maps.exists() and "_imaging" not in maps.read_text():  # Pillow is loaded: the command is at work
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    os.kill(child.pid, signal.SIGINT)
+    out, err = child.communicate(timeout=60)
+    assert (child.returncode, out) == (130, "")
+    assert err.splitlines()[-1] == "qsim: interrupted; nothing half-written is left; run the same command again"
+    assert "Traceback" not in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["long"]

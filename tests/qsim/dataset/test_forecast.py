@@ -1,0 +1,154 @@
+"""Plans: the arithmetic, and the forecast against a real run."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from qsim.cli.program import main
+from qsim.dataset import forecast as plan
+from qsim.dataset import recipe
+from qsim.dataset.forecast import START, Cost, Plan, Seconds
+from qsim.dataset.worker_pool import Limits
+from qsim.rendering.fidelity import Budget
+
+RECIPE = """[recipe]
+name = "tiny"
+frames = 12
+height = 32
+width = 48
+frame_rate = 2000.0
+psnr = 30.0
+
+[[scenes]]
+family = "fan"
+seeds = [0, 1, 2]
+
+[[streams]]
+sensor = "quiver-physical"
+bits = 3
+ppp = 3.25
+"""
+
+
+def test_the_arithmetic_of_a_forecast():
+    """10 clips of 30 frames: 10 * 6 s + 300 * (1.5 + 0.3) s = 600 s, and a tenth of a fresh process per clip or so."""
+    seconds = {"setup": Seconds(6.0, 11.0), "per_frame": Seconds(1.5, 2.9), "sensing": Seconds(0.3, 0.4)}
+    cost = Cost("fan", (512, 1024), 10, 300, samples=(8, 72), **seconds, frame_bytes=4e6)
+    assert cost.hours == pytest.approx(600 / 3600)
+    assert cost.seconds.processor == pytest.approx(10 * 11 + 300 * (2.9 + 0.4))
+    assert cost.gigabytes == pytest.approx(1.2)
+    whole = Plan((cost, cost), "llvm", 0.5)
+    assert whole.hours == pytest.approx((1200 + 20 * START / Limits().jobs) / 3600)
+    assert whole.processor_hours == pytest.approx((2 * 1100 + 20 * START / Limits().jobs) / 3600)
+    assert whole.gigabytes == pytest.approx(2.4)
+    assert f"10 machines like this: {whole.hours / 10:.3g} hours each" in "\n".join(whole.lines(10))
+    assert whole.lines(1)[-1].startswith("within a day: 1 machine like this; run this command on a machine with a GPU")
+    days = Plan((cost,) * 200, "cuda", 0.5)  # 33 hours and a little
+    times = f"{days.hours / 24:.2g} times as fast"
+    assert days.lines(1)[-1] == f"within a day: 2 machines like this, or one that is {times}"
+    assert " 8-72 " in whole.lines(1)[1]
+    kind = whole.to_dict()["kinds"][0]
+    assert (kind["frames"], kind["per_frame_seconds"]) == (300, {"wall": 1.5, "processor": 2.9})
+
+
+def test_a_few_jobs_are_looked_at_from_first_to_last():
+    wanted = recipe.parse(RECIPE.replace("[0, 1, 2]", str(list(range(42)))))
+    seeds = [job.scene_seed for job in plan._spread(list(wanted.jobs))]
+    assert seeds == [0, 10, 20, 31, 41]
+    assert len(plan._spread(list(wanted.jobs)[:3])) == 3
+    assert plan._spread(list(wanted.jobs)[:1]) == list(wanted.jobs)[:1]
+
+
+def test_a_frame_costs_what_its_samples_cost(monkeypatch: pytest.MonkeyPatch):
+    """Three budgets of 10, 20 and 90 samples: a frame costs twice that of the middle one, which is timed."""
+    wanted = recipe.parse(RECIPE)
+    samples = {0: 10, 1: 20, 2: 90}
+    monkeypatch.setattr(plan.jobs, "load_scene", lambda job: job)
+    monkeypatch.setattr(plan.jobs, "choose_budget", lambda job, scene: Budget(samples[job.scene_seed]))
+    monkeypatch.setattr(Seconds, "now", staticmethod(lambda: Seconds(0.0, 0.0)))
+    timed = []
+
+    def first_frames(job, budget, path, frames):
+        assert budget.samples == samples[job.scene_seed]
+        timed.append(job.scene_seed)
+        return FakeClip(), [Seconds(2.0 + 3 * n, 1.0 + n) for n in range(frames)]
+
+    monkeypatch.setattr(plan, "_first_frames", first_frames)
+    monkeypatch.setattr(plan, "_sense", lambda job, clip: (Seconds(0.0, 0.0), 0.0))
+    cost = plan._measure(list(wanted.jobs), Path(), 4)
+    assert timed[-1] == 1
+    assert cost.samples == (10, 90)
+    assert cost.per_frame == pytest.approx(Seconds(6.0, 2.0))
+    assert cost.setup == Seconds(0.0, 0.0)
+
+
+def test_a_clip_costs_the_choice_of_its_budget_as_well(monkeypatch: pytest.MonkeyPatch):
+    """The first choice of a process takes ten times as long: it counts as one of three, not as what each takes."""
+    clock = [0.0]
+    monkeypatch.setattr(Seconds, "now", staticmethod(lambda: Seconds(clock[0], 2 * clock[0])))
+    monkeypatch.setattr(plan.jobs, "load_scene", lambda job: job)
+    took = {0: 50.0, 1: 5.0, 2: 4.0}
+
+    def choose(job, scene):
+        clock[0] += took[job.scene_seed]
+        return Budget(8)
+
+    def first_frames(job, budget, path, frames):
+        return FakeClip(), [Seconds(clock[0] + 3 + 2 * n, 2 * clock[0] + 6 + 4 * n) for n in range(frames)]
+
+    monkeypatch.setattr(plan.jobs, "choose_budget", choose)
+    monkeypatch.setattr(plan, "_first_frames", first_frames)
+    monkeypatch.setattr(plan, "_sense", lambda job, clip: (Seconds(0.0, 0.0), 0.0))
+    cost = plan._measure(list(recipe.parse(RECIPE).jobs), Path(), 4)
+    assert cost.setup == Seconds(5 + 3 - 2, 2 * (5 + 3 - 2))
+
+
+class FakeClip:
+    """Of no frame that could be stored."""
+
+    path = Path("/nowhere")
+
+    def __len__(self) -> int:
+        return 1
+
+
+def test_plans_without_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = tmp_path / "r.toml"
+    path.write_text(RECIPE)
+    for options, message in [(["--machines", "0"], "--machines: expected"), (["--frames", "1"], "at least 2 frames")]:
+        assert main(["plan", str(path), *options]) == 2
+        assert message in capsys.readouterr().err
+
+
+def alone(home: Path, *words: str | Path) -> str:
+    """What a command prints in a process of its own whose home, where Dr.Jit keeps compiled kernels, is new."""
+    home.mkdir()
+    places = {"HOME": str(home), "XDG_CACHE_HOME": os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))}
+    command = [sys.executable, "-m", "qsim", *map(str, words)]
+    return subprocess.run(command, env=os.environ | places, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.mark.slow
+def test_a_forecast_against_a_real_run(tmp_path: Path):
+    """In processor time on both sides, which other work on the machine changes little; 30 % is what a plan promises.
+
+    Each meets the scenes for the first time: a run that finds the kernels of its plan takes less.
+    """
+    (tmp_path / "r.toml").write_text(RECIPE)
+    forecast = json.loads(alone(tmp_path / "1", "plan", tmp_path / "r.toml", "--json"))
+    alone(tmp_path / "2", "generate", tmp_path / "r.toml", "-o", tmp_path / "d", "--workers", "1")
+    logs = "".join(log.read_text() for log in (tmp_path / "d" / "logs").glob("*.log"))
+    seconds = sum(map(float, re.findall(r"processor ([\d.]+) s", logs)))
+    kind = forecast["kinds"][0]
+    each = [kind[f"{name}_seconds"]["processor"] for name in ("setup", "per_frame", "sensing")]
+    predicted = kind["clips"] * each[0] + kind["frames"] * (each[1] + each[2])
+    print(f"predicted {predicted:.1f} s, took {seconds:.1f} s of processor time")
+    assert 0.7 < seconds / predicted < 1.3
+    kept = [file for file in (tmp_path / "d" / "clips").rglob("*") if file.suffix in (".exr", ".npy")]
+    stored = sum(file.stat().st_size for file in kept)
+    assert stored == pytest.approx(forecast["gigabytes"] * 1e9, rel=0.3)

@@ -1,0 +1,66 @@
+"""The real renderer in a data set: killed, resumed, with one worker or two, from the command line, the same bytes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from fakes import tree
+
+from qsim.dataset.dataset import Dataset
+
+RECIPE = """[recipe]
+name = "real"
+frames = 3
+height = 24
+width = 32
+frame_rate = 2000.0
+psnr = 25.0
+
+[[scenes]]
+family = "fan"
+seeds = [0, 1]
+
+[[scenes]]
+family = "tumble"
+split = "test"
+
+[[streams]]
+sensor = "quiver-physical"
+bits = 3
+ppp = [3.25, 26.0]
+"""
+
+
+def generate(recipe: Path, folder: Path, *options: str) -> subprocess.Popen[bytes]:
+    line = [sys.executable, "-m", "qsim", "generate", str(recipe), "-o", str(folder), *options]
+    return subprocess.Popen(line, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
+
+
+@pytest.mark.slow
+def test_a_killed_generation_resumes_to_the_same_bytes(tmp_path: Path):
+    recipe = tmp_path / "real.toml"
+    recipe.write_text(RECIPE)
+    assert generate(recipe, tmp_path / "whole", "--workers", "1").wait() == 0
+    killed = generate(recipe, tmp_path / "killed", "--workers", "2")
+    end = time.monotonic() + 300
+    while not list((tmp_path / "killed").glob("work/*.part/journal.jsonl")):
+        assert time.monotonic() < end, "no frame was ever finished"
+        assert killed.poll() is None, "it came to its end before it could be killed"
+        time.sleep(0.01)
+    os.killpg(killed.pid, signal.SIGKILL)
+    killed.wait()
+    assert len(Dataset.open(tmp_path / "killed").names()) < 3
+    assert generate(recipe, tmp_path / "killed", "--workers", "2").wait() == 0
+    found = Dataset.open(tmp_path / "killed")
+    assert found.verify() == []
+    assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
+    for clip in found.clips():
+        assert clip.meta["psnr_of_truth"] > 24
+        assert [asset for asset in clip.meta["assets"] if asset.startswith("mesh ")]
+        for name in clip.streams:
+            stream = clip.stream(name)
+            assert stream.meta["ppp_target"] * 0.5 < stream.codes().mean() / stream.meta["sensor"]["gain"] / 0.8 * 2

@@ -1,0 +1,349 @@
+"""Recipes: what they mean, and every mistake named with file, line and key."""
+
+import json
+import random
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from fakes import make
+
+from qsim import checks
+from qsim.dataset import job_runner, recipe
+from qsim.dataset.recipe import Recipe, parse
+
+HEAD = """[recipe]
+name = "tiny"
+frames = 3
+height = 8
+width = 10
+frame_rate = 2000.0
+"""
+SCENES = """
+[[scenes]]
+family = "fan"
+seeds = [0, 2]
+speed = [1.0, 2.5]
+
+[[scenes]]
+family = "tumble"
+first = 5
+count = 2
+split = "test"
+frames = 4
+"""
+STREAMS = """
+[[streams]]
+sensor = "quiver-physical"
+bits = [1, 3]
+ppp = [0.5, 3.25]
+"""
+
+
+def test_a_recipe_becomes_jobs():
+    found = parse(HEAD + SCENES + STREAMS)
+    names = ["fan_0000", "fan_0000_x2.5", "fan_0002", "fan_0002_x2.5", "tumble_0005", "tumble_0006"]
+    assert [job.name for job in found.jobs] == names
+    assert [job.settings.frames for job in found.jobs] == [3, 3, 3, 3, 4, 4]
+    assert found.splits == {"train": names[:4], "val": [], "test": names[4:]}
+    streams = found.jobs[0].streams
+    assert [(s.bits, s.ppp) for s in streams] == [(1, 0.5), (1, 3.25), (3, 0.5), (3, 3.25)]
+    assert [s.stream_name for s in streams][3] == "quiver-physical_3bit_3.25ppp"
+    assert found.jobs[1].scene == "fan:0"
+
+
+def test_lux_and_light_as_it_is():
+    text = (
+        '[[streams]]\nsensor = "quiver-physical"\nlux = 1.5\n[[streams]]\nsensor = "quiver-physical"\nabsolute = true\n'
+    )
+    streams = parse(HEAD + SCENES + text).jobs[0].streams
+    assert [(s.ppp, s.lux) for s in streams] == [(None, 1.5), (None, None)]
+    assert [s.stream_name for s in streams] == ["quiver-physical_1.5lx", "quiver-physical_asis"]
+
+
+def test_a_digest_changes_with_everything_that_decides_the_files():
+    def digests(text: str) -> set[str]:
+        return {job.digest for job in parse(text).jobs}
+
+    base = HEAD + SCENES + STREAMS
+    assert digests(base) == digests(base + "\n# a comment\n")
+    for old, new in [("frames = 3", "frames = 5"), ("bits = [1, 3]", "bits = 3"), ("2000.0", "1000.0")]:
+        assert old in base
+        changed = digests(base.replace(old, new))
+        assert len(changed - digests(base)) >= 4
+    assert digests(base.replace('name = "tiny"\n', 'name = "tiny"\nseed = 1\n')).isdisjoint(digests(base))
+
+
+AGAIN = "[[scenes]]\nfamily = "
+MISTAKES = [
+    # (text in the good recipe, its replacement, line, what the message says)
+    ("frames = 3", "frame = 3", 3, r"unknown key 'frame' in \[recipe\] \(did you mean 'frames'\?\)"),
+    ("width = 10\n", "", 1, r"key 'width' is missing in \[recipe\]"),
+    ("first = 5", "first = 2147483647", 16, r"seeds 2147483647 to 2147483648; the largest is 2\^31 - 1"),
+    ("frame_rate = 2000.0", "frame_rate = 0.0005", 6, r"frames per second .* 0\.5 ms per frame is 2000\.0"),
+    ("frame_rate = 2000.0", 'frame_rate = "2000 fps"', 6, r"frame_rate: expected a number, got '2000 fps'"),
+    ("height = 8", "height = 0", 4, r"height: expected a whole number from 1"),
+    ("height = 8", "height = 8.5", 4, r"height: expected a whole number"),
+    ("height = 8", "height = true", 4, r"height: expected a whole number"),
+    ("width = 10", "width = -10", 5, r"width: expected a whole number"),
+    ("width = 10", "width = 10\nshutter = 50", 6, r"open share of a frame, 0 to 1, got 50"),
+    ("width = 10", "width = 10\npsnr = 0.01", 6, r"wanted error in dB"),
+    ('name = "tiny"', 'name = "../tiny"', 2, r"letters, digits"),
+    ('"fan"', '"fann"', 9, r"unknown family 'fann' \(did you mean 'fan'\?\)"),
+    ("seeds = [0, 2]", "seeds = [0, 0]", 10, r"seeds: 0 is listed twice"),
+    ("seeds = [0, 2]", "seeds = []", 10, r"expected at least one value"),
+    ("seeds = [0, 2]", "seeds = [-1]", 10, r"whole number from 0"),
+    ("seeds = [0, 2]", "seeds = [0]\ncount = 3", 11, r"either seeds or count"),
+    ("speed = [1.0, 2.5]", "speed = 0", 11, r"expected a number above 0, got 0"),
+    ("speed = [1.0, 2.5]", "speed = inf", 11, r"expected a number above 0, got inf"),
+    ("first = 5", 'first = "5"', 15, r"first: expected a whole number"),
+    ('split = "test"', 'split = "tset"', 17, r"expected one of train, val, test, got 'tset'"),
+    ('sensor = "quiver-physical"', 'sensor = "quiver-phisical"', 21, r"quiver-physical"),
+    ("bits = [1, 3]", "bits = [1, 17]", 22, r"1 to 16 bits per code, got 17"),
+    ("ppp = [0.5, 3.25]", "ppp = [0.5, -3.25]", 23, r"expected a number above 0, got -3\.25"),
+    ("ppp = [0.5, 3.25]", "pp = [0.5, 3.25]", 23, r"unknown key 'pp' in \[\[streams\]\] \(did you mean 'ppp'\?\)"),
+    ("ppp = [0.5, 3.25]", "ppp = 1.0\nlux = 1.0", 20, r"give one light level, .* ppp and lux given"),
+    ("ppp = [0.5, 3.25]", "absolute = false", 23, r"absolute can only be true"),
+    ("ppp = [0.5, 3.25]", 'ppp = [1, 2]\nname = "x"', 24, r"one name for 4 streams"),
+    ("ppp = [0.5, 3.25]", "ppp = 1e9", 23, r"light level from 1e-6 to 1e6 photons per pixel .*, got 1000000000"),
+    ("ppp = [0.5, 3.25]", "lux = 0.3e7", 23, r"lux: expected a light level"),
+    ("speed = [1.0, 2.5]", "speed = 1e9", 11, r"factor on all motions from 0\.001 to 1000"),
+    ("seeds = [0, 2]", "seeds = [0, 2]\nheight = 90000\nwidth = 90000", 8, r"90000 x 90000 pixels; at most 67108864"),
+    ("ppp = [0.5, 3.25]", "ppp = 1\ngroup = true", 24, r"group sums planes of a clocked SPAD; this is a QIS"),
+    ('"quiver-physical"\nbits = [1, 3]', '"spad512s"\ngroup = true', 22, r"the bits of a code are needed"),
+    ('"quiver-physical"', '"spad512s"\ngroup = true', 8, r"3 frames are too few for spad512s_3bit_0\.5ppp, .* sum 7"),
+    ('split = "test"', f'split = "test"\n{AGAIN}"fan"', 18, r"the clip fan_0000 is asked for twice"),
+    ('split = "test"', f'split = "test"\n{AGAIN}"tumble"', 18, r"family tumble is in the splits 'train' and"),
+    ('split = "test"', f'split = "val"\n{AGAIN}"tumble"\nfirst = 5\nspeed = 2', 18, r"splits 'val' and 'train'"),
+    ("ppp = [0.5, 3.25]", f"ppp = 3.25\n{STREAMS}", 25, r"two \[\[streams"),
+    ("frames = 4", "frames = 4\nframes = 5", 19, r"not valid TOML"),
+    ("bits = [1, 3]\nppp = [0.5, 3.25]\n", "bits = 3\nbits = 3", 23, r"not valid TOML"),
+    ("[[streams]]", "[[stream]]", 20, r"unknown key 'stream' in the recipe \(did you mean 'streams'\?\)"),
+    ("[[streams]]", "[[streams]", 20, r"not valid TOML"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "line", "message"), MISTAKES, ids=[m[1].replace("\n", " ") for m in MISTAKES])
+def test_each_mistake_is_named_with_file_and_line(tmp_path: Path, old: str, new: str, line: int, message: str):
+    text = HEAD + SCENES + STREAMS
+    assert text.count(old) >= 1
+    path = tmp_path / "bad.toml"
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(ValueError, match=message) as caught:
+        recipe.load(path)
+    assert str(caught.value).startswith(f"{path}:{line}: "), str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('scenes = [{family = "fan", seds = [2]}]\n' + HEAD, r"recipe\.toml:1: unknown key 'seds'"),
+        ("recipe.name = 'a'\nrecipe.heigt = 3", r"recipe\.toml:2: unknown key 'heigt'"),
+        (HEAD + "[scenes.a]\nfamily = 'fan'\n", r"recipe\.toml:7: 'scenes' must be sections"),
+        ("", r"section \[recipe\] is missing"),
+        ("recipe = 3", r"section \[recipe\] is missing"),
+        (HEAD, r"no \[\[scenes\]\], nothing to render"),
+        (HEAD + "[scenes]\nfamily = 'fan'\n", r"must be sections, each beginning with \[\[scenes\]\]"),
+        (HEAD + "[[scenes]]\nseeds = [1]\n", r"key 'family' is missing"),
+        (HEAD + SCENES + SCENES, r"the clip fan_0000 is asked for twice"),
+        (HEAD + SCENES + STREAMS + STREAMS, r"two \[\[streams\]\] are called"),
+        (HEAD + SCENES + "[[streams]]\nppp = 3\n", r"key 'sensor' is missing"),
+    ],
+)
+def test_recipes_without_sense(text: str, message: str):
+    with pytest.raises(ValueError, match=message):
+        parse(text)
+
+
+def test_a_sensor_whose_name_holds_a_dot_keeps_it():
+    stream = '[[streams]]\nsensor = "cmos-5.1e"\nbits = 3\nppp = 3.25\n'
+    assert parse(HEAD + SCENES + stream).jobs[0].streams[0].stream_name == "cmos-5.1e_3bit_3.25ppp"
+
+
+def test_splits_are_by_scene_whatever_the_speed():
+    text = HEAD + "".join(
+        f'[[scenes]]\nfamily = "fan"\nseeds = [0]\nspeed = {speed}\nsplit = "{split}"\n'
+        for speed, split in [(1.0, "train"), (2.0, "val")]
+    )
+    with pytest.raises(ValueError, match="scene fan:0 is in the splits 'train' and 'val'"):
+        parse(text)
+
+
+def test_training_never_sees_a_family_of_the_test_split():
+    text = HEAD + '[[scenes]]\nfamily = "fan"\n[[scenes]]\nfamily = "fan"\nfirst = 9\nsplit = "{}"\n'
+    with pytest.raises(ValueError, match="family fan is in the splits 'train' and 'test'"):
+        parse(text.format("test"))
+    assert isinstance(parse(text.format("val")), Recipe)
+
+
+def test_files_that_are_no_recipes(tmp_path: Path):
+    with pytest.raises(FileNotFoundError, match="no such recipe"):
+        recipe.load(tmp_path / "none.toml")
+    path = tmp_path / "binary.toml"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match="not a text file"):
+        recipe.load(path)
+
+
+def test_a_scene_file_beside_the_recipe(tmp_path: Path):
+    path = tmp_path / "own.toml"
+    path.write_text(HEAD + '[[scenes]]\nfamily = "mine.py"\n')
+    with pytest.raises(ValueError, match=r"own\.toml:8: no such scene file"):
+        recipe.load(path)
+    (tmp_path / "mine.py").write_text("")
+    job = recipe.load(path).jobs[0]
+    assert job.name == "mine_0000"
+    assert Path(job.family).is_absolute()
+
+
+def test_own_files_decide_by_content_not_by_place(tmp_path: Path):
+    """A scene file, a folder of a scene's things, a sensor file: edited they are another job, moved the same."""
+    sensor = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 2\nread_noise = 0.2\nbits = 3\n'
+    text = HEAD + '[[scenes]]\nfamily = "./{0}"\n[[streams]]\nsensor = "s.toml"\nbits = 3\nppp = 3.25\n'
+
+    def digest(folder: str, family: str, scene: str, sensor: str = sensor) -> str:
+        place = tmp_path / folder
+        (place / "things").mkdir(parents=True, exist_ok=True)
+        for name, content in (("scene.py", scene), ("things/a.obj", scene), ("s.toml", sensor)):
+            (place / name).write_text(content)
+        return recipe.parse(text.format(family), place / "r.toml").jobs[0].digest
+
+    for family in ("scene.py", "things"):
+        first = digest("a", family, "# one")
+        assert digest("b", family, "# one") == first
+        assert digest("a", family, "# two") != first
+        assert digest("a", family, "# one", sensor + "# edited\n") != first
+        assert digest("a", family, "# one") == first
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[3] / "scenes").glob("*.toml")), ids=lambda p: p.stem)
+def test_the_recipes_of_the_library_are_valid(path: Path):
+    assert recipe.load(path).jobs
+
+
+def test_the_large_recipe_is_what_it_says():
+    """280 clips of 114 scenes, 249 and 31, 512 x 1024, 2000 fps, shutter 0; no scene or test family shared."""
+    wanted = recipe.load(Path(__file__).parents[3] / "scenes" / "i2_2000fps.toml").jobs
+    assert len(wanted) == 280
+    assert len({job.scene for job in wanted}) == 114
+    count = {split: sum(job.split == split for job in wanted) for split in recipe.SPLITS}
+    assert count == {"train": 249, "val": 0, "test": 31}
+    render = {(s.height, s.width, s.frame_rate, s.shutter) for s in (job.settings for job in wanted)}
+    assert render == {(512, 1024, 2000.0, 0.0)}
+    families = {split: {job.family for job in wanted if job.split == split} for split in ("train", "test")}
+    assert families["train"].isdisjoint(families["test"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[3] / "scenes").glob("*.toml")), ids=lambda p: p.stem)
+def test_no_mesh_or_texture_of_a_test_scene_is_in_training(path: Path):
+    """By content, not by name: the SHA-256 of every picture and of all vertices, and photographs in whatever range."""
+    found: dict[str, set[str]] = {split: set() for split in recipe.SPLITS}
+    scenes = {job.scene: job for job in recipe.load(path).jobs}
+    for job in scenes.values():
+        scene = job_runner.load_scene(job)
+        found[job.split] |= {*job_runner.assets(scene.to_dict()), *job_runner.photographs(scene)}
+    for split in ("train", "test"):
+        assert {asset.split()[0] for asset in found[split]} >= {"mesh", "texture"}
+    assert found["test"].isdisjoint(found["train"] | found["val"])
+
+
+def calls(action: Callable[[], object]) -> int:
+    """Calls of functions, ours and built in, that an action makes."""
+    count = 0
+
+    def see(frame: object, event: str, argument: object) -> None:
+        nonlocal count
+        count += event in ("call", "c_call")
+
+    sys.setprofile(see)
+    try:
+        action()
+    finally:
+        sys.setprofile(None)
+    return count
+
+
+@pytest.mark.parametrize("kind", ["scenes", "streams", "seeds"])
+def test_the_work_of_reading_a_recipe_is_linear(kind: str):
+    """Four times as many sections or seeds: at most five times the calls. It was sixteen times for sections."""
+
+    def text(n: int) -> str:
+        scenes = [f'[[scenes]]\nfamily = "fan"\nseeds = [{i}]\n' for i in range(n if kind == "scenes" else 1)]
+        if kind == "seeds":
+            scenes = [f'[[scenes]]\nfamily = "fan"\nseeds = {list(range(n))}\n']
+        streams = [
+            f'[[streams]]\nsensor = "quiver-physical"\nbits = 3\nppp = {i + 1}\n'
+            for i in range(n if kind == "streams" else 1)
+        ]
+        return HEAD + "".join(scenes + streams)
+
+    parse(text(2))  # imports
+    assert calls(lambda: parse(text(200))) < 5 * calls(lambda: parse(text(50)))
+
+
+def test_a_list_is_looked_through_once():
+    """Values are compared for repetitions by hash, not each with each: 20 000 seeds took seconds."""
+
+    class Value:
+        compared = 0
+
+        def __init__(self, number: int) -> None:
+            self.number = number
+
+        def __hash__(self) -> int:
+            return hash(self.number)
+
+        def __eq__(self, other: object) -> bool:
+            Value.compared += 1
+            return self.number == other.number
+
+    values = [Value(i) for i in range(1000)]
+    assert checks.list_of(lambda value: value)(values) == values
+    assert Value.compared < 2000
+    with pytest.raises(ValueError, match="listed twice"):
+        checks.list_of(lambda value: value)([*values, Value(7)])
+
+
+def accepted_by_the_jobs(stem: str, folder: Path) -> bool:
+    """Whether a job with such a name makes its clip, writes its record, and tidies up."""
+    found = recipe.Settings(1, 2, 3, 2000.0)
+    job = recipe.Job(f"{stem}_0000_x0.001", f"{stem}.py", 0, 1.0, "train", found, 0, ())
+    for name in ("jobs", "failed", "clips", "logs", "locks", "work"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    try:
+        return job_runner.run_job(job, folder, make).state == "done"
+    except OSError:  # a name that the file system does not take
+        return False
+
+
+@pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
+def test_a_scene_file_is_accepted_exactly_when_its_jobs_are(tmp_path: Path, count: int):
+    """Random names of own scenes: the recipe refuses, with its line, just those that a job would fail on."""
+    rng = random.Random(1)
+    alphabet = "ab0_-. \u00fc\n\"'*[\\\t$"
+    names = ["a b", "\u00fc", "__init__", "-x", "", "a" * 180, "a.tmp-1", "x.part", ".hidden", "CON"]
+    names += ["".join(rng.choices(alphabet, k=rng.randrange(1, 6))) for _ in range(count)]
+    names += ["".join(rng.choices("ab.-_", k=rng.randrange(1, 6))) for _ in range(count)]
+    verdicts = set()
+    for n, stem in enumerate(dict.fromkeys(names)):
+        folder = tmp_path / str(n)
+        folder.mkdir()
+        (folder / f"{stem}.py").touch()
+        path = folder / "r.toml"
+        path.write_text(HEAD + "[[scenes]]\nfamily = " + json.dumps(f"{stem}.py", ensure_ascii=False))
+        expected = accepted_by_the_jobs(Path(f"{stem}.py").stem, tmp_path / "jobs")
+        if expected:
+            recipe.load(path)
+        else:
+            with pytest.raises(ValueError, match=r"r\.toml:8: clips are named after the scene"):
+                recipe.load(path)
+        verdicts.add(expected)
+    assert verdicts == {True, False}
+    long = tmp_path / ("a" * 181 + ".py")
+    long.touch()
+    (tmp_path / "r.toml").write_text(HEAD + f'[[scenes]]\nfamily = "{long.name}"\n')
+    with pytest.raises(ValueError, match=r"r\.toml:8: .* has 181 characters; at most 180"):
+        recipe.load(tmp_path / "r.toml")

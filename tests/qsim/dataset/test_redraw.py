@@ -1,0 +1,266 @@
+"""`qsim check --redraw`: right streams of every kind pass, wrong codes are named though every checksum fits."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clips import write_clip, write_dataset
+from scipy.special import gammaln
+
+from qsim import files
+from qsim.cli import program
+from qsim.clip.clip import Clip
+from qsim.clip.simulation import prepare, stored
+from qsim.clip.stream import Sensing, Stream, replay, sense, write_stream
+from qsim.dataset import redraw
+from qsim.dataset.generation import Options, generate
+from qsim.dataset.recipe import Job, Recipe, Settings
+from qsim.sensor.compiled.plan import electrons
+from qsim.sensor.qis import QIS
+from qsim.sensor.spad import BinarySPAD
+
+BINARY = '[sensor]\nmodel = "BinarySPAD"\npde = 0.5\ndark_count_rate = 200.0\nbits = {bits}\n'
+COUNTING = '[sensor]\nmodel = "CountingSPAD"\npde = 0.5\ndark_count_rate = 10.0\ndead_time = 3e-4\nbits = {bits}\n'
+QUANTA = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 1.6\nread_noise = 0.2\nbits = {bits}\n'
+MAPS = "[defects]\ndevice_seed = 4\nprnu = 0.2\ndead = 0.1\n"
+DISTURBED = "[defects]\nafterpulse = 0.1\ncrosstalk = 0.05\n"
+
+# Name -> (sensor file, what else to sense, how it says it was drawn)
+KINDS = {
+    "QIS": (QUANTA.format(bits=3), {"ppp": 3.25}, "table"),
+    "QIS of a long table": (QUANTA.format(bits=8) + "gain = 0.0085\n", {"ppp": 9000.0}, "table"),
+    "QIS of ten bits": (QUANTA.format(bits=10), {"ppp": 400.0, "seed": 5}, "process"),
+    "QIS with maps": (QUANTA.format(bits=3) + MAPS, {"ppp": 3.0, "diffraction": True}, "table"),
+    "QIS with read-out maps": (QUANTA.format(bits=3) + "[defects]\noffset = 0.3\n", {"ppp": 3.0}, "process"),
+    "planes": (BINARY.format(bits=1) + MAPS, {"ppp": 0.7}, "planes"),
+    "planes with a memory": (BINARY.format(bits=2) + DISTURBED, {"ppp": 2.0}, "planes"),
+    "summed planes of the clip": (BINARY.format(bits=2), {"ppp": 2.0, "bits": 2, "group": True}, "planes"),
+    "many planes": (BINARY.format(bits=10), {"ppp": 300.0}, "process"),
+    "counting": (COUNTING.format(bits=3), {"ppp": 3.0}, "closed form"),
+    "counting, followed": (COUNTING.format(bits=3) + "[defects]\ncarry_dead_time = true\n", {"ppp": 3.0}, "events"),
+    "counting, slices": (COUNTING.format(bits=3), {"ppp": 3.0, "slices": 3}, "events"),
+}
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> Clip:
+    return write_clip(tmp_path_factory.mktemp("clips") / "moving", frames=6, height=10, width=13)
+
+
+def drawn(clip: Clip, folder: Path, kind: str) -> Stream:
+    text, settings, _ = KINDS[kind]
+    (folder / "mine.toml").write_text(text)
+    return sense(clip, Sensing(str(folder / "mine.toml"), name="test", **settings), force=True)[0]
+
+
+def stored_again(clip: Clip, stream: Stream, values: np.ndarray, **changes: object) -> Stream:
+    """The stream with other codes, every checksum as it should be; keys that are None are left out."""
+    own = ("sha256", "checksum", "software", "format_version")
+    meta = {key: value for key, value in (stream.meta | changes).items() if key not in own and value is not None}
+    return write_stream(clip, stream.name, [values], stream.sensor, meta)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_right_streams_pass_and_wrong_codes_are_counted(clip, tmp_path, kind):
+    """With flipped codes in frames 1 and 2 all files are still what was written."""
+    stream = drawn(clip, tmp_path, kind)
+    assert stream.meta["drawn_by"] == KINDS[kind][2]
+    (found,) = redraw.redraw(stream.path)
+    assert (found.differ, found.why, found.wrong) == (0, None, False)
+    wrong = stream.codes()
+    wrong[1, 2, 3:5] ^= 1
+    wrong[min(2, len(wrong) - 1), 9, 12] ^= 1
+    stored_again(clip, stream, wrong)
+    assert clip.verify() == []
+    (found,) = redraw.redraw(clip.path)
+    assert (found.codes, found.differ, found.first) == (wrong.size, 3, 1)
+    assert found.wrong
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if KINDS[kind][2] != "events"])
+def test_a_stream_that_does_not_say_how_it_was_drawn_is_drawn_by_the_law_of_its_time(clip, tmp_path, kind):
+    """Without `drawn_by`: as today, but many planes one by one. Streams of followed photons always had the key."""
+    stream = drawn(clip, tmp_path, kind)
+    values = stream.codes()
+    if kind == "many planes":
+        planes = BinarySPAD(0.5, 200.0, 1)
+        light = stored(stream).light(clip, 0, 6)[:, None] / 1023
+        key = stored(stream).key
+        values = np.stack(
+            [
+                planes.sample(np.repeat(some, 1023, axis=0), 5e-4 / 1023, key=key.at(1023 * t)).sum(axis=0)
+                for t, some in enumerate(light)
+            ]
+        ).astype(np.uint16)
+        assert (values != stream.codes()).any(), "another law draws other codes"
+    old = stored_again(clip, stream, values, drawn_by=None)
+    assert "drawn_by" not in old.meta
+    assert redraw.redraw(old.path)[0].differ == 0
+    np.testing.assert_array_equal(*replay(clip, old, 1))
+    kept = sense(clip, Sensing(str(tmp_path / "mine.toml"), name="test", **KINDS[kind][1]))[0]
+    assert kept.meta == old.meta, "a stream that is there as asked is kept, however it was drawn"
+
+
+def test_a_law_of_a_later_version_is_refused(clip, tmp_path):
+    stream = drawn(clip, tmp_path, "QIS")
+    old = stored_again(clip, stream, stream.codes(), drawn_by="magic")
+    (found,) = redraw.redraw(old.path)
+    assert found.why == "drawn by 'magic', which this version does not know; " + (
+        "there are table, process, planes, closed form, events"
+    )
+
+
+def as_the_shifted_sums_drew(sensor: QIS, photons: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Codes as kernels drew them once: float32, one factor exp(-shift) in every weight, what underflows lost."""
+    f, steps = np.float32, electrons(sensor)
+    n = len(steps.full)
+    shift = n + 7 * np.sqrt(n) + 30 - 85
+    mean = (photons * sensor.efficiency).astype(f)
+    weight, terms = np.full(mean.shape, np.exp(-shift), f), []
+    for _ in range(n):
+        terms.append(np.where(weight < 2.0**-126, f(0), weight))
+        weight = (terms[-1] * (mean / f(steps.scale))).astype(f)
+    numbers = np.arange(n)
+    full = np.exp(numbers * np.log(steps.scale) - gammaln(numbers + 1)).astype(f)
+    codes_drawn = np.zeros(mean.shape, np.uint8)
+    for prefix, band in zip(steps.prefix, steps.band, strict=True):
+        total = sum(terms[m] * full[m] for m in range(prefix))
+        total = total + sum(terms[prefix + m] * f(band[m]) for m in range(len(band)))
+        codes_drawn += u * np.exp(mean - f(shift)) >= total
+    return codes_drawn
+
+
+def test_codes_of_the_shifted_sums_are_named(tmp_path, capsys):
+    """3 bits at 36 PPP: dark pixels got the top code; exit code 1, and what to do."""
+    from qsim.keys import uniform, words
+
+    radiance = np.repeat([0.02, 0.1, 0.3, 1.0], 16).reshape(1, 1, 64) * np.ones((2, 32, 1))
+    clip = write_clip(tmp_path / "dark", radiance=radiance)
+    stream, _ = sense(clip, Sensing("quiver-physical", bits=3, ppp=36.0, name="r"))
+    draw = prepare(clip, Sensing("quiver-physical", bits=3, ppp=36.0))
+    u = uniform(words(draw.key, stream.shape))
+    old = as_the_shifted_sums_drew(stream.sensor, draw.light(clip, 0, 2), u)
+    share = (old != stream.codes()).mean()
+    assert 0.01 < share < 0.5
+    assert program.main(["check", str(clip.path), "--redraw"]) == 0
+    assert "drawn again: 1 of 1 streams, 4096 codes; all hold the reference's codes" in capsys.readouterr().out
+    stored_again(clip, stream, old, drawn_by=None)
+    assert program.main(["check", str(clip.path)]) == 0, "checksums alone are content"
+    capsys.readouterr()
+    assert program.main(["check", str(clip.path), "--redraw"]) == 1
+    out = capsys.readouterr().out
+    assert f"r.npy: {round(share * 4096)} of 4096 codes differ from the reference's, first in frame 0" in out
+    assert "sense it again with --force" in out
+    assert "4096 codes; 1 hold wrong codes" in out
+    assert program.main(["check", str(clip.path), "--redraw", "--json"]) == 1
+    facts = json.loads(capsys.readouterr().out)
+    assert [(one["differ"], one["wrong"]) for one in facts["redrawn"]] == [(round(share * 4096), True)]
+    assert program.main(["sense", str(clip.path), "--bits", "3", "--ppp", "36", "-o", "r", "--force"]) == 0
+    assert program.main(["check", str(clip.path), "--redraw"]) == 0
+
+
+def test_streams_of_other_origin_and_damaged_ones_are_said_not_passed(clip, tmp_path, capsys):
+    own = write_clip(tmp_path / "own", frames=3, height=8, width=9)
+    meta = {"shape": [3, 8, 9], "ppp_factor": None, "exposure": 5e-4, "frame_rate": 2000.0, "source": {"format": "npy"}}
+    write_stream(own, "imported", [np.ones((3, 8, 9), np.uint8)], QIS(0.8, 1.6, 0.2, 3), meta)
+    assert program.main(["check", str(own.path), "--redraw"]) == 0
+    out = capsys.readouterr().out
+    assert "imported.npy: not drawn again: its description holds no seed: it was not drawn from a clip of ours" in out
+    assert "drawn again: 0 of 1 streams, 0 codes; so nothing is known of them" in out
+    stream, _ = sense(own, Sensing("quiver-physical", ppp=3.0, name="cut"))
+    stream.path.write_bytes(stream.path.read_bytes()[:-20])
+    assert program.main(["check", str(own.path), "--redraw"]) == 1
+    assert "cut.npy: not drawn again" in capsys.readouterr().out
+    empty = write_clip(tmp_path / "empty", frames=3, height=8, width=9)
+    assert program.main(["check", str(empty.path), "--redraw"]) == 2
+    assert "empty: holds no stream to draw again" in capsys.readouterr().err
+
+
+def test_a_few_codes_in_a_million_are_the_compiled_engines_own():
+    few = redraw.Redrawn(Path("s.npy"), 1_000_000, 5, 3)
+    assert not few.wrong
+    assert few.line() == "s.npy: 5 of 1000000 codes differ from the reference's, as many as the compiled engine may"
+    assert replace(few, differ=6).wrong
+
+
+def test_a_data_set_is_drawn_again_clip_by_clip(tmp_path, capsys):
+    """Streams added by `qsim sense`: each named with its clip; right again after --force."""
+    path = write_dataset(tmp_path / "set", {"train": 2, "test": 1})
+    assert program.main(["sense", str(path), "--bits", "3", "--ppp", "3.25", "-o", "s"]) == 0
+    found = redraw.redraw(path)
+    assert len(found) == 3
+    assert not any(one.differ for one in found)
+    clip = Clip.open(path / "clips" / "train_1")
+    stored_again(clip, clip.stream("s"), clip.stream("s").codes() ^ 1)
+    capsys.readouterr()
+    assert program.main(["check", str(path), "--redraw"]) == 1
+    out = capsys.readouterr().out
+    assert f"{clip.path / 'streams' / 's.npy'}: {14 * 36 * 44} of {14 * 36 * 44} codes differ" in out
+    assert "3 of 3 streams" in out
+
+
+def test_a_damaged_clip_is_named_and_the_others_are_drawn_again(tmp_path, capsys):
+    """The damage of one clip ended the command, and what `check` had found in others was lost."""
+    path = write_dataset(tmp_path / "set", {"train": 3})
+    assert program.main(["sense", str(path), "--bits", "3", "--ppp", "3.25", "-o", "s"]) == 0
+    about = path / "clips" / "train_1" / "clip.json"
+    about.write_text(about.read_text() + "x")
+    (path / "clips" / "train_2" / "streams" / "s.npy").unlink()
+    capsys.readouterr()
+    assert program.main(["check", str(path), "--redraw"]) == 1
+    out = capsys.readouterr().out
+    assert f"{about}: not readable as JSON" in out
+    assert f"{path / 'clips' / 'train_2' / 'streams' / 's.npy'}: missing" in out
+    assert "train_1/streams/s.npy: not drawn again" in out
+    assert "drawn again: 1 of 3 streams" in out
+    assert program.main(["check", str(about.parent), "--redraw"]) == 1
+    assert "drawn again: 0 of 1 streams, 0 codes; so nothing is known of them" in capsys.readouterr().out
+
+
+def test_what_is_said_of_a_recipes_streams_mends_them(tmp_path, capsys):
+    """Every file vouches for the wrong codes; with the file gone, `generate --repair` draws them again."""
+    settings = Settings(frames=14, height=36, width=44, frame_rate=2000.0)
+    sensing = Sensing("quiver-physical", bits=3, ppp=3.25, name="s")
+    recipe = Recipe("tiny", (Job("one", "family", 0, 1.0, "train", settings, 0, (sensing,)),), {})
+
+    def make(job: Job, target: Path, wrong: bool) -> Clip:
+        clip = write_clip(target, job=job.digest)
+        stream, _ = sense(clip, sensing)
+        return Clip.open(stored_again(clip, stream, stream.codes() ^ 1).path.parent.parent) if wrong else clip
+
+    path = tmp_path / "set"
+    generate(recipe, path, Options(workers=0), make=lambda job, target: make(job, target, True))
+    stream = path / "clips" / "one" / "streams" / "s.npy"
+    assert program.main(["check", str(path)]) == 0
+    capsys.readouterr()
+    assert program.main(["check", str(path), "--redraw"]) == 1
+    assert f"delete the file and run `qsim generate RECIPE -o {path} --repair`" in capsys.readouterr().out
+    stream.unlink()
+    generate(recipe, path, Options(workers=0, repair=True), make=lambda job, target: make(job, target, False))
+    assert stream.is_file()
+    assert program.main(["check", str(path), "--redraw"]) == 0
+
+
+def test_what_is_said_of_a_recipes_streams_of_an_earlier_version_can_be_done(tmp_path, capsys):
+    """`generate --repair` refuses data sets of earlier versions: there the right codes get another name."""
+    path = write_dataset(tmp_path / "set", {"train": 1})
+    assert program.main(["sense", str(path), "--bits", "3", "--ppp", "3.25", "-o", "s"]) == 0
+    clip = Clip.open(path / "clips" / "train_0")
+    stored_again(clip, clip.stream("s"), clip.stream("s").codes() ^ 1, drawn_by=None)
+    record = path / "jobs" / "train_0.json"
+    described = json.loads(record.read_text())
+    described["streams"] = {"s": files.sha256(clip.path / "streams" / "s.json")}
+    digest = files.write_json(record, described)
+    manifest = json.loads((path / "dataset.json").read_text())
+    manifest["jobs"]["train_0"]["record"] = digest
+    files.write_description(path / "dataset.json", manifest)
+    capsys.readouterr()
+    assert program.main(["check", str(path), "--redraw"]) == 1
+    out = capsys.readouterr().out
+    assert "--repair" not in out
+    assert f"the right one: `qsim sense {path} --name NEW` with its settings, or generate all in another folder" in out
+    assert program.main(["sense", str(path), "--bits", "3", "--ppp", "3.25", "--name", "right"]) == 0
+    assert program.main(["check", str(path)]) == 0
+    assert program.main(["check", str(clip.path / "streams" / "right.json"), "--redraw"]) == 0

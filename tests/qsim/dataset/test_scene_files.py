@@ -1,0 +1,229 @@
+"""Own scenes: every file that one reads is known, and an edit of it before a resume is refused by name."""
+
+import os
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clips import write_clip
+from fakes import RECIPE, tree
+
+from qsim import files
+from qsim.dataset import job_runner, recipe, scene_files
+from qsim.dataset.generation import Options, generate
+from qsim.dataset.recipe import Job
+
+HERE = Options(workers=0)
+ROOT = str(Path(__file__).parents[3])
+
+SCENE = '''"""A scene that reads all kinds of things."""
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parents[1]
+sys.path.insert(0, str(HERE))
+import reads_helper
+from reads_package.inner import SIZE
+sys.path.remove(str(HERE))
+
+import scenes
+
+NUMBERS = (HERE / "numbers.txt").read_text()
+
+
+def scene(seed=0, *, speed=1.0):
+    open(HERE / f"seed{seed}.bin", "rb").close()
+    (HERE / "written.log").write_text("not read")
+    meshes = sorted((HERE / "meshes").glob("*.obj"))
+    meshes[seed].read_bytes()
+    import reads_late
+    return scenes.load("fan", seed, speed)
+'''
+
+
+def write_scene(folder: Path) -> Path:
+    """The scene file with what it reads."""
+    for name in ("reads_package", "meshes", "unrelated"):
+        (folder / name).mkdir(parents=True)
+    (folder / "wheel.py").write_text(SCENE)
+    (folder / "reads_helper.py").write_text(
+        "from pathlib import Path\nDATA = (Path(__file__).parent / 'data.csv').read_text()\n"
+    )
+    (folder / "reads_late.py").write_text("LATE = 1\n")
+    (folder / "reads_package" / "__init__.py").write_text("")
+    (folder / "reads_package" / "inner.py").write_text("SIZE = 3\n")
+    for name in ("numbers.txt", "data.csv", "seed0.bin", "seed1.bin", "meshes/a.obj", "meshes/b.obj"):
+        (folder / name).write_text(name)
+    for name in ("notes.txt", "meshes/notes.txt", "unrelated/other.py", "seed7.bin"):
+        (folder / name).write_text(name)
+    return folder / "wheel.py"
+
+
+READ = {
+    *("wheel.py", "reads_helper.py", "reads_late.py", "reads_package/__init__.py", "reads_package/inner.py"),
+    *("numbers.txt", "data.csv", "seed0.bin", "seed1.bin", "meshes/a.obj", "meshes/b.obj"),
+}
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder for scenes; no helper of another test is left imported."""
+    monkeypatch.syspath_prepend(tmp_path / "scene")
+    for name in [name for name in sys.modules if name.startswith("reads_")]:
+        del sys.modules[name]
+    return tmp_path / "scene"
+
+
+def make(job: Job, path: Path) -> object:
+    """A clip that says what its scene read, as a rendered one does."""
+    _, read = job_runner.load_traced(job)
+    return write_clip(path, frames=1, height=2, width=3, seed=job.scene_seed, **job_runner.provenance(job, read))
+
+
+def test_a_python_scene_names_all_that_it_reads_every_time(place: Path):
+    path = write_scene(place)
+    for seed in (0, 1, 0):
+        _, read = scene_files.load(str(path), seed)
+        expected = {name for name in READ if not name.startswith(("seed", "meshes"))}
+        assert set(read) == expected | {f"seed{seed}.bin", f"meshes/{'ab'[seed]}.obj", "meshes/*.obj"}
+        assert all(files.sha256(place / name) == digest for name, digest in read.items() if "*" not in name)
+
+
+def test_families_of_the_library_read_nothing_and_folders_everything(tmp_path: Path):
+    assert scene_files.load("fan")[1] == {}
+    from PIL import Image
+
+    (tmp_path / "things" / "below").mkdir(parents=True)
+    Image.fromarray(np.full((4, 4, 3), 200, np.uint8)).save(tmp_path / "things" / "below" / "wood.png")
+    assert set(scene_files.load(tmp_path / "things")[1]) == {"below/wood.png"}
+
+
+def edit(file: Path, rng: random.Random) -> None:
+    """A random change that keeps size and times: a clock that was set back hides nothing."""
+    status, content = file.stat(), bytearray(file.read_bytes())
+    if content:
+        content[rng.randrange(len(content))] ^= 1
+        file.write_bytes(bytes(content))
+    else:
+        file.write_bytes(b"#")
+    os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+
+def wanted(path: Path) -> recipe.Recipe:
+    text = RECIPE.replace('"fan"', f'"{path.name}"')
+    return recipe.parse(text, path.parent / "r.toml")
+
+
+@pytest.mark.parametrize("name", sorted(READ))
+def test_an_edit_of_any_file_read_is_refused_by_name(place: Path, tmp_path: Path, name: str):
+    path, folder, rng = write_scene(place), tmp_path / "d", random.Random(name)
+    found = wanted(path)
+    own = only(found, "wheel")
+    assert generate(own, folder, HERE, make=make).failed == {}
+    before = tree(folder)
+    for unrelated in ("notes.txt", "meshes/notes.txt", "unrelated/other.py", "seed7.bin", "written.log"):
+        edit(place / unrelated, rng)
+    assert generate(own, folder, HERE, make=make).made == 0
+    (folder / "jobs" / "wheel_0001.json").unlink()  # something is left to be done
+    original = (place / name).read_bytes()
+    edit(place / name, rng)
+    again = only(wanted(path), "wheel")
+    for options in (HERE, Options(workers=0, retry=True), Options(workers=0, repair=True)):
+        with pytest.raises(ValueError, match=rf"{name} was changed since its clip wheel_000[01] was made"):
+            generate(again, folder, options, make=make)
+    (place / name).unlink()
+    if name != "wheel.py":
+        with pytest.raises(
+            ValueError, match=rf"({name} is missing|other files match .*/meshes/\*\.obj) since its clip"
+        ):
+            generate(own, folder, HERE, make=make)
+    (place / name).write_bytes(original)
+    assert generate(own, folder, HERE, make=make).failed == {}
+    assert tree(folder) == before
+
+
+def only(found: recipe.Recipe, stem: str) -> recipe.Recipe:
+    return recipe.Recipe(found.name, tuple(job for job in found.jobs if job.stem == stem), found.source)
+
+
+def test_another_mesh_in_a_folder_that_is_listed_is_refused(place: Path, tmp_path: Path):
+    path = write_scene(place)
+    own = only(wanted(path), "wheel")
+    generate(own, tmp_path / "d", HERE, make=make)
+    (place / "meshes" / "aa.obj").write_text("a new one changes which mesh a seed picks")
+    with pytest.raises(ValueError, match=r"other files match .*meshes/\*\.obj since its clip wheel_0000 was made"):
+        generate(own, tmp_path / "d", HERE, make=make)
+
+
+def test_a_data_set_of_an_earlier_version_goes_by_the_scene_file_alone(place: Path, tmp_path: Path):
+    path = write_scene(place)
+    own = only(wanted(path), "wheel")
+
+    def make_before(job: Job, target: Path) -> object:
+        return write_clip(target, frames=1, height=2, width=3, **job_runner.provenance(job))
+
+    generate(own, tmp_path / "d", HERE, make=make_before)
+    edit(place / "data.csv", random.Random(0))
+    assert generate(own, tmp_path / "d", HERE, make=make).done == 2
+    edit(path, random.Random(0))
+    with pytest.raises(ValueError, match="asked for with other settings"):
+        generate(only(wanted(path), "wheel"), tmp_path / "d", HERE, make=make)
+
+
+XML = """<scene version="3.0.0">
+  <default name="kind" value="rough"/>
+  <path value="assets"/>
+  <include filename="parts/lights.xml"/>
+  <shape type="ply"><string name="filename" value="mesh.ply"/>
+    <bsdf type="diffuse"><texture type="bitmap">
+      <string name="filename" value="tex/$kind.png"/>
+    </texture></bsdf>
+  </shape>
+</scene>
+"""
+
+
+def test_an_xml_scene_names_meshes_bitmaps_and_includes(tmp_path: Path):
+    names = ["parts/lights.xml", "parts/deep.xml", "assets/mesh.ply", "tex/rough.png", "parts/sky.exr", "unrelated.png"]
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name)
+    (tmp_path / "s.xml").write_text(XML)
+    (tmp_path / "parts" / "lights.xml").write_text(
+        '<scene version="3.0.0"><include filename="parts/deep.xml"/><include filename="parts/lights.xml"/></scene>'
+    )
+    (tmp_path / "parts" / "deep.xml").write_text(
+        '<scene version="3.0.0"><emitter type="envmap"><string name="filename" value="sky.exr"/></emitter></scene>'
+    )
+    found = {str(path.relative_to(tmp_path)) for path in scene_files.of_xml(tmp_path / "s.xml")}
+    assert found == {"s.xml", *names} - {"unrelated.png"}
+
+
+MOVED = """from pathlib import Path
+from qsim.scene.scene import Scene
+
+def scene(seed=0, *, speed=1.0):
+    return Scene.from_mitsuba(Path(__file__).with_name("s.xml"))
+"""
+SMALL_XML = """<scene version="3.0.0">
+  <sensor type="perspective"><film type="hdrfilm"/></sensor>
+  <emitter type="constant"/>
+  <shape type="obj"><string name="filename" value="m.obj"/></shape>
+</scene>
+"""
+
+
+@pytest.mark.parametrize("name", ["s.xml", "moved.py"])
+def test_choosing_an_engine_is_no_reading_of_the_scene(tmp_path: Path, name: str):
+    """In a fresh process, whose first scene starts Mitsuba: the first time names the same files as the second."""
+    (tmp_path / "moved.py").write_text(MOVED)
+    (tmp_path / "s.xml").write_text(SMALL_XML)
+    (tmp_path / "m.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")
+    code = "import sys; from qsim.dataset import scene_files as reads; print(*(sorted(reads.load(sys.argv[1])[1]) for _ in range(2)), sep='\\n')"
+    command = [sys.executable, "-c", code, str(tmp_path / name)]
+    made = subprocess.run(command, env=os.environ | {"PYTHONPATH": ROOT}, capture_output=True, text=True, check=True)
+    expected = sorted({name, "s.xml", "m.obj"})
+    assert made.stdout.splitlines() == [str(expected)] * 2

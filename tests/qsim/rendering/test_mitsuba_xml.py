@@ -1,0 +1,129 @@
+"""Scenes in Mitsuba's own XML: our camera sees what Mitsuba's camera sees, named shapes move with true flow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_scenes import CAMERA, RATE
+
+import scenes
+from qsim.rendering.fidelity import Budget
+from qsim.rendering.renderer import Renderer, render_clip
+from qsim.scene.deformation import Flag
+from qsim.scene.motion import Spin, Still, Translation
+from qsim.scene.scene import Body, Mesh, Scene
+
+SENSOR = """<sensor type="perspective"><float name="fov" value="40"/><string name="fov_axis" value="y"/>
+  <transform name="to_world"><lookat origin="0,0.5,4" target="0,0,0" up="0,1,0"/></transform>
+  <film type="hdrfilm"><integer name="width" value="33"/><integer name="height" value="24"/>
+  <rfilter type="box"/></film></sensor>"""
+LIGHT = '<emitter type="constant"><rgb name="radiance" value="0.7"/></emitter>'
+SHAPES = """<bsdf type="diffuse" id="grey"><rgb name="reflectance" value="0.4"/></bsdf>
+<shape type="sphere" id="ball"><float name="radius" value="0.5"/><point name="center" x="0.7" y="0" z="0"/></shape>
+<shape type="cube" id="box"><transform name="to_world"><scale value="0.4"/><translate x="-0.7"/></transform></shape>
+<shape type="rectangle"><transform name="to_world"><scale value="6"/><translate z="-2"/></transform>
+<ref id="grey"/></shape>"""
+BUDGET = Budget(samples=32, bounces=3)
+
+
+def written(folder, *parts: str):
+    path = folder / "room.xml"
+    path.write_text(f'<scene version="3.0.0">{"".join(parts)}</scene>')
+    return path
+
+
+@pytest.fixture
+def room(tmp_path):
+    return written(tmp_path, SENSOR, LIGHT, SHAPES)
+
+
+def test_named_shapes_move_with_their_true_flow(room):
+    """A mesh and a sphere translate: flow is focal length times the change of x/z, on each hit point."""
+    step = np.array([0.05, 0.0, 0.0])
+    motion = Translation(tuple(step * RATE))
+    scene = Scene.from_mitsuba(room, {"ball": motion, "box": motion})
+    views = Renderer(scene, frame_rate=RATE, budget=BUDGET)
+    first, second = views.frame(0), views.frame(1)
+    assert [part.name for part in scene.parts] == ["ball", "box", "shape 2"]
+    assert sorted(np.unique(first.body_id)) == [0, 1, 2]
+    expected = scene.camera.focal_pixels * step[0] / first.depth  # a step along x does not change z
+    for number in (0, 1):
+        on = first.body_id == number
+        assert on.sum() > 10
+        assert np.abs(first.flow[0][on] - expected[on]).max() < 0.02
+        assert np.abs(first.flow[1][on]).max() < 0.02
+        assert np.nonzero(second.body_id == number)[1].mean() > np.nonzero(on)[1].mean() + 0.2
+    assert (first.flow[:, first.body_id == 2] == 0).all()
+    assert (views.frame(0).radiance == first.radiance).all(), "going back gives the same frame"
+
+
+def test_a_spinning_mesh_turns_its_normals_too(room):
+    """A box turned by a right angle about its own middle looks the same, in place and in light."""
+    quarter = Spin((0, 1, 0), np.pi / 2 * RATE, center=(-0.7, 0.0, 0.0))
+    views = Renderer(Scene.from_mitsuba(room, {"box": quarter}), frame_rate=RATE, budget=Budget(128, 3))
+    first, turned = views.frame(0), views.frame(1)
+    assert (first.body_id == turned.body_id).mean() > 0.99
+    on = (first.body_id == 1) & (turned.body_id == 1)
+    assert np.abs(first.radiance[on].mean() / turned.radiance[on].mean() - 1) < 0.02
+    assert np.hypot(*first.flow)[on].max() > 0.5
+
+
+def test_our_camera_sees_what_the_files_camera_sees(room):
+    from qsim import backend
+
+    backend.select()
+    import mitsuba as mi
+
+    scene = Scene.from_mitsuba(room)
+    ours = Renderer(scene, budget=Budget(512, 3)).frame(0)
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        theirs = np.array(
+            mi.render(mi.load_file(str(room)), integrator=mi.load_dict({"type": "path", "max_depth": 4}), spp=512)
+        )[..., 0]
+    finally:
+        mi.set_log_level(mi.LogLevel.Warn)
+    assert theirs.shape == ours.radiance.shape == (24, 33)
+    assert np.sqrt(np.mean((theirs - ours.radiance) ** 2)) < 0.03 * ours.radiance.mean()
+
+
+def test_a_clip_of_a_file_says_which_and_rendering_by_name_works(room, tmp_path):
+    scene = scenes.load(room)
+    clip = render_clip(scene, tmp_path / "clip", frames=1, budget=Budget(2, 1))
+    assert clip.meta["scene"]["family"] == "room"
+    assert len(scene.to_dict()["file"]["sha256"]) == 64
+    assert scene.resized(48, 66).camera.height == 48
+
+
+LENS = SENSOR.replace('type="perspective">', 'type="thinlens"><float name="aperture_radius" value="0.1"/>')
+MEDIUM = """<shape type="sphere" id="fog"><bsdf type="null"/>
+<medium name="interior" type="homogeneous"><float name="albedo" value="0.5"/></medium></shape>"""
+
+
+@pytest.mark.parametrize(
+    ("parts", "motions", "message"),
+    [
+        ((SENSOR, LIGHT, SHAPES), {"bal": Still()}, r"room.xml: no shape has the id 'bal' \(did you mean 'ball'\?\)"),
+        ((SENSOR, LIGHT, SHAPES), {"xyz": Still()}, r"no shape has the id 'xyz'; there are 'ball', 'box', 'shape 2'"),
+        ((SENSOR, SHAPES), {}, "no emitter, every pixel would be black"),
+        ((LIGHT, SHAPES), {}, "no sensor; give a camera of your own"),
+        ((LENS, LIGHT, SHAPES), {}, "ThinLensCamera, only 'perspective' is taken over"),
+        ((SENSOR.replace("<lookat", '<scale x="-1"/><lookat'), LIGHT), {}, "mirrors the picture"),
+        ((SENSOR, LIGHT, MEDIUM), {}, "'fog' holds a participating medium"),
+        ((SENSOR, '<emitter type="sunsky"/>'), {}, "Mitsuba cannot load it: .*sunsky"),
+        ((SENSOR, "<emitter"), {}, "Mitsuba cannot load it: .*XML"),
+        ((SENSOR, LIGHT, SHAPES), {"box": Flag(np.eye(3), ())}, "shape box: shapes of a Mitsuba file move rigidly"),
+    ],
+)
+def test_what_cannot_be_taken_over_is_refused(tmp_path, parts, motions, message):
+    with pytest.raises(ValueError, match=message):
+        Scene.from_mitsuba(written(tmp_path, *parts), motions)
+
+
+def test_a_missing_file_and_a_mixture_are_refused(tmp_path, room):
+    with pytest.raises(FileNotFoundError, match=r"nothing.xml: no such file"):
+        Scene.from_mitsuba(tmp_path / "nothing.xml")
+    read = Scene.from_mitsuba(room, camera=CAMERA)
+    assert read.camera is CAMERA
+    with pytest.raises(ValueError, match="either records or those of a Mitsuba file"):
+        Scene("mix", 0, CAMERA, (), (Body("a", Mesh(np.eye(3), np.array([[0, 1, 2]]))),), file=read.file)

@@ -1,0 +1,218 @@
+"""Quick looks: pictures are declared functions of the numbers, films have all frames, terminals get half blocks."""
+
+import json
+import os
+import pty
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clips import write_clip
+from PIL import Image
+
+from qsim import colour as pictures
+from qsim.cli.program import main
+from qsim.clip.clip import RELATIVE, Clip, ClipWriter
+from qsim.report import preview, terminal
+from qsim.sensor import packing
+
+SHAPE = (5, 8, 11)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> Clip:
+    """Noise of odd size with a truth: everything moves 2 px to the right, depth grows downwards, one row has none."""
+    path = tmp_path_factory.mktemp("preview") / "odd"
+    meta = {"shape": list(SHAPE), "frame_rate": 2000.0, "exposure": 5e-4, "radiance_unit": RELATIVE, "camera": None}
+    flow = np.zeros((2, *SHAPE[1:]), np.float32)
+    flow[0] = 2.0
+    depth = np.repeat(np.linspace(1, 4, SHAPE[1], dtype=np.float32)[:, None], SHAPE[2], axis=1)
+    depth[-1] = np.inf
+    with ClipWriter(path, meta) as writer:
+        for t in range(SHAPE[0]):
+            radiance = np.random.default_rng(t).random(SHAPE[1:])
+            writer.add(t, radiance, truth={"flow": flow, "depth": depth}, error=0.01)
+    assert main(["sense", str(path), "--ppp", "3.25", "--bits", "3", "-o", "mine"]) == 0
+    return Clip.open(path)
+
+
+def test_views_are_the_declared_functions_of_the_numbers(clip):
+    views = preview.open_source(clip.path).views
+    assert list(views) == ["sharp", "codes", "average", "flow", "depth"]
+    white = views["sharp"].scale["white"]
+    assert white == pictures.peak(np.stack([clip.sharp(t) for t in range(5)]))
+    assert np.array_equal(views["sharp"].picture(2)[..., 1], pictures.tone(clip.sharp(2), white))
+    assert np.array_equal(views["codes"].picture(2)[..., 0], np.rint(clip.stream("mine").codes(2, 3)[0] * 255.0 / 7))
+    assert views["flow"].picture(1)[3, 3].tolist() == [255, 0, 0], "to the right at full speed"
+    assert "2 px/frame" in views["flow"].declared
+    assert views["depth"].picture(1)[-1].max() == 0
+    assert f"white = {white:.4g} relative" in views["sharp"].declared
+
+
+def test_average_is_of_the_frames_around(clip):
+    view = preview.open_source(clip.path).views["average"]
+    mean = clip.stream("mine").codes().mean(axis=0) / 7  # five frames: every window of eleven holds all of them
+    assert np.array_equal(view.picture(0)[..., 0], pictures.tone(mean, view.scale["white"]))
+
+
+def test_png_holds_picture_legend_and_declaration(clip, tmp_path, capsys):
+    target = tmp_path / "new" / "a.png"
+    assert (
+        main(["preview", str(clip.path), "-o", str(target), "--frame", "1", "--what", "sharp,flow", "--scale", "3"])
+        == 0
+    )
+    out = capsys.readouterr().out
+    assert "frame 1 of odd" in out
+    assert "curve (value / white)^(1/2.2)" in out
+    image = Image.open(target)
+    pixels = np.asarray(image)
+    assert pixels.shape[0] % 2 == pixels.shape[1] % 2 == 0
+    views = preview.open_source(clip.path).views
+    assert np.array_equal(pixels[: 8 * 3 : 3, : 11 * 3 : 3], views["sharp"].picture(1))
+    below = pixels[24:].reshape(-1, 3)
+    wheel = [[255, 0, 0], [0, 255, 255]]  # the ends of the legend's horizontal
+    assert all((np.abs(below.astype(int) - colour).max(axis=1) < 40).any() for colour in wheel)
+    declared = json.loads(image.text["Description"])
+    sidecar = json.loads(target.with_name("a.png.json").read_text())
+    assert declared["views"] == sidecar["views"]
+    assert sidecar["frames"] == [1, 2]
+
+
+def test_gif_and_mp4_have_every_frame(clip, tmp_path):
+    import av
+
+    for name in ("a.gif", "a.mp4"):
+        assert main(["preview", str(clip.path), "-o", str(tmp_path / name), "--fps", "10"]) == 0
+    with Image.open(tmp_path / "a.gif") as gif:
+        assert gif.n_frames == 5
+        assert gif.info["duration"] == 100
+        assert gif.info["loop"] == 0
+    with av.open(str(tmp_path / "a.mp4")) as film:
+        decoded = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    assert len(decoded) == 5
+    page = preview.sheet(preview.choose(preview.open_source(clip.path), None))
+    for t, frame in enumerate(decoded):
+        assert np.abs(frame.astype(int) - page.frame(t)).mean() < 6, "lossy, but this frame"
+
+
+def test_legends_follow_their_pictures():
+    bar = pictures.depth_legend(2, 50)
+    assert np.array_equal(bar[0, 0], pictures.depth_colours(np.array([[1.0]]), 1.0, 9.0)[0, 0])
+    assert np.array_equal(bar[0, -1], pictures.depth_colours(np.array([[9.0]]), 1.0, 9.0)[0, 0])
+
+
+def test_restored_video_says_what_it_is(tmp_path):
+    np.save(tmp_path / "video.npy", np.full((3, 4, 5), 6.5, np.float32))
+    described = {"format": "quiver-restored-1", "method": "moment", "unit": "photons", "frame_rate": 2000.0}
+    (tmp_path / "video.json").write_text(json.dumps(described))
+    view = preview.open_source(tmp_path / "video.npy").views["values"]
+    assert view.declared.startswith("restored by moment: white = 6.5 photons")
+    assert (view.picture(0) == 255).all()
+
+
+def test_packed_planes_are_unpacked(tmp_path):
+    planes = np.random.default_rng(0).integers(0, 2, (3, 4, 13)).astype(np.uint8)
+    np.save(tmp_path / "cube.npy", packing.pack(planes, 1))
+    view = preview.open_source(tmp_path / "cube.npy", width=13).views["codes"]
+    assert np.array_equal(view.picture(2)[..., 0], planes[2] * 255)
+
+
+def test_a_clip_senses_nothing_and_shows_its_light(tmp_path):
+    clip = write_clip(tmp_path / "plain", frames=3)
+    assert list(preview.open_source(clip.path).views) == ["sharp"]
+
+
+def test_half_blocks_carry_both_pixels():
+    picture = np.arange(3 * 2 * 3, dtype=np.uint8).reshape(3, 2, 3)
+    lines = terminal.blocks(picture).split("\n")
+    assert len(lines) == 2
+    assert lines[0].startswith("\x1b[38;2;0;1;2m\x1b[48;2;6;7;8m▀")
+    assert "\x1b[49m" in lines[1], "an odd last row has nothing below"
+
+
+def test_shades_go_from_dark_to_light():
+    ramp = np.repeat(np.linspace(0, 255, 10).astype(np.uint8)[None, :, None], 3, axis=2)
+    assert terminal.shades(ramp) == terminal.SHADES
+
+
+def test_fit_keeps_the_shape_and_never_enlarges():
+    picture = np.zeros((60, 80, 3), np.uint8)
+    assert terminal.fit(picture, 40, 100).shape == (30, 40, 3)
+    assert terminal.fit(picture, 100, 15).shape == (30, 40, 3)
+    assert terminal.fit(picture, 100, 100) is picture
+
+
+def _in_a_terminal(*words: object, **environment: str) -> str:
+    """What a command prints where its output is a terminal of 30 columns."""
+    master, slave = pty.openpty()
+    env = {**os.environ, "COLUMNS": "30", "LINES": "20", **environment}
+    command = [sys.executable, "-m", "qsim", *map(str, words)]
+    done = subprocess.Popen(command, stdout=slave, stderr=slave, env=env, cwd=Path(__file__).parents[3])
+    os.close(slave)
+    found = b""
+    while True:
+        try:
+            found += (chunk := os.read(master, 65536))
+        except OSError:  # the other end is closed
+            break
+        if not chunk:
+            break
+    os.close(master)
+    assert done.wait(timeout=60) == 0, found
+    return found.decode()
+
+
+def test_a_terminal_gets_colour_and_every_frame_played(clip):
+    shown = _in_a_terminal("preview", clip.path, "--what", "flow", "--play", "--fps", "200", NO_COLOR="")
+    assert "\x1b[38;2;255;0;0m" in shown
+    assert shown.count("\x1b[5A") == 4, "four rows of characters, five frames: back up four times"
+    assert "frame 4 of odd, flow to the next frame" in shown
+
+
+def test_no_colour_where_it_is_not_wanted(clip, capsys):
+    assert "\x1b[38" not in _in_a_terminal("preview", clip.path, NO_COLOR="1")
+    assert main(["preview", str(clip.path)]) == 0
+    assert "\x1b" not in capsys.readouterr().out
+
+
+def test_json_declares_without_drawing(clip, capsys):
+    assert main(["preview", str(clip.path), "--json", "--what", "depth"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["views"][0]["what"] == "depth"
+    assert found["views"][0]["far"] == pytest.approx(3.5714, abs=0.1)
+    assert found["frames"] == [2, 3]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("{clip} -o a.webm", "a.webm: a preview is a .mp4, .gif, .png file, as in -o a.mp4"),
+        ("{clip} --frame 5", "--frame 5: odd has frames 0..4"),
+        ("{clip} --what radiance", "odd: has no 'radiance' to show; there are: sharp, codes, average, flow, depth"),
+        ("{clip} --what sharpp", "unknown picture 'sharpp'; there are: sharp, radiance"),
+        ("{clip} --fps 0", "--fps: expected frames per second between 0 and 1000, got 0"),
+        ("{clip} --scale 0", "--scale: expected a whole factor of 1 to 64, got 0"),
+        ("{clip} --stream other", "no stream 'other'; there are: mine"),
+        ("codes.npy", "codes.npy: whole numbers are codes or packed planes; say --bits 3, or --width 320"),
+        ("codes.npy --bits 2", "value 5 at (t, y, x) = (0, 1, 1) is no 2-bit code"),
+        ("codes.npy --bits 17", "--bits: expected 1 to 16, got 17"),
+        ("codes.npy --width 99", "holds no packed planes of 99 columns; a row of those is 13 bytes of uint8"),
+        ("four.npy", "four.npy: expected frames [T, H, W], found an array of shape [1, 2, 3, 4]"),
+        ("words.txt", "words.txt: expected a clip folder, a stream or a .npy array; `qsim convert` reads other files"),
+        ("none", "none: no such clip"),
+    ],
+)
+def test_mistakes_are_one_line(clip, tmp_path, monkeypatch, capsys, words, message):
+    monkeypatch.chdir(tmp_path)
+    np.save("codes.npy", np.full((2, 4, 5), 5, np.uint8) * (np.arange(20).reshape(4, 5) == 6))
+    np.save("four.npy", np.zeros((1, 2, 3, 4)))
+    Path("words.txt").write_text("words")
+    before = sorted(tmp_path.iterdir())
+    assert main(["preview", *words.format(clip=clip.path).split()]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+    assert sorted(tmp_path.iterdir()) == before

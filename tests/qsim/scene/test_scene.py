@@ -1,0 +1,155 @@
+"""Scene records: what makes no sense is refused with one clear line; cameras project as drawn."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from qsim.scene.motion import Spin, Translation
+from qsim.scene.scene import (
+    Body,
+    Camera,
+    Constant,
+    Diffuse,
+    EnvironmentImage,
+    Glow,
+    Mesh,
+    PointLight,
+    Scene,
+    SunSky,
+    Texture,
+    describe,
+)
+
+TRIANGLE = Mesh(np.eye(3), np.array([[0, 1, 2]]))
+CAMERA = Camera(focal_length=8e-3, f_number=2.8, pixel_pitch=1e-5, height=7, width=10)
+
+
+LIGHT, BODY = Constant(1.0), Body("a", TRIANGLE)
+
+
+def scene(lights=(LIGHT,), bodies=(BODY,)) -> Scene:
+    return Scene("s", 0, CAMERA, tuple(lights), tuple(bodies))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pixel_pitch": 1.1}, r"pixel_pitch is in metres, got 1.1; a 1.1 um pixel is 1.1e-6"),
+        ({"focal_length": -1.0}, "focal_length is in metres"),
+        ({"wavelength": 550.0}, "550 nm is 550e-9"),
+        ({"f_number": 0.1}, "f_number"),
+        ({"transmission": 1.5}, "Camera.transmission is a share"),
+        ({"height": 0}, "Camera.height: expected a positive whole number"),
+        ({"target": (0.0, 9.0, 5.0)}, "give no orientation"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(changes, message):
+    values = {"focal_length": 8e-3, "f_number": 2.8, "pixel_pitch": 1e-6, "height": 4, "width": 4}
+    with pytest.raises(ValueError, match=message):
+        Camera(**(values | changes))
+
+
+def test_a_mesh_with_nan_names_the_vertex():
+    vertices = np.eye(3)
+    vertices[1, 2] = np.nan
+    with pytest.raises(ValueError, match=r"Mesh.vertices: nan at index \(1, 2\)"):
+        Mesh(vertices, np.array([[0, 1, 2]]))
+
+
+@pytest.mark.parametrize("faces", [np.zeros((0, 3), int), np.array([[0, 1, 3]]), np.array([[0, 1]])])
+def test_faces_must_be_triangles_of_the_mesh(faces):
+    with pytest.raises(ValueError, match="Mesh"):
+        Mesh(np.eye(3), faces)
+
+
+def test_a_scene_without_light_is_refused_and_a_glowing_body_is_light():
+    for lights in ((), (Constant(0.0),), (PointLight((0, 1, 0), 0.0),), (SunSky(sun_irradiance=0, sky_irradiance=0),)):
+        with pytest.raises(ValueError, match="no light and no glowing body"):
+            scene(lights)
+    assert scene((), (Body("lamp", TRIANGLE, Glow(1.0)),)).emits()
+
+
+def test_only_one_light_may_surround_the_scene():
+    with pytest.raises(ValueError, match="Constant and SunSky"):
+        scene((Constant(1.0), SunSky()))
+
+
+def test_two_bodies_of_one_name_are_refused():
+    with pytest.raises(ValueError, match="'a' more than once"):
+        scene(bodies=(Body("a", TRIANGLE), Body("a", TRIANGLE)))
+
+
+@dataclass(frozen=True)
+class Lost:
+    def pose(self, t):
+        return np.full((4, 4), np.nan)
+
+    def velocity(self, t):
+        return np.zeros(3), np.zeros(3)
+
+
+def test_a_motion_without_a_pose_names_the_body():
+    with pytest.raises(ValueError, match="scene s, body a: motion"):
+        scene(bodies=(Body("a", TRIANGLE, motion=Lost()),))
+
+
+def test_the_optical_axis_meets_the_middle_and_axes_point_right_and_down():
+    pixels, depth = CAMERA.project(np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]]))
+    np.testing.assert_allclose(pixels[0], (5, 3.5), atol=1e-12)
+    np.testing.assert_allclose(depth, 5)
+    assert pixels[1, 0] > 5  # +x is to the right for a camera on +z
+    assert pixels[2, 1] < 3.5  # +y is up, rows count down
+
+
+def test_projecting_the_pixel_rays_gives_the_pixel_centres():
+    camera = Camera(8e-3, 2.8, 1e-5, 7, 10, motion=Spin(axis=(0, 1, 0), rate=3.0), origin=(1, 2, 3), target=(0, 0.5, 0))
+    t = 0.123
+    pose = camera.pose(t)
+    points = pose[:3, 3] + 2.5 * camera.directions() @ pose[:3, :3].T
+    pixels, depth = camera.project(points, t)
+    y, x = np.mgrid[:7, :10] + 0.5
+    np.testing.assert_allclose(pixels, np.stack([x, y], -1), atol=1e-10)
+    np.testing.assert_allclose(depth, 2.5)
+
+
+def test_resizing_keeps_the_view_pitch_and_f_number():
+    small = CAMERA.resized(14, 20)
+    assert (small.pixel_pitch, small.f_number) == (CAMERA.pixel_pitch, CAMERA.f_number)
+    here, there = (camera.project(np.array([0.003, 0.002, 0]))[0] for camera in (CAMERA, small))
+    np.testing.assert_allclose(there, 2 * here)
+
+
+def test_off_axis_cosines_of_a_wide_view():
+    wide = Camera(focal_length=1e-4, f_number=2, pixel_pitch=1e-4, height=1, width=3)
+    np.testing.assert_allclose(wide.cosines(), [[2**-0.5, 1, 2**-0.5]])
+
+
+def test_provenance_is_json_and_tells_textures_apart():
+    bodies = [Body("a", TRIANGLE, Diffuse(Texture(np.full((5, 5), v))), Translation((1, 0, 0))) for v in (0.1, 0.2)]
+    texts = [json.dumps(scene(bodies=(body,)).to_dict()) for body in bodies]
+    assert texts[0] != texts[1]
+    assert describe(np.float32(2)) == 2.0
+
+
+def test_texture_files_become_linear_light(tmp_path):
+    from PIL import Image
+
+    path = tmp_path / "grey.png"
+    Image.fromarray(np.full((2, 3), 188, np.uint8)).save(path)
+    pixels = Texture(str(path)).pixels()
+    assert pixels.shape == (2, 3)
+    np.testing.assert_allclose(pixels, ((188 / 255 + 0.055) / 1.055) ** 2.4, rtol=1e-5)  # about a half
+    with pytest.raises(FileNotFoundError, match="nothing"):
+        Texture(str(tmp_path / "nothing.png")).pixels()
+    path.write_bytes(b"text")
+    with pytest.raises(ValueError, match="not a readable image"):
+        Texture(str(path)).pixels()
+
+
+def test_an_environment_of_darkness_is_no_light():
+    with pytest.raises(ValueError, match="no light"):
+        scene((EnvironmentImage(np.zeros((4, 8))),))

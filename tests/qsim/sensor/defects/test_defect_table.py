@@ -1,0 +1,196 @@
+"""Tables [defects], from files to streams: strict, off at zero, drawn like `defects` and `events`, replayed."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clips import write_clip
+
+from qsim.cli import program
+from qsim.clip.stream import Sensing, prepare, replay, sense
+from qsim.keys import Key, hash_name
+from qsim.optics import radiometry
+from qsim.sensor import devices, packing
+from qsim.sensor.defects import defect_table, event_simulation, fixed_pattern
+from qsim.sensor.spad import CountingSPAD
+
+BINARY = '[sensor]\nmodel = "BinarySPAD"\npde = 0.5\ndark_count_rate = 200.0\nbits = 1\n'
+COUNTING = '[sensor]\nmodel = "CountingSPAD"\npde = 0.5\ndark_count_rate = 10.0\ndead_time = 5e-5\nbits = 3\n'
+QUANTA = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 1.6\nread_noise = 0.2\nbits = 3\n'
+
+
+def device(tmp_path: Path, sensor: str, table: str | None = None) -> str:
+    path = tmp_path / "mine.toml"
+    path.write_text(sensor + ("" if table is None else f"[defects]\n{table}\n"))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    return write_clip(tmp_path_factory.mktemp("clips") / "moving", frames=6, height=10, width=13)
+
+
+def drawn(clip, sensor: str, **settings):
+    return sense(clip, Sensing(sensor, ppp=2.0, name="test", **settings), force=True)
+
+
+@pytest.mark.parametrize("sensor", [BINARY, COUNTING, QUANTA])
+@pytest.mark.parametrize("table", [None, "", "device_seed = 9", "prnu = 0.0\ndead = 0\ncrosstalk = 0.0"])
+def test_what_is_off_changes_no_bit_and_is_not_mentioned(clip, tmp_path, sensor, table):
+    plain = drawn(clip, device(tmp_path, sensor))[0].codes()
+    stream, _ = drawn(clip, device(tmp_path, sensor, table))
+    np.testing.assert_array_equal(stream.codes(), plain)
+    assert "defects" not in stream.meta
+
+
+def test_a_stream_holds_the_codes_that_the_device_draws(clip, tmp_path):
+    """Maps, dead pixels and crosstalk: as `defects.sample`, in one block or in many, and drawn again alone."""
+    table = "device_seed = 4\nprnu = 0.2\ndark = { spread = 0.3, hot_share = 0.1 }\ndead = 0.1\ncrosstalk = 0.05"
+    sensor = device(tmp_path, BINARY, table)
+    stream, _ = drawn(clip, sensor)
+    found = fixed_pattern.Defects(4, 0.2, fixed_pattern.DarkSpread(spread=0.3, hot_share=0.1), 0.1)
+    light = np.stack([radiometry.clip_photons(clip, t, stream.photons_factor) for t in range(6)])
+    expected = fixed_pattern.sample(
+        devices.load(sensor),
+        light,
+        clip.exposure,
+        key=Key(0, hash_name(clip.name)),
+        maps=fixed_pattern.draw_maps(found, (10, 13)),
+        crosstalk=0.05,
+    )
+    np.testing.assert_array_equal(stream.codes(), expected)
+    assert (expected != devices.load(sensor).sample(light, clip.exposure, key=Key(0, hash_name(clip.name)))).any()
+    for frame in (0, 3):
+        np.testing.assert_array_equal(*replay(clip, stream, frame))
+
+
+def test_afterpulses_go_on_from_block_to_block_and_replay(clip, tmp_path):
+    sensor = device(tmp_path, BINARY, "afterpulse = 0.5")
+    stream, _ = drawn(clip, sensor)
+    draw = prepare(clip, Sensing(sensor, ppp=2.0))
+    for step in (1, 2, 6):
+        np.testing.assert_array_equal(np.concatenate(list(draw.blocks(clip, 0, 6, step))), stream.codes())
+    assert (stream.codes() != drawn(clip, device(tmp_path, BINARY))[0].codes()).any()
+    device(tmp_path, BINARY, "afterpulse = 0.5")
+    stream, _ = drawn(clip, sensor)
+    np.testing.assert_array_equal(*replay(clip, stream, 5))
+
+
+def test_planes_of_a_sum_are_disturbed_one_by_one(clip, tmp_path):
+    sensor = device(tmp_path, BINARY.replace("bits = 1", "bits = 2"), "afterpulse = 0.3\nprnu = 0.1")
+    stream, _ = drawn(clip, sensor, bits=2, group=True)
+    planes = prepare(clip, Sensing(device(tmp_path, BINARY, "afterpulse = 0.3\nprnu = 0.1"), ppp=2.0 / 3))
+    np.testing.assert_array_equal(stream.codes(), planes.frames(clip, 0, 6).reshape(2, 3, 10, 13).sum(axis=1))
+
+
+def test_measured_maps_are_used_checked_and_replayed(clip, tmp_path):
+    """A dark map [1/s] larger than the frame: its mean is the sensor's rate; a hot pixel fires; a change is noticed."""
+    rates = np.full((12, 20), 10.0)
+    rates[2, 3] = 1e7
+    bad = np.zeros((12, 20), bool)
+    bad[5, 6] = True
+    np.save(tmp_path / "dark.npy", rates)
+    np.save(tmp_path / "bad.npy", bad)
+    stream, _ = drawn(clip, device(tmp_path, BINARY, 'dark_map = "dark.npy"\ndead_map = "bad.npy"'))
+    assert stream.codes()[:, 2, 3].all()
+    assert not stream.codes()[:, 5, 6].any()
+    assert stream.sensor.dark_rate == pytest.approx(rates.mean())
+    np.testing.assert_array_equal(*replay(clip, stream, 2))
+    np.save(tmp_path / "dark.npy", rates + 1)
+    with pytest.raises(ValueError, match="has changed since the stream was drawn"):
+        replay(clip, stream, 2)
+    np.save(tmp_path / "dark.npy", rates[:3])
+    with pytest.raises(ValueError, match="the dark_map has 3 x 20 pixels, the frames 10 x 13"):
+        drawn(clip, device(tmp_path, BINARY, 'dark_map = "dark.npy"'))
+
+
+def test_light_that_changes_inside_an_exposure_is_followed_photon_by_photon(tmp_path):
+    """Slices of one exposure: the codes of `events.sample`; the effect is said; one frame is drawn again alone."""
+    radiance = np.full((6, 4, 5), 0.01)
+    radiance[::3] = 1.0
+    clip = write_clip(tmp_path / "flash", radiance=radiance)
+    sensor = device(tmp_path, COUNTING.replace("5e-5", "3e-4"), "carry_dead_time = true")
+    stream, line = drawn(clip, sensor, slices=3)
+    assert len(stream) == 2
+    assert stream.exposure == pytest.approx(3 * clip.exposure)
+    assert stream.meta["drawn_by"] == "events"
+    assert "varying flux" in line
+    assert "photon by photon" in line
+    light = np.stack([radiometry.clip_photons(clip, t, stream.photons_factor) for t in range(6)]).reshape(2, 3, 4, 5)
+    expected, found, who = event_simulation.sample(
+        devices.load(sensor),
+        light,
+        3 * clip.exposure,
+        frame_time=3 / 2000,
+        key=Key(0, hash_name("flash")),
+        memory=event_simulation.Memory(carry=True),
+    )
+    assert who == "events"
+    assert stream.meta["dead_time_effects"] == pytest.approx(vars(found))
+    np.testing.assert_array_equal(stream.codes(), expected)
+    np.testing.assert_array_equal(*replay(clip, stream, 1))
+
+
+def test_effects_below_the_tolerance_take_the_closed_form(tmp_path):
+    clip = write_clip(tmp_path / "still", radiance=np.ones((6, 4, 5)))
+    sensor = device(tmp_path, COUNTING.replace("5e-5", "1e-9"), "carry_dead_time = true")
+    stream, line = drawn(clip, sensor, slices=2)
+    assert stream.meta["drawn_by"] == "closed form"
+    assert "closed form" in line
+    light = np.stack([radiometry.clip_photons(clip, t, stream.photons_factor) for t in range(6)]).reshape(3, 2, 4, 5)
+    expected = devices.load(sensor).sample(light.sum(axis=1), 2 * clip.exposure, key=Key(0, hash_name("still")))
+    np.testing.assert_array_equal(stream.codes(), expected)
+
+
+def test_dead_pixels_of_counters_stay_dead_when_followed(tmp_path):
+    clip = write_clip(tmp_path / "lit", radiance=np.ones((3, 4, 5)))
+    maps = fixed_pattern.Maps(dead=np.arange(20).reshape(4, 5) % 2 == 0)
+    sensor = CountingSPAD(0.5, 10.0, 1e-4, 3)
+    flawed = defect_table.Flawed(sensor, maps, defect_table.Flaws(carry_dead_time=True))
+    counts = defect_table.follow(
+        flawed, lambda t, y, rows: np.full((1, rows, 5), 20.0), (3, 4, 5), 5e-4, 5e-4, Key(0, 0)
+    )
+    assert not counts[:, maps.dead].any()
+    assert counts[:, ~maps.dead].all()
+    assert len(clip) == 3
+
+
+@pytest.mark.parametrize(
+    ("sensor", "table", "message"),
+    [
+        (BINARY, "prnuu = 0.1", "unknown key 'prnuu' (did you mean 'prnu'?)"),
+        (BINARY, "prnu = -1", "Defects.prnu is a number"),
+        (BINARY, "crosstalk = 1.0", "crosstalk is a probability below 1, got 1.0"),
+        (BINARY, 'dark_map = "none.npy"', "none.npy: no such file"),
+        (BINARY, "dark = { spreed = 1.0 }", "unknown key 'spreed' of dark"),
+        (BINARY, "offset = 1.0", "a BinarySPAD has no read-out"),
+        (BINARY, "carry_dead_time = true", "are for a CountingSPAD, this is a BinarySPAD"),
+        (BINARY, "carry_dead_time = 1", "carry_dead_time is true or false, got 1"),
+        (QUANTA, "crosstalk = 0.1", "a QIS has no avalanches"),
+        (COUNTING, "afterpulse = 0.1", "needs afterpulse_delay in seconds"),
+        (COUNTING, 'prnu = 0.1\ngain_map = "x.npy"', "prnu and gain_map say the same thing twice"),
+    ],
+)
+def test_mistakes_are_named(clip, tmp_path, sensor, table, message):
+    with pytest.raises((ValueError, OSError), match=re.escape(message)):
+        drawn(clip, device(tmp_path, sensor, table))
+
+
+def test_the_command_takes_defects_for_any_sensor(clip, tmp_path, capsys):
+    table = tmp_path / "bad.toml"
+    table.write_text("[defects]\ndead = 0.3\n")
+    arguments = ["sense", str(clip.path), "--ppp", "3", "--bits", "3", "-o", "dead", "--defects", str(table), "--json"]
+    assert program.main(arguments) == 0
+    json.loads(capsys.readouterr().out)
+    never = ~clip.stream("dead").codes().any(axis=0)
+    assert never.mean() > 0.1
+    assert program.main(["sense", str(clip.path), "-o", "dead", "--replay", f"{clip.name}:4"]) == 0
+
+
+def test_packed_blocks_are_the_codes(clip):
+    """What is written without an unpacked detour is what `frames` draws."""
+    draw = prepare(clip, Sensing("quiver-physical", bits=3, ppp=3.25))
+    packed = np.concatenate(list(draw.packed(clip, 6)))
+    np.testing.assert_array_equal(packed, packing.pack(draw.frames(clip, 0, 6), 3))

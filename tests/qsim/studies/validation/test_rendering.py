@@ -1,0 +1,78 @@
+"""The comparison with the obvious loop: what it finds is what it claims to find."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_scenes import plate, renderer
+
+from qsim.rendering.fidelity import Budget
+from qsim.scene.motion import Spin
+from qsim.scene.scene import SunSky
+from qsim.studies.validation import rendering
+from qsim.studies.validation.rendering import Report, Row, Target
+
+ROW = Row("a/0", 40.0, 1024, 40.2, 3.0, False, 32, True, 4, 40.6, 40.1, 0.25)
+
+
+def test_the_obvious_loop_sees_the_same_scene():
+    """Its camera, film and sampler are Mitsuba's own: both means agree within their errors."""
+    views = renderer(plate(Spin((0, 0, 1), 200.0), light=SunSky()), budget=Budget(128, 16))
+    ours = views.frame(2, with_truth=False)
+    theirs = np.mean([views.obvious(2, 64) for _ in range(2)], axis=0)
+    assert theirs.shape == ours.radiance.shape
+    difference = np.sqrt(np.mean((theirs - ours.radiance) ** 2))
+    assert difference < 0.3 * ours.radiance.mean()
+    assert theirs.mean() == pytest.approx(ours.radiance.mean(), rel=0.02)
+
+
+def test_calls_of_the_obvious_loop_draw_other_samples():
+    """A large frame is rendered in several calls, whose mean is that of all their samples."""
+    views = renderer(plate(None, light=SunSky()))
+    one, other = views.obvious(2, 4), views.obvious(2, 4, 1)
+    np.testing.assert_array_equal(one, views.obvious(2, 4))
+    assert (one != other).mean() > 0.5
+
+
+def test_the_variance_of_the_reference_is_not_held_against_an_image():
+    rng = np.random.default_rng(1)
+    truth = np.ones((300, 300))
+    target = Target(truth + 0.02 * rng.standard_normal((2, 300, 300)))
+    image = truth + 0.01 * rng.standard_normal((300, 300))
+    # Without the correction the distance would be sqrt(0.01^2 + 0.02^2 / 2) and 4.8 dB worse.
+    assert target.psnr(image) == pytest.approx(20 * math.log10(target.white / 0.01), abs=0.3)
+
+
+def test_the_verdict_needs_the_median_and_no_scene_slower():
+    good = Report(8, 10, "llvm", (ROW, replace(ROW, scene="b/0")), {"a/0": 1.0})
+    assert good.median_ratio == pytest.approx(12.0)
+    assert good.ok
+    assert not replace(good, rows=(*good.rows, replace(ROW, level=30.0, seconds=4.0))).ok
+    assert not replace(good, rows=(replace(ROW, seconds=0.5),)).ok
+    assert json.loads(json.dumps(good.to_dict()))["rows"][0]["ratio"] == pytest.approx(12.0)
+    text = rendering.table(good)
+    assert "12.0 times faster" in text
+    assert "32 denoised" in text
+
+
+def test_levels_without_the_one_that_counts_are_refused():
+    with pytest.raises(ValueError, match="40 among its levels"):
+        rendering.run([plate(None)], levels=(30.0,))
+
+
+@pytest.mark.slow
+def test_a_small_run_ends_with_rows_that_reach_their_levels(tmp_path):
+    report = rendering.run(
+        [plate(Spin((0, 0, 1), 200.0), light=SunSky())], levels=(30.0, 40.0), reference_samples=1152, rounds=1
+    )
+    assert [row.level for row in report.rows] == [30.0, 40.0]
+    for row in report.rows:
+        assert row.psnr >= row.level
+        assert row.obvious_psnr >= row.level
+        assert row.stated_psnr == pytest.approx(row.psnr, abs=4)
+    rendering.figure(report, tmp_path / "speed.png")
+    assert (tmp_path / "speed.png").stat().st_size > 5000

@@ -1,0 +1,183 @@
+"""Restorers that look at one pixel at a time: naive mean, moment inverse, maximum likelihood, and their tables.
+
+Numbers "worked by hand" are computed from the sensor's definition in double precision: 3 bits, gain 3.5 / 3.25.
+"""
+
+import numpy as np
+import pytest
+from stats import critical_z
+
+from qsim.keys import Key
+from qsim.sensor.devices import quiver_paper, quiver_physical
+from qsim.sensor.qis import QIS
+from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from quiver.baselines import METHODS, likelihood, moment, naive_mean
+from quiver.baselines.response_table import response_table
+from quiver.baselines.sliding_window import look_ahead, reflect, window_frames, window_sums
+
+EXPOSURE = 5e-4
+SENSORS = {
+    "qis-3": quiver_physical(3.25),
+    "qis-1": quiver_physical(3.25, bits=1),
+    "qis-3-noisy": QIS(0.7, 3200.0, 0.6, 3, gain=0.7, offset=0.3),
+    "spad-sum": BinarySPAD(0.4, 25.0, bits=3),
+    "spad-1": BinarySPAD(0.4, 25.0, bits=1),
+    "spad-count": CountingSPAD(0.5, 100.0, dead_time=2e-5, bits=4),
+}
+LEVELS = (0.1, 0.3, 1.0, 3.25, 6.5, 9.75, 19.5, 26.0)
+
+
+def flat(sensor, photons, frames, shape=(40, 50)):
+    return sensor.sample(np.full((frames, *shape), photons), EXPOSURE, key=Key(5, 8), engine="reference")
+
+
+def estimator_moments(sensor, photons, window, restore):
+    """Exact mean and variance of an estimate that depends on the sum of a window only."""
+    top = sensor.levels - 1
+    sums = np.arange(window * top + 1)
+    frames = np.clip(sums[None] - top * np.arange(window)[:, None], 0, top)  # any codes with this sum
+    estimate = restore(frames[:, None].astype(sensor.dtype), sensor, EXPOSURE, window=window)[window // 2, 0]
+    pmf = np.ones(1)
+    for _ in range(window):
+        pmf = np.convolve(pmf, np.exp(sensor.log_pmf(np.array([photons]), EXPOSURE))[0])
+    average = float(pmf @ estimate)
+    return average, float(pmf @ (estimate - average) ** 2), estimate, pmf
+
+
+@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("photons", LEVELS)
+def test_flat_fields_have_the_mean_the_exact_distribution_predicts(name, photons):
+    """2000 windows of a flat field, disjoint in time and space; variance of their mean from the exact distribution."""
+    sensor, window = SENSORS[name], 5
+    restored = moment.restore(flat(sensor, photons, window), sensor, EXPOSURE, window=window)[window // 2]
+    expected, variance, _, _ = estimator_moments(sensor, photons, window, moment.restore)
+    sigma = np.sqrt(variance / restored.size) + 1e-6 * expected
+    assert abs(restored.mean(dtype=float) - expected) < critical_z(1e-6, len(SENSORS) * len(LEVELS)) * sigma
+
+
+@pytest.mark.parametrize("method", ["moment", "likelihood"])
+@pytest.mark.parametrize("photons", LEVELS)
+def test_a_flat_field_is_recovered_within_four_standard_errors(method, photons):
+    """100 frames of 8 pixels; variance is the Cramer-Rao bound 1/(n I), bias of order 1/n far below.
+
+    A window of 199 frames around frame 0 holds frame 0 once and all others twice, which averages like 99.75 frames.
+    At 19.5 and 26 photons (6 and 8 times the level the gain is made for) nearly all codes are the top one: light is
+    known only as a bound, and the estimate must reach it, up to the cap half a count below saturation.
+    """
+    sensor, frames, shape = quiver_physical(3.25), 100, (2, 4)
+    codes = flat(sensor, photons, frames, shape)
+    middle = METHODS[method].restore(codes, sensor, EXPOSURE, window=2 * frames - 1)[0]
+    information = float(sensor.fisher_information(np.array([photons]), EXPOSURE)[0])
+    standard_error = 1 / np.sqrt(frames * middle.size * information)
+    cap = response_table(sensor, EXPOSURE).cap(2 * frames - 1)
+    if photons < 0.6 * cap:
+        assert abs(middle.mean() - photons) < 4 * standard_error
+    else:
+        assert middle.min() > 0.6 * cap
+        assert middle.max() <= cap * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("ppp", [3.25, 9.75, 19.5, 26.0])
+def test_the_light_a_gain_is_made_for_is_recovered(ppp):
+    """With the gain rule 3.5/PPP no level saturates: mean of 11-frame windows within 4 standard errors of the light.
+
+    The moment inverse is biased by its curvature, -mu''/(2 mu'^3) V/n, which the exact distribution gives; 0.5 % of the
+    light bounds it for all four levels.
+    """
+    sensor = quiver_physical(ppp)
+    restored = moment.restore(flat(sensor, ppp, 11), sensor, EXPOSURE, window=11)[5]
+    expected, variance, _, _ = estimator_moments(sensor, ppp, 11, moment.restore)
+    assert abs(restored.mean(dtype=float) - expected) < 4 * np.sqrt(variance / restored.size)
+    assert abs(expected - ppp) < 0.005 * ppp
+
+
+def test_caps_and_dark_level_worked_by_hand():
+    table = response_table(quiver_physical(3.25), EXPOSURE)
+    np.testing.assert_allclose([table.cap(n) for n in (1, 3, 5, 11)], [10.326, 12.873, 13.969, 15.584], atol=6e-4)
+    np.testing.assert_allclose(table.mean[0], 0.010941, atol=1e-6)
+    np.testing.assert_allclose(table.invert(2.696241, 100), 3.25, rtol=1e-5)
+
+
+def test_single_codes_worked_by_hand():
+    """The most likely light for each single 3-bit code; the last one is the cap."""
+    codes = np.arange(8, dtype=np.uint8).reshape(1, 2, 4)
+    restored = likelihood.restore(codes, quiver_physical(3.25), EXPOSURE, window=1)
+    expected = [0, 1.237, 2.467, 3.677, 4.852, 5.979, 7.055, 10.326]
+    np.testing.assert_allclose(restored.ravel(), expected, atol=6e-4)
+
+
+@pytest.mark.parametrize(("factor", "bias"), [(0.5, -0.041), (1, -0.037), (2, -0.096), (4, -0.389)])
+def test_the_naive_mean_is_as_biased_as_clipping_makes_it(factor, bias):
+    """Expectation over one code, worked by hand for 3.25 photons per pixel."""
+    sensor, photons = quiver_physical(3.25), 3.25 * factor
+    estimate = naive_mean.restore(np.arange(8, dtype=np.uint8).reshape(1, 1, 8), sensor, EXPOSURE, window=1)[0, 0]
+    unclamped = np.where(estimate > 0, estimate, -naive_mean.dark_codes(sensor, EXPOSURE) * sensor.white(EXPOSURE) / 7)
+    pmf = np.exp(sensor.log_pmf(np.array([photons]), EXPOSURE))[0]
+    assert abs(pmf @ unclamped / photons - 1 - bias) < 6e-4
+
+
+@pytest.mark.parametrize(("photons", "ratio"), [(3.25, 1.017), (6.5, 1.10)])
+def test_maximum_likelihood_comes_close_to_the_bound(photons, ratio):
+    """Variance of 11-frame estimates over 1/(11 I): worked by simulation elsewhere; 7 % is 5 sigma of 10 000 pixels."""
+    sensor = quiver_physical(3.25)
+    codes = flat(sensor, photons, 11, (100, 100))
+    restored = likelihood.restore(codes, sensor, EXPOSURE)[5].astype(float)
+    bound = 1 / (11 * float(sensor.fisher_information(np.array([photons]), EXPOSURE)[0]))
+    assert abs(restored.var() / bound - ratio) < 0.07
+    assert abs(restored.mean() / photons - 1) < 0.01
+
+
+def test_many_levels_go_the_way_of_few():
+    """8 bits leave the exact outcome names; the estimate must still be that of the histogram, pixel by pixel."""
+    sensor = quiver_paper(bits=8)
+    codes = sensor.sample(np.full((3, 4, 5), 40.0), EXPOSURE, key=Key(1, 1), engine="reference")
+    restored = likelihood.restore(codes, sensor, EXPOSURE, window=3)
+    histogram = np.apply_along_axis(np.bincount, 0, codes.reshape(3, 20), minlength=256).T
+    np.testing.assert_allclose(restored[1].ravel(), sensor.maximum_likelihood(histogram, EXPOSURE).photons, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["naive", "moment", "likelihood"])
+def test_the_order_of_the_frames_in_a_window_does_not_matter(name):
+    sensor, rng = quiver_physical(3.25), np.random.default_rng(0)
+    codes = rng.integers(0, 8, (5, 8, 10), dtype=np.uint8)
+    once = METHODS[name].restore(codes, sensor, EXPOSURE, window=5)[2]
+    again = METHODS[name].restore(codes[[3, 1, 4, 0, 2]], sensor, EXPOSURE, window=5)[2]
+    np.testing.assert_array_equal(once, again)
+
+
+@pytest.mark.parametrize("window", [1, 2, 3, 4, 11])
+@pytest.mark.parametrize("length", [1, 2, 7])
+def test_running_sums_are_sums_over_reflected_windows(window, length):
+    codes = np.random.default_rng(1).integers(0, 256, (length, 8, 10), dtype=np.uint8)
+    index = np.pad(np.arange(length), 40, mode="reflect" if length > 1 else "edge")
+    for t, total in enumerate(window_sums(codes, window, 255)):
+        frames = index[40 + t - window // 2 : 40 + t + look_ahead(window) + 1]
+        np.testing.assert_array_equal(frames, window_frames(t, window, length))
+        np.testing.assert_array_equal(total, codes[frames].astype(int).sum(axis=0))
+
+
+def test_reflection_goes_on_and_on():
+    np.testing.assert_array_equal(reflect(np.arange(-5, 8), 3), [1, 0, 1, 2, 1, 0, 1, 2, 1, 0, 1, 2, 1])
+
+
+def test_wrong_codes_and_windows_are_named():
+    sensor, codes = quiver_physical(3.25), np.zeros((4, 8, 10), np.uint8)
+    codes[2, 3, 5] = 9
+    with pytest.raises(ValueError, match=r"0\.\.7 for a 3-bit sensor, found 9 at \(t, y, x\) = \(2, 3, 5\)"):
+        moment.restore(codes, sensor, EXPOSURE)
+    with pytest.raises(ValueError, match="expected integers"):
+        naive_mean.restore(codes.astype(float), sensor, EXPOSURE)
+    with pytest.raises(ValueError, match="window is a number of frames, got 0"):
+        moment.restore(codes[:1], sensor, EXPOSURE, window=0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_unit_of_the_result(method):
+    codes = flat(SENSORS["qis-3"], 3.25, 3, (17, 19))
+    run = METHODS[method].restore
+    photons = run(codes, SENSORS["qis-3"], EXPOSURE, window=3)
+    lux = run(codes, SENSORS["qis-3"], EXPOSURE, window=3, photons_per_unit=2.47)
+    assert lux.dtype == np.float32
+    assert np.allclose(lux, photons / 2.47, rtol=1e-6)
+    with pytest.raises(ValueError, match="photons_per_unit must be a finite number above 0, got 0"):
+        run(codes, SENSORS["qis-3"], EXPOSURE, window=3, photons_per_unit=0)

@@ -1,0 +1,87 @@
+"""Variance stabilisation from the exact distribution, its unbiased inverse, and Transform Denoise on top."""
+
+import numpy as np
+import pytest
+from stats import assert_mean
+
+from qsim.keys import Key
+from qsim.sensor.devices import quiver_physical
+from qsim.sensor.spad import BinarySPAD
+from quiver.baselines import moment, transform_denoise
+from quiver.baselines.vst import stabiliser, sum_pmf
+
+EXPOSURE = 5e-4
+SENSOR = quiver_physical(3.25)
+PHOTONS = np.array([0.3, 1, 2, 3.25, 5, 8])
+
+
+def deviations(kind, samples):
+    """Exact deviation of f(mean of `samples` codes) over its target 1/sqrt(samples), at PHOTONS."""
+    transform = stabiliser(SENSOR, EXPOSURE, samples, kind)
+    pmf = sum_pmf(np.exp(SENSOR.log_pmf(PHOTONS, EXPOSURE)), samples)
+    f = transform.forward(np.arange(pmf.shape[1]) / samples).astype(float)
+    return np.sqrt(pmf @ f**2 - (pmf @ f) ** 2) / transform.deviation
+
+
+@pytest.mark.parametrize(
+    ("kind", "samples", "expected"),
+    [
+        ("table", 11, [1.08, 1.02, 1.01, 1.01, 1.02, 1.05]),
+        ("table", 3, [1.05, 1.14, 1.07, 1.05, 1.09, 1.24]),
+        ("table", 1, [0.79, 1.13, 1.22, 1.27, 1.37, 1.23]),
+        ("binomial", 11, [1.02, 1.09, 1.19, 1.32, 1.48, 1.61]),
+        ("poisson", 11, [0.96, 0.99, 1.00, 1.00, 0.92, 0.63]),
+    ],
+)
+def test_deviation_after_stabilising_worked_by_hand(kind, samples, expected):
+    """Computed once from the sensor's definition, to two digits."""
+    np.testing.assert_allclose(deviations(kind, samples), expected, atol=0.012)
+
+
+def test_only_the_table_stabilises_within_three_percent():
+    """Eleven frames, from 1 to 5 photons: where few codes are 0 or saturated. The other forms miss it there."""
+    inner = slice(1, 5)
+    assert np.abs(deviations("table", 11)[inner] - 1).max() < 0.03
+    assert np.abs(deviations("binomial", 11)[inner] - 1).max() > 0.3
+    assert np.abs(deviations("poisson", 11)[inner] - 1).max() > 0.07
+
+
+@pytest.mark.parametrize("samples", [1, 3, 11])
+@pytest.mark.parametrize("sensor", [SENSOR, BinarySPAD(0.4, 25.0, 3), quiver_physical(3.25, bits=1)], ids=str)
+def test_the_inverse_is_unbiased(sensor, samples):
+    """What a perfect denoiser returns, E[f], comes back as the light; f's own inverse would not."""
+    transform = stabiliser(sensor, EXPOSURE, samples)
+    photons = np.linspace(0.02, 0.9, 7) * transform.photons[-1]
+    pmf = sum_pmf(np.exp(sensor.log_pmf(photons, EXPOSURE)), samples)
+    expected = pmf @ transform.forward(np.arange(pmf.shape[1]) / samples)
+    np.testing.assert_allclose(transform.inverse(expected), photons, rtol=2e-4)
+    algebraic = np.interp(expected, transform.stabilised, transform.mean_code)
+    assert np.abs(algebraic - sensor.mean(photons, EXPOSURE)).max() > 1e-3
+
+
+def test_sums_of_codes_by_both_ways_agree():
+    """Direct convolution below 512 values, Fourier above; 8 bits and 3 frames take the second."""
+    pmf = np.random.default_rng(0).dirichlet(np.ones(256), 2)
+    direct = [np.convolve(np.convolve(p, p), p) for p in pmf]
+    np.testing.assert_allclose(sum_pmf(pmf, 3), direct, atol=1e-15)
+    few = pmf[:, :8] / pmf[:, :8].sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(sum_pmf(few, 2), [np.convolve(p, p) for p in few], atol=1e-15)
+
+
+@pytest.mark.parametrize("photons", [1.0, 3.25, 5.0])
+def test_a_flat_field_denoises_to_its_light(photons):
+    """The residual noise of a denoised flat field is low-pass: errors of the mean are those of the undenoised mean.
+
+    Two more sources: shrinkage of f towards block means costs nothing on average, and D is exact. 1 % covers them.
+    """
+    codes = SENSOR.sample(np.full((3, 48, 56), photons), EXPOSURE, key=Key(2, 2), engine="reference")
+    restored = transform_denoise.restore(codes, SENSOR, EXPOSURE)
+    raw = moment.restore(codes, SENSOR, EXPOSURE, window=3)
+    assert restored.std() < 0.4 * raw.std()
+    information = float(SENSOR.fisher_information(np.array([photons]), EXPOSURE)[0])
+    assert_mean(restored[1], photons, 1.3 / (3 * information) + restored[1].size * (0.01 * photons / 4.9) ** 2)
+
+
+def test_stabilisers_have_names():
+    with pytest.raises(ValueError, match="table, binomial or poisson, got 'anscombe'"):
+        stabiliser(SENSOR, EXPOSURE, 3, "anscombe")

@@ -1,0 +1,280 @@
+"""The command line as a person meets it: the whole chain, examples in the help, one clear line for every mistake."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from quiver.cli.options import size
+from quiver.cli.program import main
+from quiver.data.codes import open_clips
+
+ROOT = Path(__file__).parents[3]
+COMMANDS = ("train", "restore", "evaluate", "domain", "ablate", "bench", "convert-weights")
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
+    code = main([str(word) for word in words])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def mistake(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """The one line that a mistake gets, with exit code 2."""
+    code, out, err = run(capsys, *words)
+    assert code == 2
+    assert out == ""
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+    return err
+
+
+@pytest.fixture
+def clip(tiny_dataset: Path) -> Path:
+    return open_clips(tiny_dataset, "test")[0].path
+
+
+def train_words(data: Path, out: Path) -> list[object]:
+    small = ["--crop", 16, "--batch", 1, "--preset", "unet", "--protocol", "control", "--validate-every", 2]
+    return ["train", data, "-o", out, "--steps", 2, *small]
+
+
+def test_the_whole_chain(capsys, tiny_dataset, clip, tmp_path):
+    """Train, go on, restore with the run, evaluate it beside a classical method."""
+    run_folder, video = tmp_path / "run", tmp_path / "video.npy"
+    code, out, _ = run(capsys, *train_words(tiny_dataset, run_folder), "--json")
+    found = json.loads(out)
+    assert (code, found["steps"]) == (0, 2)
+    assert (run_folder / "curve.png").read_bytes().startswith(b"\x89PNG")
+    code, again, _ = run(capsys, *train_words(tiny_dataset, run_folder), "--json")
+    assert json.loads(again)["last_validation"] == found["last_validation"]
+
+    code, out, _ = run(capsys, "restore", clip, "-o", video, "--method", run_folder, "--ppp", 3.25, "--json")
+    assert code == 0
+    assert np.load(video).shape == tuple(json.loads(out)["shape"]) == (14, 36, 44)
+
+    methods = f"moment:1,{run_folder}"
+    code, out, _ = run(
+        capsys, "evaluate", tiny_dataset, "-o", tmp_path / "table", "--methods", methods, "--ppp", "3.25,26"
+    )
+    assert code == 0
+    assert "| run | 11 (5) | 26 PPP, 3 bit |" in out
+    assert (tmp_path / "table/evaluation.md").read_text() in out + "\n"
+
+
+def test_static_photons(capsys):
+    counts = ROOT / "tests" / "data" / "hazelnut_gates6.npz"
+    code, out, _ = run(capsys, "evaluate", "--static", counts, "--methods", "naive,moment", "--splits", 1, "--json")
+    assert code == 0
+    assert [score["method"] for score in json.loads(out)["scores"]] == ["naive", "moment"]
+
+
+def test_a_stored_stream_by_clip_by_name_and_by_file(capsys, make_clip, tmp_path):
+    from qsim.clip.stream import Sensing, sense
+
+    clip = make_clip()
+    sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25, name="mine"))
+    ways = ([clip.path], [clip.path, "--stream", "mine"], [clip.path / "streams/mine.npy"], [clip.path, "--ppp", 3.25])
+    results = []
+    for i, way in enumerate(ways):
+        path = tmp_path / f"{i}.npy"
+        assert run(capsys, "restore", *way, "-o", path, "--method", "moment")[0] == 0
+        results.append(np.load(path))
+    assert all(np.array_equal(results[0], result) for result in results[1:])
+
+
+def test_a_photon_cube(capsys, tmp_path):
+    planes = np.random.default_rng(0).integers(0, 2, (70, 6, 13), dtype=np.uint8)
+    np.save(tmp_path / "cube.npy", np.packbits(planes, axis=2))
+    words = ["--width", 13, "--planes", 7, "--sensor", "spad-320x240", "--frame-rate", 1428, "--method", "moment"]
+    code, out, _ = run(capsys, "restore", tmp_path / "cube.npy", "-o", tmp_path / "v.npy", *words, "--json")
+    assert code == 0
+    assert json.loads(out)["white"] == pytest.approx(7.0)
+    assert np.load(tmp_path / "v.npy").shape == (10, 6, 13)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_shows_an_example_and_speaks_json(capsys, command):
+    code, out, _ = run(capsys, command, "--help")
+    assert code == 0
+    assert f"quiver {command}" in out.split("example:")[1]
+    assert "--json" in out
+
+
+def test_module_and_import(tmp_path):
+    """`python -m quiver` works anywhere; importing the command line loads neither torch nor the renderer."""
+    shown = subprocess.run(
+        [sys.executable, "-m", "quiver", "--help"], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert all(command in shown.stdout for command in COMMANDS)
+    code = "import quiver.cli, sys; print({'torch', 'mitsuba', 'scipy'} & set(sys.modules))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert loaded.stdout.strip() == "set()"
+
+
+def test_misspelled_words_are_suggested(capsys):
+    assert "did you mean '--method'?" in mistake(capsys, "restore", "x", "-o", "y.npy", "--metod", "moment")
+    assert "did you mean 'restore'?" in mistake(capsys, "restor", "x")
+    assert "did you mean 'published'?" in mistake(
+        capsys, "train", "x", "-o", "y", "--protocol", "publishd", "--steps", 1
+    )
+
+
+def test_missing_things_are_named(capsys, tmp_path, tiny_dataset, clip):
+    gone = tmp_path / "gone"
+    assert f"{gone}: no such file" in mistake(capsys, "restore", gone, "-o", tmp_path / "v.npy", "--method", "moment")
+    assert f"{gone}: no such data set" in mistake(capsys, "evaluate", gone, "-o", tmp_path / "t")
+    assert f"{gone}: no such data set" in mistake(capsys, "train", gone, "-o", tmp_path / "r", "--steps", 1)
+    assert "no method 'momnt' (did you mean 'moment'?)" in mistake(
+        capsys, "evaluate", tiny_dataset, "-o", gone, "--methods", "momnt"
+    )
+    assert "no such file" in mistake(capsys, "evaluate", "--static", gone)
+    assert "give a data set" in mistake(capsys, "evaluate")
+    assert "--steps or --minutes" in mistake(capsys, "train", tiny_dataset, "-o", tmp_path / "r")
+    assert "choose one of its streams" in mistake(
+        capsys, "restore", clip, "-o", tmp_path / "v.npy", "--method", "moment"
+    )
+    assert "is a data set; name one of its clips" in mistake(capsys, "restore", tiny_dataset, "-o", tmp_path / "v.npy")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--ppp", "nan"], "expected a number above 0, got 'nan'"),
+        (["--ppp", "-3"], "expected a number above 0, got '-3'"),
+        (["--bits", "0"], "expected a whole number of at least 1, got '0'"),
+        (["--memory", "lots"], "expected a size such as 2GB"),
+        (["--mode", "fast"], "fast"),
+        (["--sensor", "quiver-fysical", "--ppp", "3"], "quiver-fysical"),
+    ],
+)
+def test_impossible_values_are_named(capsys, clip, tmp_path, words, message):
+    assert message in mistake(capsys, "restore", clip, "-o", tmp_path / "v.npy", "--method", "moment", *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.zeros((0, 4, 4), np.uint8), "expected integer codes [T, H, W], none of them 0"),
+        (np.zeros((3, 0, 4), np.uint8), "expected integer codes [T, H, W], none of them 0"),
+        (np.full((3, 4, 4), np.nan), "expected integer codes"),
+        (np.full((3, 4, 4), 9, np.uint8), "code 9 at (t, y, x) = (0, 0, 0); a 3-bit sensor has 0..7"),
+    ],
+)
+def test_arrays_that_are_no_stream_are_refused(capsys, tmp_path, array, message):
+    np.save(tmp_path / "a.npy", array)
+    words = ["--sensor", "quiver-paper", "--method", "moment"]
+    assert message in mistake(capsys, "restore", tmp_path / "a.npy", "-o", tmp_path / "v.npy", *words)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.npy"]
+
+
+def test_restored_video_is_not_taken_for_a_stream(capsys, tmp_path):
+    np.save(tmp_path / "v.npy", np.ones((3, 4, 4), np.float32))
+    (tmp_path / "v.json").write_text('{"method": "moment", "seconds_per_frame": 0.1}')
+    said = mistake(capsys, "restore", tmp_path / "v.npy", "-o", tmp_path / "w.npy", "--method", "moment")
+    assert "v.npy: is restored video; name the stream" in said
+    assert not (tmp_path / "w.npy").exists()
+
+
+def test_unreadable_files_are_named(capsys, tmp_path):
+    (tmp_path / "a.npy").write_text("not an array")
+    words = ["--sensor", "quiver-paper", "--method", "moment"]
+    assert "a.npy: not readable as .npy" in mistake(
+        capsys, "restore", tmp_path / "a.npy", "-o", tmp_path / "v.npy", *words
+    )
+    (tmp_path / "w.safetensors").write_text("not weights")
+    np.save(tmp_path / "c.npy", np.zeros((3, 4, 4), np.uint8))
+    words = ["--sensor", "quiver-paper", "--method", tmp_path / "w.safetensors"]
+    assert "not a safetensors file" in mistake(capsys, "restore", tmp_path / "c.npy", "-o", tmp_path / "v.npy", *words)
+
+
+def test_nothing_is_overwritten_without_force(capsys, tmp_path, tiny_dataset, clip):
+    video = tmp_path / "v.npy"
+    video.write_text("mine")
+    words = ["restore", clip, "-o", video, "--method", "moment", "--ppp", 3.25]
+    assert "exists; name another with -o, or use --force" in mistake(capsys, *words)
+    assert video.read_text() == "mine"
+    assert run(capsys, *words, "--force")[0] == 0
+    assert np.load(video).shape == (14, 36, 44)
+    for name in ("v", "v.mp4"):
+        assert "written as .npy" in mistake(capsys, "restore", clip, "-o", tmp_path / name, "--ppp", 3.25)
+        assert not (tmp_path / name).exists()
+
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "thesis.txt").write_text("mine")
+    assert "is no training run" in mistake(capsys, *train_words(tiny_dataset, folder))
+    assert "--force removes only what this command made" in mistake(
+        capsys, *train_words(tiny_dataset, folder), "--force"
+    )
+    assert "is no evaluation" in mistake(capsys, "evaluate", tiny_dataset, "-o", folder)
+    assert "--force removes only" in mistake(capsys, "evaluate", tiny_dataset, "-o", folder, "--force")
+    assert (folder / "thesis.txt").read_text() == "mine"
+
+
+def test_force_starts_a_run_and_a_table_anew(capsys, tmp_path, tiny_dataset):
+    assert run(capsys, *train_words(tiny_dataset, tmp_path / "r"))[0] == 0
+    other = [*train_words(tiny_dataset, tmp_path / "r"), "--seed", 1]
+    assert "holds a run with seed 0, now it is 1" in mistake(capsys, *other)
+    assert run(capsys, *other, "--force")[0] == 0
+    assert run(capsys, "evaluate", tiny_dataset, "-o", tmp_path / "t", "--methods", "moment")[0] == 0
+    other = ["evaluate", tiny_dataset, "-o", tmp_path / "t", "--methods", "moment", "--seed", 1]
+    assert "holds another evaluation" in mistake(capsys, *other)
+    assert run(capsys, *other, "--force")[0] == 0
+
+
+def test_a_checkpoint_that_is_none_is_refused(capsys, tmp_path):
+    (tmp_path / "a.pth").write_bytes(b"\x80\x04not a checkpoint")
+    assert "a.pth" in mistake(capsys, "convert-weights", tmp_path / "a.pth", "-o", tmp_path / "a.safetensors")
+    assert not (tmp_path / "a.safetensors").exists()
+
+
+@pytest.mark.parametrize(("text", "bytes_"), [("2GB", 2e9), ("500MB", 5e8), ("1.5GiB", 1.5 * 2**30), ("4096", 4096)])
+def test_sizes(text, bytes_):
+    assert size(text) == bytes_
+
+
+@pytest.mark.slow
+def test_the_ablation(capsys, tiny_dataset, tmp_path):
+    """Six networks of nearly one size, one table; done again at once, because everything is there."""
+    words = [
+        "ablate",
+        tiny_dataset,
+        "-o",
+        tmp_path / "a",
+        "--steps",
+        1,
+        "--crop",
+        16,
+        "--batch",
+        1,
+        "--mode",
+        "streaming",
+    ]
+    code, out, _ = run(capsys, *words)
+    assert code == 0
+    lines = out.strip().splitlines()[2:]
+    assert lines[0].startswith("| no | no | no |")
+    sizes = [int(line.split("|")[4].replace(",", "")) for line in lines]
+    assert max(sizes) < 1.05 * min(sizes)
+    assert run(capsys, *words)[1] == out
+
+
+@pytest.mark.slow
+def test_bench(capsys, tmp_path):
+    words = ["bench", "--methods", "moment,unet", "--size", "32x24", "--threads", 1, "-o", tmp_path / "b"]
+    code, out, _ = run(capsys, *words, "--json")
+    moment, unet = json.loads(out)["costs"]
+    assert code == 0
+    assert moment["psnr_matched"] > 15
+    assert unet["psnr_matched"] is None  # random weights: a cost, no score
+    assert 0.05 < unet["gmac_per_frame"] < 0.2
+    assert {path.name for path in (tmp_path / "b").iterdir()} == {"bench.json", "bench.md", "bench.png"}
+    assert "use --force" in mistake(capsys, *words)

@@ -1,0 +1,122 @@
+"""Options of training and measuring commands: each acts, or is refused in one line that leaves everything as it was."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from quiver.cli.program import main
+from quiver.evaluation.cost import checked_cases
+from quiver.training.run_folder import alone_in
+
+FAST = ("--steps", "2", "--crop", "16", "--batch", "1", "--preset", "unet", "--protocol", "control")
+
+
+def told(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """The one line of a refusal."""
+    code = main([str(word) for word in words])
+    out, err = capsys.readouterr()
+    assert (code, out, err.count("\n")) == (2, "", 1), err
+    return err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--minutes", "1", "--validate-every", "5"], "--validate-every: counts steps of a run with --steps"),
+        ([*FAST, "--threads", "0"], "argument --threads: expected a whole number of at least 1, got '0'"),
+        ([*FAST, "--threads", "9999"], "--threads 9999: this machine has"),
+        ([*FAST, "--crop", "18"], "--crop 18: this network needs a multiple of 4"),
+        ([*FAST, "--sensor", "spad-320x240,nosuch"], "unknown sensor 'nosuch'"),
+        ([*FAST, "--sensor", "nosuch.toml"], "nosuch.toml: no such sensor file"),
+        ([*FAST, "--bits", "17"], "17"),
+        ([*FAST, "--sensor", "a,,b"], "expected names with commas between them"),
+    ],
+)
+def test_what_cannot_act_is_refused(capsys, tiny_dataset, tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    assert message in told(capsys, "train", tiny_dataset, "-o", "r", *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def trained(data: Path, out: Path, *words: str) -> dict[str, torch.Tensor]:
+    torch.manual_seed(0)
+    assert main(["train", str(data), "-o", str(out), *FAST, *words, "-q"]) == 0
+    return load_file(out / "last.safetensors")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--sensor", "quiver-paper"],
+        ["--sensor", "quiver-physical,quiver-paper"],
+        ["--ppp", "1,10"],
+        ["--bits", "1"],
+        ["--bits", "1,3"],
+        *(
+            pytest.param(more, marks=pytest.mark.slow)
+            for more in (
+                ["--crop", "24"],
+                ["--frames", "12"],
+                ["--batch", "2"],
+                ["--optimiser", "muon"],
+                ["--learning-rate", "0.01"],
+                ["--loss", "published"],
+                ["--loss", "paper"],
+                ["--precision", "bfloat16"],
+                ["--seed", "1"],
+                ["--steps", "3"],
+                ["--protocol", "quick"],
+            )
+        ),
+    ],
+    ids=" ".join,
+)
+def test_an_option_changes_the_weights(tiny_dataset, tmp_path, words):
+    plain = trained(tiny_dataset, tmp_path / "a")
+    other = trained(tiny_dataset, tmp_path / "b", *words)
+    assert any(not torch.equal(plain[name], other[name]) for name in plain)
+
+
+@pytest.mark.parametrize(
+    ("methods", "more", "message"),
+    [
+        (("moment",), {"modes": ("exact",)}, "--modes: acts on networks, and moment is classical"),
+        (("moment", "naive"), {"precisions": ("float32",)}, "--precisions: acts on networks, and moment, naive"),
+        (("moment",), {"device": "cpu"}, "--device: acts on networks"),
+        (("unet",), {"modes": ("exact",)}, "--modes: unet shares no work between frames"),
+        (("nano",), {"modes": ("exat",)}, "--modes: no 'exat' (did you mean 'exact'?)"),
+        (("nano",), {"precisions": ("float16",)}, "--precisions: no 'float16' (did you mean 'bfloat16'?)"),
+        (("momnt",), {}, "no method 'momnt'"),
+        (("moment:x",), {}, "the window after the colon is a number of frames"),
+        (("none.safetensors",), {}, "none.safetensors: no such weights file"),
+    ],
+)
+def test_bench_refuses_before_it_measures(methods, more, message):
+    asked = {"modes": None, "precisions": None, "device": None} | more
+    with pytest.raises(ValueError if "safetensors" not in methods[0] else FileNotFoundError) as error:
+        checked_cases(methods, **asked)
+    assert message in str(error.value)
+
+
+def test_bench_replaces_only_with_a_folder(capsys, tmp_path):
+    assert "--force: replaces a result in -o FOLDER" in told(capsys, "bench", "--methods", "naive", "--force")
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b/bench.json").write_text(json.dumps({}))
+    said = told(capsys, "bench", "--methods", "naive", "-o", tmp_path / "b")
+    assert "exists; name another with -o, or use --force" in said
+
+
+def test_one_ablation_and_one_measurement_at_a_time(capsys, tiny_dataset, tmp_path):
+    (tmp_path / "a").mkdir()
+    with alone_in(tmp_path / "a", "works"):
+        words = ("ablate", tiny_dataset, "-o", tmp_path / "a", "--steps", 1, "--crop", 16, "--batch", 1, "-q")
+        assert f"{tmp_path / 'a'}: another process works here; wait" in told(capsys, *words)
+        words = ("bench", "--methods", "naive", "--size", "16x16", "-o", tmp_path / "a", "-q")
+        assert f"{tmp_path / 'a'}: another process measures here; wait" in told(capsys, *words)
+        assert [path.name for path in (tmp_path / "a").iterdir()] == ["lock"]
+    assert list((tmp_path / "a").iterdir()) == []

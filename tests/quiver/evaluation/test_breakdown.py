@@ -1,0 +1,66 @@
+"""Errors by motion and crops: sums that must agree, bins that must hold, the place where most moves."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from clips import ClipMaker
+
+from quiver.evaluation import breakdown, metrics, summary
+from quiver.evaluation.comparison import Plan, evaluate
+from quiver.restoration.restorers import restorer
+
+
+def test_every_pixel_counts_in_one_bin():
+    rng = np.random.default_rng(0)
+    output, target = rng.uniform(-0.2, 1.3, (2, 3, 11, 7))
+    speed = rng.uniform(0, 12, output.shape)
+    pixels, squares = breakdown.by_motion(output, target, speed)
+    assert sum(pixels) == output.size
+    assert sum(squares) == pytest.approx(((np.clip(output, 0, 1) - np.clip(target, 0, 1)) ** 2).sum())
+    assert breakdown.pooled([pixels], [squares])[3] == pytest.approx(
+        metrics.decibel(squares[3] / ((speed >= 2) & (speed < 4)).sum())
+    )
+    speed[0] = np.nan
+    assert sum(breakdown.by_motion(output, target, speed)[0]) == output.size * 2 // 3
+
+
+def test_clips_are_pooled_by_their_pixels():
+    found = breakdown.pooled([(9, 0, 0, 0, 0, 0), (1, 2, 0, 0, 0, 0)], [(0.0, 0, 0, 0, 0, 0), (1.0, 0.02, 0, 0, 0, 0)])
+    assert found[:2] == pytest.approx([10.0, 20.0])
+    assert all(math.isnan(psnr) for psnr in found[2:])
+    assert len(found) == len(breakdown.bin_names())
+
+
+def test_a_clip_with_flow_has_its_error_in_the_bin_of_its_motion(make_clip: ClipMaker, tmp_path):
+    flow = np.zeros((2, 36, 44), np.float32)
+    flow[0], flow[1] = 1.2, -0.9  # 1.5 px/frame
+    clip = make_clip(flow=flow)
+    plan = Plan(str(clip.path), split=None)
+    methods = [restorer("moment:3")]
+    rows = evaluate(plan, methods, tmp_path / "t")
+    again = evaluate(plan, methods, tmp_path / "t")
+    assert again == rows  # motion survives the file
+    line = summary.summarise(rows)[0]
+    assert rows[0].motion_pixels == (0, 0, math.prod(clip.shape), 0, 0, 0)
+    assert line.psnr_by_motion[2] == pytest.approx(line.scores["psnr_matched"].mean, abs=0.1)  # pooled or by frames
+    text = summary.markdown(plan, methods, rows)
+    assert f"| moment:3 | 3.25 PPP, 3 bit | - | - | {line.psnr_by_motion[2]:.2f} | - | - | - |" in text
+
+
+def test_crops_show_where_most_moves(make_clip: ClipMaker, tmp_path):
+    flow = np.zeros((2, 120, 150), np.float32)
+    flow[0, 90:110, 100:140] = 3.0
+    clip = make_clip(frames=3, height=120, width=150, flow=flow)
+    rows, columns = breakdown.place(clip, 1)
+    assert (rows.stop - rows.start, columns.stop - columns.start) == (96, 96)
+    assert rows.start <= 90
+    assert rows.stop >= 110
+    assert columns.start <= 100
+    assert columns.stop >= 140
+    still = make_clip("still", frames=3, height=120, width=40)
+    assert breakdown.place(still, 1) == (slice(40, 80), slice(0, 40))
+    assert not breakdown.sheet(tmp_path, "3.25 PPP", [clip.name], ["moment"], tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()

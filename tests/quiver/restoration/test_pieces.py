@@ -1,0 +1,268 @@
+"""What memory there is changes no answer: blocks of frames, exact tiles; where it must, the difference is said."""
+
+from __future__ import annotations
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from numpy import ndarray as Array
+from torch import nn
+
+from qsim.sensor.qis import QIS
+from quiver.baselines import METHODS
+from quiver.data.codes import Codes, array_codes
+from quiver.model.blocks import Hourglass
+from quiver.model.quiver import build
+from quiver.model.unet import UNet, UNetConfig
+from quiver.model.weights import load
+from quiver.restoration import pieces
+from quiver.restoration.pieces import bytes_per_pixel, frame_bytes, plan_pieces
+from quiver.restoration.restored_file import restore_to_file
+from quiver.restoration.restorers import (
+    MODES,
+    Options,
+    Restorer,
+    network_restorer,
+    restorer,
+    shipped_names,
+    weights_path,
+    wrap_network,
+)
+from quiver.restoration.tiles import cores, extents, plan_tiles, spans
+
+SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
+
+
+def moving(frames: int, height: int, width: int, seed: int = 0) -> Codes:
+    """Codes of smooth structure that moves 1.5 px per frame: paths and patches have something to follow."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, : width + 2 * frames].astype(float)
+    waves = sum(np.sin(a * x + b * y + c) for a, b, c in rng.uniform((-0.5, -0.5, 0), (0.5, 0.5, 6), (6, 3)))
+    shift = [int(1.5 * t) for t in range(frames)]
+    light = 3.25 * np.exp(0.4 * np.stack([waves[:, s : s + width] for s in shift]))
+    return array_codes(rng.poisson(light).clip(0, 7).astype(np.uint8), SENSOR, 5e-4)
+
+
+def quiet(method: Restorer, codes: Codes) -> Array:
+    """Restored without a warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return method.restore(codes)
+
+
+# Geometry
+
+
+@pytest.mark.parametrize("blend", [False, True])
+def test_tiles_cover_the_frame_within_the_bound(blend):
+    """Random frames, bounds, reaches and strides: weights sum to 1, tiles fit and start at multiples of the stride."""
+    rng = np.random.default_rng(0)
+    cut = 0
+    for _ in range(60):
+        height, width = (int(n) for n in rng.integers(1, 400, 2))
+        multiple, reach = int(rng.choice([1, 4, 8, 16])), int(rng.choice([0, 5, 32, 36]))
+        pixels = int(rng.integers(1000, 60_000))
+        if pixels < min(height, multiple + 80) * min(width, multiple + 80):
+            continue  # not even the smallest tile fits
+        tiles = plan_tiles(height, width, pixels, reach, multiple, blend=blend)
+        total = np.zeros((height, width))
+        for tile in tiles:
+            rows, columns = tile.weight.shape
+            assert rows * columns <= pixels
+            assert tile.y % multiple == tile.x % multiple == 0
+            total[tile.y : tile.y + rows, tile.x : tile.x + columns] += tile.weight
+        cut += len(tiles) > 1
+        np.testing.assert_allclose(total, 1, atol=1e-6)
+    assert cut > 20
+
+
+def test_the_cut_with_the_smallest_area_is_taken():
+    """Against all cuts tried one by one; 0.33 megapixel under 500 MB was 2 x 3 tiles of 343 px, 2.1 times the frame."""
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        height, width = (int(n) for n in rng.integers(60, 200, 2))
+        pixels = int(rng.integers(3000, height * width))
+
+        def area(tall: int, wide: int, height: int = height, width: int = width) -> tuple[int, int]:
+            rows, columns = ([b - a for a, b in extents(n, c, 16)] for n, c in ((height, tall), (width, wide)))
+            return max(rows) * max(columns), sum(rows) * sum(columns)
+
+        tried = [area(tall, wide) for tall in range(8, height + 8, 8) for wide in range(8, width + 8, 8)]
+        fitting = [whole for most, whole in tried if most <= pixels]
+        assert area(*cores(height, width, pixels, 16, 8))[1] == min(fitting)
+    tiles = plan_tiles(576, 576, 500_000_000 // 4248, 32, 16, blend=True)
+    assert sum(tile.weight.size for tile in tiles) < 1.3 * 576 * 576
+
+
+def test_a_bound_below_one_tile_is_refused():
+    with pytest.raises(ValueError, match=r"tile needs at least 80 x 80; raise --memory"):
+        plan_tiles(200, 200, 1000, 32, 16)
+
+
+@pytest.mark.parametrize("length", [1, 79, 80, 81, 100, 333])
+def test_weights_of_overlapping_spans_sum_to_one(length):
+    for blend in (False, True):
+        total = np.zeros(length)
+        for start, weight in spans(length, 24, 32, blend):
+            total[start : start + len(weight)] += weight
+        np.testing.assert_allclose(total, 1, atol=1e-6)
+
+
+def test_the_reach_of_the_hourglass_is_what_it_says():
+    """A pixel that changes: nothing farther than REACH answers, at any phase of the pooling, and something that far."""
+    hourglass, side, seen = Hourglass(3, 4).double().eval(), 120, []
+    frame = torch.rand(1, 3, side, side, dtype=torch.double)
+    for parameter in hourglass.parameters():
+        parameter.data.abs_()  # nothing cancels
+    for centre in range(58, 62):
+        other = frame.clone()
+        other[:, :, centre, centre] += 1
+        changed = (hourglass(other) - hourglass(frame))[0, 0].detach().nonzero()
+        seen.append(int((changed - centre).abs().max()))
+    assert max(seen) == Hourglass.REACH
+    assert Hourglass.REACH % Hourglass.MULTIPLE == 0
+
+
+# Networks
+
+
+def test_a_convolutional_network_does_not_see_the_tiles():
+    """The U-Net at random sizes and bounds: equal to 1e-5 of white, without a warning."""
+    model = UNet(UNetConfig(4)).eval()
+    rng, cut = np.random.default_rng(0), 0
+    for seed in range(8):
+        height, width = (int(n) for n in rng.integers(90, 200, 2))
+        memory = bytes_per_pixel(model, "exact") * int(rng.integers(9_000, 30_000))
+        codes = moving(1, height, width, seed)
+        tiled, whole = (quiet(wrap_network(model, "u", "", Options(memory=m)), codes) for m in (memory, 10**10))
+        cut += len(plan_pieces(model, height, width, memory, "exact").tiles) > 1
+        assert np.abs(tiled - whole).max() < 1e-5 * codes.white
+    assert cut > 3
+
+
+def nano_memory(model: nn.Module, height: int, width: int, mode: str, pixels: int) -> int:
+    """Bytes that hold a frame, and its hourglass with so many pixels at a time."""
+    padded = (height + -height % 8) * (width + -width % 8)
+    return frame_bytes(model, mode) * padded + 1200 * pixels
+
+
+def same_with_less_memory(name: str, mode: str, seed: int) -> None:
+    """A random size and a bound that holds the frame but not its hourglass: equal to 1e-5 of white, no warning."""
+    path, rng = weights_path(name), np.random.default_rng(seed)
+    height, width = (int(n) for n in rng.integers(89, 116, 2))
+    codes, network = moving(2, height, width, seed), load(path).eval()
+    memory = nano_memory(network, height, width, mode, int(rng.integers(7744, min(9000, height * width))))
+    cut = plan_pieces(network, height, width, memory, mode)
+    assert cut.exact
+    assert cut.hourglass is not None
+    assert cut.hourglass < height * width  # the hourglass does run in tiles
+    tiled, whole = (quiet(network_restorer(path, Options(memory=m, mode=mode)), codes) for m in (memory, 10**10))
+    assert np.abs(tiled - whole).max() < 1e-5 * codes.white
+
+
+@pytest.mark.parametrize("name", shipped_names())
+@pytest.mark.parametrize("mode", MODES)
+def test_memory_does_not_change_what_a_shipped_network_answers(name, mode, monkeypatch):
+    monkeypatch.setattr(pieces, "STARTING", 0)  # tiny frames: what torch takes at first would hold them whole
+    same_with_less_memory(name, mode, MODES.index(mode))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", shipped_names())
+@pytest.mark.parametrize("mode", MODES)
+def test_memory_does_not_change_what_a_shipped_network_answers_searched(name, mode, monkeypatch):
+    monkeypatch.setattr(pieces, "STARTING", 0)
+    for seed in range(3, 9):
+        same_with_less_memory(name, mode, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["nano", "quiver-s", "quiver", "unet"])
+def test_no_preset_changes_its_answer_unsaid(preset):
+    """Tiny frames, small bounds: equal to 1e-5 of white, or a warning that says by how much tiles differ."""
+    torch.manual_seed(1)
+    model, rng = build(preset).eval(), np.random.default_rng(0)
+    for seed in range(2):
+        height, width = (int(n) for n in rng.integers(96, 130, 2))
+        codes = moving(1, height, width, seed)
+        whole = wrap_network(model, preset, "", Options(memory=10**12)).restore(codes)
+        memory = bytes_per_pixel(model, "exact") * int(rng.integers(8000, height * width))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            tiled = wrap_network(model, preset, "", Options(memory=memory)).restore(codes)
+        apart = np.abs(tiled - whole).max() / codes.white
+        assert apart < 1e-5 or any("differ where they overlap" in str(w.message) for w in caught), apart
+
+
+def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path):
+    """QUIVER averages over the frame: tiles differ. The warning says by how much, and the file how it was cut."""
+    path, codes = weights_path("nano"), moving(1, 104, 120)
+    network = load(path).eval()
+    memory = bytes_per_pixel(network, "exact") * 9_000
+    cut = plan_pieces(network, 104, 120, memory, "exact")
+    assert not cut.exact
+    assert all(tile.y % 16 == tile.x % 16 == 0 for tile in cut.tiles)
+    method = network_restorer(path, Options(memory=memory))
+    with pytest.warns(UserWarning, match="differ where they overlap by") as caught:
+        meta = restore_to_file(codes, method, tmp_path / "r.npy")
+    text = str(caught[0].message)
+    assert cut.text in text
+    assert meta["identity"]["cut"] == cut.text
+    said = float(re.search(r"by ([0-9.e-]+) % of white rms", text)[1]) / 100  # type: ignore[index]
+    whole = quiet(network_restorer(path, Options(memory=10**10)), codes)
+    found = float(np.sqrt(np.mean((np.load(tmp_path / "r.npy") - whole) ** 2))) / codes.white
+    assert 0 < found < 10 * said
+    needed = int(re.search(r"--memory (\d+)MB restores it whole", text)[1]) * 10**6  # type: ignore[index]
+    assert plan_pieces(network, 104, 120, needed, "exact").exact
+
+
+@pytest.mark.slow
+def test_threads_do_not_change_the_answer():
+    """One and two threads of torch: equal to 1e-5 of white, by a network and by classical methods."""
+    codes, before = moving(2, 48, 56), torch.get_num_threads()
+    try:
+        for name in ("nano", "qbp-bm3d", "transform-denoise", "qbp"):
+            found = []
+            for threads in (1, 2):
+                torch.set_num_threads(threads)
+                found.append(restorer(name).restore(codes))
+            assert np.abs(found[0] - found[1]).max() < 1e-5 * codes.white, name
+    finally:
+        torch.set_num_threads(before)
+
+
+# Classical methods
+
+
+def same_in_blocks(name: str, seed: int) -> None:
+    """A random length, size, window and a bound down to a frame at a time: equal to 1e-5 of white."""
+    rng = np.random.default_rng(seed)
+    frames, height, width = int(rng.integers(4, 8)), *(int(n) for n in rng.integers(8, 24, 2))
+    codes, asked = moving(frames, height, width, seed), f"{name}:{rng.integers(1, 9)}"
+    whole, reports = restorer(asked).restore(codes), []
+    memory = (METHODS[name].bytes_per_pixel + 16 * int(rng.integers(1, 4))) * height * width
+    found = restorer(asked, Options(memory=memory)).restore(codes, progress=lambda done, total: reports.append(done))
+    assert np.abs(found - whole).max() < 1e-5 * codes.white
+    assert len(reports) > 1
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_memory_does_not_change_what_a_classical_method_answers(name):
+    same_in_blocks(name, len(name))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
+def test_memory_does_not_change_what_a_classical_method_answers_searched(name):
+    for seed in range(100, 115):
+        same_in_blocks(name, seed)
+
+
+def test_a_method_that_takes_more_than_the_bound_says_so():
+    codes = moving(3, 16, 20)
+    with pytest.warns(UserWarning, match=r"qbp takes about 0 MB for a frame of 16 x 20 px, above --memory"):
+        found = restorer("qbp", Options(memory=1000)).restore(codes)
+    np.testing.assert_array_equal(found, restorer("qbp").restore(codes))

@@ -1,0 +1,77 @@
+"""Tiny clips and data sets for tests: a pattern that slides over the frame, written through qsim's own writers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.clip.clip import PHYSICAL, RELATIVE, Clip, ClipWriter
+from qsim.dataset.generation import Options, generate
+from qsim.dataset.recipe import Job, Recipe, Settings
+from qsim.scene.scene import Camera
+
+ClipMaker = Callable[..., Clip]
+
+
+def sliding_pattern(frames: int, height: int, width: int, seed: int, speed: float = 1.5) -> Array:
+    """Radiance [T, H, W]: random waves and a disk, moving `speed` px per frame to the right."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width].astype(float)
+    waves = [(rng.uniform(0.1, 0.6), rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi)) for _ in range(4)]
+    clip = np.empty((frames, height, width))
+    for t in range(frames):
+        moved = x - speed * t
+        image = sum(np.sin(k * (moved * np.cos(a) + y * np.sin(a)) + p) for k, a, p in waves)
+        disk = (moved % width - width / 2) ** 2 + (y - height / 2) ** 2 < (height / 5) ** 2
+        clip[t] = 1.0 + 0.2 * image + 0.8 * disk
+    return np.maximum(clip, 0.05)
+
+
+def write_clip(
+    path: Path,
+    *,
+    frames: int = 14,
+    height: int = 36,
+    width: int = 44,
+    seed: int = 0,
+    relative: bool = False,
+    sharp: bool = False,
+    error: float | None = 0.01,
+    radiance: Array | None = None,
+    flow: Array | None = None,
+    **meta: object,
+) -> Clip:
+    stack = sliding_pattern(frames, height, width, seed) if radiance is None else radiance
+    described = {
+        "shape": list(stack.shape),
+        "frame_rate": 2000.0,
+        "exposure": 5e-4,
+        "radiance_unit": RELATIVE if relative else PHYSICAL,
+        "camera": None if relative else asdict(Camera(8e-3, 2.8, 1.1e-6, *stack.shape[1:])),
+        "scene": {"family": "sliding", "seed": seed},
+    }
+    with ClipWriter(path, described | meta) as writer:
+        for t, frame in enumerate(stack):
+            truth = None if flow is None else {"flow": flow, "flow_back": -flow, "valid": np.ones(frame.shape, bool)}
+            writer.add(t, frame, sharp=frame * 1.1 if sharp else None, truth=truth, error=error)
+    return Clip.open(path)
+
+
+def write_dataset(path: Path, splits: dict[str, int], **options: object) -> Path:
+    """A data set folder with so many clips per split, generated with our pattern in place of a renderer."""
+    settings = Settings(frames=14, height=36, width=44, frame_rate=2000.0)
+    jobs = tuple(
+        Job(f"{split}_{i}", f"{split}_family", i, 1.0, split, settings, 0, ())
+        for split, count in splits.items()
+        for i in range(count)
+    )
+
+    def make(job: Job, target: Path) -> object:
+        return write_clip(target, seed=job.scene_seed + 100 * len(job.split), job=job.digest, **options)
+
+    generate(Recipe("tiny", jobs, {}), path, Options(workers=0), make=make)
+    return path

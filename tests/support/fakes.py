@@ -1,0 +1,124 @@
+"""A renderer for tests of everything around the renderer: quick, deterministic, and slow or broken where asked for.
+
+Here and not in a test module, so that worker processes can import it by name.
+"""
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+from qsim.clip.clip import PHYSICAL, Clip, ClipWriter
+from qsim.dataset.job_runner import provenance
+from qsim.dataset.recipe import Job
+from qsim.scene.scene import Camera, describe
+
+RECIPE = """[recipe]
+name = "small"
+frames = 3
+height = 8
+width = 10
+frame_rate = 2000.0
+
+[[scenes]]
+family = "fan"
+seeds = [0, 1]
+
+[[scenes]]
+family = "tumble"
+seeds = [4]
+split = "test"
+frames = 2
+
+[[streams]]
+sensor = "quiver-physical"
+bits = [1, 3]
+ppp = 3.25
+"""
+
+
+def make(job: Job, path: Path) -> Clip:
+    """A clip of moving noise, a function of the job alone."""
+    settings = job.settings
+    camera = Camera(8e-3, 2.8, 1.1e-6, settings.height, settings.width)
+    meta = {
+        "shape": [settings.frames, settings.height, settings.width],
+        "frame_rate": settings.frame_rate,
+        "shutter": settings.shutter,
+        "exposure": 1 / settings.frame_rate,
+        "radiance_unit": PHYSICAL,
+        "camera": describe(camera),
+    }
+    with ClipWriter(path, meta | provenance(job)) as writer:
+        for t in range(settings.frames):
+            if not writer.has(t):
+                rng = np.random.default_rng([job.scene_seed, len(job.family), t])
+                radiance = rng.random((settings.height, settings.width))
+                truth = {"flow": rng.normal(size=(2, settings.height, settings.width))}
+                writer.add(t, radiance, truth=truth, error=1e-3)
+    return Clip.open(path)
+
+
+def make_slowly(job: Job, path: Path) -> Clip:
+    """The same clip, but the process is likely to be killed meanwhile."""
+    time.sleep(0.4)
+    return make(job, path)
+
+
+def make_once_allowed(job: Job, path: Path) -> Clip:
+    """The same clip, but not before a file `go` is in the data set's folder."""
+    end = time.monotonic() + 120
+    while not (path.parents[1] / "go").exists() and time.monotonic() < end:
+        time.sleep(0.02)
+    return make(job, path)
+
+
+def fail_on_tumble(job: Job, path: Path) -> Clip:
+    """Fails as a bad scene would."""
+    if job.family == "tumble":
+        raise ValueError("scene tumble: no light and no glowing body")
+    return make(job, path)
+
+
+def die_on_tumble(job: Job, path: Path) -> Clip:
+    """Dies as a process without memory would."""
+    if job.family == "tumble":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return make(job, path)
+
+
+def hoard_on_tumble(job: Job, path: Path) -> Clip:
+    """Takes more memory than a worker may."""
+    if job.family == "tumble":
+        hoard = np.ones(1 << 27)  # 1 GiB
+        time.sleep(20)
+        del hoard
+    return make(job, path)
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """Every file that a finished data set consists of, by name; logs and locks apart."""
+    kept = ("dataset.json", "clips", "jobs")
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.relative_to(folder).parts[0] in kept
+    }
+
+
+def make_with_pause(job: Job, path: Path) -> Clip:
+    """The same clip, but after each frame that it adds it waits for a file `go` in the data set's folder."""
+    add = ClipWriter.add
+
+    def add_and_wait(writer: ClipWriter, *args: Any, **kwargs: Any) -> None:
+        add(writer, *args, **kwargs)
+        end = time.monotonic() + 120
+        while not (path.parents[1] / "go").exists() and time.monotonic() < end:
+            time.sleep(0.02)
+
+    with mock.patch.object(ClipWriter, "add", add_and_wait):
+        return make(job, path)

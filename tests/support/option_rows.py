@@ -1,0 +1,220 @@
+"""One row for every option of every command: the option changes a result, or it is refused.
+
+A row runs a command twice in copies of one small work folder, without and with the option, and compares what was made.
+What is compared is the result itself: pixels, codes, weights, numbers. A change in a description alone is no effect.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import re
+import shlex
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import drjit
+import numpy as np
+
+Main = Callable[[list[str]], int]
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one run of a command left behind."""
+
+    code: int
+    out: str
+    err: str
+    folder: Path
+    threads: tuple[int, ...]  # that the compiled engine was set to, one after the other
+
+
+Result = Callable[[Run], Any]
+
+
+def arrays(run: Run) -> dict[str, Any]:
+    """Every array and picture in the folder, by path: numbers only, no descriptions."""
+    found: dict[str, Any] = {}
+    for path in sorted(p for p in run.folder.rglob("*") if p.is_file()):
+        name = path.relative_to(run.folder).as_posix()
+        if path.suffix == ".npy":
+            found[name] = np.load(path).tobytes()
+        elif path.suffix == ".npz":
+            with np.load(path) as archive:
+                found[name] = {key: archive[key].tobytes() for key in archive.files}
+        elif path.suffix != ".json":
+            found[name] = path.read_bytes()
+    return found
+
+
+def names(run: Run) -> set[str]:
+    """The files of the folder, by path: for options that say where a result goes."""
+    return {p.relative_to(run.folder).as_posix() for p in run.folder.rglob("*") if p.is_file()}
+
+
+def stdout(run: Run) -> str:
+    """What the command prints as its result, without times."""
+    return re.sub(r"\d+(\.\d+)? (s|ms|minutes|hours)\b", "", run.out)
+
+
+def stderr(run: Run) -> str:
+    """What the command tells a person beside the result."""
+    return run.err
+
+
+def numbers(*keys: str) -> Result:
+    """Values of the JSON object that a command prints with --json, by their keys."""
+
+    def chosen(run: Run) -> dict[str, Any]:
+        found = json.loads(run.out)
+        return {key: found[key] for key in keys}
+
+    return chosen
+
+
+def exit_code(run: Run) -> int:
+    """How the command ended: for options that turn a finding into a failure."""
+    return run.code
+
+
+def threads(run: Run) -> tuple[int, ...]:
+    """Threads that the compiled engine was set to: for an option that changes speed alone."""
+    return run.threads
+
+
+@dataclass(frozen=True)
+class Acts:
+    """With the option the result differs; both runs end with one of `codes`."""
+
+    command: str  # as typed, in a work folder that holds what `work` made; the option is appended
+    option: str  # as typed, with its value
+    result: Result = arrays
+    codes: tuple[int, ...] = (0,)  # exit codes that are no failure here
+    before: str | Callable[[Path], None] = ""  # a command, or an action on the folder, that comes first in both copies
+    after: str = ""  # a command that is run last in both copies
+    slow: bool = False
+
+
+@dataclass(frozen=True)
+class Refused:
+    """The option cannot act here: one line that holds `says`, exit code 2, and nothing changed on disk."""
+
+    command: str
+    option: str
+    says: str
+    before: str | Callable[[Path], None] = ""
+    slow: bool = False
+
+
+Row = Acts | Refused
+
+
+def loudness(lines: dict[str, str]) -> dict[tuple[str, str], list[Row]]:
+    """Rows of --quiet and --verbose of commands, each with a line of arguments that its parser takes."""
+    return {
+        (command, option): [Acts(f"{NOTE} {line}", option, stderr)]
+        for command, line in lines.items()
+        for option in ("--quiet", "--verbose")
+    }
+
+
+NOTE = "only a note:"  # before a command line: its own work is replaced by one line for people
+
+
+def parser_of(main: Main, home: Any) -> argparse.ArgumentParser:
+    """The parser that a program's `main` hands to `run` of the module `home`."""
+    got: list[argparse.ArgumentParser] = []
+    with mock.patch.object(home, "run", lambda parser, argv: got.append(parser) or 0):
+        main([])
+    return got[0]
+
+
+def options(parser: argparse.ArgumentParser, path: str) -> Iterator[tuple[str, str]]:
+    """(command, longest name) of every option of a program, but --help."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, command in action.choices.items():
+                yield from options(command, f"{path} {name}".strip())
+        elif action.option_strings and action.dest != "help":
+            yield path, action.option_strings[-1]
+
+
+def names_of(parser: argparse.ArgumentParser, command: str, option: str) -> set[str]:
+    """Every spelling of an option of a command."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction) and command:
+            name, _, rest = command.partition(" ")
+            return names_of(action.choices[name], rest, option)
+    return next(set(a.option_strings) for a in parser._actions if option in a.option_strings)
+
+
+def execute(main: Main, line: str, folder: Path, capsys: Any, monkeypatch: Any) -> Run:
+    """Run a command line in a folder, in this process."""
+    monkeypatch.chdir(folder)
+    capsys.readouterr()
+    noted = _only_a_note() if line.startswith(NOTE) else contextlib.nullcontext()
+    with noted, mock.patch.object(drjit, "set_thread_count", wraps=drjit.set_thread_count) as asked:
+        code = main(shlex.split(line.removeprefix(NOTE)))
+    captured = capsys.readouterr()
+    threads = tuple(call.args[0] for call in asked.call_args_list)
+    return Run(code, captured.out, captured.err, folder, threads)
+
+
+@contextlib.contextmanager
+def _only_a_note() -> Iterator[None]:
+    """Inside, a command that is parsed writes one note in place of its work."""
+    from qsim.cli import console
+
+    parse = argparse.ArgumentParser.parse_args
+
+    def noted(*args: Any, **named: Any) -> argparse.Namespace:
+        found = parse(*args, **named)
+        found.run = lambda _: console.note("a note") or 0
+        return found
+
+    with mock.patch.object(argparse.ArgumentParser, "parse_args", noted):
+        yield
+
+
+def check(row: Row, main: Main, work: Path, tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
+    """Assert what a row says."""
+    folders = []
+    for name in ("without", "with"):
+        folder = tmp_path / name / "work"
+        shutil.copytree(work, folder, symlinks=True)
+        if callable(row.before):
+            monkeypatch.chdir(folder)
+            row.before(folder)
+        elif row.before:
+            first = execute(main, row.before, folder, capsys, monkeypatch)
+            assert first.code == 0, f"{row.before}: {first.err}"
+        folders.append(folder)
+    if isinstance(row, Refused):
+        before = _state(folders[1])
+        run = execute(main, f"{row.command} {row.option}", folders[1], capsys, monkeypatch)
+        lines = [line for line in run.err.splitlines() if re.match(r"(qsim|quiver)( [a-z-]+)?: ", line)]
+        assert run.code == 2, f"accepted: {run.out}{run.err}"
+        assert row.says in run.err, run.err
+        assert len(lines) <= 1, run.err
+        assert "Traceback" not in run.err, run.err
+        assert _state(folders[1]) == before, "something was changed or left behind"
+        return
+    found = []
+    for folder, line in zip(folders, (row.command, f"{row.command} {row.option}"), strict=True):
+        run = execute(main, line, folder, capsys, monkeypatch)
+        assert run.code in row.codes, run.err
+        if row.after:
+            last = execute(main, row.after, folder, capsys, monkeypatch)
+            assert last.code == 0, f"{row.after}: {last.err}"
+        found.append(row.result(run))
+    assert found[0] != found[1], "the option changes nothing"
+
+
+def _state(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}

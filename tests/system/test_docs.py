@@ -1,0 +1,283 @@
+"""What the documents show is what the programs do.
+
+Quick: every Python block runs, page by page in one folder; every qsim and quiver command line is understood. Slow:
+every page runs from top to bottom as a reader would type it, with recipes made small. A comment above a block says
+otherwise:
+
+    <!-- not run: WHY -->           understood, not run
+    <!-- run with: OLD => NEW -->   run with these words instead (several: with " | " between them)
+    <!-- file: NAME -->             the block is a file of that name
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import qsim.cli.program
+import quiver.cli.program
+import quiver.data.codes
+from qsim.studies.validation.reading import Report
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTS = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "scenes" / "README.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
+BLOCK = re.compile(r"(?:^<!-- (not run|run with|file): (.*?) -->\n)?^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block and the comment above it."""
+
+    language: str
+    body: str
+    directive: str = ""  # not run, run with, file
+    words: str = ""
+
+    @property
+    def as_run(self) -> str:
+        """The body with the words that a test uses instead."""
+        text = self.body
+        for change in self.words.split(" | ") if self.directive == "run with" else []:
+            old, _, new = change.partition(" => ")
+            assert old in text, f"{old!r} is not in the block below its comment"
+            text = text.replace(old, new)
+        return text
+
+
+def blocks(path: Path) -> list[Block]:
+    found = BLOCK.findall(path.read_text(encoding="utf-8"))
+    return [Block(language, body, directive, words) for directive, words, language, body in found]
+
+
+def place(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def commands() -> list[list[str]]:
+    """The qsim and quiver command lines of all shell blocks, continued lines joined, comments and redirections off."""
+    found = []
+    for path in DOCUMENTS:
+        for block in blocks(path):
+            if block.language != "sh":
+                continue
+            for line in block.body.replace("\\\n", " ").splitlines():
+                words = shlex.split(line, comments=True)
+                words = words[: words.index(">")] if ">" in words else words
+                if words and words[0] in ("qsim", "quiver") and words not in found:
+                    found.append(words)
+    return found
+
+
+def test_there_is_something_to_check():
+    assert sum(block.language == "python" for path in DOCUMENTS for block in blocks(path)) >= 8
+    assert len(commands()) >= 40
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=place)
+def test_every_command_is_in_a_block_and_every_exception_says_why(path):
+    text = path.read_text(encoding="utf-8")
+    outside = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    assert not re.findall(r"^    (?:qsim|quiver|python|make) .*", outside, re.MULTILINE)
+    for block in blocks(path):
+        assert block.language in ("python", "sh", "toml", "text")
+        if block.directive == "not run":
+            assert len(block.words.split()) >= 3, "say why"
+        assert block.as_run
+
+
+def python_pages() -> list[Path]:
+    return [path for path in DOCUMENTS if any(block.language == "python" for block in blocks(path))]
+
+
+@pytest.mark.parametrize("path", python_pages(), ids=place)
+def test_python_blocks_run(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for block in blocks(path):
+        if block.language == "python" and block.directive != "not run":
+            exec(compile(block.as_run, path.name, "exec"), {"__name__": path.name})
+
+
+@pytest.mark.parametrize("words", commands(), ids=" ".join)
+def test_commands_are_understood(words, monkeypatch):
+    program, home = {"qsim": (qsim.cli.program, qsim.cli.program), "quiver": (quiver.cli.program, quiver.data.codes)}[
+        words[0]
+    ]
+    monkeypatch.setattr(home, "run", lambda parser, argv: parser.parse_args(argv))
+    assert program.main(words[1:]) is not None
+
+
+def test_a_wrong_command_would_be_noticed(monkeypatch):
+    monkeypatch.setattr(qsim.cli.program, "run", lambda parser, argv: parser.parse_args(argv))
+    with pytest.raises(SystemExit):
+        qsim.cli.program.main(["sense", "clip", "--pppp", "3"])
+
+
+def test_a_page_that_fails_would_be_noticed(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("```sh\nqsim check none   # no such clip\n```\n")
+    with pytest.raises(AssertionError, match="no such clip"):
+        follow(page, tmp_path)
+
+
+# Pages as a reader types them
+
+
+def _calibration(folder: Path) -> None:
+    """Dark and flat frames of the cameras on the page, as files."""
+    rng = np.random.default_rng(0)
+
+    def few_electrons(light: float, exposure: float) -> np.ndarray:
+        electrons = rng.poisson(light + 20 * exposure, (20, 40, 40)) + 0.25 * rng.standard_normal((20, 40, 40))
+        return np.clip(np.rint(8 * electrons + 40), 0, 255).astype(np.uint8)
+
+    for name, light, exposure in (("dark_1ms", 0, 1e-3), ("dark_50ms", 0, 5e-2), ("flat_a", 0.5, 1e-3),
+                                  ("flat_b", 2, 1e-3), ("flat_c", 6, 1e-3)):  # fmt: skip
+        np.save(folder / f"{name}.npy", few_electrons(light, exposure))
+    counts = {"dark": 0.01, "flat": 0.3, "dim": 1.6, "bright": 16}
+    for name, mean in counts.items():
+        np.save(
+            folder / f"{name}.npy",
+            np.minimum(rng.poisson(mean, (200, 24, 24)), 1 if mean < 1 else 255).astype(np.uint8),
+        )
+    for name, share in (("dark_sums", 0.01), ("flat_sums", 0.3)):
+        np.save(folder / f"{name}.npy", rng.binomial(50, share, (4, 24, 24)).astype(np.uint16))
+    subprocess.run([sys.executable, "-m", "qsim", "render", "fan", "-o", "out/fan", "--frames", "3", "--height", "32",
+                    "--width", "32", "-q"], cwd=folder, check=True, env=_environment())  # fmt: skip
+
+
+BEFORE: dict[str, Callable[[Path], None]] = {"docs/calibrate.md": _calibration}
+
+
+def _environment() -> dict[str, str]:
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    return os.environ | {"PATH": path, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+
+
+def follow(path: Path, folder: Path) -> None:
+    """Run all blocks of a page in order in a folder, which has the recipes in it, made small."""
+    (folder / "scenes").mkdir()
+    for recipe in (ROOT / "scenes").glob("*.toml"):
+        text = recipe.read_text()
+        for key, value in {"frames": 12, "height": 32, "width": 32, "psnr": 20.0}.items():
+            text = re.sub(rf"^{key} = .*", f"{key} = {value}", text, flags=re.MULTILINE)
+        (folder / "scenes" / recipe.name).write_text(text)
+    for block in blocks(path):
+        if block.directive == "not run" or block.language == "text":
+            continue
+        if block.directive == "file":
+            (folder / block.words).write_text(block.body)
+            continue
+        run = ["bash", "-e", "-c", block.as_run] if block.language == "sh" else [sys.executable, "-c", block.as_run]
+        done = subprocess.run(run, cwd=folder, env=_environment(), capture_output=True, text=True, check=False)
+        assert done.returncode == 0, f"{path.name}:\n{block.as_run}\n{done.stdout[-500:]}\n{done.stderr[-1500:]}"
+
+
+def pages_with_commands() -> list[Path]:
+    return [p for p in DOCUMENTS if any(b.language == "sh" and b.directive != "not run" for b in blocks(p))]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", pages_with_commands(), ids=place)
+def test_a_page_runs_from_top_to_bottom(path, tmp_path):
+    BEFORE.get(place(path), lambda folder: None)(tmp_path)
+    follow(path, tmp_path)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "scenes").glob("*.toml")), ids=place)
+def test_every_recipe_of_the_library_is_read(path):
+    """Those that no page runs because they are too large included."""
+    from qsim.dataset import recipe
+
+    assert recipe.load(path).jobs
+
+
+# Links, trees, the site
+
+
+def test_relative_links_lead_somewhere():
+    for path in DOCUMENTS:
+        for target in re.findall(r"\]\(([^)#\s]+)", path.read_text(encoding="utf-8")):
+            if "://" not in target:
+                assert (path.parent / target).exists(), f"{path.name}: {target}"
+
+
+def test_readme_tree_has_a_line_for_every_file():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    for folder in ("qsim", "quiver", "quiver/baselines"):
+        for path in (ROOT / folder).glob("*.py"):
+            if not path.name.startswith("__"):
+                assert re.search(rf"^\s+{re.escape(path.name)}\s+\S", text, re.MULTILINE), f"{folder}/{path.name}"
+
+
+def test_readme_tree_names_no_file_that_is_gone():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    there = {path.name for folder in ("qsim", "quiver", "scenes") for path in (ROOT / folder).rglob("*.py")}
+    named = re.findall(r"^  (\w+\.py)\s+\S", text, re.MULTILINE)
+    assert len(named) > 60
+    assert set(named) <= there
+
+
+def test_every_page_is_in_the_navigation_or_linked_from_a_page():
+    config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    links = {
+        (path.parent / target).resolve()
+        for path in DOCUMENTS
+        for target in re.findall(r"\]\(([^)#\s]+)", path.read_text(encoding="utf-8"))
+    }
+    for path in (ROOT / "docs").rglob("*.md"):
+        assert f": {path.relative_to(ROOT / 'docs').as_posix()}\n" in config or path in links, path
+
+
+def _evidence():
+    spec = importlib.util.spec_from_file_location("evidence", ROOT / "docs" / "evidence.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_of_evidence_is_made_from_its_numbers():
+    numbers = json.loads((ROOT / "docs" / "evidence.json").read_text())
+    page = (ROOT / "docs" / "evidence.md").read_text(encoding="utf-8")
+    assert page == _evidence().page(numbers), "run `python docs/evidence.py --page-only`"
+    numbers["sensor"]["report"]["ok"] = False
+    assert "outside its bounds" in _evidence().page(numbers)
+    numbers["reading"]["report"] = Report(250.0, 20.0, 300.0, 9.0, 0.3).to_dict()
+    page = _evidence().page(numbers)
+    assert "| clip folder | 250.0 | 300.0 |" in page
+    assert "(100 windows/s, 5 times the mp4) is **not reached** in this run" in page
+
+
+def test_tests_named_as_evidence_exist():
+    page = (ROOT / "docs" / "evidence.md").read_text(encoding="utf-8")
+    names = re.findall(r"`(?:tests/\w+/|tests/)?(test_\w+\.py)`", page)
+    there = {path.name for path in (ROOT / "tests").rglob("test_*.py")}
+    assert len(names) >= 10
+    assert set(names) <= there
+
+
+@pytest.mark.skipif(shutil.which("mkdocs", path=str(Path(sys.executable).parent)) is None, reason="no mkdocs here")
+def test_the_site_builds_without_a_broken_link(tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "site" / "index.html").is_file()
+    pages = "".join(path.read_text(encoding="utf-8") for path in (tmp_path / "site").rglob("*.html"))
+    loaded = re.findall(r"<(?:script|img|link)[^>]+(?:src|href)=\"(https?://[^\"]+)", pages)
+    assert not [address for address in loaded if 'rel="canonical"' not in address], "pages load nothing from elsewhere"

@@ -1,0 +1,423 @@
+"""What people do wrong, and what they are told: one line that names the cure, exit code 2, nothing half-written.
+
+Every row is a command line and words of its answer. Commands run in this process, in one folder that no mistake may
+change; what a machine may lack (GPU, new LLVM, disk, package, Python) has tests of its own below.
+"""
+
+from __future__ import annotations
+
+import builtins
+import errno
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import fakes
+import numpy as np
+import pytest
+from clips import write_clip
+
+import qsim.cli.program
+import quiver.cli.program
+from qsim import backend, files
+from qsim.dataset import generation, recipe
+
+ROOT = Path(__file__).parents[2]
+
+MISTAKES = [
+    # Names of commands, options, choices
+    ("qsim", "the following arguments are required: COMMAND; see qsim --help"),
+    ("qsim rendr fan", "unknown command 'rendr' (did you mean 'render'?)"),
+    ("qsim --jsn check lit", "unknown option --jsn"),
+    ("qsim render fan", "the following arguments are required: -o/--output"),
+    ("qsim render fan --ouput x", "unknown option --ouput (did you mean '--output'?)"),
+    ("qsim render fan -o x --fps 2000", "unknown option --fps (did you mean '--frame-rate'?)"),
+    ("qsim generate good.toml --jobs 3", "unknown option --jobs (did you mean '--workers'?)"),
+    ("qsim sense lit --photons 3", "unknown option --photons (did you mean '--ppp'?)"),
+    ("qsim sense lit -b 3", "unknown option -b"),
+    ("qsim doctor sensors", "unexpected argument sensors"),
+    ("qsim validate lens", "unknown argument what 'lens'"),
+    ("qsim completion tcsh", "there are: bash, zsh, fish"),
+    ("quiver trian data -o x", "unknown command 'trian' (did you mean 'train'?)"),
+    ("quiver train data -o x --lr 1e-3", "unknown option --lr (did you mean '--learning-rate'?)"),
+    ("quiver train data -o x --epochs 9", "unknown option --epochs (did you mean '--steps'?)"),
+    ("quiver train data -o x --preset nanno", "'nanno' (did you mean 'nano'?)"),
+    ("quiver restore lit -o x.npy --mode fast", "there are: exact, streaming, windows"),
+    # Scenes
+    ("qsim render fann -o x", "no scene family 'fann' (did you mean 'fan'?)"),
+    ("qsim render none.py -o x", "scene none.py: no such file"),
+    ("qsim render broken.py -o x", "broken.py:1: not valid Python"),
+    ("qsim render noscene.py -o x", "noscene.py: a scene file needs a function scene(seed=0, *, speed=1.0)"),
+    ("qsim render three.py -o x", "scene() returned a int; it must return a qsim.scene.Scene"),
+    ("qsim render fan -o lit", "lit: exists; name another with -o, or use --force"),
+    ("qsim validate render --scenes fann", "did you mean 'fan'?"),
+    # Sizes and numbers
+    ("qsim render fan -o x --height 0", "--height: expected a whole number from 1 to 100000, got 0"),
+    ("qsim render fan -o x --frames -3", "--frames: expected a whole number from 1 to 100000, got -3"),
+    ("qsim render fan -o x --width 12.5", "--width: expected a whole number from 1 to 100000, got 12.5"),
+    ("qsim render fan -o x --seed -1", "--seed: expected a whole number from 0 to 2^31 - 1, got -1"),
+    ("qsim render fan -o x --speed nan", "--speed: expected a number above 0, got nan"),
+    ("qsim preview lit --frame 99", "--frame 99: lit has frames 0..2"),
+    ("qsim plan good.toml --machines 0", "--machines: expected at least 1, got 0"),
+    ("qsim tradeoff --table --size 240", "a size is ROWSxCOLUMNS, as in 240x320; got '240'"),
+    ("qsim tradeoff --table --bits 1,x", "whole numbers with commas, as in 1,3,5; got '1,x'"),
+    ("quiver bench --size 64", "expected HEIGHTxWIDTH as in 128x256, got '64'"),
+    ("quiver train data -o x --steps 0", "--steps: expected a whole number of at least 1, got '0'"),
+    ("quiver restore lit -o x.npy --memory lots", "expected a size such as 2GB or 500MB, got 'lots'"),
+    # Units
+    ("qsim render fan -o x --frame-rate 0.0005", "expected frames per second from 1 to 1e8, got 0.0005; 0.5 ms"),
+    ("qsim render fan -o x --shutter 50", "--shutter: expected the open share of a frame, 0 to 1, got 50; half"),
+    ("qsim render fan -o x --psnr 500", "--psnr: expected the wanted error in dB, 10 to 80, got 500"),
+    ("qsim convert light.npy x --frame-rate 2000 --exposure 500", "exposure 500.0 s: expected more than 0 and at most"),
+    ("qsim calibrate --bits 3 --dark codes.npy 1ms -o x.toml", "'1ms' is no number; give seconds, as in 1e-3"),
+    ("qsim sense lit --ppp 3 --sensor percent.toml", "quantum_efficiency is a number, above 0 and at most 1; got 80"),
+    # Light
+    ("qsim sense lit --ppp 0", "--ppp: expected numbers above 0, got '0'"),
+    ("qsim sense lit --ppp nan", "--ppp: expected numbers above 0, got 'nan'"),
+    ("qsim sense lit --ppp=-3", "--ppp: expected numbers above 0, got '-3'"),
+    ("qsim sense lit --ppp 3 --lux 3", "give the light level as --ppp or as --lux, not both"),
+    ("qsim sense video", "its radiance is relative (imported video) and has no absolute light; give a target"),
+    ("qsim sense video --lux 3", "has no lux; give a target in photons per pixel, as in --ppp 3.25"),
+    ("qsim sense black --ppp 3", "black: mean of photons is 0, no factor reaches 3 PPP; is the light on?"),
+    # Sensors and streams
+    ("qsim sense lit --ppp 3 --bits 0", "--bits: expected 1 to 16 bits per code, got 0"),
+    ("qsim sense lit --ppp 3 --bits 17", "--bits: expected 1 to 16 bits per code, got 17"),
+    ("qsim sense lit --ppp 3 --sensor quiver-fysical", "did you mean 'quiver-physical'?"),
+    (
+        "qsim sense lit --ppp 3 --sensor key.sensor.toml",
+        "'quantum_efficency' for QIS (did you mean 'quantum_efficiency'",
+    ),
+    ("qsim sense lit --ppp 3 --sensor noise.sensor.toml", "QIS.read_noise is a number, at least 0; got -0.2"),
+    ("qsim sense lit --ppp 3 --name a/b", "name 'a/b': use letters, digits, '.', '_' and '-' only"),
+    ("qsim sense lit --ppp 3 --group", "summing planes needs the bits of a code, as in --bits 3"),
+    ("qsim sense none --ppp 3", "none: no such clip"),
+    ("qsim sense text.txt --ppp 3", "text.txt: not a clip folder (it has no clip.json)"),
+    ("qsim sense data --replay fan_0000", "--replay fan_0000: expected CLIP:FRAME, as in fan_0003:7"),
+    # What is in the way
+    ("qsim render fan -o text.txt --force", "text.txt: exists and is no clip, which is all that --force replaces"),
+    ("qsim render fan -o data --force", "data: exists and is no clip, which is all that --force replaces"),
+    (
+        "qsim convert light.npy data --force --frame-rate 2000 --exposure 1e-4 --transfer linear",
+        "data: exists and is no",
+    ),
+    ("quiver restore lit -o x --ppp 3", "x: restored video is written as .npy; name a file that ends so"),
+    ("qsim render lit -o x", "lit: is a clip, made from a scene already"),
+    ("qsim render raises.py -o x", "raises.py:2: ZeroDivisionError: division by zero"),
+    ("quiver restore text.txt -o x.npy", "text.txt: no stream, clip folder or .npy array"),
+    # Recipes
+    ("qsim generate none.toml", "none.toml: no such recipe"),
+    ("qsim generate bad.toml -o x", "bad.toml:1: not valid TOML"),
+    ("qsim generate key.toml -o x", "key.toml:3: unknown key 'frmaes' in [recipe] (did you mean 'frames'?)"),
+    ("qsim generate type.toml -o x", "type.toml:3: frames: expected a whole number from 1 to 100000, got '3'"),
+    ("qsim generate zero.toml -o x", "zero.toml:3: frames: expected a whole number from 1 to 100000, got 0"),
+    ("qsim generate rate.toml -o x", "frame_rate: expected frames per second from 1 to 1e8, got 0.0005"),
+    ("qsim generate family.toml -o x", "family.toml:9: unknown family 'fann' (did you mean 'fan'?)"),
+    ("qsim generate split.toml -o x", "split: expected one of train, val, test, got 'tset'"),
+    ("qsim generate leak.toml -o x", "the test split holds families that training never sees: move its scenes"),
+    ("qsim generate dark.toml -o x", "dark.toml:21: ppp: expected a number above 0, got -1"),
+    ("qsim generate more.toml -o data", "was made from another recipe, without the clip fan_0002; use another folder"),
+    ("qsim generate good.toml -o lit", "lit: is not empty and not a data set; use another folder"),
+    ("qsim generate good.toml --shard 5/3", "expected I/N with 1 <= I <= N, as in 7/100, got '5/3'"),
+    ("qsim generate good.toml --workers -1", "--workers: expected 0 (in this process) or more, got -1"),
+    # Foreign files
+    ("qsim convert light.npy x", "files do not say how fast the capture was; add --frame-rate, as in 2000"),
+    ("qsim convert none.npy x --frame-rate 9", "none.npy: no such file"),
+    ("qsim convert nan.npy x --frame-rate 9", "nan.npy: value nan at (t, y, x) = (0, 0, 0) is no light"),
+    ("qsim convert negative.npy x --frame-rate 9", "is no light: expected finite numbers from 0 up"),
+    ("qsim convert empty.npy x --frame-rate 9", "empty.npy: has no frames"),
+    ("qsim convert flat.npy x --frame-rate 9", "flat.npy: expected frames [T, H, W], found an array of shape [8, 10]"),
+    ("qsim convert norows.npy x --frame-rate 9", "norows.npy: frames of 0 x 10 pixels"),
+    ("qsim convert objects.npy x --frame-rate 9", "objects.npy: not readable as .npy"),
+    ("qsim convert text.txt x --frame-rate 9", "text.txt: unknown kind of file; say which with --layout"),
+    ("qsim convert broken.png x --frame-rate 9 --transfer srgb", "broken.png: not readable as PNG"),
+    ("qsim convert grey.png x --frame-rate 9", "a picture does not say how light was coded; add --transfer 'linear'"),
+    ("qsim convert odd.bin x --frame-rate 9 --layout swissspad2-half", "1001 bytes are not a whole number of"),
+    (
+        "qsim convert codes.npy x --frame-rate 9 --layout codes --bits 2",
+        "is no 2-bit code (0..3); say the right --bits",
+    ),
+    ("qsim convert light.npy x --frame-rate 9 --columns 99", "--columns 99: the frames have 10 columns"),
+    ("qsim convert lit x.webm", "x.webm: say what to write with --to: cube, exr, mp4, png, zarr"),
+    # Looking and studying
+    (
+        "qsim report empty -o x.html",
+        "nothing to report; expected a clip, a data set, a restored video or an evaluation",
+    ),
+    ("qsim report empty -o text.txt/sub/x.html", "text.txt: is a file where a folder is needed; name another with -o"),
+    ("qsim render fan -o text.txt/x", "text.txt: is a file where a folder is needed; name another with -o"),
+    ("qsim convert lit text.txt/x.npy", "text.txt: is a file where a folder is needed"),
+    ("quiver restore lit -o text.txt/x.npy --ppp 3 --method moment", "text.txt: is a file where a folder is needed"),
+    ("qsim report lit -o x.pdf", "x.pdf: a page is a .html file, as in -o x.html"),
+    ("qsim preview lit -o x.webm", "x.webm: a preview is a .mp4, .gif, .png file, as in -o x.mp4"),
+    ("qsim preview data", "data: is a data set; name one of its clips, as in data/clips/NAME"),
+    ("qsim preview codes.npy", "whole numbers are codes or packed planes; say --bits 3"),
+    ("qsim tradeoff", "give a clip or a scene, --table, or --paper-figure"),
+    ("qsim tradeoff lit", "lit: 2000 fps; this study needs a clip of at least 10000 fps, as in `qsim render fan"),
+    ("qsim tradeoff --paper-figure 3 -o x", "there are: 1, 2"),
+    ("qsim calibrate --bits 3 -o x.txt", "x.txt: the sensor file is a .toml, as in -o my_sensor.toml"),
+    ("qsim calibrate --bits 3 --dark codes.npy -o x.toml", "give a file and its exposure in seconds, as in --dark"),
+    ("qsim calibrate --bits 99 --dark codes.npy 1e-3 -o x.toml", "--bits: expected 1 to 16 bits per code, got 99"),
+    ("qsim validate sensor -o x.txt", "x.txt: a figure is a .png, .svg or .pdf file"),
+    ("qsim check lit text.txt", "text.txt: not a clip folder (it has no clip.json)"),
+    # Restoring and comparing
+    ("quiver restore none -o x.npy", "none: no such file or folder"),
+    ("quiver restore data -o x.npy", "data: is a data set; name one of its clips, as in data/clips/fan_0000"),
+    ("quiver restore lit -o x.mp4", "x.mp4: restored video is written as .npy"),
+    ("quiver restore lit -o light.npy --ppp 3", "light.npy: exists; name another with -o, or use --force"),
+    ("quiver restore lit -o x.npy --ppp 3 --method momment", "no method 'momment' (did you mean 'moment'?)"),
+    ("quiver restore lit -o x.npy --ppp 3 --method moment:x", "the window after the colon is a number of frames"),
+    ("quiver restore lit -o x.npy --ppp 3 --method none.safetensors", "none.safetensors: no such weights file"),
+    ("quiver restore lit -o x.npy --method moment", "lit: choose one of its streams with --stream (none), or sense"),
+    (
+        "quiver restore data/clips/fan_0000 -o x.npy --stream quiver-physical_3bit_3.25ppp --bits 1",
+        "--bits: data/clips/fan_0000/streams/quiver-physical_3bit_3.25ppp.npy is a stored stream, which knows its own",
+    ),
+    ("quiver restore codes.npy -o x.npy --width 10 --planes 5", "sums 2^b - 1 binary planes, got 5; use 3 or 7"),
+    ("quiver restore codes.npy -o x.npy --seed 1", "--seed: is of noise that is drawn, and codes.npy holds codes"),
+    ("quiver restore lit -o x.npy --ppp 3 --width 8", "--width: describes a bare array, and lit is a clip; leave it"),
+    (
+        "quiver restore lit -o x.npy --ppp 3 --method moment --mode streaming",
+        "--mode: acts on networks, and moment is classical; leave it out",
+    ),
+    ("quiver evaluate lit -o x --split val", "--split val: chooses clips of a data set, and lit is one clip; leave it"),
+    ("quiver evaluate data -o x --frames 5", "--frames: belongs to --static COUNTS; leave it out"),
+    ("quiver evaluate", "give a data set or clip folder and -o, or --static COUNTS"),
+    ("quiver evaluate none -o x", "none: no such data set"),
+    ("quiver evaluate data -o x --methods naive,,moment", "expected names with commas between them"),
+    ("quiver evaluate data -o lit", "lit exists and is no evaluation; choose another -o"),
+    ("quiver evaluate --static light.npy", "light.npy: expected whole counts [N, H, W] or [T, K, H, W], got float32"),
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with good and bad things in it."""
+    top = tmp_path_factory.mktemp("mistakes")
+    write_clip(top / "lit", frames=3, height=8, width=10)
+    write_clip(top / "video", frames=3, height=8, width=10, relative=True)
+    write_clip(top / "black", frames=2, relative=True, radiance=np.zeros((2, 8, 10)))
+    generation.generate(recipe.parse(fakes.RECIPE), top / "data", generation.Options(workers=0), make=fakes.make)
+    (top / "empty").mkdir()
+    arrays = {
+        "light": np.ones((3, 8, 10), np.float32),
+        "nan": np.full((3, 8, 10), np.nan, np.float32),
+        "negative": -np.ones((3, 8, 10), np.float32),
+        "empty": np.zeros((0, 8, 10), np.float32),
+        "flat": np.zeros((8, 10), np.float32),
+        "norows": np.zeros((3, 0, 10), np.float32),
+        "codes": np.full((2, 8, 10), 5, np.uint8),
+        "objects": np.array([{}], dtype=object),
+    }
+    for name, array in arrays.items():
+        np.save(top / f"{name}.npy", array, allow_pickle=True)
+    from PIL import Image
+
+    Image.fromarray(np.zeros((8, 10), np.uint8)).save(top / "grey.png")
+    sensor = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 1.6\nread_noise = 0.2\nbits = 3\n'
+    texts = {
+        "text.txt": "words\n",
+        "raises.py": "def scene(seed=0, *, speed=1.0):\n    return 1 / 0\n",
+        "broken.png": "\x89PNG\r\n",
+        "odd.bin": "x" * 1001,
+        "broken.py": "def scene(:\n",
+        "noscene.py": "x = 1\n",
+        "three.py": "def scene(seed=0, *, speed=1.0):\n    return 3\n",
+        "bad.toml": "[recipe\n",
+        "good.toml": fakes.RECIPE,
+        "percent.toml": sensor.replace("0.8", "80"),
+        "key.sensor.toml": sensor.replace("efficiency", "efficency"),
+        "noise.sensor.toml": sensor.replace("0.2", "-0.2"),
+    }
+    changes = {
+        "key": ("frames = 3", "frmaes = 3"),
+        "type": ("frames = 3", 'frames = "3"'),
+        "zero": ("frames = 3", "frames = 0"),
+        "rate": ("2000.0", "0.0005"),
+        "family": ('"fan"', '"fann"'),
+        "split": ('split = "test"', 'split = "tset"'),
+        "leak": ('family = "fan"\nseeds = [0, 1]', 'family = "tumble"\nseeds = [1]'),
+        "dark": ("ppp = 3.25", "ppp = -1"),
+        "more": ("seeds = [0, 1]", "seeds = [0, 1, 2]"),
+    }
+    for name, (old, new) in changes.items():
+        assert old in fakes.RECIPE
+        texts[f"{name}.toml"] = fakes.RECIPE.replace(old, new, 1)
+    for name, text in texts.items():
+        (top / name).write_text(text, encoding="latin-1")
+    return top
+
+
+def tree(folder: Path) -> dict[str, tuple[int, int]]:
+    """Every file with its size and time: what a mistake must leave as it was."""
+    found = {}
+    for path in folder.rglob("*"):
+        status = path.stat()
+        found[str(path)] = (status.st_size, status.st_mtime_ns) if path.is_file() else (0, 0)
+    return found
+
+
+def told(capsys: pytest.CaptureFixture[str], line: str) -> str:
+    """The one line that a mistake in the present folder gets."""
+    before = tree(Path.cwd())
+    program, *words = shlex.split(line)
+    code = {"qsim": qsim.cli.program.main, "quiver": quiver.cli.program.main}[program](words)
+    out, err = capsys.readouterr()
+    assert (code, out) == (2, ""), err
+    assert err.count("\n") == 1, err
+    assert err.startswith(program)
+    assert "Traceback" not in err
+    assert tree(Path.cwd()) == before
+    return err
+
+
+def test_there_are_enough_of_them():
+    assert len(MISTAKES) >= 60
+    assert len({line for line, _ in MISTAKES}) == len(MISTAKES)
+
+
+@pytest.mark.parametrize(("line", "words"), MISTAKES, ids=[line for line, _ in MISTAKES])
+def test_a_mistake_is_one_line_that_names_the_cure(folder, monkeypatch, capsys, line, words):
+    monkeypatch.chdir(folder)
+    assert words in told(capsys, line)
+
+
+def test_the_table_would_notice_a_traceback(folder, monkeypatch, capsys):
+    """A defect of ours is no mistake of the user: it is not hidden behind one line."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("qsim.clip.clip.Clip.open", lambda path: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        told(capsys, "qsim check lit")
+
+
+# What the machine lacks
+
+
+@pytest.mark.parametrize(
+    ("line", "target"),
+    [
+        ("qsim sense lit --ppp 3 -o mine", "lit/streams/mine.json"),
+        ("qsim preview lit -o look.png", "look.png"),
+        ("qsim report lit -o page.html", "page.html"),
+        ("qsim convert light.npy clip --frame-rate 9", "clip"),
+        ("quiver restore data/clips/fan_0000 -o x.npy --method moment --stream quiver-physical_3bit_3.25ppp", "x.npy"),
+    ],
+)
+def test_a_full_disk(folder, tmp_path, monkeypatch, capsys, line, target):
+    """The disk is full when a file is to be made safe: the cure is named, and nothing that a reader accepts is left."""
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    shutil.copytree(folder, tmp_path / "copy")
+    monkeypatch.chdir(tmp_path / "copy")
+    monkeypatch.setattr(files.os, "fsync", full)
+    program, *words = line.split()
+    assert {"qsim": qsim.cli.program.main, "quiver": quiver.cli.program.main}[program](words) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "No space left on device" in err
+    assert "make space and run the same command again" in err
+    assert not Path(target).exists()
+
+
+def test_a_folder_that_is_not_ours(folder, monkeypatch, capsys):
+    """A page that has no place to go is not drawn first."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("qsim.report.report.build", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != Path("empty"))
+    said = told(capsys, "qsim report lit -o empty/deep/x.html")
+    assert "nothing may be written into empty; name another with -o" in said
+
+
+def test_no_gpu(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("QSIM_ENGINE", "cuda")
+    monkeypatch.setattr(backend, "_choose", backend._choose.__wrapped__)
+    monkeypatch.setattr(
+        backend, "_probe_cuda", lambda: backend.Probe("cuda", None, False, "no NVIDIA driver on this machine")
+    )
+    err = told(capsys, "qsim doctor")
+    assert "engine cuda does not work here (CUDA: no NVIDIA driver on this machine); it needs an NVIDIA GPU" in err
+
+
+def test_no_gpu_for_a_network(folder, monkeypatch, capsys):
+    torch = pytest.importorskip("torch")
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    line = "quiver train data -o x --device cuda --steps 1"
+    assert "--device cuda: torch finds no CUDA device here; use --device cpu" in told(capsys, line)
+
+
+def test_an_old_llvm(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("QSIM_ENGINE", "llvm")
+    monkeypatch.setattr(backend, "_choose", backend._choose.__wrapped__)
+    monkeypatch.setattr(backend, "llvm_candidates", lambda: ["/usr/lib/libLLVM-14.so"])
+    monkeypatch.setattr(backend, "_probe", lambda *_: backend.Probe("llvm", None, False, "older than LLVM 16"))
+    err = told(capsys, "qsim doctor")
+    assert (
+        "engine llvm does not work here (/usr/lib/libLLVM-14.so: older than LLVM 16); install LLVM 16 or newer" in err
+    )
+
+
+def test_an_engine_that_does_not_exist(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("QSIM_ENGINE", "metal")
+    assert "engine 'metal': expected one of cuda, llvm, scalar" in told(capsys, "qsim doctor")
+
+
+@pytest.mark.parametrize(
+    ("package", "extra", "line"),
+    [("av", "video", "qsim preview lit -o x.mp4"), ("zarr", "formats", "qsim convert lit x.zarr")],
+)
+def test_a_package_that_is_not_installed(folder, monkeypatch, capsys, package, extra, line):
+    real = builtins.__import__
+
+    def without(name: str, *rest: object) -> object:
+        if name.split(".")[0] == package:
+            raise ModuleNotFoundError(f"No module named {package!r}", name=package)
+        return real(name, *rest)
+
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(builtins, "__import__", without)
+    assert f"needs the package {package}, which is not installed: pip install 'qsim[{extra}]'" in told(capsys, line)
+
+
+def test_too_little_memory(folder, monkeypatch, capsys):
+    def hoard(path: object) -> None:
+        raise MemoryError("Unable to allocate 7 TiB")
+
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("qsim.clip.clip.Clip.open", hoard)
+    err = told(capsys, "qsim check lit")
+    assert "not enough memory (Unable to allocate 7 TiB); try fewer or smaller frames" in err
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="no make here")
+@pytest.mark.parametrize("version", ["(3, 9, 1)", "(3, 14, 0)"])
+def test_a_wrong_python(tmp_path, version):
+    """`make setup` with a Python that says it is another version: told before anything is installed."""
+    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+        shutil.copy(ROOT / name, tmp_path)
+    fake = tmp_path / "python"
+    fake.write_text(
+        f"#!/bin/sh\nexec {sys.executable} -c \"import sys; sys.version_info = {version}; sys.version = 'other'; $2\"\n"
+    )
+    fake.chmod(0o755)
+    done = subprocess.run(
+        ["make", "setup", f"PYTHON={fake}"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert "qsim needs Python 3.11, 3.12 or 3.13, and" in done.stderr
+    assert "name another with PYTHON=python3.12" in done.stderr
+    assert not (tmp_path / ".venv").exists()
+
+
+def test_the_reader_of_our_output_is_gone(folder):
+    """`qsim doctor --devices | head -1` is no error."""
+    line = f"{sys.executable} -m qsim doctor --devices | head -1"
+    done = subprocess.run(line, shell=True, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
