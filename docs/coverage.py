@@ -31,9 +31,9 @@ def main(runs: int) -> None:
     lines = [
         "# Do the intervals of `qsim calibrate` hold what they promise?",
         "",
-        f"{runs} calibrations of each of {len(CASES)} synthetic sensors (tests/support/synthetic.py), in percent of the 95 %",
-        f"intervals that hold the truth. Made by `python docs/coverage.py {runs}`; one number of one sensor is known",
-        f"to +- {100 * sqrt(0.95 * 0.05 / runs):.1f} (one standard deviation).",
+        f"{runs} calibrations of each of {len(CASES)} synthetic sensors (tests/support/synthetic.py), in percent of",
+        f"the 95 % intervals that hold the truth. Made by `python docs/coverage.py {runs}`; a number of one sensor is",
+        f"known to +- {100 * sqrt(0.95 * 0.05 / runs):.1f} (one standard deviation).",
         "",
         "| parameter | intervals | all sensors | " + " | ".join(CASES) + " |",
         "|---|--:|--:|" + "--:|" * len(CASES),

@@ -33,7 +33,7 @@ from qsim.scene.scene import Scene
 _INSTALLED = [sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")]
 _LEFT_OUT = tuple(
     f"{os.path.realpath(folder)}{os.sep}"
-    for folder in (*_INSTALLED, os.path.dirname(__file__), "/proc", "/sys", "/dev")
+    for folder in (*_INSTALLED, str(Path(__file__).parents[1]), "/proc", "/sys", "/dev")
 )
 _LIBRARY = Path(scenes.__file__).resolve().parent
 _PARTS_LEFT_OUT = frozenset({".cache", "site-packages", "dist-packages"})

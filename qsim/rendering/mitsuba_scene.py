@@ -26,7 +26,7 @@ from qsim.scene.scene import Body, Scene
 LARGE = 20_000  # triangles from which a rigid body becomes an instance
 # How often smooth surroundings (constant, clear sky) are drawn as a bounce's emitter, against 1 for any other light.
 # Rays that a surface scatters find them anyway; drawing them takes samples from the sun or the lamp. Tried once, at
-# equal samples on fan, tumble and flag: 1.3 to 1.7 times less error than with 1 (tests/qsim/rendering/test_renderer.py asks 1.25).
+# equal samples on fan, tumble and flag: 1.3 to 1.7 times less error than with 1 (test_renderer.py asks 1.25).
 SMOOTH_WEIGHT = 1 / 1024
 SUN_DISTANCE = 1000.0  # in units of the scene's reach from the camera: parallax of the sun under 1 mrad
 

@@ -74,7 +74,7 @@ def test_sensing_and_importing(tmp_path: Path, full: Path, capsys: pytest.Captur
 
 SMALL = recipe.parse(RECIPE)
 PAIR = Options(workers=2)
-_FULL_RENDERER = '''"""As in tests/support/fakes.py, but for one job the disk is full while the folder holds a file `full`."""
+_FULL_RENDERER = '''"""As in fakes.py, but for one job the disk is full while the folder holds a file `full`."""
 
 import errno
 import os

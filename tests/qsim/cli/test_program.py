@@ -299,7 +299,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path: Path):
     """In a process of its own: SIGINT in the middle, exit code 130, one line; the same command finishes."""
     # A shell's background job ignores SIGINT, and its children with it: begin as a terminal's job does.
     code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
-    code += "import sys, fakes; from qsim.dataset import generation; from qsim.cli import program as cli; g = generation.generate;"
+    code += "import sys, fakes; from qsim.dataset import generation; from qsim import cli; g = generation.generate;"
     code += "generation.generate = lambda *args, run: g(*args, make=fakes.make_once_allowed);"
     code += "sys.exit(cli.main(sys.argv[1:]))"
     recipe_path = tmp_path / "r.toml"

@@ -32,9 +32,7 @@ from qsim.scene import textures
 from qsim.scene.scene import Body, Diffuse, Texture
 
 TESTS = Path(__file__).parents[2]
-PYTHONPATH = (
-    f"{TESTS.parent}{os.pathsep}{TESTS / 'support'}"  # of child processes; the package first: tests/qsim is no package
-)
+PYTHONPATH = f"{TESTS.parent}{os.pathsep}{TESTS / 'support'}"  # of child processes; the package first
 HERE = Options(workers=0)
 SMALL = recipe.parse(RECIPE)
 

@@ -68,8 +68,8 @@ def test_a_frame_costs_what_its_samples_cost(monkeypatch: pytest.MonkeyPatch):
     """Three budgets of 10, 20 and 90 samples: a frame costs twice that of the middle one, which is timed."""
     wanted = recipe.parse(RECIPE)
     samples = {0: 10, 1: 20, 2: 90}
-    monkeypatch.setattr(plan.jobs, "load_scene", lambda job: job)
-    monkeypatch.setattr(plan.jobs, "choose_budget", lambda job, scene: Budget(samples[job.scene_seed]))
+    monkeypatch.setattr(plan.job_runner, "load_scene", lambda job: job)
+    monkeypatch.setattr(plan.job_runner, "choose_budget", lambda job, scene: Budget(samples[job.scene_seed]))
     monkeypatch.setattr(Seconds, "now", staticmethod(lambda: Seconds(0.0, 0.0)))
     timed = []
 
@@ -91,7 +91,7 @@ def test_a_clip_costs_the_choice_of_its_budget_as_well(monkeypatch: pytest.Monke
     """The first choice of a process takes ten times as long: it counts as one of three, not as what each takes."""
     clock = [0.0]
     monkeypatch.setattr(Seconds, "now", staticmethod(lambda: Seconds(clock[0], 2 * clock[0])))
-    monkeypatch.setattr(plan.jobs, "load_scene", lambda job: job)
+    monkeypatch.setattr(plan.job_runner, "load_scene", lambda job: job)
     took = {0: 50.0, 1: 5.0, 2: 4.0}
 
     def choose(job, scene):
@@ -101,7 +101,7 @@ def test_a_clip_costs_the_choice_of_its_budget_as_well(monkeypatch: pytest.Monke
     def first_frames(job, budget, path, frames):
         return FakeClip(), [Seconds(clock[0] + 3 + 2 * n, 2 * clock[0] + 6 + 4 * n) for n in range(frames)]
 
-    monkeypatch.setattr(plan.jobs, "choose_budget", choose)
+    monkeypatch.setattr(plan.job_runner, "choose_budget", choose)
     monkeypatch.setattr(plan, "_first_frames", first_frames)
     monkeypatch.setattr(plan, "_sense", lambda job, clip: (Seconds(0.0, 0.0), 0.0))
     cost = plan._measure(list(recipe.parse(RECIPE).jobs), Path(), 4)

@@ -23,7 +23,7 @@ SCENE = '''"""A scene that reads all kinds of things."""
 import sys
 from pathlib import Path
 
-HERE = Path(__file__).parents[1]
+HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 import reads_helper
 from reads_package.inner import SIZE
@@ -222,7 +222,9 @@ def test_choosing_an_engine_is_no_reading_of_the_scene(tmp_path: Path, name: str
     (tmp_path / "moved.py").write_text(MOVED)
     (tmp_path / "s.xml").write_text(SMALL_XML)
     (tmp_path / "m.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")
-    code = "import sys; from qsim.dataset import scene_files as reads; print(*(sorted(reads.load(sys.argv[1])[1]) for _ in range(2)), sep='\\n')"
+    code = (
+        "import sys; from qsim.dataset.scene_files import load\nfor _ in range(2): print(sorted(load(sys.argv[1])[1]))"
+    )
     command = [sys.executable, "-c", code, str(tmp_path / name)]
     made = subprocess.run(command, env=os.environ | {"PYTHONPATH": ROOT}, capture_output=True, text=True, check=True)
     expected = sorted({name, "s.xml", "m.obj"})

@@ -5,7 +5,7 @@ The simulator adds a uniform half code before it rounds, so that its codes vary 
 
 import numpy as np
 import pytest
-from tests.stats import assert_mean, assert_variance
+from stats import assert_mean, assert_variance
 
 from qsim.sensor.qis import QIS
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from mpmath import mp
+from oracles import paralyzable_oracle
 from scipy import stats
-from tests.qsim.test_spad import paralyzable_oracle
 
 from qsim.keys import Key, uniform, words
 from qsim.sensor import paralyzable_steps

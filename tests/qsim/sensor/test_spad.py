@@ -9,6 +9,7 @@ from itertools import product
 import mpmath as mp
 import numpy as np
 import pytest
+from oracles import paralyzable_oracle
 from stats import assert_histogram
 
 from qsim.keys import Key
@@ -178,27 +179,6 @@ def test_dead_time_agrees_with_the_oracle():
 def test_dead_time_agrees_with_the_oracle_for_8_bits(share):
     worst = renewal_errors([share], ARRIVALS, 8)
     assert np.all(worst < LIMITS), worst
-
-
-def paralyzable_oracle(arrivals, share: float, most: int | None = None) -> list:
-    """P(N = k) by the textbook: binomial moments B_j = E[C(N, j)] summed with alternating signs; see deadtime.py.
-
-    The last moment may be `most` where so many counts hardly ever occur.
-    """
-    arrivals, a = mp.mpf(arrivals), mp.mpf(share)
-    rate, most = arrivals * mp.e ** (-arrivals * a), most or int(mp.floor(1 / a)) + 1
-    moments = [mp.mpf(1)]
-    for j in range(1, most + 1):
-        c = 1 - (j - 1) * a
-        end = min(a, max(c, mp.mpf(0)))
-        fade = mp.e ** (-arrivals * end)
-        first = 1 - fade  # the first count comes within one dead time, and j - 1 follow
-        for r in range(1, j):
-            first = (c**r - fade * (c - end) ** r) / mp.factorial(r) - first / arrivals
-        moments.append(rate ** (j - 1) * (first + rate * (c - end) ** j / mp.factorial(j)) if c > 0 else mp.mpf(0))
-    return [
-        mp.fsum((-1) ** (j - k) * mp.binomial(j, k) * moments[j] for j in range(k, most + 1)) for k in range(most + 1)
-    ]
 
 
 def paralyzable_errors(shares, all_arrivals, bits: int, digits: int = 400) -> np.ndarray:

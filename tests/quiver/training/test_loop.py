@@ -362,7 +362,8 @@ def test_two_processes_train_as_one_with_twice_the_batch(tiny_dataset, tmp_path)
     program = tmp_path / "run.py"
     program.write_text(
         "import torch\n"
-        "from quiver.training.run_folder import Settings\nfrom quiver.training.loop import train\nfrom quiver.model.unet import UNet, UNetConfig\n"
+        "from quiver.training.run_folder import Settings\nfrom quiver.training.loop import train\n"
+        "from quiver.model.unet import UNet, UNetConfig\n"
         "torch.set_num_threads(1)\ntorch.manual_seed(0)\n"
         f"train(UNet(UNetConfig(4)), Settings({str(tiny_dataset)!r}, {str(tmp_path / 'b')!r}, steps=3, crop=16,"
         " batch=2, validate_every=4, warmup=2, validation_windows=2), progress=False)\n"
