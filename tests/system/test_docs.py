@@ -218,20 +218,36 @@ def test_relative_links_lead_somewhere():
                 assert (path.parent / target).exists(), f"{path.name}: {target}"
 
 
-def test_readme_tree_has_a_line_for_every_file():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    for folder in ("qsim", "quiver", "quiver/baselines"):
-        for path in (ROOT / folder).glob("*.py"):
-            if not path.name.startswith("__"):
-                assert re.search(rf"^\s+{re.escape(path.name)}\s+\S", text, re.MULTILINE), f"{folder}/{path.name}"
+def _load(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
-def test_readme_tree_names_no_file_that_is_gone():
+def test_the_map_lists_every_file():
+    page = (ROOT / "docs" / "map.md").read_text(encoding="utf-8")
+    assert page == _load("map").page(page), "run `python docs/map.py`"
+    listed = re.findall(r"^- `(\w+\.py)` – \S", page, re.MULTILINE)
+    assert len(listed) == sum(
+        p.name[:2] != "__" for q in ("qsim", "quiver", "scenes") for p in (ROOT / q).rglob("*.py")
+    )
+
+
+def test_the_readme_names_every_room_with_its_charter():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    there = {path.name for folder in ("qsim", "quiver", "scenes") for path in (ROOT / folder).rglob("*.py")}
-    named = re.findall(r"^  (\w+\.py)\s+\S", text, re.MULTILINE)
-    assert len(named) > 60
-    assert set(named) <= there
+    rooms = [p for name in ("qsim", "quiver") for p in (ROOT / name).iterdir() if (p / "__init__.py").exists()]
+    assert len(rooms) > 15
+    for room in rooms:
+        assert f"| `{room.relative_to(ROOT)}/` | {_load('map').first_sentence(room / '__init__.py')} |" in text
+
+
+def test_files_named_on_the_map_exist():
+    """Also those of the hand-written part: full paths, and names after one of them."""
+    page = (ROOT / "docs" / "map.md").read_text(encoding="utf-8").partition("## Every file")[0]
+    there = {path.name for name in ("qsim", "quiver", "tests") for path in (ROOT / name).rglob("*.py")}
+    assert set(re.findall(r"\b([a-z_]+\.py)", page)) <= there
+    assert all((ROOT / path).exists() for path in re.findall(r"\b(?:qsim|quiver|tests)/[\w/.]*\w", page))
 
 
 def test_every_page_is_in_the_navigation_or_linked_from_a_page():
@@ -245,21 +261,14 @@ def test_every_page_is_in_the_navigation_or_linked_from_a_page():
         assert f": {path.relative_to(ROOT / 'docs').as_posix()}\n" in config or path in links, path
 
 
-def _evidence():
-    spec = importlib.util.spec_from_file_location("evidence", ROOT / "docs" / "evidence.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_the_page_of_evidence_is_made_from_its_numbers():
     numbers = json.loads((ROOT / "docs" / "evidence.json").read_text())
     page = (ROOT / "docs" / "evidence.md").read_text(encoding="utf-8")
-    assert page == _evidence().page(numbers), "run `python docs/evidence.py --page-only`"
+    assert page == _load("evidence").page(numbers), "run `python docs/evidence.py --page-only`"
     numbers["sensor"]["report"]["ok"] = False
-    assert "outside its bounds" in _evidence().page(numbers)
+    assert "outside its bounds" in _load("evidence").page(numbers)
     numbers["reading"]["report"] = Report(250.0, 20.0, 300.0, 9.0, 0.3).to_dict()
-    page = _evidence().page(numbers)
+    page = _load("evidence").page(numbers)
     assert "| clip folder | 250.0 | 300.0 |" in page
     assert "(100 windows/s, 5 times the mp4) is **not reached** in this run" in page
 
