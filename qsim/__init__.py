@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from qsim.clip.stream import Sensing, Stream, sense
     from qsim.dataset.dataset import Dataset
     from qsim.keys import Key
+    from qsim.rendering.mitsuba_xml import read_mitsuba
     from qsim.scene.scene import Camera, Scene
     from qsim.sensor.qis import QIS
     from qsim.sensor.sensor import Sensor
@@ -32,6 +33,7 @@ _HOMES = {
     "Sensing": "clip.stream",
     "Sensor": "sensor.sensor",
     "Stream": "clip.stream",
+    "read_mitsuba": "rendering.mitsuba_xml",
     "sense": "clip.stream",
 }
 
@@ -48,6 +50,7 @@ __all__ = [
     "Sensing",
     "Sensor",
     "Stream",
+    "read_mitsuba",
     "sense",
 ]
 

@@ -61,7 +61,7 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
     """The scene of a family by name, of a Python file with `scene(seed, *, speed)`, a folder of assets, or Mitsuba XML.
 
     What a folder may hold is in `own.py`. An XML scene stands still and knows no seed: a Python file that calls
-    `Scene.from_mitsuba` moves its shapes. Raises ValueError for a name that is none of these, FileNotFoundError for a
+    `qsim.read_mitsuba` moves its shapes. Raises ValueError for a name that is none of these, FileNotFoundError for a
     missing file, and for a speed other than 1 that changes no motion of a .py or .xml scene.
     """
     if str(name) in FAMILIES:
@@ -77,7 +77,9 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
     if str(name).endswith(".xml"):
         if speed != 1:
             raise ValueError(f"{name}: stands still, so that speed {speed:g} changes nothing; leave it out")
-        return Scene.from_mitsuba(name)
+        from qsim.rendering.mitsuba_xml import read_mitsuba
+
+        return read_mitsuba(name)
     if (Path(name) / "clip.json").is_file():
         raise ValueError(f"{name}: is a clip, made from a scene already; name a family, a .py or .xml file or a folder")
     if Path(name).is_dir():

@@ -3,7 +3,7 @@
     scene.xml + {shape id: motion} -> Scene(file, parts)
 
 Mitsuba keeps shapes, materials and lights; we need the names of the shapes, which of them can move, and a camera.
-`mi` is the Mitsuba module, handed in by render.py, which alone imports it.
+`mi` is the Mitsuba module.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from qsim import files
-from qsim.backend import errors_only
+from qsim.backend import errors_only, select
 from qsim.checks import suggest
 from qsim.scene.scene import Camera, MitsubaFile, Motion, Part, Scene, Vector
 
@@ -24,8 +24,20 @@ F_NUMBER, PITCH = 2.8, 1.1e-6  # of the camera that is made from the file's, whi
 MOVABLE = ("to_world", "vertex_positions")
 
 
-def read(mi: Any, path: Path, motions: Mapping[str, Motion], camera: Camera | None = None) -> Scene:
-    """The scene of an XML file; errors as in `Scene.from_mitsuba`."""
+def read_mitsuba(
+    xml: str | Path, motions: Mapping[str, Motion] | None = None, *, camera: Camera | None = None
+) -> Scene:
+    """Return the scene of a Mitsuba XML file; shapes named by their `id` follow `motions`, all others rest.
+
+    Without `camera` the file's first sensor is taken, a pinhole of its field of view and size behind an f/2.8 lens on
+    pixels of 1.1 um. The file's integrator and samples do not count. `FileNotFoundError` for a missing file;
+    `ValueError` for one that Mitsuba refuses, without light, with participating media, with a camera that is not a
+    plain `perspective`, and for motions of unknown shapes or of shapes that cannot be moved rigidly.
+    """
+    select()
+    import mitsuba as mi
+
+    path, motions = Path(xml), motions or {}
     loaded = load(mi, str(path))
     if not loaded.emitters():
         raise ValueError(f"{path}: no emitter, every pixel would be black; add one")
@@ -64,7 +76,7 @@ def load(mi: Any, path: str) -> Any:
 
 def _camera(mi: Any, loaded: Any, path: Path) -> Camera:
     """The file's first sensor as a pinhole behind an f/2.8 lens."""
-    ask = "give a camera of your own: Scene.from_mitsuba(..., camera=Camera(...))"
+    ask = "give a camera of your own: read_mitsuba(..., camera=Camera(...))"
     if not loaded.sensors():
         raise ValueError(f"{path}: no sensor; {ask}")
     sensor = loaded.sensors()[0]

@@ -14,9 +14,8 @@ from __future__ import annotations
 import copy
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,12 +25,12 @@ from qsim import backend as engines
 from qsim.clip.clamped_error import Errors, frame_errors, rms, white_in
 from qsim.clip.clip import PHYSICAL, Clip, ClipWriter
 from qsim.keys import Key, hash_name, words
-from qsim.rendering import ground_truth, mitsuba_xml
+from qsim.rendering import ground_truth
 from qsim.rendering.denoiser import cleaned_mean
 from qsim.rendering.fidelity import Budget, grid_samples
 from qsim.rendering.ground_truth import Hits
 from qsim.rendering.mitsuba_scene import Stage
-from qsim.scene.scene import Camera, Motion, Scene, describe
+from qsim.scene.scene import Scene, describe
 
 Crop = tuple[int, int, int, int]  # y, x, height, width
 
@@ -490,14 +489,6 @@ def render_clip(
             if progress is not None:
                 progress(t + 1, frames)
     return Clip.open(path)
-
-
-def read_mitsuba(path: Path, motions: Mapping[str, Motion], camera: Camera | None = None) -> Scene:
-    """What `Scene.from_mitsuba` does, here because here is where Mitsuba is."""
-    engines.select()
-    import mitsuba as mi
-
-    return mitsuba_xml.read(mi, path, motions, camera)
 
 
 def _checked_crop(scene: Scene, crop: Crop | None) -> Crop:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -388,7 +387,7 @@ class Scene:
     lights: tuple[Light, ...]
     bodies: tuple[Body, ...]
     speed: float = 1.0  # the factor that the family applied to its motions
-    file: MitsubaFile | None = None  # instead of lights and bodies of our own; see `from_mitsuba`
+    file: MitsubaFile | None = None  # instead of lights and bodies of our own; see `qsim.read_mitsuba`
     parts: tuple[Part, ...] = ()  # the file's shapes, in its order
 
     def __post_init__(self) -> None:
@@ -426,25 +425,10 @@ class Scene:
             f"{camera.focal_length * 1e3:.3g} mm f/{camera.f_number:g}>"
         )
 
-    @classmethod
-    def from_mitsuba(
-        cls, xml: str | Path, motions: Mapping[str, Motion] | None = None, *, camera: Camera | None = None
-    ) -> Scene:
-        """A scene of Mitsuba's XML whose shapes, named by their `id`, follow `motions`; one without a motion rests.
-
-        Without `camera` the file's first sensor is taken, a pinhole of its field of view and size behind an f/2.8 lens
-        on pixels of 1.1 um. The file's integrator and samples do not count. `FileNotFoundError` for a missing file;
-        `ValueError` for one that Mitsuba refuses, without light, with participating media, with a camera that is no
-        plain `perspective`, and for motions of unknown shapes or of shapes that cannot be moved rigidly.
-        """
-        from qsim.rendering.renderer import read_mitsuba
-
-        return read_mitsuba(Path(xml), motions or {}, camera)
-
     def emits(self) -> bool:
         """Whether anything gives light."""
         if self.file is not None:
-            return True  # made sure of when the file was read
+            return True  # checked when the file was read
         return any(_strength(light) > 0 for light in self.lights) or any(
             isinstance(body.material, Glow) and body.material.radiance > 0 for body in self.bodies
         )

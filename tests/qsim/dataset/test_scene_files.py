@@ -203,10 +203,10 @@ def test_an_xml_scene_names_meshes_bitmaps_and_includes(tmp_path: Path):
 
 
 MOVED = """from pathlib import Path
-from qsim.scene.scene import Scene
+from qsim import read_mitsuba
 
 def scene(seed=0, *, speed=1.0):
-    return Scene.from_mitsuba(Path(__file__).with_name("s.xml"))
+    return read_mitsuba(Path(__file__).with_name("s.xml"))
 """
 SMALL_XML = """<scene version="3.0.0">
   <sensor type="perspective"><film type="hdrfilm"/></sensor>

@@ -8,6 +8,7 @@ from small_scenes import CAMERA, RATE
 
 import scenes
 from qsim.rendering.fidelity import Budget
+from qsim.rendering.mitsuba_xml import read_mitsuba
 from qsim.rendering.renderer import Renderer, render_clip
 from qsim.scene.deformation import Flag
 from qsim.scene.motion import Spin, Still, Translation
@@ -41,7 +42,7 @@ def test_named_shapes_move_with_their_true_flow(room):
     """A mesh and a sphere translate: flow is focal length times the change of x/z, on each hit point."""
     step = np.array([0.05, 0.0, 0.0])
     motion = Translation(tuple(step * RATE))
-    scene = Scene.from_mitsuba(room, {"ball": motion, "box": motion})
+    scene = read_mitsuba(room, {"ball": motion, "box": motion})
     views = Renderer(scene, frame_rate=RATE, budget=BUDGET)
     first, second = views.frame(0), views.frame(1)
     assert [part.name for part in scene.parts] == ["ball", "box", "shape 2"]
@@ -60,7 +61,7 @@ def test_named_shapes_move_with_their_true_flow(room):
 def test_a_spinning_mesh_turns_its_normals_too(room):
     """A box turned by a right angle about its own middle looks the same, in place and in light."""
     quarter = Spin((0, 1, 0), np.pi / 2 * RATE, center=(-0.7, 0.0, 0.0))
-    views = Renderer(Scene.from_mitsuba(room, {"box": quarter}), frame_rate=RATE, budget=Budget(128, 3))
+    views = Renderer(read_mitsuba(room, {"box": quarter}), frame_rate=RATE, budget=Budget(128, 3))
     first, turned = views.frame(0), views.frame(1)
     assert (first.body_id == turned.body_id).mean() > 0.99
     on = (first.body_id == 1) & (turned.body_id == 1)
@@ -74,7 +75,7 @@ def test_our_camera_sees_what_the_files_camera_sees(room):
     backend.select()
     import mitsuba as mi
 
-    scene = Scene.from_mitsuba(room)
+    scene = read_mitsuba(room)
     ours = Renderer(scene, budget=Budget(512, 3)).frame(0)
     mi.set_log_level(mi.LogLevel.Error)
     try:
@@ -117,13 +118,13 @@ MEDIUM = """<shape type="sphere" id="fog"><bsdf type="null"/>
 )
 def test_what_cannot_be_taken_over_is_refused(tmp_path, parts, motions, message):
     with pytest.raises(ValueError, match=message):
-        Scene.from_mitsuba(written(tmp_path, *parts), motions)
+        read_mitsuba(written(tmp_path, *parts), motions)
 
 
 def test_a_missing_file_and_a_mixture_are_refused(tmp_path, room):
     with pytest.raises(FileNotFoundError, match=r"nothing.xml: no such file"):
-        Scene.from_mitsuba(tmp_path / "nothing.xml")
-    read = Scene.from_mitsuba(room, camera=CAMERA)
+        read_mitsuba(tmp_path / "nothing.xml")
+    read = read_mitsuba(room, camera=CAMERA)
     assert read.camera is CAMERA
     with pytest.raises(ValueError, match="either records or those of a Mitsuba file"):
         Scene("mix", 0, CAMERA, (), (Body("a", Mesh(np.eye(3), np.array([[0, 1, 2]]))),), file=read.file)
