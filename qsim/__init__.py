@@ -12,8 +12,9 @@ if TYPE_CHECKING:
     from qsim.clip.stream import Sensing, Stream, sense
     from qsim.dataset.dataset import Dataset
     from qsim.keys import Key
+    from qsim.optics.camera import Camera
     from qsim.rendering.mitsuba_xml import read_mitsuba
-    from qsim.scene.scene import Camera, Scene
+    from qsim.scene.scene import Scene
     from qsim.sensor.qis import QIS
     from qsim.sensor.sensor import Sensor
     from qsim.sensor.spad import BinarySPAD, CountingSPAD
@@ -22,7 +23,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "BinarySPAD": "sensor.spad",
-    "Camera": "scene.scene",
+    "Camera": "optics.camera",
     "Clip": "clip.clip",
     "ClipWriter": "clip.writer",
     "CountingSPAD": "sensor.spad",

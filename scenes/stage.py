@@ -8,10 +8,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from qsim.optics.camera import Camera
 from qsim.scene import textures
 from qsim.scene.motion import Motion
 from qsim.scene.rotation import UP, exponential, pose_matrix, unit, vector
-from qsim.scene.scene import AreaLamp, Body, Camera, Diffuse, EnvironmentImage, Material, RoughPlastic, SunSky, Texture
+from qsim.scene.scene import AreaLamp, Body, Diffuse, EnvironmentImage, Material, RoughPlastic, SunSky, Texture
 from qsim.scene.shapes import moved, sheet
 from qsim.scene.textures import Picture
 

@@ -70,7 +70,7 @@ def _run_doctor(args: argparse.Namespace) -> int:
         return 0
     from qsim import backend
     from qsim.optics import radiometry
-    from qsim.scene.scene import Camera
+    from qsim.optics.camera import Camera
 
     extras = {extra: all(find_spec(m) for m in EXTRAS if EXTRAS[m] == extra) for extra in sorted(set(EXTRAS.values()))}
     report = backend.report() | {

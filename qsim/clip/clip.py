@@ -29,7 +29,7 @@ from qsim.clip.writer import FORMAT_VERSION, PHYSICAL, RELATIVE, TRUTH, ClipWrit
 from qsim.optics import radiometry
 
 if TYPE_CHECKING:
-    from qsim.scene.scene import Camera
+    from qsim.optics.camera import Camera
 
 __all__ = ["FORMAT_VERSION", "PHYSICAL", "RELATIVE", "Clip", "ClipWriter", "Stream", "write_stream"]
 

@@ -23,7 +23,7 @@ from qsim.clip import clamped_error, exr
 from qsim.optics import radiometry
 
 if TYPE_CHECKING:
-    from qsim.scene.scene import Camera
+    from qsim.optics.camera import Camera
 
 FORMAT_VERSION = 1
 PHYSICAL = "W m^-2 sr^-1"
@@ -272,7 +272,7 @@ def camera_of(meta: dict[str, Any], where: Path) -> Camera | None:
     described = meta.get("camera")
     if described is None:
         return None
-    from qsim.scene.scene import Camera
+    from qsim.optics.camera import Camera
 
     values = {key: value for key, value in described.items() if key not in ("kind", "motion")}
     for key in ("origin", "target", "up"):

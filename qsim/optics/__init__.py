@@ -5,13 +5,15 @@ from typing import TYPE_CHECKING
 from qsim.files import lazy_names
 
 if TYPE_CHECKING:
+    from qsim.optics.camera import Camera
     from qsim.optics.radiometry import WHITE_PER_MEAN, LightLevel, diffract, expected_photons, photons_per_lux
 
-__all__ = ["WHITE_PER_MEAN", "LightLevel", "diffract", "expected_photons", "photons_per_lux"]
+__all__ = ["WHITE_PER_MEAN", "Camera", "LightLevel", "diffract", "expected_photons", "photons_per_lux"]
 
 __getattr__ = lazy_names(
     __name__,
     {
+        "Camera": "camera",
         "LightLevel": "radiometry",
         "WHITE_PER_MEAN": "radiometry",
         "diffract": "radiometry",

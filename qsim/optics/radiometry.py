@@ -19,7 +19,7 @@ from numpy import ndarray as Array
 
 if TYPE_CHECKING:
     from qsim.clip.clip import Clip
-    from qsim.scene.scene import Camera
+    from qsim.optics.camera import Camera
 
 PLANCK = 6.62607015e-34  # J s, exact (SI)
 LIGHT_SPEED = 299792458.0  # m s^-1, exact (SI)

@@ -25,7 +25,8 @@ from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.rendering.ground_truth import MOVING
 
 if TYPE_CHECKING:
-    from qsim.scene.scene import Camera, Scene
+    from qsim.optics.camera import Camera
+    from qsim.scene.scene import Scene
 
 SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
 SENSOR_SHARE = 0.01  # of the shot variance that Monte-Carlo noise may add

@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.scene.scene import Body, Camera, Scene
+from qsim.optics.camera import Camera
+from qsim.scene.scene import Body, Scene
 
 MOVING = 0.1  # px per frame; what moves farther counts as moving
 OCCLUSION_TOLERANCE = 1e-4  # relative distance by which a surface may lie before the point that it is itself

@@ -18,15 +18,14 @@ import numpy as np
 from qsim import files
 from qsim.backend import errors_only, select
 from qsim.checks import suggest
-from qsim.scene.scene import Camera, MitsubaFile, Motion, Part, Scene, Vector
+from qsim.optics.camera import Camera, Pose, Vector
+from qsim.scene.scene import MitsubaFile, Part, Scene
 
 F_NUMBER, PITCH = 2.8, 1.1e-6  # of the camera that is made from the file's, which has no pixels in metres
 MOVABLE = ("to_world", "vertex_positions")
 
 
-def read_mitsuba(
-    xml: str | Path, motions: Mapping[str, Motion] | None = None, *, camera: Camera | None = None
-) -> Scene:
+def read_mitsuba(xml: str | Path, motions: Mapping[str, Pose] | None = None, *, camera: Camera | None = None) -> Scene:
     """Return the scene of a Mitsuba XML file; shapes named by their `id` follow `motions`, all others rest.
 
     Without `camera` the file's first sensor is taken, a pinhole of its field of view and size behind an f/2.8 lens on

@@ -16,11 +16,12 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import Errors
+from qsim.optics.camera import Camera, Pose
 from qsim.rendering.denoiser import AROUND, DENOISE_COST, available, cleaned_mean
 from qsim.rendering.fidelity import COUNTS, Allowed, Budget, Finding, grid_samples
 from qsim.rendering.renderer import Renderer, instants
 from qsim.scene.motion import Still
-from qsim.scene.scene import Camera, Motion, Scene
+from qsim.scene.scene import Scene
 
 PIXELS = 3000
 MOST_MORE = 3  # frames beyond the first, the middle and the last for what these do not show, and for what moves
@@ -106,7 +107,7 @@ def rests(scene: Scene) -> bool:
     return not _moving(scene)
 
 
-def _moving(scene: Scene) -> list[Motion]:
+def _moving(scene: Scene) -> list[Pose]:
     things = (scene.camera, *scene.bodies, *scene.lights, *scene.parts)
     motions = (getattr(thing, "motion", None) for thing in things)
     return [motion for motion in motions if motion is not None and not isinstance(motion, Still)]

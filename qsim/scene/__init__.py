@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 from qsim.files import lazy_names
 
 if TYPE_CHECKING:
-    from qsim.scene.scene import Body, Camera, Scene
+    from qsim.optics.camera import Camera
+    from qsim.scene.scene import Body, Scene
 
 __all__ = ["Body", "Camera", "Scene"]
 

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from qsim.optics.camera import Vector
 from qsim.scene.rotation import (
     ORIGIN,
     UP,
     Array,
-    Vector,
     about,
     exponential,
     left_jacobian,

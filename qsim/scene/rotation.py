@@ -11,8 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qsim.optics.camera import Vector
+
 Array = NDArray[np.float64]
-Vector = tuple[float, float, float]
+
 
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 UP: Vector = (0.0, 1.0, 0.0)

@@ -2,7 +2,7 @@
 
 A number that its maker or authors did not publish is left out: a detection efficiency of 1 with the note "detected
 photons" means that light has to be given as photons that this sensor detects. A fill factor belongs to the camera
-(`scene.Camera.fill_factor`), never to the sensor, so that it enters once.
+(`optics.Camera.fill_factor`), never to the sensor, so that it enters once.
 
     load("quiver-physical", ppp=3.25)     load("spad-320x240", bits=3)     load("my_sensor.toml")
 

@@ -12,7 +12,7 @@ from numpy import ndarray as Array
 from qsim.clip.clip import PHYSICAL, RELATIVE, Clip, ClipWriter
 from qsim.dataset.generation import Options, generate
 from qsim.dataset.recipe import Job, Recipe, Settings
-from qsim.scene.scene import Camera
+from qsim.optics.camera import Camera
 
 ClipMaker = Callable[..., Clip]
 

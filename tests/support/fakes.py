@@ -15,7 +15,8 @@ import numpy as np
 from qsim.clip.clip import PHYSICAL, Clip, ClipWriter
 from qsim.dataset.job_runner import provenance
 from qsim.dataset.recipe import Job
-from qsim.scene.scene import Camera, describe
+from qsim.optics.camera import Camera
+from qsim.scene.scene import describe
 
 RECIPE = """[recipe]
 name = "small"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from qsim.optics.camera import Camera, Pose
 from qsim.rendering.fidelity import Budget
 from qsim.rendering.renderer import Renderer
-from qsim.scene.scene import Body, Camera, Constant, Diffuse, Light, Mesh, Motion, Scene, Texture
+from qsim.scene.scene import Body, Constant, Diffuse, Light, Mesh, Scene, Texture
 
 CAMERA = Camera(focal_length=2e-3, f_number=2.8, pixel_pitch=5e-5, height=24, width=33, origin=(0, 0, 4))
 SKY = Constant(0.7)
@@ -26,7 +27,7 @@ def scene(*bodies: Body, light: Light = SKY, camera: Camera = CAMERA) -> Scene:
     return Scene("test", 0, camera, (light,), bodies)
 
 
-def plate(motion: Motion | None, light: Light = SKY, camera: Camera = CAMERA) -> Scene:
+def plate(motion: Pose | None, light: Light = SKY, camera: Camera = CAMERA) -> Scene:
     """A textured plate (body 1) before a grey wall (body 0)."""
     texture = Texture(0.2 + 0.6 * np.random.default_rng(5).random((6, 6)))
     wall = Body("wall", square(12, -1), Diffuse(0.3))

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 import scenes
+from qsim.optics.camera import Camera
 from qsim.rendering.fidelity import Budget
 from qsim.rendering.renderer import Renderer
 from qsim.scene.motion import Translation
-from qsim.scene.scene import AreaLamp, Body, Camera, Constant, EnvironmentImage, PointLight, Scene, SunSky
+from qsim.scene.scene import AreaLamp, Body, Constant, EnvironmentImage, PointLight, Scene, SunSky
 from qsim.scene.shapes import sheet
 from scenes.stage import FRAME_RATE, HEIGHT, WIDTH
 

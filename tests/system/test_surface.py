@@ -15,7 +15,8 @@ import qsim
 import quiver
 from qsim import QIS, BinarySPAD, CountingSPAD, Dataset, Scene, Sensing, sense
 from qsim.dataset import generation, recipe
-from qsim.scene.scene import Camera, Constant
+from qsim.optics.camera import Camera
+from qsim.scene.scene import Constant
 
 ROOT = Path(__file__).parents[2]
 

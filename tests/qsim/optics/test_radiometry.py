@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from qsim.optics import radiometry
+from qsim.optics.camera import Camera
 from qsim.optics.radiometry import expected_photons, photon_energy, photons_per_lux, to_irradiance, to_photons
-from qsim.scene.scene import Camera
 
 PAPER = Camera(
     focal_length=8e-3, f_number=2.8, pixel_pitch=1.1e-6, height=10, width=7, transmission=0.9, wavelength=555e-9

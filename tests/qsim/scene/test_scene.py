@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from qsim.optics.camera import Camera
 from qsim.scene.motion import Spin, Translation
 from qsim.scene.scene import (
     Body,
-    Camera,
     Constant,
     Diffuse,
     EnvironmentImage,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from qsim.clip.clip import PHYSICAL, RELATIVE, Clip, ClipWriter
+from qsim.optics.camera import Camera
 from qsim.optics.radiometry import photons_per_lux
-from qsim.scene.scene import Camera
 from qsim.studies.bit_depth import paper_figures
 
 SIZE = (24, 30)
