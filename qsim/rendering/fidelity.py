@@ -21,8 +21,8 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import Errors, Stated, decibels, white_in
+from qsim.clip.motion_statistics import MOVING
 from qsim.optics.radiometry import WHITE_PER_MEAN
-from qsim.rendering.ground_truth import MOVING
 
 if TYPE_CHECKING:
     from qsim.optics.camera import Camera

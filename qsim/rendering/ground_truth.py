@@ -21,19 +21,7 @@ from numpy import ndarray as Array
 from qsim.optics.camera import Camera
 from qsim.scene.scene import Body, Scene
 
-MOVING = 0.1  # px per frame; what moves farther counts as moving
 OCCLUSION_TOLERANCE = 1e-4  # relative distance by which a surface may lie before the point that it is itself
-
-
-def moving_mean(length: Array, frames: int = 1) -> float | None:
-    """Mean motion [px] of the pixels that move more than `MOVING` in so many clip frames; None if none does.
-
-    `length` is that of the flow in px per clip frame, of any shape, NaN where unknown. The answer is for `frames` clip
-    frames. Clip pages and studies use this definition.
-    """
-    travel = length[np.isfinite(length)] * frames
-    moving = travel[travel > MOVING]
-    return float(moving.mean()) if moving.size else None
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from qsim import colour
 from qsim.clip.clamped_error import stated
 from qsim.clip.clip import RELATIVE, Clip, Stream
+from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, MOVING, SLOWEST, moving_mean
 from qsim.clip.stream import electrons_per_photon
 from qsim.optics.radiometry import clip_photons
-from qsim.rendering.ground_truth import MOVING, moving_mean
 from qsim.report import html as page
 from qsim.sensor.defects import defect_table, fixed_pattern
-from qsim.studies.bit_depth.clip_study import CODE_BITS, CODE_PLANES, SLOWEST
 
 FRAMES = 48  # of a player
 WIDTH = 512  # columns of a panel; wider pictures are shown smaller by a whole factor

@@ -62,8 +62,6 @@ STILL_FORBIDDEN: set[tuple[str, str]] = {
     ("qsim.clip", "qsim.formats"),
     ("qsim.dataset", "qsim.formats"),
     ("qsim.optics", "qsim.clip"),
-    ("qsim.report", "qsim.rendering"),
-    ("qsim.report", "qsim.studies"),
     ("qsim.sensor", "qsim.formats"),
     ("quiver", "quiver.data"),
     ("quiver.data", "qsim.cli"),

@@ -26,18 +26,15 @@ from numpy import ndarray as Array
 
 from qsim import keys
 from qsim.clip.clip import Clip
+from qsim.clip.motion_statistics import CODE_PLANES, SLOWEST, moving_mean
 from qsim.optics import radiometry
-from qsim.rendering.ground_truth import moving_mean
 from qsim.sensor import devices
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.bit_depth.laws import Structure
 
-SLOWEST = 10_000.0  # clip frames per second: below, a "plane" is too long to stand for an instant
 MODELS = ("planes", "multibit")
-CODE_BITS = 3  # motion is stated per frame of 3 bits, whatever depths are compared
-CODE_PLANES = 2**CODE_BITS - 1
 _GRID = 600  # light levels at which estimates are tabled
 
 

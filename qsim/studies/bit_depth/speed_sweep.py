@@ -15,11 +15,11 @@ from numpy import ndarray as Array
 from qsim import keys
 from qsim.clip import stream
 from qsim.clip.clip import Clip, ClipWriter
+from qsim.clip.motion_statistics import CODE_BITS
 from qsim.optics import radiometry
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.bit_depth.answer import answer, at_edge, code_motion, marked, widened
 from qsim.studies.bit_depth.clip_study import (
-    CODE_BITS,
     MODELS,
     Question,
     Study,

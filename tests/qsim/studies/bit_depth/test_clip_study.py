@@ -5,7 +5,7 @@ import pytest
 
 from qsim.cli.program import main
 from qsim.clip.clip import RELATIVE, Clip, ClipWriter
-from qsim.rendering.ground_truth import moving_mean
+from qsim.clip.motion_statistics import moving_mean
 from qsim.report import clip_section
 from qsim.studies.bit_depth import answer, clip_study
 from qsim.studies.bit_depth.clip_study import Question, study

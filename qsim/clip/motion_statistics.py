@@ -1,0 +1,26 @@
+"""How far things move in a clip, from its flow: per frame, and per frame of a bit-depth study.
+
+A **plane** is one clip frame read with one bit; a frame of b bits is 2^b - 1 planes. Clip pages and studies use these
+definitions.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy import ndarray as Array
+
+MOVING = 0.1  # px per frame; what moves farther counts as moving
+SLOWEST = 10_000.0  # clip frames per second: below, a "plane" is too long to stand for an instant
+CODE_BITS = 3  # motion is stated per frame of 3 bits, whatever depths are compared
+CODE_PLANES = 2**CODE_BITS - 1
+
+
+def moving_mean(length: Array, frames: int = 1) -> float | None:
+    """Mean motion [px] of the pixels that move more than `MOVING` in so many clip frames; None if none does.
+
+    `length` is that of the flow in px per clip frame, of any shape, NaN where unknown. The answer is for `frames` clip
+    frames.
+    """
+    travel = length[np.isfinite(length)] * frames
+    moving = travel[travel > MOVING]
+    return float(moving.mean()) if moving.size else None
