@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from quiver.data.codes import read_json
+from qsim.files import read_json
 
 SECONDS = 0.15  # that the measurement may take, after one call of each number
 

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from qsim.cli.console import bar, output
 from quiver.cli.options import add_running, command, numbers, running_options, size, use_threads, whole_numbers, words
 
 MEMORY = "2GB"  # as other commands
@@ -37,7 +38,6 @@ def add_domain(sub: Any) -> None:
 
 def _run_domain(args: argparse.Namespace) -> int:
     from quiver import threads
-    from quiver.data.codes import bar, output
     from quiver.model.weights import metadata_of
     from quiver.restoration.domain import Domain, read_scope, table
     from quiver.restoration.restorers import network_restorer, weights_path
@@ -72,7 +72,7 @@ def _run_domain(args: argparse.Namespace) -> int:
 
 
 def _question(args: argparse.Namespace) -> Any:
-    from quiver.data.codes import Light
+    from quiver.data.illumination import Light
     from quiver.evaluation.domain_measurement import CLASSICAL, Question, clips_of
 
     lights = tuple(

@@ -14,6 +14,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from qsim.cli import console
+from qsim.cli.console import note
+from qsim.files import check_ours
+
 NETWORKS = ("nano", "quiver-s", "quiver", "unet")  # see model.py
 PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see run.py
 DEFAULT_METHOD = "nano"  # of `quiver restore` and `quiver.restore`
@@ -120,7 +124,6 @@ def add_threads(parser: argparse.ArgumentParser) -> None:
 def use_threads(args: argparse.Namespace, earlier: int | None = None) -> int:
     """Set the number of torch's threads, and say which with --verbose."""
     from quiver import threads
-    from quiver.data.codes import note
 
     chosen = threads.use(args.threads, earlier)
     if args.verbose:
@@ -143,7 +146,6 @@ def running_options(args: argparse.Namespace) -> Any:
 
 def renew(folder: Path, mark: str, ours: str) -> None:
     """Remove a folder that holds the file `mark`, and files whose names match the pattern `ours` only."""
-    from quiver.data.codes import check_ours
 
     if (folder / mark).is_file():
         check_ours(folder, ours)
@@ -156,9 +158,7 @@ def command(
     sub: Any, name: str, action: Any, what: str, example: str, *, goes_on: bool = False
 ) -> argparse.ArgumentParser:
     """A command's parser, as `qsim.console.command` makes it."""
-    from quiver.data import codes
-
-    return codes.command(sub, name, action, what, example, codes.GOES_ON if goes_on else codes.STARTS_AGAIN)
+    return console.command(sub, name, action, what, example, console.GOES_ON if goes_on else console.STARTS_AGAIN)
 
 
 @contextlib.contextmanager

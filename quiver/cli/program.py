@@ -14,6 +14,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from qsim import __version__
+from qsim.cli.completion import add_completion
+from qsim.cli.console import Parser, bar, note, output, run
+from qsim.files import write_bytes, write_json
 from quiver.cli.domain import add_domain
 from quiver.cli.options import (
     DEFAULT_METHOD,
@@ -36,7 +40,6 @@ from quiver.cli.train import add_ablate, add_train
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; returns the exit code."""
-    from quiver.data.codes import Parser, __version__, add_completion, run
     from quiver.threads import wait_without_spinning
 
     wait_without_spinning()
@@ -84,7 +87,6 @@ def _add_restore(sub: Any) -> None:
 
 def _run_restore(args: argparse.Namespace) -> int:
     from quiver import threads
-    from quiver.data.codes import bar, note, output
     from quiver.restoration.restored_file import restore_to_file
     from quiver.restoration.restorers import restorer
     from quiver.restoration.sources import assumed, codes_to_restore, refuse_idle
@@ -125,7 +127,6 @@ def _run_restore(args: argparse.Namespace) -> int:
 
 def _check_domain(args: argparse.Namespace, methods: Sequence[Any], streams: Iterable[Any]) -> list[str]:
     """A line on stderr for each network outside of what it was measured for; `ValueError` with --strict."""
-    from quiver.data.codes import note
     from quiver.restoration.domain import measured_at, refuse_outside, remarks
 
     found: list[str] = []
@@ -187,7 +188,6 @@ def _run_evaluate(args: argparse.Namespace) -> int:
         return _run_static(args, methods)
     if args.source is None or args.output is None:
         raise ValueError("give a data set or clip folder and -o, or --static COUNTS")
-    from quiver.data.codes import bar, output
     from quiver.evaluation import summary
     from quiver.evaluation.comparison import evaluate, streams
     from quiver.restoration.sources import plan_of
@@ -208,9 +208,10 @@ def _run_evaluate(args: argparse.Namespace) -> int:
 
 
 def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
-    from quiver.data.codes import output, peak_of
+    from quiver.data.clips import peak_of
+    from quiver.data.photon_counts import read_counts
     from quiver.evaluation.comparison import json_safe
-    from quiver.evaluation.static_object import FORMAT, counted, evaluate_static, markdown, read_counts
+    from quiver.evaluation.static_object import FORMAT, counted, evaluate_static, markdown
     from quiver.restoration.sources import refuse_for_counts
 
     refuse_for_counts(args)
@@ -253,7 +254,6 @@ def _add_bench(sub: Any) -> None:
 
 def _run_bench(args: argparse.Namespace) -> int:
     from quiver import threads
-    from quiver.data.codes import bar, output, write_bytes, write_json
     from quiver.evaluation.comparison import json_safe
     from quiver.evaluation.cost import Setting, bench, checked_cases, figure, markdown
     from quiver.training.run_folder import alone_in
@@ -299,7 +299,6 @@ def _add_convert_weights(sub: Any) -> None:
 
 
 def _run_convert_weights(args: argparse.Namespace) -> int:
-    from quiver.data.codes import output
     from quiver.model.weights import convert_weights
 
     if args.force and args.output.exists():

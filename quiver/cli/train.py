@@ -12,6 +12,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from qsim.cli.console import note, output
 from quiver.cli.options import (
     NETWORKS,
     PROTOCOLS,
@@ -66,7 +67,7 @@ def _run_train(args: argparse.Namespace) -> int:
     import torch
 
     from quiver import threads
-    from quiver.data.codes import note, open_clips, output
+    from quiver.data.clips import open_clips
     from quiver.model.quiver import build
     from quiver.restoration.restorers import pick_device
     from quiver.training.loop import Diverged, train
@@ -159,7 +160,6 @@ def add_ablate(sub: Any) -> None:
 
 def _run_ablate(args: argparse.Namespace) -> int:
     from quiver import threads
-    from quiver.data.codes import note, output
     from quiver.evaluation import summary
     from quiver.evaluation.comparison import Plan
     from quiver.model.config import ABLATIONS

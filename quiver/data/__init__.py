@@ -1,17 +1,36 @@
-"""Codes and training windows out of qsim's files."""
+"""Codes and training windows out of qsim's files; the door to qsim's physics and data."""
 
 from typing import TYPE_CHECKING
 
 from qsim.files import lazy_names
 
 if TYPE_CHECKING:
-    from quiver.data.codes import open_clips
+    from quiver.data.clips import open_clips
+    from quiver.data.codes import Codes, array_codes, sensed, stream_codes
+    from quiver.data.illumination import Light
+    from quiver.data.windows import Windows, WindowSettings
 
-__all__ = ["open_clips"]
+__all__ = [
+    "Codes",
+    "Light",
+    "WindowSettings",
+    "Windows",
+    "array_codes",
+    "open_clips",
+    "sensed",
+    "stream_codes",
+]
 
 __getattr__ = lazy_names(
     __name__,
     {
-        "open_clips": "codes",
+        "Codes": "codes",
+        "Light": "illumination",
+        "WindowSettings": "windows",
+        "Windows": "windows",
+        "array_codes": "codes",
+        "open_clips": "clips",
+        "sensed": "codes",
+        "stream_codes": "codes",
     },
 )

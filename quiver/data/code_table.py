@@ -10,10 +10,15 @@ in plain NumPy, for worker processes that must not touch Dr.Jit.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
 from numpy import ndarray as Array
+
+from qsim import keys
+from qsim.keys import Key
+from qsim.sensor.sensor import Sensor
 
 CELLS = 1024  # along each side of the table
 U_SHIFT = 22  # 2^32 / CELLS words fall into one cell
@@ -77,3 +82,32 @@ class CodeTable:
                 )
             codes.ravel()[open_] = decided
         return codes
+
+
+@lru_cache(maxsize=64)
+def _code_table(sensor: Sensor, exposure: float) -> CodeTable | None:
+    """None for a sensor that a table cannot hold."""
+    if sensor.bits > TABLE_BITS:
+        return None
+    try:
+        return CodeTable(sensor, exposure)
+    except ValueError:
+        return None
+
+
+def draw_codes(sensor: Sensor, photons: Array, exposure: float, key: Key, origin: tuple[int, int] = (0, 0)) -> Array:
+    """Codes [T, H, W] of expected photons [T, H, W], frame t under `key.at(key.frame + t)`; quick, without Dr.Jit.
+
+    `origin` (y, x) places a crop in the full frame.
+
+    The codes of `sensor.sample(..., engine="reference")` where a sensor draws one number per pixel. A clocked SPAD
+    draws one per plane: its codes have the same exact distribution, from other numbers.
+    """
+    table = _code_table(sensor, exposure)
+    if table is None or not (photons.min() >= 0 and photons.max() < np.inf):  # the sensor names the bad pixel
+        return sensor.sample(photons, exposure, key=key, origin=origin, engine="reference")
+    first = keys.words(key, photons.shape, origin)
+    try:
+        return table.draw(photons, first)
+    except LookupError:
+        return table.draw(photons, first, keys.words(key, photons.shape, origin, redraw=1))

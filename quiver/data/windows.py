@@ -22,8 +22,17 @@ import torch
 from numpy import ndarray as Array
 from torch.utils.data import Dataset, Sampler
 
-from quiver.data.codes import Clip, Draw, Key, Light, Sensor, clip_photons, draw_codes, has_sharp, peak_of
-from quiver.data.noise import Mixture, Noise, check_windows, choose, window_codes
+from qsim.clip.clip import Clip
+from qsim.clip.simulation import Draw
+from qsim.keys import Key
+from qsim.optics.radiometry import clip_photons
+from qsim.sensor.sensor import Sensor
+from quiver.data.clips import has_sharp, peak_of
+from quiver.data.code_table import draw_codes
+from quiver.data.illumination import Light
+from quiver.data.mixture import Mixture, choose
+from quiver.data.noise import Noise
+from quiver.data.window_noise import check_windows, window_codes
 
 TRAINING, VALIDATION = 1, 2  # stages of the random keys: no two uses share noise (0 is `qsim sense`)
 

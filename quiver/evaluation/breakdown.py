@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
-from quiver.data.codes import Clip, replacing
+from qsim.files import replacing
+from quiver.data.clips import Clip
 from quiver.evaluation import metrics
 
 EDGES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)  # px/frame

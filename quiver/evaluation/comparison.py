@@ -22,22 +22,10 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from quiver.data.codes import (
-    Clip,
-    Codes,
-    Light,
-    array_codes,
-    known,
-    mean_light,
-    open_clips,
-    peak_of,
-    read_json,
-    sensed,
-    stored,
-    truth,
-    windows_sensed,
-    write_json,
-)
+from qsim.files import read_json, write_json
+from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
+from quiver.data.codes import Codes, array_codes, sensed, stored, windows_sensed
+from quiver.data.illumination import Light
 from quiver.evaluation import breakdown, metrics
 from quiver.evaluation.peak_memory import peak_memory, reset_peak
 from quiver.restoration.restorers import Restorer

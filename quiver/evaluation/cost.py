@@ -20,8 +20,14 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.checks import suggest
+from qsim.files import replacing
+from qsim.keys import Key
 from quiver.baselines import METHODS
-from quiver.data.codes import Codes, Key, Light, array_codes, draw_codes, peak_of, replacing, suggest
+from quiver.data.clips import peak_of
+from quiver.data.code_table import draw_codes
+from quiver.data.codes import Codes, array_codes
+from quiver.data.illumination import Light
 from quiver.evaluation import metrics
 from quiver.evaluation.peak_memory import peak_memory, reset_peak
 from quiver.restoration.restorers import (

@@ -17,7 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from quiver.data.codes import Clip, Light, Lock, __version__, known, mean_light, open_clips, peak_of, sensed, truth
+from qsim import __version__
+from qsim.files import Lock
+from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
+from quiver.data.codes import sensed
+from quiver.data.illumination import Light
 from quiver.evaluation import metrics
 from quiver.evaluation.comparison import in_memory
 from quiver.model.weights import annotate, metadata_of

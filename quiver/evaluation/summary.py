@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from qsim.files import replacing, write_bytes, write_json
 from quiver import threads
-from quiver.data.codes import replacing, write_bytes, write_json
 from quiver.evaluation import breakdown, metrics
 from quiver.evaluation.comparison import FORMAT, Plan, Row, json_safe
 from quiver.evaluation.metrics import Interval, over_scenes

@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_safetensors
 from torch import Tensor, nn
 
-from quiver.data.codes import write_bytes
+from qsim.files import write_bytes
 from quiver.model.quiver import QUIVER, Config
 from quiver.model.unet import UNet, UNetConfig
 

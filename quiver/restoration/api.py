@@ -10,7 +10,9 @@ import numpy as np
 from numpy import ndarray as Array
 
 from quiver.cli.options import DEFAULT_METHOD
-from quiver.data.codes import Clip, Codes, Light, Sensor, Stream, array_codes, open_stream, sensed, stream_codes
+from quiver.data.clips import Clip
+from quiver.data.codes import Codes, Sensor, Stream, array_codes, open_stream, sensed, stream_codes
+from quiver.data.illumination import Light
 from quiver.restoration.domain import refuse_outside, remarks
 from quiver.restoration.restorers import Options, restorer
 from quiver.restoration.sources import refuse_idle

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quiver.baselines import METHODS
-from quiver.data.codes import Codes, Light, Sensor
+from quiver.data.codes import Codes, Sensor
+from quiver.data.illumination import Light
 from quiver.data.noise import Noise
 
 if TYPE_CHECKING:

@@ -17,7 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from quiver.data.codes import Codes, Lock, __version__, read_json, sealed, sha256, sync_folder, write_json
+from qsim import __version__
+from qsim.files import Lock, read_json, sealed, sha256, sync_folder, write_json
+from quiver.data.codes import Codes
 from quiver.restoration.restorers import Progress, Restorer, check_finite
 
 FORMAT = "quiver-restored-1"

@@ -21,9 +21,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.checks import suggest
 from quiver.baselines import METHODS
 from quiver.baselines.sliding_window import look_ahead, reflect
-from quiver.data.codes import Codes, suggest
+from quiver.data.codes import Codes
 from quiver.restoration.pieces import Disagreement, plan_pieces
 
 if TYPE_CHECKING:

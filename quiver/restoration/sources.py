@@ -10,17 +10,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quiver.data.codes import (
-    Clip,
-    Codes,
-    Light,
-    cube_codes,
-    follows_light,
-    open_clips,
-    open_stream,
-    sensed,
-    stream_codes,
-)
+from quiver.data.clips import Clip, open_clips
+from quiver.data.codes import Codes, open_stream, sensed, stream_codes
+from quiver.data.illumination import Light, follows_light
+from quiver.data.photon_cubes import cube_codes
 
 if TYPE_CHECKING:
     from quiver.evaluation.comparison import Plan

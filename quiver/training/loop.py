@@ -25,7 +25,7 @@ from torch.utils.data import DataLoader, Subset
 from tqdm import tqdm
 
 from quiver import threads
-from quiver.data.codes import open_clips
+from quiver.data.clips import open_clips
 from quiver.data.windows import Batches, Windows, WindowSettings
 from quiver.evaluation import metrics
 from quiver.model.quiver import RADIUS, WINDOW

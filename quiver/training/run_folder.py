@@ -22,9 +22,12 @@ from typing import Any
 import torch
 from torch import nn
 
+from qsim.files import Lock, check_ours, read_json, replacing, write_bytes, write_json
 from quiver import threads
-from quiver.data.codes import Light, Lock, check_ours, open_clips, read_json, replacing, write_bytes, write_json
-from quiver.data.noise import Mixture, Noise, choose, describe
+from quiver.data.clips import open_clips
+from quiver.data.illumination import Light
+from quiver.data.mixture import Mixture, choose, describe
+from quiver.data.noise import Noise
 from quiver.model import weights
 from quiver.training.loss import PRESETS as LOSSES
 from quiver.training.optimiser import OPTIMISERS, Kind, Optimiser

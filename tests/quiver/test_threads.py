@@ -84,7 +84,10 @@ COMPARE = """
 import sys
 import numpy as np
 import torch
-from quiver.data.codes import Key, Light, array_codes, draw_codes
+from quiver.data.code_table import draw_codes
+from quiver.data.codes import array_codes
+from quiver.data.illumination import Light
+from qsim.keys import Key
 from quiver.model.quiver import build
 from quiver.restoration.restorers import Options, method_names, restorer, wrap_network
 

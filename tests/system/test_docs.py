@@ -28,7 +28,6 @@ import pytest
 
 import qsim.cli.program
 import quiver.cli.program
-import quiver.data.codes
 from qsim.studies.validation.reading import Report
 
 ROOT = Path(__file__).parents[2]
@@ -116,10 +115,8 @@ def test_python_blocks_run(path, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("words", commands(), ids=" ".join)
 def test_commands_are_understood(words, monkeypatch):
-    program, home = {"qsim": (qsim.cli.program, qsim.cli.program), "quiver": (quiver.cli.program, quiver.data.codes)}[
-        words[0]
-    ]
-    monkeypatch.setattr(home, "run", lambda parser, argv: parser.parse_args(argv))
+    program = {"qsim": qsim.cli.program, "quiver": quiver.cli.program}[words[0]]
+    monkeypatch.setattr(program, "run", lambda parser, argv: parser.parse_args(argv))
     assert program.main(words[1:]) is not None
 
 

@@ -34,7 +34,8 @@ from qsim.formats import importing, video
 from qsim.formats.recording import Hints
 from qsim.sensor import devices
 from qsim.sensor.defects import defect_table
-from quiver.data.codes import Light, cube_codes
+from quiver.data.illumination import Light
+from quiver.data.photon_cubes import cube_codes
 
 MEMORY = 400 << 20  # bytes that a reader of these tiny files may take at most
 T, H, W = 4, 6, 16

@@ -63,9 +63,6 @@ STILL_FORBIDDEN: set[tuple[str, str]] = {
     ("qsim.dataset", "qsim.formats"),
     ("qsim.optics", "qsim.clip"),
     ("qsim.sensor", "qsim.formats"),
-    ("quiver", "quiver.data"),
-    ("quiver.data", "qsim.cli"),
-    ("quiver.model", "quiver.data"),
     ("quiver.model", "quiver.restoration"),
     ("quiver.restoration", "quiver.cli"),
     ("quiver.restoration", "quiver.evaluation"),
@@ -109,8 +106,6 @@ STILL_LONG: set[str] = {
     "qsim.sensor.spad",
     "qsim.studies.bit_depth.clip_study",
     "qsim.studies.bit_depth.speed_sweep",
-    "quiver.data.codes",
-    "quiver.data.noise",
     "quiver.model.blocks",
     "quiver.training.run_folder",
 }

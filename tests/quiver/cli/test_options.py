@@ -21,7 +21,6 @@ from golden import fill_by_rule, published_state
 from option_rows import Acts, Refused, Row, Run, check, loudness, names, names_of, options, parser_of, stdout
 from safetensors.numpy import load_file
 
-import quiver.data.codes
 from qsim.clip.stream import Sensing, sense
 from qsim.sensor import devices
 from quiver import threads
@@ -577,11 +576,11 @@ def work(scale: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_option_has_a_row():
     """Read from the parsers: an option without a row fails here, and so does a row without an option."""
-    assert set(ROWS) == set(options(parser_of(program.main, quiver.data.codes), ""))
+    assert set(ROWS) == set(options(parser_of(program.main, program), ""))
 
 
 def test_every_row_shows_its_option():
-    parser = parser_of(program.main, quiver.data.codes)
+    parser = parser_of(program.main, program)
     for (command, option), rows in ROWS.items():
         assert rows
         for row in rows:

@@ -12,7 +12,7 @@ import pytest
 
 from quiver.cli.options import size
 from quiver.cli.program import main
-from quiver.data.codes import open_clips
+from quiver.data.clips import open_clips
 
 ROOT = Path(__file__).parents[3]
 COMMANDS = ("train", "restore", "evaluate", "domain", "ablate", "bench", "convert-weights")

@@ -23,8 +23,12 @@ from qsim.sensor.defects import defect_table
 from qsim.sensor.defects.defect_table import Flaws
 from qsim.sensor.defects.fixed_pattern import DarkSpread, Defects
 from quiver.cli.program import main
-from quiver.data.codes import Light, draw_codes, open_clips
-from quiver.data.noise import Noise, choose, describe, window_codes
+from quiver.data.clips import open_clips
+from quiver.data.code_table import draw_codes
+from quiver.data.illumination import Light
+from quiver.data.mixture import choose, describe
+from quiver.data.noise import Noise
+from quiver.data.window_noise import window_codes
 from quiver.data.windows import TRAINING, Place, Windows, WindowSettings, turned
 from quiver.model.unet import UNet, UNetConfig
 from quiver.restoration.restorers import restorer

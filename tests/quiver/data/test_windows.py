@@ -17,8 +17,11 @@ from qsim.optics.radiometry import clip_photons, light_level
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD, CountingSPAD
-from quiver.data.code_table import CodeTable
-from quiver.data.codes import Light, array_codes, cube_codes, draw_codes, open_clips, sensed, truth
+from quiver.data.clips import open_clips, truth
+from quiver.data.code_table import CodeTable, draw_codes
+from quiver.data.codes import array_codes, sensed
+from quiver.data.illumination import Light
+from quiver.data.photon_cubes import cube_codes
 from quiver.data.windows import Batches, Windows, WindowSettings, as_input
 
 EXPOSURE = 5e-4

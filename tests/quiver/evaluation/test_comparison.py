@@ -17,10 +17,13 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.clip.clip import RELATIVE, ClipWriter
 from qsim.clip.stream import Sensing, sense
-from quiver.data.codes import Codes, Light, array_codes, ideal_counter, open_clips, sensed, truth
+from quiver.data.clips import open_clips, truth
+from quiver.data.codes import Codes, array_codes, sensed
+from quiver.data.illumination import Light, ideal_counter
+from quiver.data.photon_counts import Counts, read_counts
 from quiver.evaluation import summary
 from quiver.evaluation.comparison import Plan, Row, append, begin, evaluate, finished, scored_frames, truth_psnr
-from quiver.evaluation.static_object import Counts, evaluate_static, markdown, mean_square, read_counts, reference
+from quiver.evaluation.static_object import evaluate_static, markdown, mean_square, reference
 from quiver.restoration.restorers import Restorer, restorer
 
 HAZELNUT = Path(__file__).parents[2] / "data" / "hazelnut_gates6.npz"

@@ -18,7 +18,9 @@ from qsim.sensor import devices
 from qsim.sensor.qis import QIS
 from quiver.baselines import METHODS
 from quiver.cli.program import main
-from quiver.data.codes import Codes, Light, array_codes, open_clips
+from quiver.data.clips import open_clips
+from quiver.data.codes import Codes, array_codes
+from quiver.data.illumination import Light
 from quiver.data.noise import Noise
 from quiver.evaluation import domain_measurement
 from quiver.model.unet import UNet, UNetConfig

@@ -19,7 +19,9 @@ from numpy import ndarray as Array
 from qsim.clip.stream import Sensing, sense
 from qsim.sensor.qis import QIS
 from quiver.cli.program import main
-from quiver.data.codes import Codes, Light, array_codes, cube_codes, open_stream, sensed, stream_codes
+from quiver.data.codes import Codes, array_codes, open_stream, sensed, stream_codes
+from quiver.data.illumination import Light
+from quiver.data.photon_cubes import cube_codes
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
 from quiver.restoration import restored_file

@@ -18,7 +18,9 @@ from torch import Tensor, nn
 
 from qsim.sensor.qis import QIS
 from quiver.baselines import METHODS
-from quiver.data.codes import Codes, Light, array_codes, sensed, truth
+from quiver.data.clips import truth
+from quiver.data.codes import Codes, array_codes, sensed
+from quiver.data.illumination import Light
 from quiver.evaluation import metrics
 from quiver.model.quiver import Output, build
 from quiver.model.unet import UNet, UNetConfig
@@ -251,7 +253,8 @@ def test_cuda_is_asked_for_by_name(tmp_path: Path):
 MEMORY_PROGRAM = """
 import numpy as np
 from quiver.evaluation.peak_memory import peak_memory, reset_peak
-from quiver.data.codes import Light, array_codes
+from quiver.data.codes import array_codes
+from quiver.data.illumination import Light
 from quiver.model.quiver import build
 from quiver.restoration.restorers import Options, wrap_network
 sensor = Light().device(5e-4)

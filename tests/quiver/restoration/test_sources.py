@@ -11,7 +11,8 @@ from clips import ClipMaker
 import quiver
 from qsim.clip.stream import Sensing, sense
 from quiver.cli.program import main
-from quiver.data.codes import Light, cube_codes, plane_bits
+from quiver.data.illumination import Light
+from quiver.data.photon_cubes import cube_codes, plane_bits
 from quiver.restoration.restorers import Options, restorer
 
 VALID = [2**b - 1 for b in range(1, 17)]
@@ -45,7 +46,7 @@ def test_planes_unpacked_in_pieces_are_the_same(tmp_path, monkeypatch):
     drawn = np.random.default_rng(1).integers(0, 2, (511 * 2, 3, 11), dtype=np.uint8)
     path = packed(drawn, tmp_path / "c.npy")
     whole = cube_codes(path, SPAD, 1000.0, planes=511, width=11).read(0, 2)
-    monkeypatch.setattr("quiver.data.codes.PLANE_PIXELS", 3 * 11 * 7)
+    monkeypatch.setattr("quiver.data.photon_cubes.PLANE_PIXELS", 3 * 11 * 7)
     np.testing.assert_array_equal(cube_codes(path, SPAD, 1000.0, planes=511, width=11).read(0, 2), whole)
 
 

@@ -1,0 +1,72 @@
+"""Light levels and the sensors that see them.
+
+light level, sensor's name or file -> sensor, and all that decides the codes of a clip
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from qsim.clip.clip import Clip
+from qsim.clip.simulation import Draw
+from qsim.clip.stream import Sensing, prepare
+from qsim.sensor import devices
+from qsim.sensor.defects.defect_table import Flaws, from_toml
+from qsim.sensor.qis import QIS
+from qsim.sensor.sensor import Sensor
+
+
+@dataclass(frozen=True)
+class Light:
+    """A light level and the sensor that sees it."""
+
+    sensor: str = "quiver-physical"  # a named device of qsim, or a TOML file
+    ppp: float | None = 3.25  # mean photons per pixel and exposure over the clip; None = the clip's own light
+    bits: int | None = 3  # None = the device's own
+
+    def device(self, exposure: float) -> Sensor:
+        """The sensor for clips with this exposure [s]."""
+        return _device(self, exposure)
+
+    def sensing(self, seed: int = 0) -> Sensing:
+        """The same in qsim's words."""
+        return Sensing(self.sensor, bits=self.bits, ppp=self.ppp, seed=seed)
+
+    def draw(self, clip: Clip, seed: int = 0) -> Draw:
+        """All that decides the codes of a clip, with the defects of a sensor file; `ValueError` if it does not fit."""
+        return prepare(clip, self.sensing(seed))
+
+    @property
+    def label(self) -> str:
+        """`3.25 PPP, 3 bit`, as tables show it."""
+        return ", ".join(
+            (
+                "own light" if self.ppp is None else f"{self.ppp:g} PPP",
+                "own bits" if self.bits is None else f"{self.bits} bit",
+            )
+        )
+
+
+def read_sensor(source: str | Mapping[str, Any], bits: int | None = None) -> tuple[Sensor, Flaws | None]:
+    """The sensor of a file with its defects, or of the record of one; `ValueError` if it has other bits."""
+    if isinstance(source, str):
+        return devices.load(source, bits=bits), from_toml(source)
+    return devices.from_dict(source), None
+
+
+@lru_cache(maxsize=64)
+def _device(light: Light, exposure: float) -> Sensor:
+    return devices.load(light.sensor, ppp=light.ppp, bits=light.bits, exposure=exposure)
+
+
+def follows_light(sensor: str) -> bool:
+    """Whether the gain of a named sensor is set from the photons per pixel."""
+    return sensor in devices.DEVICES and devices.DEVICES[sensor].follows_light
+
+
+def ideal_counter(bits: int) -> Sensor:
+    """A sensor that counts every detected photon up to 2^bits - 1, for measured photon counts."""
+    return QIS(quantum_efficiency=1.0, dark_current=0.0, read_noise=0.0, bits=bits)

@@ -1,0 +1,153 @@
+"""Chooses the noise of training windows: that of a data set's streams, changed by options."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from qsim.clip.clip import Clip
+from qsim.clip.stream import Stream
+from quiver.data.illumination import Light
+from quiver.data.noise import Noise, as_text, short_name
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """What every window draws one of, and what there is to say of the choice."""
+
+    noises: tuple[Noise, ...]
+    remark: str = ""  # where it comes from, if not from the streams
+    streams: tuple[Noise, ...] = ()  # of the clips
+
+    @property
+    def lines(self) -> list[str]:
+        """One line for people, and one more where the data set's streams say something else."""
+        told = [f"noise: {describe(self.noises)}" + (f" ({self.remark})" if self.remark else "")]
+        if self.streams and set(self.streams) != set(self.noises):
+            told.append(f"this differs from the data set's streams: {describe(self.streams)}")
+        return told
+
+
+def choose(
+    clips: Sequence[Clip],
+    sensors: Sequence[str] | None = None,
+    ppp: Sequence[float] | None = None,
+    bits: Sequence[int] | None = None,
+) -> Mixture:
+    """The noise of the clips' streams, with the sensors, light levels [photons/pixel] and bits that are asked for.
+
+    Where sensors are asked for, streams of these are taken if there are any. Without streams the default sensor and
+    light stand in for them. `ValueError` for a stream that training windows cannot be drawn as.
+    """
+    asked = bool(sensors or ppp or bits)
+    streams = _streams(clips)
+    if sensors and ppp and bits:  # nothing is left to the streams, whatever they are
+        streams = [stream for stream in streams if (stream.meta.get("planes_per_code") or 1) == 1]
+    found = _sorted(streams)
+    if not asked:
+        default = "" if found else "the default; the data set has no streams"
+        return Mixture(found or (Noise(),), default, found)
+    base = tuple(noise for noise in found if noise.sensor in (sensors or ())) or found or (Noise(),)
+    asked_for = [
+        _changed(noise, sensor, level, depth)
+        for noise in base
+        for sensor in sensors or (None,)
+        for depth in bits or (None,)
+        for level in ppp or (None,)
+    ]
+    return Mixture(_unique(asked_for), "as asked for", found)
+
+
+def _streams(clips: Sequence[Clip]) -> list[Stream]:
+    return [clip.stream(name) for clip in clips for name in clip.streams]
+
+
+def _unique(noises: Iterable[Noise]) -> tuple[Noise, ...]:
+    return tuple(dict.fromkeys(noises))
+
+
+def _sorted(streams: Iterable[Stream]) -> tuple[Noise, ...]:
+    """What streams were drawn by, each once, in an order that does not depend on their names."""
+    found = _unique(Noise.of_stream(stream) for stream in streams)
+    return tuple(sorted(found, key=lambda n: (n.sensor, n.bits or 0, n.lux or 0.0, n.ppp or 0.0, as_text(n.to_dict()))))
+
+
+def _changed(noise: Noise, sensor: str | None, ppp: float | None, bits: int | None) -> Noise:
+    """A noise with the parts that were asked for."""
+    if sensor is not None and (sensor != noise.sensor or sensor.endswith(".toml")):
+        depth = bits if bits is not None or sensor.endswith(".toml") else noise.bits
+        fresh = Noise.of(Light(sensor, noise.ppp, depth))
+        noise = replace(fresh, lux=noise.lux, diffraction=noise.diffraction)
+    if ppp is not None:
+        noise = replace(noise, ppp=ppp, lux=None)
+    if bits is not None and bits != noise.bits:
+        if noise.record is not None:
+            raise ValueError(f"{noise.sensor}: the file says bits = {noise.bits}, asked for {bits}; change one of them")
+        noise = replace(noise, bits=bits)
+    return noise
+
+
+# ---- Description
+
+
+def describe(noises: Sequence[Noise]) -> str:
+    """`spad-320x240, 1 bit, 1 and 10 PPP, dark-count map; quiver-physical, 3 bits, 3.25 PPP`"""
+    levels: dict[tuple[str, str, int | None], list[str]] = {}
+    for noise in noises:
+        effects = ", ".join([*_effects(noise), *(["diffraction"] if noise.diffraction else [])])
+        levels.setdefault((short_name(noise.sensor), effects, noise.bits), []).append(_level(noise))
+    depths: dict[tuple[str, str, tuple[str, ...]], list[int | None]] = {}
+    for (sensor, effects, bits), found in levels.items():
+        depths.setdefault((sensor, effects, tuple(found)), []).append(bits)
+    return "; ".join(
+        ", ".join(part for part in (sensor, _bits(bits), _joined(found), effects) if part)
+        for (sensor, effects, found), bits in depths.items()
+    )
+
+
+def _level(noise: Noise) -> str:
+    return f"{noise.lux:g} lx" if noise.lux is not None else "own light" if noise.ppp is None else f"{noise.ppp:g} PPP"
+
+
+def _joined(levels: Sequence[str]) -> str:
+    """`1 and 10 PPP` of `1 PPP` and `10 PPP`."""
+    units = {text.rpartition(" ")[2] for text in levels}
+    if len(units) == 1:
+        unit = units.pop()
+        return f"{_and([text.rpartition(' ')[0] for text in levels])} {unit}"
+    return _and(levels)
+
+
+def _bits(bits: Sequence[int | None]) -> str:
+    text = _and(["the sensor's own" if b is None else str(b) for b in bits])
+    return f"{text} {'bit' if list(bits) == [1] else 'bits'}"
+
+
+def _and(words: Sequence[str]) -> str:
+    return " and ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
+
+
+def _effects(noise: Noise) -> list[str]:
+    """The defects, in words."""
+    if noise.defects is None:
+        return []
+    table = json.loads(noise.defects)
+    record = {} if noise.record is None else json.loads(noise.record)
+    model = record.get("model") or type(Light(noise.sensor, noise.ppp or 1.0, noise.bits).device(5e-4)).__name__
+    dark = "dark-current" if model == "QIS" else "dark-count"
+    words = {
+        "dark_map": f"{dark} map",
+        "dark": f"{dark} spread",
+        "gain_map": "gain map",
+        "prnu": "PRNU {:.3g} %",
+        "dead_map": "map of dead pixels",
+        "dead": "{:.3g} % dead pixels",
+        "offset_map": "offset map",
+        "offset": "offsets",
+        "read_noise_map": "read-noise map",
+        "read_noise": "spread of read noise",
+        "crosstalk": "crosstalk",
+        "afterpulse": "afterpulses",
+    }
+    return [text.format(100 * table[key]) if "{" in text else text for key, text in words.items() if table.get(key)]

@@ -1,0 +1,79 @@
+"""Photon counts of a static object, read from a .npy or .npz that may be damaged."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.formats.recording import reading
+
+LARGEST = 1 << 32  # bytes of an array of counts
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Photon counts of a static object."""
+
+    frames: Array  # integers [N, H, W]
+    shares: Array  # [N]; light of each frame relative to the mean frame
+    name: str
+
+    @property
+    def light(self) -> float:
+        """Mean photons per pixel and frame."""
+        return float(self.frames.mean())
+
+
+def read_counts(path: Path) -> Counts:
+    """Counts [N, H, W], or [T, K, H, W] with K time gates, from .npy or a .npz with one array.
+
+    With gates a frame's share is its gate's mean, else its own. `ValueError` for anything else than whole counts, and
+    for a file that is damaged in any way; `FileNotFoundError` without one.
+    """
+    if path.suffix not in (".npy", ".npz"):
+        raise ValueError(f"{path}: photon counts are a .npy, or a .npz with one array")
+    with reading(path, "an array of numbers"):
+        array = _load(path)
+    if array.ndim not in (3, 4) or array.size == 0 or not np.issubdtype(array.dtype, np.integer) or array.min() < 0:
+        raise ValueError(
+            f"{path}: expected whole counts [N, H, W] or [T, K, H, W], got {array.dtype} {list(array.shape)}"
+        )
+    frames = array.reshape(-1, *array.shape[-2:])
+    light = array.mean(axis=(0, 2, 3)) if array.ndim == 4 else array.mean(axis=(1, 2))
+    if not light.min() > 0:
+        raise ValueError(f"{path}: frame or gate {int(np.argmin(light))} holds no photon at all")
+    shares = np.tile(light, len(frames) // len(light)) / light.mean()
+    return Counts(frames, shares, path.name)
+
+
+def _load(path: Path) -> Array:
+    """The one array of a .npy or .npz."""
+    with open(path, "rb") as file:
+        if path.suffix == ".npy":
+            return _array(file, path.stat().st_size)
+        with zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            if len(members) != 1:
+                names = ", ".join(member.filename.removesuffix(".npy") for member in members[:3])
+                raise ValueError(f"holds {len(members)} arrays ({names}); one is read")
+            with archive.open(members[0]) as member:
+                return _array(member, members[0].file_size)
+
+
+def _array(file: IO[bytes], size: int) -> Array:
+    """An array in the .npy format, whose header is believed only as far as its `size` [bytes] reaches."""
+    reader = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    version = np.lib.format.read_magic(file)
+    if version not in reader:
+        raise ValueError(f"version {version} of the format is unknown")
+    shape, _, dtype = reader[version](file)
+    if math.prod(shape) * dtype.itemsize > min(size, LARGEST):
+        raise ValueError(f"{dtype} {list(shape)} needs more than the {size:,} bytes that are there")
+    file.seek(0)
+    return np.asarray(np.lib.format.read_array(file, allow_pickle=False))

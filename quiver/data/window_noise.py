@@ -1,0 +1,95 @@
+"""Codes of one training window with the defects of its sensor, as `qsim sense` draws them.
+
+    Noise, clip, place -> window_codes
+
+A window's defects are those of its place in the full frame, so a pixel has the same ones as in `qsim sense`. What
+reaches into a window from outside is drawn with a margin: the neighbours' crosstalk, and the afterpulses of the frames
+before, as far as the clip has them. Counting pixels that remember an earlier exposure are refused.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.clip.clip import Clip
+from qsim.clip.simulation import Draw
+from qsim.keys import Key
+from qsim.optics.radiometry import clip_photons
+from qsim.sensor.defects.defect_table import Flawed, of_sensor
+from qsim.sensor.sensor import Sensor
+from quiver.data.code_table import draw_codes
+from quiver.data.noise import Noise, stored_defects
+
+NEGLIGIBLE = 1e-6  # chance of an afterpulse chain that is as long as the frames before a window
+
+
+class Placed(Protocol):
+    """Where a window lies in its clip."""
+
+    @property
+    def start(self) -> int: ...
+    @property
+    def y(self) -> int: ...
+    @property
+    def x(self) -> int: ...
+    @property
+    def drift(self) -> tuple[int, int]: ...
+    @property
+    def backwards(self) -> bool: ...
+    @property
+    def key(self) -> Key: ...
+
+
+@lru_cache(maxsize=16)
+def _defective(flaws: str, sensor: Sensor, shape: tuple[int, int]) -> Flawed:
+    return of_sensor(stored_defects(flaws), sensor, *shape)
+
+
+def check_windows(noise: Noise, clip: Clip) -> None:
+    """`ValueError` if windows of this clip cannot be drawn with this noise, each on its own."""
+    draw = noise.draw(clip)
+    if noise.defects is not None:
+        flawed = _defective(noise.defects, draw.plane, clip.shape[1:])
+        if flawed.follows_photons:
+            raise ValueError(
+                f"{noise.sensor}: carry_dead_time and afterpulse of counting pixels reach from exposure to exposure, "
+                "which training windows cannot follow; give --sensor with a file without them"
+            )
+
+
+def window_codes(
+    noise: Noise, draw: Draw, clip: Clip, place: Placed, frames: int, side: int, scale: float = 1.0
+) -> Array:
+    """Codes [T, side, side] of a window with defects, in the order in which its frames are seen, not turned.
+
+    The codes of `qsim sense` under `place.key`, cropped, as far as both draw the same numbers. `draw` is the noise for
+    this clip, `scale` a factor on the light. A crop that drifts keeps the pixels of its first place: the scene moves,
+    the sensor does not.
+    """
+    assert noise.defects is not None
+    flawed = _defective(noise.defects, draw.plane, clip.shape[1:])
+    length, height, width = clip.shape
+    before = length - place.start - frames if place.backwards else place.start
+    lead = min(flawed.lead(NEGLIGIBLE), before)
+    (dy, dx), last, reach = place.drift, frames - 1, flawed.reach
+    y, x = (sorted((first, first + last * way)) for first, way in zip((place.y, place.x), (dy, dx), strict=True))
+    top, left = min(reach, y[0]), min(reach, x[0])
+    rows = top + side + min(reach, height - y[1] - side)
+    columns = left + side + min(reach, width - x[1] - side)
+
+    def light(i: int) -> Array:
+        moved = min(max(i, 0), last)  # frames outside of the window are seen from its ends
+        crop = (place.y + dy * moved - top, place.x + dx * moved - left, rows, columns)
+        return scale * clip_photons(clip, place.start + i, draw.level.factor, crop, diffraction=draw.diffraction)
+
+    order = range(last + lead, -1, -1) if place.backwards else range(-lead, frames)
+    stack = np.stack([light(i) for i in order])
+    origin = (place.y - top, place.x - left)
+    part = flawed.crop(*origin, rows, columns)
+    key = place.key.at(place.start - lead if not place.backwards else 0)
+    codes = next(part.blocks([stack], clip.exposure, key, origin, draw_codes))
+    return codes[lead:, top : top + side, left : left + side]
