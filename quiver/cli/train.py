@@ -68,7 +68,7 @@ def _run_train(args: argparse.Namespace) -> int:
 
     from quiver import threads
     from quiver.data.clips import open_clips
-    from quiver.model.quiver import build
+    from quiver.model.presets import build
     from quiver.restoration.restorers import pick_device
     from quiver.training.loop import Diverged, train
     from quiver.training.run_folder import PROTOCOLS, draw_curve
@@ -162,7 +162,7 @@ def _run_ablate(args: argparse.Namespace) -> int:
     from quiver import threads
     from quiver.evaluation import summary
     from quiver.evaluation.comparison import Plan
-    from quiver.model.config import ABLATIONS
+    from quiver.model.presets import ABLATIONS
     from quiver.training.ablation import markdown, one_noise, run_ablation
 
     args.precision, precision = None, args.precision  # of restoring; training keeps its own default

@@ -103,7 +103,7 @@ def method_of(case: Case, device: str) -> tuple[Restorer, bool]:
     """The restorer of a case, and whether it has trained weights (or needs none)."""
     import torch
 
-    from quiver.model.quiver import build
+    from quiver.model.presets import build
 
     options = Options(mode=case.mode, precision=case.precision, device=device)
     if case.method.partition(":")[0] in METHODS:

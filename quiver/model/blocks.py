@@ -8,6 +8,7 @@ channel 0 = x, 1 = y; they live on the grid of frame t+1 and point into frame t.
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -23,6 +24,25 @@ WINDOW = 2 * RADIUS + 1
 NEIGHBOURS = 5  # frames seen by the feature extractors around each frame
 OFFSET_LIMIT = 10.0  # pixels, of the alignment's own offsets on top of the flow
 GREY_MEAN, GREY_DEVIATION = 0.449, 0.226  # standardisation of the flow network's input; kept as float32 buffers
+
+
+@dataclass(frozen=True)
+class Output:
+    """What a network returns, in units of x = photons/white, not clamped; None = the network has no such part."""
+
+    denoised: Tensor | None  # [B, T, 1, H, W], each frame on its own
+    scale1: Tensor  # [B, T-10, 1, H, W], restored frames 5 .. T-6
+    scale2: Tensor | None  # [B, T-10, 1, H/2, W/2]
+    scale4: Tensor | None  # [B, T-10, 1, H/4, W/4]
+    flow: Tensor | None = None  # [B, T-1, 2, H, W], pixels, on the grid of frame t+1 and pointing into frame t
+
+
+def check_input(x: Tensor, multiple: int) -> None:
+    """ValueError unless x is [B, T >= 11, 1, H, W] with sides that are multiples of `multiple`."""
+    if x.ndim != 5 or x.shape[2] != 1 or x.shape[1] < WINDOW:
+        raise ValueError(f"the network takes [B, T, 1, H, W] with T >= {WINDOW}, got {tuple(x.shape)}; pad time first")
+    if x.shape[3] % multiple or x.shape[4] % multiple or not x.shape[3] or not x.shape[4]:
+        raise ValueError(f"height and width must be multiples of {multiple}, got {tuple(x.shape[3:])}; pad space first")
 
 
 def conv(inputs: int, outputs: int, kernel: int, stride: int = 1, bias: bool = True) -> nn.Conv2d:

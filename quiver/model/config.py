@@ -107,38 +107,3 @@ class Config:
         if isinstance(values.get("flow_channels"), list):
             values["flow_channels"] = tuple(values["flow_channels"])  # type: ignore[arg-type]
         return cls(**values)  # type: ignore[arg-type]
-
-
-PRESETS: dict[str, Config] = {
-    "quiver": Config(),
-    "quiver-s": Config(channels=16),
-    # Small in everything, on half of the pixels' side; an hourglass over the window, its frames aligned, learns in
-    # minutes, the recurrent part can add to its picture. docs/results/starter.md has what it reaches.
-    "nano": Config(
-        channels=4,
-        deformable_groups=1,
-        deformable_kernel=1,  # sampling nine taps was the largest single cost
-        denoiser_growth=4,
-        denoiser_passes=1,
-        flow_channels=(8, 8),
-        flow_kernel=3,
-        flow_levels=3,
-        cell_blocks=1,
-        attention_width=32,
-        attention_temperature=8.0,
-        fold=2,
-        baseline=32,
-        sweep=7.0,
-        lecun=True,
-    ),
-}
-
-# Rows of the paper's ablation (its Table 4, without the pretrained flow): pre-denoiser, flow, multi-scale outputs.
-ABLATIONS: dict[str, tuple[bool, bool, bool]] = {
-    "none": (False, False, False),
-    "denoiser+flow": (True, True, False),
-    "scales": (False, False, True),
-    "flow+scales": (False, True, True),
-    "denoiser+scales": (True, False, True),
-    "all": (True, True, True),
-}

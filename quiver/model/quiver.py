@@ -8,13 +8,11 @@ With the presets `quiver` and `quiver-s` this is the published network to the la
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from quiver.model import schedules
 from quiver.model.blocks import (
     RADIUS,
     WINDOW,
@@ -23,14 +21,16 @@ from quiver.model.blocks import (
     Extractor,
     FlowNetwork,
     GatedFusion,
+    Output,
     PreDenoiser,
     RecurrentCell,
     Refinement,
     TemporalAttention,
+    check_input,
     neighbourhoods,
     resize,
 )
-from quiver.model.config import ABLATIONS, PRESETS, Config
+from quiver.model.config import Config
 
 CHUNK_PIXELS = 2**16  # without gradients, frames are taken together up to this many pixels
 
@@ -38,23 +38,18 @@ Pair = tuple[Tensor, Tensor]  # of the previous and the current frame
 Encoded = tuple[Tensor, Tensor, Tensor]  # R1, R2 and the recurrent cell's entry
 
 
-@dataclass(frozen=True)
-class Output:
-    """What a network returns, in units of x = photons/white, not clamped; None = the network has no such part."""
-
-    denoised: Tensor | None  # [B, T, 1, H, W], each frame on its own
-    scale1: Tensor  # [B, T-10, 1, H, W], restored frames 5 .. T-6
-    scale2: Tensor | None  # [B, T-10, 1, H/2, W/2]
-    scale4: Tensor | None  # [B, T-10, 1, H/4, W/4]
-    flow: Tensor | None = None  # [B, T-1, 2, H, W], pixels, on the grid of frame t+1 and pointing into frame t
-
-
 class QUIVER(nn.Module):
     """The network; stages are methods, so that a caller may compute each frame's share once (schedules.py)."""
 
-    def __init__(self, config: Config | int = PRESETS["quiver"]) -> None:
+    def __init__(self, config: Config | int | None = None, *, channels: int | None = None) -> None:
+        """The network of a configuration, or the published one of so many channels; 64 by default."""
         super().__init__()
-        config = Config(channels=config) if isinstance(config, int) else config
+        if channels is not None and config is not None:
+            raise ValueError("QUIVER takes a configuration or a number of channels, got both")
+        if isinstance(config, int):
+            config = Config(channels=config)
+        elif config is None:
+            config = Config() if channels is None else Config(channels=channels)
         self.config = config
         c, image = config.channels, config.fold**2
         self.denoiser = (
@@ -209,71 +204,6 @@ class QUIVER(nn.Module):
             if t + 1 < len(entries):
                 state = self.cell.state(results[-1])
         return results
-
-    # Many frames: see quiver/model/schedules.py
-
-    @torch.no_grad()
-    def windows(self, x: Tensor) -> Tensor:
-        """Every window of eleven frames from scratch, as published: [B, T, 1, H, W] -> [B, T-10, 1, H, W]."""
-        check_input(x, self.multiple)
-        outputs = [self(x[:, t : t + WINDOW]).scale1 for t in range(x.shape[1] - WINDOW + 1)]
-        return torch.cat(outputs, dim=1)
-
-    @torch.no_grad()
-    def windows_exact(self, x: Tensor) -> Tensor:
-        """The numbers of `windows`, with all that windows share computed once."""
-        check_input(x, self.multiple)
-        return torch.stack(list(schedules.exact(self, x.unbind(1))), dim=1)
-
-    @torch.no_grad()
-    def streaming(self, x: Tensor) -> Tensor:
-        """The numbers of `forward(x).scale1`, in memory that does not grow with the clip: the state is carried on."""
-        check_input(x, self.multiple)
-        return torch.stack(list(schedules.stream(self, x.unbind(1))), dim=1)
-
-
-def ablated(config: Config, row: str) -> Config:
-    """The network without some of its parts, at similar capacity: the recurrent cell grows by what was taken away.
-
-    The growth of the cell's blocks is the whole number that brings the count of parameters closest to that of
-    `config`. ValueError for an unknown row.
-    """
-    if row not in ABLATIONS:
-        raise ValueError(f"no ablation is called {row!r}; known: {', '.join(ABLATIONS)}")
-    pre_denoiser, flow, multi_scale = ABLATIONS[row]
-    wanted = parameter_count(config)
-    smaller = replace(config, pre_denoiser=pre_denoiser, flow=flow, multi_scale=multi_scale)
-    growth = config.cell_growth or 2 * config.channels
-    while parameter_count(smaller) < wanted:
-        smaller, before, growth = replace(smaller, cell_growth=growth + 1), smaller, growth + 1
-        if abs(parameter_count(before) - wanted) < abs(parameter_count(smaller) - wanted):
-            return before
-    return smaller
-
-
-def parameter_count(config: Config) -> int:
-    """Number of learnt values, counted without allocating them."""
-    with torch.device("meta"):
-        return sum(parameter.numel() for parameter in QUIVER(config).parameters())
-
-
-def build(name: str) -> nn.Module:
-    """A network with random weights by preset name, or the control "unet"; ValueError names them."""
-    if name == "unet":
-        from quiver.model.unet import UNet  # it builds on this module
-
-        return UNet()
-    if name not in PRESETS:
-        raise ValueError(f"no network is called {name!r}; known: {', '.join(PRESETS)}, unet")
-    return QUIVER(PRESETS[name])
-
-
-def check_input(x: Tensor, multiple: int) -> None:
-    """ValueError unless x is [B, T >= 11, 1, H, W] with sides that are multiples of `multiple`."""
-    if x.ndim != 5 or x.shape[2] != 1 or x.shape[1] < WINDOW:
-        raise ValueError(f"the network takes [B, T, 1, H, W] with T >= {WINDOW}, got {tuple(x.shape)}; pad time first")
-    if x.shape[3] % multiple or x.shape[4] % multiple or not x.shape[3] or not x.shape[4]:
-        raise ValueError(f"height and width must be multiples of {multiple}, got {tuple(x.shape[3:])}; pad space first")
 
 
 def add_base(pictures: Sequence[Tensor], base: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:

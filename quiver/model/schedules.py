@@ -1,7 +1,8 @@
 """Restoring a video without doing the same work for every window.
 
-Two schedules of the network's stages, both in memory that does not grow with the clip:
+Three schedules, all in memory that does not grow with the clip:
 
+`windows` every window from scratch, as published; for any network.
 `exact`   the numbers of windows recomputed from scratch. Pre-denoised frames and flows are computed once. So are the
           fused features and R1, R2 of the frames at window positions 3 to 8, where the 5-frame extractors do not
           reach beyond the window. Positions 0, 1, 2, 9, 10 see zeros there, so each window computes its own; and the
@@ -13,15 +14,12 @@ Two schedules of the network's stages, both in memory that does not grow with th
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from quiver.model.blocks import NEIGHBOURS, RADIUS, WINDOW, resize
-
-if TYPE_CHECKING:
-    from quiver.model.quiver import QUIVER, Encoded
+from quiver.model.quiver import QUIVER, Encoded
 
 REACH = NEIGHBOURS // 2  # frames the extractors see before and after
 
@@ -43,7 +41,7 @@ class Features:
     denoised: tuple[Tensor, ...]
 
 
-def stream(network: "QUIVER", frames: Iterable[Tensor]) -> Iterator[Tensor]:
+def stream(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
     """Frames [B, 1, H, W] one by one -> restored frames 5 .. T-6 [B, 1, H, W]; each seven frames late."""
     places: deque[Frame | None] = deque([None] * REACH, maxlen=NEIGHBOURS)  # frames around the encoded one
     images: deque[Tensor] = deque(maxlen=WINDOW)
@@ -66,7 +64,7 @@ def stream(network: "QUIVER", frames: Iterable[Tensor]) -> Iterator[Tensor]:
             yield _picture(network, list(r4), finest[0], images)
 
 
-def exact(network: "QUIVER", frames: Iterable[Tensor]) -> Iterator[Tensor]:
+def exact(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
     """Frames [B, 1, H, W] one by one -> restored frames 5 .. T-6 [B, 1, H, W], equal to windows from scratch."""
     window: deque[Frame] = deque(maxlen=WINDOW)
     inside: deque[Features] = deque(maxlen=WINDOW - 2 * REACH)  # of positions 2 .. 8
@@ -86,7 +84,16 @@ def exact(network: "QUIVER", frames: Iterable[Tensor]) -> Iterator[Tensor]:
             yield _picture(network, network.recur([*start, *entries, *end]), finest[0], [f.images[0] for f in window])
 
 
-def _prepare(network: "QUIVER", frames: Iterable[Tensor]) -> Iterator[Frame]:
+def windows(network: nn.Module, frames: Iterable[Tensor]) -> Iterator[Tensor]:
+    """Frames [B, 1, H, W] one by one -> restored frames 5 .. T-6 [B, 1, H, W]; nothing is shared between windows."""
+    window: deque[Tensor] = deque(maxlen=WINDOW)
+    for frame in frames:
+        window.append(frame)
+        if len(window) == WINDOW:
+            yield network(torch.stack(list(window), dim=1)).scale1[:, 0]
+
+
+def _prepare(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Frame]:
     """Fold, resize, pre-denoise, and find the flow into the frame before."""
     before: Tensor | None = None
     for raw in frames:
@@ -104,7 +111,7 @@ def _then_nothing(frames: Iterator[Frame]) -> Iterator[Frame | None]:
     yield from [None] * REACH
 
 
-def _extract(network: "QUIVER", places: Iterable[Frame | None]) -> Features:
+def _extract(network: QUIVER, places: Iterable[Frame | None]) -> Features:
     """Features of the middle of five places; None is beyond the window and counts as zeros."""
     five = list(places)
     like = next(frame for frame in five if frame is not None).denoised
@@ -114,7 +121,7 @@ def _extract(network: "QUIVER", places: Iterable[Frame | None]) -> Features:
     return Features(network.noisy_features(noisy), network.denoised_features(denoised))
 
 
-def _encode(network: "QUIVER", frame: Frame, before: Features | None, now: Features) -> "Encoded":
+def _encode(network: QUIVER, frame: Frame, before: Features | None, now: Features) -> Encoded:
     """R1, R2 and the cell's entry of a frame; `before` is None for the first of its window."""
     if before is None:
         return network.encode_first(frame.images)
@@ -124,7 +131,7 @@ def _encode(network: "QUIVER", frame: Frame, before: Features | None, now: Featu
     return network.encode_next(frame.images, noisy, denoised, frame.flows)
 
 
-def _edges(network: "QUIVER", window: Sequence[Frame], inside: Sequence[Features]) -> tuple[list[Tensor], list[Tensor]]:
+def _edges(network: QUIVER, window: Sequence[Frame], inside: Sequence[Features]) -> tuple[list[Tensor], list[Tensor]]:
     """Entries of window positions 0, 1, 2 and 9, 10, where the extractors see zeros or their neighbours do."""
     outside: list[Frame | None] = [None] * REACH
     padded = [*outside, *window, *outside]
@@ -135,7 +142,7 @@ def _edges(network: "QUIVER", window: Sequence[Frame], inside: Sequence[Features
     return entries[:3], entries[3:]
 
 
-def _picture(network: "QUIVER", r4: list[Tensor], finest: tuple[Tensor, Tensor], frames: Sequence[Tensor]) -> Tensor:
+def _picture(network: QUIVER, r4: list[Tensor], finest: tuple[Tensor, Tensor], frames: Sequence[Tensor]) -> Tensor:
     """The full-scale picture [B, 1, H, W] of the centre of eleven frames."""
     picture = network.restore(r4, *finest)[0]
     base = network.base(frames)

@@ -8,9 +8,8 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor, nn
 
-from quiver.model.blocks import WINDOW, Hourglass
+from quiver.model.blocks import WINDOW, Hourglass, Output, check_input
 from quiver.model.config import whole_number
-from quiver.model.quiver import Output, check_input
 
 
 @dataclass(frozen=True)

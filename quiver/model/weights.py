@@ -19,7 +19,8 @@ from safetensors.torch import save as to_safetensors
 from torch import Tensor, nn
 
 from qsim.files import write_bytes
-from quiver.model.quiver import QUIVER, Config
+from quiver.model.config import Config
+from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 
 FORMAT = "quiver-1"  # value of the metadata key "format" in our files

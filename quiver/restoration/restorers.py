@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -28,7 +27,6 @@ from quiver.data.codes import Codes
 from quiver.restoration.pieces import Disagreement, plan_pieces
 
 if TYPE_CHECKING:
-    import torch
     from torch import Tensor, nn
 
     from quiver.restoration.domain import Scope
@@ -180,7 +178,7 @@ def network_restorer(path: Path, options: Options) -> Restorer:
 
 def network_title(model: nn.Module) -> str:
     """What a network is, for people: `nano (U-Net on aligned frames)`, `QUIVER (quiver-s)`, `U-Net`."""
-    from quiver.model.config import PRESETS
+    from quiver.model.presets import PRESETS
     from quiver.model.quiver import QUIVER
 
     if not isinstance(model, QUIVER):
@@ -196,7 +194,8 @@ def wrap_network(
     model: nn.Module, name: str, description: str, options: Options, weights_sha256: str | None = None
 ) -> Restorer:
     """A network as a method; the checksum is that of its weights file."""
-    from quiver.model.quiver import QUIVER, RADIUS, WINDOW
+    from quiver.model.blocks import RADIUS, WINDOW
+    from quiver.model.quiver import QUIVER
 
     mode = options.mode if isinstance(model, QUIVER) else "windows"  # others share no work between frames
     model.to(pick_device(options.device)).eval()
@@ -319,19 +318,13 @@ def pad_space(frame: Tensor, multiple: int) -> Tensor:
 
 def pictures(model: nn.Module, frames: Iterable[Tensor], mode: str) -> Iterator[Tensor]:
     """Restored frames [1, 1, h, w], one for each frame that has five before and five after it."""
-    import torch
-
     from quiver.model import schedules
-    from quiver.model.quiver import QUIVER, WINDOW
+    from quiver.model.quiver import QUIVER
 
     if isinstance(model, QUIVER) and mode != "windows":
         yield from (schedules.exact if mode == "exact" else schedules.stream)(model, frames)
-        return
-    window: deque[torch.Tensor] = deque(maxlen=WINDOW)
-    for frame in frames:
-        window.append(frame)
-        if len(window) == WINDOW:
-            yield model(torch.stack(list(window), dim=1)).scale1[:, 0]
+    else:
+        yield from schedules.windows(model, frames)
 
 
 def check_finite(restored: Array, name: str, first: int = 0) -> None:

@@ -15,8 +15,9 @@ from pathlib import Path
 import torch
 
 from quiver.evaluation.comparison import Plan, Row, evaluate
-from quiver.model.config import ABLATIONS, PRESETS, Config
-from quiver.model.quiver import QUIVER, ablated, parameter_count
+from quiver.model.config import Config
+from quiver.model.presets import ABLATIONS, PRESETS, ablated, parameter_count
+from quiver.model.quiver import QUIVER
 from quiver.restoration.restorers import Options, Restorer, pick_device, restorer
 from quiver.training.loop import train
 from quiver.training.run_folder import Settings, alone_in, settled

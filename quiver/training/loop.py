@@ -28,7 +28,7 @@ from quiver import threads
 from quiver.data.clips import open_clips
 from quiver.data.windows import Batches, Windows, WindowSettings
 from quiver.evaluation import metrics
-from quiver.model.quiver import RADIUS, WINDOW
+from quiver.model.blocks import RADIUS, WINDOW
 from quiver.training.loss import PRESETS as LOSSES
 from quiver.training.loss import training_loss
 from quiver.training.optimiser import Optimiser

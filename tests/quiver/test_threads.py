@@ -88,7 +88,7 @@ from quiver.data.code_table import draw_codes
 from quiver.data.codes import array_codes
 from quiver.data.illumination import Light
 from qsim.keys import Key
-from quiver.model.quiver import build
+from quiver.model.presets import build
 from quiver.restoration.restorers import Options, method_names, restorer, wrap_network
 
 torch.manual_seed(0)

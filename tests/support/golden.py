@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from quiver.model.quiver import QUIVER, Config
+from quiver.model.config import Config
+from quiver.model.quiver import QUIVER
 from quiver.model.weights import published_name
 
 DATA = Path(__file__).parents[1] / "data"

@@ -85,9 +85,6 @@ STILL_IN_CIRCLES: set[str] = {
     "qsim.sensor.qis",
     "qsim.sensor.sensor",
     "qsim.sensor.spad",
-    "quiver.model.quiver",
-    "quiver.model.schedules",
-    "quiver.model.unet",
     "quiver.restoration.domain",
     "quiver.restoration.restorers",
 }

@@ -27,8 +27,10 @@ from quiver import threads
 from quiver.baselines import METHODS
 from quiver.cli import program
 from quiver.evaluation import cost, domain_measurement
-from quiver.model import quiver as model
-from quiver.model.config import ABLATIONS, PRESETS, Config
+from quiver.model import presets
+from quiver.model.config import Config
+from quiver.model.presets import ABLATIONS, PRESETS
+from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
 from quiver.restoration import domain, restorers
@@ -482,7 +484,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
 
 
 def tiny(name: str) -> torch.nn.Module:
-    return UNet(UNetConfig(8)) if name == "unet" else model.QUIVER(PRESETS[name])
+    return UNet(UNetConfig(8)) if name == "unet" else QUIVER(PRESETS[name])
 
 
 @pytest.fixture(scope="module")  # of this module alone: what it replaces is back for the next one
@@ -520,7 +522,7 @@ def scale() -> Iterator[None]:
         patch.setitem(PRESETS, "quiver-s", replace(SMALL, channels=4))
         for name in set(ABLATIONS) - {"all"}:
             patch.delitem(ABLATIONS, name)
-        patch.setattr(model, "build", tiny)
+        patch.setattr(presets, "build", tiny)
         patch.setattr(cost, "bench", lambda cases, setting, progress: [cost.measure(case, setting) for case in cases])
         patch.setattr(domain_measurement, "measure_cell", one_cell)
         patch.setattr(domain_measurement, "score", one_score)
@@ -558,7 +560,7 @@ def work(scale: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "[defects]\ncarry_dead_time = true\n"
     )
     torch.manual_seed(0)
-    small = fill_by_rule(model.QUIVER(SMALL))
+    small = fill_by_rule(QUIVER(SMALL))
     save(small, SMALL, folder / "small.safetensors")
     save(UNet(UNetConfig(2)), UNetConfig(2), folder / "unet.safetensors")
     seen_by = devices.load("quiver-physical", ppp=26, bits=3, exposure=5e-4)

@@ -1,7 +1,7 @@
 """QUIVER beyond the golden numbers: presets, reuse across windows, ablations, hard inputs."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import pytest
@@ -11,7 +11,9 @@ from torch import Tensor
 
 from quiver.model import blocks, deformable, plane_sweep, schedules
 from quiver.model import quiver as model_module
-from quiver.model.quiver import ABLATIONS, PRESETS, QUIVER, Config, ablated, build, parameter_count
+from quiver.model.config import Config
+from quiver.model.presets import ABLATIONS, PRESETS, ablated, build, parameter_count
+from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 
 SMALL = Config(
@@ -39,6 +41,12 @@ def draw(*shape: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> Tens
     return torch.randint(0, 8, shape, generator=torch.Generator().manual_seed(seed)).to(dtype) / 7
 
 
+@torch.no_grad()
+def run(schedule: Callable[[QUIVER, Iterable[Tensor]], Iterator[Tensor]], network: QUIVER, x: Tensor) -> Tensor:
+    """[B, T, 1, H, W] -> [B, T-10, 1, H, W]."""
+    return torch.stack(list(schedule(network, x.unbind(1))), dim=1)
+
+
 # Presets
 
 
@@ -46,6 +54,14 @@ def test_the_published_sizes_to_the_last_parameter():
     assert parameter_count(PRESETS["quiver"]) == 156_755_311
     assert parameter_count(PRESETS["quiver-s"]) == 10_866_583
     assert parameter_count(Config(channels=32)) == 40_091_487
+
+
+def test_the_width_can_be_given_by_name_or_alone():
+    with torch.device("meta"):
+        assert QUIVER().config == Config() == Config(channels=64)
+        assert QUIVER(16).config == QUIVER(channels=16).config == QUIVER(Config(channels=16)).config
+        with pytest.raises(ValueError, match="got both"):
+            QUIVER(Config(), channels=16)
 
 
 def test_the_parts_have_the_published_sizes():
@@ -192,9 +208,9 @@ def test_the_lecun_start_keeps_the_fused_features_alive():
 @BOTH
 def test_exact_reuse_equals_windows_from_scratch(config):
     network, x = lively(config), draw(2, 15, 1, 16, 24)
-    windows = network.windows(x)
+    windows = run(schedules.windows, network, x)
     assert windows.shape == (2, 5, 1, 16, 24)
-    assert float((network.windows_exact(x) - windows).abs().max()) < 1e-10 * float(windows.std())
+    assert float((run(schedules.exact, network, x) - windows).abs().max()) < 1e-10 * float(windows.std())
 
 
 @BOTH
@@ -202,13 +218,13 @@ def test_streaming_equals_one_pass_over_the_clip(config):
     network, x = lively(config), draw(2, 15, 1, 16, 24)
     with torch.no_grad():
         whole = network(x).scale1
-    assert float((network.streaming(x) - whole).abs().max()) < 1e-10 * float(whole.std())
+    assert float((run(schedules.stream, network, x) - whole).abs().max()) < 1e-10 * float(whole.std())
 
 
 def test_streaming_is_not_the_same_as_windows():
     """The carried state and the missing zeros are visible: the difference is real, and it is not large."""
     network, x = lively(SMALL), draw(1, 16, 1, 16, 24)
-    windows, stream = network.windows(x), network.streaming(x)
+    windows, stream = run(schedules.windows, network, x), run(schedules.stream, network, x)
     difference = (windows - stream).square().mean().sqrt() / windows.std()
     assert 1e-6 < float(difference) < 0.5
 
@@ -257,15 +273,15 @@ def test_reuse_saves_the_promised_time():
     torch.set_num_threads(1)
     seconds = {}
     try:
-        for name in ("windows", "windows_exact", "streaming"):
-            getattr(network16, name)(x[:, :11])
+        for schedule in (schedules.windows, schedules.exact, schedules.stream):
+            run(schedule, network16, x[:, :11])
             start = time.process_time()
-            getattr(network16, name)(x)
-            seconds[name] = time.process_time() - start
+            run(schedule, network16, x)
+            seconds[schedule] = time.process_time() - start
     finally:
         torch.set_num_threads(threads)
-    assert seconds["windows"] / seconds["windows_exact"] > 1.5, seconds
-    assert seconds["windows"] / seconds["streaming"] > 3, seconds
+    assert seconds[schedules.windows] / seconds[schedules.exact] > 1.5, seconds
+    assert seconds[schedules.windows] / seconds[schedules.stream] > 3, seconds
 
 
 # Ablations
@@ -289,7 +305,7 @@ def test_ablations_lack_what_they_say(row):
     assert (out.scale2 is None, out.scale4 is None) == (not multi_scale, not multi_scale)
     assert torch.isfinite(out.scale1).all()
     x = draw(1, 13, 1, 16, 16)
-    assert torch.allclose(network.windows(x), network.windows_exact(x), atol=1e-10)
+    assert torch.allclose(run(schedules.windows, network, x), run(schedules.exact, network, x), atol=1e-10)
 
 
 def test_an_unknown_ablation_is_named():

@@ -10,7 +10,9 @@ from golden import published_state
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from quiver.model.quiver import PRESETS, QUIVER, Config
+from quiver.model.config import Config
+from quiver.model.presets import PRESETS
+from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import ALIAS, convert_weights, from_published, load, published_name, save
 

@@ -15,7 +15,7 @@ from qsim.sensor.qis import QIS
 from quiver.baselines import METHODS
 from quiver.data.codes import Codes, array_codes
 from quiver.model.blocks import Hourglass
-from quiver.model.quiver import build
+from quiver.model.presets import build
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import load
 from quiver.restoration import pieces

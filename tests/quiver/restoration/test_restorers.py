@@ -22,7 +22,8 @@ from quiver.data.clips import truth
 from quiver.data.codes import Codes, array_codes, sensed
 from quiver.data.illumination import Light
 from quiver.evaluation import metrics
-from quiver.model.quiver import Output, build
+from quiver.model.blocks import Output
+from quiver.model.presets import build
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
 from quiver.restoration import restored_file
@@ -255,7 +256,7 @@ import numpy as np
 from quiver.evaluation.peak_memory import peak_memory, reset_peak
 from quiver.data.codes import array_codes
 from quiver.data.illumination import Light
-from quiver.model.quiver import build
+from quiver.model.presets import build
 from quiver.restoration.restorers import Options, wrap_network
 sensor = Light().device(5e-4)
 codes = array_codes(np.random.default_rng(0).integers(0, 8, (1, 320, 320), dtype=np.uint8), sensor, 5e-4)

@@ -21,8 +21,9 @@ from torch import Tensor, nn
 from qsim import files
 from quiver.cli.program import main
 from quiver.evaluation import metrics
-from quiver.model.config import PRESETS
-from quiver.model.quiver import QUIVER, RADIUS, Output
+from quiver.model.blocks import RADIUS, Output
+from quiver.model.presets import PRESETS
+from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import load
 from quiver.training import loop as training
