@@ -15,9 +15,10 @@ if TYPE_CHECKING:
     from qsim.optics.camera import Camera
     from qsim.rendering.mitsuba_xml import read_mitsuba
     from qsim.scene.scene import Scene
+    from qsim.sensor.counting import CountingSPAD
     from qsim.sensor.qis import QIS
     from qsim.sensor.sensor import Sensor
-    from qsim.sensor.spad import BinarySPAD, CountingSPAD
+    from qsim.sensor.spad import BinarySPAD
 
 __version__ = "0.1.0"
 
@@ -26,7 +27,7 @@ _HOMES = {
     "Camera": "optics.camera",
     "Clip": "clip.clip",
     "ClipWriter": "clip.writer",
-    "CountingSPAD": "sensor.spad",
+    "CountingSPAD": "sensor.counting",
     "Dataset": "dataset.dataset",
     "Key": "keys",
     "QIS": "sensor.qis",

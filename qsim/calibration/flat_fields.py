@@ -15,8 +15,8 @@ from numpy import ndarray as Array
 
 from qsim.calibration.frame_statistics import Stack
 from qsim.calibration.prnu import WIDEST, Flat, hot_by_level, hot_by_rate, surface
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
-from qsim.sensor.spad import CountingSPAD
 
 
 @dataclass(frozen=True, eq=False)

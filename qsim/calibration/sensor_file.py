@@ -24,9 +24,10 @@ from qsim.calibration.results import Calibration
 from qsim.formats import importing
 from qsim.formats.array_files import load_npy, mat_array
 from qsim.formats.recording import Hints
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.sensor.spad import BinarySPAD
 
 _BLOCK_BYTES = 1 << 25
 

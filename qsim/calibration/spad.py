@@ -23,7 +23,7 @@ from qsim.calibration.frame_statistics import Stack
 from qsim.calibration.prnu import BY_FLAT, HOT, measure_pattern
 from qsim.calibration.qis import NODES, WEIGHTS, check_stacks, goodness
 from qsim.calibration.results import Z95, Calibration, Value, normal_interval, odd_efficiency
-from qsim.sensor.spad import CountingSPAD
+from qsim.sensor.counting import CountingSPAD
 
 PERCENTILES = (1, 10, 25, 75, 90, 99, 99.9)  # of the DCR map, beside the median
 

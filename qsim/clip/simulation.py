@@ -173,8 +173,8 @@ class Draw:
 
     def missed(self, clip: Clip) -> Effects | None:
         """What the closed form of counting pixels misses in this clip; None where nothing can be missed."""
+        from qsim.sensor.counting import CountingSPAD
         from qsim.sensor.defects import defect_table as flaws
-        from qsim.sensor.spad import CountingSPAD
 
         if not isinstance(self.plane, CountingSPAD):
             return None
@@ -270,7 +270,8 @@ def plane_of(sensor: Sensor, planes: int) -> Sensor:
 
 def _check_planes(sensor: Sensor, sensing: Sensing, clip: Clip) -> None:
     """`ValueError` for sums of planes and for slices of exposures that this sensor or this clip does not have."""
-    from qsim.sensor.spad import BinarySPAD, CountingSPAD
+    from qsim.sensor.counting import CountingSPAD
+    from qsim.sensor.spad import BinarySPAD
 
     kind = type(sensor).__name__
     if sensing.group and not isinstance(sensor, BinarySPAD):

@@ -5,12 +5,13 @@ from typing import TYPE_CHECKING
 from qsim.files import lazy_names
 
 if TYPE_CHECKING:
+    from qsim.sensor.counting import CountingSPAD
     from qsim.sensor.devices import load
     from qsim.sensor.estimation import Response
     from qsim.sensor.packing import pack, unpack
     from qsim.sensor.qis import QIS
     from qsim.sensor.sensor import Sensor
-    from qsim.sensor.spad import BinarySPAD, CountingSPAD
+    from qsim.sensor.spad import BinarySPAD
 
 __all__ = ["QIS", "BinarySPAD", "CountingSPAD", "Response", "Sensor", "load", "pack", "unpack"]
 
@@ -18,7 +19,7 @@ __getattr__ = lazy_names(
     __name__,
     {
         "BinarySPAD": "spad",
-        "CountingSPAD": "spad",
+        "CountingSPAD": "counting",
         "QIS": "qis",
         "Response": "estimation",
         "Sensor": "sensor",

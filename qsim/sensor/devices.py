@@ -28,9 +28,10 @@ from types import MappingProxyType
 
 from qsim import files
 from qsim.checks import suggest
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.sensor.spad import BinarySPAD
 
 MODELS: Mapping[str, type[Sensor]] = MappingProxyType(
     {"QIS": QIS, "BinarySPAD": BinarySPAD, "CountingSPAD": CountingSPAD}

@@ -9,7 +9,8 @@ import numpy as np
 from qsim.calibration.frame_statistics import Stack, measure
 from qsim.calibration.qis import Calibration, calibrate_qis
 from qsim.calibration.spad import calibrate_spad
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.spad import BinarySPAD
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from scipy.stats import ks_2samp
 from stats import assert_share, critical_z
 
 from qsim.keys import Key
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.event_simulation import Memory, simulate
 from qsim.sensor.defects.fixed_pattern import DarkSpread, Defects, draw_maps, measured_dark_map, sample
 from qsim.sensor.qis import QIS
-from qsim.sensor.spad import CountingSPAD
 
 HERE = Path(__file__)
 SHARED = HERE.parents[3] / "shared" / "data"

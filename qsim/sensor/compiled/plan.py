@@ -27,9 +27,10 @@ from numpy import ndarray as Array
 
 from qsim.sensor import paralyzable_steps
 from qsim.sensor.compiled.curves import Curves, below, falling
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS, electron_table, table_length, thresholds
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.sensor.spad import BinarySPAD
 
 _MOST_BITS = 8  # a code is a byte
 _LIVE_BITS = 4  # of counters whose steps are added up

@@ -40,11 +40,12 @@ from qsim import files
 from qsim.checks import suggest
 from qsim.formats import array_files
 from qsim.keys import Key
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import event_simulation, fixed_pattern
 from qsim.sensor.defects.fixed_pattern import DarkSpread, Defects, Maps
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import SPAD, BinarySPAD, CountingSPAD
+from qsim.sensor.spad import SPAD, BinarySPAD
 
 _MAPS = {"gain_map": "prnu", "dark_map": "dark", "dead_map": "dead", "offset_map": "offset",
          "read_noise_map": "read_noise"}  # fmt: skip

@@ -22,7 +22,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.keys import Key
-from qsim.sensor.spad import CountingSPAD
+from qsim.sensor.counting import CountingSPAD
 
 TOLERANCE = 1e-3  # relative change of the mean count that a closed form may miss
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import CountingSPAD
 
 
 @dataclass(frozen=True)

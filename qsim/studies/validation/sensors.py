@@ -24,12 +24,10 @@ from numpy import ndarray as Array
 
 from qsim.clip.stream import Progress
 from qsim.keys import Key
+from qsim.sensor import QIS, BinarySPAD, CountingSPAD, Sensor
 from qsim.sensor.compiled import kernel, launch
 from qsim.sensor.compiled.plan import plan
 from qsim.sensor.devices import quiver_physical
-from qsim.sensor.qis import QIS
-from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
 from qsim.studies.validation.edge_cases import Case, hard_cases
 
 EXPOSURE = 5e-4  # s, 2000 frames per second

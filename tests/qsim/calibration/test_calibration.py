@@ -14,8 +14,8 @@ from qsim.calibration.qis import calibrate_qis
 from qsim.calibration.sensor_file import read_stack, sensor_of, write
 from qsim.calibration.spad import calibrate_spad, matched_variance
 from qsim.sensor import devices
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
-from qsim.sensor.spad import CountingSPAD
 
 DATA = Path(__file__).parents[2] / "data"
 

@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.devices import (
     DEVICES,
     MODELS,
@@ -18,7 +19,7 @@ from qsim.sensor.devices import (
     quiver_published,
 )
 from qsim.sensor.qis import QIS
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.sensor.spad import BinarySPAD
 
 EXPOSURE = 5e-4  # s, 2000 frames per second
 

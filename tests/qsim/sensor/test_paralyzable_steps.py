@@ -8,8 +8,8 @@ from scipy import stats
 
 from qsim.keys import Key, uniform, words
 from qsim.sensor import paralyzable_steps
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import CountingSPAD
 
 EXPOSURE = 5e-4  # s
 

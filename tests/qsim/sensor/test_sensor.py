@@ -16,9 +16,10 @@ from stats import assert_histogram, assert_mean, assert_share, critical_z
 
 import qsim.sensor.sensor
 from qsim.keys import Key, uniform, uniform_pair, words
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.sensor.spad import BinarySPAD
 
 EXPOSURE = 5e-4
 SENSORS = (

@@ -13,7 +13,8 @@ from oracles import paralyzable_oracle
 from stats import assert_histogram
 
 from qsim.keys import Key
-from qsim.sensor.spad import BinarySPAD, CountingSPAD, PlaneByPlane
+from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.spad import BinarySPAD, PlaneByPlane
 
 EXPOSURE = 1.0  # s; dead times below are shares of it
 FRACTIONS = tuple(float(Fraction(1, d)) for d in (16, 10, 4, 2, 1))

@@ -8,8 +8,9 @@ from stats import assert_mean
 
 from qsim.keys import Key
 from qsim.sensor import devices
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.sensor.spad import BinarySPAD
 from quiver.baselines import METHODS, moment
 from quiver.baselines.response_table import response_table
 

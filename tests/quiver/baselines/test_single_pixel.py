@@ -8,9 +8,10 @@ import pytest
 from stats import critical_z
 
 from qsim.keys import Key
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.devices import quiver_paper, quiver_physical
 from qsim.sensor.qis import QIS
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.sensor.spad import BinarySPAD
 from quiver.baselines import METHODS, likelihood, moment, naive_mean
 from quiver.baselines.response_table import response_table
 from quiver.baselines.sliding_window import look_ahead, reflect, window_frames, window_sums

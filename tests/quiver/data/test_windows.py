@@ -14,9 +14,10 @@ from torch.utils.data import DataLoader
 
 from qsim.keys import Key
 from qsim.optics.radiometry import clip_photons, light_level
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.sensor.spad import BinarySPAD
 from quiver.data.clips import open_clips, truth
 from quiver.data.code_table import CodeTable, draw_codes
 from quiver.data.codes import array_codes, sensed

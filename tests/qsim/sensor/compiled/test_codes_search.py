@@ -15,10 +15,11 @@ import pytest
 from qsim.keys import Key
 from qsim.sensor.compiled import kernel, launch
 from qsim.sensor.compiled.plan import plan
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.packing import pack, unpack
 from qsim.sensor.qis import QIS, thresholds
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.sensor.spad import BinarySPAD
 
 EXPOSURE = 5e-4  # s
 SHAPE = (2, 128, 162)  # 41 472 pixels: a frame of uniform light, one below 20 electrons

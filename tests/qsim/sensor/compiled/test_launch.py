@@ -14,11 +14,12 @@ from qsim.keys import Key, philox4x32
 from qsim.sensor.compiled import kernel, launch
 from qsim.sensor.compiled.curves import Curves
 from qsim.sensor.compiled.plan import Electrons, electrons, plan
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.packing import pack
 from qsim.sensor.pixels import draw_at
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.sensor.spad import BinarySPAD
 
 KEY = Key(seed=3, clip=5, frame=7)
 EXPOSURE = 5e-4  # s

@@ -13,8 +13,8 @@ from qsim.clip.stream import Sensing, prepare, replay, sense
 from qsim.keys import Key, hash_name
 from qsim.optics import radiometry
 from qsim.sensor import devices, packing
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table, event_simulation, fixed_pattern
-from qsim.sensor.spad import CountingSPAD
 
 BINARY = '[sensor]\nmodel = "BinarySPAD"\npde = 0.5\ndark_count_rate = 200.0\nbits = 1\n'
 COUNTING = '[sensor]\nmodel = "CountingSPAD"\npde = 0.5\ndark_count_rate = 10.0\ndead_time = 5e-5\nbits = 3\n'

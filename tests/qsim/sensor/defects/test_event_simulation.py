@@ -7,8 +7,9 @@ import pytest
 from stats import assert_histogram, assert_mean, assert_share
 
 from qsim.keys import Key
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.event_simulation import Effects, Memory, State, effects, expose, sample, simulate
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.sensor.spad import BinarySPAD
 
 KEY = Key(seed=1, clip=7)
 EXPOSURE = 5e-4  # s

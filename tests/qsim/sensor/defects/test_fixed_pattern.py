@@ -8,6 +8,7 @@ import pytest
 from stats import FALSE_ALARM, assert_histogram, assert_mean, assert_share, assert_variance, mixture_p_value, per_check
 
 from qsim.keys import Key
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.fixed_pattern import (
     PERFECT,
     DarkSpread,
@@ -19,7 +20,7 @@ from qsim.sensor.defects.fixed_pattern import (
     sample,
 )
 from qsim.sensor.qis import QIS
-from qsim.sensor.spad import BinarySPAD, CountingSPAD
+from qsim.sensor.spad import BinarySPAD
 
 KEY = Key(seed=3, clip=5)
 EXPOSURE = 5e-4  # s
