@@ -81,9 +81,11 @@ def _run_tradeoff(args: argparse.Namespace) -> int:
 
 
 def _tradeoff_study(args: argparse.Namespace) -> int:
-    from qsim.studies.bit_depth import speed_sweep
+    from qsim.studies.bit_depth import clips as study_clips
+    from qsim.studies.bit_depth import figures, speed_sweep
     from qsim.studies.bit_depth.answer import WIDEST, answer, widened
-    from qsim.studies.bit_depth.clip_study import Question, study
+    from qsim.studies.bit_depth.clip_study import study
+    from qsim.studies.bit_depth.readout import Question
 
     bits, instants = tuple(args.bits or (1, 2, 3, 4, 5)), 8 if args.instants is None else args.instants
     sensor = args.sensor or "quiver-physical"
@@ -92,14 +94,14 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
     widen = args.bits is None
     frames = args.frames or (2**WIDEST - 1 if widen else max(4 * question.longest, 32))
     rate = 10_000.0 if args.base_fps is None else args.base_fps
-    shape = speed_sweep.Shape(frames, height, width, rate, seed=args.seed)
+    shape = study_clips.Shape(frames, height, width, rate, seed=args.seed)
     speeds, text = _speeds(args, shape)
     levels = args.ppp or [None]
     swept = len(speeds) * len(levels) > 1
     if args.streams and swept:
         raise ValueError("--streams: writes one speed and one light level; give one --ppp and one --speed or --px")
     with bar("rendering") as progress:
-        clips = list(speed_sweep.clips_for(args.source, speeds, shape, args.output, progress))
+        clips = list(study_clips.clips_for(args.source, speeds, shape, args.output, progress))
     first = clips[0].clip
     if args.streams and clips[0].step > 1:
         raise ValueError("--streams: writes a clip at its own speed; leave out --speed and --px, or name a scene")
@@ -109,21 +111,21 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
         if swept:
             ppps = args.ppp or [first.mean_photons]
             found = speed_sweep.sweep(clips, ppps, question, widen=widen, progress=progress)
-            result, pictures = found.to_dict(), {"best.png": speed_sweep.sweep_figure(found)}
+            result, pictures = found.to_dict(), {"best.png": figures.sweep_figure(found)}
             text += [line for row in found.studies for one in row for line in speed_sweep.table(one)]
             text.append(speed_sweep.summary(found))
             answers = found.answers
         else:
             asked = replace(question, ppp=levels[0], speed=clips[0].step)
             one = widened(first, asked, note) if widen else study(first, asked, progress=progress)
-            result, pictures = speed_sweep.study_dict(one), {"tradeoff.png": speed_sweep.study_figure(one)}
+            result, pictures = speed_sweep.study_dict(one), {"tradeoff.png": figures.study_figure(one)}
             text += speed_sweep.table(one)
             question, answers = replace(question, bits=one.bits), [answer(one)]
     if args.px:
         result["px_asked"], result["speeds_found"] = args.px, speeds
     if args.streams:
         lit = replace(question, ppp=levels[0])
-        made = speed_sweep.write_streams(first, args.output / "streams", lit)
+        made = study_clips.write_streams(first, args.output / "streams", lit)
         result["streams"] = [str(path) for path in made]
         text += [f"streams 'planes' and 'multibit': {path}" for path in made]
     if args.output is not None:
@@ -175,14 +177,15 @@ def _write_study(folder: Path, name: str, result: dict[str, Any], pictures: dict
 
 def _paper_figure(args: argparse.Namespace) -> int:
     from qsim.clip.clip import Clip
-    from qsim.studies.bit_depth import paper_figures, speed_sweep
+    from qsim.studies.bit_depth import clips as study_clips
+    from qsim.studies.bit_depth import paper_figures
 
     height, width = args.size or (96, 128)
     number, speeds = args.paper_figure, args.speed or [1.0]
     if len(speeds) > 1:
         raise ValueError(f"--speed {args.speed}: --paper-figure draws one speed; give one")
     rate, frames = (paper_figures.RATE_1, 201) if number == 1 else (10_000.0, 511)
-    shape = speed_sweep.Shape(frames, height, width, rate, seed=args.seed)
+    shape = study_clips.Shape(frames, height, width, rate, seed=args.seed)
     names = [args.source] if args.source else ["fan"] if number == 1 else ["fan", "text"]
     rows, result = [], []
     for name, ppp in zip(names * (2 // len(names) if number == 2 else 1), (0.51, 0.40), strict=False):
@@ -191,7 +194,7 @@ def _paper_figure(args: argparse.Namespace) -> int:
         else:
             with bar(name) as progress:
                 path = args.output / "clips" / Path(name).stem
-                clip = speed_sweep.render(name, path, shape, speed=speeds[0], progress=progress)
+                clip = study_clips.render(name, path, shape, speed=speeds[0], progress=progress)
         panels = paper_figures.figure_1(clip, seed=args.seed) if number == 1 else (
             paper_figures.figure_2(clip, ppp, seed=args.seed)
         )  # fmt: skip

@@ -101,8 +101,6 @@ STILL_LONG: set[str] = {
     "qsim.rendering.renderer",
     "qsim.scene.scene",
     "qsim.sensor.defects.fixed_pattern",
-    "qsim.studies.bit_depth.clip_study",
-    "qsim.studies.bit_depth.speed_sweep",
     "quiver.model.blocks",
     "quiver.training.run_folder",
 }

@@ -13,7 +13,8 @@ import numpy as np
 
 from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, moving_mean
-from qsim.studies.bit_depth.clip_study import MODELS, Question, Row, Study, clip_motion, study
+from qsim.studies.bit_depth.clip_study import Row, Study, clip_motion, study
+from qsim.studies.bit_depth.readout import MODELS, Question
 
 WIDEST = 7  # bits up to which the range is widened
 LOOKS = 4  # instants at which the motion of a scene is measured

@@ -19,7 +19,8 @@ from qsim.clip.clip import Clip
 from qsim.optics import radiometry
 from qsim.sensor import devices
 from qsim.sensor.spad import BinarySPAD
-from qsim.studies.bit_depth.clip_study import Question, Reading, check_clip, clip_motion, expose
+from qsim.studies.bit_depth.clip_study import check_clip, clip_motion, expose
+from qsim.studies.bit_depth.readout import Question, Reading
 
 RATE_1 = 12_000.0  # fps of the clip of figure 1: 200, 50 and 6 of its frames are one at 60, 240 and 2000 fps
 CAMERAS = (("cmos-5.1e", 60.0), ("cmos-5.1e", 240.0), ("cmos-5.1e", 2000.0), ("quiver-paper", 2000.0))

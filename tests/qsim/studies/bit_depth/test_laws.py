@@ -1,8 +1,9 @@
 """Bit depth against motion: the paper's table, and the laws behind it."""
 
+import numpy as np
 import pytest
 
-from qsim.studies.bit_depth.laws import depths
+from qsim.studies.bit_depth.laws import Structure, depths
 
 PAPER = {  # QUIVER paper, Table 1: bits -> fps, "read noise per second", "data rate" (which is megabytes per second)
     1: (10_000, 2000, 96),
@@ -47,3 +48,14 @@ def test_exposure_is_shared():
 def test_impossible_numbers_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         paper_rows(**change)
+
+
+def test_structure_function_scales_with_speed():
+    """A ramp (D = k^2) has no blur; a sine loses amplitude by the mean of the cosine over the frame."""
+    ramp = Structure(np.arange(9.0) ** 2)
+    assert ramp.blur(9) == pytest.approx(0, abs=1e-12)
+    wave = Structure(1 - np.cos(2 * np.pi * np.arange(41) / 40))  # of sin, variance 1/2
+    mean = np.cos(2 * np.pi * np.arange(-3, 4) / 40).mean()
+    assert wave.blur(7) == pytest.approx((1 - mean) ** 2 / 2, rel=1e-9)
+    mean = np.cos(4 * np.pi * np.arange(-3, 4) / 40).mean()
+    assert wave.blur(7, 2.0) == pytest.approx((1 - mean) ** 2 / 2, rel=1e-9)

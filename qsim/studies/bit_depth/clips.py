@@ -1,0 +1,124 @@
+"""Clips of a bit-depth study: a clip at several speeds, a scene rendered at each, and clips of grouped frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from qsim import keys
+from qsim.clip import stream
+from qsim.clip.clip import Clip, ClipWriter
+from qsim.clip.stream import Progress
+from qsim.optics import radiometry
+from qsim.sensor.spad import BinarySPAD
+from qsim.studies.bit_depth.clip_study import check_clip
+from qsim.studies.bit_depth.readout import Question, plane_sensor
+
+
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """A clip at one speed: rendered so (step 1), or of every `step`-th frame."""
+
+    speed: float
+    clip: Clip
+    step: int = 1
+
+
+@dataclass(frozen=True)
+class Shape:
+    """How a scene is rendered for a study."""
+
+    frames: int
+    height: int = 96
+    width: int = 128
+    frame_rate: float = 10_000.0
+    psnr: float = 40.0  # wanted error of the radiance, dB
+    seed: int = 0
+
+
+def render(name: str, path: Path, shape: Shape, *, speed: float = 1.0, progress: Progress | None = None) -> Clip:
+    """The scene as a clip; one that is already there is kept if it is the same scene, shape, rate and speed.
+
+    `FileExistsError` if it is another one.
+    """
+    import scenes
+    from qsim.rendering import fidelity
+    from qsim.rendering.renderer import render_clip
+
+    scene = scenes.load(name, seed=shape.seed, speed=speed).resized(shape.height, shape.width)
+    if (path / "clip.json").is_file():
+        clip = Clip.open(path)
+        wanted = {"family": scene.name, "seed": scene.seed, "speed": scene.speed}
+        same = clip.shape == (shape.frames, shape.height, shape.width) and clip.frame_rate == shape.frame_rate
+        if same and clip.meta.get("scene") == wanted:
+            return clip
+        raise FileExistsError(f"{path}: exists and is another clip; name another folder with -o")
+    frames, rate = shape.frames, shape.frame_rate
+    chosen = fidelity.choose(scene, frame_rate=rate, frames=frames, psnr=shape.psnr, seed=shape.seed)
+    return render_clip(scene, path, frames=frames, frame_rate=rate, seed=shape.seed, budget=chosen, progress=progress)
+
+
+def clips_for(
+    source: str, speeds: Sequence[float], shape: Shape, folder: Path | None, progress: Progress | None = None
+) -> Iterator[Moving]:
+    """A clip folder (whole speeds from 1), or a scene rendered at each speed into FOLDER/clips."""
+    if (Path(source) / "clip.json").is_file():
+        clip = Clip.open(source)
+        if any(v < 1 or not float(v).is_integer() for v in speeds):
+            raise ValueError(f"{source}: a clip can be made faster by whole factors only; other speeds need a scene")
+        yield from (Moving(v, clip, int(v)) for v in speeds)
+        return
+    import scenes
+
+    if source not in scenes.FAMILIES and not source.endswith(".py"):
+        raise FileNotFoundError(f"{source}: neither a clip folder nor a scene; there are {', '.join(scenes.FAMILIES)}")
+    if folder is None:
+        raise ValueError(f"{source} is a scene: give a folder for its clip with -o")
+    for v in speeds:
+        path = folder / "clips" / f"{Path(source).stem}_x{v:g}"
+        yield Moving(v, render(source, path, shape, speed=v, progress=progress))
+
+
+def write_streams(clip: Clip, folder: Path, question: Question) -> list[Path]:
+    """One clip per bit depth, FOLDER/NAME_3bit, with the streams `planes` and `multibit`; returns their paths.
+
+    Its frames are the means of 2^b - 1 frames of `clip`, its sharp frames the middle ones, so that
+    `quiver evaluate FOLDER/NAME_3bit --stream planes` scores any restorer against the sharp instants.
+    """
+    check_clip(clip, question)
+    level = radiometry.light_level(clip, ppp=question.ppp)
+    plane = plane_sensor(question, level.ppp, clip.exposure)
+    if not isinstance(plane, BinarySPAD):
+        raise ValueError("streams of summed planes need a clocked SPAD; leave out the plane sensor")
+    made = []
+    for bits in question.bits:
+        m = 2**bits - 1
+        path = folder / f"{clip.name}_{bits}bit"
+        grouped = group(clip, path, m)
+        read = stream.Sensing(question.sensor, bits, ppp=m * level.ppp, seed=question.seed, name="multibit")
+        stream.sense(grouped, read)
+        key = keys.Key(seed=question.seed, clip=keys.hash_name(clip.name))
+        draw = stream.Draw(replace(plane, bits=bits), plane, level, key, m, False)
+        meta = stream.describe(clip, replace(read, name="planes"), draw) | {"planes_of": str(clip.path)}
+        meta |= {"ppp_target": m * level.ppp, "sensor_name": "planes"}
+        frames = (draw.frames(clip, t, t + 1) for t in range(len(grouped)))
+        stream.write_stream(grouped, "planes", frames, draw.sensor, meta)
+        made.append(path)
+    return made
+
+
+def group(clip: Clip, path: Path, m: int) -> Clip:
+    """A clip whose frames are means of m frames (m odd) and whose sharp frames are the middle ones."""
+    kept = ("radiance_unit", "camera", "scene", "split", "origin", "seed", "render")
+    meta = {key: clip.meta[key] for key in kept if key in clip.meta}
+    frames, height, width = clip.shape
+    meta |= {"shape": [frames // m, height, width], "frame_rate": clip.frame_rate / m, "exposure": clip.exposure * m}
+    meta |= {"shutter": 1.0, "grouped": {"from": clip.name, "frames": m}}
+    with ClipWriter(path, meta) as writer:
+        for t in range(frames // m):
+            mean = np.stack([clip.radiance(t * m + i) for i in range(m)]).mean(axis=0, dtype=np.float64)
+            writer.add(t, np.asarray(mean, np.float32), clip.sharp(t * m + m // 2) if m > 1 else None)
+    return Clip.open(path)

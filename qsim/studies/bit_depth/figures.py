@@ -1,0 +1,82 @@
+"""Figures of bit-depth studies, PNG: PSNR over bit depth, and the best depth over speed and light."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+
+from qsim.clip.motion_statistics import CODE_BITS
+from qsim.studies.bit_depth.answer import code_motion, marked
+from qsim.studies.bit_depth.clip_study import Study
+from qsim.studies.bit_depth.readout import MODELS
+from qsim.studies.bit_depth.speed_sweep import Sweep
+
+COLOURS = {"planes": "tab:orange", "multibit": "tab:blue"}
+
+
+def study_figure(found: Study) -> bytes:
+    """PSNR and the parts of the error over bit depth: points simulated, lines expected."""
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(10, 3.8), dpi=120, layout="constrained")
+    left, right = drawing.subplots(1, 2)
+    for model in MODELS:
+        rows = [row for row in found.rows if row.model == model]
+        bits, colour = [row.bits for row in rows], COLOURS[model]
+        left.plot(bits, [row.psnr_predicted_db for row in rows], color=colour, label=f"{model}, expected")
+        errors = [2 * row.psnr_error_db for row in rows]
+        left.errorbar(bits, [row.psnr_db for row in rows], errors, fmt="o", color=colour, label=f"{model}, simulated")
+    rows = [row for row in found.rows if row.model == "multibit"]
+    bits = [row.bits for row in rows]
+    for field, style in (("blur_error", "o"), ("shot_error", "s"), ("quantisation_error", "^"), ("read_error", "v")):
+        values = np.abs([getattr(row, field) for row in rows]) / found.peak
+        right.plot(
+            bits, np.where(values > 0, values, np.nan), style, label=f"|{field.replace('_', ' ')}|", linestyle="-"
+        )
+    right.plot(bits, [row.blur_predicted / found.peak for row in rows], "k:", label="blur by the structure function")
+    left.set_ylabel("PSNR of the likeliest frame [dB]")
+    right.set_ylabel("rms error / peak (multibit)")
+    right.set_yscale("log")
+    for axes in (left, right):
+        axes.set_xlabel("bits per frame of 2^b - 1 planes")
+        axes.set_xticks(bits)
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=7)
+    lux = "" if found.lux is None else f" ({found.lux:.3g} lx at 555 nm)"
+    drawing.suptitle(f"{found.clip}: {found.ppp:.3g} photons per pixel and plane{lux}, {found.frame_rate:g} planes/s")
+    return _png(drawing)
+
+
+def sweep_figure(found: Sweep) -> bytes:
+    """Best bit depth over speed and light: coloured cells and large numbers simulated, small ones by the law."""
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(11, 4.2), dpi=120, layout="constrained")
+    bits = [row.bits for line in found.studies for one in line for row in one.rows]
+    for axes, model in zip(drawing.subplots(1, 2), MODELS, strict=True):
+        table = np.array([[s.best(model).bits for s in row] for row in found.studies])
+        axes.imshow(table, origin="lower", aspect="auto", cmap="viridis", vmin=min(bits), vmax=max(bits))
+        for (i, j), best in np.ndenumerate(table):
+            near = "white" if best < (min(bits) + max(bits)) / 2 else "black"
+            axes.text(j, i, marked(found.studies[i][j], model), ha="center", va="bottom", color=near, fontsize=12)
+            axes.text(j, i, f"law {found.predicted[model][i, j]}", ha="center", va="top", color=near, fontsize=7)
+        axes.set_xticks(range(len(found.ppps)), [f"{p:g}" for p in found.ppps])
+        axes.set_yticks(range(len(found.speeds)), [_speed_label(found, i) for i in range(len(found.speeds))])
+        axes.set_xlabel("photons per pixel and plane")
+        axes.set_ylabel(f"speed (px per {CODE_BITS}-bit frame)")
+        axes.set_title(f"best bits, {model}")
+    return _png(drawing)
+
+
+def _speed_label(found: Sweep, i: int) -> str:
+    row = found.studies[i][0].rows[0]
+    motion = code_motion(row)
+    return f"{found.speeds[i]:g}" + ("" if motion is None else f" ({motion:.2g})")
+
+
+def _png(drawing: Any) -> bytes:
+    buffer = io.BytesIO()
+    drawing.savefig(buffer, format="png")
+    return buffer.getvalue()

@@ -1,0 +1,124 @@
+"""`qsim tradeoff`: numbers, figure and streams; one line where something cannot be answered."""
+
+import json
+
+import numpy as np
+import pytest
+from waves import SIZE, wave_clip
+
+from qsim.cli.program import main
+from qsim.clip.clip import Clip
+from qsim.clip.stream import replay
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    return wave_clip(tmp_path_factory.mktemp("tradeoff") / "wave", 64, 1)
+
+
+def test_command_writes_numbers_figure_and_streams(clip, tmp_path, capsys):
+    out = tmp_path / "out"
+    words = ["tradeoff", str(clip.path), "--ppp", "0.65", "--bits", "1,3", "-o", str(out), "--json", "--streams"]
+    assert main(words) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found == json.loads((out / "tradeoff.json").read_text())
+    assert [(row["model"], row["bits"]) for row in found["rows"]] == [
+        ("planes", 1), ("planes", 3), ("multibit", 1), ("multibit", 3),
+    ]  # fmt: skip
+    assert (out / "tradeoff.png").read_bytes().startswith(b"\x89PNG")
+    deep, shallow = (Clip.open(out / "streams" / f"wave_{bits}bit") for bits in (3, 1))
+    assert deep.streams == ("multibit", "planes")
+    assert deep.shape == (9, *SIZE)
+    assert deep.verify() == []
+    planes = shallow.stream("planes").codes()[:63].reshape(9, 7, *SIZE).sum(axis=1)
+    assert np.array_equal(planes, deep.stream("planes").codes())
+    assert np.array_equal(*replay(deep, deep.stream("multibit"), 4))
+    assert np.array_equal(deep.sharp(2), clip.radiance(2 * 7 + 3))
+    mean = deep.stream("multibit").photons_factor * np.mean([deep.radiance(t) for t in range(9)])
+    assert mean == pytest.approx(7 * 0.65, rel=2e-2)
+    assert main(words) == 2
+    assert "--force" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--speed", "0.5", "--ppp", "1"], "whole factors only"),
+        (["--ppp", "0.1:x"], "numbers above 0"),
+        (["--ppp", "1", "--bits", "9"], "render a longer clip"),
+        (["--ppp", "1", "--streams"], "-o"),
+    ],
+)
+def test_mistakes_are_one_line(clip, capsys, words, message):
+    assert main(["tradeoff", str(clip.path), *words]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_no_source_is_said(capsys, tmp_path):
+    assert main(["tradeoff"]) == 2
+    assert "give a clip or a scene" in capsys.readouterr().err
+    assert main(["tradeoff", "fann", "-o", str(tmp_path)]) == 2
+    assert "neither a clip folder nor a scene" in capsys.readouterr().err
+
+
+def test_bits_that_were_given_are_kept_and_others_widened(clip, capsys):
+    words = ["tradeoff", str(clip.path), "--ppp", "0.1", "--instants", "2", "--json"]
+    assert main([*words, "--bits", "1,2"]) == 0
+    given = json.loads(capsys.readouterr().out)
+    assert given["best"]["multibit"]["edge"] == ">="
+    assert {row["bits"] for row in given["rows"]} == {1, 2}
+    assert main(words) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert {row["bits"] for row in found["rows"]} >= {1, 2, 3, 4, 5}
+    assert found["answer"].startswith("at 7 px per 3-bit frame and 0.1 photons per plane: ")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--table CLIP", "--table is made from numbers alone; leave the clip or scene out"),
+        ("--table --ppp 1", "tradeoff --table: --ppp changes nothing here"),
+        ("--table --px 1", "tradeoff --table: --px changes nothing here"),
+        ("--table --speed 2", "tradeoff --table: --speed changes nothing here"),
+        ("--table --sensor spad-320x240", "tradeoff --table: --sensor changes nothing here"),
+        ("--table --plane-sensor quiver-paper", "tradeoff --table: --plane-sensor changes nothing here"),
+        ("--table --instants 2", "tradeoff --table: --instants changes nothing here"),
+        ("--table --frames 2", "tradeoff --table: --frames changes nothing here"),
+        ("--table --seed 0", "tradeoff --table: --seed changes nothing here"),
+        ("--table --streams", "tradeoff --table: --streams changes nothing here"),
+        ("--table -o x", "tradeoff --table: --output changes nothing here"),
+        ("--table --force", "tradeoff --table: --force changes nothing here"),
+        ("--table --paper-figure 1", "tradeoff --table: --paper-figure changes nothing here"),
+        ("CLIP --ppp 1 --read-noise 0", "tradeoff of a clip or scene: --read-noise changes nothing here"),
+        ("CLIP --ppp 1 --motion 10", "tradeoff of a clip or scene: --motion changes nothing here"),
+        ("CLIP --ppp 1 --size 8x8", "tradeoff of a clip: --size changes nothing here"),
+        ("CLIP --ppp 1 --base-fps 20000", "tradeoff of a clip: --base-fps changes nothing here"),
+        ("CLIP --ppp 1 --frames 9", "tradeoff of a clip: --frames changes nothing here"),
+        ("CLIP --ppp 1 --force", "tradeoff without --output: --force changes nothing here"),
+        ("CLIP --ppp 1 --px 3 --speed 2", "not allowed with argument"),
+        ("CLIP --ppp 1 --px 13.9,14", "need one and the same speed; give fewer"),
+        ("CLIP --ppp 1,2 --streams -o x", "--streams: writes one speed and one light level"),
+        ("CLIP --ppp 1 --speed 2 --bits 1,2 --streams -o x", "--streams: writes a clip at its own speed"),
+        ("--paper-figure 1 --ppp 1 -o x", "tradeoff --paper-figure: --ppp changes nothing here"),
+        ("--paper-figure 1 --px 1 -o x", "tradeoff --paper-figure: --px changes nothing here"),
+        ("--paper-figure 1 --bits 1 -o x", "tradeoff --paper-figure: --bits changes nothing here"),
+        ("--paper-figure 1 --base-fps 1 -o x", "tradeoff --paper-figure: --base-fps changes nothing here"),
+        ("--paper-figure 1 --sensor a -o x", "tradeoff --paper-figure: --sensor changes nothing here"),
+        ("--paper-figure 1 --instants 1 -o x", "tradeoff --paper-figure: --instants changes nothing here"),
+        ("--paper-figure 1 --frames 1 -o x", "tradeoff --paper-figure: --frames changes nothing here"),
+        ("--paper-figure 1 --streams -o x", "tradeoff --paper-figure: --streams changes nothing here"),
+        ("--paper-figure 1 --motion 1 -o x", "tradeoff --paper-figure: --motion changes nothing here"),
+        ("--paper-figure 1 --speed 1,2 -o x", "--paper-figure draws one speed; give one"),
+        ("--paper-figure 1 CLIP --speed 2 -o x", "tradeoff --paper-figure of a clip: --speed changes nothing here"),
+        ("--paper-figure 1 CLIP --size 8x8 -o x", "tradeoff of a clip: --size changes nothing here"),
+    ],
+)
+def test_options_that_cannot_act_are_refused(clip, capsys, tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    assert main(["tradeoff", *words.replace("CLIP", str(clip.path)).split()]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
