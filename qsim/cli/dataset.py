@@ -10,7 +10,7 @@ from typing import Any
 
 from qsim import checks, files
 from qsim.cli.console import GOES_ON, bar, checked, command, note, output
-from qsim.dataset.recipe import Job
+from qsim.dataset.job import Job
 
 # generate
 

@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any
 
 from qsim import files
+from qsim.dataset.job import Job
 from qsim.dataset.job_runner import Make, Result, mark_failed, run_job
-from qsim.dataset.recipe import Job
 
 RETRIES = 3  # of a job whose worker raised; deaths of workers are counted by the scheduler (its allowed-failures)
 

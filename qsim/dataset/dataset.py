@@ -17,8 +17,9 @@ from typing import Any
 from qsim import files, structure
 from qsim.clip.clip import Clip
 from qsim.clip.stream import Progress
+from qsim.dataset.job import Job
 from qsim.dataset.job_runner import make_record, record_path
-from qsim.dataset.recipe import SPLITS, Job
+from qsim.dataset.recipe import SPLITS
 
 FORMAT_VERSION = 1
 

@@ -21,7 +21,8 @@ from typing import Any, NamedTuple
 from qsim.clip import stream
 from qsim.clip.clip import Clip
 from qsim.dataset import job_runner
-from qsim.dataset.recipe import Job, Recipe
+from qsim.dataset.job import Job
+from qsim.dataset.recipe import Recipe
 from qsim.dataset.worker_pool import Limits
 from qsim.rendering.denoiser import DENOISE_COST
 from qsim.rendering.fidelity import Budget

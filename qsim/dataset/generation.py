@@ -18,6 +18,7 @@ from typing import Any
 from qsim import __version__, files
 from qsim.clip.stream import Progress
 from qsim.dataset.dataset import FORMAT_VERSION, Damaged, Dataset, unproven, verify_job
+from qsim.dataset.job import Job
 from qsim.dataset.job_runner import (
     FOLDERS,
     Make,
@@ -28,7 +29,7 @@ from qsim.dataset.job_runner import (
     record_path,
     render_job,
 )
-from qsim.dataset.recipe import Job, Recipe
+from qsim.dataset.recipe import Recipe
 from qsim.dataset.worker_pool import Limits, run_here, run_local
 
 Run = Callable[[list[Job], Path, Make], Generator[Result]]

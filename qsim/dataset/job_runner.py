@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 from qsim import files
 from qsim.clip import stream
 from qsim.clip.clip import Clip
-from qsim.dataset.recipe import Job
+from qsim.dataset.job import Job
 
 if TYPE_CHECKING:
     from qsim.rendering.fidelity import Budget

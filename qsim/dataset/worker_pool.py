@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+from qsim.dataset.job import Job
 from qsim.dataset.job_runner import Make, Result, mark_failed, run_job
-from qsim.dataset.recipe import Job
 
 MAX_DEATHS = 2  # of worker processes, before a job counts as failed
 MEMORY_EXIT, ORPHAN_EXIT = 70, 71  # exit codes of worker processes

@@ -11,7 +11,8 @@ from numpy import ndarray as Array
 
 from qsim.clip.clip import PHYSICAL, RELATIVE, Clip, ClipWriter
 from qsim.dataset.generation import Options, generate
-from qsim.dataset.recipe import Job, Recipe, Settings
+from qsim.dataset.job import Job, Settings
+from qsim.dataset.recipe import Recipe
 from qsim.optics.camera import Camera
 
 ClipMaker = Callable[..., Clip]

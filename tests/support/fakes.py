@@ -13,8 +13,8 @@ from unittest import mock
 import numpy as np
 
 from qsim.clip.clip import PHYSICAL, Clip, ClipWriter
+from qsim.dataset.job import Job
 from qsim.dataset.job_runner import provenance
-from qsim.dataset.recipe import Job
 from qsim.optics.camera import Camera
 from qsim.scene.scene import describe
 

@@ -94,7 +94,6 @@ STILL_LONG: set[str] = {
     "qsim.clip.stream",
     "qsim.clip.writer",
     "qsim.dataset.generation",
-    "qsim.dataset.recipe",
     "qsim.files",
     "qsim.formats.video",
     "qsim.rendering.fidelity",

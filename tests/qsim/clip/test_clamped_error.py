@@ -27,7 +27,7 @@ from qsim.clip.clamped_error import (
 )
 from qsim.clip.clip import Clip
 from qsim.dataset.dataset import Dataset
-from qsim.dataset.recipe import Job
+from qsim.dataset.job import Job
 from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.rendering import denoiser
 from qsim.rendering.fidelity import Budget, choose, dimming, moving

@@ -18,7 +18,7 @@ from qsim.clip.writer import ClipWriter
 from qsim.dataset import job_runner, recipe
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import Options, generate
-from qsim.dataset.recipe import Job
+from qsim.dataset.job import Job
 
 HERE = Options(workers=0)
 ALIKE = RECIPE.replace("seeds = [0, 1]", "seeds = [0, 1000, 10000]\nspeed = [1.0, 2.0, 2.5]").replace("[1, 3]", "[3]")

@@ -11,6 +11,7 @@ from fakes import make
 
 from qsim import checks
 from qsim.dataset import job_runner, recipe
+from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe import Recipe, parse
 
 HEAD = """[recipe]
@@ -309,8 +310,8 @@ def test_a_list_is_looked_through_once():
 
 def accepted_by_the_jobs(stem: str, folder: Path) -> bool:
     """Whether a job with such a name makes its clip, writes its record, and tidies up."""
-    found = recipe.Settings(1, 2, 3, 2000.0)
-    job = recipe.Job(f"{stem}_0000_x0.001", f"{stem}.py", 0, 1.0, "train", found, 0, ())
+    found = Settings(1, 2, 3, 2000.0)
+    job = Job(f"{stem}_0000_x0.001", f"{stem}.py", 0, 1.0, "train", found, 0, ())
     for name in ("jobs", "failed", "clips", "logs", "locks", "work"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     try:

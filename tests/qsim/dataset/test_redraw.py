@@ -16,7 +16,8 @@ from qsim.clip.simulation import prepare, stored
 from qsim.clip.stream import Sensing, Stream, replay, sense, write_stream
 from qsim.dataset import redraw
 from qsim.dataset.generation import Options, generate
-from qsim.dataset.recipe import Job, Recipe, Settings
+from qsim.dataset.job import Job, Settings
+from qsim.dataset.recipe import Recipe
 from qsim.sensor.compiled.plan import electrons
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD

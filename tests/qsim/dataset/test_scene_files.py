@@ -14,7 +14,7 @@ from fakes import RECIPE, tree
 from qsim import files
 from qsim.dataset import job_runner, recipe, scene_files
 from qsim.dataset.generation import Options, generate
-from qsim.dataset.recipe import Job
+from qsim.dataset.job import Job
 
 HERE = Options(workers=0)
 ROOT = str(Path(__file__).parents[3])
