@@ -72,11 +72,11 @@ def _run_domain(args: argparse.Namespace) -> int:
 
 
 def _question(args: argparse.Namespace) -> Any:
-    from quiver.data.illumination import Light
+    from quiver.data.illumination import Illumination
     from quiver.evaluation.domain_measurement import CLASSICAL, Question, clips_of
 
     lights = tuple(
-        Light(sensor, ppp, bits)
+        Illumination(sensor, ppp, bits)
         for sensor in args.sensor or ("quiver-physical",)
         for bits in args.bits or (3,)
         for ppp in args.ppp or (3.25,)

@@ -7,12 +7,12 @@ from qsim.files import lazy_names
 if TYPE_CHECKING:
     from quiver.data.clips import open_clips
     from quiver.data.codes import Codes, array_codes, sensed, stream_codes
-    from quiver.data.illumination import Light
+    from quiver.data.illumination import Illumination
     from quiver.data.windows import Windows, WindowSettings
 
 __all__ = [
     "Codes",
-    "Light",
+    "Illumination",
     "WindowSettings",
     "Windows",
     "array_codes",
@@ -25,7 +25,7 @@ __getattr__ = lazy_names(
     __name__,
     {
         "Codes": "codes",
-        "Light": "illumination",
+        "Illumination": "illumination",
         "WindowSettings": "windows",
         "Windows": "windows",
         "array_codes": "codes",

@@ -22,7 +22,7 @@ from qsim.keys import Key, hash_name
 from qsim.optics.radiometry import clip_photons
 from qsim.sensor.sensor import Sensor
 from quiver.data.code_table import draw_codes
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 
 __all__ = [
     "Codes",
@@ -89,7 +89,7 @@ def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "code
     return Codes(name, codes.shape, sensor, exposure, 1 / exposure, read, source, lambda: array_digest(codes))
 
 
-def sensed(clip: Clip, light: Light, seed: int = 0) -> tuple[Codes, float]:
+def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float]:
     """A clip as a sensor sees it, drawn when read, and the light factor: the codes that `qsim sense` would store."""
     sensing, draw = light.sensing(seed), light.draw(clip, seed)
 
@@ -149,7 +149,7 @@ def stored(clip: Clip, name: str) -> tuple[Codes, float]:
     return stream_codes(stream), stream.photons_factor
 
 
-def windows_sensed(clip: Clip, light: Light, seed: int, centres: range) -> Iterator[Codes]:
+def windows_sensed(clip: Clip, light: Illumination, seed: int, centres: range) -> Iterator[Codes]:
     """The published test: each window of 11 frames brought to the light level on its own, with noise of its own.
 
     `ValueError` for a light without a level (the clip's own), which cannot be forced.

@@ -20,7 +20,7 @@ from qsim.sensor.sensor import Sensor
 
 
 @dataclass(frozen=True)
-class Light:
+class Illumination:
     """A light level and the sensor that sees it."""
 
     sensor: str = "quiver-physical"  # a named device of qsim, or a TOML file
@@ -58,7 +58,7 @@ def read_sensor(source: str | Mapping[str, Any], bits: int | None = None) -> tup
 
 
 @lru_cache(maxsize=64)
-def _device(light: Light, exposure: float) -> Sensor:
+def _device(light: Illumination, exposure: float) -> Sensor:
     return devices.load(light.sensor, ppp=light.ppp, bits=light.bits, exposure=exposure)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise, as_text, short_name
 
 
@@ -77,7 +77,7 @@ def _changed(noise: Noise, sensor: str | None, ppp: float | None, bits: int | No
     """A noise with the parts that were asked for."""
     if sensor is not None and (sensor != noise.sensor or sensor.endswith(".toml")):
         depth = bits if bits is not None or sensor.endswith(".toml") else noise.bits
-        fresh = Noise.of(Light(sensor, noise.ppp, depth))
+        fresh = Noise.of(Illumination(sensor, noise.ppp, depth))
         noise = replace(fresh, lux=noise.lux, diffraction=noise.diffraction)
     if ppp is not None:
         noise = replace(noise, ppp=ppp, lux=None)
@@ -134,7 +134,7 @@ def _effects(noise: Noise) -> list[str]:
         return []
     table = json.loads(noise.defects)
     record = {} if noise.record is None else json.loads(noise.record)
-    model = record.get("model") or type(Light(noise.sensor, noise.ppp or 1.0, noise.bits).device(5e-4)).__name__
+    model = record.get("model") or type(Illumination(noise.sensor, noise.ppp or 1.0, noise.bits).device(5e-4)).__name__
     dark = "dark-current" if model == "QIS" else "dark-count"
     words = {
         "dark_map": f"{dark} map",

@@ -14,11 +14,11 @@ from qsim.clip.stream import Sensing, Stream
 from qsim.sensor.defects.defect_table import Flaws
 from qsim.sensor.defects.defect_table import from_dict as read_defects
 from qsim.sensor.sensor import Sensor
-from quiver.data.illumination import Light, read_sensor
+from quiver.data.illumination import Illumination, read_sensor
 
 
 @dataclass(frozen=True)
-class Noise(Light):
+class Noise(Illumination):
     """A light level and all that a stored stream says of what sees it; defects are those named here and no others."""
 
     lux: float | None = None  # on the faceplate, instead of `ppp`
@@ -27,7 +27,7 @@ class Noise(Light):
     defects: str | None = None  # a table [defects], as JSON; None: no defects
 
     @classmethod
-    def of(cls, light: Light) -> Noise:
+    def of(cls, light: Illumination) -> Noise:
         """What a sensor's name or file means now; `ValueError` or `FileNotFoundError` where it means nothing."""
         if isinstance(light, Noise):
             return light
@@ -93,12 +93,12 @@ class Noise(Light):
     def label(self) -> str:
         """`3.25 PPP, 3 bit, spad-320x240`"""
         light = super().label if self.lux is None else f"{self.lux:g} lx, {self.bits} bit"
-        return light if self.sensor == Light.sensor else f"{light}, {short_name(self.sensor)}"
+        return light if self.sensor == Illumination.sensor else f"{light}, {short_name(self.sensor)}"
 
     @property
-    def simple(self) -> Light:
-        """The same as a plain `Light`, where it says no more than that."""
-        light = Light(self.sensor, self.ppp, self.bits)
+    def simple(self) -> Illumination:
+        """The same as a plain `Illumination`, where it says no more than that."""
+        light = Illumination(self.sensor, self.ppp, self.bits)
         return light if Noise(self.sensor, self.ppp, self.bits) == self else self
 
     def sensing(self, seed: int = 0) -> Sensing:

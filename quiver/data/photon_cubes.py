@@ -11,13 +11,13 @@ from numpy import ndarray as Array
 from qsim.formats.array_files import load_npy
 from qsim.sensor.spad import BinarySPAD
 from quiver.data.codes import Codes, array_codes, array_digest
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 
 PLANE_PIXELS = 1 << 24  # of packed planes that are unpacked at a time: 16 MB
 
 
 def cube_codes(
-    path: Path, light: Light, frame_rate: float, *, planes: int | None = None, width: int | None = None
+    path: Path, light: Illumination, frame_rate: float, *, planes: int | None = None, width: int | None = None
 ) -> Codes:
     """Codes from a bare .npy: integers [T, H, W], or with `width` binary planes [T, H, ceil(W/8)], first pixel in the
     highest bit. Every `planes` = 2^b - 1 of them (default 1) are summed to one b-bit code of a clocked SPAD; what is
@@ -43,7 +43,7 @@ def plane_bits(planes: int) -> int:
     raise ValueError(f"planes: a b-bit code sums 2^b - 1 binary planes, got {planes}; use {near}")
 
 
-def _summed(path: Path, cube: Array, light: Light, frame_rate: float, planes: int, width: int) -> Codes:
+def _summed(path: Path, cube: Array, light: Illumination, frame_rate: float, planes: int, width: int) -> Codes:
     """Packed planes as codes, summed when they are read."""
     bits = plane_bits(planes)
     if light.bits not in (None, bits):

@@ -29,7 +29,7 @@ from qsim.optics.radiometry import clip_photons
 from qsim.sensor.sensor import Sensor
 from quiver.data.clips import has_sharp, peak_of
 from quiver.data.code_table import draw_codes
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.data.mixture import Mixture, choose
 from quiver.data.noise import Noise
 from quiver.data.window_noise import check_windows, window_codes
@@ -41,7 +41,7 @@ TRAINING, VALIDATION = 1, 2  # stages of the random keys: no two uses share nois
 class WindowSettings:
     """What a training sample is."""
 
-    lights: tuple[Light, ...] | None = None  # each sample draws one; None: those of the clips' streams
+    lights: tuple[Illumination, ...] | None = None  # each sample draws one; None: those of the clips' streams
     frames: int = 11
     crop: int = 64  # px, side of the square; validation takes the centre
     flips: bool = True  # the eight flips and quarter turns

@@ -25,7 +25,7 @@ from numpy import ndarray as Array
 from qsim.files import read_json, write_json
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import Codes, array_codes, sensed, stored, windows_sensed
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.evaluation import breakdown, metrics
 from quiver.evaluation.peak_memory import peak_memory, reset_peak
 from quiver.restoration.restorers import Restorer
@@ -43,7 +43,7 @@ class Plan:
 
     source: str  # data set or clip folder
     split: str | None = "test"  # None = all clips
-    lights: tuple[Light, ...] = (Light(),)
+    lights: tuple[Illumination, ...] = (Illumination(),)
     seed: int = 0  # of the test noise: the same for all methods and all runs
     published: bool = False  # every window exposed, drawn, scaled and scored on its own; ends of clips left out
     stream: str | None = None  # score this stored stream instead of sensing at `lights`
@@ -137,7 +137,7 @@ def peak_in_photons(plan: Plan, clip: Clip, codes: Codes, factor: float) -> floa
 
 
 def restore_clip(
-    method: Restorer, clip: Clip, light: Light, plan: Plan, codes: Codes, factor: float, out: Path | None = None
+    method: Restorer, clip: Clip, light: Illumination, plan: Plan, codes: Codes, factor: float, out: Path | None = None
 ) -> Row:
     """Restore and score one clip, and keep a crop of its middle frame under OUT; a failure becomes the row's reason."""
     row = Row(method.name, method.description, plan.stream or light.label, clip.name, scene_of(clip))

@@ -27,7 +27,7 @@ from quiver.baselines import METHODS
 from quiver.data.clips import peak_of
 from quiver.data.code_table import draw_codes
 from quiver.data.codes import Codes, array_codes
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
 from quiver.evaluation.peak_memory import peak_memory, reset_peak
 from quiver.restoration.restorers import (
@@ -85,7 +85,7 @@ class Cost:
 
 def fixed_clip(setting: Setting) -> tuple[Codes, Array]:
     """Codes of waves and a disk that move 2 px per frame, and their photons; the same for ever."""
-    sensor = Light(ppp=setting.ppp).device(EXPOSURE)
+    sensor = Illumination(ppp=setting.ppp).device(EXPOSURE)
     y, x = np.mgrid[: setting.height, : setting.width].astype(float)
     frames = []
     for t in range(setting.frames):

@@ -21,7 +21,7 @@ from qsim import __version__
 from qsim.files import Lock
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import sensed
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
 from quiver.evaluation.comparison import in_memory
 from quiver.model.weights import annotate, metadata_of
@@ -38,7 +38,7 @@ class Question:
     """What is measured."""
 
     clips: tuple[Clip, ...]
-    lights: tuple[Light, ...]
+    lights: tuple[Illumination, ...]
     methods: tuple[str, ...] = CLASSICAL
     seed: int = 0
 
@@ -110,7 +110,7 @@ def stored_cells(weights: Path, shared: Mapping[str, object]) -> tuple[Cell, ...
     return domain.cells if domain is not None and dict(domain.measured) == shared else ()
 
 
-def _known(weights: Path, shared: Mapping[str, object], light: Light) -> bool:
+def _known(weights: Path, shared: Mapping[str, object], light: Illumination) -> bool:
     return any(_measures(cell, light) for cell in stored_cells(weights, shared))
 
 
@@ -125,11 +125,11 @@ def _one_at_a_time(weights: Path) -> Iterator[None]:
         lock.delete()
 
 
-def _measures(cell: Cell, light: Light) -> bool:
+def _measures(cell: Cell, light: Illumination) -> bool:
     return (cell.sensor, cell.place.bits, cell.ppp) == (Path(light.sensor).name, light.bits, light.ppp)
 
 
-def measure_cell(network: Restorer, methods: Sequence[Restorer], question: Question, light: Light) -> Cell:
+def measure_cell(network: Restorer, methods: Sequence[Restorer], question: Question, light: Illumination) -> Cell:
     """The network and the best of the methods at one light; ValueError where a clip has no score."""
     own, *others = (_mean_score(method, question, light) for method in (network, *methods))
     if not (math.isfinite(own) and any(map(math.isfinite, others))):
@@ -141,7 +141,7 @@ def measure_cell(network: Restorer, methods: Sequence[Restorer], question: Quest
     return Cell(Path(light.sensor).name, light.ppp, place, round(own, 3), methods[best].name, round(others[best], 3))
 
 
-def _mean_score(method: Restorer, question: Question, light: Light) -> float:
+def _mean_score(method: Restorer, question: Question, light: Illumination) -> float:
     """Mean over clips; NaN for a classical method that cannot restore such codes, which then does not compete."""
     try:
         return float(np.mean([score(method, clip, light, question.seed) for clip in question.clips]))
@@ -151,7 +151,7 @@ def _mean_score(method: Restorer, question: Question, light: Light) -> float:
         return math.nan
 
 
-def score(method: Restorer, clip: Clip, light: Light, seed: int) -> float:
+def score(method: Restorer, clip: Clip, light: Illumination, seed: int) -> float:
     """Matched PSNR [dB] of one clip restored by one method."""
     drawn, factor = sensed(clip, light, seed)
     peak = peak_of(mean_light(clip, factor))

@@ -12,7 +12,7 @@ from numpy import ndarray as Array
 from quiver.cli.options import DEFAULT_METHOD
 from quiver.data.clips import Clip
 from quiver.data.codes import Codes, Sensor, Stream, array_codes, open_stream, sensed, stream_codes
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.restoration.domain import refuse_outside, remarks
 from quiver.restoration.restorers import Options, restorer
 from quiver.restoration.sources import refuse_idle
@@ -70,7 +70,7 @@ def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: f
             raise ValueError("ppp= senses a clip now; a stream knows its light")
         return stream_codes(source)
     if ppp is not None:
-        return sensed(source, Light("quiver-physical", ppp, 3))[0]
+        return sensed(source, Illumination("quiver-physical", ppp, 3))[0]
     if len(source.streams) != 1:
         there = ", ".join(source.streams) or "none"
         raise ValueError(

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from quiver.baselines import METHODS
 from quiver.data.codes import Codes, Sensor
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ class Scope:
     """What is known of a network: the cells that were measured, else what it was trained on."""
 
     domain: Domain | None = None
-    trained: tuple[Light, ...] = ()
+    trained: tuple[Illumination, ...] = ()
 
 
 def read_scope(path: Path, metadata: Mapping[str, str]) -> Scope:
@@ -150,7 +150,7 @@ def read_scope(path: Path, metadata: Mapping[str, str]) -> Scope:
     return Scope(domain, _trained(metadata.get("settings")))
 
 
-def _trained(text: str | None) -> tuple[Light, ...]:
+def _trained(text: str | None) -> tuple[Illumination, ...]:
     """Sensors, bits and light of the settings that training leaves in a weights file; empty where they do not say."""
     try:
         settings = json.loads(text or "{}")
@@ -158,7 +158,7 @@ def _trained(text: str | None) -> tuple[Light, ...]:
             return tuple(Noise.from_dict(values) for values in settings["noise"])
         sensors, bits, ppp = (_listed(settings.get(name)) for name in ("sensor", "bits", "ppp"))
         return tuple(
-            Light(str(sensor), None if light is None else float(light), None if depth is None else int(depth))
+            Illumination(str(sensor), None if light is None else float(light), None if depth is None else int(depth))
             for sensor in sensors
             for depth in bits
             for light in ppp
@@ -226,7 +226,7 @@ def refuse_outside(methods: Sequence[Restorer], found: Sequence[str]) -> None:
         raise ValueError(f"{found[0]}; without strict it runs all the same")
 
 
-def _unmeasured(name: str, trained: Sequence[Light], codes: Codes, place: Place, stream: str) -> str:
+def _unmeasured(name: str, trained: Sequence[Illumination], codes: Codes, place: Place, stream: str) -> str:
     """Weights without cells: what they were trained on, and whether the stream is like that."""
     start = f"{name} was never measured against the classical methods"
     if not trained:
@@ -239,7 +239,7 @@ def _unmeasured(name: str, trained: Sequence[Light], codes: Codes, place: Place,
     return f"{start}; it was trained on {words}, {depths or 'own'} bit, {levels or 'own'} PPP, this stream is {stream}"
 
 
-def _same(light: Light, codes: Codes, place: Place) -> bool:
+def _same(light: Illumination, codes: Codes, place: Place) -> bool:
     """Whether a stream lies where training was."""
     if light.ppp is None:
         return False

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from quiver.data.clips import Clip, open_clips
 from quiver.data.codes import Codes, open_stream, sensed, stream_codes
-from quiver.data.illumination import Light, follows_light
+from quiver.data.illumination import Illumination, follows_light
 from quiver.data.photon_cubes import cube_codes
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def _of_clip(path: Path, args: argparse.Namespace) -> Codes:
         now = "" if args.stream else ", or sense the clip now with --ppp"
         refuse(args, LIGHT, f"{stream.path} is a stored stream, which knows its own{now}")
         return stream_codes(stream)
-    return sensed(clip, Light(_sensor(args), args.ppp, _bits(args)), args.seed or 0)[0]
+    return sensed(clip, Illumination(_sensor(args), args.ppp, _bits(args)), args.seed or 0)[0]
 
 
 def _of_array(path: Path, args: argparse.Namespace) -> Codes:
@@ -86,7 +86,7 @@ def _of_array(path: Path, args: argparse.Namespace) -> Codes:
     refuse(args, ["seed"], f"is of noise that is drawn, and {path} holds codes already")
     if not follows_light(sensor):
         refuse(args, ["ppp"], f"the codes are there already, and the gain of {sensor} does not follow the light")
-    light = Light(sensor, args.ppp, args.bits if args.width is not None else _bits(args))
+    light = Illumination(sensor, args.ppp, args.bits if args.width is not None else _bits(args))
     if args.output.resolve() == path.resolve():
         raise ValueError(f"{path}: would be replaced by what is made from it; name another with -o")
     return cube_codes(path, light, args.frame_rate or FRAME_RATE, planes=args.planes, width=args.width)
@@ -117,7 +117,9 @@ def plan_of(args: argparse.Namespace) -> Plan:
     sensor = args.sensor or ("quiver-published" if args.published else "quiver-physical")
     own = sensor.endswith(".toml")  # such a file states its bits
     lights = tuple(
-        Light(sensor, ppp, bits) for bits in args.bits or ((None,) if own else (3,)) for ppp in args.ppp or (3.25,)
+        Illumination(sensor, ppp, bits)
+        for bits in args.bits or ((None,) if own else (3,))
+        for ppp in args.ppp or (3.25,)
     )
     split = None if args.split == "all" else args.split or "test"
     return Plan(args.source, split, lights, args.seed or 0, args.published, args.stream, args.peak)

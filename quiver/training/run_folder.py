@@ -25,7 +25,7 @@ from torch import nn
 from qsim.files import Lock, check_ours, read_json, replacing, write_bytes, write_json
 from quiver import threads
 from quiver.data.clips import open_clips
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.data.mixture import Mixture, choose, describe
 from quiver.data.noise import Noise
 from quiver.model import weights
@@ -100,12 +100,12 @@ class Settings:
         return (self.sensor,) if isinstance(self.sensor, str) else self.sensor
 
     @property
-    def lights(self) -> tuple[Light, ...]:
+    def lights(self) -> tuple[Illumination, ...]:
         """Every combination of sensor, bit depth and light level, with the defaults for what is not asked for."""
         if self.noise is not None:
             return self.noise
         return tuple(
-            Light(sensor, ppp, bits)
+            Illumination(sensor, ppp, bits)
             for sensor in self.sensors or ("quiver-physical",)
             for bits in self.bits or (3,)
             for ppp in self.ppp or (3.25,)

@@ -86,13 +86,13 @@ import numpy as np
 import torch
 from quiver.data.code_table import draw_codes
 from quiver.data.codes import array_codes
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from qsim.keys import Key
 from quiver.model.presets import build
 from quiver.restoration.restorers import Options, method_names, restorer, wrap_network
 
 torch.manual_seed(0)
-sensor = Light().device(5e-4)
+sensor = Illumination().device(5e-4)
 photons = np.random.default_rng(0).uniform(0.5, 6.0, (12, 16, 20))
 codes = array_codes(draw_codes(sensor, photons, 5e-4, Key(1, 2)), sensor, 5e-4)
 options = Options()

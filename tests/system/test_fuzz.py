@@ -34,7 +34,7 @@ from qsim.formats import importing, video
 from qsim.formats.recording import Hints
 from qsim.sensor import devices
 from qsim.sensor.defects import defect_table
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.data.photon_cubes import cube_codes
 
 MEMORY = 400 << 20  # bytes that a reader of these tiny files may take at most
@@ -184,7 +184,7 @@ def read_video(folder: Path) -> None:
 
 
 def read_bare(folder: Path) -> None:
-    codes = cube_codes(folder / "a.npy", Light(), 2000.0)
+    codes = cube_codes(folder / "a.npy", Illumination(), 2000.0)
     codes.read(0, min(codes.shape[0], 9))
 
 

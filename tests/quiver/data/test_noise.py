@@ -25,7 +25,7 @@ from qsim.sensor.defects.fixed_pattern import DarkSpread, Defects
 from quiver.cli.program import main
 from quiver.data.clips import open_clips
 from quiver.data.code_table import draw_codes
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.data.mixture import choose, describe
 from quiver.data.noise import Noise
 from quiver.data.window_noise import window_codes
@@ -121,7 +121,7 @@ def test_a_sensor_file_brings_its_bits_and_defects(tiny_dataset, tmp_path):
 def test_what_windows_cannot_have_is_refused(make_clip: ClipMaker, tmp_path):
     counter = sensor_file(tmp_path, COUNTER + "carry_dead_time = true\n", 3)
     with pytest.raises(ValueError, match=r"carry_dead_time and afterpulse of counting pixels.*without them"):
-        Windows([make_clip()], WindowSettings(crop=16, lights=(Light(counter, 3.0, 3),)))
+        Windows([make_clip()], WindowSettings(crop=16, lights=(Illumination(counter, 3.0, 3),)))
     sums = make_clip("sums")
     sense(sums, Sensing("spad-320x240", bits=2, ppp=3.0, group=True))
     with pytest.raises(ValueError, match="a code takes 3 clip frames, a training window one for each; give --sensor"):
@@ -131,7 +131,11 @@ def test_what_windows_cannot_have_is_refused(make_clip: ClipMaker, tmp_path):
 
 def test_every_window_is_normalised_by_its_own_sensor(make_clip: ClipMaker):
     """Codes over their top code, targets over the white of the sensor that drew them, mixed in one batch."""
-    lights = (Light("quiver-paper", 3.0, 2), Light("spad-320x240", 1.0, 1), Light("quiver-physical", 9.0, 5))
+    lights = (
+        Illumination("quiver-paper", 3.0, 2),
+        Illumination("spad-320x240", 1.0, 1),
+        Illumination("quiver-physical", 9.0, 5),
+    )
     data = Windows([make_clip()], WindowSettings(crop=16, lights=lights, flips=False, reverse=False))
     seen = set()
     for n in range(12):
@@ -188,7 +192,7 @@ def test_a_window_is_the_crop_of_the_sensed_frames(make_clip: ClipMaker, tmp_pat
         if found.none or (bits == 2 and not (found.crosstalk or found.afterpulse)):
             continue
         file = sensor_file(tmp_path, model, bits)
-        light = Light(file, rng.choice([0.3, 2.0, 20.0]), bits)
+        light = Illumination(file, rng.choice([0.3, 2.0, 20.0]), bits)
         noise = replace(Noise.of(light), defects=json.dumps(found.to_dict()))
         key = Key(seed=number, clip=3, stage=TRAINING)
         place = Place(
@@ -210,14 +214,14 @@ def test_sums_of_planes_have_the_distribution_of_their_pixels(make_clip: ClipMak
     np.save(tmp_path / "gain.npy", gain)
     file = sensor_file(tmp_path, SPAD + 'gain_map = "gain.npy"\n', 3)
     clip = make_clip(radiance=np.full((14, 20, 26), 0.5), relative=True)
-    data = Windows([clip], WindowSettings(crop=12, lights=(Light(file, 5.0, 3),), frames=11, flips=False))
+    data = Windows([clip], WindowSettings(crop=12, lights=(Illumination(file, 5.0, 3),), frames=11, flips=False))
     sums, counts = np.zeros(3), np.zeros(3)
     for n in range(12):
         codes, x = data[n]["codes"].numpy() * 7, data.place(n).x
         for kind in range(3):
             chosen = codes[..., (np.arange(x, x + 12) % 3) == kind]
             sums[kind], counts[kind] = sums[kind] + chosen.sum(), counts[kind] + chosen.size
-    sensor = Noise.of(Light(file, 5.0, 3)).draw(clip).sensor
+    sensor = Noise.of(Illumination(file, 5.0, 3)).draw(clip).sensor
     for kind, level in enumerate((5.0, 1.25, 0.0)):
         light = np.array([level])
         spread = math.sqrt(sensor.variance(light, clip.exposure)[0] / counts[kind])
@@ -231,7 +235,7 @@ def test_a_window_is_turned_with_its_defects(make_clip: ClipMaker, tmp_path):
     np.save(tmp_path / "dead.npy", dead)
     file = sensor_file(tmp_path, QIS + 'dead_map = "dead.npy"\n', 3)
     clip = make_clip(radiance=np.full((14, 20, 26), 0.5), relative=True)
-    data = Windows([clip], WindowSettings(crop=16, lights=(Light(file, 60.0, 3),)))
+    data = Windows([clip], WindowSettings(crop=16, lights=(Illumination(file, 60.0, 3),)))
     for n in range(40):
         place = data.place(n)
         window = np.broadcast_to(dead[place.y : place.y + 16, place.x : place.x + 16], (11, 16, 16))
@@ -245,7 +249,7 @@ def test_a_drifting_window_keeps_its_pixels(make_clip: ClipMaker, tmp_path):
     np.save(tmp_path / "dead.npy", dead)
     file = sensor_file(tmp_path, SPAD + 'dead_map = "dead.npy"\ncrosstalk = 0.1\nafterpulse = 0.1\n', 1)
     clip = make_clip(radiance=np.full((30, 48, 40), 0.5), relative=True)
-    settings = WindowSettings(crop=16, lights=(Light(file, 60.0, 1),), flips=False, drift=2)
+    settings = WindowSettings(crop=16, lights=(Illumination(file, 60.0, 1),), flips=False, drift=2)
     data, moved = Windows([clip], settings), 0
     for n in range(30):
         place = data.place(n)
@@ -261,7 +265,7 @@ def test_afterpulses_of_a_reversed_window_follow_its_own_time(make_clip: ClipMak
     radiance[:12] = 1.0
     clip = make_clip(radiance=radiance, relative=True)
     file = sensor_file(tmp_path, SPAD.replace("200.0", "0.0") + "afterpulse = 0.5\n", 1)
-    noise = Noise.of(Light(file, 20.0, 1))
+    noise = Noise.of(Illumination(file, 20.0, 1))
     draw = noise.draw(clip)
     forward = window_codes(noise, draw, clip, Place(0, 8, 2, 2, (0, 0), 0, 0, False, Key(1, 2)), 11, 16)
     back = window_codes(noise, draw, clip, Place(0, 8, 2, 2, (0, 0), 0, 0, True, Key(1, 2)), 11, 16)
@@ -274,7 +278,7 @@ def test_no_defects_change_no_bit(make_clip: ClipMaker, tmp_path):
     """A sensor file draws what its sensor draws, and a plain window what it always drew."""
     clip = make_clip()
     file = sensor_file(tmp_path, QIS + "prnu = 0.0\n", 3)
-    data = Windows([clip], WindowSettings(crop=16, lights=(Light(file, 3.25, 3),)))
+    data = Windows([clip], WindowSettings(crop=16, lights=(Illumination(file, 3.25, 3),)))
     place, noise = data.place(0), data.noise.noises[0]
     assert noise.defects is None
     sensor = noise.draw(clip).sensor

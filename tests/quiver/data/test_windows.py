@@ -21,7 +21,7 @@ from qsim.sensor.spad import BinarySPAD
 from quiver.data.clips import open_clips, truth
 from quiver.data.code_table import CodeTable, draw_codes
 from quiver.data.codes import array_codes, sensed
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.data.photon_cubes import cube_codes
 from quiver.data.windows import Batches, Windows, WindowSettings, as_input
 
@@ -103,7 +103,7 @@ def test_a_sample_is_what_the_docs_say(make_clip: ClipMaker):
     clip = make_clip(sharp=True)
     data = Windows([clip], WindowSettings(crop=16, flips=False, reverse=False, seed=7))
     sample, place = data[1], data.place(1)
-    light = Light()
+    light = Illumination()
     sensor, factor = light.device(clip.exposure), light_level(clip, ppp=3.25).factor
     crop, times = (place.y, place.x, 16, 16), range(place.start, place.start + 11)
     sharp = np.stack([clip_photons(clip, t, factor, crop, sharp=True) for t in times])
@@ -120,7 +120,7 @@ def test_codes_have_the_mean_of_their_photons(make_clip: ClipMaker):
     """A flat clip: 11 x 36 x 36 codes per sample against the sensor's exact mean and variance, turned or not."""
     clip = make_clip(radiance=np.full((14, 36, 36), 0.7), relative=True)
     sample = Windows([clip], WindowSettings(crop=36))[0]
-    sensor = Light().device(clip.exposure)
+    sensor = Illumination().device(clip.exposure)
     codes = sample["codes"].numpy() * 7
     level = np.array([3.25])
     assert_mean(codes, sensor.mean(level, 5e-4)[0], sensor.variance(level, 5e-4)[0])
@@ -133,7 +133,7 @@ def test_codes_have_the_mean_of_their_photons(make_clip: ClipMaker):
 @pytest.mark.parametrize("backwards", [False, True])
 def test_turns_move_codes_and_target_together(make_clip: ClipMaker, turn: int, backwards: bool):
     """At a million photons noise is invisible: codes are the clipped target, whatever the turn."""
-    data = windows(make_clip, lights=(Light("quiver-paper", ppp=3.25),))
+    data = windows(make_clip, lights=(Illumination("quiver-paper", ppp=3.25),))
     place = replace(data.place(0), turn=turn, backwards=backwards)
     exposed, sharp = data._photons(place)
     plain, _ = data._photons(replace(place, turn=0, backwards=False))
@@ -197,7 +197,7 @@ def test_processes_share_the_samples_without_overlap():
 
 
 def test_light_levels_are_mixed_and_named(make_clip: ClipMaker):
-    lights = (Light(ppp=3.25), Light(ppp=26.0), Light(ppp=3.25, bits=1))
+    lights = (Illumination(ppp=3.25), Illumination(ppp=26.0), Illumination(ppp=3.25, bits=1))
     data = windows(make_clip, lights=lights)
     found = {data.place(n).light for n in range(40)}
     assert found == {0, 1, 2}
@@ -235,18 +235,18 @@ def test_clips_that_hold_no_window_are_named(make_clip: ClipMaker):
 def test_sensed_codes_and_truth(make_clip: ClipMaker):
     """Drawn frame by frame or at once, the codes are the same; truth has the asked light level."""
     clip = make_clip()
-    codes, factor = sensed(clip, Light(), seed=2)
+    codes, factor = sensed(clip, Illumination(), seed=2)
     whole = codes.read(0, 14)
     np.testing.assert_array_equal(np.concatenate([codes.read(t, t + 1) for t in range(14)]), whole)
     assert truth(clip, factor, 0, 14).mean() == pytest.approx(3.25, rel=1e-6)
     assert codes.white == pytest.approx(8.125)
-    assert (sensed(clip, Light(), seed=3)[0].read(0, 1) != whole[:1]).any()
+    assert (sensed(clip, Illumination(), seed=3)[0].read(0, 1) != whole[:1]).any()
 
 
 def test_photon_cubes(tmp_path, rng_planes: Array):
     """Packed planes, seven to a code; a width that is no multiple of eight; leftover planes are dropped."""
     np.save(tmp_path / "cube.npy", np.packbits(rng_planes, axis=2))
-    light = Light("spad-320x240", None, 3)
+    light = Illumination("spad-320x240", None, 3)
     codes = cube_codes(tmp_path / "cube.npy", light, 1428.0, planes=7, width=13)
     assert codes.shape == (2, 5, 13)
     np.testing.assert_array_equal(codes.read(0, 2), rng_planes[:14].reshape(2, 7, 5, 13).sum(axis=1))
@@ -254,7 +254,7 @@ def test_photon_cubes(tmp_path, rng_planes: Array):
     with pytest.raises(ValueError, match=r"no cube of packed planes 30 px wide"):
         cube_codes(tmp_path / "cube.npy", light, 1428.0, planes=7, width=30)
     with pytest.raises(ValueError, match="fewer than the 31 of one code"):
-        cube_codes(tmp_path / "cube.npy", Light("spad-320x240", None, 5), 300.0, planes=31, width=13)
+        cube_codes(tmp_path / "cube.npy", Illumination("spad-320x240", None, 5), 300.0, planes=31, width=13)
 
 
 @pytest.fixture
@@ -289,6 +289,6 @@ def test_bad_radiance_names_its_clip(make_clip: ClipMaker, monkeypatch):
     clip = make_clip()
     monkeypatch.setattr(type(clip), "radiance", lambda self, t, crop=None: np.full((36, 44), np.nan, np.float32))
     with pytest.raises(ValueError, match=r"sliding_0: frames 2\.\.3: photons"):
-        sensed(clip, Light())[0].read(2, 4)
+        sensed(clip, Illumination())[0].read(2, 4)
     with pytest.raises(ValueError, match=r"sliding_0: window from frame \d: photons"):
         Windows([clip], WindowSettings(crop=36))[0]

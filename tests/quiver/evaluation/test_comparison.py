@@ -19,7 +19,7 @@ from qsim.clip.clip import RELATIVE, ClipWriter
 from qsim.clip.stream import Sensing, sense
 from quiver.data.clips import open_clips, truth
 from quiver.data.codes import Codes, array_codes, sensed
-from quiver.data.illumination import Light, ideal_counter
+from quiver.data.illumination import Illumination, ideal_counter
 from quiver.data.photon_counts import Counts, read_counts
 from quiver.evaluation import summary
 from quiver.evaluation.comparison import Plan, Row, append, begin, evaluate, finished, scored_frames, truth_psnr
@@ -44,7 +44,7 @@ def oracle(source: Path, factor: float = 1.0) -> Restorer:
 
     def restore(codes: Codes) -> Array:
         clip = known[codes.name.split(",")[0]]
-        return factor * truth(clip, sensed(clip, Light())[1], 0, len(clip))
+        return factor * truth(clip, sensed(clip, Illumination())[1], 0, len(clip))
 
     return method(f"oracle {factor:g}", restore)
 
@@ -62,7 +62,7 @@ def test_a_known_truth_scores_what_it_should(tiny_dataset):
     assert perfect.psnr > 120
     assert dark.psnr_matched > 120
     clip = open_clips(tiny_dataset, "test")[0]
-    x = truth(clip, sensed(clip, Light())[1], 0, 14) / 8.125
+    x = truth(clip, sensed(clip, Illumination())[1], 0, 14) / 8.125
     assert x.max() < 1
     expected = np.mean([-20 * math.log10(0.1 * math.sqrt(np.mean(frame**2))) for frame in x])
     assert dark.psnr == pytest.approx(expected, abs=1e-3)
@@ -142,7 +142,7 @@ def test_a_failure_keeps_its_row_and_reason(tiny_dataset, tmp_path):
 
 
 def test_the_table_holds_what_was_promised(tiny_dataset, tmp_path):
-    plan = Plan(str(tiny_dataset), lights=(Light(), Light(ppp=26.0)))
+    plan = Plan(str(tiny_dataset), lights=(Illumination(), Illumination(ppp=26.0)))
     methods = [restorer("naive"), restorer("moment:3")]
     rows = evaluate(plan, methods, tmp_path / "t")
     summary.write(tmp_path / "t", plan, methods, rows)
@@ -166,7 +166,7 @@ def test_the_table_holds_what_was_promised(tiny_dataset, tmp_path):
 def test_truth_psnr_is_the_radiance_error_in_units_of_white(make_clip: ClipMaker):
     """Relative clip, mean 1 by construction of the factor: rms 0.01 of radiance is 0.01 * 3.25 / mean of 8.125."""
     clip = make_clip(relative=True, error=0.01)
-    _, factor = sensed(clip, Light())
+    _, factor = sensed(clip, Illumination())
     expected = -20 * math.log10(0.01 * (3.25 / clip.mean_radiance) / 8.125)
     assert truth_psnr(clip, factor, 8.125, range(4)) == pytest.approx(expected)
     assert truth_psnr(make_clip("unknown", error=None), 1.0, 8.125, range(4)) is None
@@ -191,7 +191,7 @@ def test_every_sensor_is_scored_at_one_peak(make_clip: ClipMaker):
     methods = [restorer("naive"), restorer("moment:3")]
     for sensor, bits in sensors:
         ppp = float(np.exp(rng.uniform(np.log(0.3), np.log(100))))
-        rows = evaluate(Plan(str(clip.path), None, (Light(sensor, ppp, bits),)), methods)
+        rows = evaluate(Plan(str(clip.path), None, (Illumination(sensor, ppp, bits),)), methods)
         assert [row.failure for row in rows] == [None, None]
         assert [row.peak for row in rows] == pytest.approx([2.5 * ppp] * 2)
         light = clip.mean_radiance  # of light in units of the peak: radiance / (2.5 mean)
@@ -202,7 +202,9 @@ def test_every_sensor_is_scored_at_one_peak(make_clip: ClipMaker):
 
 def test_a_one_bit_sensor_in_much_light_is_not_perfect(make_clip: ClipMaker):
     """At 10 PPP every pixel of a 1-bit code lies above its own white: there all guesses were perfect, `moment` inf."""
-    plan = Plan(str(make_clip().path), None, (Light("spad-320x240", 1.0, 1), Light("spad-320x240", 10.0, 1)))
+    plan = Plan(
+        str(make_clip().path), None, (Illumination("spad-320x240", 1.0, 1), Illumination("spad-320x240", 10.0, 1))
+    )
     dim, bright = evaluate(plan, [restorer("moment")])
     assert bright.score.psnr < dim.score.psnr < 40
     hidden = evaluate(replace(plan, peak=1.0), [restorer("moment")])[1]
@@ -243,9 +245,9 @@ def test_another_peak_moves_scores_by_its_ratio(make_clip: ClipMaker):
 def test_the_published_protocol_keeps_its_white(make_clip: ClipMaker):
     """Peak = white of the sensor as published; with the default gain that is 2.5 times the light."""
     clip = make_clip()
-    paper = Plan(str(clip.path), None, (Light("quiver-paper"),), published=True)
+    paper = Plan(str(clip.path), None, (Illumination("quiver-paper"),), published=True)
     assert evaluate(paper, [restorer("moment")])[0].peak == pytest.approx(7 / 0.8)
-    assert evaluate(replace(paper, lights=(Light(),)), [restorer("moment")])[0].peak == pytest.approx(2.5 * 3.25)
+    assert evaluate(replace(paper, lights=(Illumination(),)), [restorer("moment")])[0].peak == pytest.approx(2.5 * 3.25)
     assert evaluate(replace(paper, peak=3.0), [restorer("moment")])[0].peak == 3.0
     assert "the sensor's white, as published" in summary.peak_name(paper)
 
@@ -260,7 +262,7 @@ def test_saturated_pixels_count_nowhere(tmp_path):
         for t in range(12):
             writer.add(t, rng.uniform(0.5, 1.5, (24, 30)), saturated=mask)
     clip = open_clips(tmp_path / "recorded")[0]
-    exact = truth(clip, sensed(clip, Light())[1], 0, 12)
+    exact = truth(clip, sensed(clip, Illumination())[1], 0, 12)
     noise = rng.normal(0, 1, exact.shape)
     spoilt = method("spoilt", lambda codes: exact + 0.1 * noise + np.where(mask, 5.0, 0.0))
     rows = evaluate(Plan(str(clip.path), None), [spoilt, method("whole", lambda codes: exact + 0.1 * noise)])
@@ -275,7 +277,7 @@ def test_scores_near_the_truth_are_marked(make_clip: ClipMaker):
 
     def wrong(psnr: float) -> Restorer:
         sigma = 2.5 * 3.25 * 10 ** (-psnr / 20)
-        exact = truth(clip, sensed(clip, Light())[1], 0, len(clip))
+        exact = truth(clip, sensed(clip, Illumination())[1], 0, len(clip))
         return method(f"at {psnr:g}", lambda codes: exact + rng.normal(0, sigma, exact.shape))
 
     plan, methods = Plan(str(clip.path), None), [wrong(36.0), wrong(20.0)]
@@ -315,7 +317,9 @@ def test_published_protocol_forces_every_window(tiny_dataset):
     assert max(levels) - min(levels) < 0.1
     assert rows[0].score.scale_spread > 0
     with pytest.raises(ValueError, match="give --ppp"):
-        evaluate(Plan(str(tiny_dataset), lights=(Light("quiver-paper", None),), published=True), [method("x", look)])
+        evaluate(
+            Plan(str(tiny_dataset), lights=(Illumination("quiver-paper", None),), published=True), [method("x", look)]
+        )
 
 
 def test_stored_streams_are_scored(tiny_dataset, make_clip: ClipMaker):

@@ -20,7 +20,7 @@ from quiver.baselines import METHODS
 from quiver.cli.program import main
 from quiver.data.clips import open_clips
 from quiver.data.codes import Codes, array_codes
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise
 from quiver.evaluation import domain_measurement
 from quiver.model.unet import UNet, UNetConfig
@@ -132,7 +132,7 @@ def test_light_that_is_not_told_is_estimated():
 def test_weights_without_cells_say_what_they_were_trained_on(tmp_path):
     path = weights(tmp_path, settings={"sensor": "quiver-physical", "bits": [1, 3], "ppp": [3.25, 9.75]})
     scope = domain.read_scope(path, metadata_of(path))
-    assert scope.trained == tuple(Light("quiver-physical", p, b) for b in (1, 3) for p in (3.25, 9.75))
+    assert scope.trained == tuple(Illumination("quiver-physical", p, b) for b in (1, 3) for p in (3.25, 9.75))
     same, other = domain.remark("mine", scope, stream()), domain.remark("mine", scope, stream("spad512s", 2, 1))
     assert same == (
         "mine was never measured against the classical methods; it was trained on such streams "
@@ -205,9 +205,9 @@ def test_cells_are_measured_stored_and_kept(tiny_dataset, tmp_path, monkeypatch)
     path = weights(tmp_path)
     before = tensors_digest(path)
     clips = domain_measurement.clips_of([tiny_dataset], "test")
-    lights = (Light(ppp=3.25), Light("spad-320x240", 1.0, 1))
+    lights = (Illumination(ppp=3.25), Illumination("spad-320x240", 1.0, 1))
     question = domain_measurement.Question(clips, lights, ("naive", "moment:3"))
-    asked: list[Light] = []
+    asked: list[Illumination] = []
     measured = domain_measurement.measure_cell
 
     def noted(network, methods, question, light):
@@ -250,15 +250,15 @@ def test_a_classical_method_that_fails_does_not_compete(tiny_dataset, tmp_path):
         raise ValueError("no road leads there")
 
     broken = replace(restorer("naive"), name="broken", fill=fails)
-    question = domain_measurement.Question(domain_measurement.clips_of([tiny_dataset], "test"), (Light(),))
+    question = domain_measurement.Question(domain_measurement.clips_of([tiny_dataset], "test"), (Illumination(),))
     assert (
-        domain_measurement.measure_cell(network, [broken, restorer("moment:3")], question, Light()).classical
+        domain_measurement.measure_cell(network, [broken, restorer("moment:3")], question, Illumination()).classical
         == "moment:3"
     )
     with pytest.raises(ValueError, match=r"3\.25 PPP, 3 bit: the network, or every classical method, fails"):
-        domain_measurement.measure_cell(network, [broken], question, Light())
+        domain_measurement.measure_cell(network, [broken], question, Illumination())
     with pytest.raises(ValueError, match="no road leads there"):
-        domain_measurement.measure_cell(replace(network, fill=fails), [restorer("naive")], question, Light())
+        domain_measurement.measure_cell(replace(network, fill=fails), [restorer("naive")], question, Illumination())
 
 
 # ---- Commands and the call in Python

@@ -20,7 +20,7 @@ from qsim.clip.stream import Sensing, sense
 from qsim.sensor.qis import QIS
 from quiver.cli.program import main
 from quiver.data.codes import Codes, array_codes, open_stream, sensed, stream_codes
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.data.photon_cubes import cube_codes
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
@@ -106,13 +106,13 @@ def test_a_restoration_of_something_else_starts_again(tmp_path, make_clip, block
             both = []
             for seed in (0, 1):
                 np.save(tmp_path / "codes.npy", random_codes(seed).read(0, 10))
-                both.append(cube_codes(tmp_path / "codes.npy", Light("quiver-paper", None, 3), 2000.0))
+                both.append(cube_codes(tmp_path / "codes.npy", Illumination("quiver-paper", None, 3), 2000.0))
                 os.unlink(tmp_path / "codes.npy")
             before, after = both
         case "sensed clip":
             clip = make_clip(frames=10)
-            before = sensed(clip, Light())[0]
-            after = sensed(replace(clip, meta=clip.meta | {"checksums": {}}), Light())[0]  # of other contents
+            before = sensed(clip, Illumination())[0]
+            after = sensed(replace(clip, meta=clip.meta | {"checksums": {}}), Illumination())[0]  # of other contents
         case "weights":
             options = Options(device="cpu")
             old, new = (restorer(str(weights(tmp_path, seed)), options) for seed in (0, 1))

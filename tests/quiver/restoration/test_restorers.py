@@ -20,7 +20,7 @@ from qsim.sensor.qis import QIS
 from quiver.baselines import METHODS
 from quiver.data.clips import truth
 from quiver.data.codes import Codes, array_codes, sensed
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
 from quiver.model.blocks import Output
 from quiver.model.presets import build
@@ -148,7 +148,7 @@ def test_methods_of_one_table_have_names_of_their_own(tmp_path):
 def test_the_shipped_weights_are_useful_at_once(make_clip: ClipMaker):
     """A pattern that no training saw, 1.5 px/frame: measured 6.9 dB above the best window mean; 4 dB must be there."""
     clip = make_clip(frames=15, height=64, width=72)
-    codes, factor = sensed(clip, Light())
+    codes, factor = sensed(clip, Illumination())
     target = truth(clip, factor, 0, len(clip)) / codes.white
 
     def psnr(name: str) -> float:
@@ -255,10 +255,10 @@ MEMORY_PROGRAM = """
 import numpy as np
 from quiver.evaluation.peak_memory import peak_memory, reset_peak
 from quiver.data.codes import array_codes
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.model.presets import build
 from quiver.restoration.restorers import Options, wrap_network
-sensor = Light().device(5e-4)
+sensor = Illumination().device(5e-4)
 codes = array_codes(np.random.default_rng(0).integers(0, 8, (1, 320, 320), dtype=np.uint8), sensor, 5e-4)
 method = wrap_network(build("nano"), "nano", "", Options(memory={memory}, mode="{mode}"))
 before = reset_peak()

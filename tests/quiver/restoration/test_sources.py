@@ -11,12 +11,12 @@ from clips import ClipMaker
 import quiver
 from qsim.clip.stream import Sensing, sense
 from quiver.cli.program import main
-from quiver.data.illumination import Light
+from quiver.data.illumination import Illumination
 from quiver.data.photon_cubes import cube_codes, plane_bits
 from quiver.restoration.restorers import Options, restorer
 
 VALID = [2**b - 1 for b in range(1, 17)]
-SPAD = Light("spad-320x240", None, None)
+SPAD = Illumination("spad-320x240", None, None)
 
 
 def packed(planes: np.ndarray, path: Path) -> Path:
@@ -76,8 +76,8 @@ def test_binary_planes_are_codes_of_one_bit(tmp_path):
 @pytest.mark.parametrize(
     ("light", "planes", "message"),
     [
-        (Light("spad-320x240", None, 3), 15, "sums of 15 planes are 4-bit codes, got bits = 3"),
-        (Light("quiver-paper", None, None), 7, "quiver-paper: only a clocked SPAD sums planes, this is a QIS"),
+        (Illumination("spad-320x240", None, 3), 15, "sums of 15 planes are 4-bit codes, got bits = 3"),
+        (Illumination("quiver-paper", None, None), 7, "quiver-paper: only a clocked SPAD sums planes, this is a QIS"),
     ],
 )
 def test_a_sensor_that_cannot_have_made_the_sums_is_refused(tmp_path, light, planes, message):
@@ -90,7 +90,7 @@ def test_an_archive_under_the_name_of_an_array_is_named(tmp_path):
     with open(tmp_path / "z.npy", "wb") as file:
         np.savez(file, a=np.zeros((2, 3, 4), np.uint8))
     with pytest.raises(ValueError, match=r"z\.npy: is an archive"):
-        cube_codes(tmp_path / "z.npy", Light(), 1000.0)
+        cube_codes(tmp_path / "z.npy", Illumination(), 1000.0)
 
 
 # Options
