@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from quiver.model.deformable import deform_conv2d, warp
 from quiver.model.plane_sweep import aligned, disagreement, paths
-from quiver.restoration.tiles import cores, extents
+from quiver.tiles import cores, extents
 
 RADIUS = 5  # frames before and after the restored one
 WINDOW = 2 * RADIUS + 1

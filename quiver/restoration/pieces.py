@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy import ndarray as Array
 
-from quiver.restoration.tiles import Tile, plan_tiles
+from quiver.tiles import Tile, cut_tiles
 
 if TYPE_CHECKING:
     from torch import nn
@@ -43,20 +43,20 @@ class Pieces:
         return f"{len(self.tiles)} tiles of at most {tallest} x {widest}"
 
 
-def plan_pieces(model: nn.Module, height: int, width: int, memory: int, mode: str) -> Pieces:
+def cut_pieces(model: nn.Module, height: int, width: int, memory: int, mode: str) -> Pieces:
     """The cut of a frame for a network and so many bytes; `ValueError` if they hold not even a small tile."""
     from quiver.model.blocks import Hourglass
     from quiver.model.quiver import QUIVER
 
     multiple = int(model.multiple)  # type: ignore[arg-type]
     pixels = memory // bytes_per_pixel(model, mode)
-    whole = Pieces(plan_tiles(height, width, height * width, 0))
+    whole = Pieces(cut_tiles(height, width, height * width, 0))
     if height * width <= pixels:
         return whole
     if not isinstance(model, QUIVER):
         reach = getattr(model, "reach", None)
         blend = reach is None
-        return Pieces(plan_tiles(height, width, pixels, reach or BLENDED, multiple, blend=blend), exact=not blend)
+        return Pieces(cut_tiles(height, width, pixels, reach or BLENDED, multiple, blend=blend), exact=not blend)
     padded = [side + -side % multiple for side in (height, width)]
     needed = bytes_per_pixel(model, mode) * height * width
     if model.baseline is not None:
@@ -67,7 +67,7 @@ def plan_pieces(model: nn.Module, height: int, width: int, memory: int, mode: st
         if memory >= needed:
             return Pieces(whole.tiles, hourglass=(memory - rest) // per_pixel)
     step = 2**model.config.flow_levels * model.config.fold
-    return Pieces(plan_tiles(height, width, pixels, BLENDED, max(multiple, step), blend=True), None, False, needed)
+    return Pieces(cut_tiles(height, width, pixels, BLENDED, max(multiple, step), blend=True), None, False, needed)
 
 
 def bytes_per_pixel(model: nn.Module, mode: str) -> int:

@@ -24,7 +24,7 @@ from qsim.checks import suggest
 from quiver.baselines import METHODS
 from quiver.baselines.sliding_window import look_ahead, reflect
 from quiver.data.codes import Codes
-from quiver.restoration.pieces import Disagreement, plan_pieces
+from quiver.restoration.pieces import Disagreement, cut_pieces
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -206,7 +206,7 @@ def wrap_network(
     identity = {"weights_sha256": weights_sha256, "mode": mode, "precision": options.precision}
 
     def cut(height: int, width: int) -> str:
-        return plan_pieces(model, height, width, options.memory, options.mode).text
+        return cut_pieces(model, height, width, options.memory, options.mode).text
 
     return Restorer(name, WINDOW, RADIUS, True, description, fill, mode != "streaming", identity, cut)
 
@@ -262,7 +262,7 @@ def fill_network(
     device = next(model.parameters()).device
     dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
     height, width = codes.shape[1:]
-    pieces = plan_pieces(model, height, width, options.memory, options.mode)
+    pieces = cut_pieces(model, height, width, options.memory, options.mode)
     if isinstance(model, QUIVER) and model.baseline is not None:
         model.baseline.pixels = pieces.hourglass
     multiple = int(model.multiple)  # type: ignore[arg-type]

@@ -63,7 +63,6 @@ STILL_FORBIDDEN: set[tuple[str, str]] = {
     ("qsim.dataset", "qsim.formats"),
     ("qsim.optics", "qsim.clip"),
     ("qsim.sensor", "qsim.formats"),
-    ("quiver.model", "quiver.restoration"),
     ("quiver.restoration", "quiver.cli"),
     ("quiver.restoration", "quiver.evaluation"),
 }

@@ -19,7 +19,7 @@ from quiver.model.presets import build
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import load
 from quiver.restoration import pieces
-from quiver.restoration.pieces import bytes_per_pixel, frame_bytes, plan_pieces
+from quiver.restoration.pieces import bytes_per_pixel, cut_pieces, frame_bytes
 from quiver.restoration.restored_file import restore_to_file
 from quiver.restoration.restorers import (
     MODES,
@@ -31,7 +31,7 @@ from quiver.restoration.restorers import (
     weights_path,
     wrap_network,
 )
-from quiver.restoration.tiles import cores, extents, plan_tiles, spans
+from quiver.tiles import cores, cut_tiles, extents, spans
 
 SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
 
@@ -67,7 +67,7 @@ def test_tiles_cover_the_frame_within_the_bound(blend):
         pixels = int(rng.integers(1000, 60_000))
         if pixels < min(height, multiple + 80) * min(width, multiple + 80):
             continue  # not even the smallest tile fits
-        tiles = plan_tiles(height, width, pixels, reach, multiple, blend=blend)
+        tiles = cut_tiles(height, width, pixels, reach, multiple, blend=blend)
         total = np.zeros((height, width))
         for tile in tiles:
             rows, columns = tile.weight.shape
@@ -93,13 +93,13 @@ def test_the_cut_with_the_smallest_area_is_taken():
         tried = [area(tall, wide) for tall in range(8, height + 8, 8) for wide in range(8, width + 8, 8)]
         fitting = [whole for most, whole in tried if most <= pixels]
         assert area(*cores(height, width, pixels, 16, 8))[1] == min(fitting)
-    tiles = plan_tiles(576, 576, 500_000_000 // 4248, 32, 16, blend=True)
+    tiles = cut_tiles(576, 576, 500_000_000 // 4248, 32, 16, blend=True)
     assert sum(tile.weight.size for tile in tiles) < 1.3 * 576 * 576
 
 
 def test_a_bound_below_one_tile_is_refused():
     with pytest.raises(ValueError, match=r"tile needs at least 80 x 80; raise --memory"):
-        plan_tiles(200, 200, 1000, 32, 16)
+        cut_tiles(200, 200, 1000, 32, 16)
 
 
 @pytest.mark.parametrize("length", [1, 79, 80, 81, 100, 333])
@@ -138,7 +138,7 @@ def test_a_convolutional_network_does_not_see_the_tiles():
         memory = bytes_per_pixel(model, "exact") * int(rng.integers(9_000, 30_000))
         codes = moving(1, height, width, seed)
         tiled, whole = (quiet(wrap_network(model, "u", "", Options(memory=m)), codes) for m in (memory, 10**10))
-        cut += len(plan_pieces(model, height, width, memory, "exact").tiles) > 1
+        cut += len(cut_pieces(model, height, width, memory, "exact").tiles) > 1
         assert np.abs(tiled - whole).max() < 1e-5 * codes.white
     assert cut > 3
 
@@ -155,7 +155,7 @@ def same_with_less_memory(name: str, mode: str, seed: int) -> None:
     height, width = (int(n) for n in rng.integers(89, 116, 2))
     codes, network = moving(2, height, width, seed), load(path).eval()
     memory = nano_memory(network, height, width, mode, int(rng.integers(7744, min(9000, height * width))))
-    cut = plan_pieces(network, height, width, memory, mode)
+    cut = cut_pieces(network, height, width, memory, mode)
     assert cut.exact
     assert cut.hourglass is not None
     assert cut.hourglass < height * width  # the hourglass does run in tiles
@@ -202,7 +202,7 @@ def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path):
     path, codes = weights_path("nano"), moving(1, 104, 120)
     network = load(path).eval()
     memory = bytes_per_pixel(network, "exact") * 9_000
-    cut = plan_pieces(network, 104, 120, memory, "exact")
+    cut = cut_pieces(network, 104, 120, memory, "exact")
     assert not cut.exact
     assert all(tile.y % 16 == tile.x % 16 == 0 for tile in cut.tiles)
     method = network_restorer(path, Options(memory=memory))
@@ -216,7 +216,7 @@ def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path):
     found = float(np.sqrt(np.mean((np.load(tmp_path / "r.npy") - whole) ** 2))) / codes.white
     assert 0 < found < 10 * said
     needed = int(re.search(r"--memory (\d+)MB restores it whole", text)[1]) * 10**6  # type: ignore[index]
-    assert plan_pieces(network, 104, 120, needed, "exact").exact
+    assert cut_pieces(network, 104, 120, needed, "exact").exact
 
 
 @pytest.mark.slow

@@ -71,7 +71,7 @@ def spans(length: int, core: int, reach: int, blend: bool) -> list[tuple[int, Ar
     return [(first, (shape / total[first : first + len(shape)]).astype(np.float32)) for first, shape in shapes]
 
 
-def plan_tiles(
+def cut_tiles(
     height: int, width: int, pixels: int, reach: int, multiple: int = 1, *, blend: bool = False
 ) -> list[Tile]:
     """Tiles of at most `pixels` pixels that start at multiples of `multiple`; the whole frame, if that fits.
