@@ -1,6 +1,6 @@
 """What the program computed at commit 19b9ba0, before its modules moved, it still computes: codes, light, video.
 
-Made once, by `python tests/test_unchanged.py --write`, from commit 19b9ba0, and never rewritten to make a failing test
+Made once, by `python tests/system/test_unchanged.py --write`, from commit 19b9ba0, and never rewritten to make a failing test
 pass: a failing test says that results changed. Only names that survive every move are used: those of `import qsim`,
 `quiver.restore`, and the command lines.
 
@@ -36,7 +36,7 @@ import quiver.cli
 from qsim import QIS, BinarySPAD, Camera, Clip, ClipWriter, CountingSPAD, Dataset, Key, Sensor
 from quiver import restore
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 Array = np.ndarray
 
 
@@ -647,5 +647,5 @@ def test_a_difference_is_seen():
 if __name__ == "__main__":
     os.environ["OMP_NUM_THREADS"] = "1"
     if sys.argv[1:] != ["--write"]:
-        sys.exit("usage: python tests/test_unchanged.py --write, at commit 19b9ba0 alone")
+        sys.exit("usage: python tests/system/test_unchanged.py --write, at commit 19b9ba0 alone")
     write()
