@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw
 
 import scenes
 from qsim.colour import tone
-from qsim.rendering.fidelity import Budget
+from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
 from scenes.stage import FRAME_RATE, HEIGHT
 

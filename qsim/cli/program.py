@@ -141,7 +141,9 @@ def _run_render(args: argparse.Namespace) -> int:
     from qsim.clip.clamped_error import stated
     from qsim.dataset import scene_files
     from qsim.optics import radiometry
-    from qsim.rendering import fidelity, renderer
+    from qsim.rendering import fidelity
+    from qsim.rendering.budget import explain
+    from qsim.rendering.clip_rendering import render_clip
 
     if args.output is None and not args.explain:
         raise ValueError("the following arguments are required: -o/--output; only --explain does without")
@@ -165,9 +167,9 @@ def _run_render(args: argparse.Namespace) -> int:
             seed=args.seed,
         )
         if args.output is None:
-            output(args, {"render": dataclasses.asdict(chosen)}, fidelity.explain(chosen))
+            output(args, {"render": dataclasses.asdict(chosen)}, explain(chosen))
             return 0
-        clip = renderer.render_clip(
+        clip = render_clip(
             scene,
             args.output,
             frames=args.frames,
@@ -189,7 +191,7 @@ def _run_render(args: argparse.Namespace) -> int:
         fireflies, pixels = sum(clip.meta["fireflies_per_frame"]), math.prod(clip.shape)
         how = "counted before denoising" if chosen.denoise else "counted and left in"
         text += f"\nfireflies: {fireflies} of {pixels} pixels, {how}"
-    text += "\n" + (fidelity.explain(chosen) if args.explain else radiometry.diffraction_line(scene.camera))
+    text += "\n" + (explain(chosen) if args.explain else radiometry.diffraction_line(scene.camera))
     output(args, {"clip": str(clip.path)} | {k: v for k, v in clip.meta.items() if k != "checksums"}, text)
     return 0
 

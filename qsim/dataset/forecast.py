@@ -24,8 +24,8 @@ from qsim.dataset import job_runner
 from qsim.dataset.job import Job
 from qsim.dataset.recipe import Recipe
 from qsim.dataset.worker_pool import Limits
+from qsim.rendering.budget import Budget
 from qsim.rendering.denoiser import DENOISE_COST
-from qsim.rendering.fidelity import Budget
 
 START = 3.0  # s, a fresh worker process with its renderer; measured on two cores, shared by Limits.jobs jobs
 LOOKED_AT = 5  # jobs of a kind whose budgets are chosen, at most
@@ -217,11 +217,11 @@ def _work(budget: Budget) -> float:
 
 def _first_frames(job: Job, budget: Budget, path: Path, frames: int) -> tuple[Clip, list[Seconds]]:
     """The first frames of a job's clip, and when each was done."""
-    from qsim.rendering import renderer
+    from qsim.rendering.clip_rendering import render_clip
 
     settings = job.settings
     moments: list[Seconds] = []
-    clip = renderer.render_clip(
+    clip = render_clip(
         job_runner.load_scene(job),
         path,
         frames=frames,

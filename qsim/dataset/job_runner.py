@@ -29,7 +29,7 @@ from qsim.clip.clip import Clip
 from qsim.dataset.job import Job
 
 if TYPE_CHECKING:
-    from qsim.rendering.fidelity import Budget
+    from qsim.rendering.budget import Budget
     from qsim.scene.scene import Scene
 
 Make = Callable[[Job, Path], object]  # renders a job's clip to a path; tests hand in a quick one
@@ -65,11 +65,11 @@ def provenance(job: Job, read: dict[str, str] | None = None) -> dict[str, Any]:
 
 def render_job(job: Job, path: Path) -> object:
     """Render a job's clip with the budget that its wanted error and its brightest stream ask for."""
-    from qsim.rendering import renderer
+    from qsim.rendering.clip_rendering import render_clip
 
     settings = job.settings
     scene, read = load_traced(job)
-    return renderer.render_clip(
+    return render_clip(
         scene,
         path,
         frames=settings.frames,

@@ -5,18 +5,19 @@ from typing import TYPE_CHECKING
 from qsim.files import lazy_names
 
 if TYPE_CHECKING:
-    from qsim.rendering.fidelity import Budget
+    from qsim.rendering.budget import Budget
+    from qsim.rendering.clip_rendering import render_clip
     from qsim.rendering.mitsuba_xml import read_mitsuba
-    from qsim.rendering.renderer import Renderer, render_clip
+    from qsim.rendering.renderer import Renderer
 
 __all__ = ["Budget", "Renderer", "read_mitsuba", "render_clip"]
 
 __getattr__ = lazy_names(
     __name__,
     {
-        "Budget": "fidelity",
+        "Budget": "budget",
         "Renderer": "renderer",
         "read_mitsuba": "mitsuba_xml",
-        "render_clip": "renderer",
+        "render_clip": "clip_rendering",
     },
 )

@@ -14,77 +14,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import Errors, Stated, decibels, white_in
 from qsim.clip.motion_statistics import MOVING
+from qsim.optics.camera import Camera
 from qsim.optics.radiometry import WHITE_PER_MEAN
-
-if TYPE_CHECKING:
-    from qsim.optics.camera import Camera
-    from qsim.scene.scene import Scene
+from qsim.rendering.budget import Allowed, Budget, Finding, blur_error, grid_samples
+from qsim.rendering.pilot import COUNTS, Pilot, denoised_samples, rests
+from qsim.scene.scene import Scene
 
 SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
 SENSOR_SHARE = 0.01  # of the shot variance that Monte-Carlo noise may add
 DEPTHS = (2, 4, 6, 9, 12, 16, 24)  # bounces tried, against (each depth is a kernel to compile)
 DEEPEST = 32
-COUNTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
 MOST_SAMPLES = 16384
 PEAK_INSTANTS = 25  # whose mean tells how bright the exposure of a frame is
 MOST_INSTANTS = 3 + 6 * 85
 MOST_TRIED = 15  # instants up to which more are tried against them
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that a clip models or leaves out, and how large the rest is."""
-
-    effect: str
-    chosen: str
-    size: str
-
-
-@dataclass(frozen=True)
-class Budget:
-    """What a frame costs, and why; the same record is stored in clip.json."""
-
-    samples: int = 32  # per pixel and frame, all instants and both halves together
-    bounces: int = 6  # scatterings along a path
-    sub_frames: int = 9  # instants per exposure when the shutter is open; their error is measured if 3, 6, 9 ...
-    sharp: bool = True  # also render the instant at mid-exposure when the shutter is open
-    denoise: bool = False  # Open Image Denoise; its error is measured against raw halves
-    left_out: float = 0.0  # W m^-2 sr^-1, rms of later bounces by the pilot; part of the error that a frame states
-    left_out_at_white: float = 0.0  # the same of pictures clamped at white
-    white: float = 0.0  # W m^-2 sr^-1, by the pilot; 0: not known, each frame takes its own
-    dimmed: float = 0.0  # share of the mean light that later bounces would add, by the pilot
-    dimmed_error: float = 0.0  # standard error of that share
-    findings: tuple[Finding, ...] = field(default=())
-
-    def __post_init__(self) -> None:
-        for name in ("samples", "bounces", "sub_frames"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"Budget.{name}: at least 1, got {getattr(self, name)!r}")
-
-    def grid(self, instants: int) -> int:
-        """Samples per pixel of each half at each of these instants."""
-        return grid_samples(math.ceil(self.samples / instants / 2))
-
-
-@dataclass(frozen=True)
-class Allowed:
-    """The errors that a frame may have, rms in W m^-2 sr^-1."""
-
-    white: float
-    target: float  # of picture and truth clamped at white
-    sensor: float = math.inf  # without a clamp
-
-    def part(self, errors: Errors) -> float:
-        """How much of what is allowed these errors take, 1 being all."""
-        return max(errors.at_white / self.target, errors.plain / self.sensor)
 
 
 @dataclass(frozen=True)
@@ -125,8 +75,6 @@ def choose(
     """
     if not 10 <= psnr <= 80:
         raise ValueError(f"psnr: 10 to 80 dB can be asked for, got {psnr!r}")
-    from qsim.rendering.pilot import Pilot, denoised_samples, rests  # which renders budgets
-
     pilot = Pilot.of(scene, frame_rate, shutter, frames, seed)
     full = pilot.mean(COUNTS[1], DEEPEST)
     if not full.mean() > 0:
@@ -181,12 +129,6 @@ def choose(
     )
 
 
-def explain(budget: Budget) -> str:
-    """What was modelled, what was left out, and how large it would have been; one line each."""
-    width = max((len(finding.effect) for finding in budget.findings), default=0)
-    return "\n".join(f"{f.effect:{width}}  {f.chosen}; {f.size}" for f in budget.findings)
-
-
 def shortfall(reached: Stated | None, asked: float) -> str:
     """What to say of a clip whose measured PSNR misses the one asked for by more than chance, 0.5 dB; else nothing.
 
@@ -196,35 +138,6 @@ def shortfall(reached: Stated | None, asked: float) -> str:
         return ""
     why = "the pilot foresaw less error or more light; a higher psnr takes more samples"
     return f"{reached.line}, where {asked:g} were asked for: {why}"
-
-
-def grid_samples(samples: int) -> int:
-    """The next size of an even number of cells, nearly square: 4, 6, 8, 12, 16, 20, 24, 30, 36, 42, 48, 56, 64, ...
-
-    Multijitter does worse on squares of odd numbers: measured under sun and sky, error * samples^0.7 is 0.012 to 0.015
-    at 4, 16, ... 144, but 0.018 to 0.028 at 9, 25, ... 121. On all others it is alike: at 4, 6, 8, 12, 16, 20 and 24
-    samples it stays within 5 % of its mean (fan, tumble, gears, flag, crowd).
-    """
-    size = max(4, samples)
-    while not _is_grid(size):
-        size += 1
-    return size
-
-
-def _is_grid(size: int) -> bool:
-    """Whether multijitter, whose grid is isqrt(size) high, holds just that many, evenly and nearly square."""
-    high = math.isqrt(size)
-    return size % 2 == 0 and size % high == 0 and size // high - high <= 2
-
-
-def blur_error(travel: float, instants: int) -> float:
-    """Largest error of the mean of K instants at a moving edge, as a share of its contrast.
-
-    An edge that travels m px in the exposure steps by d = m / K. While d < 1 px, a pixel's coverage is piecewise linear
-    in time and the midpoint rule errs by at most d^2 / (8 m) per kink; coarser steps leave separate ghosts of 1 / K.
-    """
-    step = travel / instants
-    return step**2 / (8 * travel) if 0 < step <= 1 else 1 / instants if step > 1 else 0.0
 
 
 def allowed_in(image: Array, psnr: float, ppp: float | None, efficiency: float) -> tuple[Allowed, Finding]:

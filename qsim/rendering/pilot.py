@@ -17,12 +17,13 @@ from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import Errors
 from qsim.optics.camera import Camera, Pose
+from qsim.rendering.budget import Allowed, Budget, Finding, grid_samples, instants
 from qsim.rendering.denoiser import AROUND, DENOISE_COST, available, cleaned_mean
-from qsim.rendering.fidelity import COUNTS, Allowed, Budget, Finding, grid_samples
-from qsim.rendering.renderer import Renderer, instants
+from qsim.rendering.renderer import Renderer
 from qsim.scene.motion import Still
 from qsim.scene.scene import Scene
 
+COUNTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
 PIXELS = 3000
 MOST_MORE = 3  # frames beyond the first, the middle and the last for what these do not show, and for what moves
 WINDOW = 96  # px, side of the windows in which the denoiser is tried, one in the middle of each quarter of the frame

@@ -13,9 +13,7 @@ from __future__ import annotations
 
 import copy
 import math
-import os
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,14 +21,13 @@ from numpy import ndarray as Array
 
 from qsim import backend as engines
 from qsim.clip.clamped_error import Errors, frame_errors, rms, white_in
-from qsim.clip.clip import PHYSICAL, Clip, ClipWriter
 from qsim.keys import Key, hash_name, words
 from qsim.rendering import ground_truth
+from qsim.rendering.budget import Budget, blur_left, grid_samples, instants
 from qsim.rendering.denoiser import cleaned_mean
-from qsim.rendering.fidelity import Budget, grid_samples
 from qsim.rendering.ground_truth import Hits
 from qsim.rendering.mitsuba_scene import Stage
-from qsim.scene.scene import Scene, describe
+from qsim.scene.scene import Scene
 
 Crop = tuple[int, int, int, int]  # y, x, height, width
 
@@ -424,71 +421,6 @@ class Renderer:
         for index, shape in zip(indices, shapes, strict=True):
             table[index] = numbers.get(shape.id(), -1)
         return table
-
-
-def blur_left(means: Array, count: int) -> float:
-    """The rms error of the mean of 3, 6, 9 ... instants, from `means` [3, 2, H, W]: of all, of thirds, of the middle.
-
-    Each in two independent halves: the product of their differences is a square that noise changes by nothing on
-    average. The error falls as a power of the instants, 1/2 (thin ghosts apart) to 2 (steps below a pixel), which the
-    middle one and the thirds show; of three instants 2 is taken. Other counts have no thirds: 0, not measured.
-    """
-    if count % 3:
-        return 0.0
-    thirds, middle = (float(np.mean(np.prod(few - means[0], axis=0))) for few in means[1:])
-    if thirds <= 0:
-        return 0.0
-    power = 2.0 if count == 3 else math.log(max(middle, thirds) / thirds) / math.log(count / 3) / 2
-    return math.sqrt(thirds) / 3 ** min(max(power, 0.5), 2.0)
-
-
-def instants(middle: float, exposure: float, count: int) -> list[float]:
-    """The middles of `count` equal parts of an exposure [s]."""
-    return [middle + float(part) * exposure for part in (np.arange(count) + 0.5) / count - 0.5]
-
-
-def render_clip(
-    scene: Scene,
-    path: str | os.PathLike[str],
-    *,
-    frames: int,
-    frame_rate: float = 2000.0,
-    shutter: float = 0.0,
-    seed: int = 0,
-    budget: Budget | None = None,
-    crop: Crop | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    extra: dict[str, Any] | None = None,
-    force: bool = False,
-) -> Clip:
-    """Render frames 0 .. frames - 1 into a clip folder; an interrupted call with the same question is continued.
-
-    `progress(done, frames)` is called after each frame; `extra` joins clip.json (the split of a data set, say).
-    """
-    if frames < 1:
-        raise ValueError(f"{path}: a clip needs at least one frame, got {frames}")
-    renderer = Renderer(scene, frame_rate=frame_rate, shutter=shutter, seed=seed, budget=budget, crop=crop)
-    y, x, height, width = renderer.crop
-    meta = {
-        "shape": [frames, height, width],
-        "origin": [y, x],
-        "frame_rate": frame_rate,
-        "shutter": shutter,
-        "exposure": (shutter if shutter > 0 else 1.0) / frame_rate,
-        "radiance_unit": PHYSICAL,
-        "camera": describe(scene.camera),
-        "scene": {"family": scene.name, "seed": scene.seed, "speed": scene.speed},
-        "seed": seed,
-        "render": asdict(renderer.budget) | {"engine": renderer.engine.backend, "variant": renderer.engine.variant},
-    }
-    with ClipWriter(path, meta | (extra or {}), force=force) as writer:
-        for t in range(frames):
-            if not writer.has(t):
-                frame = renderer.frame(t)
-                writer.add(t, frame.radiance, frame.sharp, frame.truth, frame.error, frame.fireflies, frame.errors_at)
-            if progress is not None:
-                progress(t + 1, frames)
-    return Clip.open(path)
 
 
 def _checked_crop(scene: Scene, crop: Crop | None) -> Crop:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from qsim.optics.camera import Camera, Pose
-from qsim.rendering.fidelity import Budget
+from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
 from qsim.scene.scene import Body, Constant, Diffuse, Light, Mesh, Scene, Texture
 

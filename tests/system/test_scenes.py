@@ -13,7 +13,7 @@ import pytest
 
 import scenes
 from qsim.optics.camera import Camera
-from qsim.rendering.fidelity import Budget
+from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
 from qsim.scene.motion import Translation
 from qsim.scene.scene import AreaLamp, Body, Constant, EnvironmentImage, PointLight, Scene, SunSky

@@ -46,7 +46,7 @@ def render(name: str, path: Path, shape: Shape, *, speed: float = 1.0, progress:
     """
     import scenes
     from qsim.rendering import fidelity
-    from qsim.rendering.renderer import render_clip
+    from qsim.rendering.clip_rendering import render_clip
 
     scene = scenes.load(name, seed=shape.seed, speed=speed).resized(shape.height, shape.width)
     if (path / "clip.json").is_file():

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from qsim import backend as engine
-from qsim.rendering.fidelity import Budget
+from qsim.rendering.budget import Budget
 
 FRAMES = 4  # timed, after a first one that compiles
 BUDGET = Budget(samples=32, bounces=4)

@@ -20,7 +20,7 @@ from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import Errors, decibels, error_at, white_in
 from qsim.rendering import fidelity
-from qsim.rendering.fidelity import Budget
+from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
 from qsim.scene.scene import Scene
 

@@ -27,7 +27,7 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.clip.clamped_error import Errors, decibels, error_at, white_in
 from qsim.rendering import fidelity
-from qsim.rendering.fidelity import Budget
+from qsim.rendering.budget import Budget, grid_samples
 from qsim.rendering.renderer import Renderer
 from qsim.scene.scene import Scene
 
@@ -196,7 +196,7 @@ def _reaching(scene: Scene, chosen: Budget, level: float, target: Target) -> tup
         reached = target.psnr(renderer.frame(FRAME, with_truth=False).radiance)
         if reached >= level or chosen.samples >= fidelity.MOST_SAMPLES:
             return renderer, reached
-        chosen = replace(chosen, samples=2 * fidelity.grid_samples(chosen.samples // 2 + 1))
+        chosen = replace(chosen, samples=2 * grid_samples(chosen.samples // 2 + 1))
 
 
 def _obvious_samples(renderer: Renderer, level: float, target: Target) -> tuple[int, float]:

@@ -30,7 +30,8 @@ from qsim.dataset.dataset import Dataset
 from qsim.dataset.job import Job
 from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.rendering import denoiser
-from qsim.rendering.fidelity import Budget, choose, dimming, moving
+from qsim.rendering.budget import Budget
+from qsim.rendering.fidelity import choose, dimming, moving
 from qsim.report import report
 from qsim.scene.scene import Body, Diffuse, EnvironmentImage, Glow, PointLight, RoughPlastic
 from qsim.scene.shapes import ball

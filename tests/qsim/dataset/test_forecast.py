@@ -14,7 +14,7 @@ from qsim.dataset import forecast as plan
 from qsim.dataset import recipe
 from qsim.dataset.forecast import START, Cost, Plan, Seconds
 from qsim.dataset.worker_pool import Limits
-from qsim.rendering.fidelity import Budget
+from qsim.rendering.budget import Budget
 
 RECIPE = """[recipe]
 name = "tiny"

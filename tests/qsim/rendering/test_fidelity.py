@@ -11,9 +11,10 @@ from small_scenes import CAMERA, plate, renderer, scene, square
 
 from qsim.clip.clamped_error import Errors, Stated, decibels, error_at, white_in
 from qsim.rendering import fidelity, pilot
+from qsim.rendering.budget import Allowed, Budget, blur_error, blur_left, explain, grid_samples
 from qsim.rendering.denoiser import available, mixture
-from qsim.rendering.fidelity import Allowed, Budget, Noise, blur_error, choose, explain, grid_samples, shortfall
-from qsim.rendering.renderer import Renderer, blur_left
+from qsim.rendering.fidelity import Noise, choose, shortfall
+from qsim.rendering.renderer import Renderer
 from qsim.scene.motion import Oscillation, Spin, Translation
 from qsim.scene.scene import Body, Diffuse, Glow, PointLight, Scene, SunSky, Texture
 
@@ -363,4 +364,4 @@ def test_effects_left_out_are_listed_with_their_size():
     text = explain(choose(plate(None), psnr=25, denoise=False))
     for word in ("depth of field", "diffraction", "Airy disk", "bounces", "samples", "motion blur"):
         assert word in text
-    assert fidelity.explain(Budget()) == ""
+    assert explain(Budget()) == ""

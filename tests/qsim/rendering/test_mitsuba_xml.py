@@ -7,9 +7,10 @@ import pytest
 from small_scenes import CAMERA, RATE
 
 import scenes
-from qsim.rendering.fidelity import Budget
+from qsim.rendering.budget import Budget
+from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.mitsuba_xml import read_mitsuba
-from qsim.rendering.renderer import Renderer, render_clip
+from qsim.rendering.renderer import Renderer
 from qsim.scene.deformation import Flag
 from qsim.scene.motion import Spin, Still, Translation
 from qsim.scene.scene import Body, Mesh, Scene

@@ -15,10 +15,11 @@ import pytest
 from small_scenes import CAMERA, CHEAP, RATE, plate, renderer, scene, square
 from stats import assert_same_rms, critical_z
 
+from qsim.rendering.budget import Budget
+from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.denoiser import available
-from qsim.rendering.fidelity import Budget
 from qsim.rendering.mitsuba_scene import Stage
-from qsim.rendering.renderer import Renderer, render_clip
+from qsim.rendering.renderer import Renderer
 from qsim.scene import shapes
 from qsim.scene.motion import Oscillation, Spin, Still, Translation
 from qsim.scene.scene import (
@@ -331,7 +332,7 @@ def test_an_open_shutter_blurs_by_the_motion_and_keeps_the_energy():
 
 
 def test_the_mean_of_more_instants_converges_like_the_stated_blur_error():
-    from qsim.rendering.fidelity import blur_error
+    from qsim.rendering.budget import blur_error
 
     travel = 3.0
     lamp = Body("lamp", square(0.8), Glow(1.0), Translation((travel * RATE * 4 / CAMERA.focal_pixels, 0, 0)))

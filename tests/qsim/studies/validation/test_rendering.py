@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from small_scenes import plate, renderer
 
-from qsim.rendering.fidelity import Budget
+from qsim.rendering.budget import Budget
 from qsim.scene.motion import Spin
 from qsim.scene.scene import SunSky
 from qsim.studies.validation import rendering

@@ -1,0 +1,57 @@
+"""Renders all frames of a scene into a clip folder and resumes an interrupted one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from qsim.clip.clip import PHYSICAL, Clip, ClipWriter
+from qsim.rendering.budget import Budget
+from qsim.rendering.renderer import Crop, Renderer
+from qsim.scene.scene import Scene, describe
+
+
+def render_clip(
+    scene: Scene,
+    path: str | os.PathLike[str],
+    *,
+    frames: int,
+    frame_rate: float = 2000.0,
+    shutter: float = 0.0,
+    seed: int = 0,
+    budget: Budget | None = None,
+    crop: Crop | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    extra: dict[str, Any] | None = None,
+    force: bool = False,
+) -> Clip:
+    """Render frames 0 .. frames - 1 into a clip folder; an interrupted call with the same question is continued.
+
+    `progress(done, frames)` is called after each frame; `extra` joins clip.json (the split of a data set, say).
+    """
+    if frames < 1:
+        raise ValueError(f"{path}: a clip needs at least one frame, got {frames}")
+    renderer = Renderer(scene, frame_rate=frame_rate, shutter=shutter, seed=seed, budget=budget, crop=crop)
+    y, x, height, width = renderer.crop
+    meta = {
+        "shape": [frames, height, width],
+        "origin": [y, x],
+        "frame_rate": frame_rate,
+        "shutter": shutter,
+        "exposure": (shutter if shutter > 0 else 1.0) / frame_rate,
+        "radiance_unit": PHYSICAL,
+        "camera": describe(scene.camera),
+        "scene": {"family": scene.name, "seed": scene.seed, "speed": scene.speed},
+        "seed": seed,
+        "render": asdict(renderer.budget) | {"engine": renderer.engine.backend, "variant": renderer.engine.variant},
+    }
+    with ClipWriter(path, meta | (extra or {}), force=force) as writer:
+        for t in range(frames):
+            if not writer.has(t):
+                frame = renderer.frame(t)
+                writer.add(t, frame.radiance, frame.sharp, frame.truth, frame.error, frame.fireflies, frame.errors_at)
+            if progress is not None:
+                progress(t + 1, frames)
+    return Clip.open(path)
