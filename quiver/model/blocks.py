@@ -16,8 +16,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from quiver.model.deformable import deform_conv2d, warp
-from quiver.model.plane_sweep import aligned, disagreement, paths
-from quiver.tiles import cores, extents
 
 RADIUS = 5  # frames before and after the restored one
 WINDOW = 2 * RADIUS + 1
@@ -331,115 +329,6 @@ class Refinement(nn.Module):
     def onward(self, g: Tensor, picture: Tensor) -> tuple[Tensor, Tensor]:
         """Hidden feature and picture for the next finer scale, both twice the size."""
         return self.hidden(g), self.next_picture(picture)
-
-
-class Hourglass(nn.Module):
-    """Convolutions at full, half and quarter scale, each joined to the next finer one (Ronneberger et al. 2015)."""
-
-    REACH = 36  # px: how far away a pixel of the input can be that an output depends on
-    MULTIPLE = 4  # of height and width
-
-    def __init__(self, inputs: int, width: int) -> None:
-        super().__init__()
-        w = width
-        self.down1 = nn.Sequential(*_relu_chain((inputs, w, w)))
-        self.down2 = nn.Sequential(*_relu_chain((w, 2 * w, 2 * w)))
-        self.bottom = nn.Sequential(*_relu_chain((2 * w, *[4 * w] * 5)))
-        self.up2 = nn.ConvTranspose2d(4 * w, 2 * w, 2, stride=2)
-        self.merge2 = nn.Sequential(*_relu_chain((4 * w, 2 * w, 2 * w)))
-        self.up1 = nn.ConvTranspose2d(2 * w, w, 2, stride=2)
-        self.merge1 = nn.Sequential(*_relu_chain((2 * w, w, w)))
-        self.leave = conv(w, 1, 3)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """[N, inputs, H, W] -> [N, 1, H, W], H and W multiples of 4."""
-        full = self.down1(x)
-        half = self.down2(F.max_pool2d(full, 2))
-        quarter = self.bottom(F.max_pool2d(half, 2))
-        half = self.merge2(join(self.up2(quarter), half))
-        return self.leave(self.merge1(join(self.up1(half), full)))
-
-
-class Baseline(nn.Module):
-    """Not part of the published design: a first picture straight from the window, for quick learning.
-
-    A learnt mean over time plus an hourglass over the stacked frames, at full size; before training it is about a
-    Gaussian mean. With `sweep` the frames are first drawn along the paths on which they agree (sweep.py, up to about
-    `sweep` px/frame), and the hourglass sees them both ways, beside the velocity as a share of `sweep` and the
-    standard deviation that is left over time. When it is not being trained, its answers to the eight flips and quarter
-    turns of all this are averaged: what it learnt in minutes differs among them (Lim et al. 2017, "EDSR", call it
-    geometric self-ensemble).
-    """
-
-    SIGMA = 1.5  # frames
-
-    def __init__(self, width: int, sweep: float = 0.0) -> None:
-        super().__init__()
-        self.sweep = sweep
-        weights = [math.exp(-0.5 * ((t - RADIUS) / self.SIGMA) ** 2) for t in range(WINDOW)]
-        self.weights = nn.Parameter(torch.tensor([weight / sum(weights) for weight in weights]))
-        self.correction = Hourglass(2 * WINDOW + 3 if sweep else WINDOW, width)
-        self.pixels: int | None = None  # most that the hourglass takes at once when not trained; the numbers agree
-
-    def forward(self, window: Sequence[Tensor]) -> Tensor:
-        """Eleven folded frames [N, f2, h, w] -> [N, f2, h, w]."""
-        fold = math.isqrt(window[0].shape[1])
-        frames = F.pixel_shuffle(torch.stack(list(window), dim=1), fold)[:, :, 0]  # [N, T, H, W]
-        drawn, stack = frames, [frames]
-        if self.sweep:
-            velocity, acceleration = paths(frames, self.sweep)
-            drawn = aligned(frames, velocity, acceleration)
-            stack = [drawn, frames, velocity / self.sweep, disagreement(drawn).sqrt()]
-        mean = (drawn * self.weights.view(1, -1, 1, 1)).sum(1, keepdim=True)
-        seen = join(*stack)
-        return F.pixel_unshuffle(mean + (self.correction(seen) if self.training else self._in_tiles(seen)), fold)
-
-    def _in_tiles(self, stack: Tensor) -> Tensor:
-        """`_averaged`, tile by tile where the frame has more than `pixels` pixels."""
-        height, width = stack.shape[2:]
-        if self.pixels is None or height * width <= self.pixels:
-            return self._averaged(stack)
-        reach = Hourglass.REACH
-        tall, wide = cores(height, width, self.pixels, reach, Hourglass.MULTIPLE)
-        picture = stack.new_empty(stack.shape[0], 1, height, width)
-        for y, (top, bottom) in zip(range(0, height, tall), extents(height, tall, reach), strict=True):
-            for x, (left, right) in zip(range(0, width, wide), extents(width, wide, reach), strict=True):
-                part = self._averaged(stack[:, :, top:bottom, left:right])
-                inner = part[:, :, y - top : y - top + tall, x - left : x - left + wide]
-                picture[:, :, y : y + tall, x : x + wide] = inner
-        return picture
-
-    def _averaged(self, stack: Tensor) -> Tensor:
-        """The hourglass's mean answer to the eight flips and quarter turns of what it sees."""
-        x = 2 * WINDOW if self.sweep else None  # channel of the velocity's x; its y follows
-        total = stack.new_zeros(stack.shape[0], 1, *stack.shape[2:])
-        for turns in range(4):
-            for mirrored in (False, True):
-                answer = self.correction(join(_mirrored(stack, x) if mirrored else stack))
-                total += (answer.flip(3) if mirrored else answer).rot90(-turns, (2, 3))
-            stack = _turned(stack, x)
-        return total / 8
-
-
-def _mirrored(stack: Tensor, x: int | None) -> Tensor:
-    """[N, C, H, W] with left and right exchanged; channels x and x + 1 are components of a vector (None: no vector)."""
-    flipped = stack.flip(3)
-    if x is not None:
-        flipped[:, x] *= -1
-    return flipped
-
-
-def _turned(stack: Tensor, x: int | None) -> Tensor:
-    """The same after a quarter turn: what pointed to the right points up."""
-    turned = stack.rot90(1, (2, 3))
-    if x is None:
-        return turned
-    return torch.cat([turned[:, :x], turned[:, x + 1 : x + 2], -turned[:, x : x + 1], turned[:, x + 2 :]], dim=1)
-
-
-def _relu_chain(widths: Sequence[int]) -> list[nn.Module]:
-    """conv3, ReLU, ..., conv3, ReLU through the given widths."""
-    return [layer for inputs, outputs in pairwise(widths) for layer in (conv(inputs, outputs, 3), nn.ReLU())]
 
 
 def _gelu_chain(widths: Sequence[int]) -> list[nn.Module]:

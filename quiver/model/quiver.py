@@ -17,7 +17,6 @@ from quiver.model.blocks import (
     RADIUS,
     WINDOW,
     Alignment,
-    Baseline,
     Extractor,
     FlowNetwork,
     GatedFusion,
@@ -31,6 +30,7 @@ from quiver.model.blocks import (
     resize,
 )
 from quiver.model.config import Config
+from quiver.model.initial_estimate import InitialEstimate
 
 CHUNK_PIXELS = 2**16  # without gradients, frames are taken together up to this many pixels
 
@@ -67,7 +67,9 @@ class QUIVER(nn.Module):
         )
         self.refine4 = Refinement(image, c)
         self.refine = Refinement(image, c)
-        self.baseline = Baseline(config.baseline, config.sweep if config.flow else 0.0) if config.baseline else None
+        self.baseline = (
+            InitialEstimate(config.baseline, config.sweep if config.flow else 0.0) if config.baseline else None
+        )
         if config.lecun and not self.alignment.weight.is_meta:  # nothing to draw without memory
             start_from_lecun(self)
         if config.baseline:

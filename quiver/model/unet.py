@@ -3,12 +3,15 @@
 Eleven codes enter as channels, the centre frame leaves; nothing knows about motion, time or noise.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
-from quiver.model.blocks import WINDOW, Hourglass, Output, check_input
+from quiver.model.blocks import WINDOW, Output, check_input, conv, join
 from quiver.model.config import whole_number
 
 
@@ -33,19 +36,51 @@ class UNetConfig:
         return cls(values["width"])  # type: ignore[arg-type]  # checked there
 
 
+class SmallUNet(nn.Module):
+    """Convolutions at full, half and quarter scale, each joined to the next finer one (Ronneberger et al. 2015)."""
+
+    REACH = 36  # px: how far away a pixel of the input can be that an output depends on
+    MULTIPLE = 4  # of height and width
+
+    def __init__(self, inputs: int, width: int) -> None:
+        super().__init__()
+        w = width
+        self.down1 = nn.Sequential(*_relu_chain((inputs, w, w)))
+        self.down2 = nn.Sequential(*_relu_chain((w, 2 * w, 2 * w)))
+        self.bottom = nn.Sequential(*_relu_chain((2 * w, *[4 * w] * 5)))
+        self.up2 = nn.ConvTranspose2d(4 * w, 2 * w, 2, stride=2)
+        self.merge2 = nn.Sequential(*_relu_chain((4 * w, 2 * w, 2 * w)))
+        self.up1 = nn.ConvTranspose2d(2 * w, w, 2, stride=2)
+        self.merge1 = nn.Sequential(*_relu_chain((2 * w, w, w)))
+        self.leave = conv(w, 1, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[N, inputs, H, W] -> [N, 1, H, W], H and W multiples of 4."""
+        full = self.down1(x)
+        half = self.down2(F.max_pool2d(full, 2))
+        quarter = self.bottom(F.max_pool2d(half, 2))
+        half = self.merge2(join(self.up2(quarter), half))
+        return self.leave(self.merge1(join(self.up1(half), full)))
+
+
 class UNet(nn.Module):
     """The same call as QUIVER; its output has scale 1 only."""
 
-    multiple = Hourglass.MULTIPLE
-    reach = Hourglass.REACH  # px: what is farther away does not change a pixel
+    multiple = SmallUNet.MULTIPLE
+    reach = SmallUNet.REACH  # px: what is farther away does not change a pixel
 
     def __init__(self, config: UNetConfig | None = None) -> None:
         super().__init__()
         self.config = config or UNetConfig()
-        self.hourglass = Hourglass(WINDOW, self.config.width)
+        self.hourglass = SmallUNet(WINDOW, self.config.width)
 
     def forward(self, x: Tensor) -> Output:
         """[B, T, 1, H, W] with T >= 11 -> Output for the frames 5 .. T-6; ValueError as for QUIVER."""
         check_input(x, self.multiple)
         windows = [self.hourglass(x[:, t : t + WINDOW, 0]) for t in range(x.shape[1] - WINDOW + 1)]
         return Output(None, torch.stack(windows, dim=1), None, None)
+
+
+def _relu_chain(widths: Sequence[int]) -> list[nn.Module]:
+    """conv3, ReLU, ..., conv3, ReLU through the given widths."""
+    return [layer for inputs, outputs in pairwise(widths) for layer in (conv(inputs, outputs, 3), nn.ReLU())]

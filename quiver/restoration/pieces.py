@@ -45,8 +45,8 @@ class Pieces:
 
 def cut_pieces(model: nn.Module, height: int, width: int, memory: int, mode: str) -> Pieces:
     """The cut of a frame for a network and so many bytes; `ValueError` if they hold not even a small tile."""
-    from quiver.model.blocks import Hourglass
     from quiver.model.quiver import QUIVER
+    from quiver.model.unet import SmallUNet
 
     multiple = int(model.multiple)  # type: ignore[arg-type]
     pixels = memory // bytes_per_pixel(model, mode)
@@ -61,7 +61,7 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int, mode: str
     needed = bytes_per_pixel(model, mode) * height * width
     if model.baseline is not None:
         rest = STARTING + frame_bytes(model, mode) * padded[0] * padded[1]
-        least = 16 + 2 * Hourglass.REACH  # below, overlaps are most of the work
+        least = 16 + 2 * SmallUNet.REACH  # below, overlaps are most of the work
         per_pixel = HOURGLASS_BYTES * model.config.baseline // 32
         needed = min(needed, rest + per_pixel * min(least, padded[0]) * min(least, padded[1]))
         if memory >= needed:

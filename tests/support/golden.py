@@ -56,6 +56,11 @@ def fill_by_rule(model: nn.Module) -> nn.Module:
     return model
 
 
+def draw(*shape: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> Tensor:
+    """Codes 0..7 as the network sees them."""
+    return torch.randint(0, 8, shape, generator=torch.Generator().manual_seed(seed)).to(dtype) / 7
+
+
 @torch.no_grad()
 def stages(model: QUIVER, codes: np.ndarray) -> dict[str, Tensor]:
     """One forward pass of codes/7, with what passed between the stages, under the names of the golden file."""

@@ -95,7 +95,6 @@ STILL_LONG: set[str] = {
     "qsim.rendering.renderer",
     "qsim.scene.scene",
     "qsim.sensor.defects.fixed_pattern",
-    "quiver.model.blocks",
     "quiver.training.run_folder",
 }
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from golden import fill_by_rule, network
+from golden import draw, fill_by_rule, network
 from torch import Tensor
 
-from quiver.model import blocks, deformable, plane_sweep, schedules
+from quiver.model import deformable, schedules
 from quiver.model import quiver as model_module
 from quiver.model.config import Config
 from quiver.model.presets import ABLATIONS, PRESETS, ablated, build, parameter_count
@@ -34,11 +34,6 @@ def lively(config: Config, dtype: torch.dtype = torch.float64) -> QUIVER:
     network = fill_by_rule(QUIVER(config)).to(dtype).eval()
     assert isinstance(network, QUIVER)
     return network
-
-
-def draw(*shape: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> Tensor:
-    """Codes 0..7 as the network sees them."""
-    return torch.randint(0, 8, shape, generator=torch.Generator().manual_seed(seed)).to(dtype) / 7
 
 
 @torch.no_grad()
@@ -143,32 +138,6 @@ def test_an_untrained_nano_returns_about_the_mean_of_the_middle_frames():
     assert float(weights.sum()) == pytest.approx(1)
     mean = torch.einsum("btchw,t->bchw", x, weights)
     assert float((out - mean).square().mean()) < 0.04 * float(x.var())
-
-
-@pytest.mark.parametrize("change", [blocks._turned, blocks._mirrored])
-def test_velocities_turn_with_their_frames(change):
-    """Frames drawn along turned velocities are the turned frames drawn along the velocities."""
-    frames, rest = draw(2, 11, 9, 12), torch.zeros(2, 2, 9, 12, dtype=torch.float64)
-    velocity = 3 * draw(2, 2, 9, 12, seed=1) - 1
-    seen = change(torch.cat([frames, velocity], 1), 11)
-    drawn = plane_sweep.aligned(seen[:, :11], seen[:, 11:], change(rest, 0))
-    assert torch.allclose(drawn, change(plane_sweep.aligned(frames, velocity, rest), None), atol=1e-12)
-
-
-@pytest.mark.parametrize("largest", [0.0, 7.0])
-def test_an_hourglass_in_use_answers_turned_windows_alike(largest):
-    """Its own answers differ, their mean over the eight symmetries does not; while training nothing is averaged."""
-    torch.manual_seed(0)
-    baseline = blocks.Baseline(4, largest).double().eval()
-    seen, x = draw(1, 25 if largest else 11, 8, 12), 22 if largest else None
-    with torch.no_grad():
-        mean, own = baseline._averaged(seen), baseline.correction(seen)
-        for change in (blocks._turned, blocks._mirrored):
-            assert torch.allclose(baseline._averaged(change(seen, x)), change(mean, None), atol=1e-14)
-            assert not torch.allclose(baseline.correction(change(seen, x)), change(own, None), atol=1e-3)
-        window = list(draw(11, 1, 1, 8, 12))
-        averaged = baseline(window)
-        assert not torch.allclose(baseline.train()(window), averaged, atol=1e-4)
 
 
 @pytest.mark.parametrize("lecun", [False, True])

@@ -14,9 +14,8 @@ from torch import nn
 from qsim.sensor.qis import QIS
 from quiver.baselines import METHODS
 from quiver.data.codes import Codes, array_codes
-from quiver.model.blocks import Hourglass
 from quiver.model.presets import build
-from quiver.model.unet import UNet, UNetConfig
+from quiver.model.unet import SmallUNet, UNet, UNetConfig
 from quiver.model.weights import load
 from quiver.restoration import pieces
 from quiver.restoration.pieces import bytes_per_pixel, cut_pieces, frame_bytes
@@ -113,7 +112,7 @@ def test_weights_of_overlapping_spans_sum_to_one(length):
 
 def test_the_reach_of_the_hourglass_is_what_it_says():
     """A pixel that changes: nothing farther than REACH answers, at any phase of the pooling, and something that far."""
-    hourglass, side, seen = Hourglass(3, 4).double().eval(), 120, []
+    hourglass, side, seen = SmallUNet(3, 4).double().eval(), 120, []
     frame = torch.rand(1, 3, side, side, dtype=torch.double)
     for parameter in hourglass.parameters():
         parameter.data.abs_()  # nothing cancels
@@ -122,8 +121,8 @@ def test_the_reach_of_the_hourglass_is_what_it_says():
         other[:, :, centre, centre] += 1
         changed = (hourglass(other) - hourglass(frame))[0, 0].detach().nonzero()
         seen.append(int((changed - centre).abs().max()))
-    assert max(seen) == Hourglass.REACH
-    assert Hourglass.REACH % Hourglass.MULTIPLE == 0
+    assert max(seen) == SmallUNet.REACH
+    assert SmallUNet.REACH % SmallUNet.MULTIPLE == 0
 
 
 # Networks
