@@ -85,16 +85,16 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
     from qsim.studies.bit_depth import figures, speed_sweep
     from qsim.studies.bit_depth.answer import WIDEST, answer, widened
     from qsim.studies.bit_depth.clip_study import study
-    from qsim.studies.bit_depth.readout import Question
+    from qsim.studies.bit_depth.readout import StudySettings
 
     bits, instants = tuple(args.bits or (1, 2, 3, 4, 5)), 8 if args.instants is None else args.instants
     sensor = args.sensor or "quiver-physical"
-    question = Question(bits, sensor, args.plane_sensor, None, 1, instants, args.seed)
+    settings = StudySettings(bits, sensor, args.plane_sensor, None, 1, instants, args.seed)
     height, width = args.size or (96, 128)
     widen = args.bits is None
-    frames = args.frames or (2**WIDEST - 1 if widen else max(4 * question.longest, 32))
+    frames = args.frames or (2**WIDEST - 1 if widen else max(4 * settings.longest, 32))
     rate = 10_000.0 if args.base_fps is None else args.base_fps
-    shape = study_clips.Shape(frames, height, width, rate, seed=args.seed)
+    shape = study_clips.ClipShape(frames, height, width, rate, seed=args.seed)
     speeds, text = _speeds(args, shape)
     levels = args.ppp or [None]
     swept = len(speeds) * len(levels) > 1
@@ -110,21 +110,21 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
     with bar("drawing", "study") as progress:
         if swept:
             ppps = args.ppp or [first.mean_photons]
-            found = speed_sweep.sweep(clips, ppps, question, widen=widen, progress=progress)
+            found = speed_sweep.sweep(clips, ppps, settings, widen=widen, progress=progress)
             result, pictures = found.to_dict(), {"best.png": figures.sweep_figure(found)}
             text += [line for row in found.studies for one in row for line in speed_sweep.table(one)]
             text.append(speed_sweep.summary(found))
             answers = found.answers
         else:
-            asked = replace(question, ppp=levels[0], speed=clips[0].step)
+            asked = replace(settings, ppp=levels[0], speed=clips[0].step)
             one = widened(first, asked, note) if widen else study(first, asked, progress=progress)
             result, pictures = speed_sweep.study_dict(one), {"tradeoff.png": figures.study_figure(one)}
             text += speed_sweep.table(one)
-            question, answers = replace(question, bits=one.bits), [answer(one)]
+            settings, answers = replace(settings, bits=one.bits), [answer(one)]
     if args.px:
         result["px_asked"], result["speeds_found"] = args.px, speeds
     if args.streams:
-        lit = replace(question, ppp=levels[0])
+        lit = replace(settings, ppp=levels[0])
         made = study_clips.write_streams(first, args.output / "streams", lit)
         result["streams"] = [str(path) for path in made]
         text += [f"streams 'planes' and 'multibit': {path}" for path in made]
@@ -185,7 +185,7 @@ def _paper_figure(args: argparse.Namespace) -> int:
     if len(speeds) > 1:
         raise ValueError(f"--speed {args.speed}: --paper-figure draws one speed; give one")
     rate, frames = (paper_figures.RATE_1, 201) if number == 1 else (10_000.0, 511)
-    shape = study_clips.Shape(frames, height, width, rate, seed=args.seed)
+    shape = study_clips.ClipShape(frames, height, width, rate, seed=args.seed)
     names = [args.source] if args.source else ["fan"] if number == 1 else ["fan", "text"]
     rows, result = [], []
     for name, ppp in zip(names * (2 // len(names) if number == 2 else 1), (0.51, 0.40), strict=False):

@@ -28,7 +28,7 @@ import pytest
 
 import qsim.cli.program
 import quiver.cli.program
-from qsim.studies.validation.reading import Report
+from qsim.studies.validation.reading import ReadingReport
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [
@@ -264,7 +264,7 @@ def test_the_page_of_evidence_is_made_from_its_numbers():
     assert page == _load("evidence").page(numbers), "run `python docs/evidence.py --page-only`"
     numbers["sensor"]["report"]["ok"] = False
     assert "outside its bounds" in _load("evidence").page(numbers)
-    numbers["reading"]["report"] = Report(250.0, 20.0, 300.0, 9.0, 0.3).to_dict()
+    numbers["reading"]["report"] = ReadingReport(250.0, 20.0, 300.0, 9.0, 0.3).to_dict()
     page = _load("evidence").page(numbers)
     assert "| clip folder | 250.0 | 300.0 |" in page
     assert "(100 windows/s, 5 times the mp4) is **not reached** in this run" in page

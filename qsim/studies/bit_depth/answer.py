@@ -13,8 +13,8 @@ import numpy as np
 
 from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, moving_mean
-from qsim.studies.bit_depth.clip_study import Row, Study, clip_motion, study
-from qsim.studies.bit_depth.readout import MODELS, Question
+from qsim.studies.bit_depth.clip_study import Study, StudyRow, clip_motion, study
+from qsim.studies.bit_depth.readout import MODELS, StudySettings
 
 WIDEST = 7  # bits up to which the range is widened
 LOOKS = 4  # instants at which the motion of a scene is measured
@@ -115,20 +115,20 @@ def marked(found: Study, model: str) -> str:
     return f"{at_edge(found, model)} {found.best(model).bits}".strip()
 
 
-def widened(clip: Clip, question: Question, tell: Callable[[str], None] | None = None) -> Study:
+def widened(clip: Clip, settings: StudySettings, tell: Callable[[str], None] | None = None) -> Study:
     """The study, with one more bit after the other while the deepest is best, up to 7 bits and the clip's length."""
-    found = study(clip, question)
-    while any(at_edge(found, model) == ">=" for model in MODELS) and question.bits[-1] < WIDEST:
-        question = replace(question, bits=(*question.bits, question.bits[-1] + 1))
-        if len(clip) < question.longest:
+    found = study(clip, settings)
+    while any(at_edge(found, model) == ">=" for model in MODELS) and settings.bits[-1] < WIDEST:
+        settings = replace(settings, bits=(*settings.bits, settings.bits[-1] + 1))
+        if len(clip) < settings.longest:
             break
         if tell is not None:
-            tell(f"the deepest tried is best: {question.bits[-1]} bits are tried too")
-        found = study(clip, question)
+            tell(f"the deepest tried is best: {settings.bits[-1]} bits are tried too")
+        found = study(clip, settings)
     return found
 
 
-def code_motion(row: Row) -> float | None:
+def code_motion(row: StudyRow) -> float | None:
     """Motion of a row in px per frame of 3 bits."""
     return None if row.motion_px_per_frame is None else row.motion_px_per_frame / (2**row.bits - 1) * CODE_PLANES
 

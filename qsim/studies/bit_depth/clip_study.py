@@ -30,11 +30,11 @@ from qsim.optics import radiometry
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.bit_depth.laws import Structure
-from qsim.studies.bit_depth.readout import GRID, Question, Reading, readings
+from qsim.studies.bit_depth.readout import GRID, Readout, StudySettings, readouts
 
 
 @dataclass(frozen=True)
-class Row:
+class StudyRow:
     """One bit depth of one model. Errors are rms over pixels, in photons per pixel and **clip frame** (plane)."""
 
     model: str  # "planes" or "multibit"
@@ -59,7 +59,7 @@ class Study:
     """All rows of one clip at one light level."""
 
     clip: str
-    rows: tuple[Row, ...]
+    rows: tuple[StudyRow, ...]
     ppp: float  # photons per pixel and clip frame, whole clip
     lux: float | None
     peak: float  # photons per clip frame that PSNR refers to: 2.5 x the mean light; nothing is clamped there
@@ -73,7 +73,7 @@ class Study:
         """The depths that were tried."""
         return tuple(sorted({row.bits for row in self.rows}))
 
-    def best(self, model: str) -> Row:
+    def best(self, model: str) -> StudyRow:
         """The row of highest PSNR."""
         return max((row for row in self.rows if row.model == model), key=lambda row: row.psnr_db)
 
@@ -89,42 +89,42 @@ class Exposed:
     spread: Array  # sum of p (1 - p), the variance of `fired`
 
 
-def check_clip(clip: Clip, question: Question) -> None:
-    """`ValueError` if the clip is too slow or too short for the question."""
+def check_clip(clip: Clip, settings: StudySettings) -> None:
+    """`ValueError` if the clip is too slow or too short for the settings."""
     if clip.frame_rate < SLOWEST:
         raise ValueError(
             f"{clip.path}: {clip.frame_rate:g} fps; this study needs a clip of at least {SLOWEST:g} fps, as in "
             "`qsim render fan --frame-rate 10000`"
         )
-    if len(clip) < question.longest:
+    if len(clip) < settings.longest:
         raise ValueError(
-            f"{clip.path}: {len(clip)} frames; {question.bits[-1]} bits at speed {question.speed} need "
-            f"{question.longest}; ask for fewer bits, or render a longer clip"
+            f"{clip.path}: {len(clip)} frames; {settings.bits[-1]} bits at speed {settings.speed} need "
+            f"{settings.longest}; ask for fewer bits, or render a longer clip"
         )
 
 
-def instants(frames: int, question: Question) -> tuple[int, ...]:
+def instants(frames: int, settings: StudySettings) -> tuple[int, ...]:
     """Centres of frames of the deepest depth that do not overlap, spread over the clip."""
-    span = question.longest
-    count = min(question.instants, frames // span)
+    span = settings.longest
+    count = min(settings.instants, frames // span)
     first, last = span // 2, frames - 1 - span // 2
     return tuple(int(t) for t in np.linspace(first, last, count).round()) if count > 1 else (frames // 2,)
 
 
 def expose(
-    clip: Clip, centre: int, question: Question, factor: float, plane: Sensor, structure: Array
+    clip: Clip, centre: int, settings: StudySettings, factor: float, plane: Sensor, structure: Array
 ) -> Iterator[Exposed]:
     """Frames of all depths around one clip frame, shallow to deep; adds squared differences of light to `structure`.
 
     `structure[k]` gets the mean over pixels of (light at two instants, k planes apart, symmetric about the centre)^2.
     """
-    key = keys.Key(seed=question.seed, clip=keys.hash_name(clip.name))
-    wanted = [2**b - 1 for b in question.bits]
+    key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))
+    wanted = [2**b - 1 for b in settings.bits]
     photons = radiometry.clip_photons(clip, centre, factor)
     total, fired, quiet, spread = (np.zeros_like(photons) for _ in range(4))
     before = photons
     for reach in range(wanted[-1] // 2 + 1):
-        places = [centre] if reach == 0 else [centre - reach * question.speed, centre + reach * question.speed]
+        places = [centre] if reach == 0 else [centre - reach * settings.speed, centre + reach * settings.speed]
         pair = [photons] if reach == 0 else [radiometry.clip_photons(clip, t, factor) for t in places]
         for t, light in zip(places, pair, strict=True):
             p = plane.pmf(light, clip.exposure)
@@ -139,73 +139,73 @@ def expose(
 
 
 class _Sums:
-    """Running sums over pixels and instants of one reading."""
+    """Running sums over pixels and instants of one readout."""
 
     def __init__(self) -> None:
         self.pixels = 0
         self.parts = np.zeros(6)  # simulated, predicted, their squared difference, blur, shot, noise
         self.quiet = 0.0  # noise without read noise
 
-    def add(self, reading: Reading, frame: Exposed, codes: Array, sharp: Array) -> None:
+    def add(self, readout: Readout, frame: Exposed, codes: Array, sharp: Array) -> None:
         """All errors in photons per clip frame."""
         m = frame.planes
-        light = _equivalent(reading, frame)
-        mean, variance = reading.moments(light)
-        if reading.model == "planes":
+        light = _equivalent(readout, frame)
+        mean, variance = readout.moments(light)
+        if readout.model == "planes":
             even = frame.quiet * (1 - frame.quiet / m)  # the variance if all planes saw the same light
             variance = variance * np.minimum(frame.spread / np.maximum(even, 1e-300), 1.0)
-        simulated = (reading.estimates[codes] / m - sharp) ** 2
+        simulated = (readout.estimates[codes] / m - sharp) ** 2
         predicted = (mean / m - sharp) ** 2 + variance / m**2
-        sensor = reading.sensor
-        arrivals = sensor.efficiency * frame.photons + sensor.dark_rate * _duration(reading)
+        sensor = readout.sensor
+        arrivals = sensor.efficiency * frame.photons + sensor.dark_rate * _duration(readout)
         blur, shot = (frame.photons / m - sharp) ** 2, arrivals / (m * sensor.efficiency) ** 2
         noise = ((mean - frame.photons) ** 2 + variance) / m**2
         self.pixels += simulated.size
         for i, part in enumerate((simulated, predicted, (simulated - predicted) ** 2, blur, shot, noise)):
             self.parts[i] += part.sum()
-        quiet = reading.noiseless()
-        if quiet is reading:
+        quiet = readout.noiseless()
+        if quiet is readout:
             self.quiet += noise.sum()
         else:
             mean, variance = quiet.moments(light)
             self.quiet += (((mean - frame.photons) ** 2 + variance) / m**2).sum()
 
 
-def _duration(reading: Reading) -> float:
-    return reading.exposure * (reading.planes if reading.model == "planes" else 1)
+def _duration(readout: Readout) -> float:
+    return readout.exposure * (readout.planes if readout.model == "planes" else 1)
 
 
-def _equivalent(reading: Reading, frame: Exposed) -> Array:
+def _equivalent(readout: Readout, frame: Exposed) -> Array:
     """Constant light of the whole frame that gives the same mean code."""
-    if reading.model == "multibit":
+    if readout.model == "multibit":
         return frame.photons
-    sensor = reading.sensor
+    sensor = readout.sensor
     mean_quiet = np.maximum(frame.quiet / frame.planes, 1e-290)
     if isinstance(sensor, BinarySPAD):
-        arrivals = -np.log(mean_quiet) - sensor.dark_rate * reading.exposure
+        arrivals = -np.log(mean_quiet) - sensor.dark_rate * readout.exposure
         return frame.planes * np.maximum(arrivals, 0.0) / sensor.efficiency
     grid = np.append(0.0, np.geomspace(1e-5, 1.0, 4 * GRID) * 4 * max(frame.photons.max() / frame.planes, 1e-12))
-    return frame.planes * np.interp(-mean_quiet, -sensor.pmf(grid, reading.exposure)[:, 0], grid)
+    return frame.planes * np.interp(-mean_quiet, -sensor.pmf(grid, readout.exposure)[:, 0], grid)
 
 
-def study(clip: Clip, question: Question, *, progress: Callable[[int, int], None] | None = None) -> Study:
+def study(clip: Clip, settings: StudySettings, *, progress: Callable[[int, int], None] | None = None) -> Study:
     """Draw and score every bit depth of a clip; `ValueError` if the clip is too slow, too short or has no light."""
-    check_clip(clip, question)
-    level = radiometry.light_level(clip, ppp=question.ppp)
-    forms = readings(question, level.ppp, clip.exposure)
-    centres = instants(len(clip), question)
+    check_clip(clip, settings)
+    level = radiometry.light_level(clip, ppp=settings.ppp)
+    forms = readouts(settings, level.ppp, clip.exposure)
+    centres = instants(len(clip), settings)
     sums = {(form.model, form.planes): _Sums() for form in forms}
-    by_planes = {m: [form for form in forms if form.planes == m] for m in (2**b - 1 for b in question.bits)}
-    structure, motions = np.zeros(2 ** question.bits[-1] - 1), []
+    by_planes = {m: [form for form in forms if form.planes == m] for m in (2**b - 1 for b in settings.bits)}
+    structure, motions = np.zeros(2 ** settings.bits[-1] - 1), []
     for done, centre in enumerate(centres):
         sharp = radiometry.clip_photons(clip, centre, level.factor, sharp=True)
-        motions.append(clip_motion(clip, centre, question.speed))
-        for frame in expose(clip, centre, question, level.factor, forms[0].sensor, structure):
+        motions.append(clip_motion(clip, centre, settings.speed))
+        for frame in expose(clip, centre, settings, level.factor, forms[0].sensor, structure):
             for form in by_planes[frame.planes]:
                 codes = (
                     frame.fired.astype(np.intp)
                     if form.model == "planes"
-                    else _read(clip, form, frame, centre, question)
+                    else _read(clip, form, frame, centre, settings)
                 )
                 sums[form.model, form.planes].add(form, frame, codes, sharp)
         if progress is not None:
@@ -214,12 +214,12 @@ def study(clip: Clip, question: Question, *, progress: Callable[[int, int], None
     motion = None if None in motions else float(np.mean([m for m in motions if m is not None]))
     peak = radiometry.WHITE_PER_MEAN * level.ppp
     rows = tuple(_row(clip, form, sums[form.model, form.planes], law, motion, peak, level.ppp) for form in forms)
-    return Study(clip.name, rows, level.ppp, level.lux, peak, clip.frame_rate, question.speed, centres, law)
+    return Study(clip.name, rows, level.ppp, level.lux, peak, clip.frame_rate, settings.speed, centres, law)
 
 
-def _read(clip: Clip, form: Reading, frame: Exposed, centre: int, question: Question) -> Array:
+def _read(clip: Clip, form: Readout, frame: Exposed, centre: int, settings: StudySettings) -> Array:
     """One multi-bit read of the summed light; its key is that of the instant, stage 1 (planes are stage 0)."""
-    key = keys.Key(seed=question.seed, clip=keys.hash_name(clip.name), frame=centre, stage=1)
+    key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name), frame=centre, stage=1)
     return form.sensor.sample(frame.photons, form.exposure, key=key)
 
 
@@ -234,13 +234,15 @@ def clip_motion(clip: Clip, t: int, speed: int = 1) -> float | None:
     return (moving_mean(speed * np.hypot(u, v), CODE_PLANES) or 0.0) / CODE_PLANES
 
 
-def _row(clip: Clip, form: Reading, sums: _Sums, law: Structure, motion: float | None, peak: float, ppp: float) -> Row:
+def _row(
+    clip: Clip, form: Readout, sums: _Sums, law: Structure, motion: float | None, peak: float, ppp: float
+) -> StudyRow:
     simulated, predicted, squares, blur, shot, noise = sums.parts / sums.pixels
     quiet = sums.quiet / sums.pixels
     error = math.sqrt(squares / sums.pixels)
     _, height, width = clip.shape
     fps = clip.frame_rate / form.planes
-    return Row(
+    return StudyRow(
         model=form.model,
         bits=form.bits,
         fps=fps,

@@ -15,11 +15,11 @@ from qsim.clip.stream import Progress
 from qsim.optics import radiometry
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.bit_depth.clip_study import check_clip
-from qsim.studies.bit_depth.readout import Question, plane_sensor
+from qsim.studies.bit_depth.readout import StudySettings, plane_sensor
 
 
 @dataclass(frozen=True, eq=False)
-class Moving:
+class MovingClip:
     """A clip at one speed: rendered so (step 1), or of every `step`-th frame."""
 
     speed: float
@@ -28,7 +28,7 @@ class Moving:
 
 
 @dataclass(frozen=True)
-class Shape:
+class ClipShape:
     """How a scene is rendered for a study."""
 
     frames: int
@@ -39,7 +39,7 @@ class Shape:
     seed: int = 0
 
 
-def render(name: str, path: Path, shape: Shape, *, speed: float = 1.0, progress: Progress | None = None) -> Clip:
+def render(name: str, path: Path, shape: ClipShape, *, speed: float = 1.0, progress: Progress | None = None) -> Clip:
     """The scene as a clip; one that is already there is kept if it is the same scene, shape, rate and speed.
 
     `FileExistsError` if it is another one.
@@ -62,14 +62,14 @@ def render(name: str, path: Path, shape: Shape, *, speed: float = 1.0, progress:
 
 
 def clips_for(
-    source: str, speeds: Sequence[float], shape: Shape, folder: Path | None, progress: Progress | None = None
-) -> Iterator[Moving]:
+    source: str, speeds: Sequence[float], shape: ClipShape, folder: Path | None, progress: Progress | None = None
+) -> Iterator[MovingClip]:
     """A clip folder (whole speeds from 1), or a scene rendered at each speed into FOLDER/clips."""
     if (Path(source) / "clip.json").is_file():
         clip = Clip.open(source)
         if any(v < 1 or not float(v).is_integer() for v in speeds):
             raise ValueError(f"{source}: a clip can be made faster by whole factors only; other speeds need a scene")
-        yield from (Moving(v, clip, int(v)) for v in speeds)
+        yield from (MovingClip(v, clip, int(v)) for v in speeds)
         return
     import scenes
 
@@ -79,28 +79,28 @@ def clips_for(
         raise ValueError(f"{source} is a scene: give a folder for its clip with -o")
     for v in speeds:
         path = folder / "clips" / f"{Path(source).stem}_x{v:g}"
-        yield Moving(v, render(source, path, shape, speed=v, progress=progress))
+        yield MovingClip(v, render(source, path, shape, speed=v, progress=progress))
 
 
-def write_streams(clip: Clip, folder: Path, question: Question) -> list[Path]:
+def write_streams(clip: Clip, folder: Path, settings: StudySettings) -> list[Path]:
     """One clip per bit depth, FOLDER/NAME_3bit, with the streams `planes` and `multibit`; returns their paths.
 
     Its frames are the means of 2^b - 1 frames of `clip`, its sharp frames the middle ones, so that
     `quiver evaluate FOLDER/NAME_3bit --stream planes` scores any restorer against the sharp instants.
     """
-    check_clip(clip, question)
-    level = radiometry.light_level(clip, ppp=question.ppp)
-    plane = plane_sensor(question, level.ppp, clip.exposure)
+    check_clip(clip, settings)
+    level = radiometry.light_level(clip, ppp=settings.ppp)
+    plane = plane_sensor(settings, level.ppp, clip.exposure)
     if not isinstance(plane, BinarySPAD):
         raise ValueError("streams of summed planes need a clocked SPAD; leave out the plane sensor")
     made = []
-    for bits in question.bits:
+    for bits in settings.bits:
         m = 2**bits - 1
         path = folder / f"{clip.name}_{bits}bit"
         grouped = group(clip, path, m)
-        read = stream.Sensing(question.sensor, bits, ppp=m * level.ppp, seed=question.seed, name="multibit")
+        read = stream.Sensing(settings.sensor, bits, ppp=m * level.ppp, seed=settings.seed, name="multibit")
         stream.sense(grouped, read)
-        key = keys.Key(seed=question.seed, clip=keys.hash_name(clip.name))
+        key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))
         draw = stream.Draw(replace(plane, bits=bits), plane, level, key, m, False)
         meta = stream.describe(clip, replace(read, name="planes"), draw) | {"planes_of": str(clip.path)}
         meta |= {"ppp_target": m * level.ppp, "sensor_name": "planes"}

@@ -20,7 +20,7 @@ from qsim.optics import radiometry
 from qsim.sensor import devices
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.bit_depth.clip_study import check_clip, clip_motion, expose
-from qsim.studies.bit_depth.readout import Question, Reading
+from qsim.studies.bit_depth.readout import Readout, StudySettings
 
 RATE_1 = 12_000.0  # fps of the clip of figure 1: 200, 50 and 6 of its frames are one at 60, 240 and 2000 fps
 CAMERAS = (("cmos-5.1e", 60.0), ("cmos-5.1e", 240.0), ("cmos-5.1e", 2000.0), ("quiver-paper", 2000.0))
@@ -77,17 +77,17 @@ def figure_1(clip: Clip, *, lux: float = 1.0, seed: int = 0) -> list[Panel]:
 
 def figure_2(clip: Clip, ppp: float, *, seed: int = 0, bits: Sequence[int] = BITS_2) -> list[Panel]:
     """Sums of 2^b - 1 binary planes around the middle of a clip, `ppp` detected photons per pixel and plane."""
-    question = Question(bits=tuple(bits), sensor="spad-320x240", ppp=ppp, seed=seed)
-    check_clip(clip, question)
+    settings = StudySettings(bits=tuple(bits), sensor="spad-320x240", ppp=ppp, seed=seed)
+    check_clip(clip, settings)
     level, middle = radiometry.light_level(clip, ppp=ppp), len(clip) // 2
     sharp = radiometry.clip_photons(clip, middle, level.factor, sharp=True)
     peak, speed = float(np.percentile(sharp, 99.9)), clip_motion(clip, middle)
     panels = [Panel("sharp instant", sharp, {"ppp": ppp, "peak": peak})]
     plane = BinarySPAD(1.0, 0.0)
-    nothing = np.zeros(2 ** question.bits[-1] - 1)
-    for b, frame in zip(question.bits, expose(clip, middle, question, level.factor, plane, nothing), strict=True):
+    nothing = np.zeros(2 ** settings.bits[-1] - 1)
+    for b, frame in zip(settings.bits, expose(clip, middle, settings, level.factor, plane, nothing), strict=True):
         m = frame.planes
-        image = Reading("planes", b, plane, clip.exposure).estimates[frame.fired.astype(np.intp)] / m
+        image = Readout("planes", b, plane, clip.exposure).estimates[frame.fired.astype(np.intp)] / m
         numbers = {
             "bits": b,
             "fps": clip.frame_rate / m,

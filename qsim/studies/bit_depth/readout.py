@@ -22,7 +22,7 @@ GRID = 600  # light levels at which estimates are tabled
 
 
 @dataclass(frozen=True)
-class Question:
+class StudySettings:
     """What to compare; the clip is given apart."""
 
     bits: tuple[int, ...] = (1, 2, 3, 4, 5)
@@ -48,7 +48,7 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Reading:
+class Readout:
     """One way to form a b-bit frame: estimates of its light for each code, and their exact moments over light."""
 
     model: str
@@ -100,25 +100,25 @@ class Reading:
             information = float(per_plane) / self.planes
         return 20 * math.log10(photons * math.sqrt(information)) if information > 0 else -math.inf
 
-    def noiseless(self) -> Reading:
+    def noiseless(self) -> Readout:
         """The same without read noise."""
         return replace(self, sensor=replace(self.sensor, read_noise=0.0)) if isinstance(self.sensor, QIS) else self
 
 
-def plane_sensor(question: Question, ppp: float, exposure: float) -> Sensor:
+def plane_sensor(settings: StudySettings, ppp: float, exposure: float) -> Sensor:
     """The sensor of one binary plane; `ValueError` if the named one has more than one bit."""
-    if question.plane is not None:
-        return devices.load(question.plane, ppp=ppp, bits=1, exposure=exposure)
-    read = devices.load(question.sensor, ppp=ppp, bits=1, exposure=exposure)
+    if settings.plane is not None:
+        return devices.load(settings.plane, ppp=ppp, bits=1, exposure=exposure)
+    read = devices.load(settings.sensor, ppp=ppp, bits=1, exposure=exposure)
     return BinarySPAD(read.efficiency, read.dark_rate, 1)
 
 
-def readings(question: Question, ppp: float, exposure: float) -> list[Reading]:
+def readouts(settings: StudySettings, ppp: float, exposure: float) -> list[Readout]:
     """Both models of every bit depth, at `ppp` photons per clip frame of `exposure` seconds."""
-    plane = plane_sensor(question, ppp, exposure)
-    result = [Reading("planes", b, plane, exposure) for b in question.bits]
-    for b in question.bits:
+    plane = plane_sensor(settings, ppp, exposure)
+    result = [Readout("planes", b, plane, exposure) for b in settings.bits]
+    for b in settings.bits:
         m = 2**b - 1
-        sensor = devices.load(question.sensor, ppp=m * ppp, bits=b, exposure=m * exposure)
-        result.append(Reading("multibit", b, sensor, m * exposure))
+        sensor = devices.load(settings.sensor, ppp=m * ppp, bits=b, exposure=m * exposure)
+        result.append(Readout("multibit", b, sensor, m * exposure))
     return result

@@ -15,8 +15,8 @@ from qsim.clip.stream import Progress
 from qsim.optics import radiometry
 from qsim.studies.bit_depth.answer import answer, at_edge, code_motion, widened
 from qsim.studies.bit_depth.clip_study import Study, check_clip, study
-from qsim.studies.bit_depth.clips import Moving
-from qsim.studies.bit_depth.readout import MODELS, Question, readings
+from qsim.studies.bit_depth.clips import MovingClip
+from qsim.studies.bit_depth.readout import MODELS, StudySettings, readouts
 
 
 @dataclass(frozen=True)
@@ -88,9 +88,9 @@ def study_dict(found: Study) -> dict[str, Any]:
 
 
 def sweep(
-    clips: Sequence[Moving],
+    clips: Sequence[MovingClip],
     ppps: Sequence[float],
-    question: Question,
+    settings: StudySettings,
     *,
     widen: bool = False,
     progress: Progress | None = None,
@@ -100,12 +100,12 @@ def sweep(
     The law's choice everywhere comes from the **slowest** clip alone, at its middle light level.
     """
     for one in clips:
-        check_clip(one.clip, replace(question, speed=one.step))
+        check_clip(one.clip, replace(settings, speed=one.step))
     studies = []
     for i, one in enumerate(clips):
         row = []
         for j, ppp in enumerate(ppps):
-            asked = replace(question, speed=one.step, ppp=ppp)
+            asked = replace(settings, speed=one.step, ppp=ppp)
             row.append(widened(one.clip, asked) if widen else study(one.clip, asked))
             if progress is not None:
                 progress(i * len(ppps) + j + 1, len(clips) * len(ppps))
@@ -117,7 +117,7 @@ def sweep(
     for model in MODELS:
         table = [
             [
-                law(base, clip, replace(question, bits=studies[i][j].bits), model, v / speeds[slowest], p)
+                law(base, clip, replace(settings, bits=studies[i][j].bits), model, v / speeds[slowest], p)
                 for j, p in enumerate(ppps)
             ]
             for i, v in enumerate(speeds)
@@ -142,7 +142,7 @@ def summary(found: Sweep) -> str:
     )
 
 
-def law(base: Study, clip: Clip, question: Question, model: str, speed: float, ppp: float) -> dict[int, float]:
+def law(base: Study, clip: Clip, settings: StudySettings, model: str, speed: float, ppp: float) -> dict[int, float]:
     """bits -> PSNR from the structure function of one study and the sensor's exact moments, at another speed and light.
 
     `speed` is relative to that study. Pixels are taken as constant during a frame where noise is concerned.
@@ -151,7 +151,7 @@ def law(base: Study, clip: Clip, question: Question, model: str, speed: float, p
     light = np.sort(light)[:: max(1, light.size // 4000)]
     light, scale = light * (ppp / light.mean()), (ppp / base.ppp) ** 2
     result = {}
-    for form in readings(question, ppp, clip.exposure):
+    for form in readouts(settings, ppp, clip.exposure):
         if form.model == model:
             mean, variance = form.moments(form.planes * light)
             noise = float(np.mean((mean / form.planes - light) ** 2 + variance / form.planes**2))

@@ -1,6 +1,6 @@
 """Rendering engines beside each other: the same frames by each that works here, their seconds and their means.
 
-    run(families) -> Report: one Row per engine and scene; CUDA beside LLVM beside scalar
+    run(families) -> BackendReport: one BackendRow per engine and scene; CUDA beside LLVM beside scalar
 
 A frame is radiance and ground truth. What it takes beside the compiled kernels is our own overhead.
 
@@ -31,7 +31,7 @@ DEVIATIONS = 5.0  # standard errors by which means may differ: once in two milli
 
 
 @dataclass(frozen=True)
-class Row:
+class BackendRow:
     """One engine on one scene."""
 
     engine: str
@@ -41,22 +41,22 @@ class Row:
     mean: float  # radiance over all frames and pixels, W m^-2 sr^-1
     mean_error: float  # its standard error
 
-    def deviation(self, other: Row) -> float:
+    def deviation(self, other: BackendRow) -> float:
         """Difference of the means in standard errors of the difference."""
         return abs(self.mean - other.mean) / max(math.hypot(self.mean_error, other.mean_error), 1e-12 * self.mean)
 
 
 @dataclass(frozen=True)
-class Report:
+class BackendReport:
     """All rows, scene by scene, and why the other engines are missing."""
 
     height: int
     width: int
     samples: int
-    rows: tuple[Row, ...]
+    rows: tuple[BackendRow, ...]
     missing: dict[str, str]
 
-    def reference(self, row: Row) -> Row:
+    def reference(self, row: BackendRow) -> BackendRow:
         """The row of the same scene that others are compared with: that of the last of BACKENDS, the plain one."""
         return next(r for r in reversed(self.rows) if r.scene == row.scene)
 
@@ -76,9 +76,9 @@ class Report:
 
 def run(
     families: Sequence[str], *, height: int, width: int, seed: int, progress: Callable[[str], None] | None = None
-) -> Report:
+) -> BackendReport:
     """Render a few frames of each family with every engine that works here; at least scalar does."""
-    rows: list[Row] = []
+    rows: list[BackendRow] = []
     missing: dict[str, str] = {}
     for backend in engine.BACKENDS:
         try:
@@ -92,10 +92,10 @@ def run(
                     progress(f"{backend}: {family}")
                 rows.append(pool.submit(_measure, backend, family, height, width, seed).result())
     rows.sort(key=lambda row: (families.index(row.scene), engine.BACKENDS.index(row.engine)))
-    return Report(height, width, BUDGET.samples, tuple(rows), missing)
+    return BackendReport(height, width, BUDGET.samples, tuple(rows), missing)
 
 
-def _measure(backend: str, family: str, height: int, width: int, seed: int) -> Row:
+def _measure(backend: str, family: str, height: int, width: int, seed: int) -> BackendRow:
     """In a process of its own: the engine is chosen once per process."""
     os.environ["QSIM_ENGINE"] = backend
     import scenes
@@ -112,10 +112,10 @@ def _measure(backend: str, family: str, height: int, width: int, seed: int) -> R
     radiance = np.stack([frame.radiance for frame in frames]).astype(np.float64)
     error = math.sqrt(sum(frame.error**2 for frame in frames) / len(frames) / radiance.size)
     share = None if backend == "scalar" else median(outside[1:])
-    return Row(backend, family, median(seconds[1:]), share, float(radiance.mean()), error)
+    return BackendRow(backend, family, median(seconds[1:]), share, float(radiance.mean()), error)
 
 
-def table(report: Report) -> str:
+def table(report: BackendReport) -> str:
     """The rows as text, and why engines are missing."""
     lines = [f"{report.height} x {report.width} pixels, {report.samples} samples; seconds per frame with ground truth"]
     head = f"{'scene':10} {'engine':8} {'s/frame':>8} {'faster':>7} {'outside kernels':>15}"

@@ -1,6 +1,6 @@
 """Rendering: does a budgeted frame err as asked and as stated, and has it the light of a converged one?
 
-    run(scenes) -> Report: one Row per scene and level [dB]
+    run(scenes) -> LightReport: one LightRow per scene and level [dB]
 
 Each scene gets the budget of `budget.choose`; a few of its frames are compared with converged ones, which have many
 samples and the deepest bounces. Errors count at white (white.py), those without a clamp stand beside them; the
@@ -30,7 +30,7 @@ MISSED = 0.5  # dB below what was asked for that `budget.shortfall` names, too
 
 
 @dataclass(frozen=True)
-class Row:
+class LightRow:
     """One scene at one level."""
 
     scene: str
@@ -53,13 +53,13 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Report:
+class LightReport:
     """All rows and what they were measured on."""
 
     height: int
     width: int
     engine: str
-    rows: tuple[Row, ...]
+    rows: tuple[LightRow, ...]
 
     @property
     def ok(self) -> bool:
@@ -78,7 +78,7 @@ def run(
     frames: Sequence[int] = (2, 9, 16),
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
-) -> Report:
+) -> LightReport:
     """Measure every scene at every level; all must have one size. Minutes at 96 x 192."""
     if not scenes or not levels or not frames:
         raise ValueError("validate light: needs at least one scene, one level and one frame")
@@ -91,10 +91,10 @@ def run(
             if progress is not None:
                 progress(_line(rows[-1]))
     camera = scenes[0].camera
-    return Report(camera.height, camera.width, deep.engine.backend, tuple(rows))
+    return LightReport(camera.height, camera.width, deep.engine.backend, tuple(rows))
 
 
-def _row(scene: Scene, level: float, references: Array, frames: Sequence[int], seed: int) -> Row:
+def _row(scene: Scene, level: float, references: Array, frames: Sequence[int], seed: int) -> LightRow:
     chosen = fidelity.choose(scene, psnr=level, seed=seed)
     ours = Renderer(scene, budget=chosen, seed=seed)
     drawn = [ours.frame(t, with_truth=False) for t in frames]
@@ -105,7 +105,7 @@ def _row(scene: Scene, level: float, references: Array, frames: Sequence[int], s
     noise = Errors.of_halves(np.stack([_halves(ours, t) for t in frames], axis=1), white).plain
     stated = [error_at(white, frame.errors_at) for frame in drawn], [frame.error for frame in drawn]
     error = math.hypot(noise, own.plain) / math.sqrt(images.size) / light
-    return Row(
+    return LightRow(
         f"{scene.name}/{scene.seed}",
         level,
         _decibels(white, _without(found.at_white, own.at_white)),
@@ -140,7 +140,7 @@ def _decibels(white: float, error: float) -> float:
     return math.inf if found is None else found
 
 
-def table(report: Report) -> str:
+def table(report: LightReport) -> str:
     """The rows as text, one line each, and the verdict."""
     head = f"{'scene':14} {'asked':>6} {'reached':>8} {'stated':>7} | {'unclamped: reached':>18} {'stated':>7} | "
     head += f"{'samples':>14} {'bounces':>7} | {'light':>8} {'announced':>9} {'+-':>8}"
@@ -152,7 +152,7 @@ def table(report: Report) -> str:
     return "\n".join([size, head, *map(_line, report.rows), verdict])
 
 
-def _line(row: Row) -> str:
+def _line(row: LightRow) -> str:
     ours = f"{row.samples}{' denoised' if row.denoised else ''}"
     return (
         f"{row.scene:14} {row.asked:6g} {row.reached:8.2f} {row.stated:7.2f} | {row.reached_unclamped:18.2f} "

@@ -1,6 +1,6 @@
 """Speed of reading: random training windows out of a clip, beside decoding the same windows from an mp4.
 
-    run() -> Report: windows of 11 frames of 128 x 128 per second out of 512 x 1024, ours and by FFmpeg, here and now
+    run() -> ReadingReport: windows of 11 x 128 x 128 per second out of frames of 512 x 1024, ours and by FFmpeg
 
 Each side opens its files anew for every window, as a loader would that forgets them. Ours is one thread; FFmpeg may use
 all cores, seeks to the key frame before the window and decodes from there. The windows are the same and in the same
@@ -30,7 +30,7 @@ Place = tuple[int, int, int]  # first frame, y, x
 
 
 @dataclass(frozen=True)
-class Report:
+class ReadingReport:
     """Windows per second here and now, and per second of processor time, which a busy machine changes less."""
 
     clip: float
@@ -64,7 +64,7 @@ class Report:
         ]
 
 
-def run(seconds: float = 4.0, seed: int = 0) -> Report:
+def run(seconds: float = 4.0, seed: int = 0) -> ReadingReport:
     """Write a clip and its video to a temporary folder and read both for so many seconds each, in turns."""
     with tempfile.TemporaryDirectory(prefix="qsim-reading-") as folder:
         clip = textured_clip(Path(folder) / "clip", seed)
@@ -77,7 +77,7 @@ def run(seconds: float = 4.0, seed: int = 0) -> Report:
         difference = np.mean([(sides[0](at) / 1.1 - sides[1](at) / 255.0) ** 2 for at in places])
         rates = [_rate(side, seconds / 2, seed + turn) for turn in range(2) for side in sides]
     ours, theirs = max(rates[0::2]), max(rates[1::2])
-    return Report(ours[0], theirs[0], ours[1], theirs[1], float(np.sqrt(difference)))
+    return ReadingReport(ours[0], theirs[0], ours[1], theirs[1], float(np.sqrt(difference)))
 
 
 def textured_clip(path: Path, seed: int) -> Clip:

@@ -1,6 +1,6 @@
 """Rendering: time per frame against error, the obvious loop beside ours, on scenes that tuned nothing.
 
-    run() -> Report: one Row per scene, level [dB] and method; the error is that against a converged reference
+    run() -> RenderReport: one RenderRow per scene and level [dB]; the error is that against a converged reference
 
 The obvious loop is `mi.render` per frame with the default integrator and the default `independent` sampler, a box
 filter, and the smallest power of two of samples that reaches the level. Ours is `Renderer.frame` without ground truth
@@ -40,7 +40,7 @@ FRAME = 3  # the instant that is rendered again and again
 
 
 @dataclass(frozen=True)
-class Row:
+class RenderRow:
     """One scene at one level: both methods."""
 
     scene: str
@@ -70,13 +70,13 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Report:
+class RenderReport:
     """All rows and what they were measured on."""
 
     height: int
     width: int
     engine: str
-    rows: tuple[Row, ...]
+    rows: tuple[RenderRow, ...]
     choosing_seconds: dict[str, float]  # per scene, the pilots of all levels together; once per clip, not in `seconds`
     unit: str = "dB below white, clamped"  # of every PSNR; reports without it are in dB below the 99.9th percentile
 
@@ -104,11 +104,11 @@ def run(
     rounds: int = 3,
     most_samples: int = MOST_SAMPLES,
     progress: Callable[[str], None] | None = None,
-) -> Report:
+) -> RenderReport:
     """Measure every scene at every level, at least `rounds` times; all must have one size. Minutes at 128 x 256."""
     if not scenes or AT_LEVEL not in levels:
         raise ValueError(f"validate render: needs at least one scene, and {AT_LEVEL:g} among its levels")
-    rows: list[Row] = []
+    rows: list[RenderRow] = []
     choosing: dict[str, float] = {}
     for scene in scenes:
         name = f"{scene.name}/{scene.seed}"
@@ -127,7 +127,7 @@ def run(
             if progress is not None:
                 progress(_line(rows[-1]))
     camera = scenes[0].camera
-    return Report(camera.height, camera.width, renderer.engine.backend, tuple(rows), choosing)
+    return RenderReport(camera.height, camera.width, renderer.engine.backend, tuple(rows), choosing)
 
 
 class Target:
@@ -149,7 +149,7 @@ class Target:
 
 def _compare(
     scene: Scene, name: str, level: float, chosen: Budget, target: Target, rounds: int, most_samples: int
-) -> Row:
+) -> RenderRow:
     ours, reached = _reaching(scene, chosen, level, target)
     samples, obvious_psnr = _obvious_samples(ours, level, target)
     timed = min(samples, most_samples)
@@ -166,7 +166,7 @@ def _compare(
         own.append(_clocks() - between)
     obvious_seconds, obvious_processor = np.median(theirs[1:], axis=0) * samples / timed
     seconds, processor = np.median(own[1:], axis=0)
-    return Row(
+    return RenderRow(
         name,
         level,
         samples,
@@ -215,7 +215,7 @@ def _obvious(renderer: Renderer, t: int, samples: int) -> Array:
     return np.mean([renderer.obvious(t, each, redraw) for redraw in range(calls)], axis=0)
 
 
-def table(report: Report) -> str:
+def table(report: RenderReport) -> str:
     """The rows as text, one line each, and the verdict."""
     size = f"{report.height} x {report.width} pixels, engine {report.engine}"
     lines = [f"{size}; seconds per frame, radiance only; {report.unit}"]
@@ -234,7 +234,7 @@ def table(report: Report) -> str:
     return "\n".join(lines)
 
 
-def _line(row: Row) -> str:
+def _line(row: RenderRow) -> str:
     ours = f"{row.samples}{' denoised' if row.denoised else ''}"
     return (
         f"{row.scene:14} {row.level:5g} | {row.obvious_samples:16d} {row.obvious_psnr:5.1f} "
@@ -243,7 +243,7 @@ def _line(row: Row) -> str:
     )
 
 
-def figure(report: Report, path: Path) -> None:
+def figure(report: RenderReport, path: Path) -> None:
     """Seconds per frame against the PSNR reached, one panel per scene (.png, .svg or .pdf)."""
     from matplotlib.figure import Figure
 

@@ -1,7 +1,7 @@
 """Speed against error: every sensor model and engine, measured here and now, beside what it has to reach.
 
-    run() -> Report: rows (speed, error of the cdf, chi-square, mismatches, z-scores), hard cases
-    Report.ok is false when any number is outside its bounds; speeds are outside only if asked for
+    run() -> SensorReport: rows (speed, error of the cdf, chi-square, mismatches, z-scores), hard cases
+    SensorReport.ok is false when any number is outside its bounds; speeds are outside only if asked for
 
 The bounds are those of a correct program: exact forms to rounding, statistics to a false alarm of 1e-6 for the whole
 report, compiled codes to 5 in a million.
@@ -35,7 +35,7 @@ FALSE_ALARM = 1e-6  # of all statistical checks of one report together
 CDF_BOUND = {"reference": 1e-10, "fast": 1e-5}  # float64; float32, whose near misses the reference decides
 MISMATCH_BOUND = 5.0  # pixels in a million
 FRAME = (512, 1024)  # pixels, of the published data set
-_ROUNDS = 7  # of timing; the medians count
+ROUNDS = 7  # of timing; the medians count
 
 # Name -> sensor, photons of the timing and of the histogram, how many times NumPy it has to reach (0: no target)
 MODELS: dict[str, tuple[Sensor, float, float]] = {
@@ -54,7 +54,7 @@ PACKED_TARGET = 3.0  # times NumPy's `random < p` and packbits, 1 bit
 
 
 @dataclass(frozen=True)
-class Row:
+class SensorRow:
     """One model on one engine; None where a number does not apply."""
 
     model: str
@@ -71,8 +71,8 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Report:
-    rows: list[Row]
+class SensorReport:
+    rows: list[SensorRow]
     cases: list[Case]
     pixels: int
     settings: dict[str, Any] = field(default_factory=dict)
@@ -87,7 +87,7 @@ class Report:
 
 def run(
     pixels: int = 1 << 22, seed: int = 0, *, require_speed: bool = False, progress: Progress | None = None
-) -> Report:
+) -> SensorReport:
     """Measure everything on clips of about `pixels` pixels, in frames of 512 x 1024 where it is enough; a minute."""
     if pixels < 1 << 16:
         raise ValueError(f"pixels: a chi-square and a timing need at least 65536, got {pixels}")
@@ -100,8 +100,8 @@ def run(
         if progress is not None:
             progress(n, len(MODELS) + 1)
     rows += _packed(shape, seed, require_speed)
-    settings = {"seed": seed, "exposure": EXPOSURE, "fast_engine": kernel.available(), "rounds": _ROUNDS}
-    return Report(
+    settings = {"seed": seed, "exposure": EXPOSURE, "fast_engine": kernel.available(), "rounds": ROUNDS}
+    return SensorReport(
         rows, hard_cases({name: model[0] for name, model in MODELS.items()}, EXPOSURE), int(np.prod(shape)), settings
     )
 
@@ -115,7 +115,7 @@ def _measure(
     seed: int,
     checks: int,
     require_speed: bool,
-) -> list[Row]:
+) -> list[SensorRow]:
     """Rows of one model: NumPy's way where there is one, the reference, the compiled engine where it serves."""
     light = np.full(shape, photons, np.float32)
     key = Key(seed, 1)
@@ -129,11 +129,11 @@ def _measure(
         draws["numpy"] = _numpy_way(sensor, light, seed)
     codes, seconds = _race(draws)
     speed = {engine: light.size / s / 1e6 for engine, s in seconds.items()}
-    rows = [Row(name, "numpy", speed["numpy"])] if "numpy" in speed else []
+    rows = [SensorRow(name, "numpy", speed["numpy"])] if "numpy" in speed else []
     for engine in engines:
-        p, z_mean, z_variance = _statistics(codes[engine], sensor, photons)
+        p, z_mean, z_variance = statistics(codes[engine], sensor, photons)
         ratio = seconds["numpy"] / seconds[engine] if "numpy" in seconds else None
-        row = Row(
+        row = SensorRow(
             name,
             engine,
             speed[engine],
@@ -147,11 +147,11 @@ def _measure(
             if engine == "reference"
             else float(np.mean(codes[engine] != codes["reference"]) * 1e6),
         )
-        rows.append(_judged(row, checks, require_speed))
+        rows.append(judged(row, checks, require_speed))
     return rows
 
 
-def _packed(shape: tuple[int, ...], seed: int, require_speed: bool) -> list[Row]:
+def _packed(shape: tuple[int, ...], seed: int, require_speed: bool) -> list[SensorRow]:
     """Packed binary planes against NumPy's `random < p` and packbits."""
     if not kernel.available():
         return []
@@ -166,8 +166,8 @@ def _packed(shape: tuple[int, ...], seed: int, require_speed: bool) -> list[Row]
     _, seconds = _race(draws)
     name = "clocked SPAD, 1 bit, packed"
     speed = {engine: light.size / s / 1e6 for engine, s in seconds.items()}
-    fast = Row(name, "fast", speed["fast"], seconds["numpy"] / seconds["fast"], PACKED_TARGET)
-    return [Row(name, "numpy", speed["numpy"]), _judged(fast, 1, require_speed)]
+    fast = SensorRow(name, "fast", speed["fast"], seconds["numpy"] / seconds["fast"], PACKED_TARGET)
+    return [SensorRow(name, "numpy", speed["numpy"]), judged(fast, 1, require_speed)]
 
 
 def _numpy_way(sensor: QIS, light: Array, seed: int) -> Callable[[], Array]:
@@ -185,7 +185,7 @@ def _race(draws: dict[str, Callable[[], Array]]) -> tuple[dict[str, Array], dict
     """Results and median seconds, the competitors taking turns so that all see the same machine."""
     times: dict[str, list[float]] = {name: [] for name in draws}
     codes = {}
-    for n in range(_ROUNDS + 1):
+    for n in range(ROUNDS + 1):
         for name, draw in draws.items():
             if n == 0 or name != "reference":  # slow, and nothing is asked of its speed: once is enough
                 start = time.perf_counter()
@@ -196,7 +196,7 @@ def _race(draws: dict[str, Callable[[], Array]]) -> tuple[dict[str, Array], dict
     return codes, {name: median(seconds) for name, seconds in times.items()}
 
 
-def _statistics(codes: Array, sensor: Sensor, photons: float) -> tuple[float, float, float]:
+def statistics(codes: Array, sensor: Sensor, photons: float) -> tuple[float, float, float]:
     """Chi-square p-value, z of the mean, z of the variance, against the closed form at constant light."""
     from scipy.stats import chi2
 
@@ -263,7 +263,7 @@ def _written_out(sensor: Sensor, photons: Array) -> Array | None:
     return None
 
 
-def _judged(row: Row, checks: int, require_speed: bool) -> Row:
+def judged(row: SensorRow, checks: int, require_speed: bool) -> SensorRow:
     """The row with the names of its columns that are outside their bounds."""
     each = -expm1(log1p(-FALSE_ALARM) / checks)
     limit = NormalDist().inv_cdf(1 - each / 2)
@@ -281,7 +281,7 @@ def _judged(row: Row, checks: int, require_speed: bool) -> Row:
 # ---- What people see
 
 
-def table(report: Report) -> list[str]:
+def table(report: SensorReport) -> list[str]:
     """Lines for a terminal."""
     header = ("model", "engine", "Mpixel/s", "x NumPy", "(target)", "cdf error", "chi2 p", "z mean", "z var", "ppm", "")
     lines = [header]
@@ -314,7 +314,7 @@ def _number(value: float | None, style: str) -> str:
     return "-" if value is None else format(value, style)
 
 
-def figure(report: Report, path: str | Path) -> None:
+def figure(report: SensorReport, path: str | Path) -> None:
     """Speed against error, one mark per row that has both, written to `path` (.png, .svg or .pdf)."""
     from matplotlib.figure import Figure
 

@@ -17,9 +17,9 @@ from qsim.cli.validate import ACTING
 from qsim.dataset import recipe
 from qsim.scene.scene import SunSky
 from qsim.studies.validation import light
-from qsim.studies.validation.light import Report, Row
+from qsim.studies.validation.light import LightReport, LightRow
 
-ROW = Row("a/0", 36.0, 36.4, 36.3, 30.0, 30.1, 32, 4, True, -0.0040, 0.0043, 0.0002)
+ROW = LightRow("a/0", 36.0, 36.4, 36.3, 30.0, 30.1, 32, 4, True, -0.0040, 0.0043, 0.0002)
 VALUES = {"output": "x.png", "pixels": "100", "scenes": "fan", "height": "24", "width": "32", "psnr": "30"}
 
 
@@ -117,7 +117,7 @@ def test_a_plan_for_programs_knows_its_machines(monkeypatch, place, capsys):
 
 
 def test_the_verdict_on_light_needs_error_and_light_as_said():
-    good = Report(8, 10, "llvm", (ROW,))
+    good = LightReport(8, 10, "llvm", (ROW,))
     assert good.ok
     assert "as announced" in light.table(good)
     for wrong in (replace(ROW, reached=35.4), replace(ROW, light=-0.0106), replace(ROW, light=0.0043)):

@@ -16,7 +16,7 @@ from qsim.clip.clip import RELATIVE, Clip, ClipWriter
 from qsim.clip.stream import Sensing, sense
 from qsim.optics.radiometry import clip_photons
 from qsim.report import clip_section, report
-from qsim.studies.validation.reading import Report
+from qsim.studies.validation.reading import ReadingReport
 
 
 def make_clip(path, frames: int = 5, size: tuple[int, int] = (24, 33)) -> Clip:
@@ -233,7 +233,7 @@ def test_studies_costs_and_validations_have_their_sections(tmp_path):
     frame = {"scene": "drums", "level": 40.0, "psnr": 40.5, "stated_psnr": 40.25, "samples": 16, "bounces": 4}
     frame |= {"seconds": 0.5, "obvious_seconds": 6.0, "obvious_psnr": 40.0, "ratio": 12.0}
     render = {"ok": True, "median_ratio": 12.0, "height": 8, "width": 10, "engine": "llvm", "rows": [frame]}
-    reading = Report(clip=250.5, mp4=20.0, clip_processor=300.0, mp4_processor=9.0, difference=0.01).to_dict()
+    reading = ReadingReport(clip=250.5, mp4=20.0, clip_processor=300.0, mp4_processor=9.0, difference=0.01).to_dict()
     files = {"s/tradeoff": study, "w/tradeoff": sweep, "f/figure1": figure, "sensor": sensor, "render": render}
     files["reading"] = reading
     for name, content in (files | {"b/bench": {"setting": {"height": 64}, "costs": [cost]}}).items():

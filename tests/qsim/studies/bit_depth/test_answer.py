@@ -10,7 +10,7 @@ from qsim.cli.program import main
 from qsim.clip.motion_statistics import moving_mean
 from qsim.studies.bit_depth import answer
 from qsim.studies.bit_depth.clip_study import study
-from qsim.studies.bit_depth.readout import MODELS, Question
+from qsim.studies.bit_depth.readout import MODELS, StudySettings
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -59,19 +59,19 @@ def test_a_clip_is_made_faster_by_whole_factors(clip, tmp_path, capsys):
 
 def test_an_optimum_at_the_edge_is_marked(clip):
     """Dim and slow wants many bits; the sentence says how much the neighbours lose."""
-    found = study(clip, Question(bits=(1, 2), ppp=0.1, instants=4))
+    found = study(clip, StudySettings(bits=(1, 2), ppp=0.1, instants=4))
     assert answer.at_edge(found, "multibit") == ">="
     assert answer.marked(found, "multibit") == ">= 2"
     said = answer.answer(found)
     lost = found.best("multibit").psnr_db - next(row for row in found.rows if row.model == "multibit").psnr_db
     assert f"multibit >= 2 bits, 1 bit is {lost:.1f} dB worse (the deepest tried: try --bits 1,...,4)" in said
-    deep = study(clip, Question(bits=(4, 5), ppp=30.0, instants=2))
+    deep = study(clip, StudySettings(bits=(4, 5), ppp=30.0, instants=2))
     assert answer.at_edge(deep, "multibit") == "<="
 
 
 def test_the_range_is_widened_until_the_best_is_inside(clip):
     told = []
-    found = answer.widened(clip, Question(bits=(1, 2), ppp=0.65, instants=2), told.append)
+    found = answer.widened(clip, StudySettings(bits=(1, 2), ppp=0.65, instants=2), told.append)
     assert len(told) == len(found.bits) - 2
     edges = [answer.at_edge(found, model) for model in MODELS]
     assert ">=" not in edges or 2 ** (found.bits[-1] + 1) - 1 > len(clip) or found.bits[-1] == answer.WIDEST

@@ -9,12 +9,12 @@ from qsim.cli.program import main
 from qsim.report import clip_section
 from qsim.studies.bit_depth import answer, clip_study
 from qsim.studies.bit_depth.clip_study import study
-from qsim.studies.bit_depth.readout import MODELS, Question, plane_sensor
+from qsim.studies.bit_depth.readout import MODELS, StudySettings, plane_sensor
 
 
 @pytest.fixture(scope="module")
 def found(clip):
-    return study(clip, Question(bits=(1, 3, 4), ppp=0.65, instants=4))
+    return study(clip, StudySettings(bits=(1, 3, 4), ppp=0.65, instants=4))
 
 
 def rows_of(found, model):
@@ -25,7 +25,7 @@ def rows_of(found, model):
 @pytest.mark.parametrize("plane", [None, "quiver-paper"])
 def test_simulation_agrees_with_its_expectation(clip, ppp, plane):
     """Twelve rows, none further off than its stated error allows (p = 1e-6 in all)."""
-    rows = study(clip, Question(bits=(1, 3, 4), ppp=ppp, plane=plane, instants=4)).rows
+    rows = study(clip, StudySettings(bits=(1, 3, 4), ppp=ppp, plane=plane, instants=4)).rows
     limit = critical_z(1e-6 / len(rows))
     # 3e-3: second order in the differences of light between the planes of a frame
     for row in rows:
@@ -61,9 +61,9 @@ def test_shot_noise_of_a_sum_is_that_of_its_light(found):
 
 
 def test_deeper_frames_hold_the_planes_of_shallower_ones(clip):
-    question = Question(bits=(1, 2, 3), ppp=0.65)
-    plane = plane_sensor(question, 0.65, clip.exposure)
-    frames = list(clip_study.expose(clip, 20, question, 0.65, plane, np.zeros(7)))
+    settings = StudySettings(bits=(1, 2, 3), ppp=0.65)
+    plane = plane_sensor(settings, 0.65, clip.exposure)
+    frames = list(clip_study.expose(clip, 20, settings, 0.65, plane, np.zeros(7)))
     assert [frame.planes for frame in frames] == [1, 3, 7]
     assert (frames[0].fired <= frames[1].fired).all()
     assert (frames[1].fired <= frames[2].fired).all()
@@ -73,8 +73,8 @@ def test_deeper_frames_hold_the_planes_of_shallower_ones(clip):
 def test_faster_is_every_other_frame(clip, tmp_path):
     """Speed 2 of a clip is the clip that moves twice as fast."""
     twice = wave_clip(tmp_path / "wave2", 32, 2)
-    stepped = study(clip, Question(bits=(1, 3), ppp=0.65, speed=2, instants=1))
-    fast = study(twice, Question(bits=(1, 3), ppp=0.65, instants=1))
+    stepped = study(clip, StudySettings(bits=(1, 3), ppp=0.65, speed=2, instants=1))
+    fast = study(twice, StudySettings(bits=(1, 3), ppp=0.65, instants=1))
     for a, b in zip(stepped.rows, fast.rows, strict=True):
         assert a.blur_error == pytest.approx(b.blur_error, rel=1e-6)
         assert a.motion_px_per_frame == pytest.approx(b.motion_px_per_frame)
@@ -83,9 +83,9 @@ def test_faster_is_every_other_frame(clip, tmp_path):
 def test_clips_that_cannot_answer_are_refused(clip, tmp_path, capsys):
     slow = wave_clip(tmp_path / "slow", 3, 1, frame_rate=2000.0)
     with pytest.raises(ValueError, match="at least 10000 fps"):
-        study(slow, Question(ppp=1.0))
+        study(slow, StudySettings(ppp=1.0))
     with pytest.raises(ValueError, match="7 bits at speed 1 need 127"):
-        study(clip, Question(bits=(7,), ppp=1.0))
+        study(clip, StudySettings(bits=(7,), ppp=1.0))
     assert main(["tradeoff", str(clip.path)]) == 2
     assert "--ppp" in capsys.readouterr().err
 
@@ -93,7 +93,7 @@ def test_clips_that_cannot_answer_are_refused(clip, tmp_path, capsys):
 def test_one_definition_of_motion(tmp_path):
     """Half of the field stands still: studies, figures and the clip page all say what the moving half does."""
     clip = wave_clip(tmp_path / "half", 32, 2, still=24)
-    rows = study(clip, Question(bits=(1, 3), ppp=0.65, instants=2)).rows
+    rows = study(clip, StudySettings(bits=(1, 3), ppp=0.65, instants=2)).rows
     assert [row.motion_px_per_frame for row in rows] == pytest.approx([2, 14, 2, 14])
     assert [answer.code_motion(row) for row in rows] == pytest.approx([14] * 4)
     assert 7 * clip_study.clip_motion(clip, 3) == pytest.approx(14)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from qsim import backend as engine
-from qsim.studies.validation.backends import DEVIATIONS, Report, Row, run, table
+from qsim.studies.validation.backends import DEVIATIONS, BackendReport, BackendRow, run, table
 
 
 def test_engines_that_work_here_agree():
@@ -23,9 +23,9 @@ def test_engines_that_work_here_agree():
 
 
 def test_means_apart_are_said():
-    plain = Row("scalar", "fan", 2.0, None, 1.0, 0.003)
-    other = Row("cuda", "fan", 0.5, 0.08, 1.0 + 0.9 * DEVIATIONS * 0.005, 0.004)
-    good = Report(8, 8, 32, (other, plain), {})
+    plain = BackendRow("scalar", "fan", 2.0, None, 1.0, 0.003)
+    other = BackendRow("cuda", "fan", 0.5, 0.08, 1.0 + 0.9 * DEVIATIONS * 0.005, 0.004)
+    good = BackendReport(8, 8, 32, (other, plain), {})
     assert good.ok
     assert good.to_dict()["rows"][0]["deviation"] == pytest.approx(0.9 * DEVIATIONS)
     assert good.to_dict()["rows"][0]["ratio"] == 4

@@ -7,7 +7,7 @@ import pytest
 
 from qsim.cli.program import main
 from qsim.studies.validation import reading
-from qsim.studies.validation.reading import Report
+from qsim.studies.validation.reading import ReadingReport
 
 
 def test_what_counts_as_quick():
@@ -17,7 +17,7 @@ def test_what_counts_as_quick():
         (200.0, 41.0, 0.01, False),
         (200.0, 20.0, 0.3, False),
     ]:
-        assert Report(clip, mp4, clip, mp4 / 2, difference).ok == ok
+        assert ReadingReport(clip, mp4, clip, mp4 / 2, difference).ok == ok
 
 
 @pytest.mark.slow

@@ -14,9 +14,9 @@ from qsim.rendering.budget import Budget
 from qsim.scene.motion import Spin
 from qsim.scene.scene import SunSky
 from qsim.studies.validation import rendering
-from qsim.studies.validation.rendering import Report, Row, Target
+from qsim.studies.validation.rendering import RenderReport, RenderRow, Target
 
-ROW = Row("a/0", 40.0, 1024, 40.2, 3.0, False, 32, True, 4, 40.6, 40.1, 0.25)
+ROW = RenderRow("a/0", 40.0, 1024, 40.2, 3.0, False, 32, True, 4, 40.6, 40.1, 0.25)
 
 
 def test_the_obvious_loop_sees_the_same_scene():
@@ -48,7 +48,7 @@ def test_the_variance_of_the_reference_is_not_held_against_an_image():
 
 
 def test_the_verdict_needs_the_median_and_no_scene_slower():
-    good = Report(8, 10, "llvm", (ROW, replace(ROW, scene="b/0")), {"a/0": 1.0})
+    good = RenderReport(8, 10, "llvm", (ROW, replace(ROW, scene="b/0")), {"a/0": 1.0})
     assert good.median_ratio == pytest.approx(12.0)
     assert good.ok
     assert not replace(good, rows=(*good.rows, replace(ROW, level=30.0, seconds=4.0))).ok

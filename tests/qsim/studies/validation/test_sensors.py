@@ -22,7 +22,7 @@ def report():
     with pytest.MonkeyPatch.context() as patch:
         few = {name: sensors.MODELS[name] for name in ("QIS 3 bits, gain 1", "clocked SPAD, 1 bit")}
         patch.setattr(sensors, "MODELS", few)
-        patch.setattr(sensors, "_ROUNDS", 1)
+        patch.setattr(sensors, "ROUNDS", 1)
         yield sensors.run(PIXELS)
 
 
@@ -57,7 +57,7 @@ def test_the_table_names_what_is_outside(report):
     assert "WRONG" in "\n".join(sensors.table(wrong))
 
 
-GOOD = sensors.Row("m", "fast", 1.0, 30.0, 25.0, 1e-7, 0.5, 0.1, -0.2, 0.0)
+GOOD = sensors.SensorRow("m", "fast", 1.0, 30.0, 25.0, 1e-7, 0.5, 0.1, -0.2, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -73,10 +73,10 @@ GOOD = sensors.Row("m", "fast", 1.0, 30.0, 25.0, 1e-7, 0.5, 0.1, -0.2, 0.0)
     ],
 )
 def test_each_fault_is_named(change, name):
-    assert sensors._judged(GOOD, 60, require_speed=True).wrong == ()
-    assert sensors._judged(replace(GOOD, **change), 60, require_speed=True).wrong == (name,)
+    assert sensors.judged(GOOD, 60, require_speed=True).wrong == ()
+    assert sensors.judged(replace(GOOD, **change), 60, require_speed=True).wrong == (name,)
     if name == "speed":
-        assert sensors._judged(replace(GOOD, **change), 60, require_speed=False).wrong == ()
+        assert sensors.judged(replace(GOOD, **change), 60, require_speed=False).wrong == ()
 
 
 def test_a_sensor_that_is_one_percent_off_does_not_pass():
@@ -84,11 +84,11 @@ def test_a_sensor_that_is_one_percent_off_does_not_pass():
     sensor = QIS(0.8, 1.6, 0.2, 3)
     light = np.full((1024, 1024), 3.25 * 1.01, np.float32)
     codes = sensor.sample(light, sensors.EXPOSURE, key=Key(0, 1))
-    p, z_mean, _ = sensors._statistics(codes, sensor, 3.25)
+    p, z_mean, _ = sensors.statistics(codes, sensor, 3.25)
     assert p < 1e-9
     assert z_mean > 7
     codes = sensor.sample(light / np.float32(1.01), sensors.EXPOSURE, key=Key(0, 1))
-    p, z_mean, z_variance = sensors._statistics(codes, sensor, 3.25)
+    p, z_mean, z_variance = sensors.statistics(codes, sensor, 3.25)
     assert p > 1e-6
     assert max(abs(z_mean), abs(z_variance)) < 5
 
@@ -98,7 +98,7 @@ def test_an_impossible_code_does_not_pass():
     sensor = BinarySPAD(0.5, 0.0)
     codes = np.zeros(PIXELS, np.uint8)
     codes[:50] = 1
-    assert sensors._statistics(codes, sensor, 0.0)[0] == 0.0
+    assert sensors.statistics(codes, sensor, 0.0)[0] == 0.0
 
 
 def test_the_figure_is_written_whole(report, tmp_path):
