@@ -11,7 +11,6 @@ A job is done when its record is there. Everything before can be killed at any m
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import os
 import platform
@@ -27,6 +26,7 @@ from qsim import files
 from qsim.clip import stream
 from qsim.clip.clip import Clip
 from qsim.dataset.job import Job
+from qsim.dataset.provenance import assets, origin, photographs
 
 if TYPE_CHECKING:
     from qsim.rendering.budget import Budget
@@ -35,13 +35,6 @@ if TYPE_CHECKING:
 Make = Callable[[Job, Path], object]  # renders a job's clip to a path; tests hand in a quick one
 
 FOLDERS = ("clips", "jobs", "failed", "logs", "locks", "work")  # of a data set
-
-_ASSETS = {  # record of scene.py -> its array or file, and what it is
-    "Texture": ("image", "texture"),
-    "NormalMap": ("image", "texture"),
-    "EnvironmentImage": ("image", "texture"),
-    "Mesh": ("vertices", "mesh"),
-}
 
 
 @dataclass(frozen=True)
@@ -52,15 +45,6 @@ class Result:
     # "done", "failed", "full" (no space left), "gone" (the data set's folder) or "died" (the worker process)
     state: str
     message: str = ""
-
-
-def provenance(job: Job, read: dict[str, str] | None = None) -> dict[str, Any]:
-    """What a job's clip.json says beside what the renderer knows: which job it is, its scene and split.
-
-    `read` are the files of the user's that the scene was made from (reads.py).
-    """
-    scene = {"family": Path(job.family).stem, "seed": job.scene_seed, "speed": job.speed}
-    return {"name": job.name, "job": job.digest, "split": job.split, "scene": scene} | ({"reads": read} if read else {})
 
 
 def render_job(job: Job, path: Path) -> object:
@@ -77,7 +61,7 @@ def render_job(job: Job, path: Path) -> object:
         shutter=settings.shutter,
         seed=render_seed(job),
         budget=choose_budget(job, scene),
-        extra=provenance(job, read) | {"assets": sorted(assets(scene.to_dict()) + photographs(scene))},
+        extra=origin(job, read) | {"assets": sorted(assets(scene.to_dict()) + photographs(scene))},
         force=True,  # what an earlier version of the program began is nobody's
     )
 
@@ -128,45 +112,6 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
         quantum_efficiency=1.0 if ppp is None else electrons / ppp,
         seed=render_seed(job),
     )
-
-
-def assets(described: Any) -> list[str]:
-    """The pictures and meshes in a scene's description, as `texture SHA-256`, `texture FILE` or `mesh SHA-256`."""
-    found: set[str] = set()
-    waiting = [described]
-    while waiting:
-        item = waiting.pop()
-        if isinstance(item, list):
-            waiting += item
-        elif isinstance(item, dict):
-            waiting += item.values()
-            key, kind = _ASSETS.get(str(item.get("kind")), ("", ""))
-            value = item.get(key)
-            if isinstance(value, dict):
-                found.add(f"{kind} {value['sha256']}")
-            elif isinstance(value, str):
-                found.add(f"{kind} {value}")
-    return sorted(found)
-
-
-def photographs(scene: Any) -> list[str]:
-    """`photograph NAME` for every photograph of textures.py in a scene: in whatever range, it is the same."""
-    from qsim.scene.scene import Texture
-    from qsim.scene.textures import photograph_in
-
-    found: set[str] = set()
-    waiting = [scene]
-    while waiting:
-        item = waiting.pop()
-        if isinstance(item, Texture):
-            found |= {f"photograph {name}" for name in [photograph_in(item.pixels())] if name is not None}
-        elif isinstance(item, list | tuple):
-            waiting += item
-        elif isinstance(item, dict):
-            waiting += item.values()
-        elif dataclasses.is_dataclass(item):
-            waiting += [getattr(item, part.name) for part in dataclasses.fields(item)]
-    return sorted(found)
 
 
 def record_path(folder: Path, name: str) -> Path:

@@ -28,6 +28,7 @@ from xml.etree import ElementTree
 
 import scenes
 from qsim import backend, files
+from qsim.dataset.provenance import nested
 from qsim.scene.scene import Scene
 
 _INSTALLED = [sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")]
@@ -198,18 +199,10 @@ def _imported(path: Path, found: set[Path] | None = None) -> set[Path]:
 def _named_in(scene: Any) -> set[Path]:
     """The files whose names a scene's records hold: pictures are read when it is rendered."""
     found: set[Path] = set()
-    waiting = [scene]
-    while waiting:
-        item = waiting.pop()
+    for item in nested(scene):
         if isinstance(item, str) and 0 < len(item) < 4096:
             with contextlib.suppress(OSError, ValueError):
                 found |= {Path(item).resolve()} if Path(item).is_file() else set()
-        elif isinstance(item, list | tuple):
-            waiting += item
-        elif isinstance(item, dict):
-            waiting += item.values()
-        elif dataclasses.is_dataclass(item):
-            waiting += [getattr(item, part.name) for part in dataclasses.fields(item)]
     return found
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from qsim.clip.clip import PHYSICAL, Clip, ClipWriter
 from qsim.dataset.job import Job
-from qsim.dataset.job_runner import provenance
+from qsim.dataset.provenance import origin
 from qsim.optics.camera import Camera
 from qsim.scene.scene import describe
 
@@ -54,7 +54,7 @@ def make(job: Job, path: Path) -> Clip:
         "radiance_unit": PHYSICAL,
         "camera": describe(camera),
     }
-    with ClipWriter(path, meta | provenance(job)) as writer:
+    with ClipWriter(path, meta | origin(job)) as writer:
         for t in range(settings.frames):
             if not writer.has(t):
                 rng = np.random.default_rng([job.scene_seed, len(job.family), t])

@@ -22,7 +22,7 @@ from forks import forked, killed_at
 
 from qsim import files
 from qsim.clip import stream
-from qsim.dataset import job_runner, recipe
+from qsim.dataset import job_runner, provenance, recipe
 from qsim.dataset.checking import check
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import Options, Summary, generate, watching
@@ -540,7 +540,7 @@ def test_assets_of_a_scene():
     described = {"kind": "Scene", "bodies": [{"kind": "Body", "mesh": {"kind": "Mesh", "vertices": {"sha256": "m"}},
                  "material": {"kind": "Diffuse", "reflectance": {"kind": "Texture", "image": {"sha256": "t"}}}}],
                  "lights": [{"kind": "EnvironmentImage", "image": "sky.hdr"}]}  # fmt: skip
-    assert job_runner.assets(described) == ["mesh m", "texture sky.hdr", "texture t"]
+    assert provenance.assets(described) == ["mesh m", "texture sky.hdr", "texture t"]
 
 
 def test_a_photograph_in_another_range_is_the_same_photograph():
@@ -549,10 +549,10 @@ def test_a_photograph_in_another_range_is_the_same_photograph():
     for high in (0.45, 0.7):
         material = Diffuse(Texture(textures.photograph("gravel", 0.15, high)))
         made.append(small_scenes.scene(Body("plate", small_scenes.square(), material)))
-    first, second = (set(job_runner.assets(scene.to_dict())) for scene in made)
+    first, second = (set(provenance.assets(scene.to_dict())) for scene in made)
     assert first
     assert not first & second
-    assert [job_runner.photographs(scene) for scene in made] == [["photograph gravel"], ["photograph gravel"]]
+    assert [provenance.photographs(scene) for scene in made] == [["photograph gravel"], ["photograph gravel"]]
 
 
 def test_progress_counts_the_frames_of_whoever_renders(tmp_path: Path):

@@ -10,7 +10,7 @@ import pytest
 from fakes import make
 
 from qsim import checks
-from qsim.dataset import job_runner, recipe
+from qsim.dataset import job_runner, provenance, recipe
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe import Recipe, parse
 
@@ -245,7 +245,7 @@ def test_no_mesh_or_texture_of_a_test_scene_is_in_training(path: Path):
     scenes = {job.scene: job for job in recipe.load(path).jobs}
     for job in scenes.values():
         scene = job_runner.load_scene(job)
-        found[job.split] |= {*job_runner.assets(scene.to_dict()), *job_runner.photographs(scene)}
+        found[job.split] |= {*provenance.assets(scene.to_dict()), *provenance.photographs(scene)}
     for split in ("train", "test"):
         assert {asset.split()[0] for asset in found[split]} >= {"mesh", "texture"}
     assert found["test"].isdisjoint(found["train"] | found["val"])

@@ -12,7 +12,7 @@ from clips import write_clip
 from fakes import RECIPE, tree
 
 from qsim import files
-from qsim.dataset import job_runner, recipe, scene_files
+from qsim.dataset import job_runner, provenance, recipe, scene_files
 from qsim.dataset.generation import Options, generate
 from qsim.dataset.job import Job
 
@@ -80,7 +80,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def make(job: Job, path: Path) -> object:
     """A clip that says what its scene read, as a rendered one does."""
     _, read = job_runner.load_traced(job)
-    return write_clip(path, frames=1, height=2, width=3, seed=job.scene_seed, **job_runner.provenance(job, read))
+    return write_clip(path, frames=1, height=2, width=3, seed=job.scene_seed, **provenance.origin(job, read))
 
 
 def test_a_python_scene_names_all_that_it_reads_every_time(place: Path):
@@ -163,7 +163,7 @@ def test_a_data_set_of_an_earlier_version_goes_by_the_scene_file_alone(place: Pa
     own = only(wanted(path), "wheel")
 
     def make_before(job: Job, target: Path) -> object:
-        return write_clip(target, frames=1, height=2, width=3, **job_runner.provenance(job))
+        return write_clip(target, frames=1, height=2, width=3, **provenance.origin(job))
 
     generate(own, tmp_path / "d", HERE, make=make_before)
     edit(place / "data.csv", random.Random(0))

@@ -1,0 +1,63 @@
+"""Records where a clip comes from: its job, and the pictures, meshes and photographs of its scene."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from qsim.dataset.job import Job
+
+_ASSETS = {  # record of scene.py -> its array or file, and what it is
+    "Texture": ("image", "texture"),
+    "NormalMap": ("image", "texture"),
+    "EnvironmentImage": ("image", "texture"),
+    "Mesh": ("vertices", "mesh"),
+}
+
+
+def origin(job: Job, read: dict[str, str] | None = None) -> dict[str, Any]:
+    """What a job's clip.json says beside what the renderer knows: which job it is, its scene and split.
+
+    `read` are the files of the user's that the scene was made from (reads.py).
+    """
+    scene = {"family": Path(job.family).stem, "seed": job.scene_seed, "speed": job.speed}
+    return {"name": job.name, "job": job.digest, "split": job.split, "scene": scene} | ({"reads": read} if read else {})
+
+
+def nested(value: Any) -> Iterator[Any]:
+    """Yield a value and everything inside it: items of lists and tuples, values of dicts, fields of records."""
+    waiting = [value]
+    while waiting:
+        item = waiting.pop()
+        yield item
+        if isinstance(item, list | tuple):
+            waiting += item
+        elif isinstance(item, dict):
+            waiting += item.values()
+        elif dataclasses.is_dataclass(item):
+            waiting += [getattr(item, part.name) for part in dataclasses.fields(item)]
+
+
+def assets(described: Any) -> list[str]:
+    """The pictures and meshes in a scene's description, as `texture SHA-256`, `texture FILE` or `mesh SHA-256`."""
+    found: set[str] = set()
+    for item in nested(described):
+        if isinstance(item, dict):
+            key, kind = _ASSETS.get(str(item.get("kind")), ("", ""))
+            value = item.get(key)
+            if isinstance(value, dict):
+                found.add(f"{kind} {value['sha256']}")
+            elif isinstance(value, str):
+                found.add(f"{kind} {value}")
+    return sorted(found)
+
+
+def photographs(scene: Any) -> list[str]:
+    """`photograph NAME` for every photograph of textures.py in a scene: in whatever range, it is the same."""
+    from qsim.scene.scene import Texture
+    from qsim.scene.textures import photograph_in
+
+    pictures = [item.pixels() for item in nested(scene) if isinstance(item, Texture)]
+    return sorted({f"photograph {name}" for name in map(photograph_in, pictures) if name is not None})
