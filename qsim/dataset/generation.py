@@ -17,19 +17,19 @@ from typing import Any
 
 from qsim import __version__, files
 from qsim.clip.stream import Progress
-from qsim.dataset.dataset import FORMAT_VERSION, Damaged, Dataset, unproven, verify_job
+from qsim.dataset.dataset import FORMAT_VERSION, Damaged, Dataset, unproven
 from qsim.dataset.job import Job
 from qsim.dataset.job_runner import (
     FOLDERS,
     Make,
     Result,
     failure_path,
-    make_record,
     mark_failed,
     record_path,
     render_job,
 )
 from qsim.dataset.recipe import Recipe
+from qsim.dataset.repair import repair_jobs
 from qsim.dataset.worker_pool import Limits, run_here, run_local
 
 Run = Callable[[list[Job], Path, Make], Generator[Result]]
@@ -82,7 +82,7 @@ def generate(
     try:
         with _locked(folder, options):
             repaired = _begin(recipe, folder, options.repair)
-            repaired += repair(folder, jobs) if options.repair else ()
+            repaired += repair_jobs(folder, jobs) if options.repair else ()
             failed = {} if options.retry else _failures(folder, jobs)
             todo = [job for job in jobs if not record_path(folder, job.name).is_file() and job.name not in failed]
             made: list[str] = []
@@ -134,72 +134,6 @@ def shard(jobs: tuple[Job, ...], part: tuple[int, int] | None) -> list[Job]:
     if not 1 <= i <= n:
         raise ValueError(f"shard {i}/{n}: expected i/n with 1 <= i <= n, as in --shard 7/100")
     return list(jobs[i - 1 :: n])
-
-
-def repair(folder: Path, jobs: list[Job]) -> tuple[str, ...]:
-    """Check the finished jobs and take back those with damage, so that they are made again; returns the problems.
-
-    A damaged stream is drawn again, a damaged record written again, without rendering; anything else is rendered again.
-    What `qsim sense` added to a clip that goes, goes with it, and is named.
-    """
-    entries = Dataset.open(folder).meta["jobs"]
-    checked = [_damage(folder, job, entries[job.name]) for job in jobs if record_path(folder, job.name).is_file()]
-    taken = [damage for damage in checked if damage.problems]
-    for damage in taken:  # before anything is deleted
-        clip = folder / "clips" / damage.job.name
-        if clip.is_symlink() and not damage.light:
-            raise ValueError(
-                f"{damage.problems[0]}; {clip} is a symbolic link to {os.readlink(clip)}, and --repair replaces no "
-                "links: move the folder back, or delete the link to have the clip made here"
-            )
-    return tuple(line for damage in taken for line in _take_back(folder, damage))
-
-
-@dataclass(frozen=True)
-class _Damage:
-    """What is wrong with a finished job."""
-
-    job: Job
-    problems: list[str]
-    paths: set[Path]  # the damaged files
-    light: bool  # mended without rendering: only streams, or only the record
-
-
-def _damage(folder: Path, job: Job, entry: dict[str, Any]) -> _Damage:
-    expected = entry | {"digest": job.digest, "split": job.split}
-    problems = verify_job(folder, job.name, expected)
-    record, clip = record_path(folder, job.name), folder / "clips" / job.name
-    damaged = {Path(problem.split(": ")[0]) for problem in problems}
-    if record in damaged:
-        light = damaged == {record} and _vouched_for(job, clip, expected.get("record"))
-    else:
-        light = all(path.parent == clip / "streams" for path in damaged)
-    return _Damage(job, problems, damaged, light)
-
-
-def _take_back(folder: Path, damage: _Damage) -> list[str]:
-    """Delete the record and what is damaged; returns the problems and what else is gone."""
-    record, clip = record_path(folder, damage.job.name), folder / "clips" / damage.job.name
-    streams, wanted = clip / "streams", {sensing.stream_name for sensing in damage.job.streams}
-    record.unlink()
-    lost = damage.paths if damage.light else set(streams.glob("*.json"))
-    added = sorted({path.stem for path in lost if path.parent == streams} - wanted)
-    if damage.light:
-        for path in damage.paths - {record}:
-            path.with_suffix(".json").unlink(missing_ok=True)
-            path.with_suffix(".npy").unlink(missing_ok=True)
-    elif clip.exists():
-        files.remove_folder(clip)
-    gone = [f"{streams / name}.npy: was added by `qsim sense` and is gone; sense it again" for name in added]
-    return damage.problems + gone
-
-
-def _vouched_for(job: Job, clip: Path, digest: str | None) -> bool:
-    """Whether a clip would get the record that the manifest knows."""
-    try:
-        return files.sha256(files.to_json(make_record(job, clip))) == digest
-    except FileNotFoundError:
-        return False
 
 
 def frames_done(folder: Path, jobs: list[Job]) -> int:

@@ -89,7 +89,6 @@ STILL_LONG: set[str] = {
     "qsim.calibration.qis",
     "qsim.clip.stream",
     "qsim.clip.writer",
-    "qsim.dataset.generation",
     "qsim.files",
     "qsim.formats.video",
     "qsim.rendering.renderer",

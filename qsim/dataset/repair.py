@@ -1,0 +1,79 @@
+"""Takes back the finished jobs of a data set whose files are damaged, so that they are done again."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from qsim import files
+from qsim.dataset.dataset import Dataset, verify_job
+from qsim.dataset.job import Job
+from qsim.dataset.job_runner import make_record, record_path
+
+
+def repair_jobs(folder: Path, jobs: list[Job]) -> tuple[str, ...]:
+    """Check the finished jobs and take back those with damage, so that they are made again; returns the problems.
+
+    A damaged stream is drawn again, a damaged record written again, without rendering; anything else is rendered again.
+    What `qsim sense` added to a clip that goes, goes with it, and is named.
+    """
+    entries = Dataset.open(folder).meta["jobs"]
+    checked = [_damage(folder, job, entries[job.name]) for job in jobs if record_path(folder, job.name).is_file()]
+    taken = [damage for damage in checked if damage.problems]
+    for damage in taken:  # before anything is deleted
+        clip = folder / "clips" / damage.job.name
+        if clip.is_symlink() and not damage.light:
+            raise ValueError(
+                f"{damage.problems[0]}; {clip} is a symbolic link to {os.readlink(clip)}, and --repair replaces no "
+                "links: move the folder back, or delete the link to have the clip made here"
+            )
+    return tuple(line for damage in taken for line in _take_back(folder, damage))
+
+
+@dataclass(frozen=True)
+class _Damage:
+    """What is wrong with a finished job."""
+
+    job: Job
+    problems: list[str]
+    paths: set[Path]  # the damaged files
+    light: bool  # mended without rendering: only streams, or only the record
+
+
+def _damage(folder: Path, job: Job, entry: dict[str, Any]) -> _Damage:
+    expected = entry | {"digest": job.digest, "split": job.split}
+    problems = verify_job(folder, job.name, expected)
+    record, clip = record_path(folder, job.name), folder / "clips" / job.name
+    damaged = {Path(problem.split(": ")[0]) for problem in problems}
+    if record in damaged:
+        light = damaged == {record} and _vouched_for(job, clip, expected.get("record"))
+    else:
+        light = all(path.parent == clip / "streams" for path in damaged)
+    return _Damage(job, problems, damaged, light)
+
+
+def _take_back(folder: Path, damage: _Damage) -> list[str]:
+    """Delete the record and what is damaged; returns the problems and what else is gone."""
+    record, clip = record_path(folder, damage.job.name), folder / "clips" / damage.job.name
+    streams, wanted = clip / "streams", {sensing.stream_name for sensing in damage.job.streams}
+    record.unlink()
+    lost = damage.paths if damage.light else set(streams.glob("*.json"))
+    added = sorted({path.stem for path in lost if path.parent == streams} - wanted)
+    if damage.light:
+        for path in damage.paths - {record}:
+            path.with_suffix(".json").unlink(missing_ok=True)
+            path.with_suffix(".npy").unlink(missing_ok=True)
+    elif clip.exists():
+        files.remove_folder(clip)
+    gone = [f"{streams / name}.npy: was added by `qsim sense` and is gone; sense it again" for name in added]
+    return damage.problems + gone
+
+
+def _vouched_for(job: Job, clip: Path, digest: str | None) -> bool:
+    """Whether a clip would get the record that the manifest knows."""
+    try:
+        return files.sha256(files.to_json(make_record(job, clip))) == digest
+    except FileNotFoundError:
+        return False
