@@ -5,64 +5,92 @@ The names of `__all__` are all that a notebook needs; each is imported when it i
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from qsim.files import VERSION as __version__
+from qsim.files import lazy_names
 
 if TYPE_CHECKING:
-    from qsim.clip.clip import Clip, ClipWriter
-    from qsim.clip.stream import Sensing, Stream, sense
+    from qsim.calibration.qis import calibrate_qis
+    from qsim.calibration.spad import calibrate_spad
+    from qsim.clip.clip import Clip
+    from qsim.clip.stream import Sensing, Stream, replay, sense
+    from qsim.clip.writer import ClipWriter
     from qsim.dataset.dataset import Dataset
     from qsim.keys import Key
     from qsim.optics.camera import Camera
+    from qsim.optics.radiometry import expected_photons
+    from qsim.rendering.budget import Budget
+    from qsim.rendering.clip_rendering import render_clip
+    from qsim.rendering.fidelity import choose as choose_budget
     from qsim.rendering.mitsuba_xml import read_mitsuba
+    from qsim.rendering.renderer import Renderer
     from qsim.scene.scene import Scene
     from qsim.sensor.counting import CountingSPAD
+    from qsim.sensor.devices import load as load_sensor
+    from qsim.sensor.packing import pack, unpack
     from qsim.sensor.qis import QIS
     from qsim.sensor.sensor import Sensor
     from qsim.sensor.spad import BinarySPAD
 
-__version__ = "0.1.0"
-
 _HOMES = {
     "BinarySPAD": "sensor.spad",
     "Camera": "optics.camera",
+    "Budget": "rendering.budget",
     "Clip": "clip.clip",
     "ClipWriter": "clip.writer",
     "CountingSPAD": "sensor.counting",
     "Dataset": "dataset.dataset",
     "Key": "keys",
     "QIS": "sensor.qis",
+    "Renderer": "rendering.renderer",
     "Scene": "scene.scene",
     "Sensing": "clip.stream",
     "Sensor": "sensor.sensor",
     "Stream": "clip.stream",
     "read_mitsuba": "rendering.mitsuba_xml",
+    "calibrate_qis": "calibration.qis",
+    "calibrate_spad": "calibration.spad",
+    "choose_budget": "rendering.fidelity:choose",
+    "expected_photons": "optics.radiometry",
+    "load_sensor": "sensor.devices:load",
+    "pack": "sensor.packing",
+    "render_clip": "rendering.clip_rendering",
+    "replay": "clip.stream",
     "sense": "clip.stream",
+    "unpack": "sensor.packing",
 }
 
 __all__ = [
     "QIS",
     "BinarySPAD",
+    "Budget",
     "Camera",
     "Clip",
     "ClipWriter",
     "CountingSPAD",
     "Dataset",
     "Key",
+    "Renderer",
     "Scene",
     "Sensing",
     "Sensor",
     "Stream",
+    "__version__",
+    "calibrate_qis",
+    "calibrate_spad",
+    "choose_budget",
+    "expected_photons",
+    "load_sensor",
+    "pack",
     "read_mitsuba",
+    "render_clip",
+    "replay",
     "sense",
+    "unpack",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'qsim' has no attribute {name!r}")
-    from importlib import import_module
-
-    return getattr(import_module(f"qsim.{_HOMES[name]}"), name)
+__getattr__ = lazy_names(__name__, _HOMES)
 
 
 def __dir__() -> list[str]:

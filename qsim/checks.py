@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 SPLITS = ("train", "val", "test")
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")  # of clips and streams: a safe file name
+MAX_PIXELS = 1 << 26  # of one frame: 8192 x 8192
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
     """` (did you mean '...'?)`, or nothing if no known word is close."""
     close = difflib.get_close_matches(word, list(known), n=1)
     return f" (did you mean '{close[0]}'?)" if close else ""
-
-
-def check_name(name: Any) -> str:
-    """A stream or clip name that is also a safe file name, else `ValueError`."""
-    if not isinstance(name, str) or not NAME.fullmatch(name):
-        raise ValueError(f"name {name!r:.80}: use letters, digits, '.', '_' and '-' only, as in fan_03 or qis-3bit")
-    return name
 
 
 def text(value: Any) -> str:
@@ -129,3 +124,23 @@ def list_of(check: Callable[[Any], Any]) -> Callable[[Any], list[Any]]:
         return values
 
     return checked
+
+
+def require_finite(name: str, values: np.ndarray) -> None:
+    """`ValueError` that names the first value which is not finite, and its index."""
+    bad = np.argwhere(~np.isfinite(values))
+    if len(bad):
+        index = tuple(int(i) for i in bad[0])
+        raise ValueError(f"{name}: {values[index]} at index {index}; every value must be finite")
+
+
+def check_shape(path: Path, shape: tuple[int, ...]) -> tuple[int, int, int]:
+    """(T, H, W) if there is at least one frame of a sane size, else `ValueError`."""
+    if len(shape) != 3:
+        raise ValueError(f"{path}: expected frames [T, H, W], found an array of shape {list(shape)}")
+    frames, height, width = (int(n) for n in shape)
+    if frames < 1:
+        raise ValueError(f"{path}: has no frames")
+    if not (0 < height * width <= MAX_PIXELS and height > 0):
+        raise ValueError(f"{path}: frames of {height} x {width} pixels; between 1 and {MAX_PIXELS} pixels are read")
+    return frames, height, width

@@ -5,18 +5,64 @@ All take stacks or single frames [..., H, W] and return uint8 [..., H, W] or [..
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+TRANSFERS = ("linear", "srgb", "gamma 2.2")
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue: ITU-R BT.709
 GAMMA = 2.2  # the one tone curve of every picture
 AVERAGE = 11  # frames of a plain average, the window of QUIVER
 
 
-def peak(stack: NDArray[np.floating]) -> float:
-    """The white of a clip's pictures: the 99.9th percentile of its finite values (1 for a black clip)."""
-    finite = stack[np.isfinite(stack)]
+def to_linear(values: NDArray[Any], transfer: str, top: float) -> NDArray[Any]:
+    """Linear light, float32 in 0..1, from coded values 0 ... top (IEC 61966-2-1 for srgb)."""
+    coded = np.asarray(values, np.float32) / np.float32(top)
+    if transfer == "linear":
+        return coded
+    if transfer == "gamma 2.2":
+        return coded**2.2
+    if transfer == "srgb":
+        return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    raise ValueError(f"transfer {transfer!r}: known are {', '.join(TRANSFERS)}")
+
+
+def from_linear(light: NDArray[Any], transfer: str, top: int) -> NDArray[Any]:
+    """Coded values 0 ... top, rounded, of linear light in 0..1 (clipped): the inverse of `to_linear`."""
+    light = np.clip(np.asarray(light, np.float64), 0, 1)
+    if transfer == "linear":
+        coded = light
+    elif transfer == "gamma 2.2":
+        coded = light ** (1 / 2.2)
+    elif transfer == "srgb":
+        coded = np.where(light <= 0.04045 / 12.92, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
+    else:
+        raise ValueError(f"transfer {transfer!r}: known are {', '.join(TRANSFERS)}")
+    return np.rint(coded * top).astype(np.uint8 if top < 256 else np.uint16)
+
+
+def luminance(rgb: NDArray[Any]) -> NDArray[Any]:
+    """Rec. 709 luminance [...] of linear colours [..., 3], in the precision of the input."""
+    return rgb @ LUMINANCE.astype(rgb.dtype if rgb.dtype.kind == "f" else np.float64)
+
+
+def peak(image: NDArray[np.floating]) -> float:
+    """The peak of an image, a clip or a sample of one: the 99.9th percentile of its finite values; 1 if that is 0.
+
+    The caller's docstring says whose peak it is: of a frame, of some frames of a clip, of a reference.
+    """
+    finite = image[np.isfinite(image)]
     value = float(np.percentile(finite, 99.9)) if finite.size else 0.0
     return value if value > 0 else 1.0
+
+
+def psnr(peak: float, rms: float) -> float:
+    """PSNR [dB] of an rms error below a peak, both in one unit: infinite without error, -infinite without a peak."""
+    if rms <= 0:
+        return math.inf
+    return 20 * math.log10(peak / rms) if peak > 0 else -math.inf
 
 
 def tone(linear: NDArray[np.floating], peak: float) -> NDArray[np.uint8]:

@@ -1,7 +1,6 @@
-"""Files that are either whole or absent: temporary names, sync, rename, checksums, locks.
+"""Reads and writes files: atomic writes (temporary file, fsync, rename), checksums, JSON, TOML and arrays.
 
     write_bytes / write_json:  NAME.tmp-PID -> fsync -> rename, so that a killed writer leaves nothing a reader accepts.
-    Lock:                      an advisory lock that the system releases when its holder dies.
 
 Every file that `qsim` makes goes through here, which is also where tests inject a full disk.
 """
@@ -10,24 +9,37 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
+import gzip
 import hashlib
 import json
 import os
 import re
 import shutil
-import tomllib
+import warnings
 from collections.abc import Callable, Iterator
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO
 
+import numpy as np
+
+from qsim.parsing import parse_json, parse_toml
+
+Progress = Callable[[int, int], None]  # is called with (done, total)
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")  # of clips and streams: a safe file name
 FULL = (errno.ENOSPC, errno.EDQUOT)  # of an `OSError`: no space left
-LARGEST = 1 << 64  # whole numbers in files stay below: seeds and keys have 64 bits
-DEEPEST = 64  # levels of nesting in a file
-_TOO_LARGE = "a whole number of more than 64 bits"
-_TOO_DEEP = f"nested more than {DEEPEST} levels deep"
+
+
+def _version() -> str:
+    """The version of the installed package, or of the source tree that is used without installation."""
+    try:
+        return metadata.version("qsim")
+    except metadata.PackageNotFoundError:
+        project = Path(__file__).parents[1] / "pyproject.toml"
+        return str(parse_toml(project, project.read_text(encoding="utf-8"))["project"]["version"])
+
+
+VERSION = _version()
 
 
 def sha256(source: bytes | memoryview | Path) -> str:
@@ -123,7 +135,7 @@ def wording(error: BaseException) -> str:
 _LEFTOVER = re.compile(r"(.+)\.(?:tmp|removed)-\d+", re.DOTALL)
 
 
-def sweep(path: Path) -> None:
+def remove_leftovers(path: Path) -> None:
     """Delete what killed writers of `path` left beside it: NAME.tmp-PID and NAME.removed-PID, of this exact NAME.
 
     Only for a caller who holds the lock that all writers of `path` take.
@@ -134,7 +146,7 @@ def sweep(path: Path) -> None:
             _remove(leftover)
 
 
-def sweep_below(folder: Path) -> None:
+def remove_leftovers_below(folder: Path) -> None:
     """Delete every temporary file in `folder` and below; for a caller who is the only writer there."""
     for leftover in list(folder.rglob("*.tmp-*")):
         if _LEFTOVER.fullmatch(leftover.name):
@@ -205,94 +217,13 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     return parse_toml(path, text)
 
 
-def parse_toml(path: Path, text: str) -> dict[str, Any]:
-    """The tables of a TOML text; `ValueError` as `FILE:LINE: ...` if it is not TOML, nests deeply or counts too far."""
-    if re.search(
-        rf"(?<![\w\"'.-])(?:[\w\"'-]+[ \t]*\.[ \t]*){{{DEEPEST}}}", text
-    ):  # the parser takes quadratic time for these
-        raise ValueError(f"{path}:{_line_of_depth(text)}: not valid TOML: {_TOO_DEEP}")
-    try:
-        value = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        found = re.search(r"at line (\d+)", str(error))
-        line = found[1] if found else len(text.splitlines())  # else the parser says "at end of document"
-        raise ValueError(f"{path}:{line}: not valid TOML: {error}") from None
-    except RecursionError:
-        raise ValueError(f"{path}:{_line_of_depth(text)}: not valid TOML: {_TOO_DEEP}") from None
-    except ValueError:  # of `int` for thousands of digits
-        raise ValueError(f"{path}:{_line_of_number(text)}: not valid TOML: {_TOO_LARGE}") from None
-    if problem := _too_much(value, text, infinite=True):  # which TOML can spell; each key's check refuses it
-        raise ValueError(f"{path}:{problem[0]}: not valid TOML: {problem[1]}")
-    return value
-
-
 def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; `ValueError` with the file's name if it is damaged or not an object.
-
-    NaN, infinity, whole numbers beyond 64 bits and deep nesting are refused: nothing of ours writes them.
-    """
+    """The object in a JSON file; `ValueError` as `parse_json`, also for what is not text."""
     try:
         text = path.read_text(encoding="utf-8")
-        value = json.loads(text, parse_constant=_no_constant)
-        problem = _too_much(value, text)
-    except RecursionError:
-        problem, value = (_line_of_depth(text), _TOO_DEEP), None
-    except (json.JSONDecodeError, UnicodeDecodeError, _NotFinite) as error:
+    except UnicodeDecodeError as error:
         raise ValueError(f"{path}: not readable as JSON ({error}); the file is damaged, make it again") from None
-    except ValueError:  # of `int` for thousands of digits
-        problem, value = (_line_of_number(text), _TOO_LARGE), None
-    if problem:
-        raise ValueError(
-            f"{path}: not readable as JSON ({problem[1]} in line {problem[0]}); the file is damaged, make it again"
-        )
-    if not isinstance(value, dict):
-        raise ValueError(f"{path}: expected a JSON object, found a {type(value).__name__}")
-    return value
-
-
-class _NotFinite(ValueError):
-    """NaN or infinity in JSON."""
-
-
-def _no_constant(name: str) -> float:
-    raise _NotFinite(f"{name} where a number is needed")
-
-
-def _too_much(value: Any, text: str, infinite: bool = False) -> tuple[int, str] | None:
-    """(line, problem) of the first value that is nested too deeply or too large; None if there is none."""
-    waiting: list[tuple[Any, int]] = [([value], 0)]
-    while waiting:
-        item, depth = waiting.pop()
-        for inner in item.values() if isinstance(item, dict) else item:
-            if isinstance(inner, dict | list):
-                if depth == DEEPEST:
-                    return _line_of_depth(text), _TOO_DEEP
-                waiting.append((inner, depth + 1))
-            elif isinstance(inner, int) and abs(inner) >= LARGEST:
-                return _line_of_number(text), _TOO_LARGE
-            elif isinstance(inner, float) and not infinite and abs(inner) == float("inf"):
-                return 1, "a number of more than 1e308"
-    return None
-
-
-def _line_of_depth(text: str) -> int:
-    """The first line that nests too deeply, by brackets or by dots; 1 if none is found."""
-    depth = 0
-    for n, line in enumerate(text.splitlines(), 1):
-        bare = re.sub(r'"(?:\\.|[^"\\])*"', "", line)
-        if len(re.findall(r"[\w\"'-]\s*\.", line)) >= DEEPEST:
-            return n
-        for sign in bare:
-            depth += (sign in "[{") - (sign in "]}")
-            if depth > DEEPEST:
-                return n
-    return 1
-
-
-def _line_of_number(text: str) -> int:
-    """The line of the first whole number of more than 18 digits; 1 if none is found."""
-    digits = r"(?<![\w\"'.])(?:0[xob][0-9A-Fa-f_]{16,}|[0-9][0-9_]{18,})(?![\w\"'.])"
-    return next((n for n, line in enumerate(text.splitlines(), 1) if re.search(digits, line)), 1)
+    return parse_json(path, text)
 
 
 def check_version(path: Path, found: object, known: int) -> None:
@@ -333,75 +264,84 @@ def remove_folder(folder: Path) -> None:
     shutil.rmtree(doomed)
 
 
-class Lock:
-    """An exclusive or shared advisory lock on a file; the system frees it when the process ends, however it ends.
-
-    `acquire` returns False when another process holds it and `wait` is False.
-    """
-
-    def __init__(self, path: Path, *, shared: bool = False) -> None:
-        self.path = path
-        self.mode = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
-        self._file: BinaryIO | None = None
-
-    def acquire(self, *, wait: bool = False, on_wait: Callable[[], None] | None = None) -> bool:
-        """Take the lock. With `wait`, `on_wait` is called once before waiting for another holder."""
-        while True:
-            # Open as long as the lock is held; for reading too, because NFS wants that for a shared lock.
-            file = open(self.path, "a+b")  # noqa: SIM115
-            try:
-                try:
-                    fcntl.flock(file, self.mode | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    if not wait:
-                        file.close()
-                        return False
-                    if on_wait is not None:
-                        on_wait()
-                        on_wait = None
-                    fcntl.flock(file, self.mode)
-                if self._is_current(file):
-                    self._file = file
-                    return True
-            except BaseException:
-                file.close()
-                raise
-            file.close()  # its holder deleted it: the lock is on another file by now
-
-    def _is_current(self, file: BinaryIO) -> bool:
-        """Whether the opened file is still the one of that name."""
-        try:
-            return os.path.samestat(os.fstat(file.fileno()), os.stat(self.path))
-        except FileNotFoundError:
-            return False
-
-    def delete(self) -> None:
-        """Delete the lock's file and give the lock back; who waits for it takes a new one."""
-        if self._file is not None:
-            self.path.unlink(missing_ok=True)
-        self.release()
-
-    def release(self) -> None:
-        """Give the lock back; harmless if it is not held."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
-
-    def __enter__(self) -> Lock:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.release()
-
-
 def lazy_names(package: str, homes: dict[str, str]) -> Callable[[str], Any]:
-    """`__getattr__` of a package that imports each public name from its module when it is first asked for."""
+    """Return the `__getattr__` of a package that imports each public name from its module when it is first used.
+
+    `homes` maps names to modules; "module:other" if the name is `other` there.
+    """
 
     def get(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(f"{package}.{homes[name]}"), name)
+        module, _, other = homes[name].partition(":")
+        return getattr(import_module(f"{package}.{module}"), other or name)
 
     return get
+
+
+def check_name(name: Any) -> str:
+    """A stream or clip name that is also a safe file name, else `ValueError`."""
+    if not isinstance(name, str) or not NAME.fullmatch(name):
+        raise ValueError(f"name {name!r:.80}: use letters, digits, '.', '_' and '-' only, as in fan_03 or qis-3bit")
+    return name
+
+
+@contextlib.contextmanager
+def decoding_errors(path: Path, what: str) -> Iterator[None]:
+    """Turn whatever a decoder raises or warns about into one `ValueError`; a missing file stays `FileNotFoundError`."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            yield
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path}: no such file") from None
+    except Exception as error:  # decoders raise what they like: tokenizer, zlib, struct and their own errors
+        text = " ".join(str(error).split())
+        if text.startswith(str(path)):
+            raise ValueError(text) from None
+        raise ValueError(f"{path}: not readable as {what} ({text or type(error).__name__})") from None
+
+
+def load_array(path: Path) -> np.ndarray:
+    """A .npy array of numbers as a memory map, or a .npy.gz in memory.
+
+    `FileNotFoundError` or `ValueError` for another kind of file, objects, a number without axes, lying headers.
+    """
+    if path.suffix == ".gz":
+        with decoding_errors(path, "gzipped .npy"), gzip.open(path, "rb") as packed:
+            return _read_npy(path, packed)
+    with decoding_errors(path, ".npy"):
+        with open(path, "rb") as file:
+            if file.read(2) == b"PK":
+                raise ValueError(f"{path}: is an archive (.npz) under another name; save the array alone with np.save")
+        array = np.lib.format.open_memmap(path, mode="r")
+        if array.ndim == 0:
+            raise ValueError(f"{path}: a single number without axes; an array is expected")
+        if array.dtype.hasobject or array.dtype.kind not in "buif":
+            raise ValueError(f"{path}: an array of {array.dtype}; numbers are expected")
+        if array.ndim and array.nbytes + 64 > path.stat().st_size:
+            raise ValueError(f"{path}: the header promises {array.nbytes} bytes, the file has {path.stat().st_size}")
+        return array
+
+
+def _read_npy(path: Path, file: gzip.GzipFile | BinaryIO) -> np.ndarray:
+    """An array from a stream; memory grows with what is really there, not with what the header says."""
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0), (3, 0)):
+        raise ValueError(f"{path}: version {version} of .npy is not known")
+    reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = reader(file)
+    if fortran or dtype.hasobject or dtype.kind not in "buif":
+        raise ValueError(
+            f"{path}: {dtype} in column order; only numbers in row order are read" if fortran else f"{path}: {dtype}"
+        )
+    if not shape:
+        raise ValueError(f"{path}: a single number without axes; an array is expected")
+    wanted = int(np.prod(shape, dtype=object)) * dtype.itemsize
+    content = bytearray()
+    while len(content) < wanted:
+        block = file.read(min(1 << 24, wanted - len(content)))
+        if not block:
+            raise ValueError(f"{path}: the header promises {wanted} bytes, the file has {len(content)}")
+        content += block
+    return np.frombuffer(content, dtype).reshape(shape)

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qsim.checks import NAME, SPLITS
+from qsim.checks import SPLITS
+from qsim.files import NAME
 
 SMALLEST, LARGEST = 1e-30, 1e30  # of numbers above 0 in SI units: whatever lies outside overflows in the next product
 

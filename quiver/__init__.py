@@ -5,20 +5,24 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from qsim.files import lazy_names
 
 if TYPE_CHECKING:
+    from quiver.model.quiver import QUIVER
+    from quiver.model.weights import from_published
     from quiver.restoration.api import restore
 
-__all__ = ["restore"]
+_HOMES = {
+    "QUIVER": "model.quiver",
+    "from_published": "model.weights",
+    "restore": "restoration.api",
+}
 
+__all__ = ["QUIVER", "from_published", "restore"]
 
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module 'quiver' has no attribute {name!r}")
-    from quiver.restoration import api
-
-    return getattr(api, name)
+__getattr__ = lazy_names(__name__, _HOMES)
 
 
 def __dir__() -> list[str]:

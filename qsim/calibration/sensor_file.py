@@ -21,8 +21,9 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.calibration.frame_statistics import Stack, measure, measure_sums
 from qsim.calibration.results import Calibration
+from qsim.files import load_array
 from qsim.formats import importing
-from qsim.formats.array_files import load_npy, mat_array
+from qsim.formats.array_files import mat_array
 from qsim.formats.recording import Hints
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
@@ -75,7 +76,7 @@ def read_counts(path: Path, variable: str | None = None) -> Array:
         return mat_array(path, variable)
     if variable is not None:
         raise ValueError(f"{path}: --variable names an array of a .mat file; leave it out")
-    array = load_npy(path)
+    array = load_array(path)
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or array.size == 0:
         raise ValueError(f"{path}: expected frames [T, H, W], found shape {list(array.shape)}")

@@ -21,8 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from qsim.checks import suggest
-from qsim.clip import stream
-from qsim.files import FULL, wording
+from qsim.files import FULL, Progress, wording
 
 GOES_ON = "the same command goes on where it stopped"
 STARTS_AGAIN = "nothing half-written is left; run the same command again"
@@ -273,7 +272,7 @@ def refuse_existing(path: Path, force: bool) -> None:
 
 
 @contextlib.contextmanager
-def bar(label: str, unit: str = "frame") -> Iterator[stream.Progress]:
+def bar(label: str, unit: str = "frame") -> Iterator[Progress]:
     """A progress bar with rate and time left on stderr, shown after two seconds; call it with (done, total)."""
     from tqdm import tqdm
 

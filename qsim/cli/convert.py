@@ -111,7 +111,7 @@ def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
         for n, clip in enumerate(clips, 1):
             split = clip.meta.get("split")  # it becomes a folder, and the name a file
             folder = args.output / ("all" if split is None else checks.split(split))
-            target = folder / f"{checks.check_name(clip.name)}{suffix}"
+            target = folder / f"{files.check_name(clip.name)}{suffix}"
             made.append(exporting.described(clip, target, wanted, force=args.force))
             progress(n, len(clips))
     return made
@@ -125,7 +125,7 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
                   args.stretched, args.variable, args.white)  # fmt: skip
     capture = importing.Capture(args.frame_rate, args.exposure, args.sensor, args.ppp, args.split)
     found = importing.recordings(args.input, args.layout)
-    pairs = [(source, args.output / checks.check_name(_flat_name(source, args.input))) for source in found]
+    pairs = [(source, args.output / files.check_name(_flat_name(source, args.input))) for source in found]
     made = []
     with bar("converting") as progress:
         for source, target in pairs or [(args.input, args.output)]:

@@ -15,7 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from qsim import __version__, checks
+from qsim import checks
 from qsim.cli.calibrate import add_calibrate
 from qsim.cli.completion import add_completion
 from qsim.cli.console import EXTRAS, GOES_ON, Parser, bar, checked, command, note, output, refuse_idle, run
@@ -24,12 +24,13 @@ from qsim.cli.dataset import add_check, add_generate, add_plan
 from qsim.cli.look import add_preview, add_report
 from qsim.cli.tradeoff import add_tradeoff
 from qsim.cli.validate import add_validate
+from qsim.files import VERSION
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; returns the exit code."""
     parser = Parser(prog="qsim", description="Render moving scenes and turn them into few-bit quanta-sensor streams.")
-    parser.add_argument("--version", action="version", version=f"qsim {__version__}")
+    parser.add_argument("--version", action="version", version=f"qsim {VERSION}")
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
     for add in (
         _add_doctor,

@@ -24,8 +24,9 @@ from numpy import ndarray as Array
 
 from qsim import files, structure
 from qsim.clip import exr
-from qsim.clip.stream import Progress, Stream, check_crop, write_stream
+from qsim.clip.stream import Stream, check_crop, write_stream
 from qsim.clip.writer import FORMAT_VERSION, PHYSICAL, RELATIVE, TRUTH, ClipWriter, camera_of
+from qsim.files import Progress
 from qsim.optics import radiometry
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.formats.recording import reading
+from qsim.files import decoding_errors
 
 MAGIC = bytes((0x76, 0x2F, 0x31, 0x01)) + struct.pack("<i", 2)
 _PIXEL_TYPES = {np.dtype("<u4"): 0, np.dtype("<f2"): 1, np.dtype("<f4"): 2}
@@ -90,7 +90,7 @@ def read(path: Path, size: tuple[int, int] | None = None) -> dict[str, Array]:
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; the clip is damaged, run `qsim check`")
-    with reading(path, "OpenEXR; the file is damaged, run `qsim check`"):
+    with decoding_errors(path, "OpenEXR; the file is damaged, run `qsim check`"):
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             header = dict(file.header())  # a copy: closing empties it
             names = [channel.name for channel in header["channels"]]

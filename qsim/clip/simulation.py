@@ -21,7 +21,8 @@ from qsim.sensor import packing
 
 if TYPE_CHECKING:
     from qsim.clip.clip import Clip
-    from qsim.clip.stream import Progress, Sensing, Stream
+    from qsim.clip.stream import Sensing, Stream
+    from qsim.files import Progress
     from qsim.keys import Key
     from qsim.sensor.defects.defect_table import Flawed, Flaws, Light
     from qsim.sensor.defects.event_simulation import Effects

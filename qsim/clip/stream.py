@@ -22,10 +22,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import __version__, files, structure
-from qsim.checks import check_name as check_name
+from qsim import files, locks, structure
 from qsim.clip.simulation import Draw, prepare, stored
-from qsim.formats import array_files
+from qsim.files import VERSION, Progress, check_name
 from qsim.optics import radiometry
 from qsim.sensor import packing
 
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
 
 FORMAT_VERSION = 1
 _DAMAGED = "the file is damaged, sense again with --force"
-
-Progress = Callable[[int, int], None]  # (frames done, frames in all)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +129,7 @@ class Stream:
         expected = (frames, height, packing.packed_width(width, self.bits))
         if not self.path.is_file():
             raise FileNotFoundError(f"{self.path}: no such file, though its json is there; sense again with --force")
-        array = array_files.load_npy(self.path)
+        array = files.load_array(self.path)
         if array.shape != expected or array.dtype != np.uint8:
             raise ValueError(
                 f"{self.path}: expected uint8 {list(expected)}, found {array.dtype} {list(array.shape)}; "
@@ -216,7 +213,7 @@ def writing(clip: Clip, on_wait: Callable[[], None] | None = None) -> Iterator[N
     """One process at a time writes streams of a clip; the others wait, after a call of `on_wait`."""
     folder = clip.path / "streams"
     folder.mkdir(exist_ok=True)
-    lock = files.Lock(folder / "lock")
+    lock = locks.Lock(folder / "lock")
     lock.acquire(wait=True, on_wait=on_wait)
     try:
         yield
@@ -226,7 +223,7 @@ def writing(clip: Clip, on_wait: Callable[[], None] | None = None) -> Iterator[N
 
 def _tidy(clip: Clip) -> None:
     """Delete the lock of a writer that was killed between writing its stream and deleting it."""
-    lock = files.Lock(clip.path / "streams" / "lock")
+    lock = locks.Lock(clip.path / "streams" / "lock")
     with contextlib.suppress(OSError):  # a folder that may only be read
         if lock.path.exists() and lock.acquire():
             lock.delete()
@@ -240,7 +237,7 @@ def _write(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor, meta:
     folder = clip.path / "streams"
     json_path, path = folder / f"{check_name(name)}.json", folder / f"{name}.npy"
     for file in (json_path, path):
-        files.sweep(file)
+        files.remove_leftovers(file)
     done, digest = 0, hashlib.sha256()
     with files.replacing_described(path, json_path) as (stored, described):
         head = _header(frames, height, row)
@@ -265,7 +262,7 @@ def _write(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor, meta:
             "sensor": sensor.to_dict(),
             "planes_per_code": 1,
             "sha256": digest.hexdigest(),
-            "software": {"qsim": __version__},
+            "software": {"qsim": VERSION},
         } | meta
         full["shape"] = [frames, height, width]
         described.write(files.to_json(files.sealed(full)))

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import __version__, files
-from qsim.checks import check_name
+from qsim import files, locks
 from qsim.clip import clamped_error, exr
+from qsim.files import VERSION, check_name
 from qsim.optics import radiometry
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class ClipWriter:
         self._camera = camera_of(self.meta, self.path)
         self._frames: dict[int, dict[str, Any]] = {}
         self._whole = False  # all frames and clip.json are there
-        self._lock = files.Lock(self.part / "lock")
+        self._lock = locks.Lock(self.part / "lock")
 
     def __enter__(self) -> ClipWriter:
         identity = files.to_json(self.meta)
@@ -96,8 +96,8 @@ class ClipWriter:
                 self._clear()
                 self._whole = False
                 files.write_bytes(begun, identity)
-            files.sweep_below(self.part)
-            files.sweep(self.path)  # a replacement cut short
+            files.remove_leftovers_below(self.part)
+            files.remove_leftovers(self.path)  # a replacement cut short
             self._frames = _read_journal(self.part)
         except BaseException:
             self._lock.release()
@@ -348,4 +348,4 @@ def _read_journal(part: Path) -> dict[int, dict[str, Any]]:
 @functools.cache
 def _software() -> dict[str, str]:
     versions = {name: importlib.metadata.version(name) for name in ("numpy", "mitsuba", "drjit")}
-    return {"qsim": __version__} | versions
+    return {"qsim": VERSION} | versions

@@ -13,11 +13,11 @@ from typing import Any
 from numpy import ndarray as Array
 
 from qsim import files, structure
+from qsim.checks import check_shape
 from qsim.clip.clip import Clip
-from qsim.clip.stream import Progress, Stream
+from qsim.clip.stream import Stream
 from qsim.dataset.dataset import Dataset
-from qsim.formats.array_files import load_npy
-from qsim.formats.recording import check_shape
+from qsim.files import Progress, load_array
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Restored:
 
     def frames(self) -> Array:
         """The video as a memory map; `ValueError` if the file does not fit its description."""
-        array = load_npy(self.path)
+        array = load_array(self.path)
         check_shape(self.path, array.shape)
         if array.dtype.kind != "f" or self.meta.get("shape", list(array.shape)) != list(array.shape):
             raise ValueError(f"{self.path}: {array.dtype} {list(array.shape)} is not what its .json describes")

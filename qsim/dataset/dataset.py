@@ -16,10 +16,10 @@ from typing import Any
 
 from qsim import files, structure
 from qsim.clip.clip import Clip
-from qsim.clip.stream import Progress
 from qsim.dataset.job import Job
 from qsim.dataset.job_runner import make_record, record_path
 from qsim.dataset.recipe import SPLITS
+from qsim.files import Progress
 
 FORMAT_VERSION = 1
 

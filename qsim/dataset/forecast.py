@@ -24,6 +24,7 @@ from qsim.dataset import job_runner
 from qsim.dataset.job import Job
 from qsim.dataset.recipe import Recipe
 from qsim.dataset.worker_pool import Limits
+from qsim.files import Progress
 from qsim.rendering.budget import Budget
 from qsim.rendering.denoiser import DENOISE_COST
 
@@ -144,7 +145,7 @@ def _machines(count: int) -> str:
     return f"{count} machine{'' if count == 1 else 's'}"
 
 
-def plan(recipe: Recipe, *, frames: int = 5, progress: stream.Progress | None = None) -> Plan:
+def plan(recipe: Recipe, *, frames: int = 5, progress: Progress | None = None) -> Plan:
     """Measure one job of each kind with so many frames (at least 2: the first one compiles)."""
     from qsim import backend as engine
 

@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from qsim import __version__, files
-from qsim.clip.stream import Progress
+from qsim import files
 from qsim.dataset.dataset import FORMAT_VERSION, Damaged, Dataset, unproven
 from qsim.dataset.job import Job
 from qsim.dataset.job_runner import (
@@ -31,6 +30,8 @@ from qsim.dataset.job_runner import (
 from qsim.dataset.recipe import Recipe
 from qsim.dataset.repair import repair_jobs
 from qsim.dataset.worker_pool import Limits, run_here, run_local
+from qsim.files import VERSION, Progress
+from qsim.locks import Lock
 
 Run = Callable[[list[Job], Path, Make], Generator[Result]]
 
@@ -150,10 +151,10 @@ def frames_done(folder: Path, jobs: list[Job]) -> int:
 
 def write_manifest(recipe: Recipe, folder: Path) -> None:
     """dataset.json from the recipe and the records that are there now."""
-    lock = files.Lock(folder / "locks" / "manifest")
+    lock = Lock(folder / "locks" / "manifest")
     lock.acquire(wait=True)
     with lock:
-        files.sweep(folder / "dataset.json")
+        files.remove_leftovers(folder / "dataset.json")
         jobs, failures = {}, _failures(folder, recipe.jobs)
         for job in recipe.jobs:
             entry: dict[str, Any] = {"split": job.split, "scene": job.scene, "digest": job.digest, "state": "missing"}
@@ -169,7 +170,7 @@ def write_manifest(recipe: Recipe, folder: Path) -> None:
             "splits": recipe.splits,
             "jobs": jobs,
             "complete": all(entry["state"] == "done" for entry in jobs.values()),
-            "software": {"qsim": __version__},
+            "software": {"qsim": VERSION},
         }
         files.write_description(folder / "dataset.json", manifest)
 
@@ -258,16 +259,16 @@ def _locked(folder: Path, options: Options) -> Iterator[None]:
     if folder.exists() and not _is_data_set(folder):
         raise ValueError(f"{folder}: is not empty and not a data set; use another folder")
     (folder / "locks").mkdir(parents=True, exist_ok=True)
-    locks = [files.Lock(folder / "locks" / "generate", shared=options.shard is not None)]
+    held = [Lock(folder / "locks" / "generate", shared=options.shard is not None)]
     if options.shard is not None:
-        locks.append(files.Lock(folder / "locks" / "shard-{}-of-{}".format(*options.shard)))
+        held.append(Lock(folder / "locks" / "shard-{}-of-{}".format(*options.shard)))
     try:
-        for lock in locks:
+        for lock in held:
             if not lock.acquire(wait=options.wait):
                 raise ValueError(f"{folder}: another generator is at work here; let it finish, or add --wait")
         yield
     finally:
-        for lock in locks:
+        for lock in held:
             lock.release()
 
 

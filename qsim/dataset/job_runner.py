@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qsim import files
+from qsim import files, locks
 from qsim.clip import stream
 from qsim.clip.clip import Clip
 from qsim.dataset.job import Job
@@ -132,7 +132,7 @@ def removed(folder: Path) -> str:
 
 def run_job(job: Job, folder: Path, make: Make = render_job) -> Result:
     """Do whatever of a job is not done yet. Failures are written to failed/ and returned, not raised."""
-    lock = files.Lock(folder / "locks" / job.name)
+    lock = locks.Lock(folder / "locks" / job.name)
     try:
         lock.acquire(wait=True)  # another process may still be dying over this job
         if record_path(folder, job.name).is_file():
@@ -162,7 +162,7 @@ def _do(job: Job, folder: Path, make: Make) -> Result:
     """Clip, streams, record: each whole before the next begins."""
     started, worked = time.monotonic(), time.process_time()
     for path in (record_path(folder, job.name), failure_path(folder, job.name), folder / "clips" / job.name):
-        files.sweep(path)
+        files.remove_leftovers(path)
     clip = _clip(job, folder, make)
     rendered = time.monotonic()
     for sensing in job.streams:

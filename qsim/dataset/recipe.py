@@ -35,10 +35,11 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks
-from qsim.clip.stream import Sensing, check_name
+from qsim.checks import MAX_PIXELS
+from qsim.clip.stream import Sensing
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe_toml import Section, Text
-from qsim.formats.recording import MAX_PIXELS
+from qsim.files import check_name
 
 SPLITS = checks.SPLITS
 MAX_STEM = 180  # characters of a scene's name: with seed, speed and a temporary ending it must be a file's name

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qsim import files
 from qsim.checks import suggest
+from qsim.parsing import parse_toml
 
 _NEEDED = object()  # the default of a key that has none
 
@@ -27,7 +27,7 @@ class Text:
 
     def content(self) -> dict[str, Any]:
         """What it says; `ValueError` as `FILE:LINE: ...` if it is no TOML."""
-        return files.parse_toml(self.path, self.text)
+        return parse_toml(self.path, self.text)
 
     def where(self, section: str | None, i: int, key: str | None = None) -> str:
         """`FILE:LINE` of a key in the i-th section of that name (of the section's head without a key)."""

@@ -11,9 +11,10 @@ from pathlib import Path
 
 from qsim.clip.clip import Clip
 from qsim.clip.simulation import stored
-from qsim.clip.stream import Progress, Stream
+from qsim.clip.stream import Stream
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.job_runner import record_path
+from qsim.files import Progress
 
 PROMISED = 5e-6  # share of codes in which the compiled engine may differ from the reference
 _BLOCK_PIXELS = 1 << 20

@@ -6,18 +6,19 @@ pixel whose value is no code. Bare streams of bits: planes.py.
 
 from __future__ import annotations
 
-import gzip
 import itertools
 import json
 import math
 import os
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.formats.recording import Footage, Hints, check_shape, numbered, reading
+from qsim.checks import check_shape
+from qsim.files import decoding_errors, load_array
+from qsim.formats.recording import Footage, Hints, numbered
 
 _LARGEST_CHUNK = 1 << 29  # bytes of a zarr chunk in memory; one of quanta-spad-sim has up to 200 MB
 _LARGEST_METADATA = 1 << 22  # bytes
@@ -32,7 +33,7 @@ def read_cube(path: Path, hints: Hints) -> Footage:
 
     Without a given width every bit of the last byte is a pixel. `ValueError` for another array.
     """
-    array = load_npy(path)
+    array = load_array(path)
     if array.ndim == 4:
         if hints.channel is None or not 0 <= hints.channel < array.shape[3]:
             raise ValueError(f"{path}: a colour cube of {array.shape[3]} channels; choose one with --channel 0")
@@ -52,7 +53,7 @@ def read_cube(path: Path, hints: Hints) -> Footage:
 
 def read_codes_npy(path: Path, hints: Hints) -> Footage:
     """Unpacked codes: bool or unsigned [T, H, W] with one code per pixel; the bits are those given, else 1 for bool."""
-    array = load_npy(path)
+    array = load_array(path)
     frames, height, width = check_shape(path, array.shape)
     bits = 1 if array.dtype == bool else hints.bits
     if bits is None or array.dtype.kind not in "bu":
@@ -74,7 +75,7 @@ def read_mat(path: Path, hints: Hints) -> Footage:
         files = numbered(list(path.glob("part_*.mat")))
         info = path / "info.json"
         if info.is_file():
-            with reading(info, "JSON"):
+            with decoding_errors(info, "JSON"):
                 wanted = int(json.loads(info.read_text("utf-8"))["no_parts"])
             files = [path / f"part_{k}.mat" for k in range(1, min(wanted, 100_000) + 1)]
         for file in files:
@@ -99,7 +100,7 @@ def read_zarr(path: Path, hints: Hints) -> Footage:
     codecs = _zarr_codecs(path, folder)
     if unknown := sorted(codecs - _CODECS):
         raise ValueError(f"{path}: stored by the codec {unknown[0]!r}; read are {', '.join(sorted(_CODECS))}")
-    with reading(path, "zarr"):
+    with decoding_errors(path, "zarr"):
         array: Any = zarr.open_array(store=str(folder), mode="r")
         node: Any = array if folder == path else zarr.open_group(store=str(path), mode="r", use_consolidated=False)
         attributes = {k: v for k, v in dict(node.attrs).items() if isinstance(v, str | int | float | list)}
@@ -123,7 +124,7 @@ def read_zarr(path: Path, hints: Hints) -> Footage:
     bits = hints.bits or 1
 
     def read(start: int, stop: int) -> Array:
-        with reading(path, "zarr"), zarr.config.set({"async.concurrency": 1}):  # one chunk in memory at a time
+        with decoding_errors(path, "zarr"), zarr.config.set({"async.concurrency": 1}):  # one chunk in memory at a time
             return checked_codes(path, np.asarray(array[start:stop]), bits, start)
 
     return Footage(shape, read, "zarr", bits, meta={"attributes": attributes})
@@ -139,7 +140,7 @@ def _zarr_codecs(path: Path, folder: Path) -> set[str]:
             raise ValueError(f"{file}: {file.stat().st_size} bytes of metadata; up to {_LARGEST_METADATA} are read")
     found: set[str] = set()
     for file in described:
-        with reading(file, "JSON"):
+        with decoding_errors(file, "JSON"):
             content = json.loads(file.read_text("utf-8"))
             waiting = [content[key] for key in ("codecs", "filters", "compressor") if key in content]
             while waiting:
@@ -168,7 +169,7 @@ def _count_files(folder: Path, enough: int) -> int:
 def read_visionsim(path: Path, hints: Hints) -> Footage:
     """visionsim: transforms.json with frames.npy [T, H, bytes, C] (0.1), or with shards 0000.npy, ... (later)."""
     description = path / "transforms.json"
-    with reading(description, "JSON"):
+    with decoding_errors(description, "JSON"):
         info = json.loads(description.read_text("utf-8"))
         width, channels = int(info["w"]), int(info.get("c", 1))
         packed = bool(info.get("bitpack", "bitpack_dim" in info or info.get("bitplanes", 1) == 1))
@@ -182,7 +183,7 @@ def read_visionsim(path: Path, hints: Hints) -> Footage:
         raise ValueError(f"{path}: {channels} colour planes; choose one with --channel 0")
     parts = []
     for shard in shards:
-        array = load_npy(shard)
+        array = load_array(shard)
         if array.dtype.kind != "u" or array.ndim != 4 or channel >= array.shape[3]:
             raise ValueError(
                 f"{shard}: expected unsigned [T, H, W, {channels}], found {array.dtype} {list(array.shape)}"
@@ -206,28 +207,6 @@ def read_visionsim(path: Path, hints: Hints) -> Footage:
 
     model = "binary_sum" if packed else "binary_sum_static"
     return Footage(shape, read, "visionsim", bits, model, {"bit_order": "msb"})
-
-
-def load_npy(path: Path) -> Array:
-    """A .npy array of numbers as a memory map, or a .npy.gz in memory.
-
-    `FileNotFoundError` or `ValueError` for another kind of file, objects, a number without axes, lying headers.
-    """
-    if path.suffix == ".gz":
-        with reading(path, "gzipped .npy"), gzip.open(path, "rb") as packed:
-            return _read_npy(path, packed)
-    with reading(path, ".npy"):
-        with open(path, "rb") as file:
-            if file.read(2) == b"PK":
-                raise ValueError(f"{path}: is an archive (.npz) under another name; save the array alone with np.save")
-        array = np.lib.format.open_memmap(path, mode="r")
-        if array.ndim == 0:
-            raise ValueError(f"{path}: a single number without axes; an array is expected")
-        if array.dtype.hasobject or array.dtype.kind not in "buif":
-            raise ValueError(f"{path}: an array of {array.dtype}; numbers are expected")
-        if array.ndim and array.nbytes + 64 > path.stat().st_size:
-            raise ValueError(f"{path}: the header promises {array.nbytes} bytes, the file has {path.stat().st_size}")
-        return array
 
 
 def checked_codes(path: Path, values: Array, bits: int, first: int) -> Array:
@@ -255,7 +234,7 @@ def mat_array(path: Path, variable: str | None = None) -> Array:
         return _hdf_array(path, variable)
     import scipy.io
 
-    with reading(path, "MATLAB 5 .mat"):
+    with decoding_errors(path, "MATLAB 5 .mat"):
         numbers = ("int", "uint", "single", "double", "logical")
         shapes = {name: shape for name, shape, kind in scipy.io.whosmat(path) if kind.startswith(numbers)}
         name = _chosen(path, variable, shapes)
@@ -266,7 +245,7 @@ def mat_array(path: Path, variable: str | None = None) -> Array:
 def _hdf_array(path: Path, variable: str | None) -> Array:
     import h5py
 
-    with reading(path, "MATLAB 7.3 .mat"), h5py.File(path, "r") as file:
+    with decoding_errors(path, "MATLAB 7.3 .mat"), h5py.File(path, "r") as file:
         own = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
         wanted = variable or "OUTPUT"
         if wanted in file.keys() - set(own):
@@ -320,26 +299,3 @@ def _plausible(path: Path, shape: tuple[int, ...]) -> None:
     promised, size = float(np.prod(shape, dtype=float)), path.stat().st_size
     if promised > 1032.0 * size:
         raise ValueError(f"{path}: the header promises {promised:.3g} values, which {size} bytes cannot hold")
-
-
-def _read_npy(path: Path, file: gzip.GzipFile | BinaryIO) -> Array:
-    """An array from a stream; memory grows with what is really there, not with what the header says."""
-    version = np.lib.format.read_magic(file)
-    if version not in ((1, 0), (2, 0), (3, 0)):
-        raise ValueError(f"{path}: version {version} of .npy is not known")
-    reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran, dtype = reader(file)
-    if fortran or dtype.hasobject or dtype.kind not in "buif":
-        raise ValueError(
-            f"{path}: {dtype} in column order; only numbers in row order are read" if fortran else f"{path}: {dtype}"
-        )
-    if not shape:
-        raise ValueError(f"{path}: a single number without axes; an array is expected")
-    wanted = int(np.prod(shape, dtype=object)) * dtype.itemsize
-    content = bytearray()
-    while len(content) < wanted:
-        block = file.read(min(1 << 24, wanted - len(content)))
-        if not block:
-            raise ValueError(f"{path}: the header promises {wanted} bytes, the file has {len(content)}")
-        content += block
-    return np.frombuffer(content, dtype).reshape(shape)

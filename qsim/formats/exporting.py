@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import __version__, files
+from qsim import files
 from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream, orientation
+from qsim.files import VERSION
 from qsim.formats import video
 
 
@@ -80,7 +81,7 @@ def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool 
     return made, f"{wanted.kind}, {frames} frames of {height} x {width} pixels at {rate:g} per second{shown}, {about}"
 
 
-_MARK = {"software": {"qsim": __version__}}  # of every description of an export: we made what it describes
+_MARK = {"software": {"qsim": VERSION}}  # of every description of an export: we made what it describes
 _NAMES = r"meta\.json|[0-9]{6,}\.(png|exr)|zarr\.json|frames/zarr\.json|frames/c/[0-9]+/[0-9]+/[0-9]+"
 
 
@@ -155,7 +156,7 @@ def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
     keys = ("shape", "frame_rate", "exposure", "radiance_unit", "scene", "split", "bits", "code_model", "sensor",
             "seed", "ppp_target", "ppp_factor", "width", "planes_per_code")  # fmt: skip
     found = {key: meta[key] for key in keys if key in meta}
-    found |= {"format_version": 1, "bit_order": "msb", "software": {"qsim": __version__}}
+    found |= {"format_version": 1, "bit_order": "msb", "software": {"qsim": VERSION}}
     found["orientation"] = orientation(meta)
     if isinstance(source, Clip):
         found["transfer"] = "linear" if wanted.kind in ("exr", "zarr") else wanted.transfer

@@ -19,9 +19,10 @@ from typing import Any, cast
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import __version__, files
+from qsim import files
 from qsim.clip.clip import RELATIVE, Clip, ClipWriter
-from qsim.clip.stream import FORMAT_VERSION, Progress, Stream
+from qsim.clip.stream import FORMAT_VERSION, Stream
+from qsim.files import VERSION, Progress
 from qsim.formats import array_files, raw_cameras, video
 from qsim.formats.recording import Footage, Hints, Marked, stated, turned
 
@@ -261,7 +262,7 @@ def to_stream(
         "seed": None,
         "source": {"format": footage.source} | footage.meta,
         "sha256": files.sha256(npy),
-        "software": {"qsim": __version__},
+        "software": {"qsim": VERSION},
     }
     files.write_description(description, meta)
     return Stream.open(description)
@@ -307,7 +308,7 @@ def _detect_folder(path: Path) -> str:
 
 
 def _detect_npy(path: Path) -> str:
-    array = array_files.load_npy(path)
+    array = array_files.load_array(path)
     if array.dtype == bool:
         return "codes"
     if array.dtype != np.uint8:

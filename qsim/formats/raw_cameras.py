@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.formats.recording import Footage, Hints, check_shape, check_size
+from qsim.checks import check_shape
+from qsim.formats.recording import Footage, Hints, check_size
 
 HALF, FULL = (256, 512), (512, 512)  # pixels of SwissSPAD2's half and full array
 RAW_FRAME = 512 * 512 // 8  # bytes of one full-array plane

@@ -7,10 +7,8 @@ warns about becomes one `ValueError` with the file's name.
 
 from __future__ import annotations
 
-import contextlib
 import re
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +16,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-MAX_PIXELS = 1 << 26  # of one frame: 8192 x 8192
-TRANSFERS = ("linear", "srgb", "gamma 2.2")
-
+from qsim.colour import TRANSFERS
 
 Marked = Callable[[int, int], tuple[Array, Array]]
 
@@ -61,34 +57,6 @@ class Hints:
     white: float | None = None  # of light: pixel value at which the camera saturates; None: full scale of whole numbers
 
 
-@contextlib.contextmanager
-def reading(path: Path, what: str) -> Iterator[None]:
-    """Turn whatever a decoder raises or warns about into one `ValueError`; a missing file stays `FileNotFoundError`."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            yield
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such file") from None
-    except Exception as error:  # decoders raise what they like: tokenizer, zlib, struct and their own errors
-        text = " ".join(str(error).split())
-        if text.startswith(str(path)):
-            raise ValueError(text) from None
-        raise ValueError(f"{path}: not readable as {what} ({text or type(error).__name__})") from None
-
-
-def check_shape(path: Path, shape: tuple[int, ...]) -> tuple[int, int, int]:
-    """(T, H, W) if there is at least one frame of a sane size, else `ValueError`."""
-    if len(shape) != 3:
-        raise ValueError(f"{path}: expected frames [T, H, W], found an array of shape {list(shape)}")
-    frames, height, width = (int(n) for n in shape)
-    if frames < 1:
-        raise ValueError(f"{path}: has no frames")
-    if not (0 < height * width <= MAX_PIXELS and height > 0):
-        raise ValueError(f"{path}: frames of {height} x {width} pixels; between 1 and {MAX_PIXELS} pixels are read")
-    return frames, height, width
-
-
 def check_size(path: Path, size: int, frame_bytes: int, what: str, footer: tuple[int, ...] = (0,)) -> int:
     """Frames in a raw file of `size` bytes; `ValueError` with the size if it is not a whole number of them."""
     frames, rest = divmod(size, frame_bytes)
@@ -108,32 +76,6 @@ def numbered(paths: list[Path]) -> list[Path]:
         return str(path.parent), int(numbers[-1]) if numbers else -1, path.name
 
     return sorted(paths, key=key)
-
-
-def to_linear(values: Array, transfer: str, top: float) -> Array:
-    """Linear light, float32 in 0..1, from coded values 0 ... top (IEC 61966-2-1 for srgb)."""
-    coded = np.asarray(values, np.float32) / np.float32(top)
-    if transfer == "linear":
-        return coded
-    if transfer == "gamma 2.2":
-        return coded**2.2
-    if transfer == "srgb":
-        return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4).astype(np.float32)
-    raise ValueError(f"transfer {transfer!r}: known are {', '.join(TRANSFERS)}")
-
-
-def from_linear(light: Array, transfer: str, top: int) -> Array:
-    """Coded values 0 ... top, rounded, of linear light in 0..1 (clipped): the inverse of `to_linear`."""
-    light = np.clip(np.asarray(light, np.float64), 0, 1)
-    if transfer == "linear":
-        coded = light
-    elif transfer == "gamma 2.2":
-        coded = light ** (1 / 2.2)
-    elif transfer == "srgb":
-        coded = np.where(light <= 0.04045 / 12.92, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
-    else:
-        raise ValueError(f"transfer {transfer!r}: known are {', '.join(TRANSFERS)}")
-    return np.rint(coded * top).astype(np.uint8 if top < 256 else np.uint16)
 
 
 def light_footage(

@@ -14,25 +14,22 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files
+from qsim.checks import MAX_PIXELS, check_shape
 from qsim.clip import exr
+from qsim.colour import from_linear, luminance, to_linear
+from qsim.files import decoding_errors
 from qsim.formats.array_files import checked_codes
 from qsim.formats.recording import (
-    MAX_PIXELS,
     Footage,
     Hints,
-    check_shape,
-    from_linear,
     light_footage,
     need_transfer,
     numbered,
     reached,
-    reading,
-    to_linear,
     white_of,
 )
 from qsim.sensor import packing
 
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709
 _FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG
 EXACT = 2 | 0x2000 | 0x40000  # FFmpeg's BILINEAR, FULL_CHR_H_INT, ACCURATE_RND; else colours come a code dark
 BLOCK = 16  # frames read at a time
@@ -80,7 +77,7 @@ def read_video(path: Path, hints: Hints) -> Footage:
     Frames are decoded in order and kept only while they are needed: ask for them in order.
     """
     transfer = need_transfer(path, hints)
-    with reading(path, "video"):
+    with decoding_errors(path, "video"):
         frames, height, width = _video_shape(path)
     shape = check_shape(path, (frames, height, width))
     decoder = _Decoder(path, height, width)
@@ -88,7 +85,7 @@ def read_video(path: Path, hints: Hints) -> Footage:
     white, _ = white_of(path, hints, 255)
 
     def marked(start: int, stop: int) -> tuple[Array, Array]:
-        with reading(path, "video"):
+        with decoding_errors(path, "video"):
             found = decoder.frames(start, stop)
             light = np.stack([to_luminance(f, transfer, 255, f.ndim == 3) for f in found])
             return light, np.stack([reached(f, white, f.ndim == 3) for f in found])
@@ -98,9 +95,9 @@ def read_video(path: Path, hints: Hints) -> Footage:
 
 def read_light_npy(path: Path, hints: Hints) -> Footage:
     """Numbers [T, H, W] as light: integers are coded by --transfer (full scale of their type), floats are linear."""
-    from qsim.formats.array_files import load_npy
+    from qsim.formats.array_files import load_array
 
-    array = load_npy(path)
+    array = load_array(path)
     shape = check_shape(path, array.shape)
     floats = array.dtype.kind == "f"
     transfer = "linear" if floats and hints.transfer is None else need_transfer(path, hints)
@@ -157,7 +154,7 @@ def to_luminance(values: Array, transfer: str, top: float, colour: bool) -> Arra
         return to_linear(values, transfer, top)
     if (values == values[..., :1]).all():  # grey in three channels: exact without weights
         return to_linear(values[..., 0], transfer, top)
-    return to_linear(values, transfer, top) @ _LUMINANCE
+    return luminance(to_linear(values, transfer, top))
 
 
 def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossless: bool) -> None:
@@ -297,7 +294,7 @@ def _video_shape(path: Path) -> tuple[int, int, int]:
 def _png(path: Path) -> Array:
     from PIL import Image
 
-    with reading(path, "PNG"), Image.open(path, formats=["PNG"]) as opened:
+    with decoding_errors(path, "PNG"), Image.open(path, formats=["PNG"]) as opened:
         check_shape(path, (1, opened.height, opened.width))
         if opened.mode in ("RGB", "RGBA", "P", "LA"):
             return np.asarray(opened.convert("RGB"))
@@ -310,14 +307,14 @@ def _png(path: Path) -> Array:
 def _tiff_pages(path: Path) -> int:
     import tifffile
 
-    with reading(path, "TIFF"), tifffile.TiffFile(path) as opened:
+    with decoding_errors(path, "TIFF"), tifffile.TiffFile(path) as opened:
         return len(opened.pages)  # a chain of pages that bites its tail is refused by the library
 
 
 def _tiff(path: Path, page: int) -> Array:
     import tifffile
 
-    with reading(path, "TIFF"), tifffile.TiffFile(path) as opened:
+    with decoding_errors(path, "TIFF"), tifffile.TiffFile(path) as opened:
         found: Any = opened.pages[page]
         check_shape(path, (1, found.imagelength, found.imagewidth))
         promised, there = found.nbytes, path.stat().st_size

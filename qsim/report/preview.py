@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsim import colour, files
+from qsim.checks import check_shape
 from qsim.clip.clip import Clip, Stream
-from qsim.clip.stream import Progress
-from qsim.formats.array_files import checked_codes, load_npy
-from qsim.formats.recording import check_shape
+from qsim.files import Progress, load_array
+from qsim.formats.array_files import checked_codes
 from qsim.sensor import packing
 
 Picture = NDArray[np.uint8]  # [H, W, 3]
@@ -106,7 +106,7 @@ def _stream_source(stream: Stream) -> Source:
 
 
 def _array_source(path: Path, bits: int | None, width: int | None, described: dict[str, Any]) -> Source:
-    array = load_npy(path)
+    array = load_array(path)
     array = array[None] if array.ndim == 2 else array
     length = check_shape(path, array.shape)[0]
     rate = described.get("frame_rate")

@@ -20,9 +20,9 @@ from qsim import colour, files
 from qsim.clip.clamped_error import stated
 from qsim.clip.clip import Clip, Stream
 from qsim.clip.motion_statistics import MOVING
-from qsim.clip.stream import Progress
 from qsim.dataset.checking import Restored
 from qsim.dataset.dataset import Dataset
+from qsim.files import Progress
 from qsim.optics.radiometry import clip_photons
 from qsim.report import html as page
 from qsim.report import table_sections

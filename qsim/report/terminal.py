@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from qsim.colour import luminance
+
 HALF = "▀"  # upper half block: its foreground is the upper pixel, its background the lower one
 SHADES = " .:-=+*#%@"  # dark to light, for outputs without colour
 
@@ -38,7 +40,7 @@ def _lower(picture: NDArray[np.uint8]) -> list[NDArray[np.uint8] | None]:
 
 def shades(picture: NDArray[np.uint8]) -> str:
     """The same in ten shades of plain text: every second row, as characters are twice as high as wide."""
-    grey = picture[::2].astype(float) @ [0.2126, 0.7152, 0.0722]
+    grey = luminance(picture[::2])
     steps = np.minimum((grey / 256 * len(SHADES)).astype(int), len(SHADES) - 1)
     return "\n".join("".join(SHADES[i] for i in row) for row in steps)
 

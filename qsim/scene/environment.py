@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.colour import luminance
 from qsim.scene.scene import EnvironmentImage, SunSky
 
 SKY_ROWS = 128  # of the upper and lower half together; the sky is smooth, the sun is a disk of its own
@@ -60,7 +61,7 @@ def environment_map(light: EnvironmentImage) -> Array:
     """The picture in radiance, float32 [H, W]; `ValueError` or FileNotFoundError naming the file."""
     picture = _read_hdr(Path(light.image)) if isinstance(light.image, str) else np.asarray(light.image, np.float32)
     if picture.ndim == 3:
-        picture = picture[..., :3] @ np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec. 709 luminance
+        picture = luminance(picture[..., :3])
     if picture.ndim != 2 or picture.size == 0 or not np.isfinite(picture).all() or picture.min() < 0:
         where = light.image if isinstance(light.image, str) else "EnvironmentImage.image"
         raise ValueError(f"{where}: expected finite radiance [H, W] of at least 0, found shape {picture.shape}")

@@ -19,6 +19,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from qsim.checks import require_finite
+from qsim.colour import luminance, to_linear
 from qsim.optics.camera import Camera, Pose, Vector
 
 
@@ -46,7 +48,7 @@ class Mesh:
             raise ValueError(f"Mesh: expected vertices [V, 3] and faces [F, 3], got {vertices.shape} and {faces.shape}")
         if not len(faces):
             raise ValueError("Mesh: no faces; a body needs at least one triangle")
-        _require_finite("Mesh.vertices", vertices)
+        require_finite("Mesh.vertices", vertices)
         if faces.min() < 0 or faces.max() >= len(vertices):
             raise ValueError(f"Mesh.faces: indices 0..{len(vertices) - 1} expected, found {faces.min()}..{faces.max()}")
         object.__setattr__(self, "vertices", vertices)
@@ -55,7 +57,7 @@ class Mesh:
             uv = np.asarray(self.uv, np.float64)
             if uv.shape != (len(vertices), 2):
                 raise ValueError(f"Mesh.uv: expected [{len(vertices)}, 2], got {uv.shape}")
-            _require_finite("Mesh.uv", uv)
+            require_finite("Mesh.uv", uv)
             object.__setattr__(self, "uv", uv)
 
 
@@ -77,7 +79,7 @@ class Texture:
             pixels = _read_grey(Path(self.image))
         if pixels.ndim != 2 or pixels.size == 0:
             raise ValueError(f"{where}: expected a picture [H, W], got shape {pixels.shape}")
-        _require_finite(where, pixels)
+        require_finite(where, pixels)
         return pixels
 
 
@@ -404,16 +406,7 @@ def _read_grey(path: Path) -> np.ndarray:
             colour = np.asarray(opened.convert("RGB"), np.float32) / 255
     except OSError as error:
         raise ValueError(f"texture {path}: not a readable image ({error})") from error
-    # sRGB curve (IEC 61966-2-1), then Rec. 709 luminance.
-    linear = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
-    return (linear @ np.array([0.2126, 0.7152, 0.0722])).astype(np.float32)
-
-
-def _require_finite(name: str, values: np.ndarray) -> None:
-    bad = np.argwhere(~np.isfinite(values))
-    if len(bad):
-        index = tuple(int(i) for i in bad[0])
-        raise ValueError(f"{name}: {values[index]} at index {index}; every value must be finite")
+    return luminance(to_linear(colour, "srgb", 1.0).astype(np.float64)).astype(np.float32)
 
 
 def _check_reflectance(material: Diffuse | RoughPlastic) -> None:

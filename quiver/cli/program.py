@@ -14,10 +14,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from qsim import __version__
 from qsim.cli.completion import add_completion
 from qsim.cli.console import Parser, bar, note, output, run
-from qsim.files import write_bytes, write_json
+from qsim.files import VERSION, write_bytes, write_json
 from quiver.cli.domain import add_domain
 from quiver.cli.options import (
     DEFAULT_METHOD,
@@ -46,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = Parser(
         prog="quiver", description="Restore blur-free video from few-bit quanta streams; train and compare."
     )
-    parser.add_argument("--version", action="version", version=f"quiver {__version__}")
+    parser.add_argument("--version", action="version", version=f"quiver {VERSION}")
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
     for add in (add_train, _add_restore, _add_evaluate, add_domain, add_ablate, _add_bench, _add_convert_weights):
         add(sub)

@@ -11,7 +11,7 @@ from typing import IO
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.formats.recording import reading
+from qsim.files import decoding_errors
 
 LARGEST = 1 << 32  # bytes of an array of counts
 
@@ -38,7 +38,7 @@ def read_counts(path: Path) -> Counts:
     """
     if path.suffix not in (".npy", ".npz"):
         raise ValueError(f"{path}: photon counts are a .npy, or a .npz with one array")
-    with reading(path, "an array of numbers"):
+    with decoding_errors(path, "an array of numbers"):
         array = _load(path)
     if array.ndim not in (3, 4) or array.size == 0 or not np.issubdtype(array.dtype, np.integer) or array.min() < 0:
         raise ValueError(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.formats.array_files import load_npy
+from qsim.files import load_array
 from qsim.sensor.spad import BinarySPAD
 from quiver.data.codes import Codes, array_codes, array_digest
 from quiver.data.illumination import Illumination
@@ -23,7 +23,7 @@ def cube_codes(
     highest bit. Every `planes` = 2^b - 1 of them (default 1) are summed to one b-bit code of a clocked SPAD; what is
     left at the end is not used. `frame_rate` counts codes per second. `ValueError` where these do not fit together.
     """
-    array = load_npy(path)
+    array = load_array(path)
     if width is None:
         if planes is not None:
             raise ValueError(f"{path}: planes = {planes} sums packed binary planes; give their width in pixels, too")

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from qsim import __version__
-from qsim.files import Lock
+from qsim.files import VERSION
+from qsim.locks import Lock
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
@@ -51,7 +51,7 @@ class Question:
             "methods": list(self.methods),
             "seed": self.seed,
             "score": "matched PSNR, peak 2.5 x mean light, mean over clips",
-            "quiver": __version__,
+            "quiver": VERSION,
         }
 
 

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from qsim import __version__
-from qsim.files import Lock, read_json, sealed, sha256, sync_folder, write_json
+from qsim.files import VERSION, read_json, sealed, sha256, sync_folder, write_json
+from qsim.locks import Lock
 from quiver.data.codes import Codes
 from quiver.restoration.restorers import Progress, Restorer, check_finite
 
@@ -61,7 +61,7 @@ def restore_to_file(
         _check_target(path, force)
         meta = {
             "format": FORMAT,
-            "quiver": __version__,
+            "quiver": VERSION,
             "method": method.name,
             "description": method.description,
             "identity": dict(method.identity) | {"cut": method.cut(*codes.shape[1:])},

@@ -22,7 +22,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from qsim.files import Lock, check_ours, read_json, replacing, write_bytes, write_json
+from qsim.files import check_ours, read_json, replacing, write_bytes, write_json
+from qsim.locks import Lock
 from quiver import threads
 from quiver.data.clips import open_clips
 from quiver.data.illumination import Illumination

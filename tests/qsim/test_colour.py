@@ -1,9 +1,22 @@
 """Pictures: the declared tone curve, colours that mean a direction, and no surprise at NaN or empty input."""
 
+import math
+
 import numpy as np
 import pytest
 
-from qsim.colour import code_levels, depth_colours, depth_legend, depth_range, flow_colours, flow_legend, peak, tone
+from qsim.colour import (
+    code_levels,
+    depth_colours,
+    depth_legend,
+    depth_range,
+    flow_colours,
+    flow_legend,
+    luminance,
+    peak,
+    psnr,
+    tone,
+)
 
 
 def test_tone_is_the_declared_curve_rounded_and_clipped():
@@ -79,3 +92,20 @@ def test_a_senseless_range_is_refused(near, far):
 def test_peak_ignores_the_unknown_and_is_one_for_black():
     assert peak(np.array([0.0, np.nan, 2.0, np.inf])) == pytest.approx(2.0, rel=1e-2)
     assert peak(np.zeros(3)) == peak(np.full(3, np.nan)) == 1.0
+
+
+def test_luminance_is_rec_709_in_the_precision_of_its_input():
+    rgb = np.array([[1, 1, 1], [1, 0, 0], [0, 0, 1]])
+    for dtype in (np.float32, np.float64):
+        found = luminance(rgb.astype(dtype))
+        assert found.dtype == dtype
+        np.testing.assert_allclose(found, [1, 0.2126, 0.0722], rtol=1e-6)
+    assert luminance(rgb.astype(np.uint8)).dtype == np.float64
+
+
+def test_psnr_has_one_convention_for_nothing():
+    assert psnr(1.0, 0.1) == pytest.approx(20)
+    assert psnr(2.0, 0.2) == pytest.approx(20)
+    assert psnr(1.0, 0.0) == math.inf
+    assert psnr(0.0, 0.1) == -math.inf
+    assert math.isnan(psnr(1.0, math.nan))

@@ -38,7 +38,6 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.checks import suggest
-from qsim.formats import array_files
 from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import event_simulation, fixed_pattern
@@ -264,7 +263,7 @@ def _with_dark(sensor: Sensor, rate: float) -> Sensor:
 
 
 def _read_map(path: str, key: str) -> Array:
-    array = np.array(array_files.load_npy(Path(path)))
+    array = np.array(files.load_array(Path(path)))
     if array.ndim != 2 or not array.size or array.dtype.kind not in "fuib" or not np.isfinite(array).all():
         raise ValueError(f"{path}: a {key} is [H, W] of finite numbers, found {array.dtype} {list(array.shape)}")
     if key != "offset_map" and (array < 0).any():

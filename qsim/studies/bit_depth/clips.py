@@ -11,7 +11,7 @@ import numpy as np
 from qsim import keys
 from qsim.clip import stream
 from qsim.clip.clip import Clip, ClipWriter
-from qsim.clip.stream import Progress
+from qsim.files import Progress
 from qsim.optics import radiometry
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.bit_depth.clip_study import check_clip

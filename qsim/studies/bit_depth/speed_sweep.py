@@ -11,7 +11,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clip import Clip
-from qsim.clip.stream import Progress
+from qsim.files import Progress
 from qsim.optics import radiometry
 from qsim.studies.bit_depth.answer import answer, at_edge, code_motion, widened
 from qsim.studies.bit_depth.clip_study import Study, check_clip, study

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.stream import Progress
+from qsim.files import Progress
 from qsim.keys import Key
 from qsim.sensor import QIS, BinarySPAD, CountingSPAD, Sensor
 from qsim.sensor.compiled import kernel, launch

@@ -18,9 +18,9 @@ import pytest
 from qsim.cli import dataset
 from qsim.cli.program import main
 from qsim.clip.clip import RELATIVE, Clip, ClipWriter
-from qsim.clip.stream import Progress
 from qsim.dataset import generation, recipe
 from qsim.dataset.dataset import Dataset
+from qsim.files import Progress
 
 COMMANDS = ("doctor", "render", "sense", "generate", "plan", "check", "convert")
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from clips import write_clip
 
-from qsim import files
+from qsim import locks
 from qsim.clip import stream
 from qsim.clip.clip import Clip
 
@@ -133,7 +133,7 @@ def test_what_a_failed_sensing_leaves(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_a_lock_whose_file_is_deleted_is_taken_on_the_new_one(tmp_path: Path):
     """Who waited for a deleted file must not believe to be alone."""
-    first, second, third = (files.Lock(tmp_path / "lock") for _ in range(3))
+    first, second, third = (locks.Lock(tmp_path / "lock") for _ in range(3))
     assert first.acquire()
     (tmp_path / "lock").unlink()
     assert second.acquire(), "the name is free"

@@ -20,7 +20,7 @@ import small_scenes
 from fakes import RECIPE, die_on_tumble, fail_on_tumble, hoard_on_tumble, make, make_slowly, tree
 from forks import forked, killed_at
 
-from qsim import files
+from qsim import files, locks
 from qsim.clip import stream
 from qsim.dataset import job_runner, provenance, recipe
 from qsim.dataset.checking import check
@@ -468,14 +468,14 @@ def test_a_damaged_manifest_is_made_again(tmp_path: Path, undisturbed: dict[str,
 def test_two_generators_on_one_folder(tmp_path: Path):
     folder = tmp_path / "d"
     generate(SMALL, folder, HERE, make=make)
-    lock = files.Lock(folder / "locks" / "generate")
+    lock = locks.Lock(folder / "locks" / "generate")
     assert lock.acquire()
     with pytest.raises(ValueError, match="another generator is at work here"):
         generate(SMALL, folder, HERE, make=make)
     with pytest.raises(ValueError, match="another generator is at work here"):
         generate(SMALL, folder, Options(workers=0, shard=(1, 2)), make=make)
     lock.release()
-    shard = files.Lock(folder / "locks" / "generate", shared=True)
+    shard = locks.Lock(folder / "locks" / "generate", shared=True)
     assert shard.acquire()
     assert generate(SMALL, folder, Options(workers=0, shard=(1, 2)), make=make).done == 2
     with pytest.raises(ValueError, match="another generator is at work here"):

@@ -81,7 +81,7 @@ def test_only_exact_leftovers_are_swept(tmp_path: Path, name: str):
         (tmp_path / kept).mkdir()
     (tmp_path / leftovers[0]).touch()
     (tmp_path / leftovers[1]).symlink_to(target)
-    files.sweep(tmp_path / name)
+    files.remove_leftovers(tmp_path / name)
     assert sorted(os.listdir(tmp_path)) == sorted({*others, "elsewhere"})
     assert (target / "precious").exists()
 

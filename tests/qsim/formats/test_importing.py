@@ -19,12 +19,13 @@ from hypothesis.extra import numpy as hnp
 from qsim.cli.program import main
 from qsim.clip.clip import RELATIVE, Clip, ClipWriter
 from qsim.clip.stream import Sensing, Stream, sense
+from qsim.colour import from_linear, to_linear
 from qsim.dataset import generation, recipe
 from qsim.dataset.dataset import Dataset
 from qsim.formats import exporting, importing, video
 from qsim.formats.exporting import Export
 from qsim.formats.importing import Capture
-from qsim.formats.recording import Footage, Hints, from_linear, numbered, to_linear
+from qsim.formats.recording import Footage, Hints, numbered
 
 CAPTURE = Capture(frame_rate=1000.0)
 

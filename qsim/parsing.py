@@ -1,0 +1,103 @@
+"""Parses TOML and JSON texts; errors name file and line, and deep nesting and huge numbers are refused."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+LARGEST = 1 << 64  # whole numbers in files stay below: seeds and keys have 64 bits
+DEEPEST = 64  # levels of nesting in a file
+_TOO_LARGE = "a whole number of more than 64 bits"
+_TOO_DEEP = f"nested more than {DEEPEST} levels deep"
+
+
+def parse_toml(path: Path, text: str) -> dict[str, Any]:
+    """The tables of a TOML text; `ValueError` as `FILE:LINE: ...` if it is not TOML, nests deeply or counts too far."""
+    if re.search(
+        rf"(?<![\w\"'.-])(?:[\w\"'-]+[ \t]*\.[ \t]*){{{DEEPEST}}}", text
+    ):  # the parser takes quadratic time for these
+        raise ValueError(f"{path}:{_line_of_depth(text)}: not valid TOML: {_TOO_DEEP}")
+    try:
+        value = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        found = re.search(r"at line (\d+)", str(error))
+        line = found[1] if found else len(text.splitlines())  # else the parser says "at end of document"
+        raise ValueError(f"{path}:{line}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise ValueError(f"{path}:{_line_of_depth(text)}: not valid TOML: {_TOO_DEEP}") from None
+    except ValueError:  # of `int` for thousands of digits
+        raise ValueError(f"{path}:{_line_of_number(text)}: not valid TOML: {_TOO_LARGE}") from None
+    if problem := _too_much(value, text, infinite=True):  # which TOML can spell; each key's check refuses it
+        raise ValueError(f"{path}:{problem[0]}: not valid TOML: {problem[1]}")
+    return value
+
+
+def parse_json(path: Path, text: str) -> dict[str, Any]:
+    """The object in a JSON text; `ValueError` with the file's name if it is damaged or not an object.
+
+    NaN, infinity, whole numbers beyond 64 bits and deep nesting are refused: nothing of ours writes them.
+    """
+    try:
+        value = json.loads(text, parse_constant=_no_constant)
+        problem = _too_much(value, text)
+    except RecursionError:
+        problem, value = (_line_of_depth(text), _TOO_DEEP), None
+    except (json.JSONDecodeError, _NotFinite) as error:
+        raise ValueError(f"{path}: not readable as JSON ({error}); the file is damaged, make it again") from None
+    except ValueError:  # of `int` for thousands of digits
+        problem, value = (_line_of_number(text), _TOO_LARGE), None
+    if problem:
+        raise ValueError(
+            f"{path}: not readable as JSON ({problem[1]} in line {problem[0]}); the file is damaged, make it again"
+        )
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: expected a JSON object, found a {type(value).__name__}")
+    return value
+
+
+class _NotFinite(ValueError):
+    """NaN or infinity in JSON."""
+
+
+def _no_constant(name: str) -> float:
+    raise _NotFinite(f"{name} where a number is needed")
+
+
+def _too_much(value: Any, text: str, infinite: bool = False) -> tuple[int, str] | None:
+    """(line, problem) of the first value that is nested too deeply or too large; None if there is none."""
+    waiting: list[tuple[Any, int]] = [([value], 0)]
+    while waiting:
+        item, depth = waiting.pop()
+        for inner in item.values() if isinstance(item, dict) else item:
+            if isinstance(inner, dict | list):
+                if depth == DEEPEST:
+                    return _line_of_depth(text), _TOO_DEEP
+                waiting.append((inner, depth + 1))
+            elif isinstance(inner, int) and abs(inner) >= LARGEST:
+                return _line_of_number(text), _TOO_LARGE
+            elif isinstance(inner, float) and not infinite and abs(inner) == float("inf"):
+                return 1, "a number of more than 1e308"
+    return None
+
+
+def _line_of_depth(text: str) -> int:
+    """The first line that nests too deeply, by brackets or by dots; 1 if none is found."""
+    depth = 0
+    for n, line in enumerate(text.splitlines(), 1):
+        bare = re.sub(r'"(?:\\.|[^"\\])*"', "", line)
+        if len(re.findall(r"[\w\"'-]\s*\.", line)) >= DEEPEST:
+            return n
+        for sign in bare:
+            depth += (sign in "[{") - (sign in "]}")
+            if depth > DEEPEST:
+                return n
+    return 1
+
+
+def _line_of_number(text: str) -> int:
+    """The line of the first whole number of more than 18 digits; 1 if none is found."""
+    digits = r"(?<![\w\"'.])(?:0[xob][0-9A-Fa-f_]{16,}|[0-9][0-9_]{18,})(?![\w\"'.])"
+    return next((n for n, line in enumerate(text.splitlines(), 1) if re.search(digits, line)), 1)
