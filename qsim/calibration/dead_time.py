@@ -9,6 +9,7 @@ counts, given the total, E[variance] = mean), so the choice does not bias the Fa
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from math import sqrt
 
@@ -16,12 +17,92 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.calibration.frame_statistics import Stack, measure
-from qsim.calibration.qis import Calibration, Value, normal_interval
-from qsim.calibration.spad import fitted_dead_time, matched_variance
+from qsim.calibration.results import Calibration, Value, normal_interval
+from qsim.sensor.counting import CountingSPAD
 
 CLASSES = 8
 LEAST_MEAN = 1.0  # counts; darker pixels say nothing about dead time
 LEAST_PIXELS = 50  # of a class
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """Dead time in exposures, and its variance."""
+
+    value: float
+    variance: float
+
+
+def fitted_dead_time(flats: Sequence[Stack], bits: int, paralyzable: bool) -> Ratio | None:
+    """tau/T from the time variance of every flat against its mean: weighted least squares on exact moments."""
+    from scipy.optimize import minimize_scalar
+
+    usable = [flat for flat in flats if flat.frames > 1 and flat.mean > 0]
+    if not usable:
+        return None
+    if len({flat.exposure for flat in usable}) > 1:
+        raise ValueError("calibrate: the flats have different exposures; give dead-time flats of one exposure")
+
+    def misfit(ratio: float) -> float:
+        return float(sum(r * r for r in _fano_residuals(usable, bits, ratio, paralyzable)))
+
+    # A pixel counts at most about T/tau, or T/(e tau) if every arrival blocks it: the largest mean bounds the ratio.
+    ceiling = min((0.45 if paralyzable else 0.9) / max(flat.mean for flat in usable), 2.0)
+    found = minimize_scalar(misfit, bounds=(0.0, ceiling), method="bounded", options={"xatol": 1e-9})
+    ratio = float(found.x) if misfit(float(found.x)) < misfit(0.0) else 0.0
+    step = max(ratio * 1e-3, 1e-7)
+    slope = [
+        (a - b) / step
+        for a, b in zip(
+            _fano_residuals(usable, bits, ratio + step, paralyzable),
+            _fano_residuals(usable, bits, ratio, paralyzable),
+            strict=True,
+        )
+    ]
+    return Ratio(ratio, 1 / max(float(np.dot(slope, slope)), 1e-300))
+
+
+def _fano_residuals(flats: Sequence[Stack], bits: int, ratio: float, paralyzable: bool) -> list[float]:
+    """(observed variance - that of a dead-time pixel of the same mean) / sigma, per flat.
+
+    Sigma comes from the model's moments: those of the data would count the pattern of the pixels as noise.
+    """
+    residuals = []
+    codes = np.arange(1 << bits, dtype=float)
+    sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
+    for flat in flats:
+        arrivals, expected, slope = matched_variance(flat.mean, bits, ratio, paralyzable)
+        pmf = np.exp(sensor.log_pmf(np.array(arrivals), 1.0))
+        centred = codes - pmf @ codes
+        third, fourth = float(pmf @ centred**3), float(pmf @ centred**4)
+        v = max(expected, 1e-12)
+        n = flat.pixels * (flat.frames - 1)
+        spread = max(fourth - v**2 + slope**2 * v - 2 * slope * third, 1e-12) / n
+        residuals.append((flat.variance - expected) / sqrt(spread))
+    return residuals
+
+
+def matched_variance(mean: float, bits: int, ratio: float, paralyzable: bool) -> tuple[float, float, float]:
+    """(arrivals, variance, d variance / d mean) of a counting pixel of this mean code; tau/T = `ratio`.
+
+    Newton on the rising branch; where no light gives this mean the variance is 0, which no data match.
+    """
+    sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
+    arrivals = mean
+    for _ in range(40):
+        at = np.array(arrivals)
+        slope = -float(np.sum(sensor.dcdf(at, 1.0)[:-1]))
+        excess = float(sensor.mean(at, 1.0)) - mean
+        if slope < 0.02:  # the mean hardly rises or falls again: no light gives it with this dead time
+            return arrivals, 0.0, 0.0
+        step = float(np.clip(excess / slope, -0.5 * arrivals - 0.1, 0.5 * arrivals))
+        arrivals -= step
+        if abs(step) < 1e-9 * max(arrivals, 1e-6):
+            break
+    h = 1e-4 * max(arrivals, 1e-3)
+    at = np.array([arrivals - h, arrivals, arrivals + h])
+    variance, means = sensor.variance(at, 1.0), sensor.mean(at, 1.0)
+    return arrivals, float(variance[1]), float((variance[2] - variance[0]) / (means[2] - means[0]))
 
 
 def classes_of(counts: Array, *, bits: int, exposure: float, edges: Sequence[float] | None = None) -> list[Stack]:

@@ -7,7 +7,7 @@ A million frames cost the same memory as one. Codes are integers; float arrays a
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -188,3 +188,12 @@ def _as_values(block: Array, top: int, what: str, name: str, frame: int) -> Arra
             f"{name}: {block[t, y, x]} at (t, y, x) = ({frame + t}, {y}, {x}) is no {what}, 0..{top}{cure}"
         )
     return block.astype(np.int64)
+
+
+def check_stacks(darks: Sequence[Stack], flats: Sequence[Stack]) -> None:
+    """`ValueError` unless there are stacks, all of one size."""
+    if not darks and not flats:
+        raise ValueError("calibrate: no frames at all; give dark and flat frames")
+    shapes = {stack.total.shape for stack in (*darks, *flats)}
+    if len(shapes) > 1:
+        raise ValueError(f"calibrate: stacks of different sizes {sorted(shapes)}; use the same part of the sensor")

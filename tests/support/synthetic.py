@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from qsim.calibration.frame_statistics import Stack, measure
-from qsim.calibration.qis import Calibration, calibrate_qis
+from qsim.calibration.qis import calibrate_qis
+from qsim.calibration.results import Calibration
 from qsim.calibration.spad import calibrate_spad
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.spad import BinarySPAD

@@ -83,7 +83,6 @@ STILL_IN_CIRCLES: set[str] = {
     "quiver.restoration.restorers",
 }
 STILL_LONG: set[str] = {
-    "qsim.calibration.qis",
     "qsim.clip.stream",
     "qsim.clip.writer",
     "qsim.formats.video",

@@ -8,11 +8,11 @@ import pytest
 from stats import assert_share
 from synthetic import CASES, COUNTER, Array, QISCase, SPADCase, coverage
 
-from qsim.calibration.dead_time import calibrate_static
+from qsim.calibration.dead_time import calibrate_static, matched_variance
 from qsim.calibration.frame_statistics import from_ones, measure
 from qsim.calibration.qis import calibrate_qis
 from qsim.calibration.sensor_file import read_stack, sensor_of, write
-from qsim.calibration.spad import calibrate_spad, matched_variance
+from qsim.calibration.spad import calibrate_spad
 from qsim.sensor import devices
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
