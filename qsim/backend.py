@@ -1,10 +1,10 @@
-"""Which machine renders: finds CUDA or a usable LLVM, proves it in a child process, sets Mitsuba's variant.
+"""Which machine renders: finds CUDA or a usable LLVM, proves it in a child process.
 
     CUDA with OptiX -> LLVM 16 or newer -> scalar (slow, always there)
 
 Dr.Jit 1.5 refuses LLVM 14 with an ImportError and with LLVM 15 the first render aborts the whole process. So no library
 is loaded here before a child process has rendered with it; the answer is kept in the user's cache folder, keyed by the
-library's path and time and the versions of Mitsuba and Dr.Jit. Nobody else sets a variant.
+library's path and time and the versions of Mitsuba and Dr.Jit.
 
 Environment: DRJIT_LIBLLVM_PATH names an LLVM to try first, QSIM_ENGINE=cuda|llvm|scalar insists on one engine.
 """
@@ -19,8 +19,6 @@ import re
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from importlib.metadata import version
@@ -79,33 +77,15 @@ class Probe:
     detail: str  # version, or the last line of the failure
 
 
-def select(prefer: str | None = None) -> Engine:
-    """Choose (once per process) and activate an engine; `prefer` or QSIM_ENGINE insists on "cuda", "llvm" or "scalar".
-
-    Raises ValueError when the wanted engine does not work here, with the reason and what to install.
-    """
-    engine = choose(prefer)
-    activate(engine)
-    return engine
-
-
 def choose(prefer: str | None = None) -> Engine:
-    """The engine that `select` would activate, without touching Mitsuba (which the sensor's kernels do not need)."""
+    """Choose an engine, once per process; `prefer` or QSIM_ENGINE insists on "cuda", "llvm" or "scalar".
+
+    `ValueError` when the wanted engine does not work here, with the reason and what to install.
+    """
     wanted = prefer or os.environ.get("QSIM_ENGINE") or None
     if wanted not in (None, *BACKENDS):
         raise ValueError(f"engine {wanted!r}: expected one of {', '.join(BACKENDS)}")
-    return _choose(wanted)
-
-
-def activate(engine: Engine) -> None:
-    """Make this engine's variant the current one; cheap when it already is."""
-    if engine.llvm_path:
-        os.environ["DRJIT_LIBLLVM_PATH"] = engine.llvm_path
-    import mitsuba as mi
-
-    if mi.variant() != engine.variant:
-        mi.set_variant(engine.variant)
-    limit_threads()
+    return decide(wanted)
 
 
 def limit_threads() -> None:
@@ -120,44 +100,6 @@ def limit_threads() -> None:
             dr.set_thread_count(int(wanted))
 
 
-@contextmanager
-def kernels_timed() -> Iterator[list[float]]:
-    """How long compiled kernels run inside the block, one number [s] for each; the list is filled at its end.
-
-    Empty for the scalar engine, which launches none.
-    """
-    import drjit as dr
-
-    seconds: list[float] = []
-    before = dr.flag(dr.JitFlag.KernelHistory)
-    dr.set_flag(dr.JitFlag.KernelHistory, True)
-    dr.kernel_history_clear()
-    try:
-        yield seconds
-    finally:
-        seconds += [launch["execution_time"] / 1e3 for launch in dr.kernel_history()]
-        dr.set_flag(dr.JitFlag.KernelHistory, before)
-
-
-@contextmanager
-def errors_only(mi: Any) -> Iterator[None]:
-    """Mitsuba's log inside the block without warnings that say nothing here; the caller says which."""
-    level = mi.log_level()
-    mi.set_log_level(mi.LogLevel.Error)
-    try:
-        yield
-    finally:
-        mi.set_log_level(level)
-
-
-def opaque(value: Any) -> Any:
-    """A Dr.Jit value as data: were it code, every kernel would be compiled anew whenever it changes."""
-    import drjit as dr
-
-    dr.make_opaque(value)
-    return value
-
-
 def report() -> dict[str, Any]:
     """Everything `qsim doctor` says about rendering: the choice, every probe, versions, cache file."""
     engine = choose()
@@ -167,16 +109,16 @@ def report() -> dict[str, Any]:
 
 
 @lru_cache
-def _choose(wanted: str | None) -> Engine:
+def decide(wanted: str | None) -> Engine:
     failures = []
     if wanted in (None, "cuda"):
-        probe = _probe_cuda()
+        probe = probe_cuda()
         if probe.works:
             return Engine(VARIANTS["cuda"], "cuda", None, probe.detail)
         failures.append(f"CUDA: {probe.detail}")
     if wanted in (None, "llvm"):
         for library in llvm_candidates():
-            probe = _probe(VARIANTS["llvm"], library)
+            probe = cached_probe(VARIANTS["llvm"], library)
             if probe.works:
                 return Engine(VARIANTS["llvm"], "llvm", library, f"{probe.detail}, {library}")
             failures.append(f"{library}: {probe.detail}")
@@ -199,7 +141,7 @@ def llvm_candidates() -> list[str]:
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     found = [named] if named else []
     for number in LLVM_VERSIONS:
-        for pattern in _llvm_patterns(number):
+        for pattern in llvm_patterns(number):
             found += sorted(glob.glob(pattern))
         listed = ctypes.util.find_library(f"LLVM-{number}")
         if listed and os.path.isabs(listed):
@@ -211,7 +153,7 @@ def llvm_candidates() -> list[str]:
     return list(unique.values())
 
 
-def _llvm_patterns(number: int) -> list[str]:
+def llvm_patterns(number: int) -> list[str]:
     folders = ["/usr/lib/*-linux-gnu", f"/usr/lib/llvm-{number}/lib", f"/usr/lib/llvm{number}/lib*", "/usr/lib64"]
     folders += ["/usr/lib", "/usr/local/lib", f"{sys.prefix}/lib", os.environ.get("CONDA_PREFIX", sys.prefix) + "/lib"]
     names = [f"libLLVM.so.{number}.*", f"libLLVM-{number}.so*", f"libLLVM.{number}*.dylib"]
@@ -219,28 +161,28 @@ def _llvm_patterns(number: int) -> list[str]:
     return [f"{folder}/{name}" for folder in dict.fromkeys(folders) for name in names] + brew
 
 
-def _probe_cuda() -> Probe:
+def probe_cuda() -> Probe:
     """CUDA is tried only where a driver is present; its version is part of the cache key."""
     driver = Path("/proc/driver/nvidia/version")
     if not (driver.exists() or ctypes.util.find_library("cuda") or ctypes.util.find_library("nvcuda")):
         return Probe("cuda", None, False, "no NVIDIA driver on this machine")
     stamp = driver.read_text().splitlines()[0] if driver.exists() else "driver"
-    return _probe(VARIANTS["cuda"], None, stamp)
+    return cached_probe(VARIANTS["cuda"], None, stamp)
 
 
-def _probe(variant: str, library: str | None, stamp: str = "") -> Probe:
+def cached_probe(variant: str, library: str | None, stamp: str = "") -> Probe:
     """Render once in a child process, or recall the answer of an earlier child."""
     modified = os.stat(library).st_mtime_ns if library else 0
     software = [version("mitsuba"), version("drjit"), sys.version.split()[0]]
     key = json.dumps([variant, os.path.realpath(library) if library else None, modified, stamp, *software])
     answers = _read_cache()
     if key not in answers:
-        answers = _read_cache() | {key: asdict(_run_probe(variant, library))}
+        answers = _read_cache() | {key: asdict(run_probe(variant, library))}
         _write_cache(answers)
     return Probe(**answers[key])
 
 
-def _run_probe(variant: str, library: str | None) -> Probe:
+def run_probe(variant: str, library: str | None) -> Probe:
     backend = variant.split("_")[0]
     command = [sys.executable, "-W", "ignore", "-c", _PROBE, variant, library or ""]
     try:

@@ -147,7 +147,7 @@ def _machines(count: int) -> str:
 
 def plan(recipe: Recipe, *, frames: int = 5, progress: Progress | None = None) -> Plan:
     """Measure one job of each kind with so many frames (at least 2: the first one compiles)."""
-    from qsim import backend as engine
+    from qsim import backend
 
     if frames < 2:
         raise ValueError(f"plan: at least 2 frames are needed to tell the first from the others, got {frames}")
@@ -160,7 +160,7 @@ def plan(recipe: Recipe, *, frames: int = 5, progress: Progress | None = None) -
             costs.append(_measure(members, Path(folder) / f"kind{n}", frames))
             if progress is not None:
                 progress(n, len(kinds))
-    chosen = engine.select()
+    chosen = backend.choose()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return Plan(tuple(costs), f"{chosen.backend}, {chosen.variant}", peak)
 

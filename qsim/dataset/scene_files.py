@@ -29,6 +29,7 @@ from xml.etree import ElementTree
 import scenes
 from qsim import backend, files
 from qsim.dataset.provenance import nested
+from qsim.rendering import engine
 from qsim.scene.scene import Scene
 
 _INSTALLED = [sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")]
@@ -163,7 +164,7 @@ def _for_itself() -> bool:
     frame = sys._getframe(2)
     while frame is not None:
         name = frame.f_code.co_filename
-        if name.startswith("<frozen importlib") or name == backend.__file__:
+        if name.startswith("<frozen importlib") or name in (backend.__file__, engine.__file__):
             return True
         if not name.startswith("<") and _counts(Path(os.path.realpath(name))):
             return False

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.backend import errors_only, opaque
 from qsim.rendering import mitsuba_xml
+from qsim.rendering.engine import errors_only, opaque
 from qsim.scene import scene as records
 from qsim.scene.environment import environment_map, sky_map, sun_direction, sun_radiance
 from qsim.scene.scene import Body, Scene

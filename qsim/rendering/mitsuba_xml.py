@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from qsim import files
-from qsim.backend import errors_only, select
 from qsim.checks import suggest
 from qsim.optics.camera import Camera, Pose, Vector
+from qsim.rendering.engine import errors_only, select
 from qsim.scene.scene import MitsubaFile, Part, Scene
 
 F_NUMBER, PITCH = 2.8, 1.1e-6  # of the camera that is made from the file's, which has no pixels in metres

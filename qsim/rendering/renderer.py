@@ -19,12 +19,13 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import backend as engines
+from qsim.backend import Engine
 from qsim.clip.clamped_error import Errors, frame_errors, rms, white_in
 from qsim.keys import Key, hash_name, words
 from qsim.rendering import ground_truth
 from qsim.rendering.budget import Budget, blur_left, grid_samples, instants
 from qsim.rendering.denoiser import cleaned_mean
+from qsim.rendering.engine import activate, select
 from qsim.rendering.ground_truth import Hits
 from qsim.rendering.mitsuba_scene import Stage
 from qsim.scene.scene import Scene
@@ -80,7 +81,7 @@ class Renderer:
         budget: Budget | None = None,
         crop: Crop | None = None,
         thinned: int = 1,
-        engine: engines.Engine | None = None,
+        engine: Engine | None = None,
     ) -> None:
         if not frame_rate > 0:
             raise ValueError(f"frame_rate: a positive number of frames per second is needed, got {frame_rate!r}")
@@ -90,8 +91,8 @@ class Renderer:
         self.budget = budget or Budget()
         self.crop, self.thinned = _checked_crop(scene, crop), thinned
         self.shape = -(-self.crop[2] // thinned), -(-self.crop[3] // thinned)
-        self.engine = engine or engines.select()
-        engines.activate(self.engine)
+        self.engine = engine or select()
+        activate(self.engine)
         import mitsuba as mi
 
         self._mi = mi
@@ -108,7 +109,7 @@ class Renderer:
 
     def frame(self, t: int, *, with_truth: bool = True) -> Frame:
         """Render frame t."""
-        engines.activate(self.engine)
+        activate(self.engine)
         radiance, error, errors_at, fireflies = self._exposed(self.instants(t), self.key(t))
         sharp = None
         if self.shutter > 0 and self.budget.sharp:
@@ -298,7 +299,7 @@ class Renderer:
         `mi.render` with Mitsuba's camera and film, its default integrator and its default sampler; box filter. Another
         `redraw` draws other samples.
         """
-        engines.activate(self.engine)
+        activate(self.engine)
         if self._obvious is None:
             self._obvious = Stage(self._mi, self.scene, smooth_weight=1.0)
         self._obvious.place(self.time(t))

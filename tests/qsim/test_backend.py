@@ -13,7 +13,7 @@ from qsim import backend as engine
 
 RENDER = """
 import warnings; warnings.simplefilter("ignore")
-from qsim import backend as engine
+from qsim.rendering import engine
 chosen = engine.select()
 import mitsuba as mi, numpy as np
 scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "light": {"type": "constant"},
@@ -47,7 +47,7 @@ def test_the_newest_library_is_tried_first_and_a_named_one_before_it(tmp_path, m
     for number in (16, 19, 22):
         (tmp_path / f"libLLVM.so.{number}.1").write_bytes(b"")
     (tmp_path / "mine.so").write_bytes(b"")
-    monkeypatch.setattr(engine, "_llvm_patterns", lambda number: [str(tmp_path / f"libLLVM.so.{number}.*")])
+    monkeypatch.setattr(engine, "llvm_patterns", lambda number: [str(tmp_path / f"libLLVM.so.{number}.*")])
     monkeypatch.setattr(engine.ctypes.util, "find_library", lambda name: None)
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "mine.so"))
     names = [os.path.basename(path) for path in engine.llvm_candidates()]
@@ -63,19 +63,19 @@ def test_a_library_is_probed_once_until_it_changes(tmp_path, monkeypatch):
         calls.append(path)
         return engine.Probe("llvm", path, True, "LLVM 19")
 
-    monkeypatch.setattr(engine, "_run_probe", probe)
+    monkeypatch.setattr(engine, "run_probe", probe)
     for _ in range(3):
-        assert engine._probe("llvm_ad_mono", str(library)).works
+        assert engine.cached_probe("llvm_ad_mono", str(library)).works
     assert len(calls) == 1
     os.utime(library, ns=(1, 1))
-    engine._probe("llvm_ad_mono", str(library))
+    engine.cached_probe("llvm_ad_mono", str(library))
     assert len(calls) == 2
 
 
 def test_a_file_that_is_no_library_fails_its_probe(tmp_path):
     library = tmp_path / "libLLVM.so.22.1"
     library.write_bytes(b"not a library")
-    probe = engine._probe("llvm_ad_mono", str(library))
+    probe = engine.cached_probe("llvm_ad_mono", str(library))
     assert not probe.works
     assert probe.detail
 
@@ -83,15 +83,15 @@ def test_a_file_that_is_no_library_fails_its_probe(tmp_path):
 def test_without_a_usable_llvm_the_scalar_engine_says_what_to_install(monkeypatch):
     failed = engine.Probe("llvm", "old.so", False, "older than LLVM 16")
     monkeypatch.setattr(engine, "llvm_candidates", lambda: ["old.so"])
-    monkeypatch.setattr(engine, "_probe", lambda *args: failed)
-    monkeypatch.setattr(engine, "_probe_cuda", lambda: engine.Probe("cuda", None, False, "no NVIDIA driver"))
+    monkeypatch.setattr(engine, "cached_probe", lambda *args: failed)
+    monkeypatch.setattr(engine, "probe_cuda", lambda: engine.Probe("cuda", None, False, "no NVIDIA driver"))
     with pytest.warns(RuntimeWarning, match="apt install libllvm19"):
-        chosen = engine._choose.__wrapped__(None)
+        chosen = engine.decide.__wrapped__(None)
     assert chosen.variant == "scalar_rgb"
     with pytest.raises(ValueError, match=r"engine llvm does not work here .*older than LLVM 16.*install LLVM 16"):
-        engine._choose.__wrapped__("llvm")
+        engine.decide.__wrapped__("llvm")
     with pytest.raises(ValueError, match=r"engine cuda does not work here .*no NVIDIA driver"):
-        engine._choose.__wrapped__("cuda")
+        engine.decide.__wrapped__("cuda")
 
 
 def test_a_gpu_without_optix_is_told_what_to_update(monkeypatch):
@@ -102,37 +102,37 @@ def test_a_gpu_without_optix_is_told_what_to_update(monkeypatch):
         return subprocess.CompletedProcess(args, 1, stdout="", stderr=said)
 
     monkeypatch.setattr(engine.subprocess, "run", child)
-    probe = engine._run_probe(engine.VARIANTS["cuda"], None)
+    probe = engine.run_probe(engine.VARIANTS["cuda"], None)
     assert not probe.works
     assert probe.detail.startswith("OptiX is missing or too old")
     assert probe.detail.endswith("update the NVIDIA driver")
     works = engine.Probe("llvm", "new.so", True, "LLVM 19")
-    monkeypatch.setattr(engine, "_probe_cuda", lambda: probe)
+    monkeypatch.setattr(engine, "probe_cuda", lambda: probe)
     monkeypatch.setattr(engine, "llvm_candidates", lambda: ["new.so"])
-    monkeypatch.setattr(engine, "_probe", lambda *args: works)
-    assert engine._choose.__wrapped__(None).backend == "llvm"
+    monkeypatch.setattr(engine, "cached_probe", lambda *args: works)
+    assert engine.decide.__wrapped__(None).backend == "llvm"
     with pytest.raises(ValueError, match=r"engine cuda does not work here \(CUDA: OptiX is missing.*NVIDIA GPU"):
-        engine._choose.__wrapped__("cuda")
+        engine.decide.__wrapped__("cuda")
 
 
 def test_a_working_gpu_is_taken_first_and_another_engine_can_be_asked_for(monkeypatch):
     """The choice of a device, with probes that answer as on a GPU machine."""
     cuda, llvm = engine.Probe("cuda", None, True, "CUDA with OptiX"), engine.Probe("llvm", "new.so", True, "LLVM 19")
-    monkeypatch.setattr(engine, "_probe_cuda", lambda: cuda)
+    monkeypatch.setattr(engine, "probe_cuda", lambda: cuda)
     monkeypatch.setattr(engine, "llvm_candidates", lambda: ["new.so"])
-    monkeypatch.setattr(engine, "_probe", lambda *args: llvm)
-    variants = {name: engine._choose.__wrapped__(name).variant for name in (None, *engine.BACKENDS)}
+    monkeypatch.setattr(engine, "cached_probe", lambda *args: llvm)
+    variants = {name: engine.decide.__wrapped__(name).variant for name in (None, *engine.BACKENDS)}
     assert variants == {None: "cuda_ad_mono", "cuda": "cuda_ad_mono", "llvm": "llvm_ad_mono", "scalar": "scalar_rgb"}
 
 
 def test_an_unknown_engine_is_named(monkeypatch):
     monkeypatch.setenv("QSIM_ENGINE", "metal")
     with pytest.raises(ValueError, match="engine 'metal': expected one of cuda, llvm, scalar"):
-        engine.select()
+        engine.choose()
 
 
 def test_a_broken_cache_file_is_ignored(tmp_path, monkeypatch):
     (tmp_path / "qsim").mkdir()
     (tmp_path / "qsim" / "engine.json").write_text("{half a file")
-    monkeypatch.setattr(engine, "_run_probe", lambda variant, path: engine.Probe("llvm", path, True, "LLVM 19"))
-    assert engine._probe("llvm_ad_mono", sys.executable).works
+    monkeypatch.setattr(engine, "run_probe", lambda variant, path: engine.Probe("llvm", path, True, "LLVM 19"))
+    assert engine.cached_probe("llvm_ad_mono", sys.executable).works

@@ -50,7 +50,7 @@ ROOMS: dict[str, set[str]] = {
     },
 }
 DOORS = {  # who may import these libraries
-    "mitsuba": ("qsim.backend", "qsim.rendering."),
+    "mitsuba": ("qsim.rendering.",),
     "drjit": ("qsim.backend", "qsim.rendering.", "qsim.sensor.compiled."),
     "torch": ("quiver.",),
 }

@@ -335,9 +335,9 @@ def test_a_folder_that_is_not_ours(folder, monkeypatch, capsys):
 def test_no_gpu(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     monkeypatch.setenv("QSIM_ENGINE", "cuda")
-    monkeypatch.setattr(backend, "_choose", backend._choose.__wrapped__)
+    monkeypatch.setattr(backend, "decide", backend.decide.__wrapped__)
     monkeypatch.setattr(
-        backend, "_probe_cuda", lambda: backend.Probe("cuda", None, False, "no NVIDIA driver on this machine")
+        backend, "probe_cuda", lambda: backend.Probe("cuda", None, False, "no NVIDIA driver on this machine")
     )
     err = told(capsys, "qsim doctor")
     assert "engine cuda does not work here (CUDA: no NVIDIA driver on this machine); it needs an NVIDIA GPU" in err
@@ -354,9 +354,9 @@ def test_no_gpu_for_a_network(folder, monkeypatch, capsys):
 def test_an_old_llvm(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     monkeypatch.setenv("QSIM_ENGINE", "llvm")
-    monkeypatch.setattr(backend, "_choose", backend._choose.__wrapped__)
+    monkeypatch.setattr(backend, "decide", backend.decide.__wrapped__)
     monkeypatch.setattr(backend, "llvm_candidates", lambda: ["/usr/lib/libLLVM-14.so"])
-    monkeypatch.setattr(backend, "_probe", lambda *_: backend.Probe("llvm", None, False, "older than LLVM 16"))
+    monkeypatch.setattr(backend, "cached_probe", lambda *_: backend.Probe("llvm", None, False, "older than LLVM 16"))
     err = told(capsys, "qsim doctor")
     assert (
         "engine llvm does not work here (/usr/lib/libLLVM-14.so: older than LLVM 16); install LLVM 16 or newer" in err

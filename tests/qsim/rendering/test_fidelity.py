@@ -25,9 +25,9 @@ def test_sample_counts_are_those_of_the_sampler(capfd):
         count = grid_samples(samples)
         assert samples <= count <= (math.sqrt(samples) + 2) ** 2
         assert grid_samples(count) == count
-    from qsim import backend
+    from qsim.rendering import engine
 
-    backend.select()
+    engine.select()
     import mitsuba as mi
 
     for samples in (1, 2, 3, 5, 7, 11, 13, 17, 23, 31, 32, 60, 127):

@@ -71,9 +71,9 @@ def test_a_spinning_mesh_turns_its_normals_too(room):
 
 
 def test_our_camera_sees_what_the_files_camera_sees(room):
-    from qsim import backend
+    from qsim.rendering import engine
 
-    backend.select()
+    engine.select()
     import mitsuba as mi
 
     scene = read_mitsuba(room)
