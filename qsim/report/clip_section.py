@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from qsim.clip.stream import electrons_per_photon
 from qsim.optics.radiometry import clip_photons
 from qsim.report import html as page
 from qsim.sensor.defects import defect_table, fixed_pattern
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
 
 FRAMES = 48  # of a player
 WIDTH = 512  # columns of a panel; wider pictures are shown smaller by a whole factor
@@ -71,7 +74,7 @@ def flow_panel(clip: Clip, frames: range) -> tuple[page.Panel, float, NDArray[np
     return panel, largest, speed
 
 
-def legend(largest: float) -> str:
+def legend(largest: float) -> Markup:
     """The colour wheel of the flow."""
     words = f"direction and length of the flow: rim = {largest:.2g} px/frame, white = still, grey = unknown"
     return page.picture(colour.flow_legend(72), words)
@@ -84,13 +87,13 @@ def motion(clip: Clip, frames: Sequence[int]) -> tuple[float | None, float]:
     return moving_mean(known), float(np.percentile(known, 99.9)) if known.size else 0.0
 
 
-def clip_section(clip: Clip) -> str:
+def clip_section(clip: Clip) -> Markup:
     """Truth, streams and flow of a clip, its light, its motion, what was modelled, and the error of its frames."""
     frames = chosen_frames(len(clip))
     truth = truth_stack(clip, frames)
     white = colour.peak(truth)
     panels = [page.Panel(light_name(clip), fit(colour.tone(truth, white)))]
-    figures: list[str] = []
+    figures: list[Markup] = []
     lines = [light_line(clip)]
     for name in clip.streams:
         stream = clip.stream(name)
@@ -98,7 +101,7 @@ def clip_section(clip: Clip) -> str:
         if len(stream) >= len(frames):
             panels += stream_panels(stream, frames)
         figures.append(code_histogram(clip, stream))
-    wheel = ""
+    wheel = None
     if clip.has_truth:
         panel, largest, speed = flow_panel(clip, frames)
         panels.append(panel)
@@ -177,18 +180,18 @@ def error_lines(meta: dict[str, Any]) -> list[str]:
     return lines
 
 
-def modelled(meta: dict[str, Any]) -> str:
-    """What a renderer says it modelled and left out, and how large that is, as a table; empty for other clips."""
+def modelled(meta: dict[str, Any]) -> Markup | None:
+    """What a renderer says it modelled and left out, and how large that is, as a table; None for other clips."""
     findings = meta.get("render", {}).get("findings", [])
     if not findings:
-        return ""
+        return None
     rows = [[found["effect"], found["chosen"], found["size"]] for found in findings]
     return page.table(
         page.Table("What was modelled, what was left out, and how large it is", ["effect", "chosen", "size"], rows)
     )
 
 
-def code_histogram(clip: Clip, stream: Stream) -> str:
+def code_histogram(clip: Clip, stream: Stream) -> Markup:
     """How often each code was drawn in up to FRAMES frames, and what the exact distribution expects from the light."""
     count = min(len(stream), FRAMES)
     levels = 2**stream.bits
@@ -250,7 +253,7 @@ def expected_codes(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64
     return mean
 
 
-def _motion_histogram(speed: NDArray[np.floating]) -> str:
+def _motion_histogram(speed: NDArray[np.floating]) -> Markup:
     axes, save = page.axes("motion [px/frame]", "share of pixels")
     known = speed[np.isfinite(speed)]
     axes.hist(known, bins=48, weights=np.full(known.size, 1 / max(known.size, 1)), color="tab:blue")
@@ -258,7 +261,7 @@ def _motion_histogram(speed: NDArray[np.floating]) -> str:
     return page.figure(save(), "motion between neighbouring frames, all pixels")
 
 
-def _light_histogram(truth: NDArray[np.floating], clip: Clip) -> str:
+def _light_histogram(truth: NDArray[np.floating], clip: Clip) -> Markup:
     unit = "relative" if clip.camera is None else "W m⁻² sr⁻¹"
     axes, save = page.axes(f"radiance [{unit}]", "share of pixels")
     axes.hist(truth.ravel(), bins=64, weights=np.full(truth.size, 1 / truth.size), color="tab:blue")
@@ -266,7 +269,7 @@ def _light_histogram(truth: NDArray[np.floating], clip: Clip) -> str:
     return page.figure(save(), f"light of the {light_name(clip)}, all pixels")
 
 
-def error_curve(errors: Sequence[float]) -> str:
+def error_curve(errors: Sequence[float]) -> Markup:
     """The measured error of every frame."""
     axes, save = page.axes("frame", "rms error of the radiance")
     axes.plot(errors, ".-")

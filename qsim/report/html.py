@@ -1,20 +1,25 @@
 """The parts of a report: players, tables, figures, text -> one self-contained HTML page.
 
-Nothing here knows clips or sensors: frames come as uint8 arrays, words as text. `report.py` decides what to show.
+Nothing here knows clips or sensors: frames come as uint8 arrays, text is escaped by templates/, and `report.py` decides
+what to show.
 """
 
 from __future__ import annotations
 
 import base64
-import html
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from markupsafe import Markup
 
 
 @dataclass(frozen=True)
@@ -59,67 +64,24 @@ def strip(frames: NDArray[np.uint8]) -> str:
     return picture_uri(tall, quality=None if frames.shape[2] <= 256 else 88)
 
 
-def player(panels: Sequence[Panel], *, left: int = -1, milliseconds: int = 120) -> str:
+def player(panels: Sequence[Panel], *, left: int = -1, milliseconds: int = 120) -> Markup:
     """Panels that play together, a scrubber, and a slider that reveals panel `left` over the first one."""
     count = len(panels[0].frames)
     for panel in panels:
         if len(panel.frames) != count:
             raise ValueError(f"panel {panel.caption!r} has {len(panel.frames)} frames, the first has {count}")
-    figures = "".join(
-        f'<figure data-strip="{strip(p.frames)}"><canvas role="img" aria-label="{html.escape(p.caption)}"></canvas>'
-        f"<figcaption>{html.escape(p.caption)}</figcaption></figure>"
-        for p in panels
-    )
-    controls = (
-        '<div class="controls"><button class="play" type="button" aria-pressed="false">play</button>'
-        f'<input class="frame" type="range" min="0" max="{count - 1}" value="0" aria-label="frame">'
-        "<output></output></div>"
-    )
-    comparison = _comparison(panels, left % len(panels)) if len(panels) > 1 else ""
-    return (
-        f'<div class="player" tabindex="0" data-frames="{count}" data-milliseconds="{milliseconds}">'
-        f'<div class="panels">{figures}</div>{controls}{comparison}</div>'
-    )
+    strips = [(panel.caption, strip(panel.frames)) for panel in panels]
+    return _parts().player(strips, count, left % len(panels), milliseconds)
 
 
-def _comparison(panels: Sequence[Panel], left: int) -> str:
-    def choice(chosen: int, side: str) -> str:
-        options = "".join(
-            f'<option value="{i}"{" selected" if i == chosen else ""}>{html.escape(p.caption)}</option>'
-            for i, p in enumerate(panels)
-        )
-        return f'<select aria-label="{side} picture">{options}</select>'
-
-    return (
-        '<details><summary>compare two</summary><div class="compare"><div style="position:relative">'
-        '<canvas class="under"></canvas><canvas class="over"></canvas></div>'
-        '<input class="reveal" type="range" min="0" max="100" value="50" aria-label="share of the left picture">'
-        f'<div class="controls">{choice(left, "left")}{choice(0, "right")}</div></div></details>'
-    )
-
-
-def table(content: Table) -> str:
+def table(content: Table) -> Markup:
     """A table; numbers are shown to four digits and aligned to the right."""
-
-    def cell(value: object, tag: str, is_number: bool) -> str:
-        kind = ' class="number"' if is_number else ""
-        return f"<{tag}{kind}>{html.escape(number_text(value))}</{tag}>"
-
     numeric = [
         bool(content.rows) and all(isinstance(row[i], int | float) or row[i] is None for row in content.rows)
         for i in range(len(content.headers))
     ]
-    head = "".join(cell(h, "th", n) for h, n in zip(content.headers, numeric, strict=True))
-    body = "".join(
-        f"<tr{' class=best' if i in content.best else ''}>"
-        + "".join(cell(v, "td", n) for v, n in zip(row, numeric, strict=True))
-        + "</tr>"
-        for i, row in enumerate(content.rows)
-    )
-    return (
-        f'<div class="scroll"><table><caption>{html.escape(content.caption)}</caption>'
-        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
-    )
+    rows = [[number_text(value) for value in row] for row in content.rows]
+    return _parts().table(content.caption, content.headers, rows, numeric, content.best)
 
 
 def number_text(value: object) -> str:
@@ -129,19 +91,19 @@ def number_text(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def text(words: str) -> str:
-    return f"<p>{html.escape(words)}</p>"
+def text(words: str) -> Markup:
+    """A paragraph."""
+    return _parts().text(words)
 
 
-def bullets(lines: Sequence[str]) -> str:
-    return '<ul class="plain">' + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>"
+def bullets(lines: Sequence[str]) -> Markup:
+    """A list of lines."""
+    return _parts().bullets(lines)
 
 
-def figure(png: bytes, caption: str) -> str:
+def figure(png: bytes, caption: str) -> Markup:
     """A PNG figure with its caption."""
-    uri = "data:image/png;base64," + base64.b64encode(png).decode()
-    words = html.escape(caption)
-    return f'<figure><img src="{uri}" alt="{words}"><figcaption>{words}</figcaption></figure>'
+    return _parts().figure("data:image/png;base64," + base64.b64encode(png).decode(), caption)
 
 
 def axes(x_label: str, y_label: str) -> tuple[Any, Callable[[], bytes]]:
@@ -162,25 +124,42 @@ def axes(x_label: str, y_label: str) -> tuple[Any, Callable[[], bytes]]:
     return own, save
 
 
-def picture(pixels: NDArray[np.uint8], caption: str) -> str:
+def picture(pixels: NDArray[np.uint8], caption: str) -> Markup:
     """A small picture with its caption, in its own size."""
-    words = html.escape(caption)
-    image = f'<img src="{picture_uri(pixels)}" alt="{words}">'
-    return f'<figure class="small">{image}<figcaption>{words}</figcaption></figure>'
+    return _parts().picture(picture_uri(pixels), caption)
 
 
-def grid(figures: Sequence[str]) -> str:
+def grid(figures: Sequence[Markup]) -> Markup:
     """Figures side by side where there is room."""
-    return f'<div class="figures">{"".join(figures)}</div>' if figures else ""
+    return _parts().grid(figures)
 
 
-def section(title: str, *parts: str) -> str:
-    return f"<section><h2>{html.escape(title)}</h2>{''.join(parts)}</section>"
+def section(title: str, *parts: Markup | None) -> Markup:
+    """A section with its heading; parts that are None are left out."""
+    return _parts().section(title, parts)
 
 
-def page(title: str, subtitle: str, sections: Sequence[str]) -> str:
+def together(sections: Sequence[Markup]) -> Markup:
+    """Several sections as one piece."""
+    from markupsafe import Markup
+
+    return Markup("\n").join(sections)
+
+
+def page(title: str, subtitle: str, sections: Sequence[Markup]) -> str:
     """The whole page as text; it loads nothing from anywhere."""
-    template = (Path(__file__).parent / "report.html").read_text(encoding="utf-8")
-    for name, value in {"title": html.escape(title), "subtitle": html.escape(subtitle)}.items():
-        template = template.replace("{{" + name + "}}", value)
-    return template.replace("{{body}}", "\n".join(sections))
+    return _templates().get_template("page.html").render(title=title, subtitle=subtitle, sections=sections)
+
+
+@cache
+def _templates() -> Environment:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    loader = FileSystemLoader(Path(__file__).parent / "templates")
+    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+
+
+@cache
+def _parts() -> Any:
+    """The macros of parts.html; each returns `Markup`."""
+    return _templates().get_template("parts.html").module

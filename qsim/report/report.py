@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,6 +36,9 @@ from qsim.report.clip_section import (
     motion,
     stream_panels,
 )
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
 
 INSIDE_CLIPS = {"streams", "truth", "radiance", "sharp", "jobs", "failed", "logs", "locks", "work"}
 
@@ -115,7 +118,7 @@ def _steps(kind: str, file: Path) -> int:
     return len(Dataset.open(file.parent).names()) if kind == "dataset" else 1
 
 
-def dataset_section(path: Path, step: Callable[[], None] = lambda: None) -> str:
+def dataset_section(path: Path, step: Callable[[], None] = lambda: None) -> Markup:
     """A table of the clips of a data set, `step` after each, and the first clip of each split in pictures."""
     data = Dataset.open(path.parent)
     rows, below = [], set()
@@ -138,10 +141,10 @@ def dataset_section(path: Path, step: Callable[[], None] = lambda: None) -> str:
     caption = f"{len(rows)} clips{missing}; motion in the middle frame, of pixels that move more than {MOVING:g} px"
     overview = page.section(f"Data set {data.name}", page.table(page.Table(caption, headers, rows)))
     shown = [clip for split in ("test", "train", "val") for clip in data.clips(split)[:1]]
-    return overview + "".join(clip_section(clip) for clip in shown)
+    return page.together([overview, *(clip_section(clip) for clip in shown)])
 
 
-def restored_section(path: Path) -> str:
+def restored_section(path: Path) -> Markup:
     """Restored video beside its codes and truth, all at one white."""
     video = Restored.open(path)
     meta, restored = video.meta, video.frames()
@@ -156,7 +159,7 @@ def restored_section(path: Path) -> str:
         panels = [page.Panel(light_name(clip), fit(colour.tone(photons, white))), *stream_panels(stream, frames)]
     place = len(panels)
     panels.append(page.Panel(f"restored by {meta['method']}", fit(colour.tone(shown, white))))
-    wheel = ""
+    wheel = None
     if clip is not None and len(panels) > 1 and clip.has_truth:
         panel, largest, _ = flow_panel(clip, frames)
         panels.append(panel)
@@ -176,7 +179,7 @@ def _source(meta: dict[str, Any]) -> tuple[Clip | None, Stream | None]:
         return None, None
 
 
-_DRAW: dict[str, Callable[[Path], str]] = {
+_DRAW: dict[str, Callable[[Path], Markup]] = {
     "restored": restored_section,  # moving pictures first
     "evaluation": table_sections.evaluation_section,
     "static": table_sections.static_section,

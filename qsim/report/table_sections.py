@@ -12,13 +12,16 @@ Nothing is computed here that is not in the files.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from qsim import files
 from qsim.report import html as page
 
+if TYPE_CHECKING:
+    from markupsafe import Markup
 
-def training_section(path: Path) -> str:
+
+def training_section(path: Path) -> Markup:
     """The learning curve: PSNR of the validation clips against minutes."""
     history = files.read_json(path)["history"]
     axes, save = page.axes("minutes of training", "validation PSNR, matched [dB]")
@@ -28,7 +31,7 @@ def training_section(path: Path) -> str:
     return page.section(f"Training: {path.parent.name}", page.figure(save(), words))
 
 
-def evaluation_section(path: Path) -> str:
+def evaluation_section(path: Path) -> Markup:
     """Methods on held-out clips: means and 95 % intervals over scenes, best matched PSNR of each light level bold."""
     found = files.read_json(path)
     rows = [
@@ -94,7 +97,7 @@ def _pm(interval: dict[str, Any], digits: int) -> str:
     return f"{mean:.{digits}f}" + (f" ± {half:.{digits}f}" if isinstance(half, int | float) else "")
 
 
-def static_section(path: Path) -> str:
+def static_section(path: Path) -> Markup:
     """Measured photons of a static object: restored from some frames, scored against the others."""
     found = files.read_json(path)
     headers = ["method", "PSNR [dB]", "PSNR matched [dB]", "spread over splits [dB]", "with the reference's noise [dB]"]
@@ -108,8 +111,8 @@ def static_section(path: Path) -> str:
     return page.section("Real photons", page.table(page.Table(caption, headers, rows)))
 
 
-def _speed_against_error(found: dict[str, Any]) -> str:
-    """PSNR against seconds per frame, one mark per method and light level; nothing if there is no time."""
+def _speed_against_error(found: dict[str, Any]) -> Markup | None:
+    """PSNR against seconds per frame, one mark per method and light level; None if there is no time."""
     axes, save = page.axes("seconds per frame", "PSNR matched [dB]")
     lights = list(dict.fromkeys(line["light"] for line in found["table"]))
     drawn = 0
@@ -125,14 +128,14 @@ def _speed_against_error(found: dict[str, Any]) -> str:
             axes.annotate(method, (seconds, psnr), textcoords="offset points", xytext=(4, 4), fontsize=7)
         drawn += len(points)
     if not drawn:
-        return ""
+        return None
     axes.set_xscale("log")
     axes.margins(0.15)  # for the names
     axes.legend(fontsize=7)
     return page.figure(save(), "speed against error: up and to the left is better")
 
 
-def study_section(path: Path) -> str:
+def study_section(path: Path) -> Markup:
     """Bit depth against motion: the rows of a study or the cells of a sweep, with the figure that was drawn of them."""
     found = files.read_json(path)
     rows = found.get("rows") or found.get("cells") or []
@@ -150,19 +153,19 @@ def study_section(path: Path) -> str:
     return page.section(f"Study: {path.parent.name}", page.bullets(lines), *figures, table)
 
 
-def bench_section(path: Path) -> str:
+def bench_section(path: Path) -> Markup:
     """What a restored frame costs, beside its PSNR."""
     found = files.read_json(path)
     keys = list(dict.fromkeys(key for cost in found["costs"] for key in cost if not isinstance(cost[key], list | dict)))
     rows = [[cost.get(key) for key in keys] for cost in found["costs"]]
     setting = ", ".join(f"{key} {value}" for key, value in found["setting"].items() if value is not None)
     picture = path.with_name("bench.png")
-    figure = page.figure(picture.read_bytes(), "seconds per frame against PSNR") if picture.is_file() else ""
+    figure = page.figure(picture.read_bytes(), "seconds per frame against PSNR") if picture.is_file() else None
     table = page.table(page.Table(setting, [key.replace("_", " ") for key in keys], rows))
     return page.section(f"Cost of a frame: {path.parent.name}", figure, table)
 
 
-def validation_section(path: Path) -> str:
+def validation_section(path: Path) -> Markup:
     """Speed against error of sensor models or of rendering, as `qsim validate --json` printed it."""
     found = files.read_json(path)
     verdict = "everything is within its bounds" if found["ok"] else "something is OUTSIDE its bounds"
@@ -188,11 +191,11 @@ def validation_section(path: Path) -> str:
     rows = [[row[key] for key in keys] for row in found["rows"]]
     table = page.table(page.Table(f"{what}: {verdict}", [key.replace("_", " ") for key in keys], rows))
     cases = [[case["name"], case["found"], "right" if case["ok"] else "wrong"] for case in found.get("cases", [])]
-    hard = page.table(page.Table("hard cases", ["case", "found", ""], cases)) if cases else ""
+    hard = page.table(page.Table("hard cases", ["case", "found", ""], cases)) if cases else None
     return page.section("Validation", page.figure(save(), "speed against error"), table, hard)
 
 
-def reading_section(path: Path) -> str:
+def reading_section(path: Path) -> Markup:
     """Windows read per second, from a clip and from video, as `qsim validate reading --json` printed it."""
     found = files.read_json(path)
     window, clip = (" × ".join(map(str, found[key])) for key in ("window_shape", "clip_shape"))

@@ -124,7 +124,7 @@ def test_marks_are_left_out_where_nothing_exact_is_known(tmp_path):
 
 def test_an_evaluation_says_what_its_scores_mean(folder):
     """Before format 2 the peak was the sensor's white and the factor unclamped; a page never mixes the two."""
-    assert "peak = the sensor&#x27;s white" in report.build(folder, title="All")
+    assert "peak = the sensor&#39;s white" in report.build(folder, title="All")
     path = folder / "evaluation.json"
     found = json.loads(path.read_text()) | {"peak": "2.5 x the stream's mean light", "remarks": ["<nano> was never"]}
     line = found["table"][0] | {"above_peak": 0.0961, "truth_psnr": 21.0, "near_truth": ["psnr_matched"]}
@@ -180,7 +180,7 @@ def test_clip_section_says_light_motion_model_and_error(tmp_path):
     stream = clip.stream(clip.streams[0])
     page = report.build(clip.path)
     assert f"{clip.mean_photons:.4g} photons per pixel and exposure as it is" in page
-    assert f"3.25 photons per pixel (the clip&#x27;s light × {stream.photons_factor:.4g}), as much as 1.313 lx" in page
+    assert f"3.25 photons per pixel (the clip&#39;s light × {stream.photons_factor:.4g}), as much as 1.313 lx" in page
     assert "2.6 e⁻ per pixel; 3 bit, QIS (multibit): quantum_efficiency 0.8 e-/photon" in page
     assert "<td>bounces</td><td>2</td><td>later ones &lt;1 %</td>" in page
     assert "Error of a frame (noise, blur, bounces left out): 0.01 rms in the unit of the radiance, worst 0.01" in page
