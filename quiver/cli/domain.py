@@ -40,7 +40,8 @@ def _run_domain(args: argparse.Namespace) -> int:
     from quiver import threads
     from quiver.model.weights import metadata_of
     from quiver.restoration.domain import Domain, read_scope, table
-    from quiver.restoration.restorers import network_restorer, weights_path
+    from quiver.restoration.networks import network_restorer
+    from quiver.restoration.restorers import weights_path
     from quiver.restoration.sources import refuse, refuse_idle
 
     path = weights_path(args.weights)

@@ -17,11 +17,10 @@ from typing import Any
 from qsim.cli import console
 from qsim.cli.console import note
 from qsim.files import check_ours
+from quiver.restoration.interface import MODES
 
 NETWORKS = ("nano", "quiver-s", "quiver", "unet")  # see model.py
 PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see run.py
-DEFAULT_METHOD = "nano"  # of `quiver restore` and `quiver.restore`
-MODES = ("exact", "streaming", "windows")  # see restoring.py
 
 
 def numbers(text: str) -> tuple[float, ...]:
@@ -139,7 +138,7 @@ def add_strict(parser: argparse.ArgumentParser) -> None:
 
 def running_options(args: argparse.Namespace) -> Any:
     """What `add_running` asked for, as `restoring.Options`."""
-    from quiver.restoration.restorers import Options
+    from quiver.restoration.interface import Options
 
     return Options(args.memory, args.mode or "exact", args.device or "auto", args.precision or "float32")
 

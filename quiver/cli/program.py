@@ -19,7 +19,6 @@ from qsim.cli.console import Parser, bar, note, output, run
 from qsim.files import VERSION, write_bytes, write_json
 from quiver.cli.domain import add_domain
 from quiver.cli.options import (
-    DEFAULT_METHOD,
     add_light,
     add_running,
     add_strict,
@@ -35,6 +34,7 @@ from quiver.cli.options import (
     words,
 )
 from quiver.cli.train import add_ablate, add_train
+from quiver.restoration.interface import DEFAULT_METHOD
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -126,7 +126,7 @@ def _run_restore(args: argparse.Namespace) -> int:
 
 def _check_domain(args: argparse.Namespace, methods: Sequence[Any], streams: Iterable[Any]) -> list[str]:
     """A line on stderr for each network outside of what it was measured for; `ValueError` with --strict."""
-    from quiver.restoration.domain import measured_at, refuse_outside, remarks
+    from quiver.restoration.domain_remarks import measured_at, refuse_outside, remarks
 
     found: list[str] = []
     for codes in streams:

@@ -69,7 +69,7 @@ def _run_train(args: argparse.Namespace) -> int:
     from quiver import threads
     from quiver.data.clips import open_clips
     from quiver.model.presets import build
-    from quiver.restoration.restorers import pick_device
+    from quiver.restoration.networks import pick_device
     from quiver.training.loop import Diverged, train
     from quiver.training.run_folder import PROTOCOLS, draw_curve
 

@@ -28,7 +28,7 @@ from quiver.data.codes import Codes, array_codes, sensed, stored, windows_sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import breakdown, metrics
 from quiver.evaluation.peak_memory import peak_memory, reset_peak
-from quiver.restoration.restorers import Restorer
+from quiver.restoration.interface import Restorer
 
 FORMAT = "quiver-evaluation-2"  # 1: peak = the sensor's white, factor of the least unclamped error
 PLAN_FORMAT = "quiver-plan-2"

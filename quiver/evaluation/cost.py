@@ -30,16 +30,9 @@ from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
 from quiver.evaluation.peak_memory import peak_memory, reset_peak
-from quiver.restoration.restorers import (
-    MODES,
-    Options,
-    Restorer,
-    network_restorer,
-    pick_device,
-    restorer,
-    weights_path,
-    wrap_network,
-)
+from quiver.restoration.interface import MODES, Options, Restorer
+from quiver.restoration.networks import network_restorer, pick_device, wrap_network
+from quiver.restoration.restorers import restorer, weights_path
 
 EXPOSURE = 5e-4  # s
 PRESETS = ("nano", "quiver-s", "quiver", "unet")

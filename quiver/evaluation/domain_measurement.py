@@ -26,7 +26,9 @@ from quiver.evaluation import metrics
 from quiver.evaluation.comparison import in_memory
 from quiver.model.weights import annotate, metadata_of
 from quiver.restoration.domain import KEY, Cell, Domain, merged, place_of, read_scope
-from quiver.restoration.restorers import Options, Restorer, network_restorer, restorers
+from quiver.restoration.interface import Options, Restorer
+from quiver.restoration.networks import network_restorer
+from quiver.restoration.restorers import restorers
 
 CLASSICAL = ("naive", "moment:3", "transform-denoise", "qbp", "qbp-bm3d")
 

@@ -22,7 +22,7 @@ from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import ideal_counter
 from quiver.data.photon_counts import Counts
 from quiver.evaluation import metrics
-from quiver.restoration.restorers import Restorer
+from quiver.restoration.interface import Restorer
 
 FORMAT = "quiver-static-2"  # of the JSON that `quiver evaluate --static` prints; 1: peak = the largest code
 

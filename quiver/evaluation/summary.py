@@ -13,7 +13,7 @@ from quiver import threads
 from quiver.evaluation import breakdown, metrics
 from quiver.evaluation.comparison import FORMAT, Plan, Row, json_safe
 from quiver.evaluation.metrics import Interval, over_scenes
-from quiver.restoration.restorers import Restorer
+from quiver.restoration.interface import Restorer
 
 PAPER_METHODS = ("Student-Teacher", "RVRT", "EMVD", "FloRNN", "MemDeblur", "Spk2ImgNet", "bit2bit")
 COLUMNS = (

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
-from quiver.cli.options import DEFAULT_METHOD
 from quiver.data.clips import Clip
 from quiver.data.codes import Codes, Sensor, Stream, array_codes, open_stream, sensed, stream_codes
 from quiver.data.illumination import Illumination
-from quiver.restoration.domain import refuse_outside, remarks
-from quiver.restoration.restorers import Options, restorer
+from quiver.restoration.domain_remarks import refuse_outside, remarks
+from quiver.restoration.interface import DEFAULT_METHOD, Options
+from quiver.restoration.restorers import restorer
 from quiver.restoration.sources import refuse_idle
 
 Source = Stream | Clip | str | os.PathLike[str] | Array

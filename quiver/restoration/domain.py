@@ -11,24 +11,19 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from quiver.baselines import METHODS
-from quiver.data.codes import Codes, Sensor
+from quiver.data.codes import Sensor
 from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise
-
-if TYPE_CHECKING:
-    from quiver.restoration.restorers import Restorer
 
 FORMAT = "quiver-domain-1"
 KEY = "domain"  # of the metadata of a weights file
 NEAR = 1.25  # light and gain that differ by no larger factor count as the measured ones
 MAX_CELLS = 10_000
-LIGHT_FRAMES = 11  # from which the light of a stream is estimated where it is not known
 
 
 @dataclass(frozen=True)
@@ -175,79 +170,6 @@ def place_of(sensor: Sensor, exposure: float, ppp: float) -> Place:
     """Where codes of a sensor lie that sees `ppp` photons per pixel and exposure [s]."""
     efficiency = sensor.efficiency
     return Place(type(sensor).__name__, sensor.bits, ppp * efficiency, sensor.white(exposure) * efficiency)
-
-
-def light_of(codes: Codes) -> float:
-    """Photons per pixel and code of a stream: as it says, else by the moment inverse or mean of its first frames."""
-    if codes.ppp is not None and codes.ppp > 0:
-        return float(codes.ppp)
-    some = codes.read(0, min(LIGHT_FRAMES, codes.shape[0]))
-    try:
-        found = float(METHODS["moment"].restore(some, codes.sensor, codes.exposure).mean())
-    except ValueError:  # its codes tell no light
-        found = float(METHODS["naive"].restore(some, codes.sensor, codes.exposure).mean())
-    return max(found, 1e-9 * codes.white)
-
-
-def remark(name: str, scope: Scope, codes: Codes) -> str | None:
-    """One line where a network is outside of what it was measured for; None inside."""
-    ppp = light_of(codes)
-    place = place_of(codes.sensor, codes.exposure, ppp)
-    stream = f"{codes.sensor_name or place.model}, {place.bits} bit, {ppp:.3g} PPP"
-    if scope.domain is None:
-        return _unmeasured(name, scope.trained, codes, place, stream)
-    cell = scope.domain.nearest(place)
-    if cell is None:
-        best = scope.domain.best_classical
-        return f"{name} was never measured near {stream}; {best} is mostly the best classical method where it was"
-    return None if cell.wins else f"{name} is worse than {cell.classical} on {stream}: {cell.scores} at {cell.name}"
-
-
-def remarks(methods: Iterable[Restorer], codes: Codes) -> list[str]:
-    """The remarks on all networks among the methods."""
-    found = (None if m.scope is None else remark(m.name, m.scope, codes) for m in methods)
-    return [text for text in found if text is not None]
-
-
-def measured_at(method: Restorer, codes: Codes) -> str | None:
-    """For the curious: the measurement that speaks for a network on a stream; None where nothing does."""
-    if method.scope is None or method.scope.domain is None:
-        return None
-    cell = method.scope.domain.nearest(place_of(codes.sensor, codes.exposure, light_of(codes)))
-    return None if cell is None else f"{method.name} was measured at {cell.name}: {cell.scores}"
-
-
-def refuse_outside(methods: Sequence[Restorer], found: Sequence[str]) -> None:
-    """What `strict` asks for: `ValueError` with the first remark, and where no method is a network."""
-    if not any(method.learned for method in methods):
-        names = ", ".join(method.name for method in methods)
-        raise ValueError(f"strict: acts on networks, and {names} is classical; leave it out")
-    if found:
-        raise ValueError(f"{found[0]}; without strict it runs all the same")
-
-
-def _unmeasured(name: str, trained: Sequence[Illumination], codes: Codes, place: Place, stream: str) -> str:
-    """Weights without cells: what they were trained on, and whether the stream is like that."""
-    start = f"{name} was never measured against the classical methods"
-    if not trained:
-        return f"{start}, and its file does not say what it was trained on; this stream is {stream}"
-    words = ", ".join(dict.fromkeys(light.sensor for light in trained))
-    depths = ", ".join(str(bits) for bits in sorted({light.bits for light in trained if light.bits is not None}))
-    levels = ", ".join(f"{ppp:g}" for ppp in sorted({light.ppp for light in trained if light.ppp is not None}))
-    if any(_same(light, codes, place) for light in trained):
-        return f"{start}; it was trained on such streams ({stream})"
-    return f"{start}; it was trained on {words}, {depths or 'own'} bit, {levels or 'own'} PPP, this stream is {stream}"
-
-
-def _same(light: Illumination, codes: Codes, place: Place) -> bool:
-    """Whether a stream lies where training was."""
-    if light.ppp is None:
-        return False
-    try:
-        seen = place_of(light.device(codes.exposure), codes.exposure, light.ppp)
-    except (ValueError, OSError):  # a sensor's file that is not here
-        return False
-    return seen.like(place) and abs(math.log(seen.light / place.light)) <= math.log(NEAR)
 
 
 def table(domain: Domain) -> list[str]:

@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import ndarray as Array
 
 from qsim.files import VERSION, read_json, sealed, sha256, sync_folder, write_json
 from qsim.locks import Lock
 from quiver.data.codes import Codes
-from quiver.restoration.restorers import Progress, Restorer, check_finite
+from quiver.restoration.interface import Progress, Restorer
 
 FORMAT = "quiver-restored-1"
 BLOCK_FRAMES = 256  # restored between two notes of how far a file has come
@@ -195,3 +196,10 @@ def _shifted(progress: Progress | None, first: int, length: int, block: int) -> 
     if progress is None:
         return None
     return lambda done, total: progress(first + done * block // total, length)
+
+
+def check_finite(restored: Array, name: str, first: int = 0) -> None:
+    """ValueError naming the first frame with a value that is not finite; `first` is the number of the first one."""
+    for t, frame in enumerate(restored, start=first):
+        if not np.isfinite(frame).all():
+            raise ValueError(f"{name}: restored frame {t} holds NaN or Inf; are the weights damaged?")

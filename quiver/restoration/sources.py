@@ -17,7 +17,7 @@ from quiver.data.photon_cubes import cube_codes
 
 if TYPE_CHECKING:
     from quiver.evaluation.comparison import Plan
-    from quiver.restoration.restorers import Restorer
+    from quiver.restoration.interface import Restorer
 
 BARE = ("width", "planes", "frame_rate")  # facts that only a bare array does not know
 LIGHT = ("sensor", "ppp", "bits", "seed")

@@ -18,7 +18,9 @@ from quiver.evaluation.comparison import Plan, Row, evaluate
 from quiver.model.config import Config
 from quiver.model.presets import ABLATIONS, PRESETS, ablated, parameter_count
 from quiver.model.quiver import QUIVER
-from quiver.restoration.restorers import Options, Restorer, pick_device, restorer
+from quiver.restoration.interface import Options, Restorer
+from quiver.restoration.networks import pick_device
+from quiver.restoration.restorers import restorer
 from quiver.training.loop import train
 from quiver.training.run_folder import Settings, alone_in, settled
 

@@ -89,7 +89,9 @@ from quiver.data.codes import array_codes
 from quiver.data.illumination import Illumination
 from qsim.keys import Key
 from quiver.model.presets import build
-from quiver.restoration.restorers import Options, method_names, restorer, wrap_network
+from quiver.restoration.interface import Options
+from quiver.restoration.networks import wrap_network
+from quiver.restoration.restorers import method_names, restorer
 
 torch.manual_seed(0)
 sensor = Illumination().device(5e-4)

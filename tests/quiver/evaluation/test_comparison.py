@@ -24,7 +24,8 @@ from quiver.data.photon_counts import Counts, read_counts
 from quiver.evaluation import summary
 from quiver.evaluation.comparison import Plan, Row, append, begin, evaluate, finished, scored_frames, truth_psnr
 from quiver.evaluation.static_object import evaluate_static, markdown, mean_square, reference
-from quiver.restoration.restorers import Restorer, restorer
+from quiver.restoration.interface import Restorer
+from quiver.restoration.restorers import restorer
 
 HAZELNUT = Path(__file__).parents[2] / "data" / "hazelnut_gates6.npz"
 

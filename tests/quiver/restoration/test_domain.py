@@ -27,7 +27,9 @@ from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import annotate, load, metadata_of, save
 from quiver.restoration import domain
 from quiver.restoration.domain import Cell, Domain, Place, Scope
-from quiver.restoration.restorers import PRETRAINED, Options, network_restorer, network_title, restorer
+from quiver.restoration.interface import Options
+from quiver.restoration.networks import network_restorer, network_title
+from quiver.restoration.restorers import PRETRAINED, restorer
 
 NANO_TENSORS = "6a63ccb037b3b58e691acd1cc99acfc15ca5803003a647be778a7d7d36d2ab31"  # as they were trained
 

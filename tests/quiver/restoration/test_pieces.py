@@ -18,18 +18,11 @@ from quiver.model.presets import build
 from quiver.model.unet import SmallUNet, UNet, UNetConfig
 from quiver.model.weights import load
 from quiver.restoration import pieces
+from quiver.restoration.interface import MODES, Options, Restorer
+from quiver.restoration.networks import network_restorer, wrap_network
 from quiver.restoration.pieces import bytes_per_pixel, cut_pieces, frame_bytes
 from quiver.restoration.restored_file import restore_to_file
-from quiver.restoration.restorers import (
-    MODES,
-    Options,
-    Restorer,
-    network_restorer,
-    restorer,
-    shipped_names,
-    weights_path,
-    wrap_network,
-)
+from quiver.restoration.restorers import restorer, shipped_names, weights_path
 from quiver.tiles import cores, cut_tiles, extents, spans
 
 SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)

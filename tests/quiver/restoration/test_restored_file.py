@@ -25,8 +25,9 @@ from quiver.data.photon_cubes import cube_codes
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
 from quiver.restoration import restored_file
+from quiver.restoration.interface import Options, Restorer
 from quiver.restoration.restored_file import restore_to_file
-from quiver.restoration.restorers import Options, Restorer, restorer
+from quiver.restoration.restorers import restorer
 
 SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
 EXPOSURE = 5e-4

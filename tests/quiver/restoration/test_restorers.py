@@ -27,17 +27,10 @@ from quiver.model.presets import build
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
 from quiver.restoration import restored_file
+from quiver.restoration.interface import Options, Restorer
+from quiver.restoration.networks import fill_network, network_restorer
 from quiver.restoration.restored_file import restore_to_file
-from quiver.restoration.restorers import (
-    Options,
-    Restorer,
-    fill_network,
-    method_names,
-    network_restorer,
-    restorer,
-    restorers,
-    weights_path,
-)
+from quiver.restoration.restorers import method_names, restorer, restorers, weights_path
 
 EXPOSURE = 5e-4
 DEFAULTS = Options()
@@ -257,7 +250,8 @@ from quiver.evaluation.peak_memory import peak_memory, reset_peak
 from quiver.data.codes import array_codes
 from quiver.data.illumination import Illumination
 from quiver.model.presets import build
-from quiver.restoration.restorers import Options, wrap_network
+from quiver.restoration.interface import Options
+from quiver.restoration.networks import wrap_network
 sensor = Illumination().device(5e-4)
 codes = array_codes(np.random.default_rng(0).integers(0, 8, (1, 320, 320), dtype=np.uint8), sensor, 5e-4)
 method = wrap_network(build("nano"), "nano", "", Options(memory={memory}, mode="{mode}"))

@@ -13,7 +13,8 @@ from qsim.clip.stream import Sensing, sense
 from quiver.cli.program import main
 from quiver.data.illumination import Illumination
 from quiver.data.photon_cubes import cube_codes, plane_bits
-from quiver.restoration.restorers import Options, restorer
+from quiver.restoration.interface import Options
+from quiver.restoration.restorers import restorer
 
 VALID = [2**b - 1 for b in range(1, 17)]
 SPAD = Illumination("spad-320x240", None, None)

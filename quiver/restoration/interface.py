@@ -1,0 +1,63 @@
+"""The interface of every restorer: how it runs, and what a table says about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy import ndarray as Array
+
+from quiver.data.codes import Codes
+from quiver.restoration.domain import Scope
+
+DEFAULT_METHOD = "nano"  # of `quiver restore` and `quiver.restore`
+DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory beside the weights
+MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/model/schedules.py
+
+Progress = Callable[[int, int], None]  # (steps done, steps in all)
+Fill = Callable[[Codes, Array, int, Progress | None], None]  # adds photons of frames `first` ... to zeros [t, H, W]
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to run, not what to compute: apart from `mode` and `precision` the numbers agree to rounding.
+
+    A memory that holds no whole frame of a QUIVER network is the exception: a warning then says what it changed.
+    """
+
+    memory: int = DEFAULT_MEMORY  # bytes
+    mode: str = "exact"  # exact = the published windows; streaming = state carried on, faster; windows = recomputed
+    device: str = "auto"  # auto, cpu, cuda
+    precision: str = "float32"  # or bfloat16
+
+    def __post_init__(self) -> None:
+        if self.mode not in MODES:
+            raise ValueError(f"mode {self.mode!r}; known are {', '.join(MODES)}")
+        if self.precision not in ("float32", "bfloat16"):
+            raise ValueError(f"precision {self.precision!r}; known are float32 and bfloat16")
+        if self.memory < 1:
+            raise ValueError(f"memory is a number of bytes above 0, got {self.memory}")
+
+
+@dataclass(frozen=True)
+class Restorer:
+    """A method ready to run, and what a table says about it."""
+
+    name: str
+    window: int  # frames used for one restored frame
+    look_ahead: int  # of these, future ones
+    learned: bool
+    description: str
+    fill: Fill
+    seamless: bool = True  # a range of frames restored alone equals that part of the whole
+    identity: Mapping[str, object] = field(default_factory=dict)  # settings and weights that change the answer
+    cut: Callable[[int, int], str] = lambda height, width: ""  # of a frame, where it changes the answer
+    scope: Scope | None = None  # of a network: what it was measured for or trained on; None: not known
+
+    def restore(self, codes: Codes, first: int = 0, last: int | None = None, progress: Progress | None = None) -> Array:
+        """Restored photons float32 [last - first, H, W] of frames first ... last - 1, all of them by default."""
+        length, height, width = codes.shape
+        out = np.zeros(((length if last is None else last) - first, height, width), np.float32)
+        self.fill(codes, out, first, progress)
+        return out

@@ -1,0 +1,163 @@
+"""Networks as restorers: tile by tile where a frame takes more than the memory bound (pieces.py)."""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy import ndarray as Array
+
+from quiver.baselines.sliding_window import reflect
+from quiver.data.codes import Codes
+from quiver.restoration.interface import Options, Progress, Restorer
+from quiver.restoration.pieces import Disagreement, cut_pieces
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+BLOCK_PIXELS = 1 << 22  # codes read at a time: 4 MB
+CONTEXT = 5  # frames that a network needs before and after the one it restores
+
+
+def network_restorer(path: Path, options: Options) -> Restorer:
+    """The network stored in a weights file; a training run is named after its folder."""
+    from quiver.model.weights import load, metadata_of
+    from quiver.restoration.domain import read_scope
+
+    model = load(path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    name = path.parent.name if path.name == "best.safetensors" else path.stem
+    description = f"{network_title(model)}, weights {digest[:12]}, {options.mode}"
+    method = wrap_network(model, name, description, options, weights_sha256=digest)
+    return replace(method, scope=read_scope(path, metadata_of(path)))
+
+
+def network_title(model: nn.Module) -> str:
+    """What a network is, for people: `nano (U-Net on aligned frames)`, `QUIVER (quiver-s)`, `U-Net`."""
+    from quiver.model.presets import PRESETS
+    from quiver.model.quiver import QUIVER
+
+    if not isinstance(model, QUIVER):
+        return "U-Net"
+    preset = next((name for name, config in PRESETS.items() if config == model.config), None)
+    if model.config.baseline:  # its picture is that of the hourglass; the recurrent part hardly adds to it
+        what = "U-Net on aligned frames" if model.config.sweep else "U-Net with a recurrent part"
+        return what if preset is None else f"{preset} ({what})"
+    return "QUIVER" if preset is None else f"QUIVER ({preset})"
+
+
+def wrap_network(
+    model: nn.Module, name: str, description: str, options: Options, weights_sha256: str | None = None
+) -> Restorer:
+    """A network as a method; the checksum is that of its weights file."""
+    from quiver.model.blocks import RADIUS, WINDOW
+    from quiver.model.quiver import QUIVER
+
+    mode = options.mode if isinstance(model, QUIVER) else "windows"  # others share no work between frames
+    model.to(pick_device(options.device)).eval()
+
+    def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
+        fill_network(model, codes, out, first, options, progress)
+
+    identity = {"weights_sha256": weights_sha256, "mode": mode, "precision": options.precision}
+
+    def cut(height: int, width: int) -> str:
+        return cut_pieces(model, height, width, options.memory, options.mode).text
+
+    return Restorer(name, WINDOW, RADIUS, True, description, fill, mode != "streaming", identity, cut)
+
+
+def pick_device(wanted: str) -> str:
+    """`auto` is CUDA where there is one."""
+    import torch
+
+    if wanted == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: torch finds no CUDA device here; use --device cpu")
+    return wanted
+
+
+def fill_network(
+    model: nn.Module, codes: Codes, out: Array, first: int, options: Options, progress: Progress | None
+) -> None:
+    """Restore tile by tile, frame by frame; `out` must be zero and collects the weighted tiles.
+
+    A warning says by how much tiles differ where a frame is cut in a way that changes the answer (see pieces.py).
+    """
+    import torch
+
+    from quiver.model.quiver import QUIVER
+
+    device = next(model.parameters()).device
+    dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
+    height, width = codes.shape[1:]
+    pieces = cut_pieces(model, height, width, options.memory, options.mode)
+    if isinstance(model, QUIVER) and model.baseline is not None:
+        model.baseline.pixels = pieces.hourglass
+    multiple = int(model.multiple)  # type: ignore[arg-type]
+    apart, done = Disagreement.nothing(height, width), 0
+    for tile in pieces.tiles:
+        rows, columns = tile.weight.shape
+        part = (slice(tile.y, tile.y + rows), slice(tile.x, tile.x + columns))
+        frames = (pad_space(frame, multiple).to(device) for frame in padded_frames(codes, part, first, len(out)))
+        with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
+            for t, picture in enumerate(pictures(model, frames, options.mode)):
+                restored = picture[0, 0, :rows, :columns].float().cpu().numpy()
+                out[(t, *part)] += tile.weight * restored * np.float32(codes.white)
+                if t == 0 and not pieces.exact:
+                    apart.add(tile, restored)
+                done += 1
+                if progress is not None:
+                    progress(done, len(out) * len(pieces.tiles))
+    if not pieces.exact:  # tiles that agree may still differ from the whole frame
+        rms, most = apart.measured()
+        more = f"; --memory {-(-pieces.needed // 10**6)}MB restores it whole" if pieces.needed else ""
+        warnings.warn(
+            f"{codes.name}: {options.memory / 1e6:.0f} MB hold no frame of {height} x {width} px; cut into "
+            f"{pieces.text}, which differ where they overlap by {100 * rms:.2g} % of white rms, {100 * most:.2g} % at "
+            f"most{more}",
+            stacklevel=2,
+        )
+
+
+def padded_frames(codes: Codes, part: tuple[slice, slice], first: int, count: int) -> Iterator[Tensor]:
+    """Frames first-5 ... first+count+4 (reflected at the ends of the stream) as networks see them, [1, 1, h, w]."""
+    import torch
+
+    length, height, width = codes.shape
+    top = codes.sensor.levels - 1
+    step = max(1, BLOCK_PIXELS // (height * width))  # reading, and drawing, is quicker by the block
+
+    @lru_cache(maxsize=2)
+    def block(i: int) -> Array:
+        return codes.read(i * step, min((i + 1) * step, length))
+
+    for t in reflect(np.arange(first - CONTEXT, first + count + CONTEXT), length):
+        frame = block(int(t) // step)[(int(t) % step, *part)].astype(np.float32) / np.float32(top)
+        yield torch.from_numpy(frame)[None, None]
+
+
+def pad_space(frame: Tensor, multiple: int) -> Tensor:
+    """[1, 1, h, w] continued to the right and down by its last pixels, up to multiples of `multiple`."""
+    import torch.nn.functional as functional
+
+    height, width = frame.shape[-2:]
+    return functional.pad(frame, (0, -width % multiple, 0, -height % multiple), mode="replicate")
+
+
+def pictures(model: nn.Module, frames: Iterable[Tensor], mode: str) -> Iterator[Tensor]:
+    """Restored frames [1, 1, h, w], one for each frame that has five before and five after it."""
+    from quiver.model import schedules
+    from quiver.model.quiver import QUIVER
+
+    if isinstance(model, QUIVER) and mode != "windows":
+        yield from (schedules.exact if mode == "exact" else schedules.stream)(model, frames)
+    else:
+        yield from schedules.windows(model, frames)
