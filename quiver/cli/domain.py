@@ -1,4 +1,4 @@
-"""The command `quiver domain`: what weights were measured for, and the measuring; a pair as in cli.py."""
+"""The command `quiver domain`: what weights were measured for, and the measuring; a pair of options and action."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ def _run_domain(args: argparse.Namespace) -> int:
 
         args.memory = args.memory or size(MEMORY)
         threads.check(args.threads)
-        options, question = running_options(args), _question(args)
+        options, settings = running_options(args), _settings(args)
         refuse_idle(vars(args), [network_restorer(path, options)])
         use_threads(args)
         with bar("cells", "cell") as progress:
-            found: Domain | None = measure(path, question, options, progress, force=args.force)
+            found: Domain | None = measure(path, settings, options, progress, force=args.force)
     else:
         refuse(args, MEASURING, "is of measuring, and no clips are named")
         if args.force:
@@ -72,9 +72,9 @@ def _run_domain(args: argparse.Namespace) -> int:
     return 0
 
 
-def _question(args: argparse.Namespace) -> Any:
+def _settings(args: argparse.Namespace) -> Any:
     from quiver.data.illumination import Illumination
-    from quiver.evaluation.domain_measurement import CLASSICAL, Question, clips_of
+    from quiver.evaluation.domain_measurement import CLASSICAL, DomainSettings, clips_of
 
     lights = tuple(
         Illumination(sensor, ppp, bits)
@@ -87,4 +87,4 @@ def _question(args: argparse.Namespace) -> Any:
             f"--split {args.split}: chooses clips of data sets, and only clip folders are named; leave it out"
         )
     clips = clips_of(args.clips, None if args.split == "all" else args.split or "test")
-    return Question(clips, lights, args.methods or CLASSICAL, args.seed or 0)
+    return DomainSettings(clips, lights, args.methods or CLASSICAL, args.seed or 0)

@@ -10,7 +10,7 @@ import contextlib
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -136,11 +136,28 @@ def add_strict(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def running_options(args: argparse.Namespace) -> Any:
-    """What `add_running` asked for, as `restoring.Options`."""
-    from quiver.restoration.interface import Options
+def check_domain(args: argparse.Namespace, methods: Sequence[Any], streams: Iterable[Any]) -> list[str]:
+    """A line on stderr for each network outside of what it was measured for; `ValueError` with --strict."""
+    from quiver.restoration.domain_remarks import measured_at, refuse_outside, remarks
 
-    return Options(args.memory, args.mode or "exact", args.device or "auto", args.precision or "float32")
+    found: list[str] = []
+    for codes in streams:
+        found += [text for text in remarks(methods, codes) if text not in found]
+        if args.strict:
+            refuse_outside(methods, found)
+        if args.verbose:
+            for text in filter(None, (measured_at(method, codes) for method in methods)):
+                note(f"quiver: {text}")
+    for text in found:
+        note(f"quiver: warning: {text}")
+    return found
+
+
+def running_options(args: argparse.Namespace) -> Any:
+    """What `add_running` asked for, as `RestoreOptions`."""
+    from quiver.restoration.interface import RestoreOptions
+
+    return RestoreOptions(args.memory, args.mode or "exact", args.device or "auto", args.precision or "float32")
 
 
 def renew(folder: Path, mark: str, ours: str) -> None:

@@ -1,4 +1,4 @@
-"""Commands that train: `train` one network, `ablate` six; pairs as in cli.py."""
+"""Commands that train: `train` one network, `ablate` six; pairs of options and action."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ def add_ablate(sub: Any) -> None:
 def _run_ablate(args: argparse.Namespace) -> int:
     from quiver import threads
     from quiver.evaluation import summary
-    from quiver.evaluation.comparison import Plan
+    from quiver.evaluation.comparison import Comparison
     from quiver.model.presets import ABLATIONS
     from quiver.training.ablation import markdown, one_noise, run_ablation
 
@@ -173,14 +173,14 @@ def _run_ablate(args: argparse.Namespace) -> int:
     settings, lines = one_noise(settings)
     for line in lines:
         note(line)
-    plan = Plan(args.data, args.split, tuple(noise.simple for noise in settings.noise or ()), settings.seed)
+    comparison = Comparison(args.data, args.split, tuple(noise.simple for noise in settings.noise or ()), settings.seed)
     with _signals() as interrupted:
         options, show = running_options(args), not (args.json or args.quiet)
-        found = run_ablation(settings, plan, options, should_stop=lambda: bool(interrupted), progress=show)
+        found = run_ablation(settings, comparison, options, should_stop=lambda: bool(interrupted), progress=show)
     if found is None:
         print("quiver: interrupted; the same command goes on where it stopped", file=sys.stderr)
         return 130
     methods, rows = found
-    summary.write(Path(args.output) / "table", plan, methods, rows)
-    output(args, summary.as_dict(plan, methods, rows), markdown(args.preset, rows))
+    summary.write(Path(args.output) / "table", comparison, methods, rows)
+    output(args, summary.as_dict(comparison, methods, rows), markdown(args.preset, rows))
     return 1 if any(row.failure for row in rows) else 0

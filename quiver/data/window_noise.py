@@ -9,8 +9,8 @@ before, as far as the clip has them. Counting pixels that remember an earlier ex
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 from numpy import ndarray as Array
@@ -27,21 +27,19 @@ from quiver.data.noise import Noise, stored_defects
 NEGLIGIBLE = 1e-6  # chance of an afterpulse chain that is as long as the frames before a window
 
 
-class Placed(Protocol):
-    """Where a window lies in its clip."""
+@dataclass(frozen=True)
+class WindowPlace:
+    """Where sample n comes from and how it is turned: enough to make it again."""
 
-    @property
-    def start(self) -> int: ...
-    @property
-    def y(self) -> int: ...
-    @property
-    def x(self) -> int: ...
-    @property
-    def drift(self) -> tuple[int, int]: ...
-    @property
-    def backwards(self) -> bool: ...
-    @property
-    def key(self) -> Key: ...
+    clip: int
+    start: int
+    y: int  # of the first frame taken
+    x: int
+    drift: tuple[int, int]  # px/frame along y and x: whole pixels, so that nothing is interpolated
+    light: int
+    turn: int  # quarter turns 0..3, + 4 = mirrored first
+    backwards: bool
+    key: Key
 
 
 @lru_cache(maxsize=16)
@@ -62,7 +60,7 @@ def check_windows(noise: Noise, clip: Clip) -> None:
 
 
 def window_codes(
-    noise: Noise, draw: Draw, clip: Clip, place: Placed, frames: int, side: int, scale: float = 1.0
+    noise: Noise, draw: Draw, clip: Clip, place: WindowPlace, frames: int, side: int, scale: float = 1.0
 ) -> Array:
     """Codes [T, side, side] of a window with defects, in the order in which its frames are seen, not turned.
 

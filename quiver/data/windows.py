@@ -32,7 +32,7 @@ from quiver.data.code_table import draw_codes
 from quiver.data.illumination import Illumination
 from quiver.data.mixture import Mixture, choose
 from quiver.data.noise import Noise
-from quiver.data.window_noise import check_windows, window_codes
+from quiver.data.window_noise import WindowPlace, check_windows, window_codes
 
 TRAINING, VALIDATION = 1, 2  # stages of the random keys: no two uses share noise (0 is `qsim sense`)
 
@@ -56,21 +56,6 @@ class WindowSettings:
             raise ValueError(f"WindowSettings: frames and crop must be at least 1, got {self.frames} and {self.crop}")
         if self.lights is not None and not self.lights:
             raise ValueError("WindowSettings.lights is empty; give at least one light level, or None for the streams'")
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where sample n comes from and how it is turned: enough to make it again."""
-
-    clip: int
-    start: int
-    y: int  # of the first frame taken
-    x: int
-    drift: tuple[int, int]  # px/frame along y and x: whole pixels, so that nothing is interpolated
-    light: int
-    turn: int  # quarter turns 0..3, + 4 = mirrored first
-    backwards: bool
-    key: Key
 
 
 class Windows(Dataset[dict[str, Any]]):
@@ -104,7 +89,7 @@ class Windows(Dataset[dict[str, Any]]):
     def __len__(self) -> int:
         return self.length
 
-    def place(self, n: int) -> Place:
+    def place(self, n: int) -> WindowPlace:
         """Where sample n lies, without reading it."""
         if self.fixed:
             return self._middle(n % self.length)
@@ -118,7 +103,7 @@ class Windows(Dataset[dict[str, Any]]):
             int(rng.integers(side - settings.crop - abs(way) + 1)) + max(0, -way)
             for side, way in zip((height, width), (d * (settings.frames - 1) for d in drift), strict=True)
         )
-        return Place(
+        return WindowPlace(
             clip=clip,
             start=start,
             y=y,
@@ -139,12 +124,12 @@ class Windows(Dataset[dict[str, Any]]):
         dy, dx = (int(rng.integers(-most, most + 1)) for most in (min(settings.drift, r) for r in room))
         return dy, dx
 
-    def _middle(self, index: int) -> Place:
+    def _middle(self, index: int) -> WindowPlace:
         settings, clip = self.settings, index % len(self.clips)
         length, height, width = self.clips[clip].shape
         start, y, x = (length - settings.frames) // 2, (height - settings.crop) // 2, (width - settings.crop) // 2
         key = Key(seed=settings.seed, clip=index, stage=VALIDATION)
-        return Place(clip, start, y, x, (0, 0), index // len(self.clips), 0, False, key)
+        return WindowPlace(clip, start, y, x, (0, 0), index // len(self.clips), 0, False, key)
 
     def __getitem__(self, n: int) -> dict[str, Any]:
         place = self.place(n)
@@ -173,7 +158,7 @@ class Windows(Dataset[dict[str, Any]]):
             f"{'backwards, ' if place.backwards else ''}{noise.label}, {place.key}",
         }
 
-    def _photons(self, place: Place) -> tuple[Array, Array]:
+    def _photons(self, place: WindowPlace) -> tuple[Array, Array]:
         """Expected photons of the exposed and of the sharp window, [T, h, w], turned."""
         clip, side = self.clips[place.clip], self.settings.crop
         (dy, dx), draw = place.drift, self._draw(place)
@@ -198,14 +183,14 @@ class Windows(Dataset[dict[str, Any]]):
             taken(sharp=True) if has_sharp(clip) or draw.diffraction else exposed, place
         )
 
-    def _draw(self, place: Place) -> Draw:
+    def _draw(self, place: WindowPlace) -> Draw:
         """Sensor and light factor of a place's clip and noise."""
         if (place.clip, place.light) not in self._draws:
             self._draws[place.clip, place.light] = self.noise.noises[place.light].draw(self.clips[place.clip])
         return self._draws[place.clip, place.light]
 
 
-def turned(window: Array, place: Place) -> Array:
+def turned(window: Array, place: WindowPlace) -> Array:
     """A window [T, h, w] flipped, turned and reversed as its place says."""
     window = window[:, :, ::-1] if place.turn >= 4 else window
     window = np.rot90(window, place.turn % 4, axes=(1, 2))

@@ -38,7 +38,7 @@ Progress = Callable[[str, int, int], None]  # (what is restored, rows done, rows
 
 
 @dataclass(frozen=True)
-class Plan:
+class Comparison:
     """What is evaluated; stored beside the results."""
 
     source: str  # data set or clip folder
@@ -55,7 +55,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Row:
+class ComparisonRow:
     """One clip restored by one method at one light level; either a score or the reason why there is none."""
 
     method: str
@@ -82,7 +82,7 @@ class Row:
         return json_safe(asdict(self))
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Row:
+    def from_dict(cls, values: dict[str, Any]) -> ComparisonRow:
         score = values.pop("score")
         if score is not None:
             numbers: dict[str, Any] = {name: math.nan if v is None else v for name, v in score.items()}
@@ -129,32 +129,38 @@ def truth_psnr(clip: Clip, factor: float, peak: float, frames: range) -> float |
     return metrics.truth_psnr([errors[t] * unit for t in frames])
 
 
-def peak_in_photons(plan: Plan, clip: Clip, codes: Codes, factor: float) -> float:
-    """The peak of a clip's scores: as the plan says, else 2.5 times the mean light, or as published the white."""
-    if plan.peak is None and plan.published:
+def peak_in_photons(comparison: Comparison, clip: Clip, codes: Codes, factor: float) -> float:
+    """The peak of a clip's scores: as the comparison says, else 2.5 times the mean light, or as published the white."""
+    if comparison.peak is None and comparison.published:
         return codes.white
-    return peak_of(mean_light(clip, factor), plan.peak)
+    return peak_of(mean_light(clip, factor), comparison.peak)
 
 
 def restore_clip(
-    method: Restorer, clip: Clip, light: Illumination, plan: Plan, codes: Codes, factor: float, out: Path | None = None
-) -> Row:
+    method: Restorer,
+    clip: Clip,
+    light: Illumination,
+    comparison: Comparison,
+    codes: Codes,
+    factor: float,
+    out: Path | None = None,
+) -> ComparisonRow:
     """Restore and score one clip, and keep a crop of its middle frame under OUT; a failure becomes the row's reason."""
-    row = Row(method.name, method.description, plan.stream or light.label, clip.name, scene_of(clip))
-    frames = scored_frames(len(clip), plan.published)
-    white = peak_in_photons(plan, clip, codes, factor)
+    row = ComparisonRow(method.name, method.description, comparison.stream or light.label, clip.name, scene_of(clip))
+    frames = scored_frames(len(clip), comparison.published)
+    white = peak_in_photons(comparison, clip, codes, factor)
     target, valid = truth(clip, factor, frames.start, frames.stop) / white, known(clip, frames.start, frames.stop)
-    windows = list(windows_sensed(clip, light, plan.seed, frames)) if plan.published else []
+    windows = list(windows_sensed(clip, light, comparison.seed, frames)) if comparison.published else []
     before, started = reset_peak(), time.perf_counter()
     try:
-        if plan.published:
+        if comparison.published:
             pieces = [method.restore(window, PUBLISHED_EDGE, PUBLISHED_EDGE + 1) for window in windows]
             restored = np.concatenate(pieces)
         else:
             restored = method.restore(codes)
         seconds = (time.perf_counter() - started) / len(frames)
         peak = peak_memory() - before
-        score = metrics.score(restored / np.float32(white), target, per_frame_scale=plan.published, valid=valid)
+        score = metrics.score(restored / np.float32(white), target, per_frame_scale=comparison.published, valid=valid)
     except Exception as error:  # whatever a method dies of is its result
         return replace(row, failure=f"{type(error).__name__}: {' '.join(str(error).split())}")
     matched = restored * np.float32(score.scale / white)
@@ -176,7 +182,9 @@ def restore_clip(
     )
 
 
-def keep_crops(out: Path, row: Row, clip: Clip, codes: Codes, frames: range, stacks: dict[str, Array]) -> None:
+def keep_crops(
+    out: Path, row: ComparisonRow, clip: Clip, codes: Codes, frames: range, stacks: dict[str, Array]
+) -> None:
     """The part of the middle frame where most moves, from each [T, H, W] stack and from the codes, under OUT/crops."""
     middle = len(frames) // 2
     part = breakdown.place(clip, frames[middle])
@@ -187,27 +195,29 @@ def keep_crops(out: Path, row: Row, clip: Clip, codes: Codes, frames: range, sta
 
 
 def evaluate(
-    plan: Plan, methods: Sequence[Restorer], out: Path | None = None, progress: Progress | None = None
-) -> list[Row]:
+    comparison: Comparison, methods: Sequence[Restorer], out: Path | None = None, progress: Progress | None = None
+) -> list[ComparisonRow]:
     """Every method on every clip at every light level; rows are kept in OUT/rows.jsonl and taken from there.
 
     ValueError if there is nothing to score, FileExistsError if OUT holds another evaluation.
     """
-    if plan.stream is not None and (plan.published or len(plan.lights) > 1):
+    if comparison.stream is not None and (comparison.published or len(comparison.lights) > 1):
         raise ValueError("a stored stream has one light level and one exposure; leave out --ppp and --published")
-    clips = open_clips(plan.source, plan.split)
+    clips = open_clips(comparison.source, comparison.split)
     if not clips:
-        raise ValueError(f"{plan.source}: no finished clip in split {plan.split!r}")
+        raise ValueError(f"{comparison.source}: no finished clip in split {comparison.split!r}")
     for clip in clips:
-        if not scored_frames(len(clip), plan.published):
+        if not scored_frames(len(clip), comparison.published):
             raise ValueError(f"clip {clip.name}: {len(clip)} frames are too few, the published windows have 11")
-    known = {row.key: row for row in begin(plan, out, clips)} if out is not None else {}
-    rows: list[Row] = []
-    total = len(plan.lights) * len(clips) * len(methods)
-    for light in plan.lights:
+    known = {row.key: row for row in begin(comparison, out, clips)} if out is not None else {}
+    rows: list[ComparisonRow] = []
+    total = len(comparison.lights) * len(clips) * len(methods)
+    for light in comparison.lights:
         for clip in clips:
-            drawn, factor = sensed(clip, light, plan.seed) if plan.stream is None else stored(clip, plan.stream)
-            label = plan.stream or light.label
+            drawn, factor = (
+                sensed(clip, light, comparison.seed) if comparison.stream is None else stored(clip, comparison.stream)
+            )
+            label = comparison.stream or light.label
             codes: Codes | None = None
             for method in methods:
                 key = (method.name, method.description, label, clip.name)
@@ -215,7 +225,7 @@ def evaluate(
                     progress(f"{method.name}, {clip.name}, {label}", len(rows), total)
                 if key not in known:
                     codes = codes or in_memory(drawn)
-                    known[key] = restore_clip(method, clip, light, plan, codes, factor, out)
+                    known[key] = restore_clip(method, clip, light, comparison, codes, factor, out)
                     if out is not None:
                         append(out / "rows.jsonl", known[key])
                 rows.append(known[key])
@@ -224,11 +234,13 @@ def evaluate(
     return rows
 
 
-def streams(plan: Plan) -> Iterator[Codes]:
-    """Every stream of a plan, nothing drawn yet; as `evaluate` for what cannot be scored."""
-    for light in plan.lights:
-        for clip in open_clips(plan.source, plan.split):
-            yield (sensed(clip, light, plan.seed) if plan.stream is None else stored(clip, plan.stream))[0]
+def streams(comparison: Comparison) -> Iterator[Codes]:
+    """Every stream of a comparison, nothing drawn yet; as `evaluate` for what cannot be scored."""
+    for light in comparison.lights:
+        for clip in open_clips(comparison.source, comparison.split):
+            yield (
+                sensed(clip, light, comparison.seed) if comparison.stream is None else stored(clip, comparison.stream)
+            )[0]
 
 
 def in_memory(codes: Codes) -> Codes:
@@ -236,16 +248,18 @@ def in_memory(codes: Codes) -> Codes:
     return replace(codes, read=array_codes(codes.read(0, codes.shape[0]), codes.sensor, codes.exposure).read)
 
 
-def content_digest(plan: Plan, clips: Sequence[Clip]) -> str:
+def content_digest(comparison: Comparison, clips: Sequence[Clip]) -> str:
     """SHA-256 of what is scored: the descriptions of the clips, which hold checksums, and of the stored stream."""
-    described = [[clip.meta, None if plan.stream is None else clip.stream(plan.stream).meta] for clip in clips]
+    described = [
+        [clip.meta, None if comparison.stream is None else clip.stream(comparison.stream).meta] for clip in clips
+    ]
     return hashlib.sha256(json.dumps(described, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def begin(plan: Plan, out: Path, clips: Sequence[Clip]) -> list[Row]:
+def begin(comparison: Comparison, out: Path, clips: Sequence[Clip]) -> list[ComparisonRow]:
     """Make the folder of an evaluation, or take the finished rows of an interrupted one of the same content."""
     path = out / "plan.json"
-    wanted = {"format": PLAN_FORMAT} | plan.to_dict() | {"content_sha256": content_digest(plan, clips)}
+    wanted = {"format": PLAN_FORMAT} | comparison.to_dict() | {"content_sha256": content_digest(comparison, clips)}
     if not path.exists():
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise FileExistsError(f"{out} exists and is no evaluation; choose another -o")
@@ -266,18 +280,18 @@ def begin(plan: Plan, out: Path, clips: Sequence[Clip]) -> list[Row]:
     return list(finished(text.splitlines()))
 
 
-def finished(lines: Sequence[str]) -> Iterator[Row]:
+def finished(lines: Sequence[str]) -> Iterator[ComparisonRow]:
     """Rows of a file whose last line may be torn; failures are left out, so that they are tried again."""
     for line in lines:
         try:
-            row = Row.from_dict(json.loads(line))
+            row = ComparisonRow.from_dict(json.loads(line))
         except (json.JSONDecodeError, KeyError, TypeError):
             continue
         if row.failure is None:
             yield row
 
 
-def append(path: Path, row: Row) -> None:
+def append(path: Path, row: ComparisonRow) -> None:
     with open(path, "a", encoding="utf-8") as file:
         file.write(json.dumps(row.to_dict(), sort_keys=True, allow_nan=False) + "\n")
         file.flush()

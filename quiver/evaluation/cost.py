@@ -30,7 +30,7 @@ from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
 from quiver.evaluation.peak_memory import peak_memory, reset_peak
-from quiver.restoration.interface import MODES, Options, Restorer
+from quiver.restoration.interface import MODES, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer, pick_device, wrap_network
 from quiver.restoration.restorers import restorer, weights_path
 
@@ -39,7 +39,7 @@ PRESETS = ("nano", "quiver-s", "quiver", "unet")
 
 
 @dataclass(frozen=True)
-class Case:
+class CostCase:
     """One method run in one way."""
 
     method: str
@@ -48,7 +48,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Setting:
+class CostSettings:
     """The fixed clip and what is timed on it."""
 
     height: int = 64
@@ -61,7 +61,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Cost:
+class CostRow:
     """What a case cost; NaN where it could not be measured."""
 
     method: str
@@ -76,29 +76,29 @@ class Cost:
     failure: str | None = None
 
 
-def fixed_clip(setting: Setting) -> tuple[Codes, Array]:
+def fixed_clip(settings: CostSettings) -> tuple[Codes, Array]:
     """Codes of waves and a disk that move 2 px per frame, and their photons; the same for ever."""
-    sensor = Illumination(ppp=setting.ppp).device(EXPOSURE)
-    y, x = np.mgrid[: setting.height, : setting.width].astype(float)
+    sensor = Illumination(ppp=settings.ppp).device(EXPOSURE)
+    y, x = np.mgrid[: settings.height, : settings.width].astype(float)
     frames = []
-    for t in range(setting.frames):
+    for t in range(settings.frames):
         moved = x - 2 * t
         waves = np.sin(0.31 * moved + 0.2 * y) + np.sin(0.83 * moved - 0.4 * y) + np.sin(0.15 * y + 1)
-        disk = (moved % setting.width - setting.width / 2) ** 2 + (y - setting.height / 2) ** 2
-        frames.append(1 + 0.2 * waves + 0.8 * (disk < (setting.height / 5) ** 2))
+        disk = (moved % settings.width - settings.width / 2) ** 2 + (y - settings.height / 2) ** 2
+        frames.append(1 + 0.2 * waves + 0.8 * (disk < (settings.height / 5) ** 2))
     photons = np.stack(frames)
-    photons *= setting.ppp / photons.mean()
+    photons *= settings.ppp / photons.mean()
     codes = draw_codes(sensor, photons, EXPOSURE, Key(seed=0, clip=0))
     return array_codes(codes, sensor, EXPOSURE, name="fixed clip"), photons
 
 
-def method_of(case: Case, device: str) -> tuple[Restorer, bool]:
+def method_of(case: CostCase, device: str) -> tuple[Restorer, bool]:
     """The restorer of a case, and whether it has trained weights (or needs none)."""
     import torch
 
     from quiver.model.presets import build
 
-    options = Options(mode=case.mode, precision=case.precision, device=device)
+    options = RestoreOptions(mode=case.mode, precision=case.precision, device=device)
     if case.method.partition(":")[0] in METHODS:
         return restorer(case.method, options), True
     try:
@@ -111,17 +111,17 @@ def method_of(case: Case, device: str) -> tuple[Restorer, bool]:
     return network_restorer(path, options), True
 
 
-def measure(case: Case, setting: Setting) -> Cost:
+def measure(case: CostCase, settings: CostSettings) -> CostRow:
     """Run one case in this process: two frames for its memory, which does not grow with the clip, then all, warm."""
     import torch
 
-    if setting.threads is not None:
-        torch.set_num_threads(setting.threads)
-    codes, photons = fixed_clip(setting)
-    method, trained = method_of(case, setting.device)
-    first = (setting.frames - setting.restored) // 2
-    last = first + setting.restored
-    cuda = method.learned and pick_device(setting.device) == "cuda"
+    if settings.threads is not None:
+        torch.set_num_threads(settings.threads)
+    codes, photons = fixed_clip(settings)
+    method, trained = method_of(case, settings.device)
+    first = (settings.frames - settings.restored) // 2
+    last = first + settings.restored
+    cuda = method.learned and pick_device(settings.device) == "cuda"
     if cuda:
         torch.cuda.reset_peak_memory_stats()
     before = reset_peak()
@@ -129,10 +129,10 @@ def measure(case: Case, setting: Setting) -> Cost:
     peak = torch.cuda.max_memory_allocated() if cuda else peak_memory() - before
     started = time.perf_counter()
     restored = method.restore(codes, first, last)
-    seconds = (time.perf_counter() - started) / setting.restored
-    white = peak_of(setting.ppp)
+    seconds = (time.perf_counter() - started) / settings.restored
+    white = peak_of(settings.ppp)
     score = metrics.score(restored / white, photons[first:last] / white)
-    return Cost(
+    return CostRow(
         **asdict(case),
         trained=trained,
         seconds_per_frame=seconds,
@@ -155,56 +155,58 @@ def multiply_accumulates(method: Restorer, codes: Codes, first: int) -> float:
     return counts[1] - counts[0]
 
 
-def bench(cases: Sequence[Case], setting: Setting, progress: Callable[[int, int], None] | None = None) -> list[Cost]:
+def bench(
+    cases: Sequence[CostCase], settings: CostSettings, progress: Callable[[int, int], None] | None = None
+) -> list[CostRow]:
     """Every case in a fresh process; a case that dies keeps its row, with the reason."""
     costs = []
     for i, case in enumerate(cases):
         if progress is not None:
             progress(i, len(cases))
-        costs.append(_in_own_process(case, setting))
+        costs.append(_in_own_process(case, settings))
     if progress is not None:
         progress(len(cases), len(cases))
     return costs
 
 
-def _in_own_process(case: Case, setting: Setting) -> Cost:
+def _in_own_process(case: CostCase, settings: CostSettings) -> CostRow:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_child, args=(theirs, case, setting), daemon=True)
+    process = context.Process(target=_child, args=(theirs, case, settings), daemon=True)
     process.start()
     theirs.close()
     try:
-        found: Cost | str = ours.recv()
+        found: CostRow | str = ours.recv()
     except EOFError:
         process.join()
         found = f"its process died (exit code {process.exitcode}); too little memory?"
     process.join()
-    if isinstance(found, Cost):
+    if isinstance(found, CostRow):
         return found
-    return Cost(**asdict(case), trained=False, seconds_per_frame=math.nan, peak_bytes=0, gmac_per_frame=math.nan,
+    return CostRow(**asdict(case), trained=False, seconds_per_frame=math.nan, peak_bytes=0, gmac_per_frame=math.nan,
                 psnr_matched=math.nan, failure=found)  # fmt: skip
 
 
-def _child(pipe: Any, case: Case, setting: Setting) -> None:
+def _child(pipe: Any, case: CostCase, settings: CostSettings) -> None:
     try:
-        pipe.send(measure(case, setting))
+        pipe.send(measure(case, settings))
     except Exception as error:  # whatever it dies of is its result
         pipe.send(f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
-def cases_of(methods: Sequence[str], modes: Sequence[str], precisions: Sequence[str]) -> list[Case]:
+def cases_of(methods: Sequence[str], modes: Sequence[str], precisions: Sequence[str]) -> list[CostCase]:
     """All combinations; modes and precisions make no difference to classical methods, modes none to the U-Net."""
     cases = []
     for method in methods:
         classical = method.partition(":")[0] in METHODS
         for mode in modes[:1] if classical or method == "unet" else modes:
-            cases += [Case(method, mode, precision) for precision in (precisions[:1] if classical else precisions)]
+            cases += [CostCase(method, mode, precision) for precision in (precisions[:1] if classical else precisions)]
     return cases
 
 
 def checked_cases(
     methods: Sequence[str], modes: Sequence[str] | None, precisions: Sequence[str] | None, device: str | None
-) -> list[Case]:
+) -> list[CostCase]:
     """As `cases_of`, with the defaults for None; `ValueError` for unknown names and for options that cannot act."""
     networks = [method for method in methods if method.partition(":")[0] not in METHODS]
     for method in methods:
@@ -226,10 +228,10 @@ def checked_cases(
     return cases_of(methods, modes or ("exact", "streaming"), precisions or ("float32",))
 
 
-def markdown(costs: Sequence[Cost], setting: Setting) -> str:
+def markdown(costs: Sequence[CostRow], settings: CostSettings) -> str:
     """The result as a table."""
     text = [
-        f"# Cost of a restored frame: {setting.height} x {setting.width}, {setting.ppp:g} PPP, {setting.device}",
+        f"# Cost of a restored frame: {settings.height} x {settings.width}, {settings.ppp:g} PPP, {settings.device}",
         "",
         "| method | mode | precision | s/frame | peak memory | GMAC/frame | PSNR matched |",
         "|---|---|---|---|---|---|---|",
@@ -245,7 +247,7 @@ def markdown(costs: Sequence[Cost], setting: Setting) -> str:
     return "\n".join(text) + "\n"
 
 
-def figure(costs: Sequence[Cost], path: Path) -> None:
+def figure(costs: Sequence[CostRow], path: Path) -> None:
     """PSNR against seconds per frame, as PNG; untrained networks are left out."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

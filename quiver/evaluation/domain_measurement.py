@@ -26,7 +26,7 @@ from quiver.evaluation import metrics
 from quiver.evaluation.comparison import in_memory
 from quiver.model.weights import annotate, metadata_of
 from quiver.restoration.domain import KEY, Cell, Domain, merged, place_of, read_scope
-from quiver.restoration.interface import Options, Restorer
+from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 from quiver.restoration.restorers import restorers
 
@@ -36,7 +36,7 @@ Progress = Callable[[int, int], None]  # (cells done, cells in all)
 
 
 @dataclass(frozen=True)
-class Question:
+class DomainSettings:
     """What is measured."""
 
     clips: tuple[Clip, ...]
@@ -71,7 +71,12 @@ def clips_of(sources: Sequence[Path], split: str | None) -> tuple[Clip, ...]:
 
 
 def measure(
-    weights: Path, question: Question, options: Options, progress: Progress | None = None, *, force: bool = False
+    weights: Path,
+    settings: DomainSettings,
+    options: RestoreOptions,
+    progress: Progress | None = None,
+    *,
+    force: bool = False,
 ) -> Domain:
     """Measure what is missing of the cells of a weights file, and store each in its metadata as soon as it is there.
 
@@ -79,11 +84,11 @@ def measure(
     were measured otherwise (other clips, methods, seed or version) go. The tensors of the file stay as they are.
     `ValueError` for classical methods that are none, and for cells measured otherwise without `force`.
     """
-    methods = restorers(question.methods, options)
+    methods = restorers(settings.methods, options)
     network = network_restorer(weights, options)
     if any(method.learned for method in methods):
-        raise ValueError(f"a network is measured against classical methods, got {', '.join(question.methods)}")
-    shared = question.to_dict()
+        raise ValueError(f"a network is measured against classical methods, got {', '.join(settings.methods)}")
+    shared = settings.to_dict()
     before = read_scope(weights, metadata_of(weights)).domain
     if before is not None and dict(before.measured) != shared and not force:
         changed = ", ".join(key for key, value in shared.items() if before.measured.get(key) != value)
@@ -91,13 +96,13 @@ def measure(
             f"{weights}: holds {len(before.cells)} cells that were measured otherwise (not the same: {changed}); "
             "measure into a copy of the file, or use --force to replace them"
         )
-    todo = [light for light in question.lights if force or not _known(weights, shared, light)]
+    todo = [light for light in settings.lights if force or not _known(weights, shared, light)]
     for done, light in enumerate(todo):
         if progress is not None:
             progress(done, len(todo))
         if not force and _known(weights, shared, light):  # by another process, meanwhile
             continue
-        cell = measure_cell(network, methods, question, light)
+        cell = measure_cell(network, methods, settings, light)
         with _one_at_a_time(weights):
             cells = merged(stored_cells(weights, shared), [cell])
             annotate(weights, {KEY: Domain(cells, shared).to_json()})
@@ -131,22 +136,22 @@ def _measures(cell: Cell, light: Illumination) -> bool:
     return (cell.sensor, cell.place.bits, cell.ppp) == (Path(light.sensor).name, light.bits, light.ppp)
 
 
-def measure_cell(network: Restorer, methods: Sequence[Restorer], question: Question, light: Illumination) -> Cell:
+def measure_cell(network: Restorer, methods: Sequence[Restorer], settings: DomainSettings, light: Illumination) -> Cell:
     """The network and the best of the methods at one light; ValueError where a clip has no score."""
-    own, *others = (_mean_score(method, question, light) for method in (network, *methods))
+    own, *others = (_mean_score(method, settings, light) for method in (network, *methods))
     if not (math.isfinite(own) and any(map(math.isfinite, others))):
         raise ValueError(f"{light.label}: the network, or every classical method, fails or has no score on these clips")
     best = int(np.nanargmax(others))
-    clip = question.clips[0]
+    clip = settings.clips[0]
     assert light.ppp is not None
     place = place_of(light.device(clip.exposure), clip.exposure, light.ppp)
     return Cell(Path(light.sensor).name, light.ppp, place, round(own, 3), methods[best].name, round(others[best], 3))
 
 
-def _mean_score(method: Restorer, question: Question, light: Illumination) -> float:
+def _mean_score(method: Restorer, settings: DomainSettings, light: Illumination) -> float:
     """Mean over clips; NaN for a classical method that cannot restore such codes, which then does not compete."""
     try:
-        return float(np.mean([score(method, clip, light, question.seed) for clip in question.clips]))
+        return float(np.mean([score(method, clip, light, settings.seed) for clip in settings.clips]))
     except ValueError:
         if method.learned:
             raise

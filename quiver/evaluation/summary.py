@@ -11,7 +11,7 @@ from typing import Any
 from qsim.files import replacing, write_bytes, write_json
 from quiver import threads
 from quiver.evaluation import breakdown, metrics
-from quiver.evaluation.comparison import FORMAT, Plan, Row, json_safe
+from quiver.evaluation.comparison import FORMAT, Comparison, ComparisonRow, json_safe
 from quiver.evaluation.metrics import Interval, over_scenes
 from quiver.restoration.interface import Restorer
 
@@ -39,7 +39,7 @@ SCORES = ("psnr", "psnr_matched", "ssim", "ssim_matched")
 
 
 @dataclass(frozen=True)
-class Line:
+class SummaryLine:
     """One method at one light level, over all clips."""
 
     method: str
@@ -61,15 +61,15 @@ def mean(values: Sequence[float]) -> float:
     return sum(values) / len(values) if values else math.nan
 
 
-def summarise(rows: Sequence[Row]) -> list[Line]:
+def summarise(rows: Sequence[ComparisonRow]) -> list[SummaryLine]:
     """One line per method and light level, in the order of the rows."""
-    groups: dict[tuple[str, str], list[Row]] = {}
+    groups: dict[tuple[str, str], list[ComparisonRow]] = {}
     for row in rows:
         groups.setdefault((row.light, row.method), []).append(row)
     return [_line(method, light, group) for (light, method), group in groups.items()]
 
 
-def _line(method: str, light: str, rows: Sequence[Row]) -> Line:
+def _line(method: str, light: str, rows: Sequence[ComparisonRow]) -> SummaryLine:
     good = [(row, row.score) for row in rows if row.score is not None]
     scales = [score.scale for _, score in good]
     spread = math.sqrt(mean([(s - mean(scales)) ** 2 for s in scales])) if good else math.nan
@@ -78,7 +78,7 @@ def _line(method: str, light: str, rows: Sequence[Row]) -> Line:
     moved = [row for row, _ in good if row.motion_pixels]
     by_frames = [(s.psnr_matched, s.frames) for _, s in good if s.frames]
     truths = [row.truth_psnr for row, _ in good if row.truth_psnr is not None]
-    return Line(
+    return SummaryLine(
         method=method,
         light=light,
         scores={name: over_scenes([getattr(s, name) for _, s in good], [r.scene for r, _ in good]) for name in SCORES},
@@ -95,7 +95,7 @@ def _line(method: str, light: str, rows: Sequence[Row]) -> Line:
     )
 
 
-def near_truth(row: Row, name: str = "psnr_matched") -> bool:
+def near_truth(row: ComparisonRow, name: str = "psnr_matched") -> bool:
     """Whether a clip's PSNR comes so near to what its truth is worth that the truth's own error weighs in it."""
     if row.score is None or row.truth_psnr is None:
         return False
@@ -111,21 +111,28 @@ def _interval(found: Interval, digits: int) -> str:
     return text if math.isnan(found.half_width) else f"{text} ± {found.half_width:.{digits}f}"
 
 
-def markdown(plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row], remarks: Sequence[str] = ()) -> str:
+def markdown(
+    comparison: Comparison, methods: Sequence[Restorer], rows: Sequence[ComparisonRow], remarks: Sequence[str] = ()
+) -> str:
     """The whole evaluation as Markdown: means, what weakens them, failures, per scene, what was not built.
 
     `remarks` are lines about networks outside of what they were measured for.
     """
     by_name = {method.name: method for method in methods}
     text = [
-        f"# Evaluation of {plan.source}, split {plan.split or 'all'}",
+        f"# Evaluation of {comparison.source}, split {comparison.split or 'all'}",
         "",
-        f"{_seen_by(plan)}, noise seed {plan.seed}; "
-        + ("published protocol: every window exposed, scaled and scored on its own" if plan.published else "all frames")
+        f"{_seen_by(comparison)}, noise seed {comparison.seed}; "
+        + (
+            "published protocol: every window exposed, scaled and scored on its own"
+            if comparison.published
+            else "all frames"
+        )
         + "; mean ± half-width of the 95 % interval over scenes (clips of one scene averaged first"
         + ("; there is only one, hence no interval" if len({row.scene for row in rows}) == 1 else "")
-        + f"). PSNR in dB, peak = {peak_name(plan)}; output and truth end at the peak. Matched = after the one factor "
-        + ("per window" if plan.published else "per clip")
+        + f"). PSNR in dB, peak = {peak_name(comparison)}; output and truth end at the peak. "
+        + "Matched = after the one factor "
+        + ("per window" if comparison.published else "per clip")
         + " that is best behind this clamp; by frames = its mean over all frames of all clips alike; above peak = "
         "share of the truth's pixels; n/a = the clamp hides the whole error, or no window of SSIM fits.",
         "",
@@ -141,14 +148,14 @@ def markdown(plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row], remar
     return "\n".join([*text, *_by_motion(lines), *_per_scene(rows)]) + "\n"
 
 
-def peak_name(plan: Plan) -> str:
-    """What the scores of a plan refer to."""
-    if plan.peak is not None:
-        return f"{plan.peak:g} photons per pixel"
-    return "the sensor's white, as published" if plan.published else "2.5 x the stream's mean light"
+def peak_name(comparison: Comparison) -> str:
+    """What the scores of a comparison refer to."""
+    if comparison.peak is not None:
+        return f"{comparison.peak:g} photons per pixel"
+    return "the sensor's white, as published" if comparison.published else "2.5 x the stream's mean light"
 
 
-def _table_row(line: Line, method: Restorer) -> str:
+def _table_row(line: SummaryLine, method: Restorer) -> str:
     cells = [line.method, f"{method.window} ({method.look_ahead})", line.light]
     if line.failures and line.scores["psnr"].scenes == 0:
         cells += [f"failed: {line.failures[0]}", *[""] * 9]
@@ -165,7 +172,7 @@ def _table_row(line: Line, method: Restorer) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _caveats(lines: Sequence[Line], rows: Sequence[Row]) -> list[str]:
+def _caveats(lines: Sequence[SummaryLine], rows: Sequence[ComparisonRow]) -> list[str]:
     """What weakens the scores: truth above the peak, and truth that is hardly better than the answer."""
     over: dict[str, tuple[float, str]] = {}
     for row in rows:
@@ -180,12 +187,12 @@ def _caveats(lines: Sequence[Line], rows: Sequence[Row]) -> list[str]:
     return text
 
 
-def _seen_by(plan: Plan) -> str:
-    sensors = dict.fromkeys(light.sensor for light in plan.lights)
-    return f"Stream {plan.stream}" if plan.stream is not None else f"Sensor {', '.join(sensors)}"
+def _seen_by(comparison: Comparison) -> str:
+    sensors = dict.fromkeys(light.sensor for light in comparison.lights)
+    return f"Stream {comparison.stream}" if comparison.stream is not None else f"Sensor {', '.join(sensors)}"
 
 
-def _by_motion(lines: Sequence[Line]) -> list[str]:
+def _by_motion(lines: Sequence[SummaryLine]) -> list[str]:
     """PSNR against motion; nothing where no clip has flow."""
     moving = [line for line in lines if not all(math.isnan(psnr) for psnr in line.psnr_by_motion)]
     if not moving:
@@ -199,7 +206,7 @@ def _by_motion(lines: Sequence[Line]) -> list[str]:
     return [*text, ""]
 
 
-def _per_scene(rows: Sequence[Row]) -> list[str]:
+def _per_scene(rows: Sequence[ComparisonRow]) -> list[str]:
     methods = list(dict.fromkeys(row.method for row in rows))
     text = ["## Per scene: matched PSNR in dB", "", "| scene | light | " + " | ".join(methods) + " |"]
     text.append("|---" * (len(methods) + 2) + "|")
@@ -214,14 +221,14 @@ def _per_scene(rows: Sequence[Row]) -> list[str]:
 
 
 def as_dict(
-    plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row], remarks: Sequence[str] = ()
+    comparison: Comparison, methods: Sequence[Restorer], rows: Sequence[ComparisonRow], remarks: Sequence[str] = ()
 ) -> dict[str, Any]:
     """The whole evaluation for programs."""
     found: dict[str, Any] = json_safe(
         {
             "format": FORMAT,
-            "plan": plan.to_dict(),
-            "peak": peak_name(plan),
+            "plan": comparison.to_dict(),
+            "peak": peak_name(comparison),
             "remarks": list(remarks),
             "threads": threads.current(),
             "methods": [
@@ -236,7 +243,7 @@ def as_dict(
     return found
 
 
-def figure(rows: Sequence[Row], path: Path) -> None:
+def figure(rows: Sequence[ComparisonRow], path: Path) -> None:
     """Matched PSNR of each method with its interval, one group of bars per light level, as PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -262,12 +269,18 @@ def figure(rows: Sequence[Row], path: Path) -> None:
         canvas.figure.savefig(file, format="png", dpi=120)
 
 
-def write(out: Path, plan: Plan, methods: Sequence[Restorer], rows: Sequence[Row], remarks: Sequence[str] = ()) -> None:
+def write(
+    out: Path,
+    comparison: Comparison,
+    methods: Sequence[Restorer],
+    rows: Sequence[ComparisonRow],
+    remarks: Sequence[str] = (),
+) -> None:
     """evaluation.json, .md, .png and a sheet of crops per light level, crops_LIGHT.png, in an evaluation's folder."""
     one_per_scene = list({row.scene: row.clip for row in reversed(rows)}.values())[::-1]
     for light in dict.fromkeys(row.light for row in rows):
         target = out / f"crops_{light.replace(', ', '_').replace(' ', '')}.png"
         breakdown.sheet(out, light, one_per_scene, [method.name for method in methods], target)
-    write_bytes(out / "evaluation.md", markdown(plan, methods, rows, remarks).encode())
+    write_bytes(out / "evaluation.md", markdown(comparison, methods, rows, remarks).encode())
     figure(rows, out / "evaluation.png")
-    write_json(out / "evaluation.json", as_dict(plan, methods, rows, remarks))
+    write_json(out / "evaluation.json", as_dict(comparison, methods, rows, remarks))

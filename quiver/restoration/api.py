@@ -13,7 +13,7 @@ from quiver.data.clips import Clip
 from quiver.data.codes import Codes, Sensor, Stream, array_codes, open_stream, sensed, stream_codes
 from quiver.data.illumination import Illumination
 from quiver.restoration.domain_remarks import refuse_outside, remarks
-from quiver.restoration.interface import DEFAULT_METHOD, Options
+from quiver.restoration.interface import DEFAULT_METHOD, RestoreOptions
 from quiver.restoration.restorers import restorer
 from quiver.restoration.sources import refuse_idle
 
@@ -43,7 +43,7 @@ def restore(
         video = quiver.restore("out/fan", "moment")
     """
     codes = _codes(source, sensor, exposure, ppp)
-    chosen = restorer(method, Options(device=device or "auto", mode=mode or "exact"))
+    chosen = restorer(method, RestoreOptions(device=device or "auto", mode=mode or "exact"))
     refuse_idle({"device": device, "mode": mode}, [chosen])
     found = remarks([chosen], codes)
     if strict:

@@ -27,7 +27,7 @@ MAX_CELLS = 10_000
 
 
 @dataclass(frozen=True)
-class Place:
+class OperatingPoint:
     """Where a stream lies: what decides how much its codes tell."""
 
     model: str  # of the sensor: QIS, BinarySPAD, CountingSPAD
@@ -35,7 +35,7 @@ class Place:
     light: float  # detected photons per pixel and code
     white: float  # detected photons at the top code
 
-    def like(self, other: Place) -> bool:
+    def like(self, other: OperatingPoint) -> bool:
         """Same kind and bits, and the same gain: either in photons, or in units of the light."""
         if (self.model, self.bits) != (other.model, other.bits):
             return False
@@ -49,7 +49,7 @@ class Cell:
 
     sensor: str  # that it was measured with
     ppp: float
-    place: Place
+    place: OperatingPoint
     network: float
     classical: str  # the best classical method
     classical_psnr: float
@@ -75,7 +75,7 @@ class Domain:
     cells: tuple[Cell, ...]
     measured: Mapping[str, Any]  # clips, frames, methods, seed, version: the same for all cells
 
-    def nearest(self, place: Place) -> Cell | None:
+    def nearest(self, place: OperatingPoint) -> Cell | None:
         """The cell that speaks for a stream; None where nothing near was measured."""
         like = [cell for cell in self.cells if cell.place.like(place)]
         if not like:
@@ -114,8 +114,13 @@ class Domain:
 
 
 def _cell(values: Mapping[str, Any]) -> Cell:
-    cell = Cell(**{**values, "place": Place(**values["place"])})
-    kinds: dict[str, tuple[type, ...]] = {"str": (str,), "int": (int,), "float": (int, float), "Place": (Place,)}
+    cell = Cell(**{**values, "place": OperatingPoint(**values["place"])})
+    kinds: dict[str, tuple[type, ...]] = {
+        "str": (str,),
+        "int": (int,),
+        "float": (int, float),
+        "OperatingPoint": (OperatingPoint,),
+    }
     for part in (cell, cell.place):
         for field in fields(part):
             value = getattr(part, field.name)
@@ -166,10 +171,10 @@ def _listed(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [] if value is None else [value]
 
 
-def place_of(sensor: Sensor, exposure: float, ppp: float) -> Place:
+def place_of(sensor: Sensor, exposure: float, ppp: float) -> OperatingPoint:
     """Where codes of a sensor lie that sees `ppp` photons per pixel and exposure [s]."""
     efficiency = sensor.efficiency
-    return Place(type(sensor).__name__, sensor.bits, ppp * efficiency, sensor.white(exposure) * efficiency)
+    return OperatingPoint(type(sensor).__name__, sensor.bits, ppp * efficiency, sensor.white(exposure) * efficiency)
 
 
 def table(domain: Domain) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from quiver.baselines import METHODS
 from quiver.data.codes import Codes
 from quiver.data.illumination import Illumination
-from quiver.restoration.domain import NEAR, Place, Scope, place_of
+from quiver.restoration.domain import NEAR, OperatingPoint, Scope, place_of
 from quiver.restoration.interface import Restorer
 
 LIGHT_FRAMES = 11  # from which the light of a stream is estimated where it is not known
@@ -63,7 +63,7 @@ def refuse_outside(methods: Sequence[Restorer], found: Sequence[str]) -> None:
         raise ValueError(f"{found[0]}; without strict it runs all the same")
 
 
-def _unmeasured(name: str, trained: Sequence[Illumination], codes: Codes, place: Place, stream: str) -> str:
+def _unmeasured(name: str, trained: Sequence[Illumination], codes: Codes, place: OperatingPoint, stream: str) -> str:
     """Weights without cells: what they were trained on, and whether the stream is like that."""
     start = f"{name} was never measured against the classical methods"
     if not trained:
@@ -76,7 +76,7 @@ def _unmeasured(name: str, trained: Sequence[Illumination], codes: Codes, place:
     return f"{start}; it was trained on {words}, {depths or 'own'} bit, {levels or 'own'} PPP, this stream is {stream}"
 
 
-def _same(light: Illumination, codes: Codes, place: Place) -> bool:
+def _same(light: Illumination, codes: Codes, place: OperatingPoint) -> bool:
     """Whether a stream lies where training was."""
     if light.ppp is None:
         return False

@@ -16,11 +16,13 @@ DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory beside the weights
 MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/model/schedules.py
 
 Progress = Callable[[int, int], None]  # (steps done, steps in all)
-Fill = Callable[[Codes, Array, int, Progress | None], None]  # adds photons of frames `first` ... to zeros [t, H, W]
+RestoreInto = Callable[
+    [Codes, Array, int, Progress | None], None
+]  # adds photons of frames `first` ... to zeros [t, H, W]
 
 
 @dataclass(frozen=True)
-class Options:
+class RestoreOptions:
     """How to run, not what to compute: apart from `mode` and `precision` the numbers agree to rounding.
 
     A memory that holds no whole frame of a QUIVER network is the exception: a warning then says what it changed.
@@ -49,7 +51,7 @@ class Restorer:
     look_ahead: int  # of these, future ones
     learned: bool
     description: str
-    fill: Fill
+    fill: RestoreInto
     seamless: bool = True  # a range of frames restored alone equals that part of the whole
     identity: Mapping[str, object] = field(default_factory=dict)  # settings and weights that change the answer
     cut: Callable[[int, int], str] = lambda height, width: ""  # of a frame, where it changes the answer

@@ -15,7 +15,7 @@ from numpy import ndarray as Array
 
 from quiver.baselines.sliding_window import reflect
 from quiver.data.codes import Codes
-from quiver.restoration.interface import Options, Progress, Restorer
+from quiver.restoration.interface import Progress, RestoreOptions, Restorer
 from quiver.restoration.pieces import Disagreement, cut_pieces
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ BLOCK_PIXELS = 1 << 22  # codes read at a time: 4 MB
 CONTEXT = 5  # frames that a network needs before and after the one it restores
 
 
-def network_restorer(path: Path, options: Options) -> Restorer:
+def network_restorer(path: Path, options: RestoreOptions) -> Restorer:
     """The network stored in a weights file; a training run is named after its folder."""
     from quiver.model.weights import load, metadata_of
     from quiver.restoration.domain import read_scope
@@ -53,7 +53,7 @@ def network_title(model: nn.Module) -> str:
 
 
 def wrap_network(
-    model: nn.Module, name: str, description: str, options: Options, weights_sha256: str | None = None
+    model: nn.Module, name: str, description: str, options: RestoreOptions, weights_sha256: str | None = None
 ) -> Restorer:
     """A network as a method; the checksum is that of its weights file."""
     from quiver.model.blocks import RADIUS, WINDOW
@@ -85,7 +85,7 @@ def pick_device(wanted: str) -> str:
 
 
 def fill_network(
-    model: nn.Module, codes: Codes, out: Array, first: int, options: Options, progress: Progress | None
+    model: nn.Module, codes: Codes, out: Array, first: int, options: RestoreOptions, progress: Progress | None
 ) -> None:
     """Restore tile by tile, frame by frame; `out` must be zero and collects the weighted tiles.
 

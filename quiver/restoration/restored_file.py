@@ -25,7 +25,7 @@ from quiver.restoration.interface import Progress, Restorer
 
 FORMAT = "quiver-restored-1"
 BLOCK_FRAMES = 256  # restored between two notes of how far a file has come
-TELL = {  # key of the description -> what it is called where it is why a restoration starts again
+WHAT_CHANGED = {  # key of the description -> what it is called where it is why a restoration starts again
     "codes_sha256": "the codes",
     "method": "the method",
     "description": "the method",
@@ -187,7 +187,7 @@ def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, 
     changed = [key for key in meta if found.get(key) != meta[key]]
     if not changed and found.keys() == meta.keys():
         return done, seconds, ""
-    told = dict.fromkeys(TELL[key] for key in TELL if key in changed)
+    told = dict.fromkeys(WHAT_CHANGED[key] for key in WHAT_CHANGED if key in changed)
     return 0, 0.0, f"{' and '.join(told) or 'its description'} changed since"
 
 

@@ -21,7 +21,7 @@ from qsim.checks import suggest
 from quiver.baselines import METHODS
 from quiver.baselines.sliding_window import look_ahead
 from quiver.data.codes import Codes
-from quiver.restoration.interface import Options, Progress, Restorer
+from quiver.restoration.interface import Progress, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 
 if TYPE_CHECKING:
@@ -32,12 +32,12 @@ FRAME_BYTES = 16  # per pixel and frame that a classical method holds: codes and
 BLOCK_FRAMES = 32  # that a classical method restores between two reports of progress, at most
 
 
-def restorer(name: str, options: Options | None = None) -> Restorer:
+def restorer(name: str, options: RestoreOptions | None = None) -> Restorer:
     """A method by name, shipped preset, weights file or training folder; ValueError or FileNotFoundError otherwise.
 
     A classical method may be followed by its window in frames, as in `moment:5`.
     """
-    options = options or Options()
+    options = options or RestoreOptions()
     base, _, window = name.partition(":")
     if base not in METHODS:
         return network_restorer(weights_path(name), options)
@@ -70,7 +70,7 @@ def method_names() -> list[str]:
     return [*METHODS, *shipped_names()]
 
 
-def restorers(names: Sequence[str], options: Options | None = None) -> list[Restorer]:
+def restorers(names: Sequence[str], options: RestoreOptions | None = None) -> list[Restorer]:
     """Several methods for one table; `all` stands for every method that needs no training.
 
     ValueError as for `restorer`, and where two of them would go by one name.

@@ -16,7 +16,6 @@ from quiver.data.illumination import Illumination, follows_light
 from quiver.data.photon_cubes import cube_codes
 
 if TYPE_CHECKING:
-    from quiver.evaluation.comparison import Plan
     from quiver.restoration.interface import Restorer
 
 BARE = ("width", "planes", "frame_rate")  # facts that only a bare array does not know
@@ -99,43 +98,6 @@ def _sensor(args: argparse.Namespace) -> str:
 def _bits(args: argparse.Namespace) -> int | None:
     """Bits per code: as asked, else those that a sensor's file states, else 3."""
     return args.bits or (None if _sensor(args).endswith(".toml") else 3)
-
-
-def plan_of(args: argparse.Namespace) -> Plan:
-    """What `quiver evaluate` scores on the clips of a data set, or on one clip."""
-    from quiver.evaluation.comparison import Plan
-
-    refuse(args, ("frames", "splits"), "belongs to --static COUNTS")
-    if (Path(args.source) / "clip.json").exists() and args.split not in (None, "all"):
-        raise ValueError(
-            f"--split {args.split}: chooses clips of a data set, and {args.source} is one clip; leave it out"
-        )
-    if args.stream is not None:
-        refuse(args, LIGHT, f"stream {args.stream} is stored and knows its own")
-        if args.published:
-            raise ValueError(f"--published: exposes every window now, and stream {args.stream} is stored; leave it out")
-    sensor = args.sensor or ("quiver-published" if args.published else "quiver-physical")
-    own = sensor.endswith(".toml")  # such a file states its bits
-    lights = tuple(
-        Illumination(sensor, ppp, bits)
-        for bits in args.bits or ((None,) if own else (3,))
-        for ppp in args.ppp or (3.25,)
-    )
-    split = None if args.split == "all" else args.split or "test"
-    return Plan(args.source, split, lights, args.seed or 0, args.published, args.stream, args.peak)
-
-
-def refuse_for_counts(args: argparse.Namespace) -> None:
-    """`ValueError` for options of `quiver evaluate` that cannot act on measured counts."""
-    why = "is of clips, and --static scores measured counts"
-    if args.source is not None:
-        raise ValueError(f"{args.source}: {why}; leave one of them out")
-    refuse(args, ("output", "split", "stream", "sensor", "ppp"), why)
-    for name in ("published", "force"):
-        if getattr(args, name):
-            raise ValueError(f"--{name}: {why}; leave it out")
-    if args.bits is not None and len(args.bits) > 1:
-        raise ValueError("--bits: measured counts are clipped to one depth; give one number")
 
 
 def assumed(codes: Codes, method: Restorer) -> str:

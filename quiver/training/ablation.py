@@ -14,11 +14,11 @@ from pathlib import Path
 
 import torch
 
-from quiver.evaluation.comparison import Plan, Row, evaluate
+from quiver.evaluation.comparison import Comparison, ComparisonRow, evaluate
 from quiver.model.config import Config
 from quiver.model.presets import ABLATIONS, PRESETS, ablated, parameter_count
 from quiver.model.quiver import QUIVER
-from quiver.restoration.interface import Options, Restorer
+from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import pick_device
 from quiver.restoration.restorers import restorer
 from quiver.training.loop import train
@@ -44,12 +44,12 @@ def one_noise(settings: Settings) -> tuple[Settings, list[str]]:
 
 def run_ablation(
     settings: Settings,
-    plan: Plan,
-    options: Options,
+    comparison: Comparison,
+    options: RestoreOptions,
     *,
     should_stop: Callable[[], bool] = lambda: False,
     progress: bool = True,
-) -> tuple[list[Restorer], list[Row]] | None:
+) -> tuple[list[Restorer], list[ComparisonRow]] | None:
     """Train every combination in OUT/NAME (finished ones are kept) and score them in OUT/table.
 
     None if `should_stop` ended it; the same call goes on. ValueError if the preset has no ablation.
@@ -57,12 +57,12 @@ def run_ablation(
     out = Path(settings.out)
     out.mkdir(parents=True, exist_ok=True)
     with alone_in(out, "works"):
-        return _run_ablation(settings, plan, options, should_stop, progress)
+        return _run_ablation(settings, comparison, options, should_stop, progress)
 
 
 def _run_ablation(
-    settings: Settings, plan: Plan, options: Options, should_stop: Callable[[], bool], progress: bool
-) -> tuple[list[Restorer], list[Row]] | None:
+    settings: Settings, comparison: Comparison, options: RestoreOptions, should_stop: Callable[[], bool], progress: bool
+) -> tuple[list[Restorer], list[ComparisonRow]] | None:
     out = Path(settings.out)
     for name, config in networks(settings.network).items():
         torch.manual_seed(settings.seed)
@@ -72,10 +72,10 @@ def _run_ablation(
         if should_stop():
             return None
     methods = [restorer(str(out / name), options) for name in ABLATIONS]
-    return methods, evaluate(plan, methods, out / "table")
+    return methods, evaluate(comparison, methods, out / "table")
 
 
-def markdown(preset: str, rows: Sequence[Row]) -> str:
+def markdown(preset: str, rows: Sequence[ComparisonRow]) -> str:
     """The paper's table: what is built in, parameters, PSNR after the best factor and SSIM."""
     text = ["| pre-denoiser | flow | multi-scale | parameters | PSNR matched | SSIM |", "|---|---|---|---|---|---|"]
     for name, config in networks(preset).items():

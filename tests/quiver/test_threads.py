@@ -89,7 +89,7 @@ from quiver.data.codes import array_codes
 from quiver.data.illumination import Illumination
 from qsim.keys import Key
 from quiver.model.presets import build
-from quiver.restoration.interface import Options
+from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import wrap_network
 from quiver.restoration.restorers import method_names, restorer
 
@@ -97,7 +97,7 @@ torch.manual_seed(0)
 sensor = Illumination().device(5e-4)
 photons = np.random.default_rng(0).uniform(0.5, 6.0, (12, 16, 20))
 codes = array_codes(draw_codes(sensor, photons, 5e-4, Key(1, 2)), sensor, 5e-4)
-options = Options()
+options = RestoreOptions()
 names = method_names() if "all" in sys.argv else sys.argv[1:]
 for name in names:
     preset = name in ("unet", "quiver-s", "quiver")

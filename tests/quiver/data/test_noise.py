@@ -28,8 +28,8 @@ from quiver.data.code_table import draw_codes
 from quiver.data.illumination import Illumination
 from quiver.data.mixture import choose, describe
 from quiver.data.noise import Noise
-from quiver.data.window_noise import window_codes
-from quiver.data.windows import TRAINING, Place, Windows, WindowSettings, turned
+from quiver.data.window_noise import WindowPlace, window_codes
+from quiver.data.windows import TRAINING, Windows, WindowSettings, turned
 from quiver.model.unet import UNet, UNetConfig
 from quiver.restoration.restorers import restorer
 from quiver.training.loop import train
@@ -195,7 +195,7 @@ def test_a_window_is_the_crop_of_the_sensed_frames(make_clip: ClipMaker, tmp_pat
         light = Illumination(file, rng.choice([0.3, 2.0, 20.0]), bits)
         noise = replace(Noise.of(light), defects=json.dumps(found.to_dict()))
         key = Key(seed=number, clip=3, stage=TRAINING)
-        place = Place(
+        place = WindowPlace(
             0, rng.randrange(12), rng.choice([0, 1, 2, 9]), rng.choice([0, 3, 4, 18]), (0, 0), 0, 0, False, key
         )
         side = min(8, 20 - place.y, 26 - place.x)
@@ -267,8 +267,8 @@ def test_afterpulses_of_a_reversed_window_follow_its_own_time(make_clip: ClipMak
     file = sensor_file(tmp_path, SPAD.replace("200.0", "0.0") + "afterpulse = 0.5\n", 1)
     noise = Noise.of(Illumination(file, 20.0, 1))
     draw = noise.draw(clip)
-    forward = window_codes(noise, draw, clip, Place(0, 8, 2, 2, (0, 0), 0, 0, False, Key(1, 2)), 11, 16)
-    back = window_codes(noise, draw, clip, Place(0, 8, 2, 2, (0, 0), 0, 0, True, Key(1, 2)), 11, 16)
+    forward = window_codes(noise, draw, clip, WindowPlace(0, 8, 2, 2, (0, 0), 0, 0, False, Key(1, 2)), 11, 16)
+    back = window_codes(noise, draw, clip, WindowPlace(0, 8, 2, 2, (0, 0), 0, 0, True, Key(1, 2)), 11, 16)
     assert_mean(forward[4].astype(float), 0.5, 0.25)  # frame 12, the first dark one
     assert back[:7].max() == 0  # frames 18 ... 12, before the light
     assert back[7:].mean() > 0.9

@@ -9,7 +9,7 @@ import pytest
 from clips import ClipMaker
 
 from quiver.evaluation import breakdown, metrics, summary
-from quiver.evaluation.comparison import Plan, evaluate
+from quiver.evaluation.comparison import Comparison, evaluate
 from quiver.restoration.restorers import restorer
 
 
@@ -38,15 +38,15 @@ def test_a_clip_with_flow_has_its_error_in_the_bin_of_its_motion(make_clip: Clip
     flow = np.zeros((2, 36, 44), np.float32)
     flow[0], flow[1] = 1.2, -0.9  # 1.5 px/frame
     clip = make_clip(flow=flow)
-    plan = Plan(str(clip.path), split=None)
+    comparison = Comparison(str(clip.path), split=None)
     methods = [restorer("moment:3")]
-    rows = evaluate(plan, methods, tmp_path / "t")
-    again = evaluate(plan, methods, tmp_path / "t")
+    rows = evaluate(comparison, methods, tmp_path / "t")
+    again = evaluate(comparison, methods, tmp_path / "t")
     assert again == rows  # motion survives the file
     line = summary.summarise(rows)[0]
     assert rows[0].motion_pixels == (0, 0, math.prod(clip.shape), 0, 0, 0)
     assert line.psnr_by_motion[2] == pytest.approx(line.scores["psnr_matched"].mean, abs=0.1)  # pooled or by frames
-    text = summary.markdown(plan, methods, rows)
+    text = summary.markdown(comparison, methods, rows)
     assert f"| moment:3 | 3.25 PPP, 3 bit | - | - | {line.psnr_by_motion[2]:.2f} | - | - | - |" in text
 
 

@@ -22,7 +22,16 @@ from quiver.data.codes import Codes, array_codes, sensed
 from quiver.data.illumination import Illumination, ideal_counter
 from quiver.data.photon_counts import Counts, read_counts
 from quiver.evaluation import summary
-from quiver.evaluation.comparison import Plan, Row, append, begin, evaluate, finished, scored_frames, truth_psnr
+from quiver.evaluation.comparison import (
+    Comparison,
+    ComparisonRow,
+    append,
+    begin,
+    evaluate,
+    finished,
+    scored_frames,
+    truth_psnr,
+)
 from quiver.evaluation.static_object import evaluate_static, markdown, mean_square, reference
 from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer
@@ -56,8 +65,8 @@ def broken(codes: Codes) -> Array:
 
 def test_a_known_truth_scores_what_it_should(tiny_dataset):
     """Perfect: infinite. One tenth too dark: 20 log10 of a tenth of the truth's rms; matched: infinite."""
-    plan = Plan(str(tiny_dataset))
-    rows = evaluate(plan, [oracle(tiny_dataset), oracle(tiny_dataset, 0.9)])
+    comparison = Comparison(str(tiny_dataset))
+    rows = evaluate(comparison, [oracle(tiny_dataset), oracle(tiny_dataset, 0.9)])
     assert [row.method for row in rows] == ["oracle 1", "oracle 0.9"] * 2
     perfect, dark = rows[0].score, rows[1].score
     assert perfect.psnr > 120
@@ -77,8 +86,8 @@ def test_all_methods_see_the_same_codes(tiny_dataset):
         seen.append(codes.read(0, codes.shape[0]))
         return np.ones(codes.shape)
 
-    evaluate(Plan(str(tiny_dataset)), [method("a", look), method("b", look)])
-    evaluate(Plan(str(tiny_dataset)), [method("c", look)])
+    evaluate(Comparison(str(tiny_dataset)), [method("a", look), method("b", look)])
+    evaluate(Comparison(str(tiny_dataset)), [method("c", look)])
     np.testing.assert_array_equal(seen[0], seen[1])
     np.testing.assert_array_equal(seen[0], seen[4])
     assert not np.array_equal(seen[0], seen[2])
@@ -93,22 +102,22 @@ def test_an_interrupted_evaluation_goes_on(tiny_dataset, tmp_path):
             raise KeyboardInterrupt
         return np.ones(codes.shape)
 
-    plan, out = Plan(str(tiny_dataset)), tmp_path / "table"
+    comparison, out = Comparison(str(tiny_dataset)), tmp_path / "table"
     with pytest.raises(KeyboardInterrupt):
-        evaluate(plan, [method("slow", count)], out)
+        evaluate(comparison, [method("slow", count)], out)
     with open(out / "rows.jsonl", "a") as file:
         file.write('{"method": "slow", "torn')
-    rows = evaluate(plan, [method("slow", count)], out)
+    rows = evaluate(comparison, [method("slow", count)], out)
     assert len(rows) == 2
     assert len(calls) == 3
-    assert evaluate(plan, [method("slow", count)], out) == rows
+    assert evaluate(comparison, [method("slow", count)], out) == rows
     assert len(calls) == 3
-    evaluate(plan, [replace(method("slow", count), description="other weights")], out)
+    evaluate(comparison, [replace(method("slow", count), description="other weights")], out)
     assert len(calls) == 5
     with pytest.raises(FileExistsError, match="holds another evaluation"):
-        evaluate(replace(plan, seed=1), [method("slow", count)], out)
+        evaluate(replace(comparison, seed=1), [method("slow", count)], out)
     with pytest.raises(FileExistsError, match="is no evaluation"):
-        begin(plan, tmp_path, open_clips(str(tiny_dataset), "test"))
+        begin(comparison, tmp_path, open_clips(str(tiny_dataset), "test"))
 
 
 @pytest.mark.parametrize("changed", ["codes", "light"])
@@ -116,10 +125,10 @@ def test_an_evaluation_of_other_codes_or_another_truth_is_not_continued(make_cli
     """Rows of a stream that was sensed again, or of a clip that was made again, are not mixed with new ones."""
     clip = make_clip(frames=4, height=12, width=16)
     sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25, name="s"))
-    plan, methods = Plan(str(clip.path), stream="s"), [method("ones", lambda codes: np.ones(codes.shape))]
-    evaluate(plan, methods, tmp_path / "t")
+    comparison, methods = Comparison(str(clip.path), stream="s"), [method("ones", lambda codes: np.ones(codes.shape))]
+    evaluate(comparison, methods, tmp_path / "t")
     before = (tmp_path / "t" / "rows.jsonl").read_bytes()
-    evaluate(plan, methods, tmp_path / "t")
+    evaluate(comparison, methods, tmp_path / "t")
     if changed == "codes":
         sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25, seed=5, name="s"), force=True)
     else:
@@ -127,15 +136,15 @@ def test_an_evaluation_of_other_codes_or_another_truth_is_not_continued(make_cli
         meta = json.loads(description.read_text()) | {"scene": {"family": "sliding", "seed": 9}}
         files.write_description(description, meta)
     with pytest.raises((FileExistsError, ValueError), match="changed since"):
-        evaluate(plan, methods, tmp_path / "t")
+        evaluate(comparison, methods, tmp_path / "t")
     assert (tmp_path / "t" / "rows.jsonl").read_bytes() == before
 
 
 def test_a_failure_keeps_its_row_and_reason(tiny_dataset, tmp_path):
-    plan, methods = Plan(str(tiny_dataset)), [method("broken", broken), restorer("moment:1")]
-    rows = evaluate(plan, methods, tmp_path / "t")
+    comparison, methods = Comparison(str(tiny_dataset)), [method("broken", broken), restorer("moment:1")]
+    rows = evaluate(comparison, methods, tmp_path / "t")
     assert [row.failure for row in rows[:2]] == ["RuntimeError: no road leads there", None]
-    summary.write(tmp_path / "t", plan, methods, rows)
+    summary.write(tmp_path / "t", comparison, methods, rows)
     text = (tmp_path / "t/evaluation.md").read_text()
     assert "failed: test_0: RuntimeError: no road leads there" in text
     assert "- broken, 3.25 PPP, 3 bit, test_1: RuntimeError" in text
@@ -143,10 +152,10 @@ def test_a_failure_keeps_its_row_and_reason(tiny_dataset, tmp_path):
 
 
 def test_the_table_holds_what_was_promised(tiny_dataset, tmp_path):
-    plan = Plan(str(tiny_dataset), lights=(Illumination(), Illumination(ppp=26.0)))
+    comparison = Comparison(str(tiny_dataset), lights=(Illumination(), Illumination(ppp=26.0)))
     methods = [restorer("naive"), restorer("moment:3")]
-    rows = evaluate(plan, methods, tmp_path / "t")
-    summary.write(tmp_path / "t", plan, methods, rows)
+    rows = evaluate(comparison, methods, tmp_path / "t")
+    summary.write(tmp_path / "t", comparison, methods, rows)
     found = json.loads((tmp_path / "t/evaluation.json").read_text())
     assert len(found["rows"]) == 2 * 2 * 2
     assert "RVRT" in found["not_built_yet"]
@@ -192,7 +201,7 @@ def test_every_sensor_is_scored_at_one_peak(make_clip: ClipMaker):
     methods = [restorer("naive"), restorer("moment:3")]
     for sensor, bits in sensors:
         ppp = float(np.exp(rng.uniform(np.log(0.3), np.log(100))))
-        rows = evaluate(Plan(str(clip.path), None, (Illumination(sensor, ppp, bits),)), methods)
+        rows = evaluate(Comparison(str(clip.path), None, (Illumination(sensor, ppp, bits),)), methods)
         assert [row.failure for row in rows] == [None, None]
         assert [row.peak for row in rows] == pytest.approx([2.5 * ppp] * 2)
         light = clip.mean_radiance  # of light in units of the peak: radiance / (2.5 mean)
@@ -203,15 +212,15 @@ def test_every_sensor_is_scored_at_one_peak(make_clip: ClipMaker):
 
 def test_a_one_bit_sensor_in_much_light_is_not_perfect(make_clip: ClipMaker):
     """At 10 PPP every pixel of a 1-bit code lies above its own white: there all guesses were perfect, `moment` inf."""
-    plan = Plan(
+    comparison = Comparison(
         str(make_clip().path), None, (Illumination("spad-320x240", 1.0, 1), Illumination("spad-320x240", 10.0, 1))
     )
-    dim, bright = evaluate(plan, [restorer("moment")])
+    dim, bright = evaluate(comparison, [restorer("moment")])
     assert bright.score.psnr < dim.score.psnr < 40
-    hidden = evaluate(replace(plan, peak=1.0), [restorer("moment")])[1]
+    hidden = evaluate(replace(comparison, peak=1.0), [restorer("moment")])[1]
     assert hidden.score.above_peak > 0.9
     assert not math.isinf(hidden.score.psnr)
-    text = summary.markdown(replace(plan, peak=1.0), [restorer("moment")], [dim, hidden])
+    text = summary.markdown(replace(comparison, peak=1.0), [restorer("moment")], [dim, hidden])
     assert "peak = 1 photons per pixel" in text
     assert "Warning: 100.0 % of the pixels of sliding_0 at 10 PPP, 1 bit lie above the peak" in text
     assert " inf " not in text
@@ -219,12 +228,12 @@ def test_a_one_bit_sensor_in_much_light_is_not_perfect(make_clip: ClipMaker):
 
 @pytest.mark.parametrize("peak", [1e-6, 1e9])
 def test_an_extreme_peak_has_a_table_and_no_foreign_warning(peak, tiny_dataset, tmp_path):
-    plan = Plan(str(tiny_dataset), peak=peak)
+    comparison = Comparison(str(tiny_dataset), peak=peak)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         methods = [restorer("naive")]
-        rows = evaluate(plan, methods, tmp_path / "out")
-        summary.write(tmp_path / "out", plan, methods, rows)
+        rows = evaluate(comparison, methods, tmp_path / "out")
+        summary.write(tmp_path / "out", comparison, methods, rows)
     assert all(row.failure is None for row in rows)
     crops = list((tmp_path / "out/crops").glob("*.npy"))
     assert crops
@@ -233,20 +242,20 @@ def test_an_extreme_peak_has_a_table_and_no_foreign_warning(peak, tiny_dataset, 
 
 def test_another_peak_moves_scores_by_its_ratio(make_clip: ClipMaker):
     """With nothing above either peak, twice the peak is 6.02 dB more, and the matching factor stays."""
-    plan = Plan(str(make_clip().path), None)
-    one, two = (evaluate(replace(plan, peak=peak), [restorer("moment")])[0] for peak in (40.0, 80.0))
+    comparison = Comparison(str(make_clip().path), None)
+    one, two = (evaluate(replace(comparison, peak=peak), [restorer("moment")])[0] for peak in (40.0, 80.0))
     assert two.score.psnr - one.score.psnr == pytest.approx(20 * math.log10(2), abs=1e-6)
     assert two.score.scale == pytest.approx(one.score.scale)
     assert two.truth_psnr - one.truth_psnr == pytest.approx(20 * math.log10(2))
     assert two.peak == 80.0
     with pytest.raises(ValueError, match="number of photons above 0"):
-        evaluate(replace(plan, peak=-1.0), [restorer("moment")])
+        evaluate(replace(comparison, peak=-1.0), [restorer("moment")])
 
 
 def test_the_published_protocol_keeps_its_white(make_clip: ClipMaker):
     """Peak = white of the sensor as published; with the default gain that is 2.5 times the light."""
     clip = make_clip()
-    paper = Plan(str(clip.path), None, (Illumination("quiver-paper"),), published=True)
+    paper = Comparison(str(clip.path), None, (Illumination("quiver-paper"),), published=True)
     assert evaluate(paper, [restorer("moment")])[0].peak == pytest.approx(7 / 0.8)
     assert evaluate(replace(paper, lights=(Illumination(),)), [restorer("moment")])[0].peak == pytest.approx(2.5 * 3.25)
     assert evaluate(replace(paper, peak=3.0), [restorer("moment")])[0].peak == 3.0
@@ -266,7 +275,7 @@ def test_saturated_pixels_count_nowhere(tmp_path):
     exact = truth(clip, sensed(clip, Illumination())[1], 0, 12)
     noise = rng.normal(0, 1, exact.shape)
     spoilt = method("spoilt", lambda codes: exact + 0.1 * noise + np.where(mask, 5.0, 0.0))
-    rows = evaluate(Plan(str(clip.path), None), [spoilt, method("whole", lambda codes: exact + 0.1 * noise)])
+    rows = evaluate(Comparison(str(clip.path), None), [spoilt, method("whole", lambda codes: exact + 0.1 * noise)])
     assert rows[0].score == rows[1].score
     assert rows[0].score.psnr > 35
 
@@ -281,13 +290,13 @@ def test_scores_near_the_truth_are_marked(make_clip: ClipMaker):
         exact = truth(clip, sensed(clip, Illumination())[1], 0, len(clip))
         return method(f"at {psnr:g}", lambda codes: exact + rng.normal(0, sigma, exact.shape))
 
-    plan, methods = Plan(str(clip.path), None), [wrong(36.0), wrong(20.0)]
-    rows = evaluate(plan, methods)
+    comparison, methods = Comparison(str(clip.path), None), [wrong(36.0), wrong(20.0)]
+    rows = evaluate(comparison, methods)
     assert rows[0].truth_psnr == pytest.approx(20 * math.log10(2.5 / 0.03), abs=0.01)
     near, far = summary.summarise(rows)
     assert near.near_truth == ("psnr", "psnr_matched")
     assert far.near_truth == ()
-    text = summary.markdown(plan, methods, rows)
+    text = summary.markdown(comparison, methods, rows)
     assert f"{near.scores['psnr'].mean:.2f} † |" in text
     assert f"{far.scores['psnr'].mean:.2f} |" in text
     assert "† In one clip or more within 3 dB of the truth's own PSNR" in text
@@ -312,14 +321,15 @@ def test_published_protocol_forces_every_window(tiny_dataset):
         levels.append(float(stack.mean()))
         return stack.astype(np.float32)
 
-    rows = evaluate(Plan(str(tiny_dataset), published=True), [method("look", look)])
+    rows = evaluate(Comparison(str(tiny_dataset), published=True), [method("look", look)])
     assert rows[0].score.frames == 14 - 10
     assert len(levels) == 2 * 4
     assert max(levels) - min(levels) < 0.1
     assert rows[0].score.scale_spread > 0
     with pytest.raises(ValueError, match="give --ppp"):
         evaluate(
-            Plan(str(tiny_dataset), lights=(Illumination("quiver-paper", None),), published=True), [method("x", look)]
+            Comparison(str(tiny_dataset), lights=(Illumination("quiver-paper", None),), published=True),
+            [method("x", look)],
         )
 
 
@@ -328,25 +338,25 @@ def test_stored_streams_are_scored(tiny_dataset, make_clip: ClipMaker):
 
     clip = make_clip()
     sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25, name="mine"))
-    stored = evaluate(Plan(str(clip.path), None, stream="mine"), [restorer("moment")])
-    drawn = evaluate(Plan(str(clip.path), None), [restorer("moment")])
+    stored = evaluate(Comparison(str(clip.path), None, stream="mine"), [restorer("moment")])
+    drawn = evaluate(Comparison(str(clip.path), None), [restorer("moment")])
     assert stored[0].score == drawn[0].score
     assert stored[0].light == "mine"
     with pytest.raises(FileNotFoundError, match="no stream 'none'; there are: mine"):
-        evaluate(Plan(str(clip.path), None, stream="none"), [restorer("moment")])
+        evaluate(Comparison(str(clip.path), None, stream="none"), [restorer("moment")])
 
 
 def test_nothing_to_score_is_an_error(tmp_path, tiny_dataset):
     with pytest.raises(FileNotFoundError, match="no such data set"):
-        evaluate(Plan(str(tmp_path / "none")), [restorer("moment")])
+        evaluate(Comparison(str(tmp_path / "none")), [restorer("moment")])
     with pytest.raises(ValueError, match="unknown split 'tset'"):
-        evaluate(Plan(str(tiny_dataset), "tset"), [restorer("moment")])
+        evaluate(Comparison(str(tiny_dataset), "tset"), [restorer("moment")])
 
 
 def test_rows_survive_json(tmp_path):
-    row = Row("m", "d", "l", "c", "s", failure="why")
+    row = ComparisonRow("m", "d", "l", "c", "s", failure="why")
     append(tmp_path / "rows", row)
-    assert math.isnan(Row.from_dict(json.loads((tmp_path / "rows").read_text())).seconds_per_frame)
+    assert math.isnan(ComparisonRow.from_dict(json.loads((tmp_path / "rows").read_text())).seconds_per_frame)
 
 
 # Static real photons

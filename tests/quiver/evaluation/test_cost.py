@@ -6,28 +6,28 @@ import math
 
 import numpy as np
 
-from quiver.evaluation.cost import Case, Cost, Setting, cases_of, fixed_clip, markdown, measure
+from quiver.evaluation.cost import CostCase, CostRow, CostSettings, cases_of, fixed_clip, markdown, measure
 
 
 def test_the_clip_is_fixed_and_as_bright_as_asked():
-    setting = Setting(height=20, width=28, frames=5, ppp=3.25)
-    codes, photons = fixed_clip(setting)
+    settings = CostSettings(height=20, width=28, frames=5, ppp=3.25)
+    codes, photons = fixed_clip(settings)
     assert photons.mean() == 3.25
     assert photons.min() > 0
-    np.testing.assert_array_equal(codes.read(0, 5), fixed_clip(setting)[0].read(0, 5))
+    np.testing.assert_array_equal(codes.read(0, 5), fixed_clip(settings)[0].read(0, 5))
     moved = np.abs(photons[1][:, 2:] - photons[0][:, :-2]).mean()
     assert moved < 0.2 * np.abs(photons[1] - photons[0]).mean()  # 2 px per frame, but for the disk that wraps around
 
 
 def test_only_cases_that_differ_are_run():
     cases = cases_of(("moment:3", "unet", "nano"), ("exact", "streaming"), ("float32", "bfloat16"))
-    assert [c for c in cases if c.method == "moment:3"] == [Case("moment:3", "exact", "float32")]
+    assert [c for c in cases if c.method == "moment:3"] == [CostCase("moment:3", "exact", "float32")]
     assert len([c for c in cases if c.method == "unet"]) == 2
     assert len([c for c in cases if c.method == "nano"]) == 4
 
 
 def test_a_classical_case_has_seconds_and_a_score():
-    cost = measure(Case("moment:3"), Setting(16, 16, frames=5, restored=3))
+    cost = measure(CostCase("moment:3"), CostSettings(16, 16, frames=5, restored=3))
     assert cost.trained
     assert 0 < cost.seconds_per_frame < 5
     assert cost.psnr_matched > 10
@@ -35,5 +35,5 @@ def test_a_classical_case_has_seconds_and_a_score():
 
 
 def test_the_table_names_what_failed():
-    bad = Cost("nano", "exact", "float32", False, math.nan, 0, math.nan, math.nan, failure="out of memory")
-    assert "| nano | exact | float32 | failed: out of memory" in markdown([bad], Setting())
+    bad = CostRow("nano", "exact", "float32", False, math.nan, 0, math.nan, math.nan, failure="out of memory")
+    assert "| nano | exact | float32 | failed: out of memory" in markdown([bad], CostSettings())

@@ -26,8 +26,8 @@ from quiver.evaluation import domain_measurement
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import annotate, load, metadata_of, save
 from quiver.restoration import domain
-from quiver.restoration.domain import Cell, Domain, Place, Scope
-from quiver.restoration.interface import Options
+from quiver.restoration.domain import Cell, Domain, OperatingPoint, Scope
+from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import network_restorer, network_title
 from quiver.restoration.restorers import PRETRAINED, restorer
 
@@ -184,7 +184,7 @@ def test_a_damaged_domain_is_one_line(tmp_path):
     path = weights(tmp_path)
     annotate(path, {domain.KEY: "{}"})
     with pytest.raises(ValueError, match=r"small\.safetensors: its domain is damaged .*`quiver domain`"):
-        network_restorer(path, Options(device="cpu"))
+        network_restorer(path, RestoreOptions(device="cpu"))
 
 
 def test_notes_leave_the_tensors_alone(tmp_path):
@@ -208,59 +208,61 @@ def test_cells_are_measured_stored_and_kept(tiny_dataset, tmp_path, monkeypatch)
     before = tensors_digest(path)
     clips = domain_measurement.clips_of([tiny_dataset], "test")
     lights = (Illumination(ppp=3.25), Illumination("spad-320x240", 1.0, 1))
-    question = domain_measurement.Question(clips, lights, ("naive", "moment:3"))
+    settings = domain_measurement.DomainSettings(clips, lights, ("naive", "moment:3"))
     asked: list[Illumination] = []
     measured = domain_measurement.measure_cell
 
-    def noted(network, methods, question, light):
+    def noted(network, methods, settings, light):
         asked.append(light)
-        return measured(network, methods, question, light)
+        return measured(network, methods, settings, light)
 
     monkeypatch.setattr(domain_measurement, "measure_cell", noted)
-    found = domain_measurement.measure(path, question, Options(device="cpu"))
+    found = domain_measurement.measure(path, settings, RestoreOptions(device="cpu"))
     assert asked == list(lights)
     assert tensors_digest(path) == before
     assert found == domain.read_scope(path, metadata_of(path)).domain
     assert found.measured["clips"] == [clip.name for clip in clips]
     best = max(
-        np.mean([domain_measurement.score(restorer(m), c, lights[0], 0) for c in clips]) for m in question.methods
+        np.mean([domain_measurement.score(restorer(m), c, lights[0], 0) for c in clips]) for m in settings.methods
     )
     own = next(c for c in found.cells if c.place.model == "QIS")
     assert own.classical_psnr == pytest.approx(best, abs=6e-4)
     assert (own.network < own.classical_psnr) != own.wins  # random weights
 
-    assert domain_measurement.measure(path, question, Options(device="cpu")) == found  # nothing is left to measure
+    assert (
+        domain_measurement.measure(path, settings, RestoreOptions(device="cpu")) == found
+    )  # nothing is left to measure
     assert len(asked) == 2
-    domain_measurement.measure(path, replace(question, lights=lights[:1]), Options(device="cpu"), force=True)
+    domain_measurement.measure(path, replace(settings, lights=lights[:1]), RestoreOptions(device="cpu"), force=True)
     assert len(asked) == 3
-    other_seed = replace(question, seed=1, lights=lights[:1])
+    other_seed = replace(settings, seed=1, lights=lights[:1])
     with pytest.raises(ValueError, match=r"measured otherwise \(not the same: seed"):
-        domain_measurement.measure(path, other_seed, Options(device="cpu"))
-    other = domain_measurement.measure(path, other_seed, Options(device="cpu"), force=True)
+        domain_measurement.measure(path, other_seed, RestoreOptions(device="cpu"))
+    other = domain_measurement.measure(path, other_seed, RestoreOptions(device="cpu"), force=True)
     assert len(other.cells) == 1  # cells of another noise do not stand beside these
     assert not list(tmp_path.glob("*.lock"))
     with pytest.raises(ValueError, match="measured against classical methods, got nano"):
-        domain_measurement.measure(path, replace(question, methods=("nano",)), Options(device="cpu"))
+        domain_measurement.measure(path, replace(settings, methods=("nano",)), RestoreOptions(device="cpu"))
     with pytest.raises(ValueError, match="unknown split 'none'"):
         domain_measurement.clips_of([tiny_dataset], "none")
 
 
 def test_a_classical_method_that_fails_does_not_compete(tiny_dataset, tmp_path):
-    network = network_restorer(weights(tmp_path), Options(device="cpu"))
+    network = network_restorer(weights(tmp_path), RestoreOptions(device="cpu"))
 
     def fails(*_: object) -> None:
         raise ValueError("no road leads there")
 
     broken = replace(restorer("naive"), name="broken", fill=fails)
-    question = domain_measurement.Question(domain_measurement.clips_of([tiny_dataset], "test"), (Illumination(),))
+    settings = domain_measurement.DomainSettings(domain_measurement.clips_of([tiny_dataset], "test"), (Illumination(),))
     assert (
-        domain_measurement.measure_cell(network, [broken, restorer("moment:3")], question, Illumination()).classical
+        domain_measurement.measure_cell(network, [broken, restorer("moment:3")], settings, Illumination()).classical
         == "moment:3"
     )
     with pytest.raises(ValueError, match=r"3\.25 PPP, 3 bit: the network, or every classical method, fails"):
-        domain_measurement.measure_cell(network, [broken], question, Illumination())
+        domain_measurement.measure_cell(network, [broken], settings, Illumination())
     with pytest.raises(ValueError, match="no road leads there"):
-        domain_measurement.measure_cell(replace(network, fill=fails), [restorer("naive")], question, Illumination())
+        domain_measurement.measure_cell(replace(network, fill=fails), [restorer("naive")], settings, Illumination())
 
 
 # ---- Commands and the call in Python
@@ -391,12 +393,12 @@ def test_the_shipped_weights_know_their_domain():
 
 
 def test_places_of_one_gain_are_alike():
-    one = Place("QIS", 3, 2.6, 6.5)
-    assert one.like(Place("QIS", 3, 26.0, 65.0))  # the same in units of the light
-    assert one.like(Place("QIS", 3, 1.0, 6.0))  # about the same in photons
-    assert not one.like(Place("QIS", 3, 1.0, 10.0))
-    assert not one.like(Place("QIS", 2, 2.6, 6.5))
-    assert not one.like(Place("BinarySPAD", 3, 2.6, 6.5))
+    one = OperatingPoint("QIS", 3, 2.6, 6.5)
+    assert one.like(OperatingPoint("QIS", 3, 26.0, 65.0))  # the same in units of the light
+    assert one.like(OperatingPoint("QIS", 3, 1.0, 6.0))  # about the same in photons
+    assert not one.like(OperatingPoint("QIS", 3, 1.0, 10.0))
+    assert not one.like(OperatingPoint("QIS", 2, 2.6, 6.5))
+    assert not one.like(OperatingPoint("BinarySPAD", 3, 2.6, 6.5))
 
 
 def test_a_sensor_whose_codes_tell_no_light_still_has_a_remark():

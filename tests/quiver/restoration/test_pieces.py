@@ -18,7 +18,7 @@ from quiver.model.presets import build
 from quiver.model.unet import SmallUNet, UNet, UNetConfig
 from quiver.model.weights import load
 from quiver.restoration import pieces
-from quiver.restoration.interface import MODES, Options, Restorer
+from quiver.restoration.interface import MODES, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer, wrap_network
 from quiver.restoration.pieces import bytes_per_pixel, cut_pieces, frame_bytes
 from quiver.restoration.restored_file import restore_to_file
@@ -129,7 +129,7 @@ def test_a_convolutional_network_does_not_see_the_tiles():
         height, width = (int(n) for n in rng.integers(90, 200, 2))
         memory = bytes_per_pixel(model, "exact") * int(rng.integers(9_000, 30_000))
         codes = moving(1, height, width, seed)
-        tiled, whole = (quiet(wrap_network(model, "u", "", Options(memory=m)), codes) for m in (memory, 10**10))
+        tiled, whole = (quiet(wrap_network(model, "u", "", RestoreOptions(memory=m)), codes) for m in (memory, 10**10))
         cut += len(cut_pieces(model, height, width, memory, "exact").tiles) > 1
         assert np.abs(tiled - whole).max() < 1e-5 * codes.white
     assert cut > 3
@@ -151,7 +151,7 @@ def same_with_less_memory(name: str, mode: str, seed: int) -> None:
     assert cut.exact
     assert cut.hourglass is not None
     assert cut.hourglass < height * width  # the hourglass does run in tiles
-    tiled, whole = (quiet(network_restorer(path, Options(memory=m, mode=mode)), codes) for m in (memory, 10**10))
+    tiled, whole = (quiet(network_restorer(path, RestoreOptions(memory=m, mode=mode)), codes) for m in (memory, 10**10))
     assert np.abs(tiled - whole).max() < 1e-5 * codes.white
 
 
@@ -180,11 +180,11 @@ def test_no_preset_changes_its_answer_unsaid(preset):
     for seed in range(2):
         height, width = (int(n) for n in rng.integers(96, 130, 2))
         codes = moving(1, height, width, seed)
-        whole = wrap_network(model, preset, "", Options(memory=10**12)).restore(codes)
+        whole = wrap_network(model, preset, "", RestoreOptions(memory=10**12)).restore(codes)
         memory = bytes_per_pixel(model, "exact") * int(rng.integers(8000, height * width))
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            tiled = wrap_network(model, preset, "", Options(memory=memory)).restore(codes)
+            tiled = wrap_network(model, preset, "", RestoreOptions(memory=memory)).restore(codes)
         apart = np.abs(tiled - whole).max() / codes.white
         assert apart < 1e-5 or any("differ where they overlap" in str(w.message) for w in caught), apart
 
@@ -197,14 +197,14 @@ def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path):
     cut = cut_pieces(network, 104, 120, memory, "exact")
     assert not cut.exact
     assert all(tile.y % 16 == tile.x % 16 == 0 for tile in cut.tiles)
-    method = network_restorer(path, Options(memory=memory))
+    method = network_restorer(path, RestoreOptions(memory=memory))
     with pytest.warns(UserWarning, match="differ where they overlap by") as caught:
         meta = restore_to_file(codes, method, tmp_path / "r.npy")
     text = str(caught[0].message)
     assert cut.text in text
     assert meta["identity"]["cut"] == cut.text
     said = float(re.search(r"by ([0-9.e-]+) % of white rms", text)[1]) / 100  # type: ignore[index]
-    whole = quiet(network_restorer(path, Options(memory=10**10)), codes)
+    whole = quiet(network_restorer(path, RestoreOptions(memory=10**10)), codes)
     found = float(np.sqrt(np.mean((np.load(tmp_path / "r.npy") - whole) ** 2))) / codes.white
     assert 0 < found < 10 * said
     needed = int(re.search(r"--memory (\d+)MB restores it whole", text)[1]) * 10**6  # type: ignore[index]
@@ -236,7 +236,9 @@ def same_in_blocks(name: str, seed: int) -> None:
     codes, asked = moving(frames, height, width, seed), f"{name}:{rng.integers(1, 9)}"
     whole, reports = restorer(asked).restore(codes), []
     memory = (METHODS[name].bytes_per_pixel + 16 * int(rng.integers(1, 4))) * height * width
-    found = restorer(asked, Options(memory=memory)).restore(codes, progress=lambda done, total: reports.append(done))
+    found = restorer(asked, RestoreOptions(memory=memory)).restore(
+        codes, progress=lambda done, total: reports.append(done)
+    )
     assert np.abs(found - whole).max() < 1e-5 * codes.white
     assert len(reports) > 1
 
@@ -256,5 +258,5 @@ def test_memory_does_not_change_what_a_classical_method_answers_searched(name):
 def test_a_method_that_takes_more_than_the_bound_says_so():
     codes = moving(3, 16, 20)
     with pytest.warns(UserWarning, match=r"qbp takes about 0 MB for a frame of 16 x 20 px, above --memory"):
-        found = restorer("qbp", Options(memory=1000)).restore(codes)
+        found = restorer("qbp", RestoreOptions(memory=1000)).restore(codes)
     np.testing.assert_array_equal(found, restorer("qbp").restore(codes))

@@ -25,7 +25,7 @@ from quiver.data.photon_cubes import cube_codes
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
 from quiver.restoration import restored_file
-from quiver.restoration.interface import Options, Restorer
+from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.restored_file import restore_to_file
 from quiver.restoration.restorers import restorer
 
@@ -115,14 +115,14 @@ def test_a_restoration_of_something_else_starts_again(tmp_path, make_clip, block
             before = sensed(clip, Illumination())[0]
             after = sensed(replace(clip, meta=clip.meta | {"checksums": {}}), Illumination())[0]  # of other contents
         case "weights":
-            options = Options(device="cpu")
+            options = RestoreOptions(device="cpu")
             old, new = (restorer(str(weights(tmp_path, seed)), options) for seed in (0, 1))
             why = "weights"
         case "window":
             new, why = restorer("moment:3"), "the method"
         case "precision":
             path = str(weights(tmp_path, 0))
-            old, new = (restorer(path, Options(precision=p)) for p in ("float32", "bfloat16"))
+            old, new = (restorer(path, RestoreOptions(precision=p)) for p in ("float32", "bfloat16"))
             why = "settings"
         case "sensor":
             after = array_codes(after.read(0, 10), replace(SENSOR, gain=1.0), EXPOSURE)

@@ -27,13 +27,13 @@ from quiver.model.presets import build
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
 from quiver.restoration import restored_file
-from quiver.restoration.interface import Options, Restorer
+from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import fill_network, network_restorer
 from quiver.restoration.restored_file import restore_to_file
 from quiver.restoration.restorers import method_names, restorer, restorers, weights_path
 
 EXPOSURE = 5e-4
-DEFAULTS = Options()
+DEFAULTS = RestoreOptions()
 SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
 
 
@@ -67,10 +67,10 @@ class WindowMean(CentreFrame):
 
 
 def run(
-    model: nn.Module, codes: Codes, options: Options | None = None, first: int = 0, count: int | None = None
+    model: nn.Module, codes: Codes, options: RestoreOptions | None = None, first: int = 0, count: int | None = None
 ) -> Array:
     out = np.zeros((count or codes.shape[0], *codes.shape[1:]), np.float32)
-    fill_network(model, codes, out, first, options or Options(), None)
+    fill_network(model, codes, out, first, options or RestoreOptions(), None)
     return out
 
 
@@ -104,10 +104,10 @@ def test_modes_of_the_network():
     """Exact equals windows recomputed; streaming is another schedule; bfloat16 stays near float32."""
     torch.manual_seed(0)
     codes, model = random_codes(4, 16, 16), build("nano").eval()
-    windows = run(model, codes, Options(mode="windows"))
-    np.testing.assert_allclose(run(model, codes, Options(mode="exact")), windows, atol=2e-4)
-    assert np.isfinite(run(model, codes, Options(mode="streaming"))).all()
-    low = run(model, codes, Options(mode="windows", precision="bfloat16"))
+    windows = run(model, codes, RestoreOptions(mode="windows"))
+    np.testing.assert_allclose(run(model, codes, RestoreOptions(mode="exact")), windows, atol=2e-4)
+    assert np.isfinite(run(model, codes, RestoreOptions(mode="streaming"))).all()
+    low = run(model, codes, RestoreOptions(mode="windows", precision="bfloat16"))
     assert 0 < np.abs(low - windows).max() < 0.1 * codes.white
 
 
@@ -157,7 +157,7 @@ def test_weights_are_found_by_file_folder_and_name(tmp_path):
     network = UNet(UNetConfig(2))
     save(network, network.config, tmp_path / "best.safetensors")
     assert weights_path(str(tmp_path)) == weights_path(str(tmp_path / "best.safetensors"))
-    found = network_restorer(tmp_path / "best.safetensors", Options(device="cpu"))
+    found = network_restorer(tmp_path / "best.safetensors", RestoreOptions(device="cpu"))
     assert found.name == tmp_path.name
     assert found.learned
     assert found.description.startswith("U-Net, weights ")
@@ -232,7 +232,7 @@ def test_an_interrupted_restoration_goes_on(tmp_path, monkeypatch):
 )
 def test_bad_options_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
-        Options(**changes)
+        RestoreOptions(**changes)
 
 
 def test_cuda_is_asked_for_by_name(tmp_path: Path):
@@ -241,7 +241,7 @@ def test_cuda_is_asked_for_by_name(tmp_path: Path):
     network = UNet(UNetConfig(2))
     save(network, network.config, tmp_path / "w.safetensors")
     with pytest.raises(ValueError, match="--device cuda: torch finds no CUDA"):
-        restorer(str(tmp_path / "w.safetensors"), Options(device="cuda"))
+        restorer(str(tmp_path / "w.safetensors"), RestoreOptions(device="cuda"))
 
 
 MEMORY_PROGRAM = """
@@ -250,11 +250,11 @@ from quiver.evaluation.peak_memory import peak_memory, reset_peak
 from quiver.data.codes import array_codes
 from quiver.data.illumination import Illumination
 from quiver.model.presets import build
-from quiver.restoration.interface import Options
+from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import wrap_network
 sensor = Illumination().device(5e-4)
 codes = array_codes(np.random.default_rng(0).integers(0, 8, (1, 320, 320), dtype=np.uint8), sensor, 5e-4)
-method = wrap_network(build("nano"), "nano", "", Options(memory={memory}, mode="{mode}"))
+method = wrap_network(build("nano"), "nano", "", RestoreOptions(memory={memory}, mode="{mode}"))
 before = reset_peak()
 method.restore(codes)
 print(peak_memory() - before)

@@ -13,7 +13,7 @@ from qsim.clip.stream import Sensing, sense
 from quiver.cli.program import main
 from quiver.data.illumination import Illumination
 from quiver.data.photon_cubes import cube_codes, plane_bits
-from quiver.restoration.interface import Options
+from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.restorers import restorer
 
 VALID = [2**b - 1 for b in range(1, 17)]
@@ -275,4 +275,4 @@ def test_a_mode_of_a_network_that_has_one_is_refused(inputs, tmp_path, capsys):
     words = ["restore", str(inputs["clip"]), "-o", str(tmp_path / "r.npy"), "--method", str(tmp_path / "u.safetensors")]
     assert main([*words, "--mode", "streaming"]) == 2
     assert "--mode streaming: u shares no work between frames" in capsys.readouterr().err
-    assert restorer(words[-1], Options(mode="streaming")).seamless
+    assert restorer(words[-1], RestoreOptions(mode="streaming")).seamless

@@ -1,0 +1,214 @@
+"""The commands `quiver evaluate` and `quiver bench`: scores and costs of methods; options, and what they do."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from qsim.cli.console import bar, output
+from qsim.files import write_bytes, write_json
+from quiver.cli.options import (
+    add_light,
+    add_running,
+    add_strict,
+    add_threads,
+    check_domain,
+    command,
+    count,
+    height_width,
+    positive,
+    renew,
+    running_options,
+    use_threads,
+    words,
+)
+
+if TYPE_CHECKING:
+    from quiver.evaluation.comparison import Comparison
+
+# evaluate
+
+
+def add_evaluate(sub: Any) -> None:
+    parser = command(
+        sub, "evaluate", _run_evaluate, "Compare methods on held-out clips, or on real photons of a static object.",
+        "quiver evaluate out/starter -o out/table --methods naive,moment,out/mine,out/unet --ppp 3.25,9.75,26\n"
+        "quiver evaluate out/starter/clips/fan_0003 -o out/fan_table --methods moment,nano --split all\n"
+        "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,nano", goes_on=True,
+    )  # fmt: skip
+    parser.add_argument("source", nargs="?", help="data set or clip folder")
+    parser.add_argument("-o", "--output", type=Path, help="folder for evaluation.md, .json, .png (needed for clips)")
+    parser.add_argument(
+        "--methods", type=words, default="naive,moment", help="with commas; window as in moment:3; all = all"
+    )
+    parser.add_argument("--split", choices=("train", "val", "test", "all"), help="of a data set (default test)")
+    parser.add_argument("--stream", help="score this stored stream of every clip instead of sensing now")
+    add_light(parser, several=True)
+    parser.add_argument("--seed", type=int, help="of the test noise or of the random splits (default 0)")
+    parser.add_argument("--published", action="store_true", help="every window exposed, scaled and scored on its own")
+    parser.add_argument(
+        "--peak", type=positive, help="photons per pixel that the scores refer to (default 2.5 x the mean light)"
+    )
+    parser.add_argument(
+        "--static", type=Path, metavar="COUNTS", help="photon counts [N,H,W] or [T,K,H,W], .npy or .npz"
+    )
+    parser.add_argument("--frames", type=count, help="static: frames to restore from (default 11)")
+    parser.add_argument("--splits", type=count, help="static: random splits (default 3)")
+    add_running(parser)
+    add_strict(parser)
+    parser.add_argument("--force", action="store_true", help="start again where an evaluation is")
+
+
+def _run_evaluate(args: argparse.Namespace) -> int:
+    from quiver import threads
+    from quiver.restoration.restorers import restorers
+    from quiver.restoration.sources import refuse_idle
+
+    threads.check(args.threads)
+    methods = restorers(args.methods, running_options(args))
+    refuse_idle(vars(args), methods)
+    use_threads(args)
+    if args.static is not None:
+        return _run_static(args, methods)
+    if args.source is None or args.output is None:
+        raise ValueError("give a data set or clip folder and -o, or --static COUNTS")
+    from quiver.evaluation import summary
+    from quiver.evaluation.comparison import evaluate, streams
+
+    comparison = _comparison(args)
+    remarks = check_domain(args, methods, streams(comparison))
+    if args.force and args.output.exists():
+        renew(
+            args.output,
+            "plan.json",
+            r"plan\.json|rows\.jsonl|evaluation\.(json|md|png)|crops_[^/]*\.png|crops/[^/]*\.npy|lock",
+        )
+    with bar("rows", "row") as progress:
+        rows = evaluate(comparison, methods, args.output, lambda what, done, total: progress(done, total))
+    summary.write(args.output, comparison, methods, rows, remarks)
+    output(
+        args, summary.as_dict(comparison, methods, rows, remarks), summary.markdown(comparison, methods, rows, remarks)
+    )
+    return 1 if any(row.failure for row in rows) else 0
+
+
+def _comparison(args: argparse.Namespace) -> Comparison:
+    """What `quiver evaluate` scores on the clips of a data set, or on one clip."""
+    from quiver.data.illumination import Illumination
+    from quiver.evaluation.comparison import Comparison
+    from quiver.restoration.sources import LIGHT, refuse
+
+    refuse(args, ("frames", "splits"), "belongs to --static COUNTS")
+    if (Path(args.source) / "clip.json").exists() and args.split not in (None, "all"):
+        raise ValueError(
+            f"--split {args.split}: chooses clips of a data set, and {args.source} is one clip; leave it out"
+        )
+    if args.stream is not None:
+        refuse(args, LIGHT, f"stream {args.stream} is stored and knows its own")
+        if args.published:
+            raise ValueError(f"--published: exposes every window now, and stream {args.stream} is stored; leave it out")
+    sensor = args.sensor or ("quiver-published" if args.published else "quiver-physical")
+    own = sensor.endswith(".toml")  # such a file states its bits
+    lights = tuple(
+        Illumination(sensor, ppp, bits)
+        for bits in args.bits or ((None,) if own else (3,))
+        for ppp in args.ppp or (3.25,)
+    )
+    split = None if args.split == "all" else args.split or "test"
+    return Comparison(args.source, split, lights, args.seed or 0, args.published, args.stream, args.peak)
+
+
+def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
+    from quiver.data.clips import peak_of
+    from quiver.data.photon_counts import read_counts
+    from quiver.evaluation.comparison import json_safe
+    from quiver.evaluation.static_object import FORMAT, counted, evaluate_static, markdown
+
+    _refuse_for_counts(args)
+    if not args.static.is_file():
+        raise FileNotFoundError(f"{args.static}: no such file")
+    counts = read_counts(args.static)
+    bits, frames = (args.bits or (3,))[0], args.frames or 11
+    check_domain(args, methods, [counted(counts, bits)])
+    scores = evaluate_static(
+        counts, methods, frames=frames, bits=bits, splits=args.splits or 3, seed=args.seed or 0, peak=args.peak
+    )
+    found = {"format": FORMAT, "counts": str(args.static), "frames": frames, "bits": bits}
+    found["peak"] = peak_of(counts.light, args.peak)
+    found["scores"] = [asdict(score) for score in scores]
+    output(args, json_safe(found), markdown(counts, scores, frames, bits, args.peak))
+    return 1 if any(score.failure for score in scores) else 0
+
+
+def _refuse_for_counts(args: argparse.Namespace) -> None:
+    """`ValueError` for options of `quiver evaluate` that cannot act on measured counts."""
+    from quiver.restoration.sources import refuse
+
+    why = "is of clips, and --static scores measured counts"
+    if args.source is not None:
+        raise ValueError(f"{args.source}: {why}; leave one of them out")
+    refuse(args, ("output", "split", "stream", "sensor", "ppp"), why)
+    for name in ("published", "force"):
+        if getattr(args, name):
+            raise ValueError(f"--{name}: {why}; leave it out")
+    if args.bits is not None and len(args.bits) > 1:
+        raise ValueError("--bits: measured counts are clipped to one depth; give one number")
+
+
+# bench
+
+
+def add_bench(sub: Any) -> None:
+    parser = command(
+        sub, "bench", _run_bench, "Measure what a restored frame costs, beside its PSNR.",
+        "quiver bench\n"
+        "quiver bench --methods moment,nano,quiver-s --modes exact,streaming,windows --size 128x128 -o out/bench",
+    )  # fmt: skip
+    parser.add_argument(
+        "--methods", type=words, default="moment,unet,nano", help="with commas (default moment,unet,nano)"
+    )
+    parser.add_argument("--modes", type=words, help="of networks (default exact,streaming)")
+    parser.add_argument("--precisions", type=words, help="of networks: float32, bfloat16 or both (default float32)")
+    parser.add_argument("--size", type=height_width, default="64x64", help="HEIGHTxWIDTH in px (default 64x64)")
+    parser.add_argument("--ppp", type=positive, default=3.25, help="light of the fixed clip (default 3.25)")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="of networks (default auto)")
+    add_threads(parser)
+    parser.add_argument("-o", "--output", type=Path, help="folder for bench.md, bench.json, bench.png")
+    parser.add_argument("--force", action="store_true", help="replace an existing result")
+
+
+def _run_bench(args: argparse.Namespace) -> int:
+    from quiver import threads
+    from quiver.evaluation.comparison import json_safe
+    from quiver.evaluation.cost import CostSettings, bench, checked_cases, figure, markdown
+    from quiver.training.run_folder import alone_in
+
+    if args.output is None and args.force:
+        raise ValueError("--force: replaces a result in -o FOLDER, which is not given; leave it out")
+    if args.output is not None and (args.output / "bench.json").exists() and not args.force:
+        raise FileExistsError(
+            f"{args.output / 'bench.json'}: exists; name another with -o, or use --force to replace it"
+        )
+    threads.check(args.threads)
+    cases = checked_cases(args.methods, args.modes, args.precisions, args.device)
+    height, width = args.size
+    with contextlib.ExitStack() as stack:
+        if args.output is not None:
+            args.output.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(alone_in(args.output, "measures"))
+        device = args.device or "auto"
+        settings = CostSettings(height, width, ppp=args.ppp, device=device, threads=use_threads(args))
+        progress = stack.enter_context(bar("cases", "case"))
+        costs = bench(cases, settings, progress)
+        text = markdown(costs, settings)
+        found = json_safe({"setting": asdict(settings), "costs": [asdict(cost) for cost in costs]})
+        if args.output is not None:
+            write_bytes(args.output / "bench.md", text.encode())
+            figure(costs, args.output / "bench.png")
+            write_json(args.output / "bench.json", found)
+    output(args, found, text)
+    return 1 if any(cost.failure for cost in costs) else 0

@@ -1,0 +1,89 @@
+"""The command `quiver restore`: options, and what they do."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+from qsim.cli.console import bar, note, output
+from quiver.cli.options import (
+    add_light,
+    add_running,
+    add_strict,
+    check_domain,
+    command,
+    count,
+    positive,
+    running_options,
+    use_threads,
+)
+from quiver.restoration.interface import DEFAULT_METHOD
+
+
+def add_restore(sub: Any) -> None:
+    parser = command(
+        sub, "restore", _run_restore, "Restore a stream, a clip or a photon cube; no ground truth is needed.",
+        "quiver restore out/starter/clips/fan_0003 -o out/fan.npy\n"
+        "quiver restore out/fan/streams/quiver-physical_3bit_3.25ppp.npy -o out/fan.npy --method out/mine\n"
+        "quiver restore out/fan --ppp 3.25 -o out/fan.npy --method moment\n"
+        "quiver restore cube.npy --width 320 --planes 7 --sensor spad-320x240 --frame-rate 1428 -o out/cube.npy",
+        goes_on=True,
+    )  # fmt: skip
+    parser.add_argument("source", type=Path, help="stream (.npy with its .json), clip folder, or bare .npy array")
+    parser.add_argument("-o", "--output", type=Path, required=True, help=".npy to write; a .json appears beside it")
+    parser.add_argument(
+        "--method",
+        default=DEFAULT_METHOD,
+        help=f"classical method, shipped weights, file or run (default {DEFAULT_METHOD})",
+    )
+    parser.add_argument("--stream", help="which stream of a clip (default: the only one)")
+    add_light(parser, several=False)
+    parser.add_argument("--seed", type=int, help="of the noise, where a clip is sensed now (default 0)")
+    parser.add_argument("--width", type=count, help="bare array: packed binary planes of this many pixels per row")
+    parser.add_argument("--planes", type=count, help="packed planes: 2^b - 1 are summed to one code (default 1)")
+    parser.add_argument("--frame-rate", type=positive, help="bare array: codes per second (default 2000)")
+    add_running(parser)
+    add_strict(parser)
+    parser.add_argument("--force", action="store_true", help="replace an existing result")
+
+
+def _run_restore(args: argparse.Namespace) -> int:
+    from quiver import threads
+    from quiver.restoration.restored_file import restore_to_file
+    from quiver.restoration.restorers import restorer
+    from quiver.restoration.sources import assumed, codes_to_restore, refuse_idle
+
+    target: Path = args.output
+    if target.suffix != ".npy":
+        raise ValueError(f"{target}: restored video is written as .npy; name a file that ends so")
+    codes = codes_to_restore(args)
+    for path in (target, target.with_suffix(".json")):
+        if path.exists() and not args.force:
+            raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
+    threads.check(args.threads)
+    method = restorer(args.method, running_options(args))
+    refuse_idle(vars(args), [method])
+    check_domain(args, [method], [codes])
+    used = use_threads(args, threads.recorded(target.with_name(f"{target.name}.part.json")))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    lines, started = [assumed(codes, method)], time.monotonic()
+    with bar(method.name) as progress:
+
+        def shown(done: int, total: int) -> None:
+            while lines and time.monotonic() > started + 2:  # as the bar: a mistake is one line without it
+                note(lines.pop())
+            progress(done, total)
+
+        meta = restore_to_file(codes, method, target, shown, force=args.force, note=note, threads=used)
+    for line in lines:
+        note(line)
+    length, height, width = codes.shape
+    output(
+        args,
+        {"restored": str(target)} | meta,
+        f"{target}: {length} frames of {height} x {width} by {method.name}, "
+        f"{meta['seconds_per_frame']:.3g} s per frame; photons, white = {codes.white:.4g}",
+    )
+    return 0
