@@ -1,1 +1,23 @@
 """From measured frames to sensor parameters with confidence intervals."""
+
+from typing import TYPE_CHECKING
+
+from qsim.files import lazy_names
+
+if TYPE_CHECKING:
+    from qsim.calibration.frame_statistics import FrameStatistics
+    from qsim.calibration.qis import calibrate_qis
+    from qsim.calibration.results import Calibration
+    from qsim.calibration.spad import calibrate_spad
+
+__all__ = ["Calibration", "FrameStatistics", "calibrate_qis", "calibrate_spad"]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "Calibration": "results",
+        "FrameStatistics": "frame_statistics",
+        "calibrate_qis": "qis",
+        "calibrate_spad": "spad",
+    },
+)

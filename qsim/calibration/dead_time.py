@@ -16,7 +16,7 @@ from math import sqrt
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.calibration.frame_statistics import Stack, measure
+from qsim.calibration.frame_statistics import FrameStatistics, measure
 from qsim.calibration.results import Calibration, Value, normal_interval
 from qsim.sensor.counting import CountingSPAD
 
@@ -33,7 +33,7 @@ class Ratio:
     variance: float
 
 
-def fitted_dead_time(flats: Sequence[Stack], bits: int, paralyzable: bool) -> Ratio | None:
+def fitted_dead_time(flats: Sequence[FrameStatistics], bits: int, paralyzable: bool) -> Ratio | None:
     """tau/T from the time variance of every flat against its mean: weighted least squares on exact moments."""
     from scipy.optimize import minimize_scalar
 
@@ -62,7 +62,7 @@ def fitted_dead_time(flats: Sequence[Stack], bits: int, paralyzable: bool) -> Ra
     return Ratio(ratio, 1 / max(float(np.dot(slope, slope)), 1e-300))
 
 
-def _fano_residuals(flats: Sequence[Stack], bits: int, ratio: float, paralyzable: bool) -> list[float]:
+def _fano_residuals(flats: Sequence[FrameStatistics], bits: int, ratio: float, paralyzable: bool) -> list[float]:
     """(observed variance - that of a dead-time pixel of the same mean) / sigma, per flat.
 
     Sigma comes from the model's moments: those of the data would count the pattern of the pixels as noise.
@@ -105,7 +105,9 @@ def matched_variance(mean: float, bits: int, ratio: float, paralyzable: bool) ->
     return arrivals, float(variance[1]), float((variance[2] - variance[0]) / (means[2] - means[0]))
 
 
-def classes_of(counts: Array, *, bits: int, exposure: float, edges: Sequence[float] | None = None) -> list[Stack]:
+def classes_of(
+    counts: Array, *, bits: int, exposure: float, edges: Sequence[float] | None = None
+) -> list[FrameStatistics]:
     """Stacks [T, 1, n] of pixels whose mean lies between neighbouring `edges` (default: 8 steps of equal ratio)."""
     mean = counts.mean(axis=0)
     if not edges:
@@ -120,7 +122,7 @@ def classes_of(counts: Array, *, bits: int, exposure: float, edges: Sequence[flo
     ]
 
 
-def fano(stack: Stack) -> Value:
+def fano(stack: FrameStatistics) -> Value:
     """Variance over mean in time with its 95 % interval; the size of the mean is known far better than the variance."""
     n = stack.pixels * (stack.frames - 1)
     poisson_fourth = stack.mean + 3 * stack.mean**2
@@ -156,7 +158,7 @@ def calibrate_static(
     return Calibration("CountingSPAD", bits, values, _p_value(residuals), (), residuals, paralyzable=paralyzable)
 
 
-def _sigma(stack: Stack) -> float:
+def _sigma(stack: FrameStatistics) -> float:
     """Standard error of the mean variance, Poisson fourth moment."""
     return sqrt((stack.mean + 2 * stack.mean**2) / (stack.pixels * (stack.frames - 1)))
 

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.calibration.frame_statistics import Stack
+from qsim.calibration.frame_statistics import FrameStatistics
 from qsim.calibration.prnu import WIDEST, Flat, hot_by_level, hot_by_rate, surface
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
@@ -45,7 +45,7 @@ class Response:
             return -np.expm1(-arrivals)
         return CountingSPAD(1.0, 0.0, self.ratio, self.bits, self.paralyzable).mean(arrivals, 1.0)
 
-    def of_stack(self, stack: Stack) -> tuple[Array, Array, float]:
+    def of_stack(self, stack: FrameStatistics) -> tuple[Array, Array, float]:
         """Arrivals per exposure of every pixel and their variance, both [H, W], and d code / d arrivals.
 
         The bias of a curved inverse, f''/2 times the variance of the pixel's mean, is taken off.
@@ -66,7 +66,7 @@ class Response:
         return np.maximum(found, 0.0), variance / (t * slopes**2), slope
 
 
-def dark_rates(darks: Sequence[Stack], response: Response) -> tuple[Array, Array]:
+def dark_rates(darks: Sequence[FrameStatistics], response: Response) -> tuple[Array, Array]:
     """DCR of every pixel [1/s] from all exposures, and its variance, both [H, W]."""
     weight = np.array([stack.frames * stack.exposure for stack in darks])
     weight = weight / weight.sum()
@@ -78,7 +78,9 @@ def dark_rates(darks: Sequence[Stack], response: Response) -> tuple[Array, Array
     return rate, variance
 
 
-def spad_flats(flats: Sequence[Stack], darks: Sequence[Stack], response: Response) -> tuple[list[Flat], Array | None]:
+def spad_flats(
+    flats: Sequence[FrameStatistics], darks: Sequence[FrameStatistics], response: Response
+) -> tuple[list[Flat], Array | None]:
     """Flats of a SPAD array, and the hot pixels [H, W] by the dark frames; None without them."""
     shape = flats[0].total.shape
     rate, of_rate = dark_rates(darks, response) if darks else (np.zeros(shape), np.zeros(shape))
@@ -104,7 +106,9 @@ def spad_flats(flats: Sequence[Stack], darks: Sequence[Stack], response: Respons
     return found, hot
 
 
-def qis_flats(flats: Sequence[Stack], darks: Sequence[Stack], sensor: QIS) -> tuple[list[Flat], Array]:
+def qis_flats(
+    flats: Sequence[FrameStatistics], darks: Sequence[FrameStatistics], sensor: QIS
+) -> tuple[list[Flat], Array]:
     """Flats of a QIS, and the hot pixels [H, W] by the dark frames of longest exposure.
 
     `sensor` gives the curve of mean code against electrons (fitted gain and read noise), without its dark current.
@@ -151,7 +155,7 @@ def _table(mean: Array, good: Array, curve: Callable[[Array], Array], largest: f
     return light, curve(light)
 
 
-def _dark_level(darks: Sequence[Stack], exposure: float) -> tuple[Array, Array]:
+def _dark_level(darks: Sequence[FrameStatistics], exposure: float) -> tuple[Array, Array]:
     """Dark code of every pixel at this exposure and its variance, [H, W].
 
     From the darks of this exposure; else from a straight line through all; else from the only exposure there is.

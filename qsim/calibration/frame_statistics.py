@@ -15,7 +15,7 @@ from numpy import ndarray as Array
 
 
 @dataclass(frozen=True, eq=False)
-class Stack:
+class FrameStatistics:
     """What is kept of T frames at one exposure and one light level."""
 
     frames: int
@@ -82,7 +82,7 @@ class Stack:
 
 def measure(
     blocks: Iterable[Array], *, bits: int, exposure: float, photons: float | None, name: str = "stack"
-) -> Stack:
+) -> FrameStatistics:
     """Statistics of frames [t, H, W] or [H, W] that come block by block.
 
     `ValueError` naming the stack, the frame and the pixel for codes that are no integers 0 ... 2^bits - 1, for frames
@@ -110,23 +110,12 @@ def measure(
     if sums is None:
         raise ValueError(f"{name}: has no frames")
     total, square, lagged = sums["total"], sums["square"], sums["lagged"]
-    return Stack(frames, float(exposure), photons, histogram, total, square, lagged, first, previous)
-
-
-def from_ones(ones: Array, *, frames: int, exposure: float, photons: float | None) -> Stack:
-    """The stack of 1-bit planes of which only the number of ones per pixel, [H, W], was kept; no time correlation."""
-    ones = np.asarray(ones)
-    if ones.ndim != 2 or ones.size == 0 or (ones < 0).any() or (ones > frames).any():
-        raise ValueError(f"ones per pixel are [H, W] numbers 0..{frames}, got shape {list(ones.shape)}")
-    total = ones.astype(np.float64)
-    histogram = np.array([total.size * frames - total.sum(), total.sum()]).astype(np.int64)
-    unknown = np.full(total.shape, np.nan)
-    return Stack(frames, float(exposure), photons, histogram, total, total, unknown, unknown, unknown)
+    return FrameStatistics(frames, float(exposure), photons, histogram, total, square, lagged, first, previous)
 
 
 def measure_sums(
     blocks: Iterable[Array], *, planes: int, exposure: float, photons: float | None, name: str = "stack"
-) -> Stack:
+) -> FrameStatistics:
     """Frames [t, H, W] or [H, W] of which each value sums `planes` binary planes: the stack of all these planes.
 
     `exposure` and `photons` are those of one plane. All but the order of the planes is known, so every statistic is
@@ -148,7 +137,9 @@ def measure_sums(
         frames += len(sums)
     if ones is None or squares is None:
         raise ValueError(f"{name}: has no frames")
-    whole = from_ones(ones, frames=frames * planes, exposure=exposure, photons=photons)
+    drawn, unknown = frames * planes, np.full(ones.shape, np.nan)
+    histogram = np.array([ones.size * drawn - ones.sum(), ones.sum()]).astype(np.int64)
+    whole = FrameStatistics(drawn, float(exposure), photons, histogram, ones, ones, unknown, unknown, unknown)
     if frames < 2 or planes < 2:
         return whole
     observed = float((squares - ones**2 / frames).sum()) / (frames - 1)
@@ -190,7 +181,7 @@ def _as_values(block: Array, top: int, what: str, name: str, frame: int) -> Arra
     return block.astype(np.int64)
 
 
-def check_stacks(darks: Sequence[Stack], flats: Sequence[Stack]) -> None:
+def check_stacks(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics]) -> None:
     """`ValueError` unless there are stacks, all of one size."""
     if not darks and not flats:
         raise ValueError("calibrate: no frames at all; give dark and flat frames")

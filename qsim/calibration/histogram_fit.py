@@ -16,14 +16,12 @@ from math import exp, inf, log, sqrt
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.calibration.frame_statistics import Stack
+from qsim.calibration.frame_statistics import FrameStatistics
 from qsim.calibration.photon_transfer import Transfer
+from qsim.calibration.prnu import normal_nodes
 from qsim.sensor.qis import QIS
 
-NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(5)
-WEIGHTS = WEIGHTS / WEIGHTS.sum()
-
-
+NODES, WEIGHTS = normal_nodes(5)  # of the PRNU
 LONGEST_STEP = np.array([0.3, 5.0, 1.5])  # of ln gain, offset and ln read noise in one iteration
 
 
@@ -39,7 +37,7 @@ class HistogramFit:
 
 
 def fit_histograms(
-    darks: Sequence[Stack], flats: Sequence[Stack], bits: int, start: Array, prnu_value: float
+    darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], bits: int, start: Array, prnu_value: float
 ) -> HistogramFit:
     """Maximum likelihood of the pooled histograms of all stacks by Fisher scoring with step control."""
     stacks = [*darks, *flats]
@@ -83,7 +81,7 @@ def sensor_at(parameters: Array, bits: int) -> QIS:
     return QIS(1.0, 0.0, exp(parameters[2]), bits, gain=exp(parameters[0]), offset=float(parameters[1]))
 
 
-def _arrivals(stacks: Sequence[Stack], darks: int, parameters: Array, s: float) -> tuple[Array, Array, Array]:
+def _arrivals(stacks: Sequence[FrameStatistics], darks: int, parameters: Array, s: float) -> tuple[Array, Array, Array]:
     """Expected electrons at the nodes of the PRNU [stack, node], the nodes' weights, and what light adds per unit."""
     dark = np.array([parameters[3] * stack.exposure for stack in stacks])
     light = np.concatenate([np.zeros(darks), parameters[4:]])
@@ -96,14 +94,14 @@ def _mix(table: Array, weights: Array) -> Array:
     return np.tensordot(table, weights, axes=([1], [0]))
 
 
-def _shares(stacks: Sequence[Stack], darks: int, bits: int, parameters: Array, s: float) -> Array:
+def _shares(stacks: Sequence[FrameStatistics], darks: int, bits: int, parameters: Array, s: float) -> Array:
     """P(code) of every stack, [stack, levels]."""
     arrivals, weights, _ = _arrivals(stacks, darks, parameters, s)
     return _mix(np.exp(sensor_at(parameters, bits).log_pmf(arrivals, 1.0)), weights)
 
 
 def _model(
-    stacks: Sequence[Stack], darks: int, bits: int, parameters: Array, s: float
+    stacks: Sequence[FrameStatistics], darks: int, bits: int, parameters: Array, s: float
 ) -> tuple[Array, list[Array], list[Array]]:
     """Per stack: P(code) [levels], d log P / d parameters [m, levels], and s lambda dP/dlambda [levels]."""
     shares = _shares(stacks, darks, bits, parameters, s)
@@ -124,7 +122,7 @@ def _model(
     return shares, list(jacobians), list(s * light[:, None] * by_dark)
 
 
-def _log_likelihood(stacks: Sequence[Stack], shares: Sequence[Array] | Array) -> float:
+def _log_likelihood(stacks: Sequence[FrameStatistics], shares: Sequence[Array] | Array) -> float:
     return sum(
         float(np.sum(np.where(s.histogram > 0, s.histogram * np.log(np.maximum(p, 1e-300)), 0.0)))
         for s, p in zip(stacks, shares, strict=True)
@@ -132,7 +130,7 @@ def _log_likelihood(stacks: Sequence[Stack], shares: Sequence[Array] | Array) ->
 
 
 def _information(
-    stacks: Sequence[Stack], shares: Sequence[Array] | Array, jacobians: Sequence[Array]
+    stacks: Sequence[FrameStatistics], shares: Sequence[Array] | Array, jacobians: Sequence[Array]
 ) -> tuple[Array, Array]:
     """Fisher information of the pooled histograms [m, m] and the score [m]."""
     size = jacobians[0].shape[0]
@@ -144,7 +142,9 @@ def _information(
     return information, score
 
 
-def goodness(stacks: Sequence[Stack], shares: Sequence[Array], fitted: int) -> tuple[float, tuple[Array, ...]]:
+def goodness(
+    stacks: Sequence[FrameStatistics], shares: Sequence[Array], fitted: int
+) -> tuple[float, tuple[Array, ...]]:
     """Chi-square p-value of histograms against fitted shares, bins expected below 5 pooled, and residuals per level.
 
     The common factor of a pixel moves the codes like a change of light, which is fitted, so the test keeps its level.
@@ -168,7 +168,9 @@ def _pooled(observed: Array, expected: Array, least: float = 5.0) -> tuple[Array
     return np.bincount(group, observed), np.bincount(group, expected)
 
 
-def best_fit(darks: Sequence[Stack], flats: Sequence[Stack], bits: int, transfer: Transfer, s: float) -> HistogramFit:
+def best_fit(
+    darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], bits: int, transfer: Transfer, s: float
+) -> HistogramFit:
     """The fit from the likeliest of a few starts: with resolved peaks a gain off by one peak is a local maximum."""
     reach = min(3 * sqrt(transfer.gain_variance) / transfer.gain, 0.3)
     read = sqrt(max(transfer.read_variance, 0.05**2))

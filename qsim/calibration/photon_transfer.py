@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.calibration.frame_statistics import Stack
+from qsim.calibration.frame_statistics import FrameStatistics
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Transfer:
     read_variance_variance: float
 
 
-def photon_transfer(darks: Sequence[Stack], flats: Sequence[Stack]) -> Transfer:
+def photon_transfer(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics]) -> Transfer:
     """Weighted straight line of variance over mean: slope = gain, height at the darkest stack = read noise + ADC noise.
 
     Mean and variance of one stack are correlated through the third moment: the residual v - g m of a stack has the
@@ -73,7 +73,7 @@ def photon_transfer(darks: Sequence[Stack], flats: Sequence[Stack]) -> Transfer:
     )
 
 
-def _dark_line(darks: Sequence[Stack]) -> tuple[float, float, float, Array]:
+def _dark_line(darks: Sequence[FrameStatistics]) -> tuple[float, float, float, Array]:
     """Dark mean over exposure: slope [codes/s], offset [codes], variance of the slope, weights of the means in it."""
     time = np.array([s.exposure for s in darks])
     mean = np.array([s.mean for s in darks])
@@ -88,7 +88,7 @@ def _dark_line(darks: Sequence[Stack]) -> tuple[float, float, float, Array]:
     return slope, float(np.average(mean, weights=weight) - slope * centre), 1 / lever, levers
 
 
-def spread_of_means(flats: Sequence[Stack], dark_mean: float) -> float:
+def spread_of_means(flats: Sequence[FrameStatistics], dark_mean: float) -> float:
     """Relative variance between **all** pixels' means, shading and hot pixels included: what widens the histograms."""
     best = (0.0, inf)
     for flat in flats:

@@ -29,8 +29,15 @@ WIDEST = 3.5  # the response is tabled up to so many times the brightest light o
 STEEPEST = 1.0  # largest PRNU that is looked for
 BY_DARK = "by the dark frames"
 BY_FLAT = f"by the flat: {OUTLIER:g} robust sigmas above its smooth surface"
-NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
-WEIGHTS = WEIGHTS / WEIGHTS.sum()
+
+
+def normal_nodes(count: int) -> tuple[Array, Array]:
+    """Return the nodes and weights [count] of Gauss-Hermite quadrature over a standard normal variable."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(count)
+    return nodes, weights / weights.sum()
+
+
+NODES, WEIGHTS = normal_nodes(9)
 
 
 @dataclass(frozen=True, eq=False)

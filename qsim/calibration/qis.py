@@ -14,7 +14,7 @@ from math import exp, isfinite, sqrt
 import numpy as np
 
 from qsim.calibration.flat_fields import qis_flats
-from qsim.calibration.frame_statistics import Stack, check_stacks
+from qsim.calibration.frame_statistics import FrameStatistics, check_stacks
 from qsim.calibration.histogram_fit import HistogramFit, best_fit, goodness, sensor_at
 from qsim.calibration.photon_transfer import photon_transfer, spread_of_means
 from qsim.calibration.prnu import measure_pattern
@@ -23,7 +23,7 @@ from qsim.calibration.results import Calibration, Value, log_interval, normal_in
 HIDDEN_PEAKS = 0.5  # e-: above this read noise the histogram has no separate electron peaks
 
 
-def calibrate_qis(darks: Sequence[Stack], flats: Sequence[Stack], *, bits: int) -> Calibration:
+def calibrate_qis(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], *, bits: int) -> Calibration:
     """Gain, offset, read noise, dark current, PRNU and, where the flats' photons are known, QE of a QIS.
 
     Values named `..._transfer` come from means and variances, the others from the histograms. `ValueError` if there is
@@ -86,7 +86,7 @@ def calibrate_qis(darks: Sequence[Stack], flats: Sequence[Stack], *, bits: int) 
     return Calibration("QIS", bits, values, p_value, tuple(warnings), residuals)
 
 
-def _efficiency(flats: Sequence[Stack], fit: HistogramFit) -> dict[str, Value]:
+def _efficiency(flats: Sequence[FrameStatistics], fit: HistogramFit) -> dict[str, Value]:
     """Electrons per photon, where a light standard gave the photons of the flats."""
     known = [i for i, flat in enumerate(flats) if flat.photons]
     if not known:
@@ -101,7 +101,7 @@ def _efficiency(flats: Sequence[Stack], fit: HistogramFit) -> dict[str, Value]:
     return {"quantum_efficiency": normal_interval(value, variance, "e-/photon", "light standard", floor=0.0)}
 
 
-def _advice(darks: Sequence[Stack], flats: Sequence[Stack]) -> list[str]:
+def _advice(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics]) -> list[str]:
     """What these data cannot tell."""
     words = []
     if any(stack.frames < 2 for stack in (*darks, *flats)):

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import exp, inf, sqrt
+from statistics import NormalDist
 
 from numpy import ndarray as Array
 
-Z95 = 1.959963984540054  # two-sided 95 % of the normal distribution
+Z95 = NormalDist().inv_cdf(0.975)  # two-sided 95 % of the normal distribution
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files
-from qsim.calibration.frame_statistics import Stack, measure, measure_sums
+from qsim.calibration.frame_statistics import FrameStatistics, measure, measure_sums
 from qsim.calibration.results import Calibration
 from qsim.files import load_array
 from qsim.formats import importing
@@ -42,7 +42,7 @@ def read_stack(
     width: int | None = None,
     planes: int | None = None,
     variable: str | None = None,
-) -> Stack:
+) -> FrameStatistics:
     """Statistics of frames: `.npy` of codes (floats too, if they are whole), TIFF, or any capture of `convert`.
 
     `width` says that an `.npy` is a photon cube of packed planes, `planes` that every value is the sum of so many

@@ -12,24 +12,30 @@ pixels, crosstalk, afterpulses within one frame.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import inf, isfinite, nan, sqrt
+from math import inf, isfinite, log, nan, sqrt
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.calibration.dead_time import fitted_dead_time, matched_variance
 from qsim.calibration.flat_fields import Response, dark_rates, spad_flats
-from qsim.calibration.frame_statistics import Stack, check_stacks
+from qsim.calibration.frame_statistics import FrameStatistics, check_stacks
 from qsim.calibration.histogram_fit import NODES, WEIGHTS, goodness
 from qsim.calibration.prnu import BY_FLAT, HOT, measure_pattern
 from qsim.calibration.results import Z95, Calibration, Value, normal_interval, odd_efficiency
 from qsim.sensor.counting import CountingSPAD
 
+NO_EVENT_BOUND = -log(0.025)  # expected events that give none in 2.5 % of the cases: bound of a two-sided 95 %
 PERCENTILES = (1, 10, 25, 75, 90, 99, 99.9)  # of the DCR map, beside the median
 
 
 def calibrate_spad(
-    darks: Sequence[Stack], flats: Sequence[Stack], *, bits: int, dead_time: bool = True, paralyzable: bool = False
+    darks: Sequence[FrameStatistics],
+    flats: Sequence[FrameStatistics],
+    *,
+    bits: int,
+    dead_time: bool = True,
+    paralyzable: bool = False,
 ) -> Calibration:
     """DCR (and its map), PDE x fill, PRNU, afterpulsing and, for counts of more than one bit, dead time.
 
@@ -52,7 +58,7 @@ def calibrate_spad(
         values |= _distribution(dcr_map)
         if all(stack.total.sum() == 0 for stack in darks):
             time = sum(stack.frames * stack.exposure * stack.pixels for stack in darks)
-            values["dark_count_rate"] = Value(0.0, 0.0, 3.688879454113936 / time, "1/s", "no dark count: upper bound")
+            values["dark_count_rate"] = Value(0.0, 0.0, NO_EVENT_BOUND / time, "1/s", "no dark count: upper bound")
             warnings.append("no dark count at all: the dark-count rate has an upper bound only")
     else:
         warnings.append("no dark frames: dark counts are taken as 0 and end up in the efficiency and in PRNU")
@@ -89,6 +95,8 @@ def calibrate_spad(
 
 def _distribution(rates: Array) -> dict[str, Value]:
     """Median and percentiles of the DCR map (order statistics), and the share of hot pixels (Wilson's interval)."""
+    from scipy.stats import binomtest
+
     ordered = np.sort(rates.ravel())
     n = ordered.size
     reach = Z95 * sqrt(n) / 2
@@ -107,15 +115,14 @@ def _distribution(rates: Array) -> dict[str, Value]:
             value, min(float(ordered[low]), value), max(float(ordered[high]), value), "1/s", "order statistics"
         )
     if median > 0:
-        hot = float(np.mean(ordered > HOT * median))
-        centre = (hot + Z95**2 / (2 * n)) / (1 + Z95**2 / n)
-        half = Z95 / (1 + Z95**2 / n) * sqrt(hot * (1 - hot) / n + Z95**2 / (4 * n * n))
-        found["hot_pixels"] = Value(hot, max(centre - half, 0.0), centre + half, f"above {HOT:g} medians", "counting")
+        hot = int(np.count_nonzero(ordered > HOT * median))
+        share = binomtest(hot, n).proportion_ci(method="wilson")
+        found["hot_pixels"] = Value(hot / n, float(share.low), float(share.high), f"above {HOT:g} medians", "counting")
     return found
 
 
 def _efficiency(
-    flats: Sequence[Stack], darks: Sequence[Stack], response: Response, ratio_variance: float
+    flats: Sequence[FrameStatistics], darks: Sequence[FrameStatistics], response: Response, ratio_variance: float
 ) -> dict[str, Value]:
     """PDE x fill: avalanches per photon of the light standard, flats weighed by their certainty.
 
@@ -149,7 +156,7 @@ def _efficiency(
     }
 
 
-def _spread(flats: Sequence[Stack], darks: Sequence[Stack], response: Response) -> float:
+def _spread(flats: Sequence[FrameStatistics], darks: Sequence[FrameStatistics], response: Response) -> float:
     """Relative spread of the light over **all** pixels, shading and hot ones included: widens the histograms."""
     rate = dark_rates(darks, response)[0] if darks else np.zeros(1)
     dark_spread = sum(max(s.fixed_pattern, 0.0) / s.exposure**2 for s in darks if s.frames > 1) / max(len(darks), 1)
@@ -167,7 +174,7 @@ def _spread(flats: Sequence[Stack], darks: Sequence[Stack], response: Response) 
     return sqrt(max(best[0], 0.0))
 
 
-def _dispersed(stacks: Sequence[Stack]) -> list[str]:
+def _dispersed(stacks: Sequence[FrameStatistics]) -> list[str]:
     """Sums of planes that scatter in time more or less than a binomial: wrong number of planes, or unsteady light."""
     words = []
     for i, stack in enumerate(stacks):
@@ -182,7 +189,7 @@ def _dispersed(stacks: Sequence[Stack]) -> list[str]:
     return words
 
 
-def _saturation(flats: Sequence[Stack]) -> list[str]:
+def _saturation(flats: Sequence[FrameStatistics]) -> list[str]:
     """Flats in which some pixels never leave the top code."""
     words = []
     for i, flat in enumerate(flats):
@@ -195,7 +202,7 @@ def _saturation(flats: Sequence[Stack]) -> list[str]:
 # Afterpulsing, and the test of the model
 
 
-def _afterpulsing(stacks: Sequence[Stack], bits: int) -> dict[str, Value]:
+def _afterpulsing(stacks: Sequence[FrameStatistics], bits: int) -> dict[str, Value]:
     """Chance that a count is followed by an extra one in the next frame, from neighbouring frames, all stacks together.
 
     Counts: Cov(x_t, x_t+1) = a Var(x). Planes: P(1 | 1 before) - P(1 | 0 before) = a (1 - P(1 | 0 before)).
@@ -217,7 +224,7 @@ def _afterpulsing(stacks: Sequence[Stack], bits: int) -> dict[str, Value]:
 
 
 def _goodness(
-    flats: Sequence[Stack], bits: int, ratio: float, s: float, paralyzable: bool, fitted: int
+    flats: Sequence[FrameStatistics], bits: int, ratio: float, s: float, paralyzable: bool, fitted: int
 ) -> tuple[float, tuple[Array, ...]]:
     """Flats' histograms against the model at each flat's own mean and PRNU `s`; NaN for 1-bit planes."""
     if bits == 1 or not flats:

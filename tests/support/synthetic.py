@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from qsim.calibration.frame_statistics import Stack, measure
+from qsim.calibration.frame_statistics import FrameStatistics, measure
 from qsim.calibration.qis import calibrate_qis
 from qsim.calibration.results import Calibration
 from qsim.calibration.spad import calibrate_spad
@@ -36,7 +36,7 @@ class QISCase:
         electrons = rng.poisson(expected, shape) + self.read_noise * rng.standard_normal(shape)
         return np.clip(np.rint(self.gain * electrons + self.offset), 0, 2**self.bits - 1).astype(np.int64)
 
-    def stacks(self, rng: np.random.Generator) -> tuple[list[Stack], list[Stack]]:
+    def stacks(self, rng: np.random.Generator) -> tuple[list[FrameStatistics], list[FrameStatistics]]:
         pattern = rng.standard_normal((self.side, self.side))
         darks = [
             measure([self.codes(0.0, t, pattern, rng)], bits=self.bits, exposure=t, photons=0.0) for t in self.exposures
@@ -90,7 +90,7 @@ class SPADCase:
         pattern /= pattern.mean()
         rates = self.dark_rate * rng.lognormal(0, 0.5, shape)
 
-        def stack(light: float, frames: int) -> Stack:
+        def stack(light: float, frames: int) -> FrameStatistics:
             arrivals = light * self.pde * pattern + rates * self.exposure
             cdf = sensor.cdf(arrivals, self.exposure)[..., :-1]
             codes = np.stack([(rng.random((*shape, 1)) >= cdf).sum(axis=-1) for _ in range(frames)])
@@ -171,7 +171,7 @@ class Array:
         hot = rng.random(shape) < self.hot
         dark[hot] = 0.002 * np.exp(rng.uniform(np.log(10), np.log(1000), int(hot.sum())))
 
-        def stack(electrons: np.ndarray, exposure: float, photons: float | None, frames: int) -> Stack:
+        def stack(electrons: np.ndarray, exposure: float, photons: float | None, frames: int) -> FrameStatistics:
             drawn = rng.poisson(electrons * exposure / 1e-3, (frames, *shape))
             bits = {"qis": 8, "planes": 1, "counts": 7}[self.readout]
             if self.readout == "qis":

@@ -9,7 +9,7 @@ from stats import assert_share
 from synthetic import CASES, COUNTER, Array, QISCase, SPADCase, coverage
 
 from qsim.calibration.dead_time import calibrate_static, matched_variance
-from qsim.calibration.frame_statistics import from_ones, measure
+from qsim.calibration.frame_statistics import measure, measure_sums
 from qsim.calibration.qis import calibrate_qis
 from qsim.calibration.sensor_file import read_stack, sensor_of, write
 from qsim.calibration.spad import calibrate_spad
@@ -140,7 +140,7 @@ def test_dark_pattern_that_follows_the_light_does_not_bias_prnu(correlation):
     ones = [
         rng.binomial(60000, -np.expm1(-arrivals)) for arrivals in (np.maximum(dark, 0), light + np.maximum(dark, 0))
     ]
-    stacks = [from_ones(count, frames=60000, exposure=1e-5, photons=None) for count in ones]
+    stacks = [measure_sums([count], planes=60000, exposure=1e-5, photons=None) for count in ones]
     value = calibrate_spad(stacks[:1], stacks[1:], bits=1).values["prnu"]
     assert value.low <= 0.04 <= value.high
     assert value.high - value.low < 0.003
@@ -301,7 +301,7 @@ def test_real_dark_counts():
     if not path.exists():
         pytest.skip(f"{path.name} is not part of this repository")
     ones = np.rint(-np.expm1(-np.load(path)) * 7650)
-    found = calibrate_spad([from_ones(ones, frames=7650, exposure=10.3e-6, photons=0.0)], [], bits=1)
+    found = calibrate_spad([measure_sums([ones], planes=7650, exposure=10.3e-6, photons=0.0)], [], bits=1)
     median = found.values["dark_count_rate_median"]
     assert median.low < median.value
     assert median.value == pytest.approx(127, abs=1)
