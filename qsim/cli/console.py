@@ -22,6 +22,7 @@ from typing import Any, NoReturn
 
 from qsim.checks import suggest
 from qsim.files import FULL, Progress, wording
+from qsim.process import peak_memory
 
 GOES_ON = "the same command goes on where it stopped"
 STARTS_AGAIN = "nothing half-written is left; run the same command again"
@@ -179,7 +180,8 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
     finally:
         _quiet.reset(token)
         if args.verbose:
-            print(f"{parser.prog}: {time.perf_counter() - started:.1f} s, {_peak_memory()}", file=sys.stderr)
+            spent, memory = time.perf_counter() - started, peak_memory() / 2**30
+            print(f"{parser.prog}: {spent:.1f} s, at most {memory:.2f} GiB of memory", file=sys.stderr)
 
 
 @contextlib.contextmanager
@@ -192,13 +194,6 @@ def _warnings_as_lines(prog: str) -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.showwarning = show
         yield
-
-
-def _peak_memory() -> str:
-    import resource
-
-    scale = 2**30 if sys.platform == "darwin" else 2**20  # bytes there, KiB elsewhere
-    return f"at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale:.2f} GiB of memory"
 
 
 def note(text: str) -> None:

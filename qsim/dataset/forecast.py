@@ -10,7 +10,6 @@ needs, and what a real run can fairly be compared with (every job's log says bot
 from __future__ import annotations
 
 import math
-import resource
 import tempfile
 import time
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
+from qsim import process
 from qsim.clip import stream
 from qsim.clip.clip import Clip
 from qsim.dataset import job_runner
@@ -161,7 +161,7 @@ def plan(recipe: Recipe, *, frames: int = 5, progress: Progress | None = None) -
             if progress is not None:
                 progress(n, len(kinds))
     chosen = backend.choose()
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    peak = process.peak_memory() / 2**30
     return Plan(tuple(costs), f"{chosen.backend}, {chosen.variant}", peak)
 
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import datetime
 import os
 import platform
-import resource
 import time
 import traceback
 from collections.abc import Callable
@@ -27,6 +26,7 @@ from qsim.clip import stream
 from qsim.clip.clip import Clip
 from qsim.dataset.job import Job
 from qsim.dataset.provenance import assets, origin, photographs
+from qsim.process import peak_memory
 
 if TYPE_CHECKING:
     from qsim.rendering.budget import Budget
@@ -171,7 +171,7 @@ def _do(job: Job, folder: Path, make: Make) -> Result:
     files.write_json(record_path(folder, job.name), make_record(job, clip.path))
     failure_path(folder, job.name).unlink(missing_ok=True)
     seconds = (rendered - started, time.monotonic() - rendered)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    peak = peak_memory()
     spent = f"clip {seconds[0]:.2f} s, streams {seconds[1]:.2f} s, "
     spent += f"processor {time.process_time() - worked:.2f} s, peak {peak >> 20} MiB"
     _log(folder, job.name, f"done on {platform.node()}, process {os.getpid()}: {spent}")

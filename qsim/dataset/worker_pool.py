@@ -8,7 +8,6 @@ import multiprocessing
 import multiprocessing.connection
 import multiprocessing.resource_tracker
 import os
-import resource
 import signal
 import threading
 import time
@@ -19,6 +18,7 @@ from pathlib import Path
 
 from qsim.dataset.job import Job
 from qsim.dataset.job_runner import Make, Result, mark_failed, run_job
+from qsim.process import resident_memory
 
 MAX_DEATHS = 2  # of worker processes, before a job counts as failed
 MEMORY_EXIT, ORPHAN_EXIT = 70, 71  # exit codes of worker processes
@@ -140,12 +140,3 @@ def _watch(parent: int, memory: float) -> None:
             os._exit(MEMORY_EXIT)
         time.sleep(0.5)
     os._exit(ORPHAN_EXIT)
-
-
-def resident_memory() -> int:
-    """Bytes of memory that this process holds now (its peak, where the system does not say)."""
-    try:
-        with open("/proc/self/statm", encoding="ascii") as file:
-            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -23,11 +23,11 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.files import read_json, write_json
+from qsim.process import peak_memory, reset_peak
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import Codes, array_codes, sensed, stored, windows_sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import breakdown, metrics
-from quiver.evaluation.peak_memory import peak_memory, reset_peak
 from quiver.restoration.interface import Restorer
 
 FORMAT = "quiver-evaluation-2"  # 1: peak = the sensor's white, factor of the least unclamped error

@@ -23,13 +23,13 @@ from numpy import ndarray as Array
 from qsim.checks import suggest
 from qsim.files import replacing
 from qsim.keys import Key
+from qsim.process import peak_memory, reset_peak
 from quiver.baselines import METHODS
 from quiver.data.clips import peak_of
 from quiver.data.code_table import draw_codes
 from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
-from quiver.evaluation.peak_memory import peak_memory, reset_peak
 from quiver.restoration.interface import MODES, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer, pick_device, wrap_network
 from quiver.restoration.restorers import restorer, weights_path

@@ -10,7 +10,6 @@ import json
 import os
 import pickle
 import random
-import resource
 import shutil
 import struct
 import zlib
@@ -32,6 +31,7 @@ from qsim.clip.stream import Stream
 from qsim.dataset import checking, recipe
 from qsim.formats import importing, video
 from qsim.formats.recording import Hints
+from qsim.process import peak_memory
 from qsim.sensor import devices
 from qsim.sensor.defects import defect_table
 from quiver.data.illumination import Illumination
@@ -258,7 +258,7 @@ def attack(name: str, folder: Path, rounds: int) -> str:
     make(original)
     targets = sorted(path.relative_to(original) for path in original.rglob("*") if path.is_file())
     read(original)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    before = peak_memory()
     refused = 0
     for n in range(rounds):
         victim = folder / "victim"
@@ -275,7 +275,7 @@ def attack(name: str, folder: Path, rounds: int) -> str:
         except BaseException as error:
             shutil.copytree(victim, folder / "culprit")
             return f"round {n}, {target.name}: {error!r}"
-        grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
+        grown = peak_memory() - before
         if grown > MEMORY:
             shutil.copytree(victim, folder / "culprit")
             return f"round {n}, {target.name}: {grown >> 20} MiB for a file of {target.stat().st_size} bytes"
@@ -329,7 +329,7 @@ def swap(name: str, folder: Path, rounds: int) -> str:
     original.mkdir()
     make(original)
     read(original)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    before = peak_memory()
     for target in [path for path in sorted(original.rglob("*")) if path.is_file()][:rounds]:
         for kind, content in other_kinds().items():
             victim = folder / "victim"
@@ -344,7 +344,7 @@ def swap(name: str, folder: Path, rounds: int) -> str:
                     return f"{target.name} as {kind}: {error!r}"
             except BaseException as error:
                 return f"{target.name} as {kind}: {error!r}"
-            grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
+            grown = peak_memory() - before
             if grown > MEMORY:
                 return f"{target.name} as {kind}: {grown >> 20} MiB"
     return ""
@@ -426,11 +426,11 @@ def test_zarrs_that_promise_more_than_there_is(tmp_path: Path):
     grid = {"name": "regular", "configuration": {"chunk_shape": [1 << 20, 1 << 10, 1]}}
     thick = described_zarr(tmp_path / "thick", chunk_grid=grid)
     large = described_zarr(tmp_path / "large", attributes={"a": "x" * (1 << 22)})
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    before = peak_memory()
     for folder, words in [(huge, r"1 of 1000000000000000 chunks"), (thick, "at a time"), (large, "bytes of metadata")]:
         with pytest.raises(ValueError, match=words):
             importing.read(folder, Hints("zarr"))
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before < MEMORY
+    assert peak_memory() - before < MEMORY
 
 
 @pytest.mark.parametrize("codec", ["pickle", "numcodecs.pickle", "bz2", "lzma", "json2"])

@@ -14,7 +14,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from quiver.evaluation.peak_memory import peak_memory, reset_peak
+from qsim.process import peak_memory, reset_peak
 from quiver.model.config import Config
 from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig

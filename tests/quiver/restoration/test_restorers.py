@@ -246,7 +246,7 @@ def test_cuda_is_asked_for_by_name(tmp_path: Path):
 
 MEMORY_PROGRAM = """
 import numpy as np
-from quiver.evaluation.peak_memory import peak_memory, reset_peak
+from qsim.process import peak_memory, reset_peak
 from quiver.data.codes import array_codes
 from quiver.data.illumination import Illumination
 from quiver.model.presets import build
