@@ -19,6 +19,7 @@ from numpy import ndarray as Array
 
 from qsim.rendering import mitsuba_xml
 from qsim.rendering.engine import errors_only, opaque
+from qsim.rendering.mitsuba_mesh import NORMALS, POSITIONS, mesh_shape, vertex_normals
 from qsim.scene import scene as records
 from qsim.scene.environment import environment_map, sky_map, sun_direction, sun_radiance
 from qsim.scene.scene import Body, Scene
@@ -81,9 +82,9 @@ class Stage:
             self._set(f"{name}.to_world", pose, lambda: self._transform(pose))
         else:
             world = _to_world(pose, body.vertices(t)).astype(np.float32)
-            moved = self._set(f"{name}.vertex_positions", world, lambda: world.ravel())
+            moved = self._set(f"{name}.{POSITIONS}", world, lambda: world.ravel())
             if moved and body.mesh.smooth:
-                self._normals[f"{name}.vertex_normals"] = self._normals_of(name, body, pose, world)
+                self._normals[f"{name}.{NORMALS}"] = self._normals_of(name, body, pose, world)
 
     def _normals_of(self, name: str, body: Body, pose: Array, world: Array) -> Array:
         """Unit normals of a smooth body's vertices, float32 [V, 3]; those of a rigid one are made once and turned."""
@@ -105,7 +106,7 @@ class Stage:
         """Where a shape of a file stands: its 4x4 placement, or its vertices [V, 3] and normals [V, 3] or [0, 3]."""
         if f"{part.name}.to_world" in self._parameters:
             return (np.array(self._parameters[f"{part.name}.to_world"].matrix, np.float64).reshape(4, 4),)
-        arrays = (f"{part.name}.vertex_positions", f"{part.name}.vertex_normals")
+        arrays = (f"{part.name}.{POSITIONS}", f"{part.name}.{NORMALS}")
         return tuple(
             np.array(self._parameters[key], np.float64).reshape(-1, 3) if key in self._parameters else np.zeros((0, 3))
             for key in arrays
@@ -117,8 +118,8 @@ class Stage:
             self._set(f"{name}.to_world", placed, lambda: self._transform(placed))
             return
         world = _to_world(pose, rest[0]).astype(np.float32)
-        if self._set(f"{name}.vertex_positions", world, lambda: world.ravel()) and len(rest[1]):
-            self._normals[f"{name}.vertex_normals"] = (rest[1] @ pose[:3, :3].T).astype(np.float32)
+        if self._set(f"{name}.{POSITIONS}", world, lambda: world.ravel()) and len(rest[1]):
+            self._normals[f"{name}.{NORMALS}"] = (rest[1] @ pose[:3, :3].T).astype(np.float32)
 
     def _set(self, key: str, value: Array, make: Any) -> bool:
         stamp = value.tobytes()
@@ -134,6 +135,39 @@ class Stage:
 
     def _opaque(self, value: Any) -> Any:
         return value if self.mi.variant().startswith("scalar") else opaque(value)
+
+
+def film_pass(
+    stage: Stage,
+    pose: Array,
+    crop: tuple[int, int, int, int],
+    seed: int,
+    samples: int,
+    integrator: Any,
+    sampler: str = "multijitter",
+) -> Array:
+    """Radiance of a window (y, x, height, width), float64 [H, W], by Mitsuba's own camera, film and box filter."""
+    mi, camera = stage.mi, stage.scene.camera
+    y, x, height, width = crop
+    film: dict[str, Any] = {
+        "type": "hdrfilm",
+        "width": camera.width,
+        "height": camera.height,
+        "rfilter": {"type": "box"},
+        # In Mitsuba's RGB variant a uniform spectrum is reddish (the white of sRGB is not that of equal energy);
+        # its luminance is 1.
+        "pixel_format": "luminance",
+    }
+    film |= {"crop_offset_x": x, "crop_offset_y": y, "crop_width": width, "crop_height": height}
+    view = pose @ np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's camera axes: left, up, forward
+    sensor: dict[str, Any] = {"type": "perspective", "film": film, "near_clip": 1e-4, "far_clip": 1e5}
+    sensor["to_world"] = mi.ScalarTransform4f(view.tolist())
+    sensor |= {"fov_axis": "x", "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.focal_pixels)))}
+    sensor["sampler"] = {"type": sampler, "sample_count": samples}
+    if camera.aperture_blur:
+        sensor |= {"type": "thinlens", "aperture_radius": camera.pupil_radius, "focus_distance": camera.focus}
+    image = mi.render(stage.loaded, sensor=mi.load_dict(sensor), integrator=integrator, seed=seed, spp=samples)
+    return np.array(image, np.float64)[..., 0]
 
 
 def lamp_pose(lamp: records.AreaLamp) -> Array:
@@ -178,43 +212,7 @@ def _mesh(mi: Any, body: Body, name: str, vertices: Array) -> Any:
         properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": _grey(mi, 0.0)})
     else:
         properties["bsdf"] = mi.load_dict(_bsdf(mi, body.material))
-    properties["face_normals"] = not body.mesh.smooth
-    uv = body.mesh.uv
-    mesh = mi.Mesh(
-        name,
-        len(vertices),
-        len(body.mesh.faces),
-        has_vertex_normals=body.mesh.smooth,
-        has_vertex_texcoords=uv is not None,
-        props=properties,
-    )
-    mesh.set_id(name)
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = vertices.astype(np.float32).ravel()
-    parameters["faces"] = body.mesh.faces.astype(np.uint32).ravel()
-    if uv is not None:
-        parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
-    with errors_only(mi):  # as in `place`
-        parameters.update()
-    if body.mesh.smooth:
-        # Mitsuba sums normals over faces in parallel, in an order that changes from run to run.
-        parameters["vertex_normals"] = vertex_normals(vertices, body.mesh.faces).ravel()
-        parameters.update()
-    return mesh
-
-
-def vertex_normals(vertices: Array, faces: Array) -> Array:
-    """Unit normals, float32 [V, 3]: face normals weighted by the corner's angle, always summed in the same order."""
-    corners = np.asarray(vertices, np.float64)[faces]  # [F, 3, 3]
-    edges = np.roll(corners, -1, axis=1) - corners
-    face = np.cross(edges[:, 0], -edges[:, 2])
-    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-300)
-    unit = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
-    angles = np.arccos(np.clip(-np.einsum("fik,fik->fi", unit, np.roll(unit, 1, axis=1)), -1, 1))
-    summed = np.zeros((len(vertices), 3))
-    np.add.at(summed, faces, angles[..., None] * face[:, None])
-    length = np.linalg.norm(summed, axis=1, keepdims=True)
-    return np.where(length > 0, summed / np.maximum(length, 1e-300), (0.0, 0.0, 1.0)).astype(np.float32)
+    return mesh_shape(mi, body.mesh, name, vertices, properties)
 
 
 def _light(mi: Any, scene: Scene, light: records.Light, name: str, smooth_weight: float) -> dict[str, Any]:

@@ -49,9 +49,9 @@ class Pilot:
         thinned = max(1, math.isqrt(scene.camera.height * scene.camera.width // PIXELS))
         renderer = Renderer(scene, frame_rate=frame_rate, shutter=shutter, seed=seed, budget=Budget(), thinned=thinned)
         looks = np.unique(np.linspace(0, frames - 1, min(frames, MOST_LOOKS)).round().astype(int)).tolist()
-        travel, bodies = (np.stack(each) for each in zip(*map(renderer.travel, looks), strict=True))
+        travel, bodies = (np.stack(each) for each in zip(*map(renderer.motion_extent, looks), strict=True))
         times = {0, frames // 2, frames - 1}
-        known = set(np.unique([renderer.travel(t)[1] for t in times]).tolist())
+        known = set(np.unique([renderer.motion_extent(t)[1] for t in times]).tolist())
         for _ in range(MOST_MORE):
             hidden = ~np.isin(bodies, list(known))
             if not hidden.any():

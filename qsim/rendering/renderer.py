@@ -26,8 +26,8 @@ from qsim.rendering import ground_truth
 from qsim.rendering.budget import Budget, blur_left, grid_samples, instants
 from qsim.rendering.denoiser import cleaned_mean
 from qsim.rendering.engine import activate, select
-from qsim.rendering.ground_truth import Hits
-from qsim.rendering.mitsuba_scene import Stage
+from qsim.rendering.mitsuba_scene import Stage, film_pass
+from qsim.rendering.ray_casting import RayCaster, pixel_rays
 from qsim.scene.scene import Scene
 
 Crop = tuple[int, int, int, int]  # y, x, height, width
@@ -36,8 +36,6 @@ RENDER_STAGE = 16  # of the random keys: sampler seeds
 SHARP_STAGE = 17  # the sharp instant has seeds of its own
 SURFACE_SAMPLES = 16  # per pixel, for the denoiser's albedo and normals
 MAX_LANES = 2**23  # samples in flight, about; a frame that takes more is rendered in parts
-SPEED_STEPS = 64  # of an exposure, over one of which a speed is measured: up to 32 turns are told from rest
-SPEED_PARTS = (-0.5, -0.27, 0.0, 0.23, 0.5)  # where in the exposure; uneven, so that no oscillation rests at all
 FIREFLY = 10.0  # a pixel counts as a firefly where halves differ by this many rms of the frame's difference
 
 
@@ -95,13 +93,12 @@ class Renderer:
         activate(self.engine)
         import mitsuba as mi
 
-        self._mi = mi
+        self.mi = mi
         self._key = Key(seed=seed, clip=hash_name(f"{scene.name}/{scene.seed}"), stage=RENDER_STAGE)
-        self._stage = Stage(mi, scene)
-        self._obvious: Stage | None = None
-        self._integrators: dict[int | None, Any] = {}
+        self.stage = Stage(mi, scene)
+        self._integrators: dict[int, Any] = {}
         self._samplers: dict[int, Any] = {}
-        self._numbers = self._shape_table()
+        self._caster = RayCaster(self.stage, self.engine.backend)
 
     def time(self, t: int) -> float:
         """Mid-exposure of frame t [s]."""
@@ -141,12 +138,13 @@ class Renderer:
         sums = np.zeros((3, 2, math.prod(self.shape)))
         for i, instant in enumerate(instants):
             drawn = np.empty_like(sums[0])
-            self._stage.place(instant)
+            self.stage.place(instant)
             pose = self.scene.camera.pose(instant)
             if self.engine.backend == "scalar":
                 integrator = self._integrator(budget.bounces)
-                images = [self._film_pass(self._stage, pose, int(s), samples, integrator) for s in seeds[:, i, 0]]
-                drawn[:] = np.reshape(images, drawn.shape)
+                images = [film_pass(self.stage, pose, self.crop, int(s), samples, integrator) for s in seeds[:, i, 0]]
+                thin = [image[:: self.thinned, :: self.thinned] for image in images]
+                drawn[:] = np.reshape(thin, drawn.shape)
             else:
                 for part, seed in zip(parts, seeds[0, i], strict=True):
                     drawn[:, part.start : part.stop] = self._pass(pose, int(seed), samples, budget.bounces, part)
@@ -199,17 +197,17 @@ class Renderer:
             raise ValueError("the scalar engine cannot denoise; leave Budget.denoise off or install LLVM")
         import drjit as dr
 
-        mi = self._mi
+        mi = self.mi
         samples = grid_samples(max(2, SURFACE_SAMPLES // len(instants)))
         parts = self._parts(samples)
         seeds = words(key, (len(instants), len(parts)), redraw=1)
         sums = np.zeros((4, math.prod(self.shape)))
         for instant, row in zip(instants, seeds, strict=True):
-            self._stage.place(instant)
+            self.stage.place(instant)
             for part, seed in zip(parts, row, strict=True):
                 sampler, position = self._film_positions(int(seed), samples, part)
                 ray = self._camera_ray(self.scene.camera.pose(instant), position, sampler)
-                found = self._stage.loaded.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
+                found = self.stage.loaded.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
                 bsdf = found.bsdf(ray)
                 seen = found.is_valid()
                 matt = seen & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
@@ -232,7 +230,7 @@ class Renderer:
         integrator = self._integrator(bounces)  # first: loading amid what follows would change the kernel once
         sampler, position = self._film_positions(seed, samples, part, 2)
         ray = self._camera_ray(pose, position, sampler)
-        radiance, _, _ = integrator.sample(self._stage.loaded, sampler, ray)
+        radiance, _, _ = integrator.sample(self.stage.loaded, sampler, ray)
         mean = dr.block_sum(radiance[0], samples) / samples
         return np.array(mean, np.float64).reshape(2, len(part))
 
@@ -244,7 +242,7 @@ class Renderer:
         """
         import drjit as dr
 
-        mi = self._mi
+        mi = self.mi
         lanes = times * len(part) * samples
         sampler = self._sampler(samples)
         sampler.seed(seed, lanes)
@@ -255,23 +253,18 @@ class Renderer:
         corner = mi.Point2f(mi.Float((pixel - row * columns) * step + x0), mi.Float(row * step + y0))
         return sampler, corner + sampler.next_2d()
 
-    def _integrator(self, bounces: int | None) -> Any:
-        """A path tracer without Russian roulette, so that the same seed draws the same paths at every depth.
-
-        None is Mitsuba's default: any depth, Russian roulette from the fifth bounce on.
-        """
+    def _integrator(self, bounces: int) -> Any:
+        """A path tracer without Russian roulette, so that the same seed draws the same paths at every depth."""
         if bounces not in self._integrators:
-            plugin: dict[str, Any] = {"type": "path"}
-            if bounces is not None:
-                plugin |= {"max_depth": bounces + 1, "rr_depth": 1000}
-            self._integrators[bounces] = self._mi.load_dict(plugin)
+            plugin = {"type": "path", "max_depth": bounces + 1, "rr_depth": 1000}
+            self._integrators[bounces] = self.mi.load_dict(plugin)
         return self._integrators[bounces]
 
     def _camera_ray(self, pose: Array, position: Any, sampler: Any) -> Any:
         """Rays through film positions [px]; the pose is data, not code, so that moving it compiles nothing."""
         import drjit as dr
 
-        mi, camera = self._mi, self.scene.camera
+        mi, camera = self.mi, self.scene.camera
         axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in pose[:3, i])) for i in range(4)]
         f = camera.focal_pixels
         across = (position.x - camera.width / 2) / f
@@ -288,60 +281,21 @@ class Renderer:
 
     def _sampler(self, samples: int) -> Any:
         if samples not in self._samplers:
-            sampler = self._mi.load_dict({"type": "multijitter", "sample_count": samples})
+            sampler = self.mi.load_dict({"type": "multijitter", "sample_count": samples})
             sampler.set_samples_per_wavefront(samples)
             self._samplers[samples] = sampler
         return self._samplers[samples]
 
-    def obvious(self, t: int, samples: int, redraw: int = 0) -> Array:
-        """The loop that everybody writes first, float64 [H, W]: only here to be compared with.
-
-        `mi.render` with Mitsuba's camera and film, its default integrator and its default sampler; box filter. Another
-        `redraw` draws other samples.
-        """
-        activate(self.engine)
-        if self._obvious is None:
-            self._obvious = Stage(self._mi, self.scene, smooth_weight=1.0)
-        self._obvious.place(self.time(t))
-        pose, seed = self.scene.camera.pose(self.time(t)), int(words(self.key(t), (1, 1), redraw=redraw)[0, 0])
-        return self._film_pass(self._obvious, pose, seed, samples, self._integrator(None), "independent")
-
-    def _film_pass(
-        self, stage: Stage, pose: Array, seed: int, samples: int, integrator: Any, sampler: str = "multijitter"
-    ) -> Array:
-        """Mitsuba's own camera and film; the scalar engine, which has no vectors of rays, always renders so."""
-        mi, camera = self._mi, self.scene.camera
-        y, x, height, width = self.crop
-        film: dict[str, Any] = {
-            "type": "hdrfilm",
-            "width": camera.width,
-            "height": camera.height,
-            "rfilter": {"type": "box"},
-            # In Mitsuba's RGB variant a uniform spectrum is reddish (the white of sRGB is not that of equal energy);
-            # its luminance is 1.
-            "pixel_format": "luminance",
-        }
-        film |= {"crop_offset_x": x, "crop_offset_y": y, "crop_width": width, "crop_height": height}
-        view = pose @ np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's camera axes: left, up, forward
-        sensor: dict[str, Any] = {"type": "perspective", "film": film, "near_clip": 1e-4, "far_clip": 1e5}
-        sensor["to_world"] = mi.ScalarTransform4f(view.tolist())
-        sensor |= {"fov_axis": "x", "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.focal_pixels)))}
-        sensor["sampler"] = {"type": sampler, "sample_count": samples}
-        if camera.aperture_blur:
-            sensor |= {"type": "thinlens", "aperture_radius": camera.pupil_radius, "focus_distance": camera.focus}
-        image = mi.render(stage.loaded, sensor=mi.load_dict(sensor), integrator=integrator, seed=seed, spp=samples)
-        return np.array(image, np.float64)[:: self.thinned, :: self.thinned, 0]
-
     def truth(self, t: int) -> dict[str, Array]:
         """Flow, validity, depth and body of frame t at mid-exposure, as in `Frame`."""
         camera, now, after, shape = self.scene.camera, self.time(t), self.time(t + 1), self.shape
-        rays = ground_truth.pixel_rays(camera, self.crop, self.thinned)
-        self._stage.place(now)
-        hits = self._cast(camera.pose(now), rays)
+        rays = pixel_rays(camera, self.crop, self.thinned)
+        self.stage.place(now)
+        hits = self._caster.cast(camera.pose(now), rays)
         flow, inside, then = ground_truth.flow_between(self.scene, rays, hits, now, after)
         back, _, _ = ground_truth.flow_between(self.scene, rays, hits, now, self.time(t - 1))
-        self._stage.place(after)
-        valid = inside & ground_truth.visible(hits.distance, self._cast(camera.pose(after), then))
+        self.stage.place(after)
+        valid = inside & ground_truth.visible(hits.distance, self._caster.cast(camera.pose(after), then))
         return {
             "flow": flow.reshape(2, *shape).astype(np.float32),
             "flow_back": back.reshape(2, *shape).astype(np.float32),
@@ -350,78 +304,17 @@ class Renderer:
             "body_id": hits.number.reshape(shape),
         }
 
-    def travel(self, t: int) -> tuple[Array, Array]:
-        """How far what each pixel sees runs in the exposure [px], and the body that it is, both [H, W].
+    def motion_extent(self, t: int) -> tuple[Array, Array]:
+        """How far what each pixel sees moves in the exposure [px], and the body that it is, both [H, W].
 
-        From its largest speed, not from where it comes to lie: a wheel that turns once has not rested. With the shutter
-        at 0, by its speed at the instant, in a whole frame time.
+        With the shutter at 0, by its speed at the instant, in a complete frame time.
         """
-        exposure, parts = (self.shutter or 1.0) / self.frame_rate, SPEED_PARTS if self.shutter > 0 else (0.0,)
-        rays, now = ground_truth.pixel_rays(self.scene.camera, self.crop, self.thinned), self.time(t)
-        self._stage.place(now)
-        hits = self._cast(self.scene.camera.pose(now), rays)
-        fastest, step = np.zeros(rays.shape[1]), exposure / SPEED_STEPS
-        for part in parts:
-            ends = [now + part * exposure + step / 2, now + part * exposure - step / 2]
-            late, early = (ground_truth.flow_between(self.scene, rays, hits, now, end)[0] for end in ends)
-            fastest = np.maximum(fastest, np.hypot(*(late - early)))
-        across = math.hypot(self.scene.camera.height, self.scene.camera.width)  # nothing smears farther
-        return np.minimum(fastest * SPEED_STEPS, across).reshape(self.shape), hits.number.reshape(self.shape)
-
-    def _cast(self, pose: Array, rays: Array) -> Hits:
-        """First hits along rays [3, N] of a camera with this pose."""
-        origin, directions = pose[:3, 3], pose[:3, :3] @ rays
-        if self.engine.backend == "scalar":
-            return self._cast_one_by_one(origin, directions)
-        import drjit as dr
-
-        mi = self._mi
-        direction = mi.Vector3f(directions.astype(np.float32))
-        length = dr.norm(direction)
-        eye = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in origin))
-        ray = mi.Ray3f(eye, direction / length)
-        found = self._stage.loaded.ray_intersect_preliminary(ray, coherent=True)
-        shape = dr.reinterpret_array(mi.UInt32, found.shape)
-        instance: Any = dr.reinterpret_array(mi.UInt32, found.instance)
-        hit = found.is_valid()
-        # Where nothing was hit, Dr.Jit leaves whatever the memory held.
-        index = dr.select(hit, dr.select(instance > 0, instance, shape), 0)
-        distance = dr.select(hit, found.t / length, dr.inf)
-        triangle, weights = dr.select(hit, found.prim_index, 0), dr.select(hit, found.prim_uv, 0)
-        dr.eval(index, distance, triangle, weights)  # rays are cast once, not once for each answer
-        number = self._numbers[np.minimum(np.array(index), len(self._numbers) - 1)]
-        far = np.where(number >= 0, np.array(distance, np.float64), np.inf)
-        return Hits(far, number, np.array(triangle, np.int64), np.array(weights, np.float64).reshape(2, -1).T)
-
-    def _cast_one_by_one(self, origin: Array, directions: Array) -> Hits:
-        mi = self._mi
-        numbers = self._stage.shape_numbers()
-        lengths = np.linalg.norm(directions, axis=0)
-        distance, number = np.full(len(lengths), np.inf), np.full(len(lengths), -1, np.int32)
-        triangle, weights = np.zeros(len(lengths), np.int64), np.zeros((len(lengths), 2))
-        for i, (direction, length) in enumerate(zip(directions.T, lengths, strict=True)):
-            ray = mi.Ray3f(origin.tolist(), (direction / length).tolist())
-            found = self._stage.loaded.ray_intersect_preliminary(ray)
-            if found.is_valid():
-                number[i] = numbers.get((found.instance or found.shape).id(), -1)
-                triangle[i], weights[i] = found.prim_index, found.prim_uv
-                distance[i] = found.t / length if number[i] >= 0 else np.inf
-        return Hits(distance, number, triangle, weights)
-
-    def _shape_table(self) -> Array:
-        """Body numbers by Dr.Jit's registry index; unknown shapes (the sun) are surroundings, -1."""
-        if self.engine.backend == "scalar":
-            return np.zeros(0, np.int32)
-        import drjit as dr
-
-        mi, numbers = self._mi, self._stage.shape_numbers()
-        shapes = self._stage.loaded.shapes()
-        pointers: list[Any] = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)) for shape in shapes]
-        indices = [int(pointer[0]) for pointer in pointers]
-        table = np.full(max([0, *indices]) + 2, -1, np.int32)
-        for index, shape in zip(indices, shapes, strict=True):
-            table[index] = numbers.get(shape.id(), -1)
-        return table
+        now, exposure = self.time(t), (self.shutter or 1.0) / self.frame_rate
+        rays = pixel_rays(self.scene.camera, self.crop, self.thinned)
+        self.stage.place(now)
+        hits = self._caster.cast(self.scene.camera.pose(now), rays)
+        extent = ground_truth.motion_extent(self.scene, rays, hits, now, exposure, sharp=self.shutter == 0)
+        return extent.reshape(self.shape), hits.number.reshape(self.shape)
 
 
 def _checked_crop(scene: Scene, crop: Crop | None) -> Crop:

@@ -82,7 +82,6 @@ STILL_LONG: set[str] = {
     "qsim.clip.stream",
     "qsim.clip.writer",
     "qsim.formats.video",
-    "qsim.rendering.renderer",
     "qsim.scene.scene",
     "qsim.sensor.defects.fixed_pattern",
     "quiver.training.run_folder",

@@ -26,8 +26,11 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.clip.clamped_error import Errors, decibels, error_at, white_in
+from qsim.keys import words
 from qsim.rendering import fidelity
 from qsim.rendering.budget import Budget, grid_samples
+from qsim.rendering.engine import activate
+from qsim.rendering.mitsuba_scene import Stage, film_pass
 from qsim.rendering.renderer import Renderer
 from qsim.scene.scene import Scene
 
@@ -147,11 +150,36 @@ class Target:
         return decibels(self.white, error) or math.inf
 
 
+class NaiveLoop:
+    """Naive reference: one `mi.render` per frame, with Mitsuba's camera and film, default integrator and sampler."""
+
+    def __init__(self, renderer: Renderer) -> None:
+        self._renderer = renderer
+        self._stage = Stage(renderer.mi, renderer.scene, smooth_weight=1.0)
+        self._integrator = renderer.mi.load_dict({"type": "path"})
+
+    def frame(self, t: int, samples: int, redraw: int = 0) -> Array:
+        """Return the radiance of the window at mid-exposure of frame t, float64 [H, W]; `redraw` selects samples."""
+        ours, now = self._renderer, self._renderer.time(t)
+        activate(ours.engine)
+        self._stage.place(now)
+        pose, seed = ours.scene.camera.pose(now), int(words(ours.key(t), (1, 1), redraw=redraw)[0, 0])
+        return film_pass(self._stage, pose, ours.crop, seed, samples, self._integrator, "independent")
+
+    def mean(self, t: int, samples: int) -> Array:
+        """Return the same from one or more calls, as memory demands."""
+        height, width = self._renderer.shape
+        calls = min(samples, 2 ** max(0, math.ceil(math.log2(samples * height * width / 2**24))))
+        each = samples // calls
+        return np.mean([self.frame(t, each, redraw) for redraw in range(calls)], axis=0)
+
+
 def _compare(
     scene: Scene, name: str, level: float, chosen: Budget, target: Target, rounds: int, most_samples: int
 ) -> RenderRow:
     ours, reached = _reaching(scene, chosen, level, target)
-    samples, obvious_psnr = _obvious_samples(ours, level, target)
+    naive = NaiveLoop(ours)
+    samples, obvious_psnr = _naive_samples(naive, level, target)
     timed = min(samples, most_samples)
     theirs, own, stated = [], [], 0.0
     end = time.perf_counter() + ENOUGH
@@ -159,7 +187,7 @@ def _compare(
         if i > rounds and time.perf_counter() > end:
             break
         started = _clocks()
-        _obvious(ours, FRAME + i, timed)
+        naive.mean(FRAME + i, timed)
         between = _clocks()
         stated = target.decibels(error_at(target.white, ours.frame(FRAME + i, with_truth=False).errors_at))
         theirs.append(between - started)
@@ -199,20 +227,12 @@ def _reaching(scene: Scene, chosen: Budget, level: float, target: Target) -> tup
         chosen = replace(chosen, samples=2 * grid_samples(chosen.samples // 2 + 1))
 
 
-def _obvious_samples(renderer: Renderer, level: float, target: Target) -> tuple[int, float]:
+def _naive_samples(naive: NaiveLoop, level: float, target: Target) -> tuple[int, float]:
     """The smallest power of two that reaches the level, and the PSNR there: MSE of independent samples is c / n."""
     trial = 64
-    measured = target.psnr(_obvious(renderer, FRAME, trial))
+    measured = target.psnr(naive.mean(FRAME, trial))
     samples = 2 ** max(0, math.ceil(math.log2(trial) + (level - measured) / (10 * math.log10(2))))
     return samples, measured + 10 * math.log10(samples / trial)
-
-
-def _obvious(renderer: Renderer, t: int, samples: int) -> Array:
-    """Large counts in several calls, as memory demands."""
-    height, width = renderer.shape
-    calls = min(samples, 2 ** max(0, math.ceil(math.log2(samples * height * width / 2**24))))
-    each = samples // calls
-    return np.mean([renderer.obvious(t, each, redraw) for redraw in range(calls)], axis=0)
 
 
 def table(report: RenderReport) -> str:

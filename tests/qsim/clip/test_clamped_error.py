@@ -234,4 +234,4 @@ def test_a_rendered_clip_states_its_error_below_its_own_white(tmp_path, capsys):
 
 def test_plates_that_stand_still_do_not_move():
     chosen = renderer(plate(None))
-    assert chosen.travel(0)[0].max() == 0
+    assert chosen.motion_extent(0)[0].max() == 0

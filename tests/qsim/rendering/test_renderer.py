@@ -115,7 +115,7 @@ def test_smooth_surroundings_are_rarely_drawn_which_changes_no_mean_and_lowers_t
     things = Body("floor", square(4, -1), Diffuse(0.6)), Body("plate", square(0.7), RoughPlastic(0.4))
     made = replace(scene(*things), lights=lights)
     ours, plain = (renderer(made, budget=Budget(64, 3)) for _ in range(2))
-    plain._stage = Stage(plain._mi, plain.scene, smooth_weight=1.0)
+    plain.stage = Stage(plain.mi, plain.scene, smooth_weight=1.0)
     a, b = (r.frame(0, with_truth=False) for r in (ours, plain))
     spread = math.hypot(a.error, b.error) / math.sqrt(a.radiance.size)
     assert abs(a.radiance.mean(dtype=float) - b.radiance.mean(dtype=float)) < critical_z(checks=2) * spread

@@ -1,0 +1,55 @@
+"""Meshes of Mitsuba: the names of their parameters, their construction, and vertex normals that repeat exactly."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.rendering.engine import errors_only
+from qsim.scene.scene import Mesh
+
+# The only place that names a mesh's parameters: other releases of Mitsuba call them differently.
+POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
+
+
+def mesh_shape(mi: Any, mesh: Mesh, name: str, vertices: Array, properties: Any) -> Any:
+    """A Mitsuba mesh with these vertices [V, 3]; `properties` holds its bsdf and emitter."""
+    properties["face_normals"] = not mesh.smooth
+    uv = mesh.uv
+    shape = mi.Mesh(
+        name,
+        len(vertices),
+        len(mesh.faces),
+        has_vertex_normals=mesh.smooth,
+        has_vertex_texcoords=uv is not None,
+        props=properties,
+    )
+    shape.set_id(name)
+    parameters = mi.traverse(shape)
+    parameters[POSITIONS] = vertices.astype(np.float32).ravel()
+    parameters[FACES] = mesh.faces.astype(np.uint32).ravel()
+    if uv is not None:
+        parameters[TEXCOORDS] = uv.astype(np.float32).ravel()
+    with errors_only(mi):  # as in `place`
+        parameters.update()
+    if mesh.smooth:
+        # Mitsuba sums normals over faces in parallel, in an order that changes from run to run.
+        parameters[NORMALS] = vertex_normals(vertices, mesh.faces).ravel()
+        parameters.update()
+    return shape
+
+
+def vertex_normals(vertices: Array, faces: Array) -> Array:
+    """Unit normals, float32 [V, 3]: face normals weighted by the corner's angle, always summed in the same order."""
+    corners = np.asarray(vertices, np.float64)[faces]  # [F, 3, 3]
+    edges = np.roll(corners, -1, axis=1) - corners
+    face = np.cross(edges[:, 0], -edges[:, 2])
+    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-300)
+    unit = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
+    angles = np.arccos(np.clip(-np.einsum("fik,fik->fi", unit, np.roll(unit, 1, axis=1)), -1, 1))
+    summed = np.zeros((len(vertices), 3))
+    np.add.at(summed, faces, angles[..., None] * face[:, None])
+    length = np.linalg.norm(summed, axis=1, keepdims=True)
+    return np.where(length > 0, summed / np.maximum(length, 1e-300), (0.0, 0.0, 1.0)).astype(np.float32)

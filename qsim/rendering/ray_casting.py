@@ -1,0 +1,92 @@
+"""Casts rays into a loaded scene: distance, body and triangle of the first hit along each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.optics.camera import Camera
+from qsim.rendering.mitsuba_scene import Stage
+
+
+@dataclass(frozen=True)
+class Hits:
+    """First surfaces along rays, one entry per ray [N]."""
+
+    distance: Array  # float64, in lengths of the ray (z of the camera's axes where the ray's z is 1); inf: nothing hit
+    number: Array  # int32, body number; lamps follow the bodies; -1 where nothing is
+    triangle: Array  # int64, index into the mesh's faces
+    weights: Array  # float64 [N, 2], barycentric weights of the triangle's second and third vertex
+
+
+def pixel_rays(camera: Camera, crop: tuple[int, int, int, int], thinned: int = 1) -> Array:
+    """Rays [3, N] through the pixel centres of a window, row by row, in the camera's axes and with unit z."""
+    y, x, height, width = crop
+    rays = camera.directions()[y : y + height : thinned, x : x + width : thinned]
+    return np.ascontiguousarray(rays.reshape(-1, 3).T)
+
+
+class RayCaster:
+    """First hits in a loaded scene, at the time at which it stands; one ray after the other on the scalar engine."""
+
+    def __init__(self, stage: Stage, backend: str) -> None:
+        self._mi, self._stage, self._scalar = stage.mi, stage, backend == "scalar"
+        self._numbers = self._shape_table()
+
+    def cast(self, pose: Array, rays: Array) -> Hits:
+        """First hits along rays [3, N] of a camera with this pose."""
+        origin, directions = pose[:3, 3], pose[:3, :3] @ rays
+        if self._scalar:
+            return self._cast_one_by_one(origin, directions)
+        import drjit as dr
+
+        mi = self._mi
+        direction = mi.Vector3f(directions.astype(np.float32))
+        length = dr.norm(direction)
+        eye = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in origin))
+        ray = mi.Ray3f(eye, direction / length)
+        found = self._stage.loaded.ray_intersect_preliminary(ray, coherent=True)
+        shape = dr.reinterpret_array(mi.UInt32, found.shape)
+        instance: Any = dr.reinterpret_array(mi.UInt32, found.instance)
+        hit = found.is_valid()
+        # Where nothing was hit, Dr.Jit leaves whatever the memory held.
+        index = dr.select(hit, dr.select(instance > 0, instance, shape), 0)
+        distance = dr.select(hit, found.t / length, dr.inf)
+        triangle, weights = dr.select(hit, found.prim_index, 0), dr.select(hit, found.prim_uv, 0)
+        dr.eval(index, distance, triangle, weights)  # rays are cast once, not once for each answer
+        number = self._numbers[np.minimum(np.array(index), len(self._numbers) - 1)]
+        far = np.where(number >= 0, np.array(distance, np.float64), np.inf)
+        return Hits(far, number, np.array(triangle, np.int64), np.array(weights, np.float64).reshape(2, -1).T)
+
+    def _cast_one_by_one(self, origin: Array, directions: Array) -> Hits:
+        mi = self._mi
+        numbers = self._stage.shape_numbers()
+        lengths = np.linalg.norm(directions, axis=0)
+        distance, number = np.full(len(lengths), np.inf), np.full(len(lengths), -1, np.int32)
+        triangle, weights = np.zeros(len(lengths), np.int64), np.zeros((len(lengths), 2))
+        for i, (direction, length) in enumerate(zip(directions.T, lengths, strict=True)):
+            ray = mi.Ray3f(origin.tolist(), (direction / length).tolist())
+            found = self._stage.loaded.ray_intersect_preliminary(ray)
+            if found.is_valid():
+                number[i] = numbers.get((found.instance or found.shape).id(), -1)
+                triangle[i], weights[i] = found.prim_index, found.prim_uv
+                distance[i] = found.t / length if number[i] >= 0 else np.inf
+        return Hits(distance, number, triangle, weights)
+
+    def _shape_table(self) -> Array:
+        """Body numbers by Dr.Jit's registry index; unknown shapes (the sun) are surroundings, -1."""
+        if self._scalar:
+            return np.zeros(0, np.int32)
+        import drjit as dr
+
+        mi, numbers = self._mi, self._stage.shape_numbers()
+        shapes = self._stage.loaded.shapes()
+        pointers: list[Any] = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)) for shape in shapes]
+        indices = [int(pointer[0]) for pointer in pointers]
+        table = np.full(max([0, *indices]) + 2, -1, np.int32)
+        for index, shape in zip(indices, shapes, strict=True):
+            table[index] = numbers.get(shape.id(), -1)
+        return table
