@@ -41,7 +41,7 @@ def add_preview(sub: Any) -> None:
 
 
 def _kinds(text: str) -> list[str]:
-    from qsim.report.preview import KINDS
+    from qsim.report.views import KINDS
 
     kinds = [word.strip() for word in text.split(",")]
     for kind in kinds:
@@ -52,6 +52,7 @@ def _kinds(text: str) -> list[str]:
 
 def _run_preview(args: argparse.Namespace) -> int:
     from qsim.report import preview
+    from qsim.report.views import choose, declaration, open_source
 
     target: Path | None = args.output
     if target is not None:
@@ -71,10 +72,10 @@ def _run_preview(args: argparse.Namespace) -> int:
     if args.frame is not None and (args.play or args.fps is not None):
         raise ValueError("--frame: shows one frame; leave out --play and --fps, or leave it out for a film of all")
     args.fps = 12.0 if args.fps is None else args.fps
-    source = preview.open_source(args.path, bits=args.bits, width=args.width, stream=args.stream)
+    source = open_source(args.path, bits=args.bits, width=args.width, stream=args.stream)
     if args.frame is not None and not 0 <= args.frame < source.length:
         raise ValueError(f"--frame {args.frame}: {source.name} has frames 0..{source.length - 1}")
-    views = preview.choose(source, args.what, several=target is not None)
+    views = choose(source, args.what, several=target is not None)
     if args.stream is not None and not any(view.kind in ("codes", "average") for view in views):
         raise ValueError(f"--stream {args.stream}: no picture of codes is shown; add --what codes, or leave it out")
     film = args.frame is None and (args.play if target is None else target.suffix != ".png")
@@ -89,31 +90,32 @@ def _run_preview(args: argparse.Namespace) -> int:
         page = preview.sheet(views, args.scale)
         preview.write(target, page, frames, args.fps, about | {"shown_fps": args.fps}, progress)
     lines = [f"{target}: frame {shown} of {source.name}" + (f" at {args.fps:g} fps" if film else "")]
-    found = about | {"preview": str(target), "views": [preview.declaration(view) for view in views]}
+    found = about | {"preview": str(target), "views": [declaration(view) for view in views]}
     output(args, found, lines + [view.declared for view in views])
     return 0
 
 
 def _show(args: argparse.Namespace, source: Any, views: list[Any], frames: range) -> int:
     """Pictures on stdout: colour if it is a terminal (and NO_COLOR is not set), else shades of text."""
-    from qsim.report import preview, terminal
+    from qsim.report import preview
+    from qsim.report.views import declaration
 
     found = {"source": str(args.path), "frames": [frames.start, frames.stop]}
     if args.json:
-        output(args, found | {"views": [preview.declaration(view) for view in views]}, "")
+        output(args, found | {"views": [declaration(view) for view in views]}, "")
         return 0
     coloured = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
     window = shutil.get_terminal_size()
-    draw = terminal.blocks if coloured else terminal.shades
+    draw = preview.half_blocks if coloured else preview.shades
     for view in views:
         for t in frames:
-            text = draw(terminal.fit(view.picture(t), window.columns, max(window.lines - 4, 8)))
+            text = draw(preview.fit_terminal(view.picture(t), window.columns, max(window.lines - 4, 8)))
             print(text, flush=True)
             if t + 1 < frames.stop:
                 time.sleep(1 / args.fps)
-                print(terminal.up(text) if coloured else "")
+                print(preview.cursor_up(text) if coloured else "")
         if view.legend is not None:
-            print(draw(terminal.fit(view.legend, 24, 12)))
+            print(draw(preview.fit_terminal(view.legend, 24, 12)))
         print(f"frame {frames[-1]} of {source.name}, {view.declared}")
     return 0
 

@@ -22,7 +22,7 @@ from qsim.dataset.dataset import Dataset
 from qsim.formats import exporting, importing
 from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints
-from qsim.report import preview, report
+from qsim.report import report, views
 from quiver.data import codes as data
 from quiver.restoration.restored_file import restore_to_file
 from quiver.restoration.restorers import restorer
@@ -206,7 +206,7 @@ def use_rest(folder: Path) -> None:
     assert stream.sensor.levels
     exporting.export(stream, folder / "png", Export("png"), force=True)
     data.open_stream(folder / "capture.npy")
-    preview.open_source(folder / "video.npy").views["values"].picture(0)
+    views.open_source(folder / "video.npy").views["values"].picture(0)
     data.open_stream(folder / "video.npy")
 
 

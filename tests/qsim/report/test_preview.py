@@ -1,4 +1,4 @@
-"""Quick looks: pictures are declared functions of the numbers, films have all frames, terminals get half blocks."""
+"""Quick looks: pictures hold legend and declaration, films have all frames, terminals get half blocks."""
 
 import json
 import os
@@ -9,52 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clips import write_clip
 from PIL import Image
 
 from qsim import colour as pictures
 from qsim.cli.program import main
-from qsim.clip.clip import RELATIVE, Clip, ClipWriter
-from qsim.report import preview, terminal
-from qsim.sensor import packing
-
-SHAPE = (5, 8, 11)
-
-
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory) -> Clip:
-    """Noise of odd size with a truth: everything moves 2 px to the right, depth grows downwards, one row has none."""
-    path = tmp_path_factory.mktemp("preview") / "odd"
-    meta = {"shape": list(SHAPE), "frame_rate": 2000.0, "exposure": 5e-4, "radiance_unit": RELATIVE, "camera": None}
-    flow = np.zeros((2, *SHAPE[1:]), np.float32)
-    flow[0] = 2.0
-    depth = np.repeat(np.linspace(1, 4, SHAPE[1], dtype=np.float32)[:, None], SHAPE[2], axis=1)
-    depth[-1] = np.inf
-    with ClipWriter(path, meta) as writer:
-        for t in range(SHAPE[0]):
-            radiance = np.random.default_rng(t).random(SHAPE[1:])
-            writer.add(t, radiance, truth={"flow": flow, "depth": depth}, error=0.01)
-    assert main(["sense", str(path), "--ppp", "3.25", "--bits", "3", "-o", "mine"]) == 0
-    return Clip.open(path)
-
-
-def test_views_are_the_declared_functions_of_the_numbers(clip):
-    views = preview.open_source(clip.path).views
-    assert list(views) == ["sharp", "codes", "average", "flow", "depth"]
-    white = views["sharp"].scale["white"]
-    assert white == pictures.peak(np.stack([clip.sharp(t) for t in range(5)]))
-    assert np.array_equal(views["sharp"].picture(2)[..., 1], pictures.tone(clip.sharp(2), white))
-    assert np.array_equal(views["codes"].picture(2)[..., 0], np.rint(clip.stream("mine").codes(2, 3)[0] * 255.0 / 7))
-    assert views["flow"].picture(1)[3, 3].tolist() == [255, 0, 0], "to the right at full speed"
-    assert "2 px/frame" in views["flow"].declared
-    assert views["depth"].picture(1)[-1].max() == 0
-    assert f"white = {white:.4g} relative" in views["sharp"].declared
-
-
-def test_average_is_of_the_frames_around(clip):
-    view = preview.open_source(clip.path).views["average"]
-    mean = clip.stream("mine").codes().mean(axis=0) / 7  # five frames: every window of eleven holds all of them
-    assert np.array_equal(view.picture(0)[..., 0], pictures.tone(mean, view.scale["white"]))
+from qsim.report import preview
+from qsim.report.views import choose, open_source
 
 
 def test_png_holds_picture_legend_and_declaration(clip, tmp_path, capsys):
@@ -69,7 +29,7 @@ def test_png_holds_picture_legend_and_declaration(clip, tmp_path, capsys):
     image = Image.open(target)
     pixels = np.asarray(image)
     assert pixels.shape[0] % 2 == pixels.shape[1] % 2 == 0
-    views = preview.open_source(clip.path).views
+    views = open_source(clip.path).views
     assert np.array_equal(pixels[: 8 * 3 : 3, : 11 * 3 : 3], views["sharp"].picture(1))
     below = pixels[24:].reshape(-1, 3)
     wheel = [[255, 0, 0], [0, 255, 255]]  # the ends of the legend's horizontal
@@ -92,7 +52,7 @@ def test_gif_and_mp4_have_every_frame(clip, tmp_path):
     with av.open(str(tmp_path / "a.mp4")) as film:
         decoded = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
     assert len(decoded) == 5
-    page = preview.sheet(preview.choose(preview.open_source(clip.path), None))
+    page = preview.sheet(choose(open_source(clip.path), None))
     for t, frame in enumerate(decoded):
         assert np.abs(frame.astype(int) - page.frame(t)).mean() < 6, "lossy, but this frame"
 
@@ -103,30 +63,9 @@ def test_legends_follow_their_pictures():
     assert np.array_equal(bar[0, -1], pictures.depth_colours(np.array([[9.0]]), 1.0, 9.0)[0, 0])
 
 
-def test_restored_video_says_what_it_is(tmp_path):
-    np.save(tmp_path / "video.npy", np.full((3, 4, 5), 6.5, np.float32))
-    described = {"format": "quiver-restored-1", "method": "moment", "unit": "photons", "frame_rate": 2000.0}
-    (tmp_path / "video.json").write_text(json.dumps(described))
-    view = preview.open_source(tmp_path / "video.npy").views["values"]
-    assert view.declared.startswith("restored by moment: white = 6.5 photons")
-    assert (view.picture(0) == 255).all()
-
-
-def test_packed_planes_are_unpacked(tmp_path):
-    planes = np.random.default_rng(0).integers(0, 2, (3, 4, 13)).astype(np.uint8)
-    np.save(tmp_path / "cube.npy", packing.pack(planes, 1))
-    view = preview.open_source(tmp_path / "cube.npy", width=13).views["codes"]
-    assert np.array_equal(view.picture(2)[..., 0], planes[2] * 255)
-
-
-def test_a_clip_senses_nothing_and_shows_its_light(tmp_path):
-    clip = write_clip(tmp_path / "plain", frames=3)
-    assert list(preview.open_source(clip.path).views) == ["sharp"]
-
-
 def test_half_blocks_carry_both_pixels():
     picture = np.arange(3 * 2 * 3, dtype=np.uint8).reshape(3, 2, 3)
-    lines = terminal.blocks(picture).split("\n")
+    lines = preview.half_blocks(picture).split("\n")
     assert len(lines) == 2
     assert lines[0].startswith("\x1b[38;2;0;1;2m\x1b[48;2;6;7;8m▀")
     assert "\x1b[49m" in lines[1], "an odd last row has nothing below"
@@ -134,14 +73,14 @@ def test_half_blocks_carry_both_pixels():
 
 def test_shades_go_from_dark_to_light():
     ramp = np.repeat(np.linspace(0, 255, 10).astype(np.uint8)[None, :, None], 3, axis=2)
-    assert terminal.shades(ramp) == terminal.SHADES
+    assert preview.shades(ramp) == preview.SHADES
 
 
 def test_fit_keeps_the_shape_and_never_enlarges():
     picture = np.zeros((60, 80, 3), np.uint8)
-    assert terminal.fit(picture, 40, 100).shape == (30, 40, 3)
-    assert terminal.fit(picture, 100, 15).shape == (30, 40, 3)
-    assert terminal.fit(picture, 100, 100) is picture
+    assert preview.fit_terminal(picture, 40, 100).shape == (30, 40, 3)
+    assert preview.fit_terminal(picture, 100, 15).shape == (30, 40, 3)
+    assert preview.fit_terminal(picture, 100, 100) is picture
 
 
 def _in_a_terminal(*words: object, **environment: str) -> str:

@@ -1,0 +1,219 @@
+"""What a clip, a stream or an array can be shown as: views, each a declared function of the numbers.
+
+    path -> Source (views: what a picture shows, and how) -> View.picture(t), uint8 [H, W, 3]
+
+Whites and colour scales are those of the whole clip (from at most SAMPLES frames), so that frames can be compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qsim import colour, files
+from qsim.checks import check_shape
+from qsim.clip.clip import Clip, Stream
+from qsim.files import load_array
+from qsim.formats.array_files import checked_codes
+from qsim.sensor import packing
+
+Picture = NDArray[np.uint8]  # [H, W, 3]
+SAMPLES = 16  # frames that decide the scales of a clip
+KINDS = ("sharp", "radiance", "codes", "average", "flow", "depth")  # that --what knows
+CURVE = f"(value / white)^(1/{colour.GAMMA:g})"
+
+
+@dataclass(frozen=True)
+class View:
+    """One thing to look at."""
+
+    kind: str  # of KINDS, or "values"
+    declared: str  # what it is and how numbers became colours, for caption and sidecar
+    picture: Callable[[int], Picture]
+    legend: Picture | None = None
+    scale: dict[str, float] = field(default_factory=dict)  # the numbers of the declaration
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a path holds."""
+
+    name: str
+    length: int  # frames
+    frame_rate: float | None  # per second of the scene, if known
+    views: dict[str, View]
+
+
+def open_source(path: Path, *, bits: int | None = None, width: int | None = None, stream: str | None = None) -> Source:
+    """The views of a clip folder, a stream (.npy or .json) or an array [T, H, W] or [H, W] in a .npy.
+
+    `bits` and `width` tell what a bare array of whole numbers holds: codes, or packed binary planes of so many columns;
+    `stream` chooses one of a clip's streams (default: the first). `FileNotFoundError` or `ValueError` with the cure.
+    """
+    if (path / "dataset.json").is_file():
+        raise ValueError(f"{path}: is a data set; name one of its clips, as in {path / 'clips'}/NAME")
+    if path.is_dir() or not path.exists():
+        clip = Clip.open(path)
+        _refuse(path, "a clip, whose streams know their bits", bits=bits, width=width)
+        return _clip_source(clip, stream)
+    _refuse(path, "no clip", stream=stream)
+    sidecar = path.with_suffix(".json")
+    described = files.read_json(sidecar) if sidecar.is_file() else {}
+    if "ppp_factor" in described:
+        _refuse(path, "a stream, which knows its bits", bits=bits, width=width)
+        return _stream_source(Stream.open(sidecar))
+    if path.suffix != ".npy":
+        raise ValueError(f"{path}: expected a clip folder, a stream or a .npy array; `qsim convert` reads other files")
+    return _array_source(path, bits, width, described)
+
+
+def _refuse(path: Path, what: str, **options: int | str | None) -> None:
+    """A `ValueError` for options that change nothing of what a path holds."""
+    for name, value in options.items():
+        if value is not None:
+            raise ValueError(f"{path}: is {what}; leave out --{name}")
+
+
+def _clip_source(clip: Clip, chosen: str | None) -> Source:
+    unit = "relative" if clip.camera is None else "W/m2/sr"
+    views = {"sharp": _light_view("sharp", "sharp radiance", unit, len(clip), clip.sharp)}
+    if any(name.startswith("sharp/") for name in clip.meta["checksums"]):
+        views["radiance"] = _light_view("radiance", "radiance of the exposure", unit, len(clip), clip.radiance)
+    if chosen is not None or clip.streams:
+        views |= _stream_source(clip.stream(chosen or clip.streams[0])).views
+    if clip.has_truth:
+        views |= {"flow": _flow_view(clip), "depth": _depth_view(clip)}
+    shortest = len(clip)
+    if "codes" in views:
+        shortest = min(shortest, len(clip.stream(chosen or clip.streams[0])))
+    return Source(clip.name, shortest, clip.frame_rate, views)
+
+
+def _stream_source(stream: Stream) -> Source:
+    def read(start: int, stop: int) -> NDArray[Any]:
+        return stream.codes(start, stop)
+
+    views = _code_views(stream.name, stream.bits, len(stream), read)
+    return Source(stream.name, len(stream), float(stream.meta["frame_rate"]), views)
+
+
+def _array_source(path: Path, bits: int | None, width: int | None, described: dict[str, Any]) -> Source:
+    array = load_array(path)
+    array = array[None] if array.ndim == 2 else array
+    length = check_shape(path, array.shape)[0]
+    rate = described.get("frame_rate")
+    if array.dtype.kind == "f":
+        _refuse(path, "an array of values, no codes", bits=bits, width=width)
+        what, unit = described.get("method", "values"), described.get("unit", "as stored")
+        title = f"restored by {what}" if "method" in described else what
+        view = _light_view("values", title, unit, length, lambda t: np.asarray(array[t], np.float64))
+        return Source(path.stem, length, rate, {"values": view})
+    if array.dtype.kind == "b":
+        _refuse(path, "an array of truth values", bits=bits, width=width)
+        bits = 1
+    elif width is not None:
+        _refuse(path, "packed planes of 1 bit, as --width says", bits=bits)
+        return _packed_source(path, array, width)
+    if bits is None:
+        raise ValueError(f"{path}: whole numbers are codes or packed planes; say --bits 3, or --width 320 for planes")
+    if not 1 <= bits <= 16:
+        raise ValueError(f"--bits: expected 1 to 16, got {bits}")
+
+    def read(start: int, stop: int) -> NDArray[Any]:
+        return checked_codes(path, np.asarray(array[start:stop]), bits, start)
+
+    return Source(path.stem, length, rate, _code_views(path.stem, bits, length, read))
+
+
+def _packed_source(path: Path, array: NDArray[Any], width: int) -> Source:
+    if array.dtype != np.uint8 or width < 1 or packing.packed_width(width, 1) != array.shape[2]:
+        raise ValueError(
+            f"{path}: {array.dtype} {list(array.shape)} holds no packed planes of {width} columns; "
+            f"a row of those is {packing.packed_width(max(width, 1), 1)} bytes of uint8"
+        )
+
+    def read(start: int, stop: int) -> NDArray[Any]:
+        return packing.unpack(np.asarray(array[start:stop]), 1, width)
+
+    return Source(path.stem, len(array), None, _code_views(path.stem, 1, len(array), read))
+
+
+def _samples(length: int) -> list[int]:
+    return sorted({int(t) for t in np.linspace(0, length - 1, min(length, SAMPLES))})
+
+
+def _grey(levels: NDArray[np.uint8]) -> Picture:
+    return np.repeat(levels[..., None], 3, axis=-1)
+
+
+def _light_view(kind: str, title: str, unit: str, length: int, read: Callable[[int], NDArray[Any]]) -> View:
+    white = colour.peak(np.stack([read(t) for t in _samples(length)]))
+    declared = f"{title}: white = {white:.4g} {unit}, curve {CURVE}"
+    return View(kind, declared, lambda t: _grey(colour.tone(read(t), white)), None, {"white": white})
+
+
+def _code_views(name: str, bits: int, length: int, read: Callable[[int, int], NDArray[Any]]) -> dict[str, View]:
+    top = 2**bits - 1
+    reach = colour.AVERAGE // 2
+
+    def average(t: int) -> NDArray[np.float64]:
+        mean: NDArray[np.float64] = read(max(t - reach, 0), min(t + reach + 1, length)).mean(axis=0) / top
+        return mean
+
+    def code(t: int) -> Picture:
+        return _grey(colour.code_levels(read(t, t + 1)[0], bits))
+
+    white = colour.peak(np.stack([average(t) for t in _samples(length)]))
+    shown = f"codes of {name}: 0 black, {top} white, no curve"
+    mean = f"plain average of {colour.AVERAGE} frames: white = {white * top:.4g} codes, curve {CURVE}"
+    return {
+        "codes": View("codes", shown, code, None, {"bits": bits}),
+        "average": View("average", mean, lambda t: _grey(colour.tone(average(t), white)), None, {"white": white}),
+    }
+
+
+def _flow_view(clip: Clip) -> View:
+    speeds = np.stack([np.hypot(*clip.flow(t)) for t in _samples(len(clip))])
+    finite = speeds[np.isfinite(speeds)]
+    largest = max(float(np.percentile(finite, 99.9)) if finite.size else 0.0, 0.5)
+    declared = f"flow to the next frame: rim of the wheel = {largest:.3g} px/frame, white still, grey unknown"
+    return View(
+        "flow",
+        declared,
+        lambda t: colour.flow_colours(clip.flow(t), largest),
+        colour.flow_legend(48),
+        {"largest": largest},
+    )
+
+
+def _depth_view(clip: Clip) -> View:
+    near, far = colour.depth_range(np.stack([clip.depth(t) for t in _samples(len(clip))]))
+    declared = f"depth: {near:.3g} m (left of the bar) to {far:.3g} m, even in 1/depth, black where nothing is"
+    return View(
+        "depth",
+        declared,
+        lambda t: colour.depth_colours(clip.depth(t), near, far),
+        colour.depth_legend(),
+        {"near": near, "far": far},
+    )
+
+
+def choose(source: Source, wanted: list[str] | None, *, several: bool = True) -> list[View]:
+    """The views asked for, or the usual ones: all of a clip but `radiance` and `average` (one if not `several`)."""
+    if wanted is None:
+        usual = [view for kind, view in source.views.items() if kind not in ("radiance", "average")]
+        return usual if several else usual[:1]
+    for kind in wanted:
+        if kind not in source.views:
+            raise ValueError(f"{source.name}: has no '{kind}' to show; there are: {', '.join(source.views)}")
+    return [source.views[kind] for kind in wanted]
+
+
+def declaration(view: View) -> dict[str, Any]:
+    """What a view shows and how, for programs."""
+    return {"what": view.kind, "declared": view.declared} | view.scale
