@@ -101,6 +101,13 @@ def words(key: Key, shape: tuple[int, ...], origin: tuple[int, int] = (0, 0), re
     return crop if frames else crop[0]
 
 
+def words_at(key: Key, at: Array, redraw: int = 0) -> Array:
+    """The words of single pixels, int [3, p] = (frame, row, column) of the full frame: uint32 [p]."""
+    frame, y, x = at
+    blocks = philox4x32(np.stack([x >> 2, y, frame, np.full_like(x, redraw)]), key.philox_key)
+    return blocks[x & 3, np.arange(x.size)]
+
+
 def uniform(first: Array, second: Array | None = None) -> Array:
     """Numbers in (0, 1): the middle of the cell that a word names, or that two words name (2^-64 wide).
 

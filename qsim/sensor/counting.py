@@ -16,13 +16,18 @@ from numpy import ndarray as Array
 
 from qsim.keys import Key, uniform_pair, words
 from qsim.sensor import paralyzable_steps
+from qsim.sensor.compiled.curves import Curves, below, by_pairs, falling
+from qsim.sensor.compiled.plan import MOST_BITS, Live, Plan
+from qsim.sensor.distribution import require_number
 from qsim.sensor.paralyzable import Paralyzable, most_counts
 from qsim.sensor.poisson import poisson_log_pmf
 from qsim.sensor.qis_steps import decide, search
-from qsim.sensor.sensor import require_number
 from qsim.sensor.spad import SPAD
 
 _ROWS = 1 << 14  # pixels of a block that is drawn step by step
+_SUMMED_BITS = 4  # of counters whose steps a kernel adds up
+_PARALYSED = 45.0  # arrivals per dead time, at least one of which then comes in each: the code is 1 to 1e-16
+_BRIGHT = 1000.0  # arrivals up to which those of many dead times have curves
 _UNDERFLOW = 1e-290  # below, sums in floating point may have lost terms
 
 
@@ -75,7 +80,7 @@ class CountingSPAD(SPAD):
             lambda k, mean: -share[k] * np.exp(poisson_log_pmf(mean * share[k], k)),
         )
 
-    def _cdf(self, arrivals: Array, exposure: float) -> Array:
+    def cdf_of(self, arrivals: Array, exposure: float) -> Array:
         """F_k = P(N < k + 1) = Q(k + 1, live_k): the regularised incomplete gamma function."""
         from scipy.special import gammaincc
 
@@ -85,7 +90,7 @@ class CountingSPAD(SPAD):
         cdf[:, -1] = 1.0
         return cdf
 
-    def _log_pmf(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
+    def log_pmf_of(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
         """P(N = k) = Pois(k; live_(k-1)) + integral of Pois(k; x) from live_k to live_(k-1): two positive terms."""
         from scipy.special import gammainc, gammaincc
 
@@ -105,15 +110,31 @@ class CountingSPAD(SPAD):
         result[:, 0] = -arrivals
         return result
 
-    def _draw(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
+    def kernel_plan(self, exposure: float) -> Plan | None:
+        """F_k = sum of k + 1 Poisson terms of the live time of few bits; curves for more, and if paralyzable."""
+        if self.bits > MOST_BITS:
+            return None
+        dark, count, law = self.dark_rate * exposure, self.levels - 1, self.dead_time_law(exposure)
+        if law is not None:
+            curves = _paralyzable_curves(law, count)
+        elif self.bits <= _SUMMED_BITS:
+            shares = 1 - np.arange(count) * (self.dead_time / exposure)
+            live = Live(self.levels, tuple(float(share) for share in shares[shares > 0]))
+            return Plan.summed(self.efficiency, dark, live)
+        else:
+            cdf, slope = self.steps(exposure)
+            curves = falling(by_pairs(cdf, count), by_pairs(slope, count), count)
+        return Plan.looked_up(self.efficiency, dark, curves)
+
+    def _draw_frame(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
         law = self.dead_time_law(exposure)
         if law is not None and law.by_steps:
             return self._draw_rows(photons, exposure, key, origin, _ROWS)
         if self.bits <= 8:
-            return super()._draw(photons, exposure, key, origin)
+            return super()._draw_frame(photons, exposure, key, origin)
         if law is not None:
             enough = min(self.bits, most_counts(exposure / self.dead_time).bit_length())
-            draw = super()._draw if enough == self.bits else replace(self, bits=enough)._draw
+            draw = super()._draw_frame if enough == self.bits else replace(self, bits=enough)._draw_frame
             return draw(photons, exposure, key, origin).astype(self.dtype)
         return self._draw_by_bisection(photons, exposure, key, origin)
 
@@ -172,7 +193,7 @@ class CountingSPAD(SPAD):
         guess = self._guess(arrivals, exposure, np.where(below < 0.5, ndtri(below), -ndtri(above)))
         return search(passed, self.levels - 1, guess).reshape(photons.shape).astype(self.dtype)
 
-    def _slope(self, arrivals: Array, exposure: float) -> Array:
+    def slope_of(self, arrivals: Array, exposure: float) -> Array:
         """dF_k/dlive_k = -Pois(k; live_k)."""
         if (paralyzable := self.dead_time_law(exposure)) is not None:
             return paralyzable.slope(arrivals)
@@ -181,6 +202,24 @@ class CountingSPAD(SPAD):
         slope = -share * np.exp(poisson_log_pmf(arrivals[:, None] * share, k))
         slope[:, -1] = 0.0
         return slope
+
+
+def _paralyzable_curves(law: Paralyzable, count: int) -> Curves | None:
+    """Curves of the steps F_0 ... F_(count - 1)."""
+    if law.by_steps:
+        return below(
+            lambda mean: paralyzable_steps.steps(law.ratio, count, mean[0])[0],
+            lambda mean: paralyzable_steps.steps(law.ratio, count, mean[0])[1],
+            count,
+            _BRIGHT,
+        )
+    return below(
+        lambda mean: law.cdf(mean[0])[:, :-1].T,
+        lambda mean: law.slope(mean[0])[:, :-1].T,
+        count,
+        _PARALYSED * max(law.ratio, 1.0),
+        settled=True,
+    )
 
 
 def _log_tail(at_once: Array, before: Array, live: Array, k: Array) -> Array:

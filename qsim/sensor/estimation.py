@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 from math import log
 from statistics import NormalDist
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy import ndarray as Array
 
-if TYPE_CHECKING:
-    from qsim.sensor.sensor import Sensor
+from qsim.sensor.distribution import Distribution
 
 _DECADES, _PER_DECADE = 8, 128  # of the grid: linear interpolation between its points is good to 4e-5
 _FLAT = 1e-14  # change of the cdf per doubling of light at which a sensor is taken as saturated
@@ -68,7 +66,7 @@ class _Grid:
 
 
 @lru_cache(maxsize=32)
-def _grid(sensor: Sensor, exposure: float) -> _Grid:
+def _grid(sensor: Distribution, exposure: float) -> _Grid:
     end, brightest = sensor.white(exposure), sensor.brightest(exposure)
     if brightest <= 0:
         raise ValueError(f"{type(sensor).__name__}: dark counts alone exceed the light above which the mean code falls")
@@ -88,7 +86,7 @@ def _grid(sensor: Sensor, exposure: float) -> _Grid:
     return _Grid(photons, np.maximum(sensor.log_pmf(photons, exposure), _NEVER), saturates)
 
 
-def response(sensor: Sensor, exposure: float) -> Response:
+def response(sensor: Distribution, exposure: float) -> Response:
     """The tables of `Response` from no light to saturation (or to where the mean code begins to fall)."""
     grid = _grid(sensor, exposure)
     codes, pmf = np.arange(sensor.levels, dtype=float), np.exp(grid.log_pmf)
@@ -103,7 +101,7 @@ def response(sensor: Sensor, exposure: float) -> Response:
     return Response(grid.photons, mean, variance, stabilised, expected)
 
 
-def maximum_likelihood(sensor: Sensor, histogram: Array, exposure: float, confidence: float = 0.95) -> Estimate:
+def maximum_likelihood(sensor: Distribution, histogram: Array, exposure: float, confidence: float = 0.95) -> Estimate:
     """See `Sensor.maximum_likelihood`."""
     counts = _checked(sensor, histogram)
     if not 0 < confidence < 1:
@@ -118,7 +116,7 @@ def maximum_likelihood(sensor: Sensor, histogram: Array, exposure: float, confid
     return Estimate(*found.reshape(3, *counts.shape[:-1]))
 
 
-def _checked(sensor: Sensor, histogram: Array) -> Array:
+def _checked(sensor: Distribution, histogram: Array) -> Array:
     counts = np.asarray(histogram, np.float64)
     if counts.ndim == 0 or counts.shape[-1] != sensor.levels:
         raise ValueError(f"histogram has the shape [..., {sensor.levels}], one bin per code; got {list(counts.shape)}")
@@ -131,7 +129,7 @@ def _checked(sensor: Sensor, histogram: Array) -> Array:
     return counts
 
 
-def _refuse_impossible(sensor: Sensor, exposure: float, counts: Array) -> None:
+def _refuse_impossible(sensor: Distribution, exposure: float, counts: Array) -> None:
     impossible = (counts > 0) & (_grid(sensor, exposure).log_pmf <= _NEVER).all(axis=0)
     if impossible.any():
         *where, code = (int(i) for i in np.argwhere(impossible)[0])
@@ -142,7 +140,7 @@ def _refuse_impossible(sensor: Sensor, exposure: float, counts: Array) -> None:
 class _Likelihood:
     """Histograms [h, levels] as functions of light: for some rows at one light level each, [p], [p] -> [p]."""
 
-    sensor: Sensor
+    sensor: Distribution
     exposure: float
     counts: Array
 

@@ -19,13 +19,17 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.keys import Key, uniform_pair, words
-from qsim.sensor.poisson import Mixture
+from qsim.sensor.compiled.curves import by_pairs, falling
+from qsim.sensor.compiled.plan import MOST_BITS, Electrons, Plan
+from qsim.sensor.distribution import require_bits, require_number
+from qsim.sensor.poisson import Mixture, poisson_quantile
 from qsim.sensor.qis_steps import Thresholds, decide
-from qsim.sensor.sensor import Sensor, require_bits, require_number
+from qsim.sensor.sensor import Sensor
 
 _REACH = 39.0  # sigmas: Phi(-39) = 1e-333 is 0 in float64
 _BLOCK, _SPAN = 256, 4096  # most levels, and electrons between them, that share one table
 _LONG = 1 << 13  # electrons of a table x (codes + 32); above, few steps are looked at, each by itself
+_LONGEST_TABLE = 2048  # electrons in a table that is looked through for short sums
 _BLUR = 8.3  # sigmas: 1 - Phi(8.3) = 5e-17 is nothing beside 1
 _FARTHEST = 1e15  # electrons; no light reaches further
 _WIDEST = 1 << 22  # numbers in all thresholds of a sensor
@@ -68,16 +72,16 @@ class QIS(Sensor):
         """Photons at which x = 1: top code / (gain QE); neither offset, dark current nor full well enters."""
         return (self.levels - 1) / (self.gain * self.quantum_efficiency)
 
-    def _cdf(self, arrivals: Array, exposure: float) -> Array:
+    def cdf_of(self, arrivals: Array, exposure: float) -> Array:
         return np.concatenate([t.evaluate_cdf(arrivals) for _, t in self._tables()], axis=1)
 
-    def _log_pmf(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
+    def log_pmf_of(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
         parts = []
         for codes, table in self._tables():
             parts.append(table.evaluate_log_pmf(arrivals, None if wanted is None else wanted[:, codes]))
         return np.concatenate(parts, axis=1)
 
-    def _slope(self, arrivals: Array, exposure: float) -> Array:
+    def slope_of(self, arrivals: Array, exposure: float) -> Array:
         return np.concatenate([t.evaluate_slope(arrivals) for _, t in self._tables()], axis=1)
 
     def _tables(self) -> Iterator[tuple[slice, Mixture]]:
@@ -108,28 +112,56 @@ class QIS(Sensor):
         codes, near = decide(steps.cdf, self.levels - 1, u.ravel(), mean, guess)
         return codes.reshape(u.shape), near.reshape(u.shape) <= 2.0**-32
 
-    def _draw(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
+    def kernel_plan(self, exposure: float) -> Plan | None:
+        """Short sums over electrons, or curves where those are too long."""
+        if self.bits > MOST_BITS:
+            return None
+        dark, count = self.dark_rate * exposure, self.levels - 1
+        if (sums := self.short_sums()) is not None:
+            return Plan.summed(self.efficiency, dark, sums)
+        steps = thresholds(self)
+        if steps is None:
+            return None
+        return Plan.looked_up(
+            self.efficiency, dark, falling(by_pairs(steps.cdf, count), by_pairs(steps.slope, count), count)
+        )
+
+    def short_sums(self) -> Electrons | None:
+        """The steps of at most 8 bits as sums over electrons; None if they are too long."""
+        if table_length(self) > _LONGEST_TABLE:
+            return None
+        table = electron_table(self, 0, self.levels)
+        cdf = np.concatenate([np.ones((table.first, self.levels - 1)), table.cdf[:, :-1]])
+        return Electrons.of(cdf, table.tail_cdf[:-1])
+
+    def _draw_frame(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
         if self.bits <= _PROCESS_BITS:
-            return super()._draw(photons, exposure, key, origin)
-        return self._draw_process(photons, exposure, key, origin)
+            return super()._draw_frame(photons, exposure, key, origin)
+        return self.read_out(photons, exposure, key, origin)
 
-    def _draw_process(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
-        """Electrons, read noise and ADC one after the other, each by inverting its distribution at a 64-bit number.
+    def read_out(
+        self,
+        photons: Array,
+        exposure: float,
+        key: Key,
+        origin: tuple[int, int] = (0, 0),
+        noise: Array | float = 1.0,
+        offset: Array | float = 0.0,
+    ) -> Array:
+        """Codes [H, W] of photons [H, W]: electrons, read noise and ADC, each inverted at a 64-bit number.
 
+        `noise` is relative to `read_noise` and `offset` [codes] is added to that of the sensor: a number, or [H, W].
         Error: that of the inverted functions, below 1e-13 in any probability (tested for means to 65 000).
         """
         from scipy.special import ndtri
-
-        from qsim.sensor.poisson import poisson_quantile
 
         w = [words(key, photons.shape, origin, redraw) for redraw in range(4)]
         electrons = poisson_quantile(self.arrivals(photons, exposure), *uniform_pair(w[0], w[1]))
         if self.full_well is not None:
             electrons = np.minimum(electrons, self.full_well)
-        if self.read_noise:
-            below, above = uniform_pair(w[2], w[3])
-            electrons = electrons + self.read_noise * np.where(below < 0.5, ndtri(below), -ndtri(above))
-        return self.codes_of(electrons)
+        below, above = uniform_pair(w[2], w[3])
+        electrons = electrons + self.read_noise * noise * np.where(below < 0.5, ndtri(below), -ndtri(above))
+        return self.codes_of(electrons + offset / self.gain)
 
 
 def table_length(sensor: QIS) -> float:

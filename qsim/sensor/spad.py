@@ -12,9 +12,11 @@ from typing import ClassVar
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.keys import Key, uniform, uniform_pair, words
+from qsim.keys import Key, uniform_pair, words
+from qsim.sensor.compiled.plan import MOST_BITS, Live, Plan
+from qsim.sensor.distribution import require_bits, require_number
 from qsim.sensor.qis_steps import search
-from qsim.sensor.sensor import Sensor, require_bits, require_number
+from qsim.sensor.sensor import Sensor
 
 _PLANES_BITS = 8  # of a sum of planes; above, the sum is drawn at once
 _BATCH = 1 << 17  # words of a batch of planes
@@ -65,25 +67,32 @@ class BinarySPAD(SPAD):
         """Binary planes in one code, M = 2^bits - 1."""
         return self.levels - 1
 
-    def _cdf(self, arrivals: Array, exposure: float) -> Array:
-        cdf = np.minimum(np.cumsum(np.exp(self._log_pmf(arrivals, exposure)), axis=1), 1.0)
+    def cdf_of(self, arrivals: Array, exposure: float) -> Array:
+        cdf = np.minimum(np.cumsum(np.exp(self.log_pmf_of(arrivals, exposure)), axis=1), 1.0)
         cdf[:, -1] = 1.0
         return cdf
 
-    def _log_pmf(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
+    def log_pmf_of(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
         """Binomial(M, p) with p = 1 - exp(-arrivals / M)."""
         from scipy.special import xlogy
 
         k, per_plane = np.arange(self.levels), arrivals[:, None] / self.planes
         return _log_binomials(self.planes) + xlogy(k, -np.expm1(-per_plane)) - (self.planes - k) * per_plane
 
-    def _slope(self, arrivals: Array, exposure: float) -> Array:
+    def slope_of(self, arrivals: Array, exposure: float) -> Array:
         """dF_k/dp = -M C(M-1, k) p^k (1-p)^(M-1-k), dp/darrivals = (1-p) / M."""
         from scipy.special import xlogy
 
         k, per_plane = np.arange(self.planes), arrivals[:, None] / self.planes
         log_slope = _log_binomials(self.planes - 1) + xlogy(k, -np.expm1(-per_plane)) - (self.planes - k) * per_plane
         return np.pad(-np.exp(log_slope), ((0, 0), (0, 1)))
+
+    def kernel_plan(self, exposure: float) -> Plan | None:
+        """F_0 = exp(-arrivals / M) of each of M planes."""
+        if self.bits > MOST_BITS:
+            return None
+        m = self.planes
+        return Plan.summed(self.efficiency / m, self.dark_rate * exposure / m, Live(2, (1.0,)), planes=m)
 
     def sample_planes(
         self,
@@ -108,7 +117,7 @@ class BinarySPAD(SPAD):
             codes[t] = single.sample(group, exposure, key=at, origin=origin, engine=engine).sum(axis=0)
         return codes
 
-    def _draw(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
+    def _draw_frame(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
         if self.bits <= _PLANES_BITS:
             return self._draw_planes(photons, exposure, key, origin)
         return self._draw_sum(photons, exposure, key, origin)
@@ -141,31 +150,31 @@ class BinarySPAD(SPAD):
         """
         single, m = replace(self, bits=1), self.planes
         codes = np.zeros(photons.shape, self.dtype)
-        rows = max(1, _BATCH // max(photons.shape[1], 1))
+        rows = max(1, _BATCH // max(photons.shape[1] * m, 1))
         for y in range(0, len(photons), rows):
             light = np.asarray(photons[y : y + rows], np.float64) / m
-            dark = single.cdf(light, exposure / m)[..., 0]
             step = max(1, _BATCH // max(light.size, 1))
             for plane in range(0, m, step):
-                at = key.at(key.frame * m + plane)
-                batch, place = (min(step, m - plane), *light.shape), (origin[0] + y, origin[1])
-                first = words(at, batch, place)
-                u = uniform(first)
-                fires = u >= dark
-                tail = np.abs(u - dark) <= 2.0**-32
-                if tail.any():
-                    second = words(at, batch, place, redraw=1)[tail]
-                    lit = np.broadcast_to(light, batch)[tail]
-                    fires[tail] = single.codes_at(first[tail], second, lit, exposure / m)
-                codes[y : y + rows] += fires.sum(axis=0, dtype=self.dtype)
+                at, place = key.at(key.frame * m + plane), (origin[0] + y, origin[1])
+                fired = single.draw_block(light, exposure / m, at, place, planes=min(step, m - plane))
+                codes[y : y + rows] += fired.sum(axis=0, dtype=self.dtype)
         return codes
+
+    def draw_at(self, photons: Array, exposure: float, *, key: Key, at: Array) -> Array:
+        """As every sensor; the sum of the planes, plane p of frame f being frame f M + p of a 1-bit sensor."""
+        if self.bits == 1:
+            return super().draw_at(photons, exposure, key=key, at=at)
+        single, m = replace(self, bits=1), self.planes
+        first = at * np.array([[m], [1], [1]])
+        planes = (first + np.array([[plane], [0], [0]]) for plane in range(m))
+        return np.sum([single.draw_at(photons / m, exposure / m, key=key, at=plane) for plane in planes], axis=0)
 
 
 @dataclass(frozen=True)
 class PlaneByPlane(BinarySPAD):
     """A clocked pixel as streams without `drawn_by` have it: planes one by one at any number of bits."""
 
-    def _draw(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
+    def _draw_frame(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
         return self._draw_planes(photons, exposure, key, origin)
 
 

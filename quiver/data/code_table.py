@@ -11,13 +11,13 @@ in plain NumPy, for worker processes that must not touch Dr.Jit.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim import keys
 from qsim.keys import Key
+from qsim.sensor.distribution import Distribution
 from qsim.sensor.sensor import Sensor
 
 CELLS = 1024  # along each side of the table
@@ -26,22 +26,12 @@ TABLE_BITS = 5  # wider codes change within too many cells
 MARGIN = 1e-12  # relative; wider than the rounding of sqrt and product
 
 
-class Exact(Protocol):
-    """What the table needs of a sensor."""
-
-    def white(self, exposure: float) -> float: ...
-
-    def cdf(self, photons: Array, exposure: float) -> Array: ...
-
-    def codes_at(self, first: Array, second: Array, photons: Array, exposure: float) -> Array: ...
-
-
 class CodeTable:
     """Codes by cell for one sensor at one exposure; 255 where the cell does not decide."""
 
     UNDECIDED = np.uint8(255)
 
-    def __init__(self, sensor: Exact, exposure: float) -> None:
+    def __init__(self, sensor: Distribution, exposure: float) -> None:
         """ValueError for a sensor whose codes do not grow with light (a paralyzable counter)."""
         self.sensor, self.exposure = sensor, exposure
         brightest = sensor.white(exposure)
@@ -68,19 +58,14 @@ class CodeTable:
         codes = self.table[row * CELLS + (first >> np.uint32(U_SHIFT)).astype(np.int32)]
         open_ = np.flatnonzero(codes == self.UNDECIDED)
         if open_.size:
-            words = first.ravel()[open_]
-            cdf = self.sensor.cdf(photons.ravel()[open_], self.exposure)[:, :-1]
-            u = ((words.astype(np.float64) + 0.5) * 2.0**-32)[:, None]
-            decided = np.count_nonzero(u >= cdf, axis=1)
-            tail = (np.abs(u - cdf) <= 2.0**-32).any(axis=1)
-            if tail.any():
+
+            def further(undecided: Array) -> Array:
                 if second is None:
                     raise LookupError("32 bits do not decide; give second words")
-                at = open_[tail]
-                decided[tail] = self.sensor.codes_at(
-                    words[tail], second.ravel()[at], photons.ravel()[at], self.exposure
-                )
-            codes.ravel()[open_] = decided
+                return second.ravel()[open_[undecided]]
+
+            light, words = photons.ravel()[open_], first.ravel()[open_]
+            codes.ravel()[open_] = self.sensor.draw(light, self.exposure, words, further)
         return codes
 
 

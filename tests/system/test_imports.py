@@ -68,15 +68,6 @@ STILL_IN_CIRCLES: set[str] = {
     "qsim.clip.stream",
     "qsim.clip.writer",
     "qsim.optics.radiometry",
-    "qsim.sensor.compiled.kernel",
-    "qsim.sensor.compiled.launch",
-    "qsim.sensor.compiled.plan",
-    "qsim.sensor.counting",
-    "qsim.sensor.estimation",
-    "qsim.sensor.pixels",
-    "qsim.sensor.qis",
-    "qsim.sensor.sensor",
-    "qsim.sensor.spad",
 }
 STILL_LONG: set[str] = {
     "qsim.clip.stream",

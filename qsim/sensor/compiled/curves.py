@@ -34,6 +34,12 @@ class Curves:
     brightest: float  # x up to which they hold
 
 
+def by_pairs(step: Callable[[Array, Array], Array], count: int) -> Steps:
+    """F_0 ... F_(count - 1) of rows of means, from a function of pairs: codes int [p], Poisson means [p] -> [p]."""
+    codes = np.arange(count)[:, None]
+    return lambda mean: step(np.broadcast_to(codes, mean.shape).ravel(), mean.ravel()).reshape(mean.shape)
+
+
 def falling(cdf: Steps, slope: Steps, count: int) -> Curves | None:
     """Curves of `count` steps that only fall with light, from F_k and dF_k/dlambda; None if no grid is fine enough."""
     dark, bright = cdf(np.zeros((count, 1))), cdf(np.full((count, 1), _HIGH**2))

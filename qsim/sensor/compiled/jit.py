@@ -6,13 +6,17 @@ import os
 import sys
 import warnings
 from functools import cache
+from math import log
 from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim import backend as engine
+from qsim.keys import ROUNDS
 
+_MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # of Philox4x32; see keys.py
+_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 _PACKET = 16  # numbers that a kernel works on at a time, at most
 _INFINITY = 0x7F800000  # float32; larger bit patterns are NaN or negative
 
@@ -69,11 +73,11 @@ def no_light(photons: list[Any]) -> Any:
     import drjit as dr
 
     jit = backend()
-    doubt: Any = jit.Bool(False)
+    wrong: Any = jit.Bool(False)
     for theta in photons:
         pattern: Any = dr.reinterpret_array(jit.UInt32, theta)
-        doubt |= pattern >= _INFINITY
-    return doubt
+        wrong |= pattern >= _INFINITY
+    return wrong
 
 
 def uniform32(word: Any) -> Any:
@@ -87,3 +91,38 @@ def smaller(a: Any, b: Any) -> Any:
     import drjit as dr
 
     return dr.select(a < b, a, b)
+
+
+def philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
+    """Four words of one block; the compiled twin of keys.philox4x32 at redraw 0."""
+    import drjit as dr
+
+    u32 = type(x)
+    c0, c1, c2, c3 = x, y, frame, u32(0)
+    for _ in range(ROUNDS):
+        a, b = u32(_MULTIPLIERS[0]), u32(_MULTIPLIERS[1])
+        c0, c1, c2, c3 = dr.mul_hi(b, c2) ^ c1 ^ high, b * c2, dr.mul_hi(a, c0) ^ c3 ^ low, a * c0
+        high, low = high + _KEY_STEPS[0], low + _KEY_STEPS[1]
+    return [c0, c1, c2, c3]
+
+
+def exp_below_zero(x: Any) -> Any:
+    """exp(x) of float32 -87 <= x <= 0 within 1.2e-7 of its value: `drjit.exp` also minds everything that is not there.
+
+    2^n exp(r) with |r| <= log(2)/2; adding 1.5 2^23 rounds n to its last bits, where the exponent takes it from. The
+    polynomial is that of Cephes (Moshier, expf).
+    """
+    import drjit as dr
+
+    real, bits = backend().Float, backend().UInt32
+    magic = real(1.5 * 2.0**23)
+    shifted = dr.fma(x, real(1 / log(2)), magic)
+    n = shifted - magic
+    r = dr.fma(n, real(-0.693359375), x)  # log(2) in two parts, the first one short
+    r = dr.fma(n, real(2.12194440e-4), r)
+    series = real(1.9875691500e-4)
+    for c in (1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1):
+        series = dr.fma(series, r, real(c))
+    value: Any = dr.reinterpret_array(bits, dr.fma(series, r * r, r) + 1)
+    exponent: Any = dr.reinterpret_array(bits, shifted)
+    return dr.reinterpret_array(real, value + (exponent << 23))

@@ -1,53 +1,43 @@
-"""What one lane of a compiled kernel computes, in Dr.Jit: two neighbouring pixels of one frame.
+"""The compiled kernel, in Dr.Jit: one thread draws the codes of two neighbouring pixels of one frame.
 
-    photons of 2 pixels + where they are -> 2 words of Philox -> their steps F_k (ladders.py) -> 2 codes, and a doubt
+    photons of 2 pixels + their index -> 2 words of Philox -> their steps F_k (plan.py) -> 2 codes, and "uncertain"
 
-`launch` starts a kernel over a block; it is traced once per plan and replayed after that. kernels.py has the clips.
+`start` runs a kernel over a block. A kernel is traced once per plan and replayed after that; launch.py draws clips.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, lru_cache
-from math import log
 from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.keys import ROUNDS, Key
+from qsim.keys import Key
 from qsim.sensor.compiled import lookup
 from qsim.sensor.compiled.curves import Curves
-from qsim.sensor.compiled.jit import available, backend, no_light, smaller, uniform32, whole_packets
-from qsim.sensor.compiled.plan import Electrons, Live, Plan, plan
-from qsim.sensor.sensor import Sensor
+from qsim.sensor.compiled.jit import backend, exp_below_zero, no_light, philox, smaller, uniform32, whole_packets
+from qsim.sensor.compiled.plan import Electrons, Live, Plan
 
-_MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # of Philox4x32; see keys.py
-_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 _CERTAIN = 80.0  # arrivals that are sure to bring 15: P(N < 15) = 1e-19
-_CONSTANT_PLANS = 32  # sensors of a process that get kernels of their own
+CONSTANT_PLANS = 32  # sensors of a process that get kernels of their own
 
 
-def steps(sensor: Sensor, photons: Array, exposure: float) -> Array:
-    """The steps F_0 ... as the kernel has them, for validation: photons [p] -> float64 [p, steps] of one plane.
-
-    `ValueError` if no kernel serves this sensor.
-    """
-    chosen = plan(sensor, exposure) if available() else None
-    if chosen is None:
-        raise ValueError(f"no compiled kernel serves {sensor}")
+def cdf_steps(plan: Plan, photons: Array) -> Array:
+    """The steps F_0 ... as the kernel has them, for validation: photons [p] -> float64 [p, steps] of one plane."""
     import drjit as dr
 
     jit = backend()
     light = jit.Float(np.asarray(photons, np.float32))
-    if isinstance(chosen.steps, Curves):
-        efficiency, dark, _, _, *curves = lookup.arguments(chosen.efficiency, chosen.dark, chosen.margin, chosen.steps)
+    if isinstance(plan.steps, Curves):
+        efficiency, dark, _, _, *curves = lookup.arguments(plan.efficiency, plan.dark, plan.margin, plan.steps)
         x = dr.sqrt(dr.fma(jit.Float64(light), efficiency, dark))
-        each = [lookup.curve(curves, jit.UInt32(k), x).numpy().astype(float) for k in range(len(chosen.steps.rate))]
+        each = [lookup.curve(curves, jit.UInt32(k), x).numpy().astype(float) for k in range(len(plan.steps.rate))]
         return np.stack(np.broadcast_arrays(*each, photons)[:-1], axis=1)
-    efficiency, dark, _, *scalars = [jit.Float(number) for number in _numbers(chosen)]
+    efficiency, dark, _, *scalars = [jit.Float(number) for number in _numbers(plan)]
     mean = dr.fma(light, efficiency, dark)
-    values, unit = _steps(_sums(chosen), mean, scalars)
+    values, unit = _steps(_sums(plan), mean, scalars)
     columns = [(value / unit).numpy().astype(float) for value in values]
     return np.stack(np.broadcast_arrays(*columns, photons)[:-1], axis=1)
 
@@ -60,9 +50,9 @@ def fixed_scalars(key: Key, origin: tuple[int, int]) -> list[Any]:
     return [dr.opaque(backend().UInt32, number & 0xFFFFFFFF) for number in numbers]
 
 
-@lru_cache(maxsize=2)  # of one clip: whole parts, and the last one
-def _places(shape: tuple[int, int, int]) -> list[Any]:
-    """Where each lane of [frames, rows, lanes] is: t, y and x in the bits of one number, and how to take them apart.
+@lru_cache(maxsize=2)  # of one clip: full parts, and the last one
+def _pixel_indices(shape: tuple[int, int, int]) -> list[Any]:
+    """Index of each thread of [frames, rows, threads]: t, y and x in the bits of one number, and shifts and masks.
 
     Reading it is cheaper than the two divisions that would find it.
     """
@@ -77,7 +67,7 @@ def _places(shape: tuple[int, int, int]) -> list[Any]:
     return [u32(whole_packets(number.reshape(-1))), *(dr.opaque(u32, n) for n in (below_y, below_t, *masks))]
 
 
-def launch(
+def start(
     plan: Plan,
     light: Array,
     shape: tuple[int, int, int],
@@ -85,10 +75,10 @@ def launch(
     fixed: list[Any],
     bits: int | None,
 ) -> list[Any]:
-    """Start a kernel: pairs of float32 photons as uint64 [n] -> what each lane writes, and 1 where it is doubtful.
+    """Start a kernel: pairs of float32 photons as uint64 [n] -> two codes per thread, and 1 where one is uncertain.
 
-    `shape` = frames, rows, lanes; `first` = frame and row. Without `bits` a lane writes a byte per code, the first one
-    lowest; with `bits` the codes follow each other bit by bit, the first one highest.
+    `shape` = frames, rows, threads; `first` = frame and row. Without `bits` a thread writes a byte per code, the first
+    one lowest; with `bits` the codes follow each other bit by bit, the first one highest.
     """
     import drjit as dr
 
@@ -98,7 +88,7 @@ def launch(
         kernel = _curve_kernel(len(plan.steps.rate), bits)
     else:
         kernel = _kernel(plan, bits)
-    return list(kernel(jit.UInt64(light), *numbers, _arguments(plan), _places(shape), *fixed))
+    return list(kernel(jit.UInt64(light), *numbers, arguments(plan), _pixel_indices(shape), *fixed))
 
 
 @lru_cache(maxsize=64)
@@ -123,59 +113,46 @@ def _traced(
     planes: int,
     bits: int | None,
 ) -> Callable[..., tuple[Any, Any]]:
-    """A kernel that draws with `count`: photons, words and arguments of a lane -> its codes and a doubt."""
+    """A kernel that draws with `count`: photons, words and arguments of a thread -> its codes, and "uncertain"."""
     import drjit as dr
 
     jit = backend()
 
     def draw(
-        pair: Any, frame: Any, row: Any, arguments: list[Any], places: list[Any], block: Any, high: Any, low: Any
+        pair: Any, frame: Any, row: Any, arguments: list[Any], indices: list[Any], block: Any, high: Any, low: Any
     ) -> tuple[Any, Any]:
-        place, below_y, below_t, mask_x, mask_y = places
-        t, y, x = place >> below_t, (place & mask_y) >> below_y, place & mask_x
+        index, below_y, below_t, mask_x, mask_y = indices
+        t, y, x = index >> below_t, (index & mask_y) >> below_y, index & mask_x
         first_plane = (frame + t) * planes
         photons = [dr.reinterpret_array(jit.Float, jit.UInt32(half)) for half in (pair, pair >> 32)]
 
         def words(plane: Any) -> list[Any]:
-            """Two neighbouring lanes share a block of four words."""
-            w = _philox(x // 2 + block, y + row, first_plane + plane, high, low)
+            """Two neighbouring threads share a block of four words."""
+            w = philox(x // 2 + block, y + row, first_plane + plane, high, low)
             right = (x & 1) == 1
             return [dr.select(right, w[2], w[0]), dr.select(right, w[3], w[1])]
 
-        codes, doubt = count(photons, words, arguments)
+        codes, uncertain = count(photons, words, arguments)
         if bits is None:
             out = codes[0] | (codes[1] << 8)
         else:
             out = (codes[0] << bits) | codes[1]
             out = jit.UInt8(out) if bits <= 4 else out
-        return out, jit.UInt8(dr.select(doubt, jit.UInt32(1), jit.UInt32(0)))
+        return out, jit.UInt8(dr.select(uncertain, jit.UInt32(1), jit.UInt32(0)))
 
     return dr.freeze(draw, warn_after=1000)
-
-
-def _philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
-    """Four words of one block; the compiled twin of keys.philox4x32 at redraw 0."""
-    import drjit as dr
-
-    u32 = type(x)
-    c0, c1, c2, c3 = x, y, frame, u32(0)
-    for _ in range(ROUNDS):
-        a, b = u32(_MULTIPLIERS[0]), u32(_MULTIPLIERS[1])
-        c0, c1, c2, c3 = dr.mul_hi(b, c2) ^ c1 ^ high, b * c2, dr.mul_hi(a, c0) ^ c3 ^ low, a * c0
-        high, low = high + _KEY_STEPS[0], low + _KEY_STEPS[1]
-    return [c0, c1, c2, c3]
 
 
 def _count(
     plan: Plan, photons: list[Any], words: Callable[[Any], list[Any]], scalars: list[Any]
 ) -> tuple[list[Any], Any]:
-    """Codes of the pixels of a lane, and whether one of them is doubtful."""
+    """Codes of the pixels of a thread, and whether one of them is uncertain."""
     import drjit as dr
 
     jit, real = backend(), backend().Float
     sums = _sums(plan)
     efficiency, dark, margin, *scalars = scalars
-    doubt = no_light(photons)
+    uncertain = no_light(photons)
     arrivals = [dr.fma(theta, efficiency, dark) for theta in photons]
 
     if plan.planes == 1:
@@ -184,8 +161,8 @@ def _count(
             steps, unit = _steps(sums, mean, scalars)
             code, near = _search(steps, uniform32(word) * unit)
             codes.append(code)
-            doubt |= ~(near >= margin * unit)
-        return codes, doubt
+            uncertain |= ~(near >= margin * unit)
+        return codes, uncertain
     nothing = [_steps(sums, mean, scalars)[0][0] for mean in arrivals]
 
     def add_plane(plane: Any, near: Any, *counts: Any) -> tuple[Any, ...]:
@@ -198,7 +175,7 @@ def _count(
 
     state = (jit.UInt32(0), real(1), *(jit.UInt32(0) for _ in photons))
     _, near, *codes = dr.while_loop(state, lambda plane, *_: plane < plan.planes, add_plane)
-    return codes, doubt | ~(near >= margin)
+    return codes, uncertain | ~(near >= margin)
 
 
 def _search(steps: list[Any], u: Any) -> tuple[Any, Any]:
@@ -232,7 +209,7 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
             total = real(1)
             for n in range(k, 0, -1):
                 total = dr.fma(total, live * (1 / n), 1)
-            result.append(total * _exp_below_zero(-live))
+            result.append(total * exp_below_zero(-live))
         return result + [real(2)] * (steps.levels - 1 - len(result)), real(1)  # no live time: never passed
     n = len(steps.full)
     highest, scale = scalars[:2]
@@ -254,28 +231,6 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
     return result, unit
 
 
-def _exp_below_zero(x: Any) -> Any:
-    """exp(x) of float32 -87 <= x <= 0 within 1.2e-7 of its value: `drjit.exp` also minds everything that is not there.
-
-    2^n exp(r) with |r| <= log(2)/2; adding 1.5 2^23 rounds n to its last bits, where the exponent takes it from. The
-    polynomial is that of Cephes (Moshier, expf).
-    """
-    import drjit as dr
-
-    real, bits = backend().Float, backend().UInt32
-    magic = real(1.5 * 2.0**23)
-    shifted = dr.fma(x, real(1 / log(2)), magic)
-    n = shifted - magic
-    r = dr.fma(n, real(-0.693359375), x)  # log(2) in two parts, the first one short
-    r = dr.fma(n, real(2.12194440e-4), r)
-    series = real(1.9875691500e-4)
-    for c in (1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1):
-        series = dr.fma(series, r, real(c))
-    value: Any = dr.reinterpret_array(bits, dr.fma(series, r * r, r) + 1)
-    exponent: Any = dr.reinterpret_array(bits, shifted)
-    return dr.reinterpret_array(real, value + (exponent << 23))
-
-
 def _numbers(plan: Plan) -> list[float]:
     """The numbers of a plan, in the order in which `_count` and `_steps` take them."""
     values, steps = [plan.efficiency, plan.dark, plan.margin], _sums(plan)
@@ -288,7 +243,7 @@ def _numbers(plan: Plan) -> list[float]:
 
 
 @lru_cache(maxsize=32)
-def _arguments(plan: Plan) -> list[Any]:
+def arguments(plan: Plan) -> list[Any]:
     """Nothing for the first sensors of a process, whose numbers are constants of kernels of their own; for the rest the
     numbers, as arguments of a shared (about 20 % slower) kernel: a training that varies its sensors compiles once.
     """
@@ -296,7 +251,7 @@ def _arguments(plan: Plan) -> list[Any]:
 
     if isinstance(plan.steps, Curves):
         return lookup.arguments(plan.efficiency, plan.dark, plan.margin, plan.steps)
-    if _arguments.cache_info().misses <= _CONSTANT_PLANS:
+    if arguments.cache_info().misses <= CONSTANT_PLANS:
         return []
     return [dr.opaque(backend().Float, number) for number in _numbers(plan)]
 

@@ -15,7 +15,7 @@ def count(steps: int, photons: list[Any], words: Callable[[Any], list[Any]], giv
 
     jit = backend()
     efficiency, dark, margin, brightest, *curves = given
-    doubt, codes = no_light(photons), []
+    uncertain, codes = no_light(photons), []
     for theta, word in zip(photons, words(jit.UInt32(0)), strict=True):
         x, u = dr.sqrt(dr.fma(jit.Float64(theta), efficiency, dark)), uniform32(word)
         code, near, half = jit.UInt32(0), jit.Float(1), (steps + 1) // 2
@@ -25,8 +25,8 @@ def count(steps: int, photons: list[Any], words: Callable[[Any], list[Any]], giv
             code += dr.select(distance >= 0, jit.UInt32(half), jit.UInt32(0))
             half //= 2
         codes.append(code)
-        doubt |= ~(near >= margin) | (x > brightest)
-    return codes, doubt
+        uncertain |= ~(near >= margin) | (x > brightest)
+    return codes, uncertain
 
 
 def curve(curves: list[Any], k: Any, x: Any) -> Any:

@@ -19,9 +19,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.keys import Key, hash_name, uniform, uniform_pair, words
+from qsim.keys import Key, hash_name, uniform, words
+from qsim.sensor.distribution import require_number
 from qsim.sensor.qis import QIS
-from qsim.sensor.sensor import Sensor, require_number
+from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import SPAD, BinarySPAD
 
 _DEVICE = hash_name("qsim fixed pattern")  # the "clip" of all device maps
@@ -229,7 +230,7 @@ def pmf(sensor: Sensor, photons: Array, exposure: float, maps: Maps) -> Array:
 
 
 def _read_out_pmf(sensor: QIS, photons: Array, exposure: float, maps: Maps) -> Array:
-    """What `_read_out` draws: sum over electrons n of Pois(n) P(code | n), each pixel with its own noise and offset."""
+    """The law of `QIS.read_out`: sum over electrons n of Pois(n) P(code | n), noise and offset of each pixel."""
     from scipy.special import ndtr, pdtr, pdtrik
 
     mean = sensor.arrivals(photons, exposure)
@@ -269,8 +270,13 @@ def _draw(
             else engine(sensor, light, exposure, key, origin)
         )
     elif isinstance(sensor, QIS):
+        noise = 1.0 if maps.read_noise is None else maps.read_noise
+        offset = 0.0 if maps.offset is None else maps.offset
         codes = np.stack(
-            [_read_out(sensor, frame, exposure, key.at(key.frame + t), maps, origin) for t, frame in enumerate(light)]
+            [
+                sensor.read_out(frame, exposure, key.at(key.frame + t), origin, noise, offset)
+                for t, frame in enumerate(light)
+            ]
         )
     else:
         raise ValueError(f"{type(sensor).__name__} has no read-out: maps of offset and read noise are for a QIS")
@@ -283,23 +289,6 @@ def _without_dark(sensor: Sensor) -> Sensor:
     if isinstance(sensor, SPAD):
         return replace(sensor, dark_count_rate=0.0)
     raise ValueError(f"{type(sensor).__name__}: unknown to the dark map")
-
-
-def _read_out(sensor: QIS, photons: Array, exposure: float, key: Key, maps: Maps, origin: tuple[int, int]) -> Array:
-    """Electrons, read noise and ADC one after the other, each pixel with its own noise and offset: [H, W]."""
-    from scipy.special import ndtri
-
-    from qsim.sensor.poisson import poisson_quantile
-
-    w = [words(key, photons.shape, origin, redraw) for redraw in range(4)]
-    electrons = poisson_quantile(sensor.arrivals(photons, exposure), *uniform_pair(w[0], w[1]))
-    if sensor.full_well is not None:
-        electrons = np.minimum(electrons, sensor.full_well)
-    below, above = uniform_pair(w[2], w[3])
-    noise = sensor.read_noise * (1.0 if maps.read_noise is None else maps.read_noise)
-    electrons = electrons + noise * np.where(below < 0.5, ndtri(below), -ndtri(above))
-    offset = 0.0 if maps.offset is None else maps.offset
-    return sensor.codes_of(electrons + offset / sensor.gain)
 
 
 # ---- Memory and neighbours

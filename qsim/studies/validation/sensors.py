@@ -25,9 +25,9 @@ from numpy import ndarray as Array
 from qsim.files import Progress
 from qsim.keys import Key
 from qsim.sensor import QIS, BinarySPAD, CountingSPAD, Sensor
-from qsim.sensor.compiled import kernel, launch
-from qsim.sensor.compiled.plan import plan
+from qsim.sensor.compiled import jit, kernel
 from qsim.sensor.devices import quiver_physical
+from qsim.sensor.sensor import plan_of
 from qsim.studies.validation.edge_cases import Case, hard_cases
 
 EXPOSURE = 5e-4  # s, 2000 frames per second
@@ -100,7 +100,7 @@ def run(
         if progress is not None:
             progress(n, len(MODELS) + 1)
     rows += _packed(shape, seed, require_speed)
-    settings = {"seed": seed, "exposure": EXPOSURE, "fast_engine": kernel.available(), "rounds": ROUNDS}
+    settings = {"seed": seed, "exposure": EXPOSURE, "fast_engine": jit.available(), "rounds": ROUNDS}
     return SensorReport(
         rows, hard_cases({name: model[0] for name, model in MODELS.items()}, EXPOSURE), int(np.prod(shape)), settings
     )
@@ -120,7 +120,7 @@ def _measure(
     light = np.full(shape, photons, np.float32)
     key = Key(seed, 1)
     engines = ["reference"]
-    if kernel.available() and plan(sensor, EXPOSURE) is not None:
+    if jit.available() and plan_of(sensor, EXPOSURE) is not None:
         engines.append("fast")
     draws: dict[str, Callable[[], Array]] = {
         engine: partial(sensor.sample, light, EXPOSURE, key=key, engine=engine) for engine in engines
@@ -153,7 +153,7 @@ def _measure(
 
 def _packed(shape: tuple[int, ...], seed: int, require_speed: bool) -> list[SensorRow]:
     """Packed binary planes against NumPy's `random < p` and packbits."""
-    if not kernel.available():
+    if not jit.available():
         return []
     sensor, _, _ = MODELS["clocked SPAD, 1 bit"]
     light = np.full(shape, 0.7, np.float32)
@@ -161,7 +161,7 @@ def _packed(shape: tuple[int, ...], seed: int, require_speed: bool) -> list[Sens
     rng = np.random.default_rng(seed)
     draws = {
         "numpy": lambda: np.packbits(rng.random(shape) < share, axis=-1),
-        "fast": lambda: launch.sample_packed(sensor, light, EXPOSURE, key=Key(seed, 1)),
+        "fast": lambda: sensor.sample_packed(light, EXPOSURE, key=Key(seed, 1)),
     }
     _, seconds = _race(draws)
     name = "clocked SPAD, 1 bit, packed"
@@ -234,7 +234,9 @@ def _cdf_error(sensor: Sensor, engine: str) -> float | None:
         return None
     found = sensor.cdf(photons, EXPOSURE)[:, :-1]
     if engine == "fast":
-        found = kernel.steps(sensor, photons, EXPOSURE)
+        plan = plan_of(sensor, EXPOSURE)
+        assert plan is not None
+        found = kernel.cdf_steps(plan, photons)
         if isinstance(sensor, BinarySPAD):  # the kernel compares plane by plane
             expected = np.exp(-sensor.arrivals(photons, EXPOSURE) / sensor.planes)[:, None]
         found, expected = np.minimum(found, 1), np.minimum(expected, 1)

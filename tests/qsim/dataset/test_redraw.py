@@ -18,7 +18,6 @@ from qsim.dataset import redraw
 from qsim.dataset.generation import Options, generate
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe import Recipe
-from qsim.sensor.compiled.plan import electrons
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 
@@ -115,7 +114,7 @@ def test_a_law_of_a_later_version_is_refused(clip, tmp_path):
 
 def as_the_shifted_sums_drew(sensor: QIS, photons: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Codes as kernels drew them once: float32, one factor exp(-shift) in every weight, what underflows lost."""
-    f, steps = np.float32, electrons(sensor)
+    f, steps = np.float32, sensor.short_sums()
     n = len(steps.full)
     shift = n + 7 * np.sqrt(n) + 30 - 85
     mean = (photons * sensor.efficiency).astype(f)

@@ -178,7 +178,7 @@ def test_the_process_has_the_distribution_of_the_cdf(bits, read_noise, photons):
     """Two engines, one function: the step-by-step draw, used above 8 bits, against the pmf of few bits."""
     sensor = QIS(0.8, 1.6, read_noise, bits, gain=1.0769, full_well=photons)  # passed by 4 to 26 % of the pixels
     light = np.full((300, 401), photons)
-    codes = sensor._draw_process(light, EXPOSURE, Key(7, bits), (0, 0))
+    codes = sensor.read_out(light, EXPOSURE, Key(7, bits))
     assert_histogram(codes, sensor.pmf(photons, EXPOSURE), checks=3)
 
 

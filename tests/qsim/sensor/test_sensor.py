@@ -8,17 +8,16 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 from stats import assert_histogram, assert_mean, assert_share, critical_z
 
-import qsim.sensor.sensor
 from qsim.keys import Key, uniform, uniform_pair, words
+from qsim.sensor.compiled import jit
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
-from qsim.sensor.sensor import Sensor
+from qsim.sensor.sensor import Sensor, fast_engine_works
 from qsim.sensor.spad import BinarySPAD
 
 EXPOSURE = 5e-4
@@ -359,11 +358,8 @@ def test_types_and_shapes_of_codes():
 
 
 def test_without_a_compiler_the_reference_serves_and_says_so_once(monkeypatch: pytest.MonkeyPatch):
-    lanes = ModuleType("qsim.sensor.compiled.kernel")
-    lanes.available = lambda: False
-    monkeypatch.setitem(sys.modules, "qsim.sensor.compiled.kernel", lanes)
-    monkeypatch.setattr("qsim.sensor.compiled.kernel", lanes, raising=False)
-    qsim.sensor.sensor._fast_engine.cache_clear()
+    monkeypatch.setattr(jit, "available", lambda: False)
+    fast_engine_works.cache_clear()
     sensor, light = SENSORS[0], np.full((4, 5), 2.0)
     try:
         with pytest.warns(UserWarning, match="no usable LLVM or CUDA: codes are drawn by the NumPy engine"):
@@ -372,7 +368,7 @@ def test_without_a_compiler_the_reference_serves_and_says_so_once(monkeypatch: p
             warnings.simplefilter("error")
             sensor.sample(light, EXPOSURE, key=Key(1, 1), engine="fast")
     finally:
-        qsim.sensor.sensor._fast_engine.cache_clear()
+        fast_engine_works.cache_clear()
     np.testing.assert_array_equal(codes, sensor.sample(light, EXPOSURE, key=Key(1, 1), engine="reference"))
 
 

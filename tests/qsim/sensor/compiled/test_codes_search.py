@@ -13,19 +13,18 @@ import numpy as np
 import pytest
 
 from qsim.keys import Key
-from qsim.sensor.compiled import kernel, launch
-from qsim.sensor.compiled.plan import plan
+from qsim.sensor.compiled import jit
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.packing import pack, unpack
 from qsim.sensor.qis import QIS, thresholds
-from qsim.sensor.sensor import Sensor
+from qsim.sensor.sensor import Sensor, plan_of
 from qsim.sensor.spad import BinarySPAD
 
 EXPOSURE = 5e-4  # s
 SHAPE = (2, 128, 162)  # 41 472 pixels: a frame of uniform light, one below 20 electrons
 ORIGINS = ((0, 0), (5, 8), (3, 7))
 BATCHES, SENSORS = 20, 375  # of random sensors, and 5 for every number of terms: 10 000
-needs_engine = pytest.mark.skipif(not kernel.available(), reason="no usable LLVM or CUDA on this machine")
+needs_engine = pytest.mark.skipif(not jit.available(), reason="no usable LLVM or CUDA on this machine")
 
 
 def random_sensor(rng: np.random.Generator, bits: int) -> Sensor:
@@ -94,13 +93,21 @@ def compare(sensor: Sensor, rng: np.random.Generator, count: Count, monkeypatch:
     """Both engines on the same light; AssertionError with the sensor's repr if more than 3 pixels differ."""
     photons, origin, key = random_light(rng, sensor), ORIGINS[rng.integers(3)], Key(int(rng.integers(1 << 31)), 7)
     asked = []
-    monkeypatch.setattr(launch, "draw_at", lambda *given: asked.append(given[5].shape[1]) or DRAW_AT(*given))
-    if rng.random() < 0.5:
-        found = launch.sample(sensor, photons, EXPOSURE, key=key, origin=origin)
-    else:
-        packed = launch.sample_packed(sensor, photons, EXPOSURE, key=key, origin=origin)
-        found = unpack(packed, sensor.bits, SHAPE[2])
-        np.testing.assert_array_equal(pack(found, sensor.bits), packed, err_msg=repr(sensor))  # no stray bits
+    draw_at = type(sensor).draw_at
+
+    def counted(self, light, *given, **places):
+        if self == sensor:  # not one of its planes
+            asked.append(light.size)
+        return draw_at(self, light, *given, **places)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(sensor), "draw_at", counted)
+        if rng.random() < 0.5:
+            found = sensor.sample(photons, EXPOSURE, key=key, origin=origin, engine="fast")
+        else:
+            packed = sensor.sample_packed(photons, EXPOSURE, key=key, origin=origin, engine="fast")
+            found = unpack(packed, sensor.bits, SHAPE[2])
+            np.testing.assert_array_equal(pack(found, sensor.bits), packed, err_msg=repr(sensor))  # no stray bits
     expected = sensor.sample(photons, EXPOSURE, key=key, origin=origin, engine="reference")
     differ = int(np.count_nonzero(found != expected))
     where = np.argwhere(found != expected)[:3].tolist()
@@ -110,10 +117,7 @@ def compare(sensor: Sensor, rng: np.random.Generator, count: Count, monkeypatch:
     count.pixels, count.differ = count.pixels + found.size, count.differ + differ
     if sensor.bits <= 8:
         count.few_bits += 1
-        count.handed += plan(sensor, EXPOSURE) is None or sum(asked) > 4 * found.size  # packed: octets of 8
-
-
-DRAW_AT = launch.draw_at
+        count.handed += plan_of(sensor, EXPOSURE) is None or sum(asked) > 4 * found.size  # packed: octets of 8
 
 
 def check(count: Count) -> None:
@@ -211,12 +215,12 @@ def corner_batch(seed: int, sensors: int) -> None:
         y, x = (int(i) for i in rng.integers(0, 1000, 2))
         key = Key(int(rng.integers(1 << 31)), 3, int(rng.integers(100)))
         expected = sensor.sample(photons, EXPOSURE, key=key, origin=(y, x), engine="reference")
-        whole = launch.sample(sensor, photons, EXPOSURE, key=key, origin=(y, x), smallest=1)
-        packed = launch.sample_packed(sensor, photons, EXPOSURE, key=key, origin=(y, x), smallest=1)
+        whole = sensor.sample(photons, EXPOSURE, key=key, origin=(y, x), engine="fast")
+        packed = sensor.sample_packed(photons, EXPOSURE, key=key, origin=(y, x), engine="fast")
         np.testing.assert_array_equal(packed, pack(whole, sensor.bits), err_msg=repr(sensor))
         top, left = int(rng.integers(shape[1])), int(rng.integers(width))
         part, place = photons[:, top:, left:], (y + top, x + left)
-        crop = launch.sample(sensor, part, EXPOSURE, key=key, origin=place, smallest=1)
+        crop = sensor.sample(part, EXPOSURE, key=key, origin=place, engine="fast")
         found = np.count_nonzero(whole != expected), np.count_nonzero(crop != expected[:, top:, left:])
         assert max(found) <= 2, f"{found} pixels differ, key {key}, {shape} at {(y, x)}: {sensor!r}"
         pixels, differ = pixels + whole.size + crop.size, differ + sum(found)

@@ -8,7 +8,7 @@ import pytest
 
 from qsim.cli import program
 from qsim.keys import Key
-from qsim.sensor.compiled import kernel
+from qsim.sensor.compiled import jit
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.validation import sensors
@@ -32,7 +32,7 @@ def test_the_report_holds_a_row_for_every_engine_and_is_well(report):
     engines = {(row.model, row.engine) for row in report.rows}
     assert ("QIS 3 bits, gain 1", "numpy") in engines
     assert ("clocked SPAD, 1 bit", "reference") in engines
-    assert (("QIS 3 bits, gain 1", "fast") in engines) == kernel.available()
+    assert (("QIS 3 bits, gain 1", "fast") in engines) == jit.available()
     for row in report.rows:
         assert row.megapixels_per_second > 0
         if row.engine == "reference":
