@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from qsim.calibration.qis import calibrate_qis
     from qsim.calibration.spad import calibrate_spad
     from qsim.clip.clip import Clip
-    from qsim.clip.stream import Sensing, Stream, replay, sense
+    from qsim.clip.sensing import Sensing, replay, sense
+    from qsim.clip.stream import Stream
     from qsim.clip.writer import ClipWriter
     from qsim.dataset.dataset import Dataset
     from qsim.keys import Key
@@ -45,7 +46,7 @@ _HOMES = {
     "QIS": "sensor.qis",
     "Renderer": "rendering.renderer",
     "Scene": "scene.scene",
-    "Sensing": "clip.stream",
+    "Sensing": "clip.sensing",
     "Sensor": "sensor.sensor",
     "Stream": "clip.stream",
     "read_mitsuba": "rendering.mitsuba_xml",
@@ -56,8 +57,8 @@ _HOMES = {
     "load_sensor": "sensor.devices:load",
     "pack": "sensor.packing",
     "render_clip": "rendering.clip_rendering",
-    "replay": "clip.stream",
-    "sense": "clip.stream",
+    "replay": "clip.sensing",
+    "sense": "clip.sensing",
     "unpack": "sensor.packing",
 }
 

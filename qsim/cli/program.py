@@ -70,13 +70,13 @@ def _run_doctor(args: argparse.Namespace) -> int:
         output(args, {"devices": listing}, [_device_text(device) for device in listing])
         return 0
     from qsim import backend
-    from qsim.optics import radiometry
     from qsim.optics.camera import Camera
+    from qsim.optics.diffraction import diffraction_line
 
     extras = {extra: all(find_spec(m) for m in EXTRAS if EXTRAS[m] == extra) for extra in sorted(set(EXTRAS.values()))}
     report = backend.report() | {
         "extras": extras,
-        "lens": radiometry.diffraction_line(Camera(8e-3, 2.8, 1.1e-6, 512, 1024)),
+        "lens": diffraction_line(Camera(8e-3, 2.8, 1.1e-6, 512, 1024)),
     }
     width = max(len(key) for key in report)
     missing = ", ".join(f"{extra} (pip install 'qsim[{extra}]')" for extra, there in extras.items() if not there)
@@ -141,7 +141,7 @@ def _run_render(args: argparse.Namespace) -> int:
     from qsim import backend
     from qsim.clip.clamped_error import stated
     from qsim.dataset import scene_files
-    from qsim.optics import radiometry
+    from qsim.optics.diffraction import diffraction_line
     from qsim.rendering import fidelity
     from qsim.rendering.budget import explain
     from qsim.rendering.clip_rendering import render_clip
@@ -192,7 +192,7 @@ def _run_render(args: argparse.Namespace) -> int:
         fireflies, pixels = sum(clip.meta["fireflies_per_frame"]), math.prod(clip.shape)
         how = "counted before denoising" if chosen.denoise else "counted and left in"
         text += f"\nfireflies: {fireflies} of {pixels} pixels, {how}"
-    text += "\n" + (explain(chosen) if args.explain else radiometry.diffraction_line(scene.camera))
+    text += "\n" + (explain(chosen) if args.explain else diffraction_line(scene.camera))
     output(args, {"clip": str(clip.path)} | {k: v for k, v in clip.meta.items() if k != "checksums"}, text)
     return 0
 
@@ -236,7 +236,7 @@ def _add_sense(sub: Any) -> None:
 
 
 def _run_sense(args: argparse.Namespace) -> int:
-    from qsim.clip import stream
+    from qsim.clip.sensing import Sensing, sense
 
     if args.ppp and args.lux:
         raise ValueError("give the light level as --ppp or as --lux, not both")
@@ -244,7 +244,7 @@ def _run_sense(args: argparse.Namespace) -> int:
     if args.name and len(levels) > 1:
         raise ValueError(f"--name {args.name}: one name for {len(levels)} light levels; leave it out")
     wanted = [
-        stream.Sensing(args.sensor or "quiver-physical", args.bits, seed=args.seed, name=args.name, group=args.group,
+        Sensing(args.sensor or "quiver-physical", args.bits, seed=args.seed, name=args.name, group=args.group,
                        diffraction=args.diffraction, defects=args.defects, slices=args.slices, **level)
         for level in levels
     ]  # fmt: skip
@@ -264,7 +264,7 @@ def _run_sense(args: argparse.Namespace) -> int:
                     progress(start + done, frames)
 
                 waiting = partial(note, f"{clip.path}: waiting for another process that senses this clip")
-                found, line = stream.sense(clip, sensing, force=args.force, progress=count, on_wait=waiting)
+                found, line = sense(clip, sensing, force=args.force, progress=count, on_wait=waiting)
                 before += len(clip)
                 facts = {"clip": str(clip.path), "stream": found.name, "made": bool(drawn), "light": line}
                 made.append(facts | _light(found.meta))
@@ -281,7 +281,7 @@ def _light(meta: dict[str, Any]) -> dict[str, Any]:
 
 
 def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
-    from qsim.clip import stream
+    from qsim.clip.sensing import replay
 
     refuse_idle(args, "--replay draws what is stored", ["group", "diffraction", "defects", "force"])
     if args.slices != 1:
@@ -296,7 +296,7 @@ def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
     known = clip.streams
     named = args.sensor or args.bits or args.ppp or args.lux or args.seed  # each is part of a stream's name
     stored = clip.stream(known[0] if len(known) == 1 and not args.name and not named else sensing.stream_name)
-    drawn, kept = stream.replay(clip, stored, int(number))
+    drawn, kept = replay(clip, stored, int(number))
     differ = int((drawn != kept).sum())
     found = {"clip": clip.name, "stream": stored.name, "frame": int(number), "pixels": drawn.size, "differ": differ}
     verdict = (

@@ -24,15 +24,15 @@ from numpy import ndarray as Array
 
 from qsim import files, structure
 from qsim.clip import exr
-from qsim.clip.stream import Stream, check_crop, write_stream
+from qsim.clip.stream import Stream
 from qsim.clip.writer import FORMAT_VERSION, PHYSICAL, RELATIVE, TRUTH, ClipWriter, camera_of
 from qsim.files import Progress
-from qsim.optics import radiometry
+from qsim.optics.radiometry import Crop, check_crop
 
 if TYPE_CHECKING:
     from qsim.optics.camera import Camera
 
-__all__ = ["FORMAT_VERSION", "PHYSICAL", "RELATIVE", "Clip", "ClipWriter", "Stream", "write_stream"]
+__all__ = ["FORMAT_VERSION", "PHYSICAL", "RELATIVE", "Clip", "ClipWriter", "Stream"]
 
 _DAMAGED = "the file is damaged; make the clip again, or take clip.json from a copy"
 
@@ -124,11 +124,11 @@ class Clip:
         """The camera without its motion; None for relative radiance."""
         return camera_of(self.meta, self.path / "clip.json")
 
-    def radiance(self, t: int, crop: radiometry.Crop | None = None) -> Array:
+    def radiance(self, t: int, crop: Crop | None = None) -> Array:
         """What the sensor integrates in frame t, float32 [H, W]; crop = (y, x, height, width)."""
         return self._half("radiance", t, crop)
 
-    def sharp(self, t: int, crop: radiometry.Crop | None = None) -> Array:
+    def sharp(self, t: int, crop: Crop | None = None) -> Array:
         """The scene at mid-exposure, float32 [H, W], which a restorer should return; `radiance` where not stored."""
         return self._half("sharp" if f"sharp/{t:06d}.exr" in self.meta["checksums"] else "radiance", t, crop)
 
@@ -152,7 +152,7 @@ class Clip:
         """int32 [H, W]: number of the body seen, -1 where nothing is."""
         return self._truth(t, "id").view(np.int32)
 
-    def saturated(self, t: int, crop: radiometry.Crop | None = None) -> Array:
+    def saturated(self, t: int, crop: Crop | None = None) -> Array:
         """bool [H, W]: True where the light of frame t is a lower bound, because the camera saturated.
 
         `meta["saturated_pixels"]` counts them over all frames; `meta["saturation"]` says at which pixel value.
@@ -211,7 +211,7 @@ class Clip:
                 continue
         return found
 
-    def _half(self, folder: str, t: int, crop: radiometry.Crop | None) -> Array:
+    def _half(self, folder: str, t: int, crop: Crop | None) -> Array:
         self._check_frame(t)
         _, height, width = self.shape
         if crop is not None:

@@ -20,13 +20,12 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.files import decoding_errors
+from qsim.optics.radiometry import Crop
 
 MAGIC = bytes((0x76, 0x2F, 0x31, 0x01)) + struct.pack("<i", 2)
 _PIXEL_TYPES = {np.dtype("<u4"): 0, np.dtype("<f2"): 1, np.dtype("<f4"): 2}
 _ZIP_ROWS = 16  # rows per chunk of the ZIP method
 HALF_MAX = 65504.0
-
-Crop = tuple[int, int, int, int]  # y, x, height, width
 
 
 def encode(channels: dict[str, Array], *, compress: bool = False) -> bytes:

@@ -1,6 +1,6 @@
 """A sensor's draw of one clip: light of clip frames in, codes of stream frames out, block by block.
 
-    prepare(clip, sensing) -> Draw --packed--> bytes of a stream      --frames--> codes of some frames, for replay
+    Draw --packed--> bytes of a stream      --frames--> codes of some frames, for replay
 
 A code sees one clip frame, or several: as binary planes that are summed (clocked pixels), or as slices of one exposure
 in which the light changes (counting pixels).
@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.clip.photons import clip_photons
 from qsim.optics import radiometry
 from qsim.sensor import packing
 
 if TYPE_CHECKING:
     from qsim.clip.clip import Clip
-    from qsim.clip.stream import Sensing, Stream
+    from qsim.clip.stream import Stream
     from qsim.files import Progress
     from qsim.keys import Key
     from qsim.sensor.defects.defect_table import Flawed, Flaws, Light
@@ -72,10 +73,7 @@ class Draw:
     def light(self, clip: Clip, start: int, stop: int) -> Array:
         """Photons [stop - start, H, W] of clip frames."""
         return np.stack(
-            [
-                radiometry.clip_photons(clip, t, self.level.factor, diffraction=self.diffraction)
-                for t in range(start, stop)
-            ]
+            [clip_photons(clip, t, self.level.factor, diffraction=self.diffraction) for t in range(start, stop)]
         )
 
     def frames(self, clip: Clip, start: int, stop: int) -> Array:
@@ -165,7 +163,7 @@ class Draw:
             crop = (row, 0, rows, clip.shape[2])
             first = frame * self.planes
             each = (
-                radiometry.clip_photons(clip, t, self.level.factor, crop, diffraction=self.diffraction)
+                clip_photons(clip, t, self.level.factor, crop, diffraction=self.diffraction)
                 for t in range(first, first + self.planes)
             )
             return np.stack(list(each))
@@ -194,42 +192,6 @@ class Draw:
         shape = (frames, *clip.shape[1:])
         exposure, frame_time = self._exposure(clip), self.planes / clip.frame_rate
         return flaws.follow(flawed, self._slices(clip), shape, exposure, frame_time, self.key)
-
-
-def prepare(clip: Clip, sensing: Sensing) -> Draw:
-    """The sensor, light factor and key for one clip; `ValueError` if they do not fit it."""
-    from qsim.sensor.defects import defect_table as flaws
-
-    source = sensing.defects or (sensing.sensor if sensing.sensor.endswith(".toml") else None)
-    return assemble(clip, sensing, None if source is None else flaws.from_toml(source))
-
-
-def assemble(clip: Clip, sensing: Sensing, found: Flaws | None, own: Sensor | None = None) -> Draw:
-    """As `prepare`, with these defects, and with this sensor in place of the one that `sensing` names."""
-    from qsim import keys
-    from qsim.sensor import devices
-    from qsim.sensor.defects import defect_table as flaws
-
-    planes = sensing.slices
-    if sensing.group:
-        if sensing.bits is None:
-            raise ValueError(f"{clip.name}: summing planes needs the bits of a code, as in --bits 3")
-        if sensing.slices != 1:
-            raise ValueError(f"{clip.name}: --group sums planes, --slices are of counting pixels; give one of them")
-        planes = 2**sensing.bits - 1
-    if not 1 <= planes <= len(clip):
-        what = f"one code of {planes} planes" if sensing.group else f"one exposure of {planes} slices"
-        raise ValueError(f"{clip.name}: {len(clip)} frames are too few for {what}")
-    target = None if sensing.ppp is None else sensing.ppp / planes
-    level = radiometry.light_level(clip, ppp=target, lux=sensing.lux)
-    sensor = own or devices.load(
-        sensing.sensor, ppp=level.ppp * planes, bits=sensing.bits, exposure=clip.exposure * planes
-    )
-    if found is not None:  # measured dark counts take the place of the sensor's
-        sensor = flaws.of_sensor(found, sensor, *clip.shape[1:]).sensor
-    _check_planes(sensor, sensing, clip)
-    key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
-    return Draw(sensor, plane_of(sensor, planes), level, key, planes, sensing.diffraction, found)
 
 
 def stored(stream: Stream) -> Draw:
@@ -267,17 +229,3 @@ def plane_of(sensor: Sensor, planes: int) -> Sensor:
     from qsim.sensor.spad import BinarySPAD
 
     return dataclasses.replace(sensor, bits=1) if planes > 1 and isinstance(sensor, BinarySPAD) else sensor
-
-
-def _check_planes(sensor: Sensor, sensing: Sensing, clip: Clip) -> None:
-    """`ValueError` for sums of planes and for slices of exposures that this sensor or this clip does not have."""
-    from qsim.sensor.counting import CountingSPAD
-    from qsim.sensor.spad import BinarySPAD
-
-    kind = type(sensor).__name__
-    if sensing.group and not isinstance(sensor, BinarySPAD):
-        raise ValueError(f"{sensing.sensor}: only a clocked SPAD (BinarySPAD) sums planes, this is a {kind}")
-    if sensing.slices > 1 and not isinstance(sensor, CountingSPAD):
-        raise ValueError(f"{sensing.sensor}: slices of an exposure are for a CountingSPAD, this is a {kind}")
-    if sensing.slices > 1 and clip.exposure < 0.999 / clip.frame_rate:
-        raise ValueError(f"{clip.name}: slices of one exposure need a clip whose shutter is open all the time")

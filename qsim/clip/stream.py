@@ -1,6 +1,4 @@
-"""Few-bit streams of a clip: sensing, storing, reading, replaying.
-
-    clip (radiance) --light level, optics--> photons --sensor, key--> codes --> streams/NAME.npy + streams/NAME.json
+"""Few-bit streams on disk: packed codes and the description that they can be drawn from again.
 
 NAME.npy is uint8 [T, H, ceil(W*bits/8)], each row packed alone, most significant bit first: one bit is a photon cube.
 NAME.json is written last and holds everything needed to draw any frame again: sensor, light factor, key, widths.
@@ -9,7 +7,6 @@ NAME.json is written last and holds everything needed to draw any frame again: s
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import hashlib
 import io
 import math
@@ -23,13 +20,11 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files, locks, structure
-from qsim.clip.simulation import Draw, prepare, stored
-from qsim.files import VERSION, Progress, check_name
-from qsim.optics import radiometry
+from qsim.files import VERSION, Progress
+from qsim.optics.radiometry import Crop, check_crop
 from qsim.sensor import packing
 
 if TYPE_CHECKING:
-    from qsim.clip.clip import Clip
     from qsim.sensor.sensor import Sensor
 
 FORMAT_VERSION = 1
@@ -137,7 +132,7 @@ class Stream:
             )
         return array
 
-    def codes(self, start: int = 0, stop: int | None = None, crop: radiometry.Crop | None = None) -> Array:
+    def codes(self, start: int = 0, stop: int | None = None, crop: Crop | None = None) -> Array:
         """Codes [stop - start, h, w] of frames start ... stop - 1: uint8, uint16 above 8 bits; crop = (y, x, h, w)."""
         frames, height, width = self.shape
         stop = frames if stop is None else stop
@@ -168,14 +163,6 @@ class Stream:
         return [] if "checksum" in self.meta else [self.path.with_suffix(".json")]
 
 
-def check_crop(crop: radiometry.Crop, height: int, width: int, where: str) -> radiometry.Crop:
-    """The crop (y, x, h, w) if it lies inside the frame, else `ValueError`."""
-    y, x, h, w = crop
-    if y < 0 or x < 0 or h < 1 or w < 1 or y + h > height or x + w > width:
-        raise ValueError(f"{where}: crop (y, x, h, w) = {(y, x, h, w)} is not inside {height} x {width} pixels")
-    return crop
-
-
 def orientation(meta: dict[str, Any]) -> str:
     """Of a clip or stream: what its reader said of the file it was imported from; what we rendered is upright."""
     origin = meta.get("source")
@@ -183,35 +170,9 @@ def orientation(meta: dict[str, Any]) -> str:
     return str(meta.get("orientation", imported))
 
 
-def write_stream(clip: Clip, name: str, codes_iter: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
-    """Store codes ([H, W] frames or [t, H, W] blocks, in order) as a stream of `clip`; the json comes last.
-
-    `meta` must hold shape (T, H, W), ppp_factor, exposure and frame_rate. `ValueError` if there are not T frames.
-    """
-    shape = tuple(meta["shape"][1:])
-
-    def packed() -> Iterator[Array]:
-        done = 0
-        for block in codes_iter:
-            block = block if block.ndim == 3 else block[None]
-            if block.shape[1:] != shape:
-                raise ValueError(f"{clip.path}, {name}: frame {done} is {block.shape[1:]}, expected {shape}")
-            yield packing.pack(block, sensor.bits)
-            done += len(block)
-
-    return write_packed(clip, name, packed(), sensor, meta)
-
-
-def write_packed(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
-    """As `write_stream` for blocks that are packed already: uint8 [t, H, ceil(W bits / 8)]."""
-    with writing(clip):
-        return _write(clip, name, blocks, sensor, meta)
-
-
 @contextlib.contextmanager
-def writing(clip: Clip, on_wait: Callable[[], None] | None = None) -> Iterator[None]:
-    """One process at a time writes streams of a clip; the others wait, after a call of `on_wait`."""
-    folder = clip.path / "streams"
+def writing(folder: Path, on_wait: Callable[[], None] | None = None) -> Iterator[None]:
+    """One process at a time writes streams of a folder; the others wait, after a call of `on_wait`."""
     folder.mkdir(exist_ok=True)
     lock = locks.Lock(folder / "lock")
     lock.acquire(wait=True, on_wait=on_wait)
@@ -221,21 +182,15 @@ def writing(clip: Clip, on_wait: Callable[[], None] | None = None) -> Iterator[N
         lock.delete()
 
 
-def _tidy(clip: Clip) -> None:
-    """Delete the lock of a writer that was killed between writing its stream and deleting it."""
-    lock = locks.Lock(clip.path / "streams" / "lock")
-    with contextlib.suppress(OSError):  # a folder that may only be read
-        if lock.path.exists() and lock.acquire():
-            lock.delete()
+def write_packed(path: Path, blocks: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
+    """Store packed codes (uint8 [t, H, ceil(W bits / 8)], in order) as `path`, NAME.npy; the json comes last.
 
-
-def _write(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
-    """Write the codes and the json; the caller holds the clip's lock."""
+    `meta` must hold shape (T, H, W), ppp_factor, exposure and frame_rate. `ValueError` if there are not T frames.
+    """
     frames, height, width = meta["shape"]
     bits = sensor.bits
     row = packing.packed_width(width, bits)
-    folder = clip.path / "streams"
-    json_path, path = folder / f"{check_name(name)}.json", folder / f"{name}.npy"
+    json_path = path.with_suffix(".json")
     for file in (json_path, path):
         files.remove_leftovers(file)
     done, digest = 0, hashlib.sha256()
@@ -257,7 +212,7 @@ def _write(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor, meta:
             "bits": bits,
             "width": width,
             "bit_order": "msb",
-            "orientation": orientation(clip.meta),
+            "orientation": "upright",
             "code_model": sensor.code_model,
             "sensor": sensor.to_dict(),
             "planes_per_code": 1,
@@ -274,122 +229,3 @@ def _header(*shape: int) -> bytes:
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": shape})
     return file.getvalue()
-
-
-@dataclass(frozen=True)
-class Sensing:
-    """What to draw: a sensor at a light level, with a seed; independent of the clip."""
-
-    sensor: str  # a name of qsim.devices or a .toml file
-    bits: int | None = None  # None: the device's own
-    ppp: float | None = None  # photons per pixel and code over the whole clip; neither ppp nor lux: light as it is
-    lux: float | None = None  # faceplate lux at 555 nm
-    seed: int = 0
-    name: str | None = None  # of the stream; made from the rest if None
-    group: bool = False  # a code sums 2^bits - 1 binary planes, each its own clip frame
-    diffraction: bool = False  # blur by the lens's Airy pattern
-    defects: str | None = None  # .toml with a table [defects]; None: that of the sensor's file, if it has one
-    slices: int = 1  # clip frames in one exposure of a counting SPAD: light that changes inside it
-
-    @property
-    def stream_name(self) -> str:
-        """The given name, or for example `quiver-physical_3bit_3.25ppp`."""
-        if self.name is not None:
-            return check_name(self.name)
-        light = (
-            "asis" if self.ppp is self.lux is None else f"{self.ppp:g}ppp" if self.lux is None else f"{self.lux:g}lx"
-        ).replace("e+", "e")  # a name holds no +
-        bits = "" if self.bits is None else f"_{self.bits}bit"
-        seed = f"_seed{self.seed}" if self.seed else ""
-        sensor = Path(self.sensor).name.removesuffix(".toml")
-        return check_name(f"{sensor}{bits}_{light}{seed}")
-
-
-def describe(clip: Clip, sensing: Sensing, draw: Draw) -> dict[str, Any]:
-    """The json of the stream that `draw` makes, without what only the written file knows."""
-    frames, height, width = clip.shape
-    return {
-        "shape": [frames // draw.planes, height, width],
-        "sensor_name": sensing.sensor,
-        "ppp_target": sensing.ppp,
-        "lux_target": sensing.lux,
-        "ppp": draw.level.ppp * draw.planes,
-        "ppp_factor": draw.level.factor,
-        "mean_photons_before": draw.level.mean_before * draw.planes,
-        "equivalent_lux_555nm": draw.level.lux,
-        "radiance_unit": clip.meta["radiance_unit"],
-        "transfer": "linear",
-        "diffraction": draw.diffraction,
-        "seed": draw.key.seed,
-        "clip_key": draw.key.clip,
-        "clip": clip.name,
-        "frame_rate": clip.frame_rate / draw.planes,
-        "exposure": clip.exposure * draw.planes,
-        "planes_per_code": draw.planes,
-        "drawn_by": draw.law,
-    } | ({} if draw.flaws is None else {"defects": draw.flaws.to_dict()})
-
-
-def sense(
-    clip: Clip,
-    sensing: Sensing,
-    *,
-    force: bool = False,
-    progress: Progress | None = None,
-    on_wait: Callable[[], None] | None = None,
-) -> tuple[Stream, str]:
-    """Draw and store a stream; returns it and its line of light. A stream that is already there as asked is kept.
-
-    Waits, after a call of `on_wait`, while another process senses this clip. `FileExistsError` if the name is taken by
-    another stream and `force` is not set.
-    """
-    draw = prepare(clip, sensing)
-    meta = describe(clip, sensing, draw)
-    line = draw.level.line(clip, draw.planes * electrons_per_photon(draw.sensor))
-    missed = draw.missed(clip)
-    if missed is not None:
-        from qsim.sensor.defects.event_simulation import TOLERANCE
-
-        draw = dataclasses.replace(draw, followed=missed if missed.largest > TOLERANCE else None)
-        meta["drawn_by"] = draw.law
-        meta["dead_time_effects"] = dataclasses.asdict(missed)
-        line += f"; {missed}: {'photon by photon' if draw.followed else 'below ' + str(TOLERANCE) + ', closed form'}"
-    kept = None if force else _kept(clip, sensing, draw, meta)
-    if kept is not None:
-        _tidy(clip)
-        return kept, line
-    with writing(clip, on_wait):
-        kept = None if force else _kept(clip, sensing, draw, meta)  # made by the process that was waited for
-        if kept is not None:
-            return kept, line
-        blocks = draw.packed(clip, meta["shape"][0], progress)
-        return _write(clip, sensing.stream_name, blocks, draw.sensor, meta), line
-
-
-def _kept(clip: Clip, sensing: Sensing, draw: Draw, meta: dict[str, Any]) -> Stream | None:
-    """The stream that is there as asked, or None; `FileExistsError` if another one has its name."""
-    json_path = clip.path / "streams" / f"{sensing.stream_name}.json"
-    try:
-        old = Stream.open(json_path)
-    except FileNotFoundError:
-        return None
-    if (
-        all(old.meta.get(key, value if key == "drawn_by" else None) == value for key, value in meta.items())
-        and old.meta.get("defects") == meta.get("defects")
-        and old.meta["sensor"] == draw.sensor.to_dict()
-    ):
-        return old
-    raise FileExistsError(f"{json_path}: exists with other settings; name this stream with --name, or use --force")
-
-
-def replay(clip: Clip, stream: Stream, frame: int) -> tuple[Array, Array]:
-    """One frame drawn again from the stream's json alone, and the stored one: both codes [H, W]."""
-    if not 0 <= frame < len(stream):
-        raise ValueError(f"{stream.path}: frame {frame} asked for, the stream has frames 0..{len(stream) - 1}")
-    return stored(stream).frames(clip, frame, frame + 1)[0], stream.codes(frame, frame + 1)[0]
-
-
-def electrons_per_photon(sensor: Sensor) -> float:
-    """Quantum or photon-detection efficiency of a sensor, for the line of light."""
-    described = sensor.to_dict()
-    return float(described.get("quantum_efficiency", described.get("pde", 1.0)))

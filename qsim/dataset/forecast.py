@@ -18,8 +18,8 @@ from statistics import median
 from typing import Any, NamedTuple
 
 from qsim import process
-from qsim.clip import stream
 from qsim.clip.clip import Clip
+from qsim.clip.sensing import sense
 from qsim.dataset import job_runner
 from qsim.dataset.job import Job
 from qsim.dataset.recipe import Recipe
@@ -239,9 +239,9 @@ def _sense(job: Job, clip: Clip) -> tuple[Seconds, float]:
     """Seconds and bytes per frame of all streams together; the second drawing counts, the first one compiles."""
     wall = processor = size = 0.0
     for sensing in job.streams:
-        stream.sense(clip, sensing)
+        sense(clip, sensing)
         started = Seconds.now()
-        drawn, _ = stream.sense(clip, sensing, force=True)
+        drawn, _ = sense(clip, sensing, force=True)
         spent = Seconds.now().since(started)
         wall, processor = wall + spent.wall, processor + spent.processor
         size += drawn.path.stat().st_size

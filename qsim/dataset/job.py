@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from qsim import files
-from qsim.clip.stream import Sensing
+from qsim.clip.sensing import Sensing
 from qsim.files import to_json
 
 

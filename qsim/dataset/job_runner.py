@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qsim import files, locks
-from qsim.clip import stream
 from qsim.clip.clip import Clip
+from qsim.clip.sensing import sense
 from qsim.dataset.job import Job
 from qsim.dataset.provenance import assets, origin, photographs
 from qsim.process import peak_memory
@@ -99,7 +99,7 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
     for sensing in job.streams:
         if sensing.ppp is not None:
             sensor = devices.load(sensing.sensor, ppp=sensing.ppp, bits=sensing.bits, exposure=1 / settings.frame_rate)
-            share = stream.electrons_per_photon(sensor)
+            share = sensor.efficiency
             if sensing.ppp * share > electrons:
                 electrons, ppp = sensing.ppp * share, sensing.ppp
     return fidelity.choose(
@@ -166,7 +166,7 @@ def _do(job: Job, folder: Path, make: Make) -> Result:
     clip = _clip(job, folder, make)
     rendered = time.monotonic()
     for sensing in job.streams:
-        _, line = stream.sense(clip, sensing)
+        _, line = sense(clip, sensing)
         _log(folder, job.name, line)
     files.write_json(record_path(folder, job.name), make_record(job, clip.path))
     failure_path(folder, job.name).unlink(missing_ok=True)

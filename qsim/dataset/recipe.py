@@ -36,7 +36,7 @@ from typing import Any
 
 from qsim import checks
 from qsim.checks import MAX_PIXELS
-from qsim.clip.stream import Sensing
+from qsim.clip.sensing import Sensing
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe_toml import Section, Text
 from qsim.files import check_name

@@ -6,7 +6,8 @@ from qsim.files import lazy_names
 
 if TYPE_CHECKING:
     from qsim.optics.camera import Camera
-    from qsim.optics.radiometry import WHITE_PER_MEAN, LightLevel, diffract, expected_photons, photons_per_lux
+    from qsim.optics.diffraction import diffract
+    from qsim.optics.radiometry import WHITE_PER_MEAN, LightLevel, expected_photons, photons_per_lux
 
 __all__ = ["WHITE_PER_MEAN", "Camera", "LightLevel", "diffract", "expected_photons", "photons_per_lux"]
 
@@ -16,7 +17,7 @@ __getattr__ = lazy_names(
         "Camera": "camera",
         "LightLevel": "radiometry",
         "WHITE_PER_MEAN": "radiometry",
-        "diffract": "radiometry",
+        "diffract": "diffraction",
         "expected_photons": "radiometry",
         "photons_per_lux": "radiometry",
     },

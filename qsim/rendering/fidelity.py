@@ -282,7 +282,7 @@ def _error(errors: tuple[float, ...], samples: float) -> float:
 
 def _left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, ...]:
     """Effects that the renderer does not draw, with their size where the pilot knows it."""
-    from qsim.optics import radiometry
+    from qsim.optics.diffraction import diffraction_line
 
     depths = np.concatenate([truth["depth"].ravel() for truth in truths])
     depths = depths[np.isfinite(depths) & (depths > camera.focal_length)]
@@ -293,6 +293,6 @@ def _left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, 
     how = "thin lens" if camera.aperture_blur else "left out, pinhole"
     return (
         Finding("depth of field", how, f"largest blur circle {blur:.2g} px at f/{camera.f_number:g}"),
-        Finding("diffraction", "left out here", radiometry.diffraction_line(camera)),
+        Finding("diffraction", "left out here", diffraction_line(camera)),
         Finding("lens aberrations, polarisation, spectra", "not modelled", "size unknown"),
     )

@@ -22,6 +22,7 @@ from numpy import ndarray as Array
 from qsim.backend import Engine
 from qsim.clip.clamped_error import Errors, frame_errors, rms, white_in
 from qsim.keys import Key, hash_name, words
+from qsim.optics.radiometry import Crop, check_crop
 from qsim.rendering import ground_truth
 from qsim.rendering.budget import Budget, blur_left, grid_samples, instants
 from qsim.rendering.denoiser import cleaned_mean
@@ -29,8 +30,6 @@ from qsim.rendering.engine import activate, select
 from qsim.rendering.mitsuba_scene import Stage, film_pass
 from qsim.rendering.ray_casting import RayCaster, pixel_rays
 from qsim.scene.scene import Scene
-
-Crop = tuple[int, int, int, int]  # y, x, height, width
 
 RENDER_STAGE = 16  # of the random keys: sampler seeds
 SHARP_STAGE = 17  # the sharp instant has seeds of its own
@@ -319,9 +318,4 @@ class Renderer:
 
 def _checked_crop(scene: Scene, crop: Crop | None) -> Crop:
     height, width = scene.camera.height, scene.camera.width
-    if crop is None:
-        return 0, 0, height, width
-    y, x, rows, columns = crop
-    if min(y, x) < 0 or min(rows, columns) < 1 or y + rows > height or x + columns > width:
-        raise ValueError(f"crop (y, x, height, width) = {crop} does not lie in the {height} x {width} frame")
-    return crop
+    return (0, 0, height, width) if crop is None else check_crop(crop, height, width)

@@ -13,8 +13,7 @@ from qsim import colour
 from qsim.clip.clamped_error import stated
 from qsim.clip.clip import RELATIVE, Clip, Stream
 from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, MOVING, SLOWEST, moving_mean
-from qsim.clip.stream import electrons_per_photon
-from qsim.optics.radiometry import clip_photons
+from qsim.clip.photons import clip_photons
 from qsim.report import html as page
 from qsim.sensor.defects import defect_table, fixed_pattern
 
@@ -134,7 +133,7 @@ def stream_line(stream: Stream) -> str:
     ppp, lux = meta.get("ppp"), meta.get("equivalent_lux_555nm")
     light = "" if ppp is None else f": {ppp:.4g} photons per pixel (the clip's light × {stream.photons_factor:.4g})"
     light += "" if lux is None else f", as much as {lux:.4g} lx at 555 nm"
-    light += "" if ppp is None else f", {ppp * electrons_per_photon(stream.sensor):.3g} e⁻ per pixel"
+    light += "" if ppp is None else f", {ppp * stream.sensor.efficiency:.3g} e⁻ per pixel"
     return f"Stream {stream.name}{light}; {stream.bits} bit, {stream.sensor}{defects_words(stream)}"
 
 

@@ -20,10 +20,10 @@ from qsim import colour, files
 from qsim.clip.clamped_error import stated
 from qsim.clip.clip import Clip, Stream
 from qsim.clip.motion_statistics import MOVING
+from qsim.clip.photons import clip_photons
 from qsim.dataset.checking import Restored
 from qsim.dataset.dataset import Dataset
 from qsim.files import Progress
-from qsim.optics.radiometry import clip_photons
 from qsim.report import html as page
 from qsim.report import table_sections
 from qsim.report.clip_section import (

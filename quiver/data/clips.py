@@ -8,8 +8,9 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clip import Clip
+from qsim.clip.photons import clip_photons
 from qsim.dataset.dataset import Dataset
-from qsim.optics.radiometry import WHITE_PER_MEAN, clip_photons
+from qsim.optics.radiometry import WHITE_PER_MEAN
 
 __all__ = ["Clip", "has_sharp", "known", "mean_light", "open_clips", "peak_of", "truth"]
 

@@ -16,10 +16,11 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clip import Clip
-from qsim.clip.stream import Stream, describe
+from qsim.clip.photons import clip_photons
+from qsim.clip.sensing import describe
+from qsim.clip.stream import Stream
 from qsim.files import read_json, sha256, to_json
 from qsim.keys import Key, hash_name
-from qsim.optics.radiometry import clip_photons
 from qsim.sensor.sensor import Sensor
 from quiver.data.code_table import draw_codes
 from quiver.data.illumination import Illumination

@@ -11,8 +11,8 @@ from functools import lru_cache
 from typing import Any
 
 from qsim.clip.clip import Clip
+from qsim.clip.sensing import Sensing, prepare
 from qsim.clip.simulation import Draw
-from qsim.clip.stream import Sensing, prepare
 from qsim.sensor import devices
 from qsim.sensor.defects.defect_table import Flaws, from_toml
 from qsim.sensor.qis import QIS

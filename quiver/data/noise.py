@@ -9,8 +9,9 @@ from functools import lru_cache
 from typing import Any
 
 from qsim.clip.clip import Clip
-from qsim.clip.simulation import Draw, assemble
-from qsim.clip.stream import Sensing, Stream
+from qsim.clip.sensing import Sensing, assemble
+from qsim.clip.simulation import Draw
+from qsim.clip.stream import Stream
 from qsim.sensor.defects.defect_table import Flaws
 from qsim.sensor.defects.defect_table import from_dict as read_defects
 from qsim.sensor.sensor import Sensor

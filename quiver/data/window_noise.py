@@ -16,9 +16,9 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clip import Clip
+from qsim.clip.photons import clip_photons
 from qsim.clip.simulation import Draw
 from qsim.keys import Key
-from qsim.optics.radiometry import clip_photons
 from qsim.sensor.defects.defect_table import Flawed, of_sensor
 from qsim.sensor.sensor import Sensor
 from quiver.data.code_table import draw_codes

@@ -23,9 +23,9 @@ from numpy import ndarray as Array
 from torch.utils.data import Dataset, Sampler
 
 from qsim.clip.clip import Clip
+from qsim.clip.photons import clip_photons
 from qsim.clip.simulation import Draw
 from qsim.keys import Key
-from qsim.optics.radiometry import clip_photons
 from qsim.sensor.sensor import Sensor
 from quiver.data.clips import has_sharp, peak_of
 from quiver.data.code_table import draw_codes

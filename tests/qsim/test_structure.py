@@ -16,7 +16,8 @@ from clips import write_clip
 from qsim import files
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
-from qsim.clip.stream import Sensing, Stream, replay, sense
+from qsim.clip.sensing import Sensing, replay, sense
+from qsim.clip.stream import Stream
 from qsim.dataset import checking, generation, recipe
 from qsim.dataset.dataset import Dataset
 from qsim.formats import exporting, importing

@@ -15,7 +15,7 @@ import torch
 from clips import ClipMaker, write_clip
 
 import qsim.cli.program
-from qsim.clip import stream
+from qsim.clip import sensing
 from quiver import threads
 from quiver.cli import program
 from quiver.model.unet import UNet, UNetConfig
@@ -182,13 +182,13 @@ def test_every_command_that_computes_has_the_option(capsys):
 def test_the_compiled_engine_has_as_many_and_the_next_command_all(tmp_path, monkeypatch, capsys):
     """Inside the command Dr.Jit and processes that it starts have the number; after it, what there was before."""
     drjit = pytest.importorskip("drjit")
-    before, seen, plain = drjit.thread_count(), [], stream.sense
+    before, seen, plain = drjit.thread_count(), [], sensing.sense
 
     def watched(*args: object, **kwargs: object) -> object:
         seen.append((os.environ.get("QSIM_THREADS"), drjit.thread_count()))
         return plain(*args, **kwargs)
 
-    monkeypatch.setattr(stream, "sense", watched)
+    monkeypatch.setattr(sensing, "sense", watched)
     clip = write_clip(tmp_path / "c", frames=3, height=96, width=96)
     for name, more in (("one", ["--threads", "1"]), ("all", [])):
         assert qsim.cli.program.main(["sense", str(clip.path), "--ppp", "3", "--bits", "3", "-o", name, *more]) == 0

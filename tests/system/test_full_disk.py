@@ -13,7 +13,7 @@ from clips import write_clip
 from fakes import RECIPE, make, tree
 
 from qsim.cli.program import main
-from qsim.clip.stream import Sensing, sense
+from qsim.clip.sensing import Sensing, sense
 from qsim.dataset import recipe
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import Options, Summary, generate

@@ -26,6 +26,7 @@ from numpy import ndarray as Array
 from qsim import keys
 from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import CODE_PLANES, SLOWEST, moving_mean
+from qsim.clip.photons import clip_photons, light_level
 from qsim.optics import radiometry
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
@@ -120,12 +121,12 @@ def expose(
     """
     key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))
     wanted = [2**b - 1 for b in settings.bits]
-    photons = radiometry.clip_photons(clip, centre, factor)
+    photons = clip_photons(clip, centre, factor)
     total, fired, quiet, spread = (np.zeros_like(photons) for _ in range(4))
     before = photons
     for reach in range(wanted[-1] // 2 + 1):
         places = [centre] if reach == 0 else [centre - reach * settings.speed, centre + reach * settings.speed]
-        pair = [photons] if reach == 0 else [radiometry.clip_photons(clip, t, factor) for t in places]
+        pair = [photons] if reach == 0 else [clip_photons(clip, t, factor) for t in places]
         for t, light in zip(places, pair, strict=True):
             p = plane.pmf(light, clip.exposure)
             fired += plane.sample(light, clip.exposure, key=key.at(t))
@@ -191,14 +192,14 @@ def _equivalent(readout: Readout, frame: Exposed) -> Array:
 def study(clip: Clip, settings: StudySettings, *, progress: Callable[[int, int], None] | None = None) -> Study:
     """Draw and score every bit depth of a clip; `ValueError` if the clip is too slow, too short or has no light."""
     check_clip(clip, settings)
-    level = radiometry.light_level(clip, ppp=settings.ppp)
+    level = light_level(clip, ppp=settings.ppp)
     forms = readouts(settings, level.ppp, clip.exposure)
     centres = instants(len(clip), settings)
     sums = {(form.model, form.planes): _Sums() for form in forms}
     by_planes = {m: [form for form in forms if form.planes == m] for m in (2**b - 1 for b in settings.bits)}
     structure, motions = np.zeros(2 ** settings.bits[-1] - 1), []
     for done, centre in enumerate(centres):
-        sharp = radiometry.clip_photons(clip, centre, level.factor, sharp=True)
+        sharp = clip_photons(clip, centre, level.factor, sharp=True)
         motions.append(clip_motion(clip, centre, settings.speed))
         for frame in expose(clip, centre, settings, level.factor, forms[0].sensor, structure):
             for form in by_planes[frame.planes]:

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from qsim import keys
-from qsim.clip import stream
 from qsim.clip.clip import Clip, ClipWriter
+from qsim.clip.photons import light_level
+from qsim.clip.sensing import Sensing, describe, sense, write_stream
+from qsim.clip.simulation import Draw
 from qsim.files import Progress
-from qsim.optics import radiometry
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.bit_depth.clip_study import check_clip
 from qsim.studies.bit_depth.readout import StudySettings, plane_sensor
@@ -89,7 +90,7 @@ def write_streams(clip: Clip, folder: Path, settings: StudySettings) -> list[Pat
     `quiver evaluate FOLDER/NAME_3bit --stream planes` scores any restorer against the sharp instants.
     """
     check_clip(clip, settings)
-    level = radiometry.light_level(clip, ppp=settings.ppp)
+    level = light_level(clip, ppp=settings.ppp)
     plane = plane_sensor(settings, level.ppp, clip.exposure)
     if not isinstance(plane, BinarySPAD):
         raise ValueError("streams of summed planes need a clocked SPAD; leave out the plane sensor")
@@ -98,14 +99,14 @@ def write_streams(clip: Clip, folder: Path, settings: StudySettings) -> list[Pat
         m = 2**bits - 1
         path = folder / f"{clip.name}_{bits}bit"
         grouped = group(clip, path, m)
-        read = stream.Sensing(settings.sensor, bits, ppp=m * level.ppp, seed=settings.seed, name="multibit")
-        stream.sense(grouped, read)
+        read = Sensing(settings.sensor, bits, ppp=m * level.ppp, seed=settings.seed, name="multibit")
+        sense(grouped, read)
         key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))
-        draw = stream.Draw(replace(plane, bits=bits), plane, level, key, m, False)
-        meta = stream.describe(clip, replace(read, name="planes"), draw) | {"planes_of": str(clip.path)}
+        draw = Draw(replace(plane, bits=bits), plane, level, key, m, False)
+        meta = describe(clip, replace(read, name="planes"), draw) | {"planes_of": str(clip.path)}
         meta |= {"ppp_target": m * level.ppp, "sensor_name": "planes"}
         frames = (draw.frames(clip, t, t + 1) for t in range(len(grouped)))
-        stream.write_stream(grouped, "planes", frames, draw.sensor, meta)
+        write_stream(grouped, "planes", frames, draw.sensor, meta)
         made.append(path)
     return made
 

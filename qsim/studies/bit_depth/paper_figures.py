@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 
 from qsim import colour, keys
 from qsim.clip.clip import Clip
-from qsim.optics import radiometry
+from qsim.clip.photons import clip_photons, light_level
 from qsim.sensor import devices
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.bit_depth.clip_study import check_clip, clip_motion, expose
@@ -46,8 +46,8 @@ def figure_1(clip: Clip, *, lux: float = 1.0, seed: int = 0) -> list[Panel]:
     longest = round(clip.frame_rate / min(fps for _, fps in CAMERAS))
     if len(clip) < longest:
         raise ValueError(f"{clip.path}: {len(clip)} frames; one frame at 60 fps takes {longest}")
-    level, middle = radiometry.light_level(clip, lux=lux), len(clip) // 2
-    sharp = radiometry.clip_photons(clip, middle, level.factor, sharp=True)
+    level, middle = light_level(clip, lux=lux), len(clip) // 2
+    sharp = clip_photons(clip, middle, level.factor, sharp=True)
     peak = float(np.percentile(sharp, 99.9))
     speed = clip_motion(clip, middle)
     panels = [Panel("sharp instant", sharp, {"ppp": level.ppp, "lux": lux, "peak": peak})]
@@ -55,7 +55,7 @@ def figure_1(clip: Clip, *, lux: float = 1.0, seed: int = 0) -> list[Panel]:
     for name, fps in CAMERAS:
         n = round(clip.frame_rate / fps)
         first = middle - n // 2
-        light = np.sum([radiometry.clip_photons(clip, t, level.factor) for t in range(first, first + n)], axis=0)
+        light = np.sum([clip_photons(clip, t, level.factor) for t in range(first, first + n)], axis=0)
         sensor = devices.load(name, exposure=n * clip.exposure)
         codes = sensor.sample(light, n * clip.exposure, key=key)
         found, where = np.unique(codes, return_inverse=True)  # few of the 1024 codes of a deep pixel occur
@@ -79,8 +79,8 @@ def figure_2(clip: Clip, ppp: float, *, seed: int = 0, bits: Sequence[int] = BIT
     """Sums of 2^b - 1 binary planes around the middle of a clip, `ppp` detected photons per pixel and plane."""
     settings = StudySettings(bits=tuple(bits), sensor="spad-320x240", ppp=ppp, seed=seed)
     check_clip(clip, settings)
-    level, middle = radiometry.light_level(clip, ppp=ppp), len(clip) // 2
-    sharp = radiometry.clip_photons(clip, middle, level.factor, sharp=True)
+    level, middle = light_level(clip, ppp=ppp), len(clip) // 2
+    sharp = clip_photons(clip, middle, level.factor, sharp=True)
     peak, speed = float(np.percentile(sharp, 99.9)), clip_motion(clip, middle)
     panels = [Panel("sharp instant", sharp, {"ppp": ppp, "peak": peak})]
     plane = BinarySPAD(1.0, 0.0)

@@ -11,8 +11,8 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clip import Clip
+from qsim.clip.photons import clip_photons
 from qsim.files import Progress
-from qsim.optics import radiometry
 from qsim.studies.bit_depth.answer import answer, at_edge, code_motion, widened
 from qsim.studies.bit_depth.clip_study import Study, check_clip, study
 from qsim.studies.bit_depth.clips import MovingClip
@@ -147,7 +147,7 @@ def law(base: Study, clip: Clip, settings: StudySettings, model: str, speed: flo
 
     `speed` is relative to that study. Pixels are taken as constant during a frame where noise is concerned.
     """
-    light = np.concatenate([radiometry.clip_photons(clip, t, 1.0, sharp=True).ravel() for t in base.instants])
+    light = np.concatenate([clip_photons(clip, t, 1.0, sharp=True).ravel() for t in base.instants])
     light = np.sort(light)[:: max(1, light.size // 4000)]
     light, scale = light * (ppp / light.mean()), (ppp / base.ppp) ** 2
     result = {}

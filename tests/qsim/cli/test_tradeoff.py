@@ -8,7 +8,7 @@ from waves import SIZE, wave_clip
 
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
-from qsim.clip.stream import replay
+from qsim.clip.sensing import replay
 
 
 @pytest.fixture(scope="module")

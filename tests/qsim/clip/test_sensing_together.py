@@ -18,6 +18,7 @@ from clips import write_clip
 from qsim import locks
 from qsim.clip import stream
 from qsim.clip.clip import Clip
+from qsim.clip.sensing import Sensing, sense
 
 FORK = multiprocessing.get_context("fork")  # everything is imported already: the processes start together
 
@@ -35,7 +36,7 @@ def sense_again(path: Path, seed: int, seconds: float, answers: multiprocessing.
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         if seed < 4:
-            made, _ = stream.sense(clip, stream.Sensing("quiver-physical", 3, 3.25, seed=seed, name="same"), force=True)
+            made, _ = sense(clip, Sensing("quiver-physical", 3, 3.25, seed=seed, name="same"), force=True)
             found["made"] += made.meta["seed"] == seed
         try:
             opened = clip.stream("same")
@@ -68,7 +69,7 @@ def together(target, arguments: list[tuple]) -> list:
 def test_no_reader_sees_codes_of_another_seed_than_its_json(tmp_path: Path, seconds: float):
     """Four replace a stream, four read it. Before there was a lock 68 of 575 reads were mixed."""
     path = write_clip(tmp_path / "c", frames=3).path
-    stream.sense(Clip.open(path), stream.Sensing("quiver-physical", 3, 3.25, name="same"))
+    sense(Clip.open(path), Sensing("quiver-physical", 3, 3.25, name="same"))
     found = sum(together(sense_again, [(path, seed, seconds) for seed in range(8)]), Counter[str]())
     assert set(found) <= {"made", "whole", "replaced", "absent"}, found
     assert found["whole"] > 20, found
@@ -82,9 +83,9 @@ def sense_first(path: Path, start: float, answers: multiprocessing.Queue) -> Non
     clip, waits, drawn = Clip.open(path), [], []
     time.sleep(max(0.0, start - time.monotonic()))
     try:
-        made, _ = stream.sense(
+        made, _ = sense(
             clip,
-            stream.Sensing("quiver-physical", 3, 3.25),
+            Sensing("quiver-physical", 3, 3.25),
             progress=lambda done, total: drawn.append(done),
             on_wait=lambda: waits.append(1),
         )
@@ -105,28 +106,28 @@ def test_eight_that_sense_the_same_for_the_first_time_make_it_once(tmp_path: Pat
 
 def test_a_stream_that_was_replaced_says_so_and_a_mapped_one_stays(tmp_path: Path):
     clip = write_clip(tmp_path / "c", frames=3)
-    wanted = [stream.Sensing("quiver-physical", 3, 3.25, seed=seed, name="same") for seed in (1, 2)]
-    first, _ = stream.sense(clip, wanted[0])
+    wanted = [Sensing("quiver-physical", 3, 3.25, seed=seed, name="same") for seed in (1, 2)]
+    first, _ = sense(clip, wanted[0])
     mapped, unread = clip.stream("same"), clip.stream("same")
     before = mapped.codes()
-    second, _ = stream.sense(clip, wanted[1], force=True)
+    second, _ = sense(clip, wanted[1], force=True)
     np.testing.assert_array_equal(mapped.codes(), before)
     with pytest.raises(ValueError, match=r"same\.json: was replaced since it was opened; open the stream again"):
         unread.codes()
     assert "was replaced" in unread.verify()[0]
     assert (second.codes() != before).any()
-    stream.sense(clip, wanted[0], force=True)
+    sense(clip, wanted[0], force=True)
     np.testing.assert_array_equal(first.codes(), before)  # the same codes again: nothing was mixed
 
 
 def test_what_a_failed_sensing_leaves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The old stream stays whole until the new one is on the disk."""
     clip = write_clip(tmp_path / "c", frames=3)
-    wanted = stream.Sensing("quiver-physical", 3, 3.25, name="same")
-    old, _ = stream.sense(clip, wanted)
+    wanted = Sensing("quiver-physical", 3, 3.25, name="same")
+    old, _ = sense(clip, wanted)
     blocks = iter([old.packed[:1]])
     with pytest.raises(ValueError, match="got 1 frames, expected 3"):
-        stream.write_packed(clip, "same", blocks, old.sensor, old.meta)
+        stream.write_packed(clip.path / "streams" / "same.npy", blocks, old.sensor, old.meta)
     assert clip.verify() == []
     assert clip.stream("same").meta == old.meta
 
@@ -154,8 +155,8 @@ def test_two_light_levels_share_their_random_numbers_and_another_seed_does_not(t
     clip = write_clip(tmp_path / "c", radiance=light)
 
     def noise(ppp: float, seed: int = 0) -> np.ndarray:
-        wanted = stream.Sensing("quiver-physical", 3, ppp, seed=seed)
-        return stream.sense(clip, wanted)[0].codes().astype(float).ravel()
+        wanted = Sensing("quiver-physical", 3, ppp, seed=seed)
+        return sense(clip, wanted)[0].codes().astype(float).ravel()
 
     low, high, other = noise(3.25), noise(4.0), noise(4.0, seed=1)
     assert np.corrcoef(low, high)[0, 1] == pytest.approx(0.96, abs=0.01)

@@ -21,7 +21,7 @@ from fakes import RECIPE, die_on_tumble, fail_on_tumble, hoard_on_tumble, make, 
 from forks import forked, killed_at
 
 from qsim import files, locks
-from qsim.clip import stream
+from qsim.clip.sensing import Sensing, sense
 from qsim.dataset import job_runner, provenance, recipe
 from qsim.dataset.checking import check
 from qsim.dataset.dataset import Dataset
@@ -422,7 +422,7 @@ def test_repair_names_the_streams_that_go_with_a_clip(tmp_path: Path):
     folder = tmp_path / "d"
     generate(SMALL, folder, HERE, make=make)
     for damaged in ("radiance/000000.exr", "streams/own.npy"):
-        drawn, _ = stream.sense(Dataset.open(folder).clips()[0], stream.Sensing("quiver-physical", bits=2, name="own"))
+        drawn, _ = sense(Dataset.open(folder).clips()[0], Sensing("quiver-physical", bits=2, name="own"))
         damage(drawn.path.parents[1] / damaged, "bit-flipped")
         repaired = generate(SMALL, folder, Options(workers=0, repair=True), make=make).repaired
         assert f"{drawn.path}: was added by `qsim sense` and is gone; sense it again" in repaired

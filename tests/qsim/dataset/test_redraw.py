@@ -12,8 +12,9 @@ from scipy.special import gammaln
 from qsim import files
 from qsim.cli import program
 from qsim.clip.clip import Clip
-from qsim.clip.simulation import prepare, stored
-from qsim.clip.stream import Sensing, Stream, replay, sense, write_stream
+from qsim.clip.sensing import Sensing, prepare, replay, sense, write_stream
+from qsim.clip.simulation import stored
+from qsim.clip.stream import Stream
 from qsim.dataset import redraw
 from qsim.dataset.generation import Options, generate
 from qsim.dataset.job import Job, Settings

@@ -15,7 +15,7 @@ import quiver.cli.program
 from qsim import files
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
-from qsim.clip.stream import Sensing, sense
+from qsim.clip.sensing import Sensing, sense
 from qsim.dataset import generation, recipe
 from qsim.dataset.dataset import Dataset
 from qsim.formats import exporting

@@ -18,7 +18,8 @@ from hypothesis.extra import numpy as hnp
 
 from qsim.cli.program import main
 from qsim.clip.clip import RELATIVE, Clip, ClipWriter
-from qsim.clip.stream import Sensing, Stream, sense
+from qsim.clip.sensing import Sensing, sense
+from qsim.clip.stream import Stream
 from qsim.colour import from_linear, to_linear
 from qsim.dataset import generation, recipe
 from qsim.dataset.dataset import Dataset

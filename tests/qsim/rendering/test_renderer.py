@@ -15,6 +15,7 @@ import pytest
 from small_scenes import CAMERA, CHEAP, RATE, plate, renderer, scene, square
 from stats import assert_same_rms, critical_z
 
+from qsim.optics.camera import Camera
 from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.denoiser import available
@@ -25,7 +26,6 @@ from qsim.scene.motion import Oscillation, Spin, Still, Translation
 from qsim.scene.scene import (
     AreaLamp,
     Body,
-    Camera,
     Conductor,
     Constant,
     Dielectric,
@@ -448,7 +448,7 @@ def test_a_crop_shows_the_window_of_the_whole():
         window = whole.truth[name][..., 3:12, 5:19]
         np.testing.assert_allclose(part.truth[name], window, atol=1e-5)
     assert np.sqrt(np.mean((part.radiance - whole.radiance[3:12, 5:19]) ** 2)) < 3 * math.hypot(part.error, whole.error)
-    with pytest.raises(ValueError, match="does not lie in the 24 x 33 frame"):
+    with pytest.raises(ValueError, match="is not inside 24 x 33 pixels"):
         renderer(made, crop=(0, 20, 9, 14))
 
 

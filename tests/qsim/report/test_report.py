@@ -13,8 +13,8 @@ from stats import mixture_p_value
 
 from qsim.cli.program import main
 from qsim.clip.clip import RELATIVE, Clip, ClipWriter
-from qsim.clip.stream import Sensing, sense
-from qsim.optics.radiometry import clip_photons
+from qsim.clip.photons import clip_photons
+from qsim.clip.sensing import Sensing, sense
 from qsim.report import clip_section, report
 from qsim.studies.validation.reading import ReadingReport
 

@@ -21,7 +21,7 @@ from golden import fill_by_rule, published_state
 from option_rows import Acts, Refused, Row, Run, check, loudness, names, names_of, options, parser_of, stdout
 from safetensors.numpy import load_file
 
-from qsim.clip.stream import Sensing, sense
+from qsim.clip.sensing import Sensing, sense
 from qsim.sensor import devices
 from quiver import threads
 from quiver.baselines import METHODS

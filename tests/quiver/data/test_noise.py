@@ -16,9 +16,9 @@ from numpy import ndarray as Array
 from stats import assert_mean
 
 from qsim.clip.clip import Clip
-from qsim.clip.stream import Sensing, sense
+from qsim.clip.photons import clip_photons, light_level
+from qsim.clip.sensing import Sensing, sense
 from qsim.keys import Key
-from qsim.optics.radiometry import clip_photons, light_level
 from qsim.sensor.defects import defect_table
 from qsim.sensor.defects.defect_table import Flaws
 from qsim.sensor.defects.fixed_pattern import DarkSpread, Defects

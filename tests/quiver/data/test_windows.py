@@ -12,8 +12,8 @@ from numpy import ndarray as Array
 from stats import assert_histogram, assert_mean
 from torch.utils.data import DataLoader
 
+from qsim.clip.photons import clip_photons, light_level
 from qsim.keys import Key
-from qsim.optics.radiometry import clip_photons, light_level
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor

@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 
 from qsim import files
 from qsim.clip.clip import RELATIVE, ClipWriter
-from qsim.clip.stream import Sensing, sense
+from qsim.clip.sensing import Sensing, sense
 from quiver.data.clips import open_clips, truth
 from quiver.data.codes import Codes, array_codes, sensed
 from quiver.data.illumination import Illumination, ideal_counter
@@ -334,7 +334,7 @@ def test_published_protocol_forces_every_window(tiny_dataset):
 
 
 def test_stored_streams_are_scored(tiny_dataset, make_clip: ClipMaker):
-    from qsim.clip.stream import Sensing, sense
+    from qsim.clip.sensing import Sensing, sense
 
     clip = make_clip()
     sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25, name="mine"))

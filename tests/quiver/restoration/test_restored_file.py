@@ -16,7 +16,7 @@ import pytest
 from forks import forked, killed_at
 from numpy import ndarray as Array
 
-from qsim.clip.stream import Sensing, sense
+from qsim.clip.sensing import Sensing, sense
 from qsim.sensor.qis import QIS
 from quiver.cli.program import main
 from quiver.data.codes import Codes, array_codes, open_stream, sensed, stream_codes

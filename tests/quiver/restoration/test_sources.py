@@ -9,7 +9,7 @@ import pytest
 from clips import ClipMaker
 
 import quiver
-from qsim.clip.stream import Sensing, sense
+from qsim.clip.sensing import Sensing, sense
 from quiver.cli.program import main
 from quiver.data.illumination import Illumination
 from quiver.data.photon_cubes import cube_codes, plane_bits

@@ -9,9 +9,9 @@ import pytest
 from clips import write_clip
 
 from qsim.cli import program
-from qsim.clip.stream import Sensing, prepare, replay, sense
+from qsim.clip.photons import clip_photons
+from qsim.clip.sensing import Sensing, prepare, replay, sense
 from qsim.keys import Key, hash_name
-from qsim.optics import radiometry
 from qsim.sensor import devices, packing
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table, event_simulation, fixed_pattern
@@ -51,7 +51,7 @@ def test_a_stream_holds_the_codes_that_the_device_draws(clip, tmp_path):
     sensor = device(tmp_path, BINARY, table)
     stream, _ = drawn(clip, sensor)
     found = fixed_pattern.Defects(4, 0.2, fixed_pattern.DarkSpread(spread=0.3, hot_share=0.1), 0.1)
-    light = np.stack([radiometry.clip_photons(clip, t, stream.photons_factor) for t in range(6)])
+    light = np.stack([clip_photons(clip, t, stream.photons_factor) for t in range(6)])
     expected = fixed_pattern.sample(
         devices.load(sensor),
         light,
@@ -118,7 +118,7 @@ def test_light_that_changes_inside_an_exposure_is_followed_photon_by_photon(tmp_
     assert stream.meta["drawn_by"] == "events"
     assert "varying flux" in line
     assert "photon by photon" in line
-    light = np.stack([radiometry.clip_photons(clip, t, stream.photons_factor) for t in range(6)]).reshape(2, 3, 4, 5)
+    light = np.stack([clip_photons(clip, t, stream.photons_factor) for t in range(6)]).reshape(2, 3, 4, 5)
     expected, found, who = event_simulation.sample(
         devices.load(sensor),
         light,
@@ -139,7 +139,7 @@ def test_effects_below_the_tolerance_take_the_closed_form(tmp_path):
     stream, line = drawn(clip, sensor, slices=2)
     assert stream.meta["drawn_by"] == "closed form"
     assert "closed form" in line
-    light = np.stack([radiometry.clip_photons(clip, t, stream.photons_factor) for t in range(6)]).reshape(3, 2, 4, 5)
+    light = np.stack([clip_photons(clip, t, stream.photons_factor) for t in range(6)]).reshape(3, 2, 4, 5)
     expected = devices.load(sensor).sample(light.sum(axis=1), 2 * clip.exposure, key=Key(0, hash_name("still")))
     np.testing.assert_array_equal(stream.codes(), expected)
 

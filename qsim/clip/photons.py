@@ -1,0 +1,67 @@
+"""Expected photons of a clip's frames, and the light level of a clip for a sensor."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.clip.clip import Clip
+from qsim.optics.diffraction import diffract
+from qsim.optics.radiometry import Crop, LightLevel, expected_photons, photons_per_lux, ppp_factor
+
+
+def light_level(clip: Clip, *, ppp: float | None = None, lux: float | None = None) -> LightLevel:
+    """The light of a clip: scaled to `ppp` photons per pixel, to `lux` on the faceplate, or as it is (neither given).
+
+    `ValueError` for a black clip, for both targets at once, and for a clip of relative radiance without `ppp`.
+    """
+    if ppp is not None and lux is not None:
+        raise ValueError(f"{clip.name}: give the light level as ppp or as lux, not both")
+    camera = clip.camera
+    if camera is None:
+        if ppp is None:
+            what = "lux" if lux is not None else "absolute light"
+            raise ValueError(
+                f"{clip.name}: its radiance is relative (imported video) and has no {what}; "
+                "give a target in photons per pixel, as in --ppp 3.25"
+            )
+        return LightLevel(ppp_factor(clip.mean_radiance, ppp, clip.name), ppp, clip.mean_radiance, None)
+    per_lux = photons_per_lux(camera, clip.exposure)
+    if lux is not None:
+        ppp = lux * per_lux
+    factor = 1.0 if ppp is None else ppp_factor(clip.mean_photons, ppp, clip.name)
+    level = clip.mean_photons if ppp is None else ppp
+    return LightLevel(factor, level, clip.mean_photons, level / per_lux)
+
+
+def clip_photons(
+    clip: Clip, t: int, factor: float = 1.0, crop: Crop | None = None, *, sharp: bool = False, diffraction: bool = False
+) -> Array:
+    """Expected photons [h, w] of frame t, or of its sharp instant, times a factor; crop = (y, x, height, width)."""
+    if diffraction and crop is not None:
+        whole = clip_photons(clip, t, factor, sharp=sharp, diffraction=True)
+        y, x, height, width = crop
+        return whole[y : y + height, x : x + width]
+    radiance = clip.sharp(t, crop) if sharp else clip.radiance(t, crop)
+    camera = clip.camera
+    if camera is None:
+        if diffraction:
+            raise ValueError(f"{clip.name}: diffraction needs a camera, and this clip's radiance is relative")
+        return radiance.astype(np.float64) * factor
+    y, x = clip.origin
+    if crop is not None:
+        y, x = y + crop[0], x + crop[1]
+    if diffraction:
+        radiance = diffract(radiance, camera)
+    return expected_photons(radiance, camera, clip.exposure, origin=(y, x)) * factor
+
+
+def light_line(clip: Clip, level: LightLevel, electrons_per_photon: float | None = None) -> str:
+    """`fan_03: mean radiance 0.0254 W/m2/sr, 3.25 PPP (factor 0.84), then 1.31 lx at 555 nm, 2.60 e-/pixel`."""
+    unit = " (relative)" if level.lux is None else " W/m2/sr"
+    text = f"{clip.name}: mean radiance {clip.mean_radiance:.4g}{unit}, {level.ppp:.4g} PPP (factor {level.factor:.4g})"
+    if level.lux is not None:
+        text += f", then {level.lux:.4g} lx at 555 nm"
+    if electrons_per_photon is not None:
+        text += f", {level.ppp * electrons_per_photon:.3g} e-/pixel"
+    return text

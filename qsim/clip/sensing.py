@@ -1,0 +1,224 @@
+"""Senses clips: prepares the draw of a `Sensing`, stores its stream, and replays stored frames.
+
+clip (radiance) --light level, optics--> photons --sensor, key--> codes --> streams/NAME.npy + streams/NAME.json
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from numpy import ndarray as Array
+
+from qsim import locks
+from qsim.clip.clip import Clip
+from qsim.clip.photons import light_level, light_line
+from qsim.clip.simulation import Draw, plane_of, stored
+from qsim.clip.stream import Stream, orientation, write_packed, writing
+from qsim.files import Progress, check_name
+from qsim.sensor import packing
+
+if TYPE_CHECKING:
+    from qsim.sensor.defects.defect_table import Flaws
+    from qsim.sensor.sensor import Sensor
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """What to draw: a sensor at a light level, with a seed; independent of the clip."""
+
+    sensor: str  # a name of qsim.devices or a .toml file
+    bits: int | None = None  # None: the device's own
+    ppp: float | None = None  # photons per pixel and code over the whole clip; neither ppp nor lux: light as it is
+    lux: float | None = None  # faceplate lux at 555 nm
+    seed: int = 0
+    name: str | None = None  # of the stream; made from the rest if None
+    group: bool = False  # a code sums 2^bits - 1 binary planes, each its own clip frame
+    diffraction: bool = False  # blur by the lens's Airy pattern
+    defects: str | None = None  # .toml with a table [defects]; None: that of the sensor's file, if it has one
+    slices: int = 1  # clip frames in one exposure of a counting SPAD: light that changes inside it
+
+    @property
+    def stream_name(self) -> str:
+        """The given name, or for example `quiver-physical_3bit_3.25ppp`."""
+        if self.name is not None:
+            return check_name(self.name)
+        light = (
+            "asis" if self.ppp is self.lux is None else f"{self.ppp:g}ppp" if self.lux is None else f"{self.lux:g}lx"
+        ).replace("e+", "e")  # a name holds no +
+        bits = "" if self.bits is None else f"_{self.bits}bit"
+        seed = f"_seed{self.seed}" if self.seed else ""
+        sensor = Path(self.sensor).name.removesuffix(".toml")
+        return check_name(f"{sensor}{bits}_{light}{seed}")
+
+
+def prepare(clip: Clip, sensing: Sensing) -> Draw:
+    """The sensor, light factor and key for one clip; `ValueError` if they do not fit it."""
+    from qsim.sensor.defects import defect_table as flaws
+
+    source = sensing.defects or (sensing.sensor if sensing.sensor.endswith(".toml") else None)
+    return assemble(clip, sensing, None if source is None else flaws.from_toml(source))
+
+
+def assemble(clip: Clip, sensing: Sensing, found: Flaws | None, own: Sensor | None = None) -> Draw:
+    """As `prepare`, with these defects, and with this sensor in place of the one that `sensing` names."""
+    from qsim import keys
+    from qsim.sensor import devices
+    from qsim.sensor.defects import defect_table as flaws
+
+    planes = sensing.slices
+    if sensing.group:
+        if sensing.bits is None:
+            raise ValueError(f"{clip.name}: summing planes needs the bits of a code, as in --bits 3")
+        if sensing.slices != 1:
+            raise ValueError(f"{clip.name}: --group sums planes, --slices are of counting pixels; give one of them")
+        planes = 2**sensing.bits - 1
+    if not 1 <= planes <= len(clip):
+        what = f"one code of {planes} planes" if sensing.group else f"one exposure of {planes} slices"
+        raise ValueError(f"{clip.name}: {len(clip)} frames are too few for {what}")
+    target = None if sensing.ppp is None else sensing.ppp / planes
+    level = light_level(clip, ppp=target, lux=sensing.lux)
+    sensor = own or devices.load(
+        sensing.sensor, ppp=level.ppp * planes, bits=sensing.bits, exposure=clip.exposure * planes
+    )
+    if found is not None:  # measured dark counts take the place of the sensor's
+        sensor = flaws.of_sensor(found, sensor, *clip.shape[1:]).sensor
+    _check_planes(sensor, sensing, clip)
+    key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
+    return Draw(sensor, plane_of(sensor, planes), level, key, planes, sensing.diffraction, found)
+
+
+def _check_planes(sensor: Sensor, sensing: Sensing, clip: Clip) -> None:
+    """`ValueError` for sums of planes and for slices of exposures that this sensor or this clip does not have."""
+    from qsim.sensor.counting import CountingSPAD
+    from qsim.sensor.spad import BinarySPAD
+
+    kind = type(sensor).__name__
+    if sensing.group and not isinstance(sensor, BinarySPAD):
+        raise ValueError(f"{sensing.sensor}: only a clocked SPAD (BinarySPAD) sums planes, this is a {kind}")
+    if sensing.slices > 1 and not isinstance(sensor, CountingSPAD):
+        raise ValueError(f"{sensing.sensor}: slices of an exposure are for a CountingSPAD, this is a {kind}")
+    if sensing.slices > 1 and clip.exposure < 0.999 / clip.frame_rate:
+        raise ValueError(f"{clip.name}: slices of one exposure need a clip whose shutter is open all the time")
+
+
+def describe(clip: Clip, sensing: Sensing, draw: Draw) -> dict[str, Any]:
+    """The json of the stream that `draw` makes, without what only the written file knows."""
+    frames, height, width = clip.shape
+    return {
+        "shape": [frames // draw.planes, height, width],
+        "sensor_name": sensing.sensor,
+        "ppp_target": sensing.ppp,
+        "lux_target": sensing.lux,
+        "ppp": draw.level.ppp * draw.planes,
+        "ppp_factor": draw.level.factor,
+        "mean_photons_before": draw.level.mean_before * draw.planes,
+        "equivalent_lux_555nm": draw.level.lux,
+        "radiance_unit": clip.meta["radiance_unit"],
+        "transfer": "linear",
+        "diffraction": draw.diffraction,
+        "seed": draw.key.seed,
+        "clip_key": draw.key.clip,
+        "clip": clip.name,
+        "frame_rate": clip.frame_rate / draw.planes,
+        "exposure": clip.exposure * draw.planes,
+        "planes_per_code": draw.planes,
+        "drawn_by": draw.law,
+    } | ({} if draw.flaws is None else {"defects": draw.flaws.to_dict()})
+
+
+def sense(
+    clip: Clip,
+    sensing: Sensing,
+    *,
+    force: bool = False,
+    progress: Progress | None = None,
+    on_wait: Callable[[], None] | None = None,
+) -> tuple[Stream, str]:
+    """Draw and store a stream; returns it and its line of light. A stream that is already there as asked is kept.
+
+    Waits, after a call of `on_wait`, while another process senses this clip. `FileExistsError` if the name is taken by
+    another stream and `force` is not set.
+    """
+    draw = prepare(clip, sensing)
+    meta = describe(clip, sensing, draw)
+    line = light_line(clip, draw.level, draw.planes * draw.sensor.efficiency)
+    missed = draw.missed(clip)
+    if missed is not None:
+        from qsim.sensor.defects.event_simulation import TOLERANCE
+
+        draw = dataclasses.replace(draw, followed=missed if missed.largest > TOLERANCE else None)
+        meta["drawn_by"] = draw.law
+        meta["dead_time_effects"] = dataclasses.asdict(missed)
+        line += f"; {missed}: {'photon by photon' if draw.followed else 'below ' + str(TOLERANCE) + ', closed form'}"
+    kept = None if force else _kept(clip, sensing, draw, meta)
+    if kept is not None:
+        _tidy(clip)
+        return kept, line
+    with writing(clip.path / "streams", on_wait):
+        kept = None if force else _kept(clip, sensing, draw, meta)  # made by the process that was waited for
+        if kept is not None:
+            return kept, line
+        blocks = draw.packed(clip, meta["shape"][0], progress)
+        return _write(clip, sensing.stream_name, blocks, draw.sensor, meta), line
+
+
+def _kept(clip: Clip, sensing: Sensing, draw: Draw, meta: dict[str, Any]) -> Stream | None:
+    """The stream that is there as asked, or None; `FileExistsError` if another one has its name."""
+    json_path = clip.path / "streams" / f"{sensing.stream_name}.json"
+    try:
+        old = Stream.open(json_path)
+    except FileNotFoundError:
+        return None
+    if (
+        all(old.meta.get(key, value if key == "drawn_by" else None) == value for key, value in meta.items())
+        and old.meta.get("defects") == meta.get("defects")
+        and old.meta["sensor"] == draw.sensor.to_dict()
+    ):
+        return old
+    raise FileExistsError(f"{json_path}: exists with other settings; name this stream with --name, or use --force")
+
+
+def replay(clip: Clip, stream: Stream, frame: int) -> tuple[Array, Array]:
+    """One frame drawn again from the stream's json alone, and the stored one: both codes [H, W]."""
+    if not 0 <= frame < len(stream):
+        raise ValueError(f"{stream.path}: frame {frame} asked for, the stream has frames 0..{len(stream) - 1}")
+    return stored(stream).frames(clip, frame, frame + 1)[0], stream.codes(frame, frame + 1)[0]
+
+
+def write_stream(clip: Clip, name: str, codes_iter: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
+    """Store codes ([H, W] frames or [t, H, W] blocks, in order) as a stream of `clip`; the json comes last.
+
+    `meta` must hold shape (T, H, W), ppp_factor, exposure and frame_rate. `ValueError` if there are not T frames.
+    """
+    shape = tuple(meta["shape"][1:])
+
+    def packed() -> Iterator[Array]:
+        done = 0
+        for block in codes_iter:
+            block = block if block.ndim == 3 else block[None]
+            if block.shape[1:] != shape:
+                raise ValueError(f"{clip.path}, {name}: frame {done} is {block.shape[1:]}, expected {shape}")
+            yield packing.pack(block, sensor.bits)
+            done += len(block)
+
+    with writing(clip.path / "streams"):
+        return _write(clip, name, packed(), sensor, meta)
+
+
+def _write(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
+    """Store packed blocks as a stream of the clip; the caller holds the lock of its streams."""
+    path = clip.path / "streams" / f"{check_name(name)}.npy"
+    return write_packed(path, blocks, sensor, {"orientation": orientation(clip.meta)} | meta)
+
+
+def _tidy(clip: Clip) -> None:
+    """Delete the lock of a writer that was killed between writing its stream and deleting it."""
+    lock = locks.Lock(clip.path / "streams" / "lock")
+    with contextlib.suppress(OSError):  # a folder that may only be read
+        if lock.path.exists() and lock.acquire():
+            lock.delete()
