@@ -8,7 +8,6 @@ SENSOR_dark.npy     DCR map [1/s], float32 [H, W] (SPAD)
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -21,6 +20,7 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.calibration.frame_statistics import FrameStatistics, measure, measure_sums
 from qsim.calibration.results import Calibration
+from qsim.figures import figure_png, new_figure
 from qsim.files import load_array
 from qsim.formats import importing
 from qsim.formats.array_files import mat_array
@@ -146,9 +146,7 @@ def as_dict(found: Calibration) -> dict[str, Any]:
 
 def figure(found: Calibration) -> bytes:
     """Residuals of every stack's histogram in sigmas, as PNG; a good fit scatters between -2 and 2."""
-    from matplotlib.figure import Figure
-
-    drawing = Figure(figsize=(7, 3.2), dpi=120, layout="constrained")
+    drawing = new_figure(7, 3.2)
     axes = drawing.subplots()
     for i, residual in enumerate(found.residuals):
         axes.plot(np.flatnonzero(residual), residual[residual != 0], ".", markersize=3, label=f"stack {i}")
@@ -159,9 +157,7 @@ def figure(found: Calibration) -> bytes:
     axes.set_title(f"{found.model}: histograms against the fitted model, {p}", fontsize=10)
     if found.residuals:
         axes.legend(fontsize=7, ncols=3)
-    buffer = io.BytesIO()
-    drawing.savefig(buffer, format="png")
-    return buffer.getvalue()
+    return figure_png(drawing)
 
 
 def write(found: Calibration, path: Path, title: str) -> list[Path]:
