@@ -171,9 +171,8 @@ def _do(job: Job, folder: Path, make: Make) -> Result:
     files.write_json(record_path(folder, job.name), make_record(job, clip.path))
     failure_path(folder, job.name).unlink(missing_ok=True)
     seconds = (rendered - started, time.monotonic() - rendered)
-    peak = peak_memory()
     spent = f"clip {seconds[0]:.2f} s, streams {seconds[1]:.2f} s, "
-    spent += f"processor {time.process_time() - worked:.2f} s, peak {peak >> 20} MiB"
+    spent += f"processor {time.process_time() - worked:.2f} s, peak {peak_memory() >> 20} MiB"
     _log(folder, job.name, f"done on {platform.node()}, process {os.getpid()}: {spent}")
     return Result(job.name, "done")
 
