@@ -123,13 +123,13 @@ def add_plan(sub: Any) -> None:
 
 
 def _run_plan(args: argparse.Namespace) -> int:
-    from qsim.dataset import forecast, recipe
+    from qsim.dataset import cost_forecast, recipe
 
     if args.machines < 1:
         raise ValueError(f"--machines: expected at least 1, got {args.machines}")
     wanted = recipe.load(args.recipe)
     with bar("planning", "kind") as progress:
-        found = forecast.plan(wanted, frames=args.frames, progress=progress)
+        found = cost_forecast.forecast(wanted, frames=args.frames, progress=progress)
     facts = {"recipe": wanted.name, "machines": args.machines, "hours_each": found.hours / args.machines}
     output(args, facts | found.to_dict(), found.lines(args.machines))
     return 0

@@ -17,7 +17,6 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
-from qsim import process
 from qsim.clip.clip import Clip
 from qsim.clip.sensing import sense
 from qsim.dataset import job_runner
@@ -25,8 +24,10 @@ from qsim.dataset.job import Job
 from qsim.dataset.recipe import Recipe
 from qsim.dataset.worker_pool import Limits
 from qsim.files import Progress
+from qsim.process import peak_memory
 from qsim.rendering.budget import Budget
 from qsim.rendering.denoiser import DENOISE_COST
+from qsim.tables import text_table
 
 START = 3.0  # s, a fresh worker process with its renderer; measured on two cores, shared by Limits.jobs jobs
 LOOKED_AT = 5  # jobs of a kind whose budgets are chosen, at most
@@ -79,7 +80,7 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class Plan:
+class Forecast:
     """A forecast for this machine, one worker process."""
 
     costs: tuple[Cost, ...]
@@ -116,21 +117,25 @@ class Plan:
 
     def lines(self, machines: int) -> list[str]:
         """The forecast as text."""
-        head = (
-            f"{'family':12} {'size':>11} {'clips':>6} {'frames':>7} {'samples':>9} {'s/clip':>7} {'s/frame':>8} "
-            f"{'hours':>8} {'GB':>8}"
-        )
+        header = ("family", "size", "clips", "frames", "samples", "s/clip", "s/frame", "hours", "GB")
         rows = [
-            f"{c.family:12} {c.size[0]:>5} x{c.size[1]:>4} {c.clips:6} {c.frames:7} "
-            f"{'-'.join(str(n) for n in sorted(set(c.samples))):>9} {c.setup.wall:7.2f} "
-            f"{c.per_frame.wall + c.sensing.wall:8.3f} {c.hours:8.3f} {c.gigabytes:8.3f}"
-            for c in self.costs
+            (
+                cost.family,
+                f"{cost.size[0]} x {cost.size[1]}",
+                f"{cost.clips}",
+                f"{cost.frames}",
+                "-".join(str(n) for n in sorted(set(cost.samples))),
+                f"{cost.setup.wall:.2f}",
+                f"{cost.per_frame.wall + cost.sensing.wall:.3f}",
+                f"{cost.hours:.3f}",
+                f"{cost.gigabytes:.3f}",
+            )
+            for cost in self.costs
         ]
         day = max(1, math.ceil(self.hours / 24))
         faster = f", or one that is {self.hours / 24:.2g} times as fast" if day > 1 else ""
         return [
-            head,
-            *rows,
+            *text_table(rows, header),
             f"in all: {self.hours:.3g} hours on this machine ({self.engine}, one worker; "
             f"{self.processor_hours:.3g} hours of processor time), {self.gigabytes:.3g} GB, "
             f"{self.peak_memory:.2g} GiB of memory per worker",
@@ -145,7 +150,7 @@ def _machines(count: int) -> str:
     return f"{count} machine{'' if count == 1 else 's'}"
 
 
-def plan(recipe: Recipe, *, frames: int = 5, progress: Progress | None = None) -> Plan:
+def forecast(recipe: Recipe, *, frames: int = 5, progress: Progress | None = None) -> Forecast:
     """Measure one job of each kind with so many frames (at least 2: the first one compiles)."""
     from qsim import backend
 
@@ -157,17 +162,16 @@ def plan(recipe: Recipe, *, frames: int = 5, progress: Progress | None = None) -
     costs = []
     with tempfile.TemporaryDirectory(prefix="qsim-plan-") as folder:
         for n, members in enumerate(kinds.values(), 1):
-            costs.append(_measure(members, Path(folder) / f"kind{n}", frames))
+            costs.append(measure_kind(members, Path(folder) / f"kind{n}", frames))
             if progress is not None:
                 progress(n, len(kinds))
     chosen = backend.choose()
-    peak = process.peak_memory() / 2**30
-    return Plan(tuple(costs), f"{chosen.backend}, {chosen.variant}", peak)
+    return Forecast(tuple(costs), f"{chosen.backend}, {chosen.variant}", peak_memory() / 2**30)
 
 
-def _measure(members: list[Job], folder: Path, frames: int) -> Cost:
+def measure_kind(members: list[Job], folder: Path, frames: int) -> Cost:
     """Every job is met for the first time, as in a run: a scene has kernels of its own, which its pilot compiles."""
-    looked_at = _spread(members)
+    looked_at = evenly_spaced(members)
     budgets, choosing = zip(*map(_budget, looked_at), strict=True)
     work = [_work(budget) for budget in budgets]
     typical = Seconds(*map(median, zip(*choosing, strict=True)))  # the first of a process also imports
@@ -175,7 +179,7 @@ def _measure(members: list[Job], folder: Path, frames: int) -> Cost:
     job = looked_at[middle]
     settings = job.settings
     started = Seconds.now()
-    clip, moments = _first_frames(job, budgets[middle], folder, min(frames, settings.frames))
+    clip, moments = render_first_frames(job, budgets[middle], folder, min(frames, settings.frames))
     # The first frame carries scene and compilation; the others are what each further frame costs.
     first, more = moments[0].since(started), moments[-1].since(moments[0])
     if len(moments) > 1:
@@ -184,7 +188,7 @@ def _measure(members: list[Job], folder: Path, frames: int) -> Cost:
     else:
         per_frame, setup = first, typical
     dearer = sum(work) / len(work) / work[middle]
-    sensing, codes = _sense(job, clip)
+    sensing, codes = sense_streams(job, clip)
     stored = sum(file.stat().st_size for file in clip.path.rglob("*.exr")) / len(clip)
     return Cost(
         family=Path(job.family).stem,
@@ -199,7 +203,7 @@ def _measure(members: list[Job], folder: Path, frames: int) -> Cost:
     )
 
 
-def _spread(members: list[Job]) -> list[Job]:
+def evenly_spaced(members: list[Job]) -> list[Job]:
     """At most LOOKED_AT of them, evenly spaced, from the first to the last."""
     count = min(LOOKED_AT, len(members))
     return [members[round(i * (len(members) - 1) / max(1, count - 1))] for i in range(count)]
@@ -216,7 +220,7 @@ def _work(budget: Budget) -> float:
     return budget.samples + (DENOISE_COST if budget.denoise else 0.0)
 
 
-def _first_frames(job: Job, budget: Budget, path: Path, frames: int) -> tuple[Clip, list[Seconds]]:
+def render_first_frames(job: Job, budget: Budget, path: Path, frames: int) -> tuple[Clip, list[Seconds]]:
     """The first frames of a job's clip, and when each was done."""
     from qsim.rendering.clip_rendering import render_clip
 
@@ -235,7 +239,7 @@ def _first_frames(job: Job, budget: Budget, path: Path, frames: int) -> tuple[Cl
     return clip, moments
 
 
-def _sense(job: Job, clip: Clip) -> tuple[Seconds, float]:
+def sense_streams(job: Job, clip: Clip) -> tuple[Seconds, float]:
     """Seconds and bytes per frame of all streams together; the second drawing counts, the first one compiles."""
     wall = processor = size = 0.0
     for sensing in job.streams:

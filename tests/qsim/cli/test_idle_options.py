@@ -108,10 +108,10 @@ def test_a_recipe_knows_that_an_xml_scene_stands_still_and_is_one(place):
 
 
 def test_a_plan_for_programs_knows_its_machines(monkeypatch, place, capsys):
-    from qsim.dataset import forecast
+    from qsim.dataset import cost_forecast
 
-    found = forecast.Plan((), "llvm", 1.0)
-    monkeypatch.setattr(forecast, "plan", lambda *_, **__: found)
+    found = cost_forecast.Forecast((), "llvm", 1.0)
+    monkeypatch.setattr(cost_forecast, "forecast", lambda *_, **__: found)
     assert main(["plan", str(place / "t.toml"), "--machines", "4", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["machines"] == 4
 

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from qsim.cli.program import main
-from qsim.dataset import forecast as plan
-from qsim.dataset import recipe
-from qsim.dataset.forecast import START, Cost, Plan, Seconds
+from qsim.dataset import cost_forecast, job_runner, recipe
+from qsim.dataset.cost_forecast import START, Cost, Forecast, Seconds
 from qsim.dataset.worker_pool import Limits
 from qsim.rendering.budget import Budget
 
@@ -42,13 +41,13 @@ def test_the_arithmetic_of_a_forecast():
     assert cost.hours == pytest.approx(600 / 3600)
     assert cost.seconds.processor == pytest.approx(10 * 11 + 300 * (2.9 + 0.4))
     assert cost.gigabytes == pytest.approx(1.2)
-    whole = Plan((cost, cost), "llvm", 0.5)
+    whole = Forecast((cost, cost), "llvm", 0.5)
     assert whole.hours == pytest.approx((1200 + 20 * START / Limits().jobs) / 3600)
     assert whole.processor_hours == pytest.approx((2 * 1100 + 20 * START / Limits().jobs) / 3600)
     assert whole.gigabytes == pytest.approx(2.4)
     assert f"10 machines like this: {whole.hours / 10:.3g} hours each" in "\n".join(whole.lines(10))
     assert whole.lines(1)[-1].startswith("within a day: 1 machine like this; run this command on a machine with a GPU")
-    days = Plan((cost,) * 200, "cuda", 0.5)  # 33 hours and a little
+    days = Forecast((cost,) * 200, "cuda", 0.5)  # 33 hours and a little
     times = f"{days.hours / 24:.2g} times as fast"
     assert days.lines(1)[-1] == f"within a day: 2 machines like this, or one that is {times}"
     assert " 8-72 " in whole.lines(1)[1]
@@ -58,18 +57,18 @@ def test_the_arithmetic_of_a_forecast():
 
 def test_a_few_jobs_are_looked_at_from_first_to_last():
     wanted = recipe.parse(RECIPE.replace("[0, 1, 2]", str(list(range(42)))))
-    seeds = [job.scene_seed for job in plan._spread(list(wanted.jobs))]
+    seeds = [job.scene_seed for job in cost_forecast.evenly_spaced(list(wanted.jobs))]
     assert seeds == [0, 10, 20, 31, 41]
-    assert len(plan._spread(list(wanted.jobs)[:3])) == 3
-    assert plan._spread(list(wanted.jobs)[:1]) == list(wanted.jobs)[:1]
+    assert len(cost_forecast.evenly_spaced(list(wanted.jobs)[:3])) == 3
+    assert cost_forecast.evenly_spaced(list(wanted.jobs)[:1]) == list(wanted.jobs)[:1]
 
 
 def test_a_frame_costs_what_its_samples_cost(monkeypatch: pytest.MonkeyPatch):
     """Three budgets of 10, 20 and 90 samples: a frame costs twice that of the middle one, which is timed."""
     wanted = recipe.parse(RECIPE)
     samples = {0: 10, 1: 20, 2: 90}
-    monkeypatch.setattr(plan.job_runner, "load_scene", lambda job: job)
-    monkeypatch.setattr(plan.job_runner, "choose_budget", lambda job, scene: Budget(samples[job.scene_seed]))
+    monkeypatch.setattr(job_runner, "load_scene", lambda job: job)
+    monkeypatch.setattr(job_runner, "choose_budget", lambda job, scene: Budget(samples[job.scene_seed]))
     monkeypatch.setattr(Seconds, "now", staticmethod(lambda: Seconds(0.0, 0.0)))
     timed = []
 
@@ -78,9 +77,9 @@ def test_a_frame_costs_what_its_samples_cost(monkeypatch: pytest.MonkeyPatch):
         timed.append(job.scene_seed)
         return FakeClip(), [Seconds(2.0 + 3 * n, 1.0 + n) for n in range(frames)]
 
-    monkeypatch.setattr(plan, "_first_frames", first_frames)
-    monkeypatch.setattr(plan, "_sense", lambda job, clip: (Seconds(0.0, 0.0), 0.0))
-    cost = plan._measure(list(wanted.jobs), Path(), 4)
+    monkeypatch.setattr(cost_forecast, "render_first_frames", first_frames)
+    monkeypatch.setattr(cost_forecast, "sense_streams", lambda job, clip: (Seconds(0.0, 0.0), 0.0))
+    cost = cost_forecast.measure_kind(list(wanted.jobs), Path(), 4)
     assert timed[-1] == 1
     assert cost.samples == (10, 90)
     assert cost.per_frame == pytest.approx(Seconds(6.0, 2.0))
@@ -91,7 +90,7 @@ def test_a_clip_costs_the_choice_of_its_budget_as_well(monkeypatch: pytest.Monke
     """The first choice of a process takes ten times as long: it counts as one of three, not as what each takes."""
     clock = [0.0]
     monkeypatch.setattr(Seconds, "now", staticmethod(lambda: Seconds(clock[0], 2 * clock[0])))
-    monkeypatch.setattr(plan.job_runner, "load_scene", lambda job: job)
+    monkeypatch.setattr(job_runner, "load_scene", lambda job: job)
     took = {0: 50.0, 1: 5.0, 2: 4.0}
 
     def choose(job, scene):
@@ -101,10 +100,10 @@ def test_a_clip_costs_the_choice_of_its_budget_as_well(monkeypatch: pytest.Monke
     def first_frames(job, budget, path, frames):
         return FakeClip(), [Seconds(clock[0] + 3 + 2 * n, 2 * clock[0] + 6 + 4 * n) for n in range(frames)]
 
-    monkeypatch.setattr(plan.job_runner, "choose_budget", choose)
-    monkeypatch.setattr(plan, "_first_frames", first_frames)
-    monkeypatch.setattr(plan, "_sense", lambda job, clip: (Seconds(0.0, 0.0), 0.0))
-    cost = plan._measure(list(recipe.parse(RECIPE).jobs), Path(), 4)
+    monkeypatch.setattr(job_runner, "choose_budget", choose)
+    monkeypatch.setattr(cost_forecast, "render_first_frames", first_frames)
+    monkeypatch.setattr(cost_forecast, "sense_streams", lambda job, clip: (Seconds(0.0, 0.0), 0.0))
+    cost = cost_forecast.measure_kind(list(recipe.parse(RECIPE).jobs), Path(), 4)
     assert cost.setup == Seconds(5 + 3 - 2, 2 * (5 + 3 - 2))
 
 
