@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.figures import new_figure, write_figure
 from qsim.files import replacing
 from quiver.data.clips import Clip
 from quiver.evaluation import metrics
@@ -86,15 +87,12 @@ def save_crop(path: Path, picture: Array) -> None:
 
 def sheet(out: Path, light: str, clips: Sequence[str], methods: Sequence[str], target: Path) -> bool:
     """One row per clip, one column per method, as PNG; False if there is nothing to show. White = white, gamma 2.2."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     rows = [clip for clip in clips if crop_file(out, light, clip, "truth").exists()][:SCENES_SHOWN]
     if not rows:
         return False
     columns = ["truth", "codes", *methods]
-    canvas = FigureCanvasAgg(Figure(figsize=(1.5 * len(columns), 1.55 * len(rows) + 0.4), layout="constrained"))
-    grid = canvas.figure.subplots(len(rows), len(columns), squeeze=False)
+    drawing = new_figure(1.5 * len(columns), 1.55 * len(rows) + 0.4)
+    grid = drawing.subplots(len(rows), len(columns), squeeze=False)
     for clip, line in zip(rows, grid, strict=True):
         for column, axes in zip(columns, line, strict=True):
             axes.set_xticks([])
@@ -106,6 +104,5 @@ def sheet(out: Path, light: str, clips: Sequence[str], methods: Sequence[str], t
             if clip == rows[0]:
                 axes.set_title(column, fontsize=8)
         line[0].set_ylabel(clip, fontsize=7)
-    with replacing(target) as file:
-        canvas.figure.savefig(file, format="png", dpi=110)
+    write_figure(drawing, target)
     return True

@@ -34,7 +34,7 @@ FORMAT = "quiver-evaluation-2"  # 1: peak = the sensor's white, factor of the le
 PLAN_FORMAT = "quiver-plan-2"
 PUBLISHED_EDGE = 5  # frames at each end that the published evaluation leaves out
 
-Progress = Callable[[str, int, int], None]  # (what is restored, rows done, rows in all)
+ComparisonProgress = Callable[[str, int, int], None]  # (what is restored, rows done, rows in all)
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,10 @@ def keep_crops(
 
 
 def evaluate(
-    comparison: Comparison, methods: Sequence[Restorer], out: Path | None = None, progress: Progress | None = None
+    comparison: Comparison,
+    methods: Sequence[Restorer],
+    out: Path | None = None,
+    progress: ComparisonProgress | None = None,
 ) -> list[ComparisonRow]:
     """Every method on every clip at every light level; rows are kept in OUT/rows.jsonl and taken from there.
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,11 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.checks import suggest
-from qsim.files import replacing
+from qsim.figures import new_figure, write_figure
+from qsim.files import Progress
 from qsim.keys import Key
 from qsim.process import peak_memory, reset_peak
+from qsim.tables import markdown_table
 from quiver.baselines import METHODS
 from quiver.data.clips import peak_of
 from quiver.data.code_table import draw_codes
@@ -155,9 +157,7 @@ def multiply_accumulates(method: Restorer, codes: Codes, first: int) -> float:
     return counts[1] - counts[0]
 
 
-def bench(
-    cases: Sequence[CostCase], settings: CostSettings, progress: Callable[[int, int], None] | None = None
-) -> list[CostRow]:
+def bench(cases: Sequence[CostCase], settings: CostSettings, progress: Progress | None = None) -> list[CostRow]:
     """Every case in a fresh process; a case that dies keeps its row, with the reason."""
     costs = []
     for i, case in enumerate(cases):
@@ -233,27 +233,24 @@ def markdown(costs: Sequence[CostRow], settings: CostSettings) -> str:
     text = [
         f"# Cost of a restored frame: {settings.height} x {settings.width}, {settings.ppp:g} PPP, {settings.device}",
         "",
-        "| method | mode | precision | s/frame | peak memory | GMAC/frame | PSNR matched |",
-        "|---|---|---|---|---|---|---|",
     ]
+    table = []
     for c in costs:
-        row = f"| {c.method} | {c.mode} | {c.precision} | "
+        case = [c.method, c.mode, c.precision]
         if c.failure is not None:
-            text.append(row + f"failed: {c.failure} | | | |")
+            table.append([*case, f"failed: {c.failure}", "", "", ""])
             continue
         gmac = "-" if math.isnan(c.gmac_per_frame) else f"{c.gmac_per_frame:.3g}"
         psnr = "untrained" if math.isnan(c.psnr_matched) else f"{c.psnr_matched:.2f} dB"
-        text.append(row + f"{c.seconds_per_frame:.3g} | {c.peak_bytes / 1e6:.0f} MB | {gmac} | {psnr} |")
-    return "\n".join(text) + "\n"
+        table.append([*case, f"{c.seconds_per_frame:.3g}", f"{c.peak_bytes / 1e6:.0f} MB", gmac, psnr])
+    header = ("method", "mode", "precision", "s/frame", "peak memory", "GMAC/frame", "PSNR matched")
+    return "\n".join([*text, *markdown_table(table, header)]) + "\n"
 
 
 def figure(costs: Sequence[CostRow], path: Path) -> None:
     """PSNR against seconds per frame, as PNG; untrained networks are left out."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    canvas = FigureCanvasAgg(Figure(figsize=(6, 4), layout="constrained"))
-    axes = canvas.figure.subplots()
+    drawing = new_figure(6, 4)
+    axes = drawing.subplots()
     for c in costs:
         if c.failure is None and not math.isnan(c.psnr_matched):
             axes.plot(c.seconds_per_frame, c.psnr_matched, "o", label=f"{c.method}, {c.mode}, {c.precision}")
@@ -262,5 +259,4 @@ def figure(costs: Sequence[CostRow], path: Path) -> None:
         axes.legend(fontsize=7)
     axes.set_xlabel("seconds per frame")
     axes.set_ylabel("PSNR after the best factor [dB]")
-    with replacing(path) as file:
-        canvas.figure.savefig(file, format="png", dpi=120)
+    write_figure(drawing, path)

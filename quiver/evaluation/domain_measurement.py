@@ -11,13 +11,13 @@ import contextlib
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from qsim.files import VERSION
+from qsim.files import VERSION, Progress
 from qsim.locks import Lock
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import sensed
@@ -31,8 +31,6 @@ from quiver.restoration.networks import network_restorer
 from quiver.restoration.restorers import restorers
 
 CLASSICAL = ("naive", "moment:3", "transform-denoise", "qbp", "qbp-bm3d")
-
-Progress = Callable[[int, int], None]  # (cells done, cells in all)
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass, fields
-from math import inf, isfinite, log10, nan, pi, sqrt
+from math import inf, isfinite, nan, pi, sqrt
 
 import numpy as np
 
+from qsim import colour
+
 SSIM_WINDOW = 7  # px; uniform window and sample covariance are the defaults of the field (spec 5.3)
-SSIM_K1, SSIM_K2 = 0.01, 0.03
 FACTORS = (0.01, 100.0)  # between these the best factor is looked for
 ABOVE_PEAK = 0.05  # share of target pixels above the peak from which a score is doubtful
 NEAR_TRUTH = 3.0  # dB; a score so close to the truth's own error says little about the method
@@ -64,7 +65,7 @@ def _pair(output: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def decibel(mse: float) -> float:
     """PSNR [dB] of a mean squared error at peak 1; infinite for 0."""
-    return inf if mse <= 0 else -10 * log10(mse)
+    return colour.psnr(1.0, sqrt(max(mse, 0.0)))
 
 
 def above_peak(target: np.ndarray, valid: np.ndarray | None = None) -> float:
@@ -170,15 +171,6 @@ def _least(values: np.ndarray, goal: np.ndarray) -> float:
     return best
 
 
-def _box(image: np.ndarray, size: int) -> np.ndarray:
-    """Mean over every size x size window that lies inside, [..., H - size + 1, W - size + 1], by running sums."""
-    for axis in (-1, -2):
-        image = np.moveaxis(image, axis, -1)
-        sums = np.cumsum(np.concatenate([np.zeros((*image.shape[:-1], 1)), image], axis=-1), axis=-1)
-        image = np.moveaxis((sums[..., size:] - sums[..., :-size]) / size, -1, axis)
-    return image
-
-
 def ssim(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
     """Structural similarity of every frame, [T]: 7 x 7 uniform window, sample covariance, data range 1, clamped inputs.
 
@@ -194,20 +186,18 @@ def ssim(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None = None
     )
 
 
-def _ssim_frame(a: np.ndarray, b: np.ndarray, keep: np.ndarray | None = None) -> float:
-    pixels = SSIM_WINDOW**2
-    sample = pixels / (pixels - 1)
-    mean_a, mean_b = _box(a, SSIM_WINDOW), _box(b, SSIM_WINDOW)
-    var_a = sample * (_box(a * a, SSIM_WINDOW) - mean_a**2)
-    var_b = sample * (_box(b * b, SSIM_WINDOW) - mean_b**2)
-    covariance = sample * (_box(a * b, SSIM_WINDOW) - mean_a * mean_b)
-    c1, c2 = SSIM_K1**2, SSIM_K2**2
-    luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
-    structure = (2 * covariance + c2) / (var_a + var_b + c2)
-    index = luminance * structure
-    if keep is not None:
-        index = index[_box(keep.astype(float), SSIM_WINDOW) > 1 - 0.5 / pixels]
-    return float(np.mean(index)) if index.size else nan
+def _ssim_frame(output: np.ndarray, target: np.ndarray, keep: np.ndarray | None) -> float:
+    """Return the SSIM of one frame [H, W]; with `keep` bool [H, W], the mean over windows of kept pixels alone."""
+    from scipy.ndimage import minimum_filter
+    from skimage.metrics import structural_similarity
+
+    if keep is None:
+        return float(structural_similarity(output, target, win_size=SSIM_WINDOW, data_range=1.0))
+    index = structural_similarity(output, target, win_size=SSIM_WINDOW, data_range=1.0, full=True)[1]
+    edge = SSIM_WINDOW // 2
+    inner = (slice(edge, -edge), slice(edge, -edge))
+    kept = index[inner][minimum_filter(keep, SSIM_WINDOW)[inner]]
+    return float(kept.mean()) if kept.size else nan
 
 
 def score(
@@ -318,4 +308,4 @@ def truth_psnr(errors: Sequence[float]) -> float:
     for rms in errors:
         if not isfinite(rms) or rms < 0:
             raise ValueError(f"truth_psnr: an rms error must be a finite number >= 0, got {rms!r}")
-    return _mean(np.array([decibel(rms**2) for rms in errors]))
+    return _mean(np.array([colour.psnr(1.0, rms) for rms in errors]))

@@ -17,6 +17,7 @@ from math import nan
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.tables import markdown_table
 from quiver.data.clips import peak_of
 from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import ideal_counter
@@ -143,14 +144,14 @@ def markdown(counts: Counts, scores: Sequence[StaticScore], frames: int, bits: i
         "over random splits. n/a: no error is left beside the reference's noise.",
         *([] if not above > metrics.ABOVE_PEAK else ["", metrics.doubtful("the reference", above)]),
         "",
-        "| method | PSNR | PSNR matched | matched, as measured | factor |",
-        "|---|---|---|---|---|",
     ]
+    table = []
     for s in scores:
         if s.failure is not None:
-            text.append(f"| {s.method} | failed: {s.failure} | | | |")
+            table.append([s.method, f"failed: {s.failure}", "", "", ""])
             continue
         matched = f"{s.psnr_matched:.2f} ± {s.psnr_matched_spread:.2f}"
         cells = [f"{s.psnr:.2f}", matched, f"{s.psnr_as_measured:.2f}", f"{s.scale:.3f}"]
-        text.append(f"| {s.method} | " + " | ".join("n/a" if cell.startswith("nan") else cell for cell in cells) + " |")
-    return "\n".join(text) + "\n"
+        table.append([s.method, *("n/a" if cell.startswith("nan") else cell for cell in cells)])
+    header = ("method", "PSNR", "PSNR matched", "matched, as measured", "factor")
+    return "\n".join([*text, *markdown_table(table, header)]) + "\n"

@@ -8,7 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from qsim.files import replacing, write_bytes, write_json
+from qsim.figures import new_figure, write_figure
+from qsim.files import write_bytes, write_json
+from qsim.tables import markdown_table
 from quiver import threads
 from quiver.evaluation import breakdown, metrics
 from quiver.evaluation.comparison import FORMAT, Comparison, ComparisonRow, json_safe
@@ -136,11 +138,9 @@ def markdown(
         + " that is best behind this clamp; by frames = its mean over all frames of all clips alike; above peak = "
         "share of the truth's pixels; n/a = the clamp hides the whole error, or no window of SSIM fits.",
         "",
-        "| " + " | ".join(COLUMNS) + " |",
-        "|---" * len(COLUMNS) + "|",
     ]
     lines = summarise(rows)
-    text += [_table_row(line, by_name[line.method]) for line in lines]
+    text += markdown_table([_cells(line, by_name[line.method]) for line in lines], COLUMNS)
     text += ["", *_caveats(lines, rows), *[f"{remark}\n" for remark in remarks]]
     text += [MEMORY, "", f"The paper also compares with {', '.join(PAPER_METHODS)}: not built yet.", ""]
     failures = [f"- {line.method}, {line.light}, {reason}" for line in lines for reason in line.failures]
@@ -155,7 +155,7 @@ def peak_name(comparison: Comparison) -> str:
     return "the sensor's white, as published" if comparison.published else "2.5 x the stream's mean light"
 
 
-def _table_row(line: SummaryLine, method: Restorer) -> str:
+def _cells(line: SummaryLine, method: Restorer) -> list[str]:
     cells = [line.method, f"{method.window} ({method.look_ahead})", line.light]
     if line.failures and line.scores["psnr"].scenes == 0:
         cells += [f"failed: {line.failures[0]}", *[""] * 9]
@@ -169,7 +169,7 @@ def _table_row(line: SummaryLine, method: Restorer) -> str:
         cells += ["-" if line.peak_bytes is None else f"{line.peak_bytes / 1e6:.0f} MB"]
         cells += [f"{100 * line.above_peak:.1f} %"]
         cells += ["not measured" if line.truth_psnr is None else f"{line.truth_psnr:.1f}"]
-    return "| " + " | ".join(cells) + " |"
+    return cells
 
 
 def _caveats(lines: Sequence[SummaryLine], rows: Sequence[ComparisonRow]) -> list[str]:
@@ -198,26 +198,24 @@ def _by_motion(lines: Sequence[SummaryLine]) -> list[str]:
     if not moving:
         return []
     text = ["## By motion: matched PSNR in dB of all pixels that move so many px/frame", ""]
-    text += ["| method | light | " + " | ".join(breakdown.bin_names()) + " |"]
-    text += ["|---" * (len(breakdown.EDGES) + 1) + "|"]
-    for line in moving:
-        cells = ["-" if math.isnan(psnr) else f"{psnr:.2f}" for psnr in line.psnr_by_motion]
-        text.append(f"| {line.method} | {line.light} | " + " | ".join(cells) + " |")
-    return [*text, ""]
+    cells = [
+        [line.method, line.light, *("-" if math.isnan(psnr) else f"{psnr:.2f}" for psnr in line.psnr_by_motion)]
+        for line in moving
+    ]
+    return [*text, *markdown_table(cells, ["method", "light", *breakdown.bin_names()]), ""]
 
 
 def _per_scene(rows: Sequence[ComparisonRow]) -> list[str]:
     methods = list(dict.fromkeys(row.method for row in rows))
-    text = ["## Per scene: matched PSNR in dB", "", "| scene | light | " + " | ".join(methods) + " |"]
-    text.append("|---" * (len(methods) + 2) + "|")
+    table = []
     for scene, light in dict.fromkeys((row.scene, row.light) for row in rows):
         cells = []
         for method in methods:
             chosen = [row for row in rows if (row.scene, row.light, row.method) == (scene, light, method)]
             found = [row.score.psnr_matched for row in chosen if row.score is not None]
             cells.append(_number(mean(found), 2) + (" †" if any(near_truth(row) for row in chosen) else ""))
-        text.append(f"| {scene} | {light} | " + " | ".join(cells) + " |")
-    return text
+        table.append([scene, light, *cells])
+    return ["## Per scene: matched PSNR in dB", "", *markdown_table(table, ["scene", "light", *methods])]
 
 
 def as_dict(
@@ -245,28 +243,22 @@ def as_dict(
 
 def figure(rows: Sequence[ComparisonRow], path: Path) -> None:
     """Matched PSNR of each method with its interval, one group of bars per light level, as PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     lines = [line for line in summarise(rows) if line.scores["psnr"].scenes]
     lights, methods = list(dict.fromkeys(x.light for x in lines)), list(dict.fromkeys(x.method for x in lines))
-    canvas = FigureCanvasAgg(
-        Figure(figsize=(4 + 1.2 * max(3, len(lights) * len(methods) / 2), 4), layout="constrained")
-    )
-    axes = canvas.figure.subplots()
+    drawing = new_figure(4 + 1.2 * max(3, len(lights) * len(methods) / 2), 4)
+    axes = drawing.subplots()
     width = 0.8 / max(1, len(methods))
     for i, method in enumerate(methods):
         own = {line.light: line.scores["psnr_matched"] for line in lines if line.method == method}
         places = [lights.index(light) + (i - (len(methods) - 1) / 2) * width for light in own]
         error = [x.half_width for x in own.values()]  # NaN, of one scene, draws none
-        look = {"color": f"C{i % 10}", "hatch": ("", "///", "...")[i // 10 % 3], "edgecolor": "white"}
+        look: dict[str, Any] = {"color": f"C{i % 10}", "hatch": ("", "///", "...")[i // 10 % 3], "edgecolor": "white"}
         axes.bar(places, [x.mean for x in own.values()], width, yerr=error, capsize=3, label=method, **look)
     axes.set_xticks(range(len(lights)), lights)
     axes.set_ylabel("PSNR after the best factor [dB]")
     if methods:
-        canvas.figure.legend(fontsize="small", loc="outside right upper")
-    with replacing(path) as file:
-        canvas.figure.savefig(file, format="png", dpi=120)
+        drawing.legend(fontsize="small", loc="outside right upper")
+    write_figure(drawing, path)
 
 
 def write(

@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from qsim.tables import markdown_table
 from quiver.data.codes import Sensor
 from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise
@@ -179,12 +180,12 @@ def place_of(sensor: Sensor, exposure: float, ppp: float) -> OperatingPoint:
 
 def table(domain: Domain) -> list[str]:
     """The cells as a Markdown table, the winner of each in bold."""
-    text = ["| sensor | bits | PPP | network | best classical method |", "|---|---|---|---|---|"]
+    rows = []
     for cell in domain.cells:
         ours, theirs = f"{cell.network:.2f}", f"{cell.classical_psnr:.2f}"
         ours, theirs = (f"**{ours}**", theirs) if cell.wins else (ours, f"**{theirs}**")
-        text.append(f"| {cell.sensor} | {cell.place.bits} | {cell.ppp:g} | {ours} | {cell.classical} {theirs} |")
-    return text
+        rows.append((cell.sensor, str(cell.place.bits), f"{cell.ppp:g}", ours, f"{cell.classical} {theirs}"))
+    return markdown_table(rows, ("sensor", "bits", "PPP", "network", "best classical method"))
 
 
 def merged(old: Iterable[Cell], new: Iterable[Cell]) -> tuple[Cell, ...]:

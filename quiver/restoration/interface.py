@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.files import Progress
 from quiver.data.codes import Codes
 from quiver.restoration.domain import Scope
 
@@ -15,7 +16,6 @@ DEFAULT_METHOD = "nano"  # of `quiver restore` and `quiver.restore`
 DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory beside the weights
 MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/model/schedules.py
 
-Progress = Callable[[int, int], None]  # (steps done, steps in all)
 RestoreInto = Callable[
     [Codes, Array, int, Progress | None], None
 ]  # adds photons of frames `first` ... to zeros [t, H, W]

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.files import Progress
 from quiver.baselines.sliding_window import reflect
 from quiver.data.codes import Codes
-from quiver.restoration.interface import Progress, RestoreOptions, Restorer
+from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.pieces import Disagreement, cut_pieces
 
 if TYPE_CHECKING:

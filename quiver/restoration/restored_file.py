@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.files import VERSION, read_json, sealed, sha256, sync_folder, write_json
+from qsim.files import VERSION, Progress, read_json, sealed, sha256, sync_folder, write_json
 from qsim.locks import Lock
 from quiver.data.codes import Codes
-from quiver.restoration.interface import Progress, Restorer
+from quiver.restoration.interface import Restorer
 
 FORMAT = "quiver-restored-1"
 BLOCK_FRAMES = 256  # restored between two notes of how far a file has come

@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING
 from numpy import ndarray as Array
 
 from qsim.checks import suggest
+from qsim.files import Progress
 from quiver.baselines import METHODS
 from quiver.baselines.sliding_window import look_ahead
 from quiver.data.codes import Codes
-from quiver.restoration.interface import Progress, RestoreOptions, Restorer
+from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 
 if TYPE_CHECKING:

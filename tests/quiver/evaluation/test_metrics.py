@@ -25,13 +25,46 @@ def test_psnr_of_a_constant_error_is_worked_by_hand():
     assert np.all(np.isinf(metrics.psnr(target, target)))
 
 
-def test_ssim_equals_scikit_image():
-    structural_similarity = pytest.importorskip("skimage.metrics").structural_similarity
-    for height, width in ((7, 7), (10, 13), (33, 8)):
-        target = pattern(2, height, width)
-        output = np.clip(target + np.random.default_rng(1).normal(0, 0.1, target.shape), 0, 1)
-        expected = [structural_similarity(a, b, data_range=1.0) for a, b in zip(output, target, strict=True)]
-        np.testing.assert_allclose(metrics.ssim(output, target), expected, atol=1e-10)
+def noisy_pair(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """A target [2, H, W] and the same with noise of 0.1 of the peak."""
+    target = pattern(2, height, width)
+    return np.clip(target + np.random.default_rng(1).normal(0, 0.1, target.shape), 0, 1), target
+
+
+def ssim_by_definition(a: np.ndarray, b: np.ndarray, keep: np.ndarray) -> float:
+    """Wang et al. 2004, window by window, with sample covariances; the mean over windows of kept pixels alone."""
+    found = []
+    for y, x in np.ndindex(a.shape[0] - 6, a.shape[1] - 6):
+        window = (slice(y, y + 7), slice(x, x + 7))
+        if keep[window].all():
+            (var_a, both), (_, var_b) = np.cov(a[window].ravel(), b[window].ravel())
+            mean_a, mean_b = a[window].mean(), b[window].mean()
+            light = (2 * mean_a * mean_b + 1e-4) / (mean_a**2 + mean_b**2 + 1e-4)
+            found.append(light * (2 * both + 9e-4) / (var_a + var_b + 9e-4))
+    return float(np.mean(found)) if found else math.nan
+
+
+@pytest.mark.parametrize(("height", "width"), [(7, 7), (10, 13), (33, 8)])
+def test_ssim_is_that_of_its_definition(height: int, width: int):
+    """Of complete frames, and of frames in which some pixels are not valid."""
+    output, target = noisy_pair(height, width)
+    valid = np.ones(target.shape, bool)
+    for keep in (valid, valid & (np.arange(width) > 0)):
+        expected = [ssim_by_definition(*three) for three in zip(output, target, keep, strict=True)]
+        np.testing.assert_allclose(metrics.ssim(output, target, keep), expected, rtol=1e-11)
+    np.testing.assert_allclose(metrics.ssim(output, target, valid), metrics.ssim(output, target), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "before"),
+    [
+        (7, 7, (0.9083027496771398, 0.9297019169509092)),
+        (10, 13, (0.9030129395396174, 0.8872972953457845)),
+        (33, 8, (0.8975030346701526, 0.8915015011201638)),
+    ],
+)
+def test_ssim_is_what_it_was_before_scikit_image_computed_it(height: int, width: int, before: tuple[float, float]):
+    np.testing.assert_allclose(metrics.ssim(*noisy_pair(height, width)), before, rtol=1e-12)
 
 
 def test_ssim_of_itself_is_one_and_of_tiny_frames_unknown():
