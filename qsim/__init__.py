@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from qsim.rendering.fidelity import choose as choose_budget
     from qsim.rendering.mitsuba_xml import read_mitsuba
     from qsim.rendering.renderer import Renderer
-    from qsim.scene.scene import Scene
+    from qsim.scene import Scene
     from qsim.sensor.counting import CountingSPAD
     from qsim.sensor.devices import load as load_sensor
     from qsim.sensor.packing import pack, unpack

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from qsim.checks import suggest
-from qsim.scene.scene import Scene
+from qsim.scene import Scene
 from scenes import (
     crowd,
     drums,

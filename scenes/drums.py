@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene import textures
-from qsim.scene.motion import Oscillation, Spin, Still
+from qsim.scene import Body, Diffuse, Oscillation, Scene, Spin, Still, Texture, textures
 from qsim.scene.rotation import vector
-from qsim.scene.scene import Body, Diffuse, Scene, Texture
 from qsim.scene.shapes import ball, cylinder
 from qsim.scene.textures import Picture
 from scenes import stage

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene.motion import Spin, Still
+from qsim.scene import Body, Conductor, Constant, Diffuse, Mesh, RoughPlastic, Scene, Spin, Still, Texture
 from qsim.scene.props import rotor
 from qsim.scene.rotation import exponential, pose_matrix
-from qsim.scene.scene import Body, Conductor, Constant, Diffuse, Mesh, RoughPlastic, Scene, Texture
 from qsim.scene.shapes import ball, cylinder, merged, moved, wire
 from scenes import stage
 from scenes.stage import any_angle, between, sign

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene import textures
-from qsim.scene.motion import Spin, Translation
+from qsim.scene import Body, Diffuse, Mesh, Scene, Spin, Texture, Translation, textures
 from qsim.scene.rotation import exponential, pose_matrix, vector
-from qsim.scene.scene import Body, Diffuse, Mesh, Scene, Texture
 from qsim.scene.shapes import blob, box, merged, moved
 from scenes import stage
 from scenes.stage import any_angle, between, sign

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene.deformation import Flag, Ripple
-from qsim.scene.motion import Motion, Oscillation, Still
+from qsim.scene import Body, Conductor, Diffuse, Flag, Motion, Oscillation, Ripple, Scene, Still, Texture
 from qsim.scene.rotation import pose_matrix
-from qsim.scene.scene import Body, Conductor, Diffuse, Scene, Texture
 from qsim.scene.shapes import cylinder, moved, sheet
 from scenes import stage
 from scenes.stage import any_angle, between, sign

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene import textures
-from qsim.scene.motion import Spin, Still
+from qsim.scene import Body, Conductor, Diffuse, Material, RoughPlastic, Scene, Spin, Still, Texture, textures
 from qsim.scene.props import gear
 from qsim.scene.rotation import exponential, pose_matrix
-from qsim.scene.scene import Body, Conductor, Diffuse, Material, RoughPlastic, Scene, Texture
 from qsim.scene.shapes import cylinder, moved
 from scenes import stage
 from scenes.stage import between, sign

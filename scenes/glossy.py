@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene.motion import Spin, Translation
+from qsim.scene import Body, Conductor, Material, Mesh, RoughPlastic, Scene, Spin, Texture, Translation
 from qsim.scene.props import gear
 from qsim.scene.rotation import exponential, pose_matrix
-from qsim.scene.scene import Body, Conductor, Material, Mesh, RoughPlastic, Scene, Texture
 from qsim.scene.shapes import ball, blob, box, cylinder, moved, polyhedron, torus
 from scenes import stage
 from scenes.stage import any_angle, between, pick, sign

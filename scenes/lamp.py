@@ -4,9 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene.motion import Motion, Pendulum, Spin, Still, Translation
+from qsim.scene import (
+    AreaLamp,
+    Body,
+    Conductor,
+    Constant,
+    Diffuse,
+    Material,
+    Motion,
+    Pendulum,
+    RoughPlastic,
+    Scene,
+    Spin,
+    Still,
+    Texture,
+    Translation,
+)
 from qsim.scene.rotation import vector
-from qsim.scene.scene import AreaLamp, Body, Conductor, Constant, Diffuse, Material, RoughPlastic, Scene, Texture
 from scenes import stage, tumble
 from scenes.stage import any_angle, between, sign
 

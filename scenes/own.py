@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from qsim.scene.scene import Body, Diffuse, EnvironmentImage, Light, Material, Mesh, RoughPlastic, Scene, Texture
+from qsim.scene import Body, Diffuse, EnvironmentImage, Light, Material, Mesh, RoughPlastic, Scene, Texture
 from qsim.scene.shapes import MESH_SUFFIXES, mesh_file
 from qsim.scene.textures import PICTURE_SUFFIXES
 from scenes import stage, tumble

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene.motion import Ballistic
+from qsim.scene import Ballistic, Body, Conductor, Diffuse, Material, RoughPlastic, Scene
 from qsim.scene.rotation import vector
-from qsim.scene.scene import Body, Conductor, Diffuse, Material, RoughPlastic, Scene
 from qsim.scene.shapes import ball, polyhedron
 from scenes import stage
 from scenes.stage import any_angle, between, pick

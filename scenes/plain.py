@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene.motion import Spin, Translation
+from qsim.scene import Body, Constant, Diffuse, Mesh, RoughPlastic, Scene, Spin, Translation
 from qsim.scene.rotation import vector
-from qsim.scene.scene import Body, Constant, Diffuse, Mesh, RoughPlastic, Scene
 from qsim.scene.shapes import ball, blob, box, cylinder, polyhedron, torus
 from scenes import stage
 from scenes.stage import any_angle, between, pick, sign

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene.motion import Motion, Shake, Spin, Translation, Wave
+from qsim.scene import Body, Constant, Diffuse, Motion, Scene, Shake, Spin, Texture, Translation, Wave
 from qsim.scene.rotation import exponential, pose_matrix, vector
-from qsim.scene.scene import Body, Constant, Diffuse, Scene, Texture
 from qsim.scene.shapes import ball, box, cylinder, moved, sheet
 from scenes import stage
 from scenes.stage import any_angle, between, pick, sign

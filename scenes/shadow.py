@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene.motion import Motion, Oscillation, Spin, Still, Translation
+from qsim.scene import Body, Diffuse, Mesh, Motion, Oscillation, Scene, Spin, Still, SunSky, Translation
 from qsim.scene.props import rotor
 from qsim.scene.rotation import pose_matrix, rotation_between, vector
-from qsim.scene.scene import Body, Diffuse, Mesh, Scene, SunSky
 from qsim.scene.shapes import blob, box, merged, moved, polyhedron
 from scenes import stage
 from scenes.stage import any_angle, between, pick, sign

@@ -9,10 +9,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from qsim.optics.camera import Camera
-from qsim.scene import textures
-from qsim.scene.motion import Motion
+from qsim.scene import (
+    AreaLamp,
+    Body,
+    Diffuse,
+    EnvironmentImage,
+    Material,
+    Motion,
+    RoughPlastic,
+    SunSky,
+    Texture,
+    textures,
+)
 from qsim.scene.rotation import UP, exponential, pose_matrix, unit, vector
-from qsim.scene.scene import AreaLamp, Body, Diffuse, EnvironmentImage, Material, RoughPlastic, SunSky, Texture
 from qsim.scene.shapes import moved, sheet
 from qsim.scene.textures import Picture
 

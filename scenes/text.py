@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene import textures
-from qsim.scene.motion import Motion, Oscillation, Pendulum, Still, Translation
+from qsim.scene import (
+    Body,
+    Diffuse,
+    Motion,
+    Oscillation,
+    Pendulum,
+    RoughPlastic,
+    Scene,
+    Still,
+    Texture,
+    Translation,
+    textures,
+)
 from qsim.scene.props import letters
 from qsim.scene.rotation import pose_matrix, vector
-from qsim.scene.scene import Body, Diffuse, RoughPlastic, Scene, Texture
 from qsim.scene.shapes import box, moved, sheet
 from scenes import stage
 from scenes.stage import any_angle, between, pick

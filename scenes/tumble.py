@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene.motion import Ballistic
+from qsim.scene import Ballistic, Body, Diffuse, Mesh, Scene
 from qsim.scene.props import gear
 from qsim.scene.rotation import vector
-from qsim.scene.scene import Body, Diffuse, Mesh, Scene
 from qsim.scene.shapes import ball, blob, box, cylinder, polyhedron, torus
 from scenes import stage
 from scenes.stage import any_angle, between, pick

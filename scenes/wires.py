@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene.motion import Motion, Oscillation, Spin, Still
+from qsim.scene import Body, Conductor, Diffuse, Material, Mesh, Motion, Oscillation, RoughPlastic, Scene, Spin, Still
 from qsim.scene.props import spring
 from qsim.scene.rotation import exponential, pose_matrix, vector
-from qsim.scene.scene import Body, Conductor, Diffuse, Material, Mesh, RoughPlastic, Scene
 from qsim.scene.shapes import merged, moved, torus, wire
 from scenes import stage
 from scenes.stage import any_angle, between, pick, sign

@@ -30,7 +30,7 @@ from qsim.process import peak_memory
 
 if TYPE_CHECKING:
     from qsim.rendering.budget import Budget
-    from qsim.scene.scene import Scene
+    from qsim.scene import Scene
 
 Make = Callable[[Job, Path], object]  # renders a job's clip to a path; tests hand in a quick one
 

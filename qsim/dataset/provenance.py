@@ -56,7 +56,7 @@ def assets(described: Any) -> list[str]:
 
 def photographs(scene: Any) -> list[str]:
     """`photograph NAME` for every photograph of textures.py in a scene: in whatever range, it is the same."""
-    from qsim.scene.scene import Texture
+    from qsim.scene import Texture
     from qsim.scene.textures import photograph_in
 
     pictures = [item.pixels() for item in nested(scene) if isinstance(item, Texture)]

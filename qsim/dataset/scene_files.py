@@ -30,7 +30,7 @@ import scenes
 from qsim import backend, files
 from qsim.dataset.provenance import nested
 from qsim.rendering import engine
-from qsim.scene.scene import Scene
+from qsim.scene import Scene
 
 _INSTALLED = [sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")]
 _LEFT_OUT = tuple(

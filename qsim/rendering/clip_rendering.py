@@ -10,7 +10,7 @@ from typing import Any
 from qsim.clip.clip import PHYSICAL, Clip, ClipWriter
 from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Crop, Renderer
-from qsim.scene.scene import Scene, describe
+from qsim.scene import Scene, describe
 
 
 def render_clip(

@@ -25,7 +25,7 @@ from qsim.optics.camera import Camera
 from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.rendering.budget import Allowed, Budget, Finding, blur_error, grid_samples
 from qsim.rendering.pilot import COUNTS, Pilot, denoised_samples, rests
-from qsim.scene.scene import Scene
+from qsim.scene import Scene
 
 SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
 SENSOR_SHARE = 0.01  # of the shot variance that Monte-Carlo noise may add

@@ -19,7 +19,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.rendering.ray_casting import Hits
-from qsim.scene.scene import Body, Scene
+from qsim.scene import Body, Scene
 
 SPEED_STEPS = 64  # of an exposure, over one of which a speed is measured: up to 32 turns are told from rest
 SPEED_PARTS = (-0.5, -0.27, 0.0, 0.23, 0.5)  # where in the exposure; uneven, so that no oscillation rests at all

@@ -8,7 +8,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.rendering.engine import errors_only
-from qsim.scene.scene import Mesh
+from qsim.scene import Mesh
 
 # The only place that names a mesh's parameters: other releases of Mitsuba call them differently.
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"

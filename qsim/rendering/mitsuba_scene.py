@@ -20,9 +20,8 @@ from numpy import ndarray as Array
 from qsim.rendering import mitsuba_xml
 from qsim.rendering.engine import errors_only, opaque
 from qsim.rendering.mitsuba_mesh import NORMALS, POSITIONS, mesh_shape, vertex_normals
-from qsim.scene import scene as records
+from qsim.scene import Body, Part, Scene, lights, materials
 from qsim.scene.environment import environment_map, sky_map, sun_direction, sun_radiance
-from qsim.scene.scene import Body, Scene
 
 LARGE = 20_000  # triangles from which a rigid body becomes an instance
 # How often smooth surroundings (constant, clear sky) are drawn as a bounce's emitter, against 1 for any other light.
@@ -94,15 +93,15 @@ class Stage:
             self._rest_normals[name] = vertex_normals(body.mesh.vertices, body.mesh.faces)
         return (self._rest_normals[name] @ pose[:3, :3].T).astype(np.float32)
 
-    def _place_light(self, name: str, light: records.Light, pose: Array) -> None:
-        if isinstance(light, records.AreaLamp):
+    def _place_light(self, name: str, light: lights.Light, pose: Array) -> None:
+        if isinstance(light, lights.AreaLamp):
             placed = pose @ lamp_pose(light)
             self._set(f"{name}.to_world", placed, lambda: self._transform(placed))
-        elif isinstance(light, records.PointLight):
+        elif isinstance(light, lights.PointLight):
             position = _to_world(pose, np.array([light.position]))[0]
             self._set(f"{name}.position", position, lambda: self._opaque(self.mi.Point3f(position.tolist())))
 
-    def _rest_of(self, part: records.Part) -> tuple[Array, ...]:
+    def _rest_of(self, part: Part) -> tuple[Array, ...]:
         """Where a shape of a file stands: its 4x4 placement, or its vertices [V, 3] and normals [V, 3] or [0, 3]."""
         if f"{part.name}.to_world" in self._parameters:
             return (np.array(self._parameters[f"{part.name}.to_world"].matrix, np.float64).reshape(4, 4),)
@@ -170,7 +169,7 @@ def film_pass(
     return np.array(image, np.float64)[..., 0]
 
 
-def lamp_pose(lamp: records.AreaLamp) -> Array:
+def lamp_pose(lamp: lights.AreaLamp) -> Array:
     """Matrix that takes the square -1..1 in x, y (facing +z) to the lamp at its place, float64 [4, 4]."""
     forward = np.subtract(lamp.target, lamp.origin)
     forward = forward / np.linalg.norm(forward)
@@ -187,7 +186,7 @@ def lamp_pose(lamp: records.AreaLamp) -> Array:
 def _is_instance(body: Body) -> bool:
     """Whether a body is held as an instance of a mesh in its own coordinates."""
     rigid = body.motion is not None and not body.deforms
-    return rigid and len(body.mesh.faces) >= LARGE and not isinstance(body.material, records.Glow)
+    return rigid and len(body.mesh.faces) >= LARGE and not isinstance(body.material, materials.Glow)
 
 
 def _scene_dict(mi: Any, scene: Scene, smooth_weight: float) -> dict[str, Any]:
@@ -207,7 +206,7 @@ def _scene_dict(mi: Any, scene: Scene, smooth_weight: float) -> dict[str, Any]:
 
 def _mesh(mi: Any, body: Body, name: str, vertices: Array) -> Any:
     properties = mi.Properties()
-    if isinstance(body.material, records.Glow):
+    if isinstance(body.material, materials.Glow):
         properties["emitter"] = mi.load_dict({"type": "area", "radiance": _grey(mi, body.material.radiance)})
         properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": _grey(mi, 0.0)})
     else:
@@ -215,28 +214,28 @@ def _mesh(mi: Any, body: Body, name: str, vertices: Array) -> Any:
     return mesh_shape(mi, body.mesh, name, vertices, properties)
 
 
-def _light(mi: Any, scene: Scene, light: records.Light, name: str, smooth_weight: float) -> dict[str, Any]:
+def _light(mi: Any, scene: Scene, light: lights.Light, name: str, smooth_weight: float) -> dict[str, Any]:
     match light:
-        case records.Constant(radiance):
+        case lights.Constant(radiance):
             return {name: {"type": "constant", "radiance": _grey(mi, radiance), "sampling_weight": smooth_weight}}
-        case records.SunSky():
+        case lights.SunSky():
             sky = {"type": "envmap", "bitmap": _rgb_bitmap(mi, sky_map(light)), "sampling_weight": smooth_weight}
             return {name: sky} | ({"sun": _sun(mi, scene, light)} if light.sun_irradiance > 0 else {})
-        case records.EnvironmentImage(rotation=rotation):
+        case lights.EnvironmentImage(rotation=rotation):
             turn = mi.ScalarTransform4f().rotate([0, 1, 0], math.degrees(rotation))
             bitmap = _rgb_bitmap(mi, environment_map(light))
             return {name: {"type": "envmap", "bitmap": bitmap, "to_world": turn}}
-        case records.AreaLamp(radiance=radiance):
+        case lights.AreaLamp(radiance=radiance):
             place = mi.ScalarTransform4f(lamp_pose(light).tolist())
             black = {"type": "diffuse", "reflectance": _grey(mi, 0.0)}
             emitter = {"type": "area", "radiance": _grey(mi, radiance)}
             return {name: {"type": "rectangle", "to_world": place, "bsdf": black, "emitter": emitter}}
-        case records.PointLight(position, intensity):
+        case lights.PointLight(position, intensity):
             return {name: {"type": "point", "position": list(position), "intensity": _grey(mi, intensity)}}
     raise ValueError(f"{light!r} is not one of the lights of qsim.scene")
 
 
-def _sun(mi: Any, scene: Scene, light: records.SunSky) -> dict[str, Any]:
+def _sun(mi: Any, scene: Scene, light: lights.SunSky) -> dict[str, Any]:
     """A far disk that shines on the scene; its angular radius and irradiance are those of the record."""
     centre = np.asarray(scene.camera.origin)
     points = [_to_world(body.pose(0.0), body.vertices(0.0)) for body in scene.bodies] or [centre[None]]
@@ -251,34 +250,34 @@ def _sun(mi: Any, scene: Scene, light: records.SunSky) -> dict[str, Any]:
     return {"type": "disk", "to_world": place, "emitter": emitter}
 
 
-def _bsdf(mi: Any, material: records.Material) -> dict[str, Any]:
+def _bsdf(mi: Any, material: materials.Material) -> dict[str, Any]:
     match material:
-        case records.Diffuse(reflectance, relief):
+        case materials.Diffuse(reflectance, relief):
             inner = {"type": "diffuse", "reflectance": _reflectance(mi, reflectance)}
-        case records.RoughPlastic(reflectance, roughness, ior, relief):
+        case materials.RoughPlastic(reflectance, roughness, ior, relief):
             inner = {"type": "roughplastic", "diffuse_reflectance": _reflectance(mi, reflectance), "alpha": roughness}
             inner |= {"int_ior": ior, "distribution": "ggx", "nonlinear": True}
-        case records.Conductor(eta, k, roughness, relief):
+        case materials.Conductor(eta, k, roughness, relief):
             inner = {"type": "conductor", "eta": _grey(mi, eta), "k": _grey(mi, k)}
             if roughness > 0:
                 inner |= {"type": "roughconductor", "alpha": roughness, "distribution": "ggx"}
-        case records.Dielectric(ior, roughness, thin):
+        case materials.Dielectric(ior, roughness, thin):
             kind = "thindielectric" if thin else "roughdielectric" if roughness > 0 else "dielectric"
             rough = {"alpha": roughness, "distribution": "ggx"} if kind == "roughdielectric" else {}
             return {"type": kind, "int_ior": ior} | rough
         case _:
             raise ValueError(f"{material!r} is not one of the materials of qsim.scene")
     match relief:
-        case records.Bump(texture, height):
+        case materials.Bump(texture, height):
             inner = {"type": "bumpmap", "relief": _texture(mi, texture), "scale": height, "inner": inner}
-        case records.NormalMap(image, repeat):
+        case materials.NormalMap(image, repeat):
             picture = _bitmap(mi, np.asarray(image, np.float32), repeat)
             inner = {"type": "normalmap", "normalmap": picture, "inner": inner}
     return {"type": "twosided", "inner": inner}
 
 
-def _reflectance(mi: Any, value: float | records.Texture) -> Any:
-    if isinstance(value, records.Texture):
+def _reflectance(mi: Any, value: float | materials.Texture) -> Any:
+    if isinstance(value, materials.Texture):
         pixels = value.pixels()
         if pixels.min() < 0 or pixels.max() > 1:
             raise ValueError(f"Texture of a reflectance: 0..1 expected, found {pixels.min()}..{pixels.max()}")
@@ -288,7 +287,7 @@ def _reflectance(mi: Any, value: float | records.Texture) -> Any:
     return _grey(mi, value)
 
 
-def _texture(mi: Any, texture: records.Texture) -> dict[str, Any]:
+def _texture(mi: Any, texture: materials.Texture) -> dict[str, Any]:
     return _bitmap(mi, texture.pixels()[..., None], texture.repeat, "nearest" if texture.nearest else "bilinear")
 
 

@@ -20,7 +20,7 @@ from qsim.checks import suggest
 from qsim.optics.camera import Camera, Pose, Vector
 from qsim.rendering.engine import errors_only, select
 from qsim.rendering.mitsuba_mesh import POSITIONS
-from qsim.scene.scene import MitsubaFile, Part, Scene
+from qsim.scene import MitsubaFile, Part, Scene
 
 F_NUMBER, PITCH = 2.8, 1.1e-6  # of the camera that is made from the file's, which has no pixels in metres
 MOVABLE = ("to_world", POSITIONS)

@@ -20,8 +20,7 @@ from qsim.optics.camera import Camera, Pose
 from qsim.rendering.budget import Allowed, Budget, Finding, grid_samples, instants
 from qsim.rendering.denoiser import AROUND, DENOISE_COST, available, cleaned_mean
 from qsim.rendering.renderer import Renderer
-from qsim.scene.motion import Still
-from qsim.scene.scene import Scene
+from qsim.scene import Scene, Still
 
 COUNTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
 PIXELS = 3000

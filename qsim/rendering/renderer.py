@@ -29,7 +29,7 @@ from qsim.rendering.denoiser import cleaned_mean
 from qsim.rendering.engine import activate, select
 from qsim.rendering.mitsuba_scene import Stage, film_pass
 from qsim.rendering.ray_casting import RayCaster, pixel_rays
-from qsim.scene.scene import Scene
+from qsim.scene import Scene
 
 RENDER_STAGE = 16  # of the random keys: sampler seeds
 SHARP_STAGE = 17  # the sharp instant has seeds of its own

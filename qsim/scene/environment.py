@@ -15,7 +15,8 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.colour import luminance
-from qsim.scene.scene import EnvironmentImage, SunSky
+from qsim.scene.image_files import read_hdr
+from qsim.scene.lights import EnvironmentImage, SunSky
 
 SKY_ROWS = 128  # of the upper and lower half together; the sky is smooth, the sun is a disk of its own
 
@@ -59,67 +60,10 @@ def sky_map(light: SunSky, rows: int = SKY_ROWS) -> Array:
 
 def environment_map(light: EnvironmentImage) -> Array:
     """The picture in radiance, float32 [H, W]; `ValueError` or FileNotFoundError naming the file."""
-    picture = _read_hdr(Path(light.image)) if isinstance(light.image, str) else np.asarray(light.image, np.float32)
+    picture = read_hdr(Path(light.image)) if isinstance(light.image, str) else np.asarray(light.image, np.float32)
     if picture.ndim == 3:
         picture = luminance(picture[..., :3])
     if picture.ndim != 2 or picture.size == 0 or not np.isfinite(picture).all() or picture.min() < 0:
         where = light.image if isinstance(light.image, str) else "EnvironmentImage.image"
         raise ValueError(f"{where}: expected finite radiance [H, W] of at least 0, found shape {picture.shape}")
     return (picture * light.scale).astype(np.float32)
-
-
-def _read_hdr(path: Path) -> Array:
-    """Linear picture [H, W] or [H, W, 3] of an .exr (OpenEXR) or Radiance .hdr file."""
-    if not path.is_file():
-        raise FileNotFoundError(f"environment {path}: no such file")
-    if path.suffix.lower() == ".hdr":
-        return _read_radiance(path)
-    import OpenEXR
-
-    try:
-        channels = OpenEXR.File(str(path)).channels()
-    except Exception as error:  # the binding raises several kinds for a bad file
-        raise ValueError(f"environment {path}: not a readable OpenEXR file ({error})") from error
-    for name in ("RGB", "RGBA", "Y"):
-        if name in channels:
-            return np.asarray(channels[name].pixels, np.float32)
-    raise ValueError(f"environment {path}: has channels {sorted(channels)}, expected RGB or Y")
-
-
-def _read_radiance(path: Path) -> Array:
-    """Radiance RGBE (Ward, "Real pixels", Graphics Gems II, 1991), flat or new-style run lengths."""
-    content = path.read_bytes()
-    head, _, rest = content.partition(b"\n\n")
-    size, _, body = rest.partition(b"\n")
-    words = size.split()
-    if not head.startswith(b"#?") or len(words) != 4 or (words[0], words[2]) != (b"-Y", b"+X"):
-        raise ValueError(f"environment {path}: not a Radiance .hdr file with rows from top to bottom")
-    height, width = int(words[1]), int(words[3])
-    rgbe = np.empty((height, width, 4), np.uint8)
-    at = 0
-    try:
-        for y in range(height):
-            at = _read_row(body, at, rgbe[y])
-    except (IndexError, ValueError) as error:
-        raise ValueError(f"environment {path}: damaged at byte {len(content) - len(body) + at}") from error
-    scale = np.ldexp(1.0, rgbe[..., 3].astype(np.int32) - 136)
-    return (rgbe[..., :3] * np.where(rgbe[..., 3:] > 0, scale[..., None], 0)).astype(np.float32)
-
-
-def _read_row(body: bytes, at: int, row: Array) -> int:
-    width = len(row)
-    if body[at : at + 2] != b"\x02\x02" or not 8 <= width < 32768:
-        row[:] = np.frombuffer(body, np.uint8, 4 * width, at).reshape(width, 4)
-        return at + 4 * width
-    at += 4
-    for channel in range(4):
-        x = 0
-        while x < width:
-            count = body[at]
-            if count > 128:
-                row[x : x + count - 128, channel] = body[at + 1]
-                x, at = x + count - 128, at + 2
-            else:
-                row[x : x + count, channel] = np.frombuffer(body, np.uint8, count, at + 1)
-                x, at = x + count, at + 1 + count
-    return at

@@ -20,8 +20,9 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from qsim.checks import require_finite
-from qsim.colour import luminance, to_linear
-from qsim.optics.camera import Camera, Pose, Vector
+from qsim.optics.camera import Camera, Pose
+from qsim.scene.lights import ENVIRONMENTS, Light, strength
+from qsim.scene.materials import Diffuse, Glow, Material
 
 
 @runtime_checkable
@@ -59,178 +60,6 @@ class Mesh:
                 raise ValueError(f"Mesh.uv: expected [{len(vertices)}, 2], got {uv.shape}")
             require_finite("Mesh.uv", uv)
             object.__setattr__(self, "uv", uv)
-
-
-@dataclass(frozen=True, eq=False)
-class Texture:
-    """A picture on a surface: an array [H, W] of linear values, or an image file (sRGB grey or colour)."""
-
-    image: np.ndarray | str  # float [H, W] linear, or a path; a path's colours become linear luminance (Rec. 709)
-    repeat: tuple[float, float] = (1.0, 1.0)  # how often the picture fits into u, v = 0..1
-    nearest: bool = False  # nearest texel instead of bilinear
-
-    def pixels(self) -> np.ndarray:
-        """Linear values, float32 [H, W]; raises FileNotFoundError or ValueError naming the file."""
-        if not isinstance(self.image, str | Path):
-            pixels = np.asarray(self.image, np.float32)
-            where = "Texture.image"
-        else:
-            where = str(self.image)
-            pixels = _read_grey(Path(self.image))
-        if pixels.ndim != 2 or pixels.size == 0:
-            raise ValueError(f"{where}: expected a picture [H, W], got shape {pixels.shape}")
-        require_finite(where, pixels)
-        return pixels
-
-
-@dataclass(frozen=True, eq=False)
-class Bump:
-    """Relief that only tilts normals: a height map (in metres where 1 means `height`)."""
-
-    texture: Texture
-    height: float = 1.0  # m
-
-
-@dataclass(frozen=True, eq=False)
-class NormalMap:
-    """Tangent-space normals as a picture, float [H, W, 3] in 0..1 (0.5, 0.5, 1 is flat)."""
-
-    image: np.ndarray
-    repeat: tuple[float, float] = (1.0, 1.0)
-
-
-Relief = Bump | NormalMap | None
-
-
-@dataclass(frozen=True, eq=False)
-class Diffuse:
-    """Lambertian surface, both sides."""
-
-    reflectance: float | Texture = 0.5  # 0..1
-    relief: Relief = None
-
-    def __post_init__(self) -> None:
-        _check_reflectance(self)
-
-
-@dataclass(frozen=True, eq=False)
-class RoughPlastic:
-    """Diffuse base under a rough dielectric coat (GGX)."""
-
-    reflectance: float | Texture = 0.5  # of the base, 0..1
-    roughness: float = 0.1  # GGX alpha
-    ior: float = 1.49
-    relief: Relief = None
-
-    def __post_init__(self) -> None:
-        _check_reflectance(self)
-
-
-@dataclass(frozen=True, eq=False)
-class Conductor:
-    """Metal by its complex index at the camera's wavelength; roughness 0 is a mirror. Default: aluminium at 550 nm.
-
-    Aluminium 0.96 + 6.70i, silver 0.055 + 3.32i, gold 0.42 + 2.35i, copper 1.04 + 2.59i, chromium 3.12 + 3.31i
-    (rounded from the usual handbooks at 550 nm).
-    """
-
-    eta: float = 0.96
-    k: float = 6.70
-    roughness: float = 0.1  # GGX alpha
-    relief: Relief = None
-
-
-@dataclass(frozen=True, eq=False)
-class Dielectric:
-    """Glass or water; roughness 0 is clear. `thin` is a pane without thickness."""
-
-    ior: float = 1.5
-    roughness: float = 0.0
-    thin: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Glow:
-    """A surface that emits the same radiance in all directions, on its outer side, and reflects nothing."""
-
-    radiance: float  # W m^-2 sr^-1
-
-    def __post_init__(self) -> None:
-        _check_light(self, "radiance")
-
-
-Material = Diffuse | RoughPlastic | Conductor | Dielectric | Glow
-
-
-@dataclass(frozen=True, eq=False)
-class Constant:
-    """The same radiance from every direction."""
-
-    radiance: float  # W m^-2 sr^-1
-
-    def __post_init__(self) -> None:
-        _check_light(self, "radiance")
-
-
-@dataclass(frozen=True, eq=False)
-class SunSky:
-    """A clear sky (CIE standard general sky, type 12), a sun disk, and a ground of constant radiance below the horizon.
-
-    Both irradiances are those in the rendered band. Azimuth 0 is +z, pi/2 is +x.
-    """
-
-    elevation: float = 0.8  # rad above the horizon
-    azimuth: float = 0.6  # rad
-    sun_irradiance: float = 1.0  # W m^-2 on a plane facing the sun
-    sky_irradiance: float = 0.25  # W m^-2 on the ground, sky alone
-    ground_reflectance: float = 0.2  # 0..1
-    sun_radius: float = 4.65e-3  # rad; the real sun's mean angular radius
-
-    def __post_init__(self) -> None:
-        _check_light(self, "sun_irradiance", "sky_irradiance")
-
-
-@dataclass(frozen=True, eq=False)
-class AreaLamp:
-    """A rectangle that shines from `origin` towards `target`, on that side only."""
-
-    origin: Vector
-    target: Vector
-    width: float  # m
-    height: float  # m
-    radiance: float  # W m^-2 sr^-1
-    motion: Pose | None = None  # world motion: pose(t) is applied after the placement
-
-    def __post_init__(self) -> None:
-        _check_light(self, "radiance")
-
-
-@dataclass(frozen=True, eq=False)
-class PointLight:
-    """An isotropic point: irradiance at distance r is intensity / r^2."""
-
-    position: Vector
-    intensity: float  # W sr^-1
-    motion: Pose | None = None
-
-    def __post_init__(self) -> None:
-        _check_light(self, "intensity")
-
-
-@dataclass(frozen=True, eq=False)
-class EnvironmentImage:
-    """An equirectangular picture of radiance around the scene: array [H, W] or a file (.hdr, .exr), zenith on top.
-
-    The first and last column meet at azimuth `rotation` + pi; the middle column is azimuth `rotation` (0 is +z).
-    """
-
-    image: np.ndarray | str
-    scale: float = 1.0  # radiance per unit of the picture, W m^-2 sr^-1
-    rotation: float = 0.0  # rad about +y
-
-
-Light = Constant | SunSky | AreaLamp | PointLight | EnvironmentImage
-ENVIRONMENTS = (Constant, SunSky, EnvironmentImage)
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,7 +160,7 @@ class Scene:
         """Whether anything gives light."""
         if self.file is not None:
             return True  # checked when the file was read
-        return any(_strength(light) > 0 for light in self.lights) or any(
+        return any(strength(light) > 0 for light in self.lights) or any(
             isinstance(body.material, Glow) and body.material.radiance > 0 for body in self.bodies
         )
 
@@ -379,44 +208,3 @@ def _check_motion(scene: str, body: Body | Part) -> None:
     elif body.deforms and body.vertices(0.0).shape != body.mesh.vertices.shape:
         expected, found = body.mesh.vertices.shape, body.vertices(0.0).shape
         raise ValueError(f"scene {scene}, body {body.name}: deform must keep the mesh's {expected}, got {found}")
-
-
-def _strength(light: Light) -> float:
-    """Some measure that is 0 only for a light that is off."""
-    match light:
-        case Constant(radiance) | AreaLamp(radiance=radiance):
-            return radiance
-        case SunSky(sun_irradiance=sun, sky_irradiance=sky):
-            return sun + sky
-        case PointLight(intensity=intensity):
-            return intensity
-        case EnvironmentImage(image, scale):
-            return scale * (1.0 if isinstance(image, str) else float(np.max(image)))
-    raise ValueError(f"{light!r} is not one of the lights of qsim.scene")
-
-
-def _read_grey(path: Path) -> np.ndarray:
-    """An image file as linear luminance, float32 [H, W]."""
-    from PIL import Image
-
-    if not path.is_file():
-        raise FileNotFoundError(f"texture {path}: no such file")
-    try:
-        with Image.open(path) as opened:
-            colour = np.asarray(opened.convert("RGB"), np.float32) / 255
-    except OSError as error:
-        raise ValueError(f"texture {path}: not a readable image ({error})") from error
-    return luminance(to_linear(colour, "srgb", 1.0).astype(np.float64)).astype(np.float32)
-
-
-def _check_reflectance(material: Diffuse | RoughPlastic) -> None:
-    found, kind = material.reflectance, type(material).__name__
-    if not isinstance(found, Texture) and not (isinstance(found, int | float | np.number) and 0 <= found <= 1):
-        raise ValueError(f"{kind}.reflectance: a number from 0 to 1 or a Texture is expected, got {found!r}")
-
-
-def _check_light(light: Any, *names: str) -> None:
-    for name in names:
-        found = getattr(light, name)
-        if not (isinstance(found, int | float | np.number) and np.isfinite(found) and found >= 0):
-            raise ValueError(f"{type(light).__name__}.{name}: a finite number from 0 up is expected, got {found!r}")

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from qsim.scene.scene import Texture
+from qsim.scene.materials import Texture
 
 Picture = NDArray[np.float32]
 

@@ -16,7 +16,7 @@ from qsim.clip.clip import PHYSICAL, Clip, ClipWriter
 from qsim.dataset.job import Job
 from qsim.dataset.provenance import origin
 from qsim.optics.camera import Camera
-from qsim.scene.scene import describe
+from qsim.scene import describe
 
 RECIPE = """[recipe]
 name = "small"

@@ -7,7 +7,7 @@ import numpy as np
 from qsim.optics.camera import Camera, Pose
 from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
-from qsim.scene.scene import Body, Constant, Diffuse, Light, Mesh, Scene, Texture
+from qsim.scene import Body, Constant, Diffuse, Light, Mesh, Scene, Texture
 
 CAMERA = Camera(focal_length=2e-3, f_number=2.8, pixel_pitch=5e-5, height=24, width=33, origin=(0, 0, 4))
 SKY = Constant(0.7)

@@ -63,7 +63,6 @@ STILL_IN_CIRCLES: set[str] = set()
 STILL_LONG: set[str] = {
     "qsim.clip.writer",
     "qsim.formats.video",
-    "qsim.scene.scene",
     "qsim.sensor.defects.fixed_pattern",
     "quiver.training.run_folder",
 }

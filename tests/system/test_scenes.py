@@ -15,8 +15,7 @@ import scenes
 from qsim.optics.camera import Camera
 from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
-from qsim.scene.motion import Translation
-from qsim.scene.scene import AreaLamp, Body, Constant, EnvironmentImage, PointLight, Scene, SunSky
+from qsim.scene import AreaLamp, Body, Constant, EnvironmentImage, PointLight, Scene, SunSky, Translation
 from qsim.scene.shapes import sheet
 from scenes.stage import FRAME_RATE, HEIGHT, WIDTH
 

@@ -16,7 +16,7 @@ import quiver
 from qsim import QIS, BinarySPAD, CountingSPAD, Dataset, Scene, Sensing, sense
 from qsim.dataset import generation, recipe
 from qsim.optics.camera import Camera
-from qsim.scene.scene import Constant
+from qsim.scene import Constant
 
 ROOT = Path(__file__).parents[2]
 

@@ -22,7 +22,7 @@ from qsim.clip.clamped_error import Errors, decibels, error_at, white_in
 from qsim.rendering import fidelity
 from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
-from qsim.scene.scene import Scene
+from qsim.scene import Scene
 
 LEVELS = (36.0,)  # dB below white
 ENOUGH = 4.5  # standard errors; a right program exceeds them in one of 100 000 rows

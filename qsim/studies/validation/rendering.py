@@ -32,7 +32,7 @@ from qsim.rendering.budget import Budget, grid_samples
 from qsim.rendering.engine import activate
 from qsim.rendering.mitsuba_scene import Stage, film_pass
 from qsim.rendering.renderer import Renderer
-from qsim.scene.scene import Scene
+from qsim.scene import Scene
 
 LEVELS = (30.0, 35.0, 40.0, 45.0)  # dB below white
 WANTED_RATIO, AT_LEVEL = 10.0, 40.0  # of the median scene

@@ -15,7 +15,7 @@ import scenes
 from qsim.cli.program import main
 from qsim.cli.validate import ACTING
 from qsim.dataset import recipe
-from qsim.scene.scene import SunSky
+from qsim.scene import SunSky
 from qsim.studies.validation import light
 from qsim.studies.validation.light import LightReport, LightRow
 

@@ -33,7 +33,7 @@ from qsim.rendering import denoiser
 from qsim.rendering.budget import Budget
 from qsim.rendering.fidelity import choose, dimming, moving
 from qsim.report import report
-from qsim.scene.scene import Body, Diffuse, EnvironmentImage, Glow, PointLight, RoughPlastic
+from qsim.scene import Body, Diffuse, EnvironmentImage, Glow, PointLight, RoughPlastic
 from qsim.scene.shapes import ball
 
 SIZE = 200  # px, sides of the pictures of noise

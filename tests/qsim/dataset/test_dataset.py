@@ -28,8 +28,7 @@ from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import Options, Summary, generate, watching
 from qsim.dataset.job_runner import Make
 from qsim.dataset.worker_pool import Limits, run_here
-from qsim.scene import textures
-from qsim.scene.scene import Body, Diffuse, Texture
+from qsim.scene import Body, Diffuse, Texture, textures
 
 TESTS = Path(__file__).parents[2]
 PYTHONPATH = f"{TESTS.parent}{os.pathsep}{TESTS / 'support'}"  # of child processes; the package first

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qsim.optics.camera import Camera
-from qsim.scene.motion import Spin
+from qsim.scene import Spin
 
 CAMERA = Camera(focal_length=8e-3, f_number=2.8, pixel_pitch=1e-5, height=7, width=10)
 

@@ -15,8 +15,7 @@ from qsim.rendering.budget import Allowed, Budget, blur_error, blur_left, explai
 from qsim.rendering.denoiser import available, mixture
 from qsim.rendering.fidelity import Noise, choose, shortfall
 from qsim.rendering.renderer import Renderer
-from qsim.scene.motion import Oscillation, Spin, Translation
-from qsim.scene.scene import Body, Diffuse, Glow, PointLight, Scene, SunSky, Texture
+from qsim.scene import Body, Diffuse, Glow, Oscillation, PointLight, Scene, Spin, SunSky, Texture, Translation
 
 
 def test_sample_counts_are_those_of_the_sampler(capfd):

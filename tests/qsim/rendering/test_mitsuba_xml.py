@@ -11,9 +11,7 @@ from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.mitsuba_xml import read_mitsuba
 from qsim.rendering.renderer import Renderer
-from qsim.scene.deformation import Flag
-from qsim.scene.motion import Spin, Still, Translation
-from qsim.scene.scene import Body, Mesh, Scene
+from qsim.scene import Body, Flag, Mesh, Scene, Spin, Still, Translation
 
 SENSOR = """<sensor type="perspective"><float name="fov" value="40"/><string name="fov_axis" value="y"/>
   <transform name="to_world"><lookat origin="0,0.5,4" target="0,0,0" up="0,1,0"/></transform>

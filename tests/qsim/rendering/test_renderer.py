@@ -21,9 +21,7 @@ from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.denoiser import available
 from qsim.rendering.mitsuba_scene import Stage
 from qsim.rendering.renderer import Renderer
-from qsim.scene import shapes
-from qsim.scene.motion import Oscillation, Spin, Still, Translation
-from qsim.scene.scene import (
+from qsim.scene import (
     AreaLamp,
     Body,
     Conductor,
@@ -33,11 +31,16 @@ from qsim.scene.scene import (
     EnvironmentImage,
     Glow,
     Mesh,
+    Oscillation,
     PointLight,
     RoughPlastic,
     Scene,
+    Spin,
+    Still,
     SunSky,
     Texture,
+    Translation,
+    shapes,
 )
 
 # Radiometry

@@ -5,21 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from qsim.scene.deformation import Flag, Ripple
-from qsim.scene.motion import (
-    GRAVITY,
+from qsim.scene import (
     Ballistic,
     Composition,
+    Flag,
     Keyframes,
     Motion,
     Oscillation,
     Pendulum,
+    Ripple,
     Shake,
     Spin,
     Still,
     Translation,
     Wave,
 )
+from qsim.scene.motion import GRAVITY
 from qsim.scene.rotation import exponential, left_jacobian, logarithm, rotation_between, rotation_matrix
 from qsim.scene.shapes import sheet
 

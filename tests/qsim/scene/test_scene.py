@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from qsim.optics.camera import Camera
-from qsim.scene.motion import Translation
-from qsim.scene.scene import (
+from qsim.scene import (
     Body,
     Constant,
     Diffuse,
@@ -21,6 +20,7 @@ from qsim.scene.scene import (
     Scene,
     SunSky,
     Texture,
+    Translation,
     describe,
 )
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from qsim.scene import Mesh
 from qsim.scene.props import gear, glyph_outlines, letters, rotor, spring
 from qsim.scene.rotation import pose_matrix, rotation_matrix
-from qsim.scene.scene import Mesh
 from qsim.scene.shapes import (
     ball,
     blob,

@@ -15,7 +15,7 @@ def still_clip(path, frames: int, rate: float, camera: Camera | None = None) -> 
     """An even grey field that never changes."""
     meta = {"shape": [frames, *SIZE], "frame_rate": rate, "exposure": 1 / rate, "radiance_unit": RELATIVE}
     if camera is not None:
-        from qsim.scene.scene import describe
+        from qsim.scene import describe
 
         meta |= {"radiance_unit": PHYSICAL, "camera": describe(camera)}
     with ClipWriter(path, meta) as writer:

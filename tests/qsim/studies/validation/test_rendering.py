@@ -11,8 +11,7 @@ import pytest
 from small_scenes import plate, renderer
 
 from qsim.rendering.budget import Budget
-from qsim.scene.motion import Spin
-from qsim.scene.scene import SunSky
+from qsim.scene import Spin, SunSky
 from qsim.studies.validation import rendering
 from qsim.studies.validation.rendering import NaiveLoop, RenderReport, RenderRow, Target
 

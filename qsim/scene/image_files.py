@@ -1,0 +1,81 @@
+"""Reads pictures: image files as linear luminance, OpenEXR and Radiance files as radiance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.colour import luminance, to_linear
+
+
+def read_grey(path: Path) -> np.ndarray:
+    """An image file as linear luminance, float32 [H, W]."""
+    from PIL import Image
+
+    if not path.is_file():
+        raise FileNotFoundError(f"texture {path}: no such file")
+    try:
+        with Image.open(path) as opened:
+            colour = np.asarray(opened.convert("RGB"), np.float32) / 255
+    except OSError as error:
+        raise ValueError(f"texture {path}: not a readable image ({error})") from error
+    return luminance(to_linear(colour, "srgb", 1.0).astype(np.float64)).astype(np.float32)
+
+
+def read_hdr(path: Path) -> Array:
+    """Linear picture [H, W] or [H, W, 3] of an .exr (OpenEXR) or Radiance .hdr file."""
+    if not path.is_file():
+        raise FileNotFoundError(f"environment {path}: no such file")
+    if path.suffix.lower() == ".hdr":
+        return _read_radiance(path)
+    import OpenEXR
+
+    try:
+        channels = OpenEXR.File(str(path)).channels()
+    except Exception as error:  # the binding raises several kinds for a bad file
+        raise ValueError(f"environment {path}: not a readable OpenEXR file ({error})") from error
+    for name in ("RGB", "RGBA", "Y"):
+        if name in channels:
+            return np.asarray(channels[name].pixels, np.float32)
+    raise ValueError(f"environment {path}: has channels {sorted(channels)}, expected RGB or Y")
+
+
+def _read_radiance(path: Path) -> Array:
+    """Radiance RGBE (Ward, "Real pixels", Graphics Gems II, 1991), flat or new-style run lengths."""
+    content = path.read_bytes()
+    head, _, rest = content.partition(b"\n\n")
+    size, _, body = rest.partition(b"\n")
+    words = size.split()
+    if not head.startswith(b"#?") or len(words) != 4 or (words[0], words[2]) != (b"-Y", b"+X"):
+        raise ValueError(f"environment {path}: not a Radiance .hdr file with rows from top to bottom")
+    height, width = int(words[1]), int(words[3])
+    rgbe = np.empty((height, width, 4), np.uint8)
+    at = 0
+    try:
+        for y in range(height):
+            at = _read_row(body, at, rgbe[y])
+    except (IndexError, ValueError) as error:
+        raise ValueError(f"environment {path}: damaged at byte {len(content) - len(body) + at}") from error
+    scale = np.ldexp(1.0, rgbe[..., 3].astype(np.int32) - 136)
+    return (rgbe[..., :3] * np.where(rgbe[..., 3:] > 0, scale[..., None], 0)).astype(np.float32)
+
+
+def _read_row(body: bytes, at: int, row: Array) -> int:
+    width = len(row)
+    if body[at : at + 2] != b"\x02\x02" or not 8 <= width < 32768:
+        row[:] = np.frombuffer(body, np.uint8, 4 * width, at).reshape(width, 4)
+        return at + 4 * width
+    at += 4
+    for channel in range(4):
+        x = 0
+        while x < width:
+            count = body[at]
+            if count > 128:
+                row[x : x + count - 128, channel] = body[at + 1]
+                x, at = x + count - 128, at + 2
+            else:
+                row[x : x + count, channel] = np.frombuffer(body, np.uint8, count, at + 1)
+                x, at = x + count, at + 1 + count
+    return at

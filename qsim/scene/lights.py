@@ -1,0 +1,102 @@
+"""Lights and environments, as frozen records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from qsim.optics.camera import Pose, Vector
+
+
+@dataclass(frozen=True, eq=False)
+class Constant:
+    """The same radiance from every direction."""
+
+    radiance: float  # W m^-2 sr^-1
+
+    def __post_init__(self) -> None:
+        check_light(self, "radiance")
+
+
+@dataclass(frozen=True, eq=False)
+class SunSky:
+    """A clear sky (CIE standard general sky, type 12), a sun disk, and a ground of constant radiance below the horizon.
+
+    Both irradiances are those in the rendered band. Azimuth 0 is +z, pi/2 is +x.
+    """
+
+    elevation: float = 0.8  # rad above the horizon
+    azimuth: float = 0.6  # rad
+    sun_irradiance: float = 1.0  # W m^-2 on a plane facing the sun
+    sky_irradiance: float = 0.25  # W m^-2 on the ground, sky alone
+    ground_reflectance: float = 0.2  # 0..1
+    sun_radius: float = 4.65e-3  # rad; the real sun's mean angular radius
+
+    def __post_init__(self) -> None:
+        check_light(self, "sun_irradiance", "sky_irradiance")
+
+
+@dataclass(frozen=True, eq=False)
+class AreaLamp:
+    """A rectangle that shines from `origin` towards `target`, on that side only."""
+
+    origin: Vector
+    target: Vector
+    width: float  # m
+    height: float  # m
+    radiance: float  # W m^-2 sr^-1
+    motion: Pose | None = None  # world motion: pose(t) is applied after the placement
+
+    def __post_init__(self) -> None:
+        check_light(self, "radiance")
+
+
+@dataclass(frozen=True, eq=False)
+class PointLight:
+    """An isotropic point: irradiance at distance r is intensity / r^2."""
+
+    position: Vector
+    intensity: float  # W sr^-1
+    motion: Pose | None = None
+
+    def __post_init__(self) -> None:
+        check_light(self, "intensity")
+
+
+@dataclass(frozen=True, eq=False)
+class EnvironmentImage:
+    """An equirectangular picture of radiance around the scene: array [H, W] or a file (.hdr, .exr), zenith on top.
+
+    The first and last column meet at azimuth `rotation` + pi; the middle column is azimuth `rotation` (0 is +z).
+    """
+
+    image: np.ndarray | str
+    scale: float = 1.0  # radiance per unit of the picture, W m^-2 sr^-1
+    rotation: float = 0.0  # rad about +y
+
+
+Light = Constant | SunSky | AreaLamp | PointLight | EnvironmentImage
+ENVIRONMENTS = (Constant, SunSky, EnvironmentImage)
+
+
+def strength(light: Light) -> float:
+    """Some measure that is 0 only for a light that is off."""
+    match light:
+        case Constant(radiance) | AreaLamp(radiance=radiance):
+            return radiance
+        case SunSky(sun_irradiance=sun, sky_irradiance=sky):
+            return sun + sky
+        case PointLight(intensity=intensity):
+            return intensity
+        case EnvironmentImage(image, scale):
+            return scale * (1.0 if isinstance(image, str) else float(np.max(image)))
+    raise ValueError(f"{light!r} is not one of the lights of qsim.scene")
+
+
+def check_light(light: Any, *names: str) -> None:
+    for name in names:
+        found = getattr(light, name)
+        if not (isinstance(found, int | float | np.number) and np.isfinite(found) and found >= 0):
+            raise ValueError(f"{type(light).__name__}.{name}: a finite number from 0 up is expected, got {found!r}")

@@ -1,0 +1,119 @@
+"""Surfaces: materials with textures and relief, as frozen records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from qsim.checks import require_finite
+from qsim.scene.image_files import read_grey
+from qsim.scene.lights import check_light
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """A picture on a surface: an array [H, W] of linear values, or an image file (sRGB grey or colour)."""
+
+    image: np.ndarray | str  # float [H, W] linear, or a path; a path's colours become linear luminance (Rec. 709)
+    repeat: tuple[float, float] = (1.0, 1.0)  # how often the picture fits into u, v = 0..1
+    nearest: bool = False  # nearest texel instead of bilinear
+
+    def pixels(self) -> np.ndarray:
+        """Linear values, float32 [H, W]; raises FileNotFoundError or ValueError naming the file."""
+        if not isinstance(self.image, str | Path):
+            pixels = np.asarray(self.image, np.float32)
+            where = "Texture.image"
+        else:
+            where = str(self.image)
+            pixels = read_grey(Path(self.image))
+        if pixels.ndim != 2 or pixels.size == 0:
+            raise ValueError(f"{where}: expected a picture [H, W], got shape {pixels.shape}")
+        require_finite(where, pixels)
+        return pixels
+
+
+@dataclass(frozen=True, eq=False)
+class Bump:
+    """Relief that only tilts normals: a height map (in metres where 1 means `height`)."""
+
+    texture: Texture
+    height: float = 1.0  # m
+
+
+@dataclass(frozen=True, eq=False)
+class NormalMap:
+    """Tangent-space normals as a picture, float [H, W, 3] in 0..1 (0.5, 0.5, 1 is flat)."""
+
+    image: np.ndarray
+    repeat: tuple[float, float] = (1.0, 1.0)
+
+
+Relief = Bump | NormalMap | None
+
+
+@dataclass(frozen=True, eq=False)
+class Diffuse:
+    """Lambertian surface, both sides."""
+
+    reflectance: float | Texture = 0.5  # 0..1
+    relief: Relief = None
+
+    def __post_init__(self) -> None:
+        _check_reflectance(self)
+
+
+@dataclass(frozen=True, eq=False)
+class RoughPlastic:
+    """Diffuse base under a rough dielectric coat (GGX)."""
+
+    reflectance: float | Texture = 0.5  # of the base, 0..1
+    roughness: float = 0.1  # GGX alpha
+    ior: float = 1.49
+    relief: Relief = None
+
+    def __post_init__(self) -> None:
+        _check_reflectance(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Conductor:
+    """Metal by its complex index at the camera's wavelength; roughness 0 is a mirror. Default: aluminium at 550 nm.
+
+    Aluminium 0.96 + 6.70i, silver 0.055 + 3.32i, gold 0.42 + 2.35i, copper 1.04 + 2.59i, chromium 3.12 + 3.31i
+    (rounded from the usual handbooks at 550 nm).
+    """
+
+    eta: float = 0.96
+    k: float = 6.70
+    roughness: float = 0.1  # GGX alpha
+    relief: Relief = None
+
+
+@dataclass(frozen=True, eq=False)
+class Dielectric:
+    """Glass or water; roughness 0 is clear. `thin` is a pane without thickness."""
+
+    ior: float = 1.5
+    roughness: float = 0.0
+    thin: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Glow:
+    """A surface that emits the same radiance in all directions, on its outer side, and reflects nothing."""
+
+    radiance: float  # W m^-2 sr^-1
+
+    def __post_init__(self) -> None:
+        check_light(self, "radiance")
+
+
+Material = Diffuse | RoughPlastic | Conductor | Dielectric | Glow
+
+
+def _check_reflectance(material: Diffuse | RoughPlastic) -> None:
+    found, kind = material.reflectance, type(material).__name__
+    if not isinstance(found, Texture) and not (isinstance(found, int | float | np.number) and 0 <= found <= 1):
+        raise ValueError(f"{kind}.reflectance: a number from 0 to 1 or a Texture is expected, got {found!r}")
