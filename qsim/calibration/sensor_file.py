@@ -23,7 +23,7 @@ from qsim.calibration.results import Calibration
 from qsim.figures import figure_png, new_figure
 from qsim.files import load_array
 from qsim.formats import importing
-from qsim.formats.array_files import mat_array
+from qsim.formats.mat_files import mat_array
 from qsim.formats.recording import Hints
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
@@ -64,10 +64,10 @@ def _blocks(path: Path, bits: int, width: int | None, variable: str | None) -> I
         if width is not None:
             raise ValueError(f"{path}: --width is of packed planes, and a .mat holds one value per pixel; leave it out")
         return _array_blocks(mat_array(path, variable))
-    footage = importing.read(path, Hints(bits=min(bits, 16), width=width, variable=variable), compared=("bits",))
-    if footage.is_light or footage.bits != bits:
-        raise ValueError(f"{path}: holds {footage.source}, not values of {bits} bits")
-    return (block for _, block in importing.blocks(footage))
+    recording = importing.read(path, Hints(bits=min(bits, 16), width=width, variable=variable), compared=("bits",))
+    if recording.is_light or recording.bits != bits:
+        raise ValueError(f"{path}: holds {recording.source}, not values of {bits} bits")
+    return (block for _, block in importing.blocks(recording))
 
 
 def read_counts(path: Path, variable: str | None = None) -> Array:

@@ -12,7 +12,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
-from qsim.formats import exporting, importing
+from qsim.formats import detection, exporting, importing
 from qsim.formats.recording import TRANSFERS, Hints
 
 _SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr"}
@@ -34,7 +34,7 @@ def add_convert(sub: Any) -> None:
         "output", type=Path, help="clip folder, stream name, .npy, .mp4 or .zarr, or a folder with --to"
     )
     reading = parser.add_argument_group("what a foreign file may not say")
-    reading.add_argument("--layout", help=f"kind of the input: {', '.join(importing.LAYOUTS)}")
+    reading.add_argument("--layout", help=f"kind of the input: {', '.join(detection.LAYOUTS)}")
     reading.add_argument("--frame-rate", type=float, help="frames per second of the capture (not of a video file)")
     reading.add_argument("--exposure", type=float, help="seconds of light per frame (default: the whole frame)")
     reading.add_argument("--transfer", help=f"how pictures code light: {', '.join(TRANSFERS)} (also for writing)")
@@ -123,21 +123,23 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
         raise ValueError(f"{args.input}: files do not say how fast the capture was; add --frame-rate, as in 2000")
     hints = Hints(args.layout, args.height, args.width, args.bits, args.transfer, args.channel, args.flip, args.columns,
                   args.stretched, args.variable, args.white)  # fmt: skip
-    capture = importing.Capture(args.frame_rate, args.exposure, args.sensor, args.ppp, args.split)
-    found = importing.recordings(args.input, args.layout)
+    capture = importing.Import(args.frame_rate, args.exposure, args.sensor, args.ppp, args.split)
+    found = detection.recordings(args.input, args.layout)
     pairs = [(source, args.output / files.check_name(_flat_name(source, args.input))) for source in found]
     made = []
     with bar("converting") as progress:
         for source, target in pairs or [(args.input, args.output)]:
-            footage = importing.read(source, hints)
-            if footage.is_light:
+            recording = importing.read(source, hints)
+            if recording.is_light:
                 if target.suffix in _SUFFIXES:
                     raise ValueError(f"{target}: light is read into a clip, a folder; name it without {target.suffix}")
-                clip = importing.to_clip(footage, target, capture, force=args.force, progress=progress)
-                made.append((clip.path, f"{_size(clip)}, light of {footage.source}; {importing.saturation_line(clip)}"))
+                clip = importing.to_clip(recording, target, capture, force=args.force, progress=progress)
+                made.append(
+                    (clip.path, f"{_size(clip)}, light of {recording.source}; {importing.saturation_line(clip)}")
+                )
                 continue
-            stream = importing.to_stream(footage, target, capture, force=args.force, progress=progress)
-            made.append((stream.path, f"{_size(stream)}, codes of {stream.bits} bits, {footage.source}"))
+            stream = importing.to_stream(recording, target, capture, force=args.force, progress=progress)
+            made.append((stream.path, f"{_size(stream)}, codes of {stream.bits} bits, {recording.source}"))
     return made
 
 

@@ -5,15 +5,18 @@ from typing import TYPE_CHECKING
 from qsim.files import lazy_names
 
 if TYPE_CHECKING:
+    from qsim.formats.detection import detect
     from qsim.formats.exporting import export
-    from qsim.formats.importing import detect, read, to_clip, to_stream
+    from qsim.formats.importing import read, to_clip, to_stream
+    from qsim.formats.recording import Recording
 
-__all__ = ["detect", "export", "read", "to_clip", "to_stream"]
+__all__ = ["Recording", "detect", "export", "read", "to_clip", "to_stream"]
 
 __getattr__ = lazy_names(
     __name__,
     {
-        "detect": "importing",
+        "Recording": "recording",
+        "detect": "detection",
         "export": "exporting",
         "read": "importing",
         "to_clip": "importing",

@@ -1,7 +1,7 @@
-"""Recordings in files that say their shape: .npy, .mat, zarr, visionsim's folders; packed planes or one code a pixel.
+"""Reads and writes recordings in files that state their shape: .npy, zarr and the folders of visionsim.
 
-Each reader takes a path and the user's hints and returns a `Footage` of codes; `ValueError` names the file, and the
-pixel whose value is no code. Bare streams of bits: planes.py.
+Each reader takes a path and the user's hints and returns a `Recording` of codes; `ValueError` names the file, and the
+pixel whose value is no code. Bare streams of bits: raw_cameras.py.
 """
 
 from __future__ import annotations
@@ -10,15 +10,28 @@ import itertools
 import json
 import math
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import files
 from qsim.checks import check_shape
+from qsim.colour import to_linear
 from qsim.files import decoding_errors, load_array
-from qsim.formats.recording import Footage, Hints, numbered
+from qsim.formats.recording import (
+    Hints,
+    Recording,
+    checked_codes,
+    light_recording,
+    need_transfer,
+    numbered,
+    reached,
+    white_of,
+)
+from qsim.sensor import packing
 
 _LARGEST_CHUNK = 1 << 29  # bytes of a zarr chunk in memory; one of quanta-spad-sim has up to 200 MB
 _LARGEST_METADATA = 1 << 22  # bytes
@@ -28,7 +41,7 @@ _CODECS = {"blosc", "bytes", "crc32c", "delta", "gzip", "lz4", "packbits", "shar
            "zlib", "zstd"}  # fmt: skip
 
 
-def read_cube(path: Path, hints: Hints) -> Footage:
+def read_cube(path: Path, hints: Hints) -> Recording:
     """Photon cube: uint8 [T, H, ceil(W/8)], rows padded, most significant bit first; [.., C] of colour needs a channel.
 
     Without a given width every bit of the last byte is a pixel. `ValueError` for another array.
@@ -48,10 +61,10 @@ def read_cube(path: Path, hints: Hints) -> Footage:
     def read(start: int, stop: int) -> Array:
         return np.unpackbits(np.asarray(array[start:stop]), axis=-1, count=width)
 
-    return Footage((frames, height, width), read, "photon cube", 1, meta={"bit_order": "msb"})
+    return Recording((frames, height, width), read, "photon cube", 1, meta={"bit_order": "msb"})
 
 
-def read_codes_npy(path: Path, hints: Hints) -> Footage:
+def read_codes_npy(path: Path, hints: Hints) -> Recording:
     """Unpacked codes: bool or unsigned [T, H, W] with one code per pixel; the bits are those given, else 1 for bool."""
     array = load_array(path)
     frames, height, width = check_shape(path, array.shape)
@@ -62,37 +75,28 @@ def read_codes_npy(path: Path, hints: Hints) -> Footage:
     def read(start: int, stop: int) -> Array:
         return checked_codes(path, np.asarray(array[start:stop]), bits, start)
 
-    return Footage((frames, height, width), read, "codes", bits)
+    return Recording((frames, height, width), read, "codes", bits)
 
 
-def read_mat(path: Path, hints: Hints) -> Footage:
-    """SwissSPAD .mat: OUTPUT [H, W, T] of one file, or of part_1.mat ... part_n.mat in a folder with info.json.
+def read_light_npy(path: Path, hints: Hints) -> Recording:
+    """Numbers [T, H, W] as light: integers are coded by --transfer (full scale of their type), floats are linear."""
+    array = load_array(path)
+    shape = check_shape(path, array.shape)
+    floats = array.dtype.kind == "f"
+    transfer = "linear" if floats and hints.transfer is None else need_transfer(path, hints)
+    top = 1.0 if floats else float(np.iinfo(array.dtype).max)
+    full = float("inf") if floats else top
+    white, _ = white_of(path, hints, full)
 
-    Another name is taken from `hints.variable`, or if it is the only array of frames.
-    """
-    files = [path]
-    if path.is_dir():
-        files = numbered(list(path.glob("part_*.mat")))
-        info = path / "info.json"
-        if info.is_file():
-            with decoding_errors(info, "JSON"):
-                wanted = int(json.loads(info.read_text("utf-8"))["no_parts"])
-            files = [path / f"part_{k}.mat" for k in range(1, min(wanted, 100_000) + 1)]
-        for file in files:
-            if not file.is_file():
-                raise FileNotFoundError(f"{file}: missing, though info.json speaks of {len(files)} parts")
-        if not files:
-            raise FileNotFoundError(f"{path}: holds no part_1.mat")
-    parts = [mat_array(file, hints.variable) for file in files]
-    if len({part.shape[1:] for part in parts}) > 1:
-        raise ValueError(f"{path}: the parts differ in size: {sorted({part.shape[1:] for part in parts})}")
-    planes = np.concatenate(parts)
-    bits = hints.bits or 1
-    codes = checked_codes(path, planes, bits, 0)
-    return Footage(check_shape(path, codes.shape), lambda a, b: codes[a:b], "SwissSPAD .mat", bits)
+    def marked(start: int, stop: int) -> tuple[Array, Array]:
+        values = _checked_light(path, array[start:stop], start)
+        light = values.astype(np.float32) if floats and transfer == "linear" else to_linear(values, transfer, top)
+        return light, reached(values, white)
+
+    return light_recording(path, shape, marked, ".npy", {"transfer": transfer}, hints, full)
 
 
-def read_zarr(path: Path, hints: Hints) -> Footage:
+def read_zarr(path: Path, hints: Hints) -> Recording:
     """zarr v2 or v3 in a folder: array `frames` of a group, or an array at the root; [T, H, W], one code a pixel."""
     import zarr
 
@@ -127,7 +131,7 @@ def read_zarr(path: Path, hints: Hints) -> Footage:
         with decoding_errors(path, "zarr"), zarr.config.set({"async.concurrency": 1}):  # one chunk in memory at a time
             return checked_codes(path, np.asarray(array[start:stop]), bits, start)
 
-    return Footage(shape, read, "zarr", bits, meta={"attributes": attributes})
+    return Recording(shape, read, "zarr", bits, meta={"attributes": attributes})
 
 
 def _zarr_codecs(path: Path, folder: Path) -> set[str]:
@@ -166,7 +170,7 @@ def _count_files(folder: Path, enough: int) -> int:
     return count
 
 
-def read_visionsim(path: Path, hints: Hints) -> Footage:
+def read_visionsim(path: Path, hints: Hints) -> Recording:
     """visionsim: transforms.json with frames.npy [T, H, bytes, C] (0.1), or with shards 0000.npy, ... (later)."""
     description = path / "transforms.json"
     with decoding_errors(description, "JSON"):
@@ -206,96 +210,43 @@ def read_visionsim(path: Path, hints: Hints) -> Footage:
         return checked_codes(path, joined, bits, start)
 
     model = "binary_sum" if packed else "binary_sum_static"
-    return Footage(shape, read, "visionsim", bits, model, {"bit_order": "msb"})
+    return Recording(shape, read, "visionsim", bits, model, {"bit_order": "msb"})
 
 
-def checked_codes(path: Path, values: Array, bits: int, first: int) -> Array:
-    """Codes as uint8 (uint16 above 8 bits); `ValueError` with frame and pixel if one is above 2^bits - 1."""
-    top = 2**bits - 1
-    if values.dtype != bool and values.size and int(values.max()) > top:
-        t, y, x = (int(i) for i in np.argwhere(values > top)[0])
-        raise ValueError(
-            f"{path}: value {int(values[t, y, x])} at (t, y, x) = ({first + t}, {y}, {x}) is no {bits}-bit code "
-            f"(0..{top}); say the right --bits, or --stretched"
-        )
-    return values.astype(np.uint8 if bits <= 8 else np.uint16)
+def _checked_light(path: Path, values: Array, first: int) -> Array:
+    """The values if they are light: finite, not negative, within single precision; else `ValueError` with the place."""
+    good = (values >= 0) & (values < 3e38)
+    if not good.all():
+        t, y, x = (int(i) for i in np.argwhere(~good)[0])
+        place = f"(t, y, x) = ({first + t}, {y}, {x})"
+        raise ValueError(f"{path}: value {values[t, y, x]} at {place} is no light: expected finite numbers from 0 up")
+    return np.asarray(values)
 
 
-def mat_array(path: Path, variable: str | None = None) -> Array:
-    """An array of a .mat file as [T, H, W]: level 5 by scipy, 7.3 (HDF5, axes reversed) by h5py; [H, W] is one frame.
-
-    The one called `variable`; without a name OUTPUT, or the only array of numbers in two or three dimensions.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    with open(path, "rb") as file:
-        head = file.read(1024)
-    if b"\x89HDF\r\n\x1a\n" in head:
-        return _hdf_array(path, variable)
-    import scipy.io
-
-    with decoding_errors(path, "MATLAB 5 .mat"):
-        numbers = ("int", "uint", "single", "double", "logical")
-        shapes = {name: shape for name, shape, kind in scipy.io.whosmat(path) if kind.startswith(numbers)}
-        name = _chosen(path, variable, shapes)
-        _plausible(path, shapes[name])
-        return _frames_first(path, name, scipy.io.loadmat(path, variable_names=[name])[name])
+def write_cube(path: Path, blocks: Iterator[Array], shape: tuple[int, int, int]) -> None:
+    """Binary planes as a photon cube: uint8 [T, H, ceil(W/8)], rows padded, most significant bit first."""
+    frames, height, width = shape
+    with files.replacing(path) as file:
+        header = {"descr": "|u1", "fortran_order": False, "shape": (frames, height, packing.packed_width(width, 1))}
+        np.lib.format.write_array_header_1_0(file, header)
+        for block in blocks:
+            file.write(packing.pack(block, 1).tobytes())
 
 
-def _hdf_array(path: Path, variable: str | None) -> Array:
-    import h5py
+def write_zarr(folder: Path, blocks: Iterator[Array], shape: tuple[int, int, int], attributes: dict[str, Any]) -> None:
+    """A zarr v3 group with `frames` [T, H, W], chunks of whole frames; binary codes as quanta-spad-sim stores them."""
+    import zarr
 
-    with decoding_errors(path, "MATLAB 7.3 .mat"), h5py.File(path, "r") as file:
-        own = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
-        wanted = variable or "OUTPUT"
-        if wanted in file.keys() - set(own):
-            raise ValueError(
-                f"{path}: {wanted} is a link, which may lead into another file; store the planes themselves"
-            )
-        shapes = {name: file[name].shape for name in own if isinstance(file[name], h5py.Dataset)}
-        name = _chosen(path, variable, shapes)
-        stored = file[name]
-        if stored.external or stored.is_virtual:
-            raise ValueError(f"{path}: {name} lies in other files, which are not read; store the planes themselves")
-        _plausible(path, stored.shape)
-        if stored.dtype.kind not in "buif":
-            raise ValueError(f"{path}: {name} is {stored.dtype} {list(stored.shape)}, expected numbers [T, W, H]")
-        return _frames_first(path, name, stored[...].T)
-
-
-def _chosen(path: Path, variable: str | None, shapes: dict[str, tuple[int, ...]]) -> str:
-    """The array to read; `ValueError` with the names found where the choice is open."""
-    if variable is not None:
-        if variable not in shapes:
-            raise ValueError(f"{path}: has no array {variable}; it holds {sorted(shapes)}")
-        return variable
-    if "OUTPUT" in shapes:
-        return "OUTPUT"
-    images = sorted(
-        name for name, shape in shapes.items() if len(shape) in (2, 3) and min(shape) > 0 and max(shape) > 1
-    )
-    if len(images) == 1:
-        return images[0]
-    if not images:
-        raise ValueError(f"{path}: has no array of frames; it holds {sorted(shapes)}")
-    raise ValueError(f"{path}: holds the arrays {images}; choose one with --variable {images[0]}")
-
-
-def _frames_first(path: Path, name: str, planes: Array) -> Array:
-    """MATLAB's [H, W, T] or [H, W] as [T, H, W]; whole numbers stored as floats become integers."""
-    if planes.dtype.kind not in "buif" or planes.ndim not in (2, 3):
-        raise ValueError(f"{path}: {name} is {planes.dtype} {list(planes.shape)}, expected unsigned [H, W, T]")
-    planes = planes if planes.ndim == 3 else planes[..., None]
-    if planes.dtype.kind in "if":
-        whole = np.rint(planes)
-        if planes.size and not (np.isfinite(planes).all() and (whole == planes).all() and whole.min() >= 0):
-            raise ValueError(f"{path}: {name} holds values that are no counts: expected whole numbers from 0 up")
-        planes = whole.astype(np.uint32) if not planes.size or whole.max() < 2**32 else planes
-    return np.ascontiguousarray(planes.transpose(2, 0, 1))
-
-
-def _plausible(path: Path, shape: tuple[int, ...]) -> None:
-    """Deflate shrinks at most 1032-fold: a header that promises more than that is lying."""
-    promised, size = float(np.prod(shape, dtype=float)), path.stat().st_size
-    if promised > 1032.0 * size:
-        raise ValueError(f"{path}: the header promises {promised:.3g} values, which {size} bytes cannot hold")
+    group = zarr.open_group(str(folder), mode="w", zarr_format=3)
+    group.attrs.update(attributes)
+    per_chunk = max(1, min(max(shape[0], 1), (8 << 20) // (shape[1] * shape[2])))
+    array = None
+    start = 0
+    for block in blocks:
+        if array is None:
+            chunks = (per_chunk, *shape[1:])
+            array = group.create_array(
+                "frames", shape=shape, chunks=chunks, dtype=block.dtype, config={"write_empty_chunks": True}
+            )  # dark chunks too: a reader cannot tell one that was left out from one that was lost
+        array[start : start + len(block)] = block
+        start += len(block)

@@ -14,8 +14,11 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream, orientation
+from qsim.colour import code_levels, peak
 from qsim.files import VERSION
-from qsim.formats import video
+from qsim.formats import array_files, images, video
+
+BLOCK = 16  # frames read at a time
 
 
 @dataclass(frozen=True)
@@ -104,11 +107,11 @@ def _check_ours(place: Path, description: Path, single: bool) -> None:
         files.check_ours(place, _NAMES)
 
 
-def _cube(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+def _cube(source: Clip | Stream, path: Path, _wanted: Export, _meta: dict[str, Any]) -> None:
     if isinstance(source, Clip) or source.bits != 1:
         what = "a clip holds light" if isinstance(source, Clip) else f"this stream has {source.bits}"
         raise ValueError(f"{source.path}: a photon cube holds one bit per pixel, {what}; sense it with --bits 1")
-    video.write_cube(path, _code_blocks(source), source.shape)
+    array_files.write_cube(path, _code_blocks(source), source.shape)
 
 
 def _mp4(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
@@ -121,25 +124,25 @@ def _mp4(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]
 
 def _png(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
     if isinstance(source, Clip):
-        video.write_png(path, _grey(source, wanted, meta))
+        images.write_png(path, _grey(source, wanted, meta))
     else:
-        images = (image for block in _code_blocks(source) for image in block)
-        video.write_png(path, (image.astype(bool) if source.bits == 1 else image for image in images))
+        codes = (image for block in _code_blocks(source) for image in block)
+        images.write_png(path, (image.astype(bool) if source.bits == 1 else image for image in codes))
 
 
-def _exr(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+def _exr(source: Clip | Stream, path: Path, _wanted: Export, _meta: dict[str, Any]) -> None:
     if not isinstance(source, Clip):
         raise ValueError(f"{source.path}: EXR holds light, this is a stream of codes; use png, zarr or mp4")
-    video.write_exr(path, (source.radiance(t) for t in range(len(source))))
+    images.write_exr(path, (source.radiance(t) for t in range(len(source))))
 
 
-def _zarr(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+def _zarr(source: Clip | Stream, path: Path, _wanted: Export, meta: dict[str, Any]) -> None:
     frames, height, width = source.shape
     rate = float(meta["frame_rate"])
     # quanta-spad-sim calls the length of the whole recording T_exp.
     attributes = {"fps": rate, "T_exp": frames / rate, "T": frames, "H": height, "W": width, "shape": [*source.shape]}
     blocks = _light_blocks(source) if isinstance(source, Clip) else _code_blocks(source)
-    video.write_zarr(path, blocks, source.shape, attributes | {"qsim": meta})
+    array_files.write_zarr(path, blocks, source.shape, attributes | {"qsim": meta})
 
 
 EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
@@ -170,24 +173,24 @@ def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
 def _grey(source: Clip | Stream, wanted: Export, meta: dict[str, Any]) -> Iterator[Array]:
     if isinstance(source, Clip):
         for block in _light_blocks(source):
-            yield from video.grey(block, meta["white"], wanted.transfer)
+            yield from images.grey(block, meta["white"], wanted.transfer)
     else:
         for block in _code_blocks(source):
-            yield from video.stretch(block, source.bits)
+            yield from code_levels(block, source.bits)
 
 
 def _white(clip: Clip) -> float:
+    """Return the peak of up to 64 frames of a clip, of every second row and column, in its unit."""
     step = max(1, len(clip) // 32)
     samples = np.stack([clip.radiance(t)[::2, ::2] for t in range(0, len(clip), step)])
-    white = float(np.percentile(samples, 99.9))
-    return white if white > 0 else 1.0
+    return peak(samples)
 
 
 def _light_blocks(clip: Clip) -> Iterator[Array]:
-    for start in range(0, len(clip), video.BLOCK):
-        yield np.stack([clip.radiance(t) for t in range(start, min(start + video.BLOCK, len(clip)))])
+    for start in range(0, len(clip), BLOCK):
+        yield np.stack([clip.radiance(t) for t in range(start, min(start + BLOCK, len(clip)))])
 
 
 def _code_blocks(stream: Stream) -> Iterator[Array]:
-    for start in range(0, len(stream), video.BLOCK):
-        yield stream.codes(start, min(start + video.BLOCK, len(stream)))
+    for start in range(0, len(stream), BLOCK):
+        yield stream.codes(start, min(start + BLOCK, len(stream)))

@@ -1,8 +1,8 @@
 """Raw files of photon counting cameras: binary planes as streams of bits, in every layout of the field that we know.
 
-Each reader takes a path and the user's hints and returns a `Footage` of codes; bits come first or last in a byte,
+Each reader takes a path and the user's hints and returns a `Recording` of codes; bits come first or last in a byte,
 rows are in order or not, halves are upside down or not, as its docstring and its `meta` say: these files say nothing
-of it themselves. Files that say their shape: arrays.py.
+of it themselves. Files that say their shape: array_files.py.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.checks import check_shape
-from qsim.formats.recording import Footage, Hints, check_size
+from qsim.formats.recording import Hints, Recording, check_size
 
 HALF, FULL = (256, 512), (512, 512)  # pixels of SwissSPAD2's half and full array
 RAW_FRAME = 512 * 512 // 8  # bytes of one full-array plane
 
 
-def read_swissspad2_half(path: Path, hints: Hints) -> Footage:
+def read_swissspad2_half(path: Path, _hints: Hints) -> Recording:
     """SwissSPAD2 half array: raw planes of 256 x 512, one bit stream, least significant bit first; file or folder."""
     files = raw_files(path)
     counts = [check_size(file, file.stat().st_size, RAW_FRAME // 2, "SwissSPAD2 half-array") for file in files]
@@ -34,7 +34,7 @@ def read_swissspad2_half(path: Path, hints: Hints) -> Footage:
     return _raw(files, counts, RAW_FRAME // 2, HALF, decode, "SwissSPAD2 half array", meta)
 
 
-def read_swissspad2_full(path: Path, hints: Hints) -> Footage:
+def read_swissspad2_full(path: Path, _hints: Hints) -> Recording:
     """SwissSPAD2 full array: 512 x 512 in eight zones of 128 columns, bottom half upside down, LSB first."""
     files = raw_files(path)
     counts = [check_size(file, file.stat().st_size, RAW_FRAME, "SwissSPAD2 full-array") for file in files]
@@ -51,7 +51,7 @@ def read_swissspad2_full(path: Path, hints: Hints) -> Footage:
     return _raw(files, counts, RAW_FRAME, FULL, decode, "SwissSPAD2 full array", meta)
 
 
-def read_spad512s(path: Path, hints: Hints) -> Footage:
+def read_spad512s(path: Path, _hints: Hints) -> Recording:
     """SPAD512S: raw planes of 512 x 512, row by row, most significant bit first; some files end with 4 more bytes.
 
     Public readers disagree about left and right: the file is read as it lies, `orientation` says so, and `flip_lr` is
@@ -68,7 +68,7 @@ def read_spad512s(path: Path, hints: Hints) -> Footage:
     return _raw(files, counts, RAW_FRAME, FULL, decode, "SPAD512S", meta)
 
 
-def read_spike(path: Path, hints: Hints) -> Footage:
+def read_spike(path: Path, hints: Hints) -> Recording:
     """Spike camera: one bit stream, least significant bit first, frames upside down; size by hints or config.yaml."""
     height, width = hints.height, hints.width
     config = path.parent / "config.yaml"
@@ -111,7 +111,7 @@ def raw_files(path: Path) -> list[Path]:
 
 def _raw(
     files: list[Path], counts: list[int], frame_bytes: int, size: tuple[int, int], decode: Any, source: str, meta: Any
-) -> Footage:
+) -> Recording:
     ends = np.cumsum(counts)
 
     def read(start: int, stop: int) -> Array:
@@ -123,4 +123,4 @@ def _raw(
                 parts.append(decode(raw))
         return np.concatenate(parts)
 
-    return Footage((int(ends[-1]), *size), read, source, 1, meta=meta)
+    return Recording((int(ends[-1]), *size), read, source, 1, meta=meta)

@@ -1,6 +1,6 @@
 """Frames from anywhere: one small record between foreign files and ours, and the care that reading them needs.
 
-A `Footage` is either codes (0 ... 2^bits - 1, of a photon counting sensor) or light (linear, in arbitrary units).
+A `Recording` is either codes (0 ... 2^bits - 1, of a photon counting sensor) or light (linear, in arbitrary units).
 Readers trust no header: sizes are compared with the file before anything is allocated, and whatever a decoder raises or
 warns about becomes one `ValueError` with the file's name.
 """
@@ -22,7 +22,7 @@ Marked = Callable[[int, int], tuple[Array, Array]]
 
 
 @dataclass(frozen=True, eq=False)
-class Footage:
+class Recording:
     """Frames [T, H, W] that are read when asked for."""
 
     shape: tuple[int, int, int]
@@ -78,7 +78,7 @@ def numbered(paths: list[Path]) -> list[Path]:
     return sorted(paths, key=key)
 
 
-def light_footage(
+def light_recording(
     path: Path,
     shape: tuple[int, int, int],
     marked: Marked,
@@ -86,10 +86,10 @@ def light_footage(
     meta: dict[str, Any],
     hints: Hints,
     full: float,
-) -> Footage:
-    """Footage of light; `full` is the largest value that the file's pixels can hold, infinite for floats."""
+) -> Recording:
+    """Recording of light; `full` is the largest value that the file's pixels can hold, infinite for floats."""
     white, assumed = white_of(path, hints, full)
-    return Footage(shape, lambda a, b: marked(a, b)[0], source, None, "", meta, marked, white, assumed)
+    return Recording(shape, lambda a, b: marked(a, b)[0], source, None, "", meta, marked, white, assumed)
 
 
 def white_of(path: Path, hints: Hints, full: float) -> tuple[float | None, bool]:
@@ -119,34 +119,46 @@ def need_transfer(path: Path, hints: Hints) -> str:
     return hints.transfer
 
 
-def stated(footage: Footage, bit_order: str, orientation: str) -> Footage:
-    """The footage with bit order and orientation in its `meta`; what its reader says of them itself is kept."""
-    return replace(footage, meta={"bit_order": bit_order, "orientation": orientation} | footage.meta)
+def with_stated_layout(recording: Recording, bit_order: str, orientation: str) -> Recording:
+    """The recording with bit order and orientation in its `meta`; what its reader says of them itself is kept."""
+    return replace(recording, meta={"bit_order": bit_order, "orientation": orientation} | recording.meta)
 
 
-def turned(footage: Footage, hints: Hints) -> Footage:
-    """The footage with the user's flips and column cut applied; its `orientation` says that it was flipped."""
-    frames, height, width = footage.shape
+def reoriented(recording: Recording, hints: Hints) -> Recording:
+    """The recording with the user's flips and column cut applied; its `orientation` says that it was flipped."""
+    frames, height, width = recording.shape
     columns = hints.columns or width
     if not 0 < columns <= width:
         raise ValueError(f"--columns {columns}: the frames have {width} columns")
     if hints.flip not in ("none", "lr", "ud", "both"):
         raise ValueError(f"--flip {hints.flip!r}: known are lr, ud, both")
     if hints.flip == "none" and columns == width:
-        return footage
+        return recording
     rows = slice(None, None, -1 if hints.flip in ("ud", "both") else 1)
     across = slice(None, None, -1 if hints.flip in ("lr", "both") else 1)
 
     def read(start: int, stop: int) -> Array:
-        return np.ascontiguousarray(footage.read(start, stop)[..., :columns][:, rows, across])
+        return np.ascontiguousarray(recording.read(start, stop)[..., :columns][:, rows, across])
 
     def marked(start: int, stop: int) -> tuple[Array, Array]:
-        assert footage.marked is not None
-        light, mask = (block[..., :columns][:, rows, across] for block in footage.marked(start, stop))
+        assert recording.marked is not None
+        light, mask = (block[..., :columns][:, rows, across] for block in recording.marked(start, stop))
         return np.ascontiguousarray(light), np.ascontiguousarray(mask)
 
-    meta = footage.meta | {"flip": hints.flip, "columns_kept": columns}
+    meta = recording.meta | {"flip": hints.flip, "columns_kept": columns}
     if hints.flip != "none":
-        meta["orientation"] = f"{footage.meta.get('orientation', 'unknown')}; then --flip {hints.flip}"
-    kept = marked if footage.marked is not None else None
-    return replace(footage, shape=(frames, height, columns), read=read, meta=meta, marked=kept)
+        meta["orientation"] = f"{recording.meta.get('orientation', 'unknown')}; then --flip {hints.flip}"
+    kept = marked if recording.marked is not None else None
+    return replace(recording, shape=(frames, height, columns), read=read, meta=meta, marked=kept)
+
+
+def checked_codes(path: Path, values: Array, bits: int, first: int) -> Array:
+    """Codes as uint8 (uint16 above 8 bits); `ValueError` with frame and pixel if one is above 2^bits - 1."""
+    top = 2**bits - 1
+    if values.dtype != bool and values.size and int(values.max()) > top:
+        t, y, x = (int(i) for i in np.argwhere(values > top)[0])
+        raise ValueError(
+            f"{path}: value {int(values[t, y, x])} at (t, y, x) = ({first + t}, {y}, {x}) is no {bits}-bit code "
+            f"(0..{top}); say the right --bits, or --stretched"
+        )
+    return values.astype(np.uint8 if bits <= 8 else np.uint16)

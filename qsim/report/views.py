@@ -19,7 +19,7 @@ from qsim import colour, files
 from qsim.checks import check_shape
 from qsim.clip.clip import Clip, Stream
 from qsim.files import load_array
-from qsim.formats.array_files import checked_codes
+from qsim.formats.recording import checked_codes
 from qsim.sensor import packing
 
 Picture = NDArray[np.uint8]  # [H, W, 3]

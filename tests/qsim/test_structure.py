@@ -101,8 +101,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     generation.generate(recipe.load(folder / "r.toml"), folder / "data", generation.Options(workers=0), make=fakes.make)
     sense(Clip.open(folder / "data" / "clips" / "fan_0000"), Sensing("quiver-physical", bits=2, ppp=26.0))
     np.save(folder / "codes.npy", np.arange(96, dtype=np.uint8).reshape(2, 6, 8) % 8)
-    footage = importing.read(folder / "codes.npy", Hints("codes", bits=3))
-    importing.to_stream(footage, folder / "capture", importing.Capture(1000.0))
+    recording = importing.read(folder / "codes.npy", Hints("codes", bits=3))
+    importing.to_stream(recording, folder / "capture", importing.Import(1000.0))
     (folder / "codes.npy").unlink()
     restore_to_file(data.stream_codes(clip.stream("counts")), restorer("moment"), folder / "video.npy")
     return folder

@@ -29,7 +29,7 @@ from qsim.clip import exr
 from qsim.clip.clip import RELATIVE, Clip, ClipWriter
 from qsim.clip.stream import Stream
 from qsim.dataset import checking, recipe
-from qsim.formats import importing, video
+from qsim.formats import array_files, detection, images, importing, video
 from qsim.formats.recording import Hints
 from qsim.process import peak_memory
 from qsim.sensor import devices
@@ -65,7 +65,7 @@ def make_spike(folder: Path) -> None:
 
 
 def make_png(folder: Path) -> None:
-    video.write_png(folder, iter(some_planes() * 200))
+    images.write_png(folder, iter(some_planes() * 200))
 
 
 def make_tiff(folder: Path) -> None:
@@ -100,7 +100,7 @@ def make_visionsim(folder: Path) -> None:
 
 
 def make_zarr(folder: Path) -> None:
-    video.write_zarr(folder, iter([some_planes()]), (T, H, W), {"fps": 1000})
+    array_files.write_zarr(folder, iter([some_planes()]), (T, H, W), {"fps": 1000})
 
 
 def make_raw(encode: Callable[[np.ndarray], bytes], height: int) -> Callable[[Path], None]:
@@ -112,8 +112,8 @@ def make_raw(encode: Callable[[np.ndarray], bytes], height: int) -> Callable[[Pa
 
 def make_stream(folder: Path) -> None:
     np.save(folder / "codes.npy", some_planes() * 5)
-    footage = importing.read(folder / "codes.npy", Hints("codes", bits=3))
-    importing.to_stream(footage, folder / "s", importing.Capture(1000.0))
+    recording = importing.read(folder / "codes.npy", Hints("codes", bits=3))
+    importing.to_stream(recording, folder / "s", importing.Import(1000.0))
     (folder / "codes.npy").unlink()
 
 
@@ -144,11 +144,11 @@ def read_clip(folder: Path) -> None:
 
 def reader(hints: Hints, file: str | None = None) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
-        footage = importing.read(folder / file if file else folder, hints)
-        found = footage.read(0, min(footage.shape[0], 64))
-        assert found.shape == (min(footage.shape[0], 64), *footage.shape[1:])
-        if footage.bits is not None:
-            assert found.max() < 2**footage.bits
+        recording = importing.read(folder / file if file else folder, hints)
+        found = recording.read(0, min(recording.shape[0], 64))
+        assert found.shape == (min(recording.shape[0], 64), *recording.shape[1:])
+        if recording.bits is not None:
+            assert found.max() < 2**recording.bits
 
     return read
 
@@ -189,7 +189,7 @@ def read_bare(folder: Path) -> None:
 
 
 def read_detected(folder: Path) -> None:
-    assert importing.detect(folder / "a.npy") in importing.LAYOUTS
+    assert detection.detect(folder / "a.npy") in detection.LAYOUTS
 
 
 def read_calibration(folder: Path) -> None:
@@ -392,7 +392,7 @@ def test_a_header_that_promises_a_terabyte(tmp_path: Path):
 
 def test_a_picture_of_a_terapixel(tmp_path: Path):
     (tmp_path / "p").mkdir()
-    video.write_png(tmp_path / "p", iter([np.zeros((5, 7), np.uint8)]))
+    images.write_png(tmp_path / "p", iter([np.zeros((5, 7), np.uint8)]))
     content = bytearray((tmp_path / "p" / "000000.png").read_bytes())
     content[16:24] = struct.pack(">II", 1 << 20, 1 << 20)
     content[29:33] = struct.pack(">I", zlib.crc32(bytes(content[12:29])))

@@ -9,7 +9,7 @@ from qsim.calibration.frame_statistics import measure, measure_sums
 from qsim.calibration.spad import calibrate_spad
 from qsim.cli.program import main
 from qsim.formats import importing
-from qsim.formats.array_files import mat_array
+from qsim.formats.mat_files import mat_array
 from qsim.formats.recording import Hints
 
 H, W = 12, 14
@@ -190,8 +190,8 @@ def test_the_only_array_of_a_mat_is_taken(tmp_path, level):
             file["gate"] = np.ones((1, 1))
     assert np.array_equal(mat_array(path), codes)
     assert np.array_equal(mat_array(path, "counts"), codes)
-    footage = importing.read(path, Hints(bits=4))
-    assert np.array_equal(footage.read(0, 4), codes)
+    recording = importing.read(path, Hints(bits=4))
+    assert np.array_equal(recording.read(0, 4), codes)
     with pytest.raises(ValueError, match="has no array OUTPUT; it holds"):
         mat_array(path, "OUTPUT")
 

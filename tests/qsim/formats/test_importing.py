@@ -20,15 +20,15 @@ from qsim.cli.program import main
 from qsim.clip.clip import RELATIVE, Clip, ClipWriter
 from qsim.clip.sensing import Sensing, sense
 from qsim.clip.stream import Stream
-from qsim.colour import from_linear, to_linear
+from qsim.colour import code_levels, from_linear, to_linear
 from qsim.dataset import generation, recipe
 from qsim.dataset.dataset import Dataset
-from qsim.formats import exporting, importing, video
+from qsim.formats import array_files, detection, exporting, images, importing, video
 from qsim.formats.exporting import Export
-from qsim.formats.importing import Capture
-from qsim.formats.recording import Footage, Hints, numbered
+from qsim.formats.importing import Import
+from qsim.formats.recording import Hints, Recording, numbered
 
-CAPTURE = Capture(frame_rate=1000.0)
+CAPTURE = Import(frame_rate=1000.0)
 
 
 def random_planes(*shape: int, seed: int = 0) -> np.ndarray:
@@ -43,8 +43,8 @@ def one(shape: tuple[int, ...], *places: tuple[int, ...]) -> np.ndarray:
 
 
 def everything(path: Path, **hints: Any) -> np.ndarray:
-    footage = importing.read(path, Hints(**hints))
-    return footage.read(0, footage.shape[0])
+    recording = importing.read(path, Hints(**hints))
+    return recording.read(0, recording.shape[0])
 
 
 # Golden bytes of formats known from the field
@@ -52,7 +52,7 @@ def everything(path: Path, **hints: Any) -> np.ndarray:
 
 def test_golden_photon_cube(tmp_path: Path):
     planes_ = one((1, 2, 10), (0, 0, 0), (0, 1, 9))
-    video.write_cube(tmp_path / "a.npy", iter([planes_]), (1, 2, 10))
+    array_files.write_cube(tmp_path / "a.npy", iter([planes_]), (1, 2, 10))
     cube = np.load(tmp_path / "a.npy")
     assert cube.tolist() == [[[128, 0], [0, 64]]]
     assert cube.dtype == np.uint8
@@ -98,7 +98,7 @@ def test_golden_spad512s():
 )  # fmt: skip
 def test_photon_cubes_of_every_width(tmp_path_factory: pytest.TempPathFactory, codes: np.ndarray):
     path = tmp_path_factory.getbasetemp() / "cube.npy"
-    video.write_cube(path, iter([codes]), codes.shape)
+    array_files.write_cube(path, iter([codes]), codes.shape)
     np.testing.assert_array_equal(everything(path, layout="cube", width=codes.shape[2]), codes)
     whole = everything(path, layout="cube")
     assert whole.shape[2] == -(-codes.shape[2] // 8) * 8
@@ -111,8 +111,8 @@ def test_codes_through_our_stream_and_every_export(tmp_path: Path, bits: int, wi
     codes = np.random.default_rng(bits).integers(0, 2**bits, (3, 5, width)).astype(np.uint8)
     codes[0, 0, 0], codes[0, 1, 0], codes[0, 2, 0] = 0, 1, 2**bits - 1
     np.save(tmp_path / "codes.npy", codes)
-    footage = importing.read(tmp_path / "codes.npy", Hints("codes", bits=bits))
-    stream = importing.to_stream(footage, tmp_path / "s", CAPTURE)
+    recording = importing.read(tmp_path / "codes.npy", Hints("codes", bits=bits))
+    stream = importing.to_stream(recording, tmp_path / "s", CAPTURE)
     np.testing.assert_array_equal(stream.codes(), codes)
     np.testing.assert_array_equal(
         stream.codes(1, 3, (1, width // 2, 3, width - width // 2)), codes[1:, 1:4, width // 2 :]
@@ -224,10 +224,10 @@ def test_numbered_files_are_read_in_the_order_of_their_numbers(tmp_path: Path):
         folder = tmp_path / "0" / str(n // 4)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / f"filename{n}.bin").write_bytes(raw_planes.half(expected[2 * n : 2 * n + 2]))
-    footage = importing.read(tmp_path, Hints("swissspad2-half"))
-    assert footage.shape == (22, 256, 512)
-    np.testing.assert_array_equal(footage.read(0, 22), expected)
-    np.testing.assert_array_equal(footage.read(5, 13), expected[5:13])
+    recording = importing.read(tmp_path, Hints("swissspad2-half"))
+    assert recording.shape == (22, 256, 512)
+    np.testing.assert_array_equal(recording.read(0, 22), expected)
+    np.testing.assert_array_equal(recording.read(5, 13), expected[5:13])
     assert [p.name for p in numbered([Path("a10.png"), Path("a9.png"), Path("a1.png")])] == [
         "a1.png",
         "a9.png",
@@ -270,10 +270,10 @@ def test_zarr_of_both_versions(tmp_path: Path, version: int, root: bool):
         group.attrs["fps"] = 1000
         array = group.create_array("frames", shape=expected.shape, chunks=(4, 5, 7), dtype="u1")
     array[...] = expected
-    footage = importing.read(Path(path))
-    np.testing.assert_array_equal(footage.read(0, 11), expected)
+    recording = importing.read(Path(path))
+    np.testing.assert_array_equal(recording.read(0, 11), expected)
     if not root:
-        assert footage.meta["attributes"]["fps"] == 1000
+        assert recording.meta["attributes"]["fps"] == 1000
 
 
 def test_zarr_without_frames_or_with_missing_chunks(tmp_path: Path):
@@ -281,7 +281,7 @@ def test_zarr_without_frames_or_with_missing_chunks(tmp_path: Path):
     zarr.open_group(str(tmp_path / "e.zarr"), mode="w").create_array("frames", shape=(0, 5, 7), dtype="u1")
     with pytest.raises(ValueError, match="has no frames"):
         importing.read(tmp_path / "e.zarr")
-    video.write_zarr(tmp_path / "m.zarr", iter([random_planes(4, 5, 7)]), (4, 5, 7), {})
+    array_files.write_zarr(tmp_path / "m.zarr", iter([random_planes(4, 5, 7)]), (4, 5, 7), {})
     shutil.rmtree(tmp_path / "m.zarr" / "frames" / "c")
     with pytest.raises(ValueError, match="0 of 1 chunks are there; the recording is incomplete"):
         importing.read(tmp_path / "m.zarr")
@@ -323,8 +323,8 @@ def test_visionsim_folders(tmp_path: Path, width: int, sharded: bool):
         importing.read(tmp_path)
     for channel in range(3):
         np.testing.assert_array_equal(everything(tmp_path, channel=channel), expected[..., channel])
-    footage = importing.read(tmp_path, Hints(channel=1))
-    np.testing.assert_array_equal(footage.read(3, 6), expected[3:6, ..., 1])
+    recording = importing.read(tmp_path, Hints(channel=1))
+    np.testing.assert_array_equal(recording.read(3, 6), expected[3:6, ..., 1])
     (tmp_path / "transforms.json").write_text(json.dumps(info | {"w": width + 8}))
     with pytest.raises(ValueError, match="do not hold the width"):
         importing.read(tmp_path, Hints(channel=0))
@@ -386,7 +386,7 @@ def sample(folder: Path, layout: str) -> tuple[Path, Hints]:
         video.write_video(path, iter(255 * planes_), 30, lossless=True)
     elif layout == "png":
         path = folder
-        video.write_png(folder, iter(planes_.astype(bool)))
+        images.write_png(folder, iter(planes_.astype(bool)))
     elif layout == "tiff":
         path = folder / "a.tif"
         pytest.importorskip("tifffile").imwrite(path, planes_[0].astype(bool))
@@ -397,7 +397,7 @@ def sample(folder: Path, layout: str) -> tuple[Path, Hints]:
     elif layout == "zarr":
         pytest.importorskip("zarr")
         path = folder / "a.zarr"
-        video.write_zarr(path, iter([planes_]), (2, 16, 16), {})
+        array_files.write_zarr(path, iter([planes_]), (2, 16, 16), {})
     elif layout == "mat":
         from scipy.io import savemat
 
@@ -422,17 +422,17 @@ def promised() -> dict[str, tuple[str, str]]:
     return found
 
 
-@pytest.mark.parametrize("layout", importing.LAYOUTS)
+@pytest.mark.parametrize("layout", detection.LAYOUTS)
 def test_every_reader_says_bit_order_and_orientation(tmp_path: Path, layout: str):
     """As promised in docs/files.md, in what is read and in what is made of it."""
     (tmp_path / "in").mkdir()
-    footage = importing.read(*sample(tmp_path / "in", layout))
-    make = importing.to_clip if footage.is_light else importing.to_stream
-    made = make(footage, tmp_path / "made", CAPTURE)
+    recording = importing.read(*sample(tmp_path / "in", layout))
+    make = importing.to_clip if recording.is_light else importing.to_stream
+    made = make(recording, tmp_path / "made", CAPTURE)
     order, rows = promised()[layout]
-    assert footage.meta["bit_order"].startswith(order)
-    assert footage.meta["orientation"].startswith(rows)
-    said = {key: footage.meta[key] for key in ("bit_order", "orientation")}
+    assert recording.meta["bit_order"].startswith(order)
+    assert recording.meta["orientation"].startswith(rows)
+    said = {key: recording.meta[key] for key in ("bit_order", "orientation")}
     assert made.meta["source"] == made.meta["source"] | said
     assert made.meta.get("orientation", said["orientation"]) == said["orientation"]
     exported = exporting.export(made, tmp_path / "out", Export("png"))
@@ -457,8 +457,8 @@ def test_a_disputed_side_stays_disputed_and_a_flip_is_remembered(tmp_path: Path)
 
 
 def test_footage_whose_reader_says_nothing_is_not_called_upright(tmp_path: Path):
-    footage = Footage((1, 2, 8), lambda start, stop: random_planes(stop - start, 2, 8), "somewhere", 1)
-    assert importing.to_stream(footage, tmp_path / "s", CAPTURE).meta["orientation"] == "unknown"
+    recording = Recording((1, 2, 8), lambda start, stop: random_planes(stop - start, 2, 8), "somewhere", 1)
+    assert importing.to_stream(recording, tmp_path / "s", CAPTURE).meta["orientation"] == "unknown"
 
 
 # Pictures and video
@@ -493,13 +493,13 @@ def test_png_and_tiff_pictures_of_light(tmp_path: Path):
     tifffile = pytest.importorskip("tifffile")
     rng = np.random.default_rng(0)
     for dtype in (np.uint8, np.uint16):
-        images = rng.integers(0, np.iinfo(dtype).max, (3, 9, 7)).astype(dtype)
+        pictures = rng.integers(0, np.iinfo(dtype).max, (3, 9, 7)).astype(dtype)
         folder = tmp_path / f"png{np.dtype(dtype).name}"
         folder.mkdir()
-        video.write_png(folder, iter(images))
-        expected = to_linear(images, "srgb", np.iinfo(dtype).max)
+        images.write_png(folder, iter(pictures))
+        expected = to_linear(pictures, "srgb", np.iinfo(dtype).max)
         np.testing.assert_array_equal(everything(folder, transfer="srgb"), expected)
-        for photometric, stored in [("minisblack", images), ("miniswhite", np.iinfo(dtype).max - images)]:
+        for photometric, stored in [("minisblack", pictures), ("miniswhite", np.iinfo(dtype).max - pictures)]:
             path = tmp_path / f"{photometric}.tif"
             tifffile.imwrite(path, stored, photometric=photometric)
             np.testing.assert_array_equal(everything(path, transfer="srgb"), expected)
@@ -521,18 +521,18 @@ def test_codes_in_pictures(tmp_path: Path):
     bits1 = random_planes(2, 5, 7).astype(bool)
     codes = np.random.default_rng(1).integers(0, 8, (2, 5, 7)).astype(np.uint8)
     codes[0, 0, :2] = 0, 7
-    for name, images in [("one", bits1), ("three", codes), ("wide", video.stretch(codes, 3))]:
+    for name, pictures in [("one", bits1), ("three", codes), ("wide", code_levels(codes, 3))]:
         (tmp_path / name).mkdir()
-        video.write_png(tmp_path / name, iter(images))
+        images.write_png(tmp_path / name, iter(pictures))
     np.testing.assert_array_equal(everything(tmp_path / "one"), bits1)
     np.testing.assert_array_equal(everything(tmp_path / "three", bits=3), codes)
     np.testing.assert_array_equal(everything(tmp_path / "wide", bits=3, stretched=True), codes)
     with pytest.raises(ValueError, match=r"value \d+ at \(t, y, x\) = .* is no 3-bit code .* --stretched"):
         everything(tmp_path / "wide", bits=3)
-    lossy = video.stretch(codes, 3)
+    lossy = code_levels(codes, 3)
     lossy[1, 2, 3] ^= 2
     (tmp_path / "lossy").mkdir()
-    video.write_png(tmp_path / "lossy", iter(lossy))
+    images.write_png(tmp_path / "lossy", iter(lossy))
     with pytest.raises(ValueError, match=r"\(t, y, x\) = \(1, 2, 3\).*coded with loss"):
         everything(tmp_path / "lossy", bits=3, stretched=True)
 
@@ -554,9 +554,9 @@ def test_lossless_video_is_bit_exact_and_ordinary_video_is_not(tmp_path: Path):
     stream = importing.to_stream(importing.read(tmp_path / "c.npy", Hints("codes", bits=3)), tmp_path / "s", CAPTURE)
     exact = exporting.export(stream, tmp_path / "exact.mp4", Export("mp4"))
     found = everything(exact, transfer="linear") * 255
-    np.testing.assert_array_equal(np.rint(found), video.stretch(codes, 3))
+    np.testing.assert_array_equal(np.rint(found), code_levels(codes, 3))
     lossy = exporting.export(stream, tmp_path / "lossy.mp4", Export("mp4", lossless=False))
-    difference = np.rint(everything(lossy, transfer="linear") * 255) - video.stretch(codes, 3)
+    difference = np.rint(everything(lossy, transfer="linear") * 255) - code_levels(codes, 3)
     assert np.abs(difference).max() > 8
     assert json.loads((tmp_path / "exact.mp4.json").read_text())["frame_rate"] == 1000.0
 
@@ -591,20 +591,20 @@ def test_a_folder_of_videos_becomes_clips(tmp_path: Path):
 
 def test_a_tree_of_picture_folders_becomes_clips(tmp_path: Path):
     """As X4K1000FPS's test set has it: test/Type1/TEST01/0000.png ..."""
-    images = np.random.default_rng(0).integers(0, 255, (3, 9, 7)).astype(np.uint8)
+    pictures = np.random.default_rng(0).integers(0, 255, (3, 9, 7)).astype(np.uint8)
     for n, name in enumerate(["Type1/TEST01_000_f0433", "Type1/TEST02", "Type2/v1.0"]):
         (tmp_path / "in" / name).mkdir(parents=True)
-        video.write_png(tmp_path / "in" / name, iter(images[: n + 1]))
+        images.write_png(tmp_path / "in" / name, iter(pictures[: n + 1]))
     (tmp_path / "in" / "scene").mkdir()  # planes with their pictures beside them are another kind
     np.save(tmp_path / "in" / "scene" / "0.npy", np.zeros((2, 3, 4), np.uint8))
-    video.write_png(tmp_path / "in" / "scene", iter(images))
+    images.write_png(tmp_path / "in" / "scene", iter(pictures))
     options = ["--frame-rate", "1000", "--transfer", "srgb", "--split", "test"]
     assert main(["convert", str(tmp_path / "in"), str(tmp_path / "out"), *options]) == 0
     found = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert found == ["Type1_TEST01_000_f0433", "Type1_TEST02", "Type2_v1.0"]
     clip = Clip.open(tmp_path / "out" / "Type2_v1.0")
     assert clip.shape == (3, 9, 7)
-    np.testing.assert_allclose(clip.radiance(2), to_linear(images[2], "srgb", 255), rtol=2**-10)
+    np.testing.assert_allclose(clip.radiance(2), to_linear(pictures[2], "srgb", 255), rtol=2**-10)
     assert main(["convert", str(tmp_path / "in" / "Type2" / "v1.0"), str(tmp_path / "one"), *options]) == 0
     assert Clip.open(tmp_path / "one").shape == (3, 9, 7)
 
@@ -786,9 +786,9 @@ def test_three_raw_layouts_of_one_size_are_not_guessed(tmp_path: Path):
     assert sorted(evidence) == ["spad512s", "swissspad2-full", "swissspad2-half"]
     assert min(evidence, key=lambda name: float(evidence[name])) == "spad512s"
     path.write_bytes(raw_planes.spad512s(waves) + b"\0\0\0\0")
-    assert importing.detect(path) == "spad512s"
+    assert detection.detect(path) == "spad512s"
     path.rename(tmp_path / "acq_000.bin")
-    assert importing.detect(tmp_path / "acq_000.bin") == "spad512s"
+    assert detection.detect(tmp_path / "acq_000.bin") == "spad512s"
 
 
 @pytest.mark.parametrize("top", [1, 3, 7, 15, 127])
@@ -806,7 +806,7 @@ def test_detection_by_name_signature_and_type(tmp_path: Path):
     np.save(tmp_path / "counts.npy", np.full((2, 3, 4), 5, np.uint16))
     np.save(tmp_path / "planes.npy", np.ones((2, 3, 4), bool))
     kinds = {"cube": "cube", "light": "light", "counts": "light", "planes": "codes"}
-    assert {name: importing.detect(tmp_path / f"{name}.npy") for name in kinds} == kinds
+    assert {name: detection.detect(tmp_path / f"{name}.npy") for name in kinds} == kinds
     (tmp_path / "x.xyz").touch()
     with pytest.raises(ValueError, match="unknown kind of file; say which with --layout: cube, "):
         importing.read(tmp_path / "x.xyz")
@@ -823,9 +823,9 @@ def test_detection_by_name_signature_and_type(tmp_path: Path):
 
 def test_captures_without_sense():
     with pytest.raises(ValueError, match="frame rate: expected frames per second above 0"):
-        Capture(0)
+        Import(0)
     with pytest.raises(ValueError, match=r"at most a frame's 0\.001 s"):
-        Capture(1000, exposure=2e-3)
+        Import(1000, exposure=2e-3)
 
 
 def test_wrong_kinds_are_refused_with_advice(tmp_path: Path):

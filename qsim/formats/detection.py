@@ -1,0 +1,140 @@
+"""Names the layout of a foreign file or folder from names, signatures, side files and sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from qsim.files import load_array
+from qsim.formats import array_files, images, mat_files, raw_cameras, video
+from qsim.formats.recording import Hints, Recording
+
+Reader = Callable[[Path, Hints], Recording]
+LAYOUTS: dict[str, Reader] = {  # the names of --layout
+    "cube": array_files.read_cube,
+    "codes": array_files.read_codes_npy,
+    "light": array_files.read_light_npy,
+    "video": video.read_video,
+    "png": images.read_png,
+    "tiff": images.read_tiff,
+    "swissspad2-half": raw_cameras.read_swissspad2_half,
+    "swissspad2-full": raw_cameras.read_swissspad2_full,
+    "spad512s": raw_cameras.read_spad512s,
+    "visionsim": array_files.read_visionsim,
+    "zarr": array_files.read_zarr,
+    "mat": mat_files.read_mat,
+    "spike": raw_cameras.read_spike,
+}
+_WHOLE = "none: whole bytes per pixel"
+# (bit order, orientation) of the layouts whose readers leave it out, and why it is assumed.
+ASSUMED: dict[str, tuple[str, str]] = {
+    "cube": ("msb", "upright"),  # np.packbits along rows, row 0 on top: so photoncube shows it
+    "codes": (_WHOLE, "upright"),  # row 0 on top, as whatever draws an array draws it
+    "light": (_WHOLE, "upright"),  # the same
+    "video": (_WHOLE, "upright"),  # decoders give the top row first; a telephone's rotation tag is not followed
+    "png": ("msb if 1-bit", "upright"),  # by the standard: leftmost pixel in the high bit, top row first
+    "tiff": ("msb if 1-bit", "upright"),  # tifffile undoes FillOrder; an Orientation tag is not followed
+    "visionsim": ("msb", "upright"),  # np.packbits along rows of pictures as rendered
+    "zarr": (_WHOLE, "upright"),  # quanta-spad-sim draws row 0 on top
+    "mat": (_WHOLE, "as stored"),  # OUTPUT's rows are the array's; which way the camera hung is not in a file
+}
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv")
+PICTURES = {".png": "png", ".tif": "tiff", ".tiff": "tiff"}
+_SMALL = 8_388_608  # bytes that three raw layouts share
+
+
+def detect(path: Path) -> str:
+    """The layout's name, from names, signatures, side files and sizes; `ValueError` that lists the candidates."""
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file")
+    if path.is_dir():
+        return _detect_folder(path)
+    suffix = "".join(path.suffixes[-2:]) if path.suffix == ".gz" else path.suffix.lower()
+    simple = {".png": "png", ".tif": "tiff", ".tiff": "tiff", ".mat": "mat", ".dat": "spike", ".npy.gz": "cube"}
+    if suffix in simple:
+        return simple[suffix]
+    if suffix in VIDEOS:
+        return "video"
+    if suffix == ".npy":
+        return _detect_npy(path)
+    if suffix == ".bin":
+        return _detect_raw(path)
+    raise ValueError(f"{path}: unknown kind of file; say which with --layout: {', '.join(LAYOUTS)}")
+
+
+def recordings(folder: Path, layout: str | None) -> list[Path]:
+    """What a folder of many recordings holds: videos anywhere below it (I2-2000FPS), or folders of pictures (X4K).
+
+    Empty if `folder` is a file, or one recording itself.
+    """
+    if not folder.is_dir() or layout not in (None, "video", "png", "tiff"):
+        return []
+    if layout in (None, "video"):
+        videos = sorted(file for file in folder.rglob("*") if file.suffix.lower() in VIDEOS)
+        if videos or layout == "video":
+            return videos
+    if any(item.is_file() for item in folder.iterdir()):
+        return []
+    kinds = (layout,) if layout else ("png", "tiff")
+    places = {file.parent for file in folder.rglob("*") if PICTURES.get(file.suffix.lower()) in kinds}
+    return sorted(place for place in places if not any(place.glob("*.npy")))
+
+
+def _detect_folder(path: Path) -> str:
+    if (path / "transforms.json").is_file():
+        return "visionsim"
+    if (path / "transforms.db").is_file():
+        raise ValueError(f"{path}: describes its frames in transforms.db; let visionsim write a transforms.json")
+    if any((path / name).is_file() for name in ("zarr.json", ".zgroup", ".zarray")):
+        return "zarr"
+    if (path / "info.json").is_file() or any(path.glob("part_*.mat")):
+        return "mat"
+    for pattern, layout in (("*.png", "png"), ("*.tif*", "tiff")):
+        if any(path.glob(pattern)):
+            return layout
+    if any(path.rglob("*.bin")):
+        return _detect_raw(raw_cameras.raw_files(path)[0], many=True)
+    raise ValueError(f"{path}: a folder of no known kind; say which with --layout: {', '.join(LAYOUTS)}")
+
+
+def _detect_npy(path: Path) -> str:
+    array = load_array(path)
+    if array.dtype == bool:
+        return "codes"
+    if array.dtype != np.uint8:
+        return "light"
+    if array.ndim == 4:
+        return "cube"
+    top = max((int(array[t].max()) for t in range(len(array)) if array[t].size), default=0)
+    bits = (top + 1).bit_length() - 1
+    if top + 1 == 1 << bits and bits < 8:
+        raise ValueError(
+            f"{path}: uint8 up to {top}: codes of {bits} bits, packed planes or dark pictures; choose with "
+            f"--layout codes (and --bits {max(bits, 1)}), --layout cube or --layout light"
+        )
+    return "cube"
+
+
+def _detect_raw(path: Path, many: bool = False) -> str:
+    size = path.stat().st_size
+    if size == _SMALL + 4 or path.name.startswith("acq_"):
+        return "spad512s"
+    candidates = ["swissspad2-half", "swissspad2-full", "spad512s"]
+    if many and path.name.startswith("filename"):
+        candidates.pop()
+    fitting = [
+        name for name in candidates if size % (raw_cameras.RAW_FRAME // (1 + (name == "swissspad2-half"))) == 0 < size
+    ]
+    if not fitting:
+        raise ValueError(
+            f"{path}: {size} bytes fit none of {', '.join(candidates)}; the file is truncated, or another kind"
+        )
+    evidence = []
+    for name in fitting:
+        sample = LAYOUTS[name](path, Hints()).read(0, min(64, size // raw_cameras.RAW_FRAME) or 1)
+        evidence.append(f"{name} (roughness {raw_cameras.roughness(sample):.2f})")
+    raise ValueError(
+        f"{path}: {size} bytes fit {', '.join(evidence)}; choose one with --layout (the right one is usually near 1)"
+    )
