@@ -27,7 +27,7 @@ from typing import Any
 
 from qsim import files
 from qsim.dataset.job import Job
-from qsim.dataset.job_runner import Make, Result, mark_failed, run_job
+from qsim.dataset.job_runner import RenderJob, Result, mark_failed, run_job
 
 RETRIES = 3  # of a job whose worker raised; deaths of workers are counted by the scheduler (its allowed-failures)
 
@@ -41,7 +41,7 @@ class Cluster:
     def __init__(self, address: str, *, gpus: float = 0, timeout: float = 10.0) -> None:
         self.address, self.gpus, self.timeout = address, gpus, timeout
 
-    def __call__(self, jobs: list[Job], folder: Path, make: Make) -> Generator[Result]:
+    def __call__(self, jobs: list[Job], folder: Path, make: RenderJob) -> Generator[Result]:
         distributed = _distributed()
         resources = {"GPU": self.gpus} if self.gpus > 0 else None
         try:
@@ -79,7 +79,7 @@ def _result(future: Any, job: Job, folder: Path) -> Result:
     except Exception as error:  # the worker's: whatever it may be, it belongs to this job
         message = f"on the cluster: {type(error).__name__}: {_short(error)}"
         mark_failed(folder, job, message)
-        return Result(job.name, "died", message)
+        return Result(job.name, "crashed", message)
     assert isinstance(found, Result)
     return found
 

@@ -20,7 +20,7 @@ from qsim.dataset.dataset import FORMAT_VERSION, Damaged, Dataset, unproven
 from qsim.dataset.job import Job
 from qsim.dataset.job_runner import (
     FOLDERS,
-    Make,
+    RenderJob,
     Result,
     failure_path,
     mark_failed,
@@ -33,7 +33,7 @@ from qsim.dataset.worker_pool import Limits, run_here, run_local
 from qsim.files import VERSION, Progress
 from qsim.locks import Lock
 
-Run = Callable[[list[Job], Path, Make], Generator[Result]]
+Executor = Callable[[list[Job], Path, RenderJob], Generator[Result]]
 
 
 _ELSEWHERE = "a worker says that it is done, but it is not here; does every worker have this folder at this path?"
@@ -68,8 +68,8 @@ def generate(
     path: str | os.PathLike[str],
     options: Options | None = None,
     *,
-    make: Make = render_job,
-    run: Run | None = None,
+    make: RenderJob = render_job,
+    run: Executor | None = None,
     on_result: Callable[[Result], None] | None = None,
 ) -> Summary:
     """Make what is missing of a recipe's data set in folder `path`.
@@ -292,11 +292,11 @@ def _failures(folder: Path, jobs: Sequence[Job]) -> dict[str, str]:
     return found
 
 
-def _runner(options: Options) -> Run:
+def _runner(options: Options) -> Executor:
     if options.workers == 0:
         return run_here
 
-    def run(jobs: list[Job], folder: Path, make: Make) -> Generator[Result]:
+    def run(jobs: list[Job], folder: Path, make: RenderJob) -> Generator[Result]:
         return run_local(jobs, folder, make, options.workers, options.limits)
 
     return run

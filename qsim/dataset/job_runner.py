@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from qsim.rendering.budget import Budget
     from qsim.scene import Scene
 
-Make = Callable[[Job, Path], object]  # renders a job's clip to a path; tests hand in a quick one
+RenderJob = Callable[[Job, Path], object]  # renders a job's clip to a path; tests hand in a quick one
 
 FOLDERS = ("clips", "jobs", "failed", "logs", "locks", "work")  # of a data set
 
@@ -42,7 +42,7 @@ class Result:
     """What became of one job."""
 
     name: str
-    # "done", "failed", "full" (no space left), "gone" (the data set's folder) or "died" (the worker process)
+    # "done", "failed", "full" (no space left), "gone" (the data set's folder) or "crashed" (the worker process)
     state: str
     message: str = ""
 
@@ -130,7 +130,7 @@ def removed(folder: Path) -> str:
     return f"{gone[0]}: was removed while the data set was being made; run the same command again" if gone else ""
 
 
-def run_job(job: Job, folder: Path, make: Make = render_job) -> Result:
+def run_job(job: Job, folder: Path, make: RenderJob = render_job) -> Result:
     """Do whatever of a job is not done yet. Failures are written to failed/ and returned, not raised."""
     lock = locks.Lock(folder / "locks" / job.name)
     try:
@@ -158,7 +158,7 @@ def run_job(job: Job, folder: Path, make: Make = render_job) -> Result:
         lock.release()
 
 
-def _do(job: Job, folder: Path, make: Make) -> Result:
+def _do(job: Job, folder: Path, make: RenderJob) -> Result:
     """Clip, streams, record: each whole before the next begins."""
     started, worked = time.monotonic(), time.process_time()
     for path in (record_path(folder, job.name), failure_path(folder, job.name), folder / "clips" / job.name):
@@ -191,7 +191,7 @@ def mark_failed(folder: Path, job: Job, message: str) -> None:
     files.write_json(failure_path(folder, job.name), {"name": job.name, "digest": job.digest, "error": message})
 
 
-def _clip(job: Job, folder: Path, make: Make) -> Clip:
+def _clip(job: Job, folder: Path, make: RenderJob) -> Clip:
     """The job's finished clip, rendered if it is not there."""
     path, work = folder / "clips" / job.name, folder / "work" / job.name
     if path.is_symlink() and not path.is_dir():

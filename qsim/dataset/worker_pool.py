@@ -17,10 +17,10 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from qsim.dataset.job import Job
-from qsim.dataset.job_runner import Make, Result, mark_failed, run_job
+from qsim.dataset.job_runner import RenderJob, Result, mark_failed, run_job
 from qsim.process import resident_memory
 
-MAX_DEATHS = 2  # of worker processes, before a job counts as failed
+MAX_CRASHES = 2  # of worker processes, before a job counts as failed
 MEMORY_EXIT, ORPHAN_EXIT = 70, 71  # exit codes of worker processes
 
 
@@ -32,51 +32,51 @@ class Limits:
     jobs: int = 8  # per process: a fresh one replaces it, because renderers grow
 
 
-def run_here(jobs: list[Job], folder: Path, make: Make) -> Generator[Result]:
+def run_here(jobs: list[Job], folder: Path, make: RenderJob) -> Generator[Result]:
     """The jobs one after the other in this process."""
     for job in jobs:
         yield run_job(job, folder, make)
 
 
-def run_local(jobs: list[Job], folder: Path, make: Make, workers: int, limits: Limits) -> Generator[Result]:
+def run_local(jobs: list[Job], folder: Path, make: RenderJob, workers: int, limits: Limits) -> Generator[Result]:
     """The jobs in `workers` fresh processes, each with its own renderer; one that dies takes down only its job."""
     queue = collections.deque(jobs)
-    deaths: collections.Counter[str] = collections.Counter()
-    crew: list[_Worker] = []
+    crashes: collections.Counter[str] = collections.Counter()
+    pool: list[_Worker] = []
     try:
-        while queue or any(worker.job for worker in crew):
-            while queue and len([w for w in crew if w.job]) < workers:
-                worker = next((w for w in crew if w.job is None), None)
+        while queue or any(worker.job for worker in pool):
+            while queue and len([w for w in pool if w.job]) < workers:
+                worker = next((w for w in pool if w.job is None), None)
                 if worker is None:
                     worker = _Worker(folder, make, limits.memory)
-                    crew.append(worker)
+                    pool.append(worker)
                 worker.give(queue.popleft())
-            for connection in multiprocessing.connection.wait([w.pipe for w in crew if w.job]):
-                worker = next(w for w in crew if w.pipe is connection)
+            for connection in multiprocessing.connection.wait([w.pipe for w in pool if w.job]):
+                worker = next(w for w in pool if w.pipe is connection)
                 job, result = worker.take()
                 if result is None:  # the process died
-                    crew.remove(worker)
-                    deaths[job.name] += 1
-                    if deaths[job.name] < MAX_DEATHS:
+                    pool.remove(worker)
+                    crashes[job.name] += 1
+                    if crashes[job.name] < MAX_CRASHES:
                         queue.append(job)
                         continue
                     result = Result(
-                        job.name, "died", f"its worker process died {MAX_DEATHS} times ({worker.last_words})"
+                        job.name, "crashed", f"its worker process crashed {MAX_CRASHES} times ({worker.exit_reason})"
                     )
                     mark_failed(folder, job, result.message)
                 elif worker.jobs >= limits.jobs:
-                    crew.remove(worker)
-                    worker.dismiss()
+                    pool.remove(worker)
+                    worker.close()
                 yield result
     finally:
-        for worker in crew:
-            worker.dismiss(at_once=worker.job is not None)
+        for worker in pool:
+            worker.close(terminate=worker.job is not None)
 
 
 class _Worker:
     """A process of its own that does one job after the other; it ends when the parent does."""
 
-    def __init__(self, folder: Path, make: Make, memory: float) -> None:
+    def __init__(self, folder: Path, make: RenderJob, memory: float) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs, folder, make, memory, os.getpid()), daemon=True)
@@ -109,7 +109,7 @@ class _Worker:
             return job, None
 
     @property
-    def last_words(self) -> str:
+    def exit_reason(self) -> str:
         """Why the process is gone, in words."""
         code = self.process.exitcode
         if code == MEMORY_EXIT:
@@ -118,14 +118,15 @@ class _Worker:
             return f"signal {signal.Signals(-code).name}; SIGKILL is often a lack of memory"
         return f"exit code {code}"
 
-    def dismiss(self, at_once: bool = False) -> None:
-        if at_once:
+    def close(self, terminate: bool = False) -> None:
+        """End the process: after its job, or at once."""
+        if terminate:
             self.process.terminate()
         self.pipe.close()
         self.process.join()
 
 
-def _work(pipe: Connection, folder: Path, make: Make, memory: float, parent: int) -> None:
+def _work(pipe: Connection, folder: Path, make: RenderJob, memory: float, parent: int) -> None:
     """A worker process: jobs in, results out, until the pipe closes."""
     threading.Thread(target=_watch, args=(parent, memory), daemon=True).start()
     with contextlib.suppress(EOFError):

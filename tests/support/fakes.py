@@ -85,8 +85,8 @@ def fail_on_tumble(job: Job, path: Path) -> Clip:
     return make(job, path)
 
 
-def die_on_tumble(job: Job, path: Path) -> Clip:
-    """Dies as a process without memory would."""
+def crash_on_tumble(job: Job, path: Path) -> Clip:
+    """Ends as a process without memory does."""
     if job.family == "tumble":
         os.kill(os.getpid(), signal.SIGKILL)
     return make(job, path)

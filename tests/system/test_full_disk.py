@@ -17,7 +17,7 @@ from qsim.clip.sensing import Sensing, sense
 from qsim.dataset import recipe
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import Options, Summary, generate
-from qsim.dataset.job_runner import Make
+from qsim.dataset.job_runner import RenderJob
 from qsim.formats import exporting, importing
 from qsim.formats.exporting import Export
 
@@ -97,7 +97,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return tree(folder)
 
 
-def stops_at_a_full_disk(folder: Path, maker: Make) -> str:
+def stops_at_a_full_disk(folder: Path, maker: RenderJob) -> str:
     """Generate with two workers on a full disk: one line with the folder and what to do, and all that is read is whole.
 
     Returns the line.

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 import small_scenes
-from fakes import RECIPE, die_on_tumble, fail_on_tumble, hoard_on_tumble, make, make_slowly, tree
+from fakes import RECIPE, crash_on_tumble, fail_on_tumble, hoard_on_tumble, make, make_slowly, tree
 from forks import forked, killed_at
 
 from qsim import files, locks
@@ -26,7 +26,7 @@ from qsim.dataset import job_runner, provenance, recipe
 from qsim.dataset.checking import check
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import Options, Summary, generate, watching
-from qsim.dataset.job_runner import Make
+from qsim.dataset.job_runner import RenderJob
 from qsim.dataset.worker_pool import Limits, run_here
 from qsim.scene import Body, Diffuse, Texture, textures
 
@@ -335,14 +335,14 @@ def test_clips_that_were_made_somewhere_else_are_named(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("maker", "why"),
-    [(die_on_tumble, "signal SIGKILL"), (hoard_on_tumble, "more memory than --memory")],
+    [(crash_on_tumble, "signal SIGKILL"), (hoard_on_tumble, "more memory than --memory")],
 )
-def test_a_dying_worker_takes_down_only_its_job(tmp_path: Path, maker: Make, why: str):
+def test_a_crashing_worker_takes_down_only_its_job(tmp_path: Path, maker: RenderJob, why: str):
     options = Options(workers=2, limits=Limits(memory=0.7))
     summary = generate(SMALL, tmp_path / "d", options, make=maker)
     assert summary.done == 2
     assert list(summary.failed) == ["tumble_0004"]
-    assert "died 2 times" in summary.failed["tumble_0004"]
+    assert "crashed 2 times" in summary.failed["tumble_0004"]
     assert why in summary.failed["tumble_0004"]
 
 
