@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from qsim.optics.radiometry import expected_photons
     from qsim.rendering.budget import Budget
     from qsim.rendering.clip_rendering import render_clip
-    from qsim.rendering.fidelity import choose as choose_budget
+    from qsim.rendering.fidelity import choose_budget
     from qsim.rendering.mitsuba_xml import read_mitsuba
     from qsim.rendering.renderer import Renderer
     from qsim.scene import Scene
@@ -52,7 +52,7 @@ _HOMES = {
     "read_mitsuba": "rendering.mitsuba_xml",
     "calibrate_qis": "calibration.qis",
     "calibrate_spad": "calibration.spad",
-    "choose_budget": "rendering.fidelity:choose",
+    "choose_budget": "rendering.fidelity",
     "expected_photons": "optics.radiometry",
     "load_sensor": "sensor.devices:load",
     "pack": "sensor.packing",

@@ -158,7 +158,7 @@ def _run_render(args: argparse.Namespace) -> int:
     loaded, read = scene_files.load(args.scene, seed=args.seed, speed=args.speed)
     scene = loaded.resized(args.height, args.width)
     with bar(args.output.name if args.output else "pilot") as progress:
-        chosen = fidelity.choose(
+        chosen = fidelity.choose_budget(
             scene,
             frame_rate=args.frame_rate,
             shutter=args.shutter,

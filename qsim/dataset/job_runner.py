@@ -102,7 +102,7 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
             share = sensor.efficiency
             if sensing.ppp * share > electrons:
                 electrons, ppp = sensing.ppp * share, sensing.ppp
-    return fidelity.choose(
+    return fidelity.choose_budget(
         scene,
         frame_rate=settings.frame_rate,
         shutter=settings.shutter,

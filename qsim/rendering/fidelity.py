@@ -1,6 +1,6 @@
 """How much work a scene needs: bounces, instants per exposure and samples, from the error that is asked for.
 
-    choose(scene, ..., psnr=40, ppp=26) -> Budget;  explain(budget) -> what is modelled, left out, and how large it is
+    choose_budget(scene, ..., psnr=40, ppp=26) -> Budget; its findings say what is modelled, left out, and how large
 
 A pilot (pilot.py) looks at every n-th pixel in its true size. Two limits are kept, the stricter one counts:
 
@@ -55,7 +55,7 @@ class Noise:
         return Errors(*(_error(errors, samples) / math.sqrt(instants) for errors in (self.at_white, self.plain)))
 
 
-def choose(
+def choose_budget(
     scene: Scene,
     *,
     frame_rate: float = 2000.0,

@@ -58,7 +58,7 @@ def render(name: str, path: Path, shape: ClipShape, *, speed: float = 1.0, progr
             return clip
         raise FileExistsError(f"{path}: exists and is another clip; name another folder with -o")
     frames, rate = shape.frames, shape.frame_rate
-    chosen = fidelity.choose(scene, frame_rate=rate, frames=frames, psnr=shape.psnr, seed=shape.seed)
+    chosen = fidelity.choose_budget(scene, frame_rate=rate, frames=frames, psnr=shape.psnr, seed=shape.seed)
     return render_clip(scene, path, frames=frames, frame_rate=rate, seed=shape.seed, budget=chosen, progress=progress)
 
 

@@ -2,7 +2,7 @@
 
     run(scenes) -> LightReport: one LightRow per scene and level [dB]
 
-Each scene gets the budget of `budget.choose`; a few of its frames are compared with converged ones, which have many
+Each scene gets the budget of `choose_budget`; a few of its frames are compared with converged ones, which have many
 samples and the deepest bounces. Errors count at white (white.py), those without a clamp stand beside them; the
 reference's own noise is taken off. The mean light is held against what the budget announces: the bounces left out, and
 nothing else but noise, whose standard error comes from independent halves.
@@ -95,7 +95,7 @@ def run(
 
 
 def _row(scene: Scene, level: float, references: Array, frames: Sequence[int], seed: int) -> LightRow:
-    chosen = fidelity.choose(scene, psnr=level, seed=seed)
+    chosen = fidelity.choose_budget(scene, psnr=level, seed=seed)
     ours = Renderer(scene, budget=chosen, seed=seed)
     drawn = [ours.frame(t, with_truth=False) for t in frames]
     truth = references.mean(axis=0)

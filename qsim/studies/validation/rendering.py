@@ -4,7 +4,7 @@
 
 The obvious loop is `mi.render` per frame with the default integrator and the default `independent` sampler, a box
 filter, and the smallest power of two of samples that reaches the level. Ours is `Renderer.frame` without ground truth
-and with the budget that `budget.choose` gives for the level, error measurement included. Both start from a loaded scene
+and with the budget that `choose_budget` gives for the level, error measurement included. Both start from a loaded scene
 and are timed alternately, so that a busy machine is fair to both; processor seconds stand beside wall seconds, because
 other programs do not change them. Rows of short frames take up to 15 rounds: the median of three was seen a fifth off.
 The reference's own variance is subtracted.
@@ -124,7 +124,7 @@ def run(
             if progress is not None:
                 progress(f"{name}: {level:g} dB")
             started = time.perf_counter()
-            chosen = fidelity.choose(scene, psnr=level)
+            chosen = fidelity.choose_budget(scene, psnr=level)
             choosing[name] = choosing.get(name, 0.0) + time.perf_counter() - started
             rows.append(_compare(scene, name, level, chosen, target, rounds, most_samples))
             if progress is not None:

@@ -31,7 +31,7 @@ from qsim.dataset.job import Job
 from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.rendering import denoiser
 from qsim.rendering.budget import Budget
-from qsim.rendering.fidelity import choose, dimming, moving
+from qsim.rendering.fidelity import choose_budget, dimming, moving
 from qsim.report import report
 from qsim.scene import Body, Diffuse, EnvironmentImage, Glow, PointLight, RoughPlastic
 from qsim.scene.shapes import ball
@@ -85,7 +85,7 @@ def test_white_is_the_lower_of_two():
 def test_a_spark_in_the_dark_gets_a_budget():
     """Fewer than one pixel in a thousand has light: the 99.9th percentile is 0."""
     spark = scene(Body("spark", square(0.05), Glow(5.0)), light=PointLight((0, 0, -5), 1e-9))
-    chosen = choose(replace(spark, camera=CAMERA.resized(64, 88)), psnr=20, frames=1, denoise=False)
+    chosen = choose_budget(replace(spark, camera=CAMERA.resized(64, 88)), psnr=20, frames=1, denoise=False)
     assert chosen.white > 0
     frame = renderer(replace(spark, camera=CAMERA.resized(64, 88)), budget=chosen).frame(0, with_truth=False)
     assert np.percentile(frame.radiance, 99.9) == 0 < frame.radiance.mean()
@@ -145,7 +145,7 @@ def test_a_scene_with_highlights_reaches_what_was_asked_and_stated():
     Against a converged frame, whose own error is taken off. Six frames of 3168 pixels know their error to about 3 %.
     """
     made = sun_in_a_ball()
-    chosen = choose(made, psnr=30, frames=1, denoise=False)
+    chosen = choose_budget(made, psnr=30, frames=1, denoise=False)
     many = renderer(made, seed=5, budget=Budget(1024, chosen.bounces))
     halves = many.halves([0.0], many.budget, many.key(0))
     truth = halves.mean(axis=0)

@@ -13,7 +13,7 @@ from qsim.clip.clamped_error import Errors, Stated, decibels, error_at, white_in
 from qsim.rendering import fidelity, pilot
 from qsim.rendering.budget import Allowed, Budget, blur_error, blur_left, explain, grid_samples
 from qsim.rendering.denoiser import available, mixture
-from qsim.rendering.fidelity import Noise, choose, shortfall
+from qsim.rendering.fidelity import Noise, choose_budget, shortfall
 from qsim.rendering.renderer import Renderer
 from qsim.scene import Body, Diffuse, Glow, Oscillation, PointLight, Scene, Spin, SunSky, Texture, Translation
 
@@ -52,7 +52,7 @@ def test_the_blur_error_bounds_the_midpoint_rule_at_an_edge(travel, instants):
 
 def test_no_motion_needs_one_instant():
     assert blur_error(0.0, 1) == 0
-    chosen = choose(plate(None, light=SunSky()), shutter=1.0, psnr=30, denoise=False)
+    chosen = choose_budget(plate(None, light=SunSky()), shutter=1.0, psnr=30, denoise=False)
     assert chosen.sub_frames == 1
     assert not chosen.sharp
 
@@ -60,7 +60,7 @@ def test_no_motion_needs_one_instant():
 @pytest.mark.parametrize("psnr", [32.0, 42.0])
 def test_the_error_asked_for_is_reached_without_waste(psnr):
     made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
-    chosen = choose(made, psnr=psnr, denoise=False)
+    chosen = choose_budget(made, psnr=psnr, denoise=False)
     frames = [Renderer(made, budget=chosen).frame(t, with_truth=False) for t in (1, 9)]
     white = white_in(np.stack([frame.radiance for frame in frames]))
     reached = decibels(white, math.sqrt(np.mean([error_at(white, frame.errors_at) ** 2 for frame in frames])))
@@ -69,17 +69,17 @@ def test_the_error_asked_for_is_reached_without_waste(psnr):
 
 def test_more_light_on_the_sensor_asks_for_more_samples():
     made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
-    plain, bright = (choose(made, psnr=25, ppp=ppp, denoise=False) for ppp in (None, 300.0))
+    plain, bright = (choose_budget(made, psnr=25, ppp=ppp, denoise=False) for ppp in (None, 300.0))
     assert bright.samples > plain.samples
     assert "the sensor at 300 photons" in explain(bright)
 
 
 def test_bounces_follow_the_scene():
     """One matt plate in the open needs one bounce or few; the inside of a bright corner needs more."""
-    open_air = choose(scene(Body("plate", square(1.5), Diffuse(0.5))), psnr=30, denoise=False)
+    open_air = choose_budget(scene(Body("plate", square(1.5), Diffuse(0.5))), psnr=30, denoise=False)
     lamp = Body("lamp", square(0.4, -0.9), Glow(20.0))
     walls = [Body(f"wall{i}", square(2.2, -1.1), Diffuse(0.95), turned) for i, turned in enumerate(BOX)]
-    closed = choose(Scene("box", 0, CAMERA, (), (lamp, *walls)), psnr=30, denoise=False)
+    closed = choose_budget(Scene("box", 0, CAMERA, (), (lamp, *walls)), psnr=30, denoise=False)
     assert open_air.bounces < closed.bounces
     assert "bounces" in explain(closed)
 
@@ -91,7 +91,7 @@ BOX = [Spin((0, 1, 0), 0.0, angle) for angle in (0.0, math.pi / 2, -math.pi / 2)
 
 def test_an_open_shutter_gets_an_odd_number_of_instants():
     made = plate(Spin((0, 0, 1), 400.0), light=PointLight((1, 2, 4), 30.0))
-    chosen = choose(made, shutter=1.0, psnr=35, denoise=False)
+    chosen = choose_budget(made, shutter=1.0, psnr=35, denoise=False)
     assert chosen.sub_frames % 2 == 1
     assert chosen.sub_frames > 1
     assert chosen.sharp
@@ -107,7 +107,7 @@ def test_a_shadow_that_moves_on_a_wall_at_rest_is_blurred_too():
     slat = Body("slat", square(0.15), Diffuse(0.5), Translation((100.0, 0.0, 0.0), (-0.5, 0.0, 2.0)))
     made = scene(Body("wall", square(6, -1), Diffuse(0.7)), slat, light=PointLight((0.0, 0.0, 3.0), 40.0))
     made = replace(made, camera=replace(CAMERA, origin=(0.0, 0.0, 1.5)))
-    chosen = choose(made, shutter=1.0, psnr=55, denoise=False)
+    chosen = choose_budget(made, shutter=1.0, psnr=55, denoise=False)
     assert chosen.sub_frames > 3
     assert chosen.sharp
     assert "light and shadow" in explain(chosen)
@@ -122,7 +122,7 @@ def test_a_shadow_that_moves_on_a_wall_at_rest_is_blurred_too():
 
 def held(made: Scene, psnr: float, t: int) -> tuple[Budget, float, float, float]:
     """What is chosen for an open shutter; rms error at white allowed, of frame t against 315 instants, and stated."""
-    chosen = choose(made, shutter=1.0, psnr=psnr, denoise=False)
+    chosen = choose_budget(made, shutter=1.0, psnr=psnr, denoise=False)
     frame = renderer(made, shutter=1.0, budget=chosen).frame(t, with_truth=False)
     many = Budget(8 * 315, chosen.bounces, 315, sharp=False)
     truth = renderer(made, shutter=1.0, seed=1, budget=many).frame(t, with_truth=False).radiance
@@ -236,19 +236,19 @@ def test_bounces_that_no_pilot_tried_are_not_called_nothing():
 
 def test_the_choice_is_a_function_of_the_question():
     made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
-    assert choose(made, psnr=25) == choose(made, psnr=25)
+    assert choose_budget(made, psnr=25) == choose_budget(made, psnr=25)
 
 
 def test_a_lamp_behind_a_wall_is_said():
     made = scene(Body("wall", square(50, -1), Diffuse(0.5)), light=PointLight((0, 0, -2), 1.0))
     with pytest.raises(ValueError, match="the pilot saw no light"):
-        choose(made)
+        choose_budget(made)
 
 
 @pytest.mark.parametrize("psnr", [0.0, 200.0])
 def test_an_error_nobody_can_ask_for_is_refused(psnr):
     with pytest.raises(ValueError, match="10 to 80 dB"):
-        choose(plate(None), psnr=psnr)
+        choose_budget(plate(None), psnr=psnr)
 
 
 def test_a_budget_of_nothing_is_refused():
@@ -332,7 +332,7 @@ def test_the_denoiser_is_tried_beside_the_middle_of_a_large_frame():
     lamp = Body("lamp", square(200 / camera.focal_pixels * 4), Glow(0.3))
     leaves = Texture(np.random.default_rng(1).random((96, 96)), nearest=True)
     made = scene(Body("wall", square(12, -1), Diffuse(leaves)), lamp, light=SunSky(), camera=camera)
-    chosen = choose(made, psnr=42, denoise=True)
+    chosen = choose_budget(made, psnr=42, denoise=True)
     frame = Renderer(made, budget=chosen).frame(3, with_truth=False)
     white = white_in(frame.radiance)
     assert decibels(white, error_at(white, frame.errors_at)) > 41
@@ -360,7 +360,7 @@ def test_denoising_without_the_package_is_refused(monkeypatch):
 
 
 def test_effects_left_out_are_listed_with_their_size():
-    text = explain(choose(plate(None), psnr=25, denoise=False))
+    text = explain(choose_budget(plate(None), psnr=25, denoise=False))
     for word in ("depth of field", "diffraction", "Airy disk", "bounces", "samples", "motion blur"):
         assert word in text
     assert explain(Budget()) == ""
