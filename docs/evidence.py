@@ -52,7 +52,7 @@ SENSOR = """## Sensors
 - **cdf error**: the largest difference of P(code ≤ k) from sums and integrals written out anew in another way.
 - **p**: chi-square of drawn codes against the closed form; **z**: mean and variance in standard errors.
 - **differ**: pixels in a million where the compiled engine and the reference engine give another code for the same key.
-- **× NumPy**: times faster than the obvious NumPy lines (Poisson, normal, round, clip) in the same process.
+- **× NumPy**: times faster than the usual NumPy lines (Poisson, normal, round, clip) in the same process.
 """
 
 RENDERING = """## Rendering
@@ -61,7 +61,7 @@ Radiance is compared with a converged reference of the same scene. fan, tumble, 
 looked at while the budget was written and are left out. No constant was chosen on the others, nor on their
 seed, but one: the deepest bounce that is tried, after glass lacked light, which makes ours slower there.
 **asked** is the wanted PSNR; **reached** what a frame has against the reference; **stated** what its own error
-says: measured noise, and the bounces left out by the pilot. **obvious** is the loop that one would write
+says: measured noise, and the bounces left out by the pilot. **naive** is the loop that one would write
 first, with as many samples (a power of two) as it needs for the same PSNR.
 """
 
@@ -162,7 +162,7 @@ def sensor(report: dict[str, Any]) -> str:
 
 def rendering(report: dict[str, Any]) -> str:
     header = ["scene", "asked [dB]", "reached [dB]", "stated [dB]", "samples", "denoised", "bounces", "s/frame",
-              "obvious s/frame", "obvious [dB]", "times faster"]  # fmt: skip
+              "naive s/frame", "naive [dB]", "times faster"]  # fmt: skip
     rows = [
         [
             row["scene"],
@@ -187,7 +187,7 @@ def rendering(report: dict[str, Any]) -> str:
     size = (
         f"Frames of {report['height']} × {report['width']}; the median scene at 40 dB is {report['median_ratio']:.3f} "
         f"times faster; the wanted speed (10 times there, and nowhere slower) is {wanted} in this run. The "
-        "loop takes powers of two of samples and overshoots (**obvious [dB]**): could it stop at the PSNR that ours "
+        "loop takes powers of two of samples and overshoots (**naive [dB]**): could it stop at the PSNR that ours "
         f"reached, the median would be {equal:.1f}; could it stop at 40 dB exactly, with ours as it is, {exact:.1f}."
     )
     picture = f"![Seconds per frame against PSNR]({FIGURE.relative_to(HERE).as_posix()})"

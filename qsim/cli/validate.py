@@ -8,6 +8,7 @@ from typing import Any
 
 from qsim import checks
 from qsim.cli.console import bar, checked, command, note, output, refuse_existing, refuse_idle
+from qsim.figures import check_figure
 
 PIXELS, HEIGHT, WIDTH, PSNR = 1 << 22, 128, 256, 36.0  # defaults
 
@@ -51,9 +52,7 @@ def _run_validate(args: argparse.Namespace) -> int:
         refuse_idle(args, f"validate {args.what} without --output", ["force"] if "force" in acting else [])
     args.height, args.width = args.height or HEIGHT, args.width or WIDTH
     if args.output is not None:
-        from qsim.studies.validation import sensors
-
-        sensors.check_figure(args.output)
+        check_figure(args.output)
         refuse_existing(args.output, args.force)
     run = {"sensor": _sensor, "render": _render, "light": _light, "engines": _engines, "reading": _reading}
     return run[args.what](args)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from qsim import colour
 from qsim.clip.clamped_error import stated
 from qsim.clip.clip import RELATIVE, Clip, Stream
-from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, MOVING, SLOWEST, moving_mean
+from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, MOVING, SLOWEST, largest_motion, moving_mean
 from qsim.clip.photons import clip_photons
 from qsim.report import html as page
 from qsim.sensor.defects import defect_table, fixed_pattern
@@ -67,8 +67,7 @@ def flow_panel(clip: Clip, frames: range) -> tuple[page.Panel, float, NDArray[np
     """Flow in colour, the motion [px/frame] of the full colour, and the length of the flow [T, H, W]."""
     flow = np.stack([clip.flow(t) for t in frames])
     speed = np.hypot(flow[:, 0], flow[:, 1])
-    known = speed[np.isfinite(speed)]
-    largest = max(float(np.percentile(known, 99.9)) if known.size else 0.0, 0.5)
+    largest = max(largest_motion(speed), 0.5)
     panel = page.Panel(f"flow, full colour at {largest:.1f} px/frame", fit(colour.flow_colours(flow, largest)))
     return panel, largest, speed
 
@@ -82,8 +81,7 @@ def legend(largest: float) -> Markup:
 def motion(clip: Clip, frames: Sequence[int]) -> tuple[float | None, float]:
     """Mean motion of the pixels that move (None if none does) and the 99.9th percentile of all, in px/frame."""
     speed = np.stack([np.hypot(*clip.flow(t)) for t in frames])
-    known = speed[np.isfinite(speed)]
-    return moving_mean(known), float(np.percentile(known, 99.9)) if known.size else 0.0
+    return moving_mean(speed), largest_motion(speed)
 
 
 def clip_section(clip: Clip) -> Markup:

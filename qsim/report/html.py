@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qsim.figures import figure_png, new_figure
+
 if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
@@ -108,20 +110,12 @@ def figure(png: bytes, caption: str) -> Markup:
 
 def axes(x_label: str, y_label: str) -> tuple[Any, Callable[[], bytes]]:
     """One small set of axes, and a function that gives its picture as PNG bytes."""
-    from matplotlib.figure import Figure
-
-    drawing = Figure(figsize=(6.4, 3.0), dpi=110, layout="constrained")
+    drawing = new_figure(6.4, 3.0)
     own = drawing.subplots()
     own.set_xlabel(x_label)
     own.set_ylabel(y_label)
     own.grid(alpha=0.3)
-
-    def save() -> bytes:
-        buffer = io.BytesIO()
-        drawing.savefig(buffer, format="png")
-        return buffer.getvalue()
-
-    return own, save
+    return own, lambda: figure_png(drawing)
 
 
 def picture(pixels: NDArray[np.uint8], caption: str) -> Markup:

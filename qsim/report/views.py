@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from qsim import colour, files
 from qsim.checks import check_shape
 from qsim.clip.clip import Clip, Stream
+from qsim.clip.motion_statistics import largest_motion
 from qsim.files import load_array
 from qsim.formats.recording import checked_codes
 from qsim.sensor import packing
@@ -179,8 +180,7 @@ def _code_views(name: str, bits: int, length: int, read: Callable[[int, int], ND
 
 def _flow_view(clip: Clip) -> View:
     speeds = np.stack([np.hypot(*clip.flow(t)) for t in _samples(len(clip))])
-    finite = speeds[np.isfinite(speeds)]
-    largest = max(float(np.percentile(finite, 99.9)) if finite.size else 0.0, 0.5)
+    largest = max(largest_motion(speeds), 0.5)
     declared = f"flow to the next frame: rim of the wheel = {largest:.3g} px/frame, white still, grey unknown"
     return View(
         "flow",

@@ -27,6 +27,7 @@ from qsim import keys
 from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import CODE_PLANES, SLOWEST, moving_mean
 from qsim.clip.photons import clip_photons, light_level
+from qsim.colour import psnr
 from qsim.optics import radiometry
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
@@ -254,8 +255,8 @@ def _row(
         quantisation_error=signed_root(quiet - shot),
         read_error=signed_root(noise - quiet),
         snr_db=form.snr_db(form.planes * ppp),
-        psnr_db=_decibels(peak, simulated),
-        psnr_predicted_db=_decibels(peak, predicted),
+        psnr_db=psnr(peak, math.sqrt(simulated)),
+        psnr_predicted_db=psnr(peak, math.sqrt(predicted)),
         psnr_error_db=10 / math.log(10) * error / simulated,
         sigmas=(simulated - predicted) / error if error > 0 else 0.0,
         data_rate_megabytes_per_second=height * width * form.bits * fps / 8e6,
@@ -265,7 +266,3 @@ def _row(
 def signed_root(square: float) -> float:
     """sqrt(|x|) with the sign of x."""
     return math.copysign(math.sqrt(abs(square)), square)
-
-
-def _decibels(peak: float, mse: float) -> float:
-    return 10 * math.log10(peak**2 / mse) if mse > 0 else math.inf

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import io
-from typing import Any
-
 import numpy as np
 
 from qsim.clip.motion_statistics import CODE_BITS
+from qsim.figures import figure_png, new_figure
 from qsim.studies.bit_depth.answer import code_motion, marked
 from qsim.studies.bit_depth.clip_study import Study
 from qsim.studies.bit_depth.readout import MODELS
@@ -18,9 +16,7 @@ COLOURS = {"planes": "tab:orange", "multibit": "tab:blue"}
 
 def study_figure(found: Study) -> bytes:
     """PSNR and the parts of the error over bit depth: points simulated, lines expected."""
-    from matplotlib.figure import Figure
-
-    drawing = Figure(figsize=(10, 3.8), dpi=120, layout="constrained")
+    drawing = new_figure(10, 3.8)
     left, right = drawing.subplots(1, 2)
     for model in MODELS:
         rows = [row for row in found.rows if row.model == model]
@@ -46,14 +42,12 @@ def study_figure(found: Study) -> bytes:
         axes.legend(fontsize=7)
     lux = "" if found.lux is None else f" ({found.lux:.3g} lx at 555 nm)"
     drawing.suptitle(f"{found.clip}: {found.ppp:.3g} photons per pixel and plane{lux}, {found.frame_rate:g} planes/s")
-    return _png(drawing)
+    return figure_png(drawing)
 
 
 def sweep_figure(found: Sweep) -> bytes:
     """Best bit depth over speed and light: coloured cells and large numbers simulated, small ones by the law."""
-    from matplotlib.figure import Figure
-
-    drawing = Figure(figsize=(11, 4.2), dpi=120, layout="constrained")
+    drawing = new_figure(11, 4.2)
     bits = [row.bits for line in found.studies for one in line for row in one.rows]
     for axes, model in zip(drawing.subplots(1, 2), MODELS, strict=True):
         table = np.array([[s.best(model).bits for s in row] for row in found.studies])
@@ -67,16 +61,10 @@ def sweep_figure(found: Sweep) -> bytes:
         axes.set_xlabel("photons per pixel and plane")
         axes.set_ylabel(f"speed (px per {CODE_BITS}-bit frame)")
         axes.set_title(f"best bits, {model}")
-    return _png(drawing)
+    return figure_png(drawing)
 
 
 def _speed_label(found: Sweep, i: int) -> str:
     row = found.studies[i][0].rows[0]
     motion = code_motion(row)
     return f"{found.speeds[i]:g}" + ("" if motion is None else f" ({motion:.2g})")
-
-
-def _png(drawing: Any) -> bytes:
-    buffer = io.BytesIO()
-    drawing.savefig(buffer, format="png")
-    return buffer.getvalue()

@@ -6,7 +6,6 @@ QIS at 2000 fps. Figure 2: binary planes at 10 000 fps averaged to 3, 5, 7 and 9
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ from numpy import ndarray as Array
 from qsim import colour, keys
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons, light_level
+from qsim.figures import figure_png, new_figure
 from qsim.sensor import devices
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.bit_depth.clip_study import check_clip, clip_motion, expose
@@ -48,7 +48,7 @@ def figure_1(clip: Clip, *, lux: float = 1.0, seed: int = 0) -> list[Panel]:
         raise ValueError(f"{clip.path}: {len(clip)} frames; one frame at 60 fps takes {longest}")
     level, middle = light_level(clip, lux=lux), len(clip) // 2
     sharp = clip_photons(clip, middle, level.factor, sharp=True)
-    peak = float(np.percentile(sharp, 99.9))
+    peak = colour.peak(sharp)
     speed = clip_motion(clip, middle)
     panels = [Panel("sharp instant", sharp, {"ppp": level.ppp, "lux": lux, "peak": peak})]
     key = keys.Key(seed=seed, clip=keys.hash_name(clip.name), frame=middle)
@@ -69,7 +69,7 @@ def figure_1(clip: Clip, *, lux: float = 1.0, seed: int = 0) -> list[Panel]:
             "photons_per_frame": float(light.mean()),
             "electrons_per_frame": float(sensor.efficiency * light.mean()),
             "blur_error": _rms(light / n - sharp) / peak,
-            "psnr_db": -20 * math.log10(_rms(image - sharp) / peak),
+            "psnr_db": colour.psnr(peak, _rms(image - sharp)),
         }
         panels.append(Panel(f"{name}, {fps:g} fps", image, numbers))
     return panels
@@ -81,7 +81,7 @@ def figure_2(clip: Clip, ppp: float, *, seed: int = 0, bits: Sequence[int] = BIT
     check_clip(clip, settings)
     level, middle = light_level(clip, ppp=ppp), len(clip) // 2
     sharp = clip_photons(clip, middle, level.factor, sharp=True)
-    peak, speed = float(np.percentile(sharp, 99.9)), clip_motion(clip, middle)
+    peak, speed = colour.peak(sharp), clip_motion(clip, middle)
     panels = [Panel("sharp instant", sharp, {"ppp": ppp, "peak": peak})]
     plane = BinarySPAD(1.0, 0.0)
     nothing = np.zeros(2 ** settings.bits[-1] - 1)
@@ -94,7 +94,7 @@ def figure_2(clip: Clip, ppp: float, *, seed: int = 0, bits: Sequence[int] = BIT
             "motion_px_per_frame": None if speed is None else m * speed,
             "detections_per_pixel": float(frame.fired.mean()),
             "blur_error": _rms(frame.photons / m - sharp) / peak,
-            "psnr_db": -20 * math.log10(_rms(image - sharp) / peak),
+            "psnr_db": colour.psnr(peak, _rms(image - sharp)),
         }
         shown = replace(plane, bits=b)
         panels.append(
@@ -109,12 +109,10 @@ def _rms(values: Array) -> float:
 
 def draw(rows: Sequence[Sequence[Panel]]) -> bytes:
     """The panels, one clip per line, each line with the tone curve of its sharp instant: PNG."""
-    from matplotlib.figure import Figure
-
     columns = max(len(row) for row in rows)
     _, width = rows[0][0].image.shape
     shape = rows[0][0].image.shape[0] / width
-    drawing = Figure(figsize=(2.6 * columns, (2.6 * shape + 0.55) * len(rows)), dpi=120, layout="constrained")
+    drawing = new_figure(2.6 * columns, (2.6 * shape + 0.55) * len(rows))
     for line, row in zip(drawing.subplots(len(rows), columns, squeeze=False), rows, strict=True):
         for axes, panel in zip(line, row, strict=True):
             peak = float(row[0].numbers["peak"])  # type: ignore[arg-type]  # of the sharp instant, always a number
@@ -124,6 +122,4 @@ def draw(rows: Sequence[Sequence[Panel]]) -> bytes:
             motion = panel.numbers.get("motion_px_per_frame")
             about = "" if score is None else f"\n{score:.1f} dB" + ("" if motion is None else f", {motion:.2g} px")
             axes.set_title(panel.label + about, fontsize=8)
-    buffer = io.BytesIO()
-    drawing.savefig(buffer, format="png")
-    return buffer.getvalue()
+    return figure_png(drawing)

@@ -12,11 +12,13 @@ from numpy import ndarray as Array
 
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
+from qsim.colour import psnr
 from qsim.files import Progress
 from qsim.studies.bit_depth.answer import answer, at_edge, code_motion, widened
-from qsim.studies.bit_depth.clip_study import Study, check_clip, study
+from qsim.studies.bit_depth.clip_study import Study, StudyRow, check_clip, study
 from qsim.studies.bit_depth.clips import MovingClip
 from qsim.studies.bit_depth.readout import MODELS, StudySettings, readouts
+from qsim.tables import text_table
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,7 @@ def law(base: Study, clip: Clip, settings: StudySettings, model: str, speed: flo
             mean, variance = form.moments(form.planes * light)
             noise = float(np.mean((mean / form.planes - light) ** 2 + variance / form.planes**2))
             error = noise + scale * base.structure.blur(form.planes, speed)
-            result[form.bits] = 10 * math.log10(scale * base.peak**2 / error)
+            result[form.bits] = psnr(base.peak * math.sqrt(scale), math.sqrt(error))
     return result
 
 
@@ -175,17 +177,25 @@ def table(found: Study) -> list[str]:
     lines = [
         f"{found.clip}: {found.ppp:.4g} photons per pixel and plane{lux}; {found.frame_rate:g} planes/s, speed x"
         f"{found.speed}, {len(found.instants)} instants; errors are rms in photons per plane, peak {found.peak:.3g}",
-        "model     bits       fps  px/frame   blur (law)       shot   levels     read  SNR dB   PSNR dB (expected)"
-        "     +-  sigmas    MB/s",
     ]
-    return lines + [_line(row) for row in found.rows]
+    header = ("model", "bits", "fps", "px/frame", "blur", "(law)", "shot", "levels", "read", "SNR dB", "PSNR dB",
+              "(expected)", "+-", "sigmas", "MB/s")  # fmt: skip
+    return lines + text_table(map(_cells, found.rows), header)
 
 
-def _line(r: Any) -> str:
-    motion = "-" if r.motion_px_per_frame is None else f"{r.motion_px_per_frame:.2f}"
-    return (
-        f"{r.model:9} {r.bits:4d} {r.fps:9.1f}  {motion:>8}  {r.blur_error:6.3f} ({r.blur_predicted:.3f})"
-        f"  {r.shot_error:7.3f}  {r.quantisation_error:7.3f}  {r.read_error:7.3f}  {r.snr_db:6.2f}"
-        f"    {r.psnr_db:6.2f} ({r.psnr_predicted_db:6.2f})  {r.psnr_error_db:5.2f}  {r.sigmas:6.2f}"
-        f"  {r.data_rate_megabytes_per_second:6.2f}"
-    )
+def _cells(row: StudyRow) -> list[str]:
+    return [
+        row.model,
+        str(row.bits),
+        f"{row.fps:.1f}",
+        "-" if row.motion_px_per_frame is None else f"{row.motion_px_per_frame:.2f}",
+        f"{row.blur_error:.3f}",
+        f"({row.blur_predicted:.3f})",
+        *(f"{error:.3f}" for error in (row.shot_error, row.quantisation_error, row.read_error)),
+        f"{row.snr_db:.2f}",
+        f"{row.psnr_db:.2f}",
+        f"({row.psnr_predicted_db:.2f})",
+        f"{row.psnr_error_db:.2f}",
+        f"{row.sigmas:.2f}",
+        f"{row.data_rate_megabytes_per_second:.2f}",
+    ]

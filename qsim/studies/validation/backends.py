@@ -25,6 +25,7 @@ import numpy as np
 from qsim import backend as engine
 from qsim.rendering.budget import Budget
 from qsim.rendering.engine import kernels_timed
+from qsim.tables import text_table
 
 FRAMES = 4  # timed, after a first one that compiles
 BUDGET = Budget(samples=32, bounces=4)
@@ -119,17 +120,16 @@ def _measure(backend: str, family: str, height: int, width: int, seed: int) -> B
 def table(report: BackendReport) -> str:
     """The rows as text, and why engines are missing."""
     lines = [f"{report.height} x {report.width} pixels, {report.samples} samples; seconds per frame with ground truth"]
-    head = f"{'scene':10} {'engine':8} {'s/frame':>8} {'faster':>7} {'outside kernels':>15}"
-    lines.append(f"{head} {'mean radiance':>22} {'off by':>14}")
+    rows = []
     for row in report.rows:
         plain = report.reference(row)
         off = "" if row is plain else f"{row.deviation(plain):.1f} std. errors"
         mean = f"{row.mean:.5g} +- {row.mean_error:.1g}"
         ratio = plain.seconds / row.seconds
         outside = "" if row.outside is None else f"{row.outside:.1%}"
-        lines.append(
-            f"{row.scene:10} {row.engine:8} {row.seconds:8.3f} {ratio:7.1f} {outside:>15} {mean:>22} {off:>14}"
-        )
+        rows.append((row.scene, row.engine, f"{row.seconds:.3f}", f"{ratio:.1f}", outside, mean, off))
+    header = ("scene", "engine", "s/frame", "faster", "outside kernels", "mean radiance", "off by")
+    lines += text_table(rows, header, left=2)
     lines += [f"{backend}: {why}" for backend, why in report.missing.items()]
     lines.append(f"means agree within {DEVIATIONS:g} standard errors: {'yes' if report.ok else 'NO'}")
     return "\n".join(lines)

@@ -18,11 +18,13 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.clamped_error import Errors, decibels, error_at, white_in
+from qsim.clip.clamped_error import Errors, error_at, white_in
+from qsim.colour import psnr
 from qsim.rendering import fidelity
 from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
 from qsim.scene import Scene
+from qsim.tables import text_table
 
 LEVELS = (36.0,)  # dB below white
 ENOUGH = 4.5  # standard errors; a right program exceeds them in one of 100 000 rows
@@ -89,7 +91,7 @@ def run(
         for level in levels:
             rows.append(_row(scene, level, references, frames, seed))
             if progress is not None:
-                progress(_line(rows[-1]))
+                progress(f"{rows[-1].scene}: {level:g} dB asked, {rows[-1].reached:.2f} dB reached")
     camera = scenes[0].camera
     return LightReport(camera.height, camera.width, deep.engine.backend, tuple(rows))
 
@@ -108,10 +110,10 @@ def _row(scene: Scene, level: float, references: Array, frames: Sequence[int], s
     return LightRow(
         f"{scene.name}/{scene.seed}",
         level,
-        _decibels(white, _without(found.at_white, own.at_white)),
-        _decibels(white, _mean(stated[0])),
-        _decibels(white, _without(found.plain, own.plain)),
-        _decibels(white, _mean(stated[1])),
+        psnr(white, _without(found.at_white, own.at_white)),
+        psnr(white, _mean(stated[0])),
+        psnr(white, _without(found.plain, own.plain)),
+        psnr(white, _mean(stated[1])),
         chosen.samples,
         chosen.bounces,
         chosen.denoise,
@@ -135,27 +137,27 @@ def _mean(errors: Sequence[float]) -> float:
     return math.sqrt(float(np.mean(np.square(errors))))
 
 
-def _decibels(white: float, error: float) -> float:
-    found = decibels(white, error)
-    return math.inf if found is None else found
-
-
 def table(report: LightReport) -> str:
     """The rows as text, one line each, and the verdict."""
-    head = f"{'scene':14} {'asked':>6} {'reached':>8} {'stated':>7} | {'unclamped: reached':>18} {'stated':>7} | "
-    head += f"{'samples':>14} {'bounces':>7} | {'light':>8} {'announced':>9} {'+-':>8}"
     verdict = "every error is as asked, every light as announced"
     wrong = [row.scene for row in report.rows if not row.ok]
     if wrong:
         verdict = f"NOT as asked or announced: {', '.join(wrong)}"
     size = f"{report.height} x {report.width} pixels, engine {report.engine}; dB below white, light in %"
-    return "\n".join([size, head, *map(_line, report.rows), verdict])
+    header = ("scene", "asked", "reached", "stated", "unclamped: reached", "stated", "samples", "bounces",
+              "light", "announced", "+-", "")  # fmt: skip
+    return "\n".join([size, *text_table(map(_cells, report.rows), header), verdict])
 
 
-def _line(row: LightRow) -> str:
-    ours = f"{row.samples}{' denoised' if row.denoised else ''}"
-    return (
-        f"{row.scene:14} {row.asked:6g} {row.reached:8.2f} {row.stated:7.2f} | {row.reached_unclamped:18.2f} "
-        f"{row.stated_unclamped:7.2f} | {ours:>14} {row.bounces:7d} | {100 * row.light:+8.3f} "
-        f"{-100 * row.announced:+9.3f} {100 * row.light_error:8.3f}{'' if row.ok else '  NOT OK'}"
-    )
+def _cells(row: LightRow) -> list[str]:
+    return [
+        row.scene,
+        f"{row.asked:g}",
+        *(f"{value:.2f}" for value in (row.reached, row.stated, row.reached_unclamped, row.stated_unclamped)),
+        f"{row.samples}{' denoised' if row.denoised else ''}",
+        str(row.bounces),
+        f"{100 * row.light:+.3f}",
+        f"{-100 * row.announced:+.3f}",
+        f"{100 * row.light_error:.3f}",
+        "" if row.ok else "NOT OK",
+    ]

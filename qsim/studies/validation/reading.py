@@ -21,6 +21,7 @@ from numpy import ndarray as Array
 
 from qsim.clip.clip import RELATIVE, Clip, ClipWriter
 from qsim.formats import exporting
+from qsim.tables import text_table
 
 FRAMES, HEIGHT, WIDTH = 65, 512, 1024
 WINDOW, CROP = 11, 128
@@ -54,13 +55,16 @@ class ReadingReport:
 
     def lines(self) -> list[str]:
         """The report as text."""
+        sides = (
+            ("clip folder", self.clip, self.clip_processor, f"{WANTED:g}"),
+            ("mp4", self.mp4, self.mp4_processor, ""),
+            ("ratio", self.ratio, self.clip_processor / self.mp4_processor, f"{RATIO:g}"),
+        )
+        rows = [(name, f"{wall:.1f}", f"{processor:.1f}", wanted) for name, wall, processor, wanted in sides]
         return [
-            f"windows of {WINDOW} x {CROP} x {CROP} at random places in a clip of {FRAMES} x {HEIGHT} x {WIDTH},",
-            "per second, and per second of processor time:",
-            f"  clip folder  {self.clip:8.1f}  {self.clip_processor:8.1f}   (wanted: {WANTED:g} per second)",
-            f"  mp4          {self.mp4:8.1f}  {self.mp4_processor:8.1f}",
-            f"  ratio        {self.ratio:8.1f}  {self.clip_processor / self.mp4_processor:8.1f}   (wanted: {RATIO:g})",
-            f"  the same pictures to {self.difference:.3f} of white, the video's loss",
+            f"windows of {WINDOW} x {CROP} x {CROP} at random places in a clip of {FRAMES} x {HEIGHT} x {WIDTH}",
+            *text_table(rows, ("from", "windows/s", "per processor second", "wanted")),
+            f"the same pictures to {self.difference:.3f} of white, the video's loss",
         ]
 
 

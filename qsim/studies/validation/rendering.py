@@ -1,8 +1,8 @@
-"""Rendering: time per frame against error, the obvious loop beside ours, on scenes that tuned nothing.
+"""Rendering: time per frame against error, the naive loop beside ours, on scenes that tuned nothing.
 
     run() -> RenderReport: one RenderRow per scene and level [dB]; the error is that against a converged reference
 
-The obvious loop is `mi.render` per frame with the default integrator and the default `independent` sampler, a box
+The naive loop is `mi.render` per frame with the default integrator and the default `independent` sampler, a box
 filter, and the smallest power of two of samples that reaches the level. Ours is `Renderer.frame` without ground truth
 and with the budget that `choose_budget` gives for the level, error measurement included. Both start from a loaded scene
 and are timed alternately, so that a busy machine is fair to both; processor seconds stand beside wall seconds, because
@@ -16,7 +16,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from io import BytesIO
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -24,8 +23,9 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files
-from qsim.clip.clamped_error import Errors, decibels, error_at, white_in
+from qsim.clip.clamped_error import Errors, error_at, white_in
+from qsim.colour import psnr
+from qsim.figures import new_figure, write_figure
 from qsim.keys import words
 from qsim.rendering import fidelity
 from qsim.rendering.budget import Budget, grid_samples
@@ -33,10 +33,11 @@ from qsim.rendering.engine import activate
 from qsim.rendering.mitsuba_scene import Stage, film_pass
 from qsim.rendering.renderer import Renderer
 from qsim.scene import Scene
+from qsim.tables import text_table
 
 LEVELS = (30.0, 35.0, 40.0, 45.0)  # dB below white
 WANTED_RATIO, AT_LEVEL = 10.0, 40.0  # of the median scene
-MOST_SAMPLES = 2**8  # the obvious loop is timed up to here; beyond, time is proportional to samples and says so
+MOST_SAMPLES = 2**8  # the naive loop is timed up to here; beyond, time is proportional to samples and says so
 TUNED = ("fan", "tumble", "gears", "flag", "crowd", "drums", "text")  # looked at while the budget was written
 MOST_ROUNDS, ENOUGH = 15, 5.0  # of timing a row; seconds after which the least number of rounds is enough
 FRAME = 3  # the instant that is rendered again and again
@@ -48,28 +49,33 @@ class RenderRow:
 
     scene: str
     level: float  # dB below white asked for, as all dB here
-    obvious_samples: int
-    obvious_psnr: float  # dB reached
-    obvious_seconds: float  # per frame, median
-    extrapolated: bool  # obvious_seconds is proportional from fewer samples
+    naive_samples: int
+    naive_psnr: float  # dB reached
+    naive_seconds: float  # per frame, median
+    extrapolated: bool  # naive_seconds is proportional from fewer samples
     samples: int
     denoised: bool
     bounces: int
     psnr: float  # dB reached, ours
     stated_psnr: float  # dB that our measured error states
     seconds: float  # per frame, median
-    obvious_processor: float = math.nan  # processor seconds per frame, all threads, median
+    naive_processor: float = math.nan  # processor seconds per frame, all threads, median
     processor: float = math.nan  # the same, ours
 
     @property
     def ratio(self) -> float:
         """How many times faster ours is."""
-        return self.obvious_seconds / self.seconds
+        return self.naive_seconds / self.seconds
 
     @property
     def processor_ratio(self) -> float:
         """How many times less processor time ours takes."""
-        return self.obvious_processor / self.processor
+        return self.naive_processor / self.processor
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the row for JSON, where the fields of the naive loop begin with "obvious_", as in stored files."""
+        fields = {name.replace("naive_", "obvious_"): value for name, value in asdict(self).items()}
+        return fields | {"ratio": self.ratio, "processor_ratio": self.processor_ratio}
 
 
 @dataclass(frozen=True)
@@ -95,7 +101,7 @@ class RenderReport:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
-        rows = [asdict(row) | {"ratio": row.ratio, "processor_ratio": row.processor_ratio} for row in self.rows]
+        rows = [row.to_dict() for row in self.rows]
         return asdict(self) | {"rows": rows, "median_ratio": self.median_ratio, "ok": self.ok}
 
 
@@ -128,7 +134,7 @@ def run(
             choosing[name] = choosing.get(name, 0.0) + time.perf_counter() - started
             rows.append(_compare(scene, name, level, chosen, target, rounds, most_samples))
             if progress is not None:
-                progress(_line(rows[-1]))
+                progress(f"{name}: {level:g} dB reached {rows[-1].ratio:.1f} times faster")
     camera = scenes[0].camera
     return RenderReport(camera.height, camera.width, renderer.engine.backend, tuple(rows), choosing)
 
@@ -144,10 +150,7 @@ class Target:
     def psnr(self, image: Array) -> float:
         """dB of an image that is independent of the reference."""
         square = Errors.between(image, self.image, self.white).at_white ** 2 - self.variance
-        return self.decibels(math.sqrt(max(square, self.variance / 100)))
-
-    def decibels(self, error: float) -> float:
-        return decibels(self.white, error) or math.inf
+        return psnr(self.white, math.sqrt(max(square, self.variance / 100)))
 
 
 class NaiveLoop:
@@ -179,7 +182,7 @@ def _compare(
 ) -> RenderRow:
     ours, reached = _reaching(scene, chosen, level, target)
     naive = NaiveLoop(ours)
-    samples, obvious_psnr = _naive_samples(naive, level, target)
+    samples, naive_psnr = _naive_samples(naive, level, target)
     timed = min(samples, most_samples)
     theirs, own, stated = [], [], 0.0
     end = time.perf_counter() + ENOUGH
@@ -189,17 +192,17 @@ def _compare(
         started = _clocks()
         naive.mean(FRAME + i, timed)
         between = _clocks()
-        stated = target.decibels(error_at(target.white, ours.frame(FRAME + i, with_truth=False).errors_at))
+        stated = psnr(target.white, error_at(target.white, ours.frame(FRAME + i, with_truth=False).errors_at))
         theirs.append(between - started)
         own.append(_clocks() - between)
-    obvious_seconds, obvious_processor = np.median(theirs[1:], axis=0) * samples / timed
+    naive_seconds, naive_processor = np.median(theirs[1:], axis=0) * samples / timed
     seconds, processor = np.median(own[1:], axis=0)
     return RenderRow(
         name,
         level,
         samples,
-        obvious_psnr,
-        float(obvious_seconds),
+        naive_psnr,
+        float(naive_seconds),
         timed < samples,
         ours.budget.samples,
         ours.budget.denoise,
@@ -207,7 +210,7 @@ def _compare(
         reached,
         stated,
         float(seconds),
-        float(obvious_processor),
+        float(naive_processor),
         float(processor),
     )
 
@@ -239,9 +242,8 @@ def table(report: RenderReport) -> str:
     """The rows as text, one line each, and the verdict."""
     size = f"{report.height} x {report.width} pixels, engine {report.engine}"
     lines = [f"{size}; seconds per frame, radiance only; {report.unit}"]
-    head = f"{'scene':14} {'level':>5} | {'obvious: samples':>16} {'dB':>5} {'s':>8}"
-    lines.append(f"{head} | {'ours: samples':>14} {'dB':>5} {'s':>7} | faster, in processor time")
-    lines += [_line(row) for row in report.rows]
+    header = ("scene", "level", "naive: samples", "dB", "s", "ours: samples", "dB", "s", "faster", "in processor time")
+    lines += text_table(map(_cells, report.rows), header)
     if any(row.extrapolated for row in report.rows):
         lines.append("* proportional to the time of fewer samples")
     choosing = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in report.choosing_seconds.items())
@@ -254,35 +256,36 @@ def table(report: RenderReport) -> str:
     return "\n".join(lines)
 
 
-def _line(row: RenderRow) -> str:
-    ours = f"{row.samples}{' denoised' if row.denoised else ''}"
-    return (
-        f"{row.scene:14} {row.level:5g} | {row.obvious_samples:16d} {row.obvious_psnr:5.1f} "
-        f"{row.obvious_seconds:7.3f}{'*' if row.extrapolated else ' '} | {ours:>14} {row.psnr:5.1f} "
-        f"{row.seconds:7.3f} | {row.ratio:6.1f} {row.processor_ratio:18.1f}"
-    )
+def _cells(row: RenderRow) -> list[str]:
+    return [
+        row.scene,
+        f"{row.level:g}",
+        str(row.naive_samples),
+        f"{row.naive_psnr:.1f}",
+        f"{row.naive_seconds:.3f}{'*' if row.extrapolated else ''}",
+        f"{row.samples}{' denoised' if row.denoised else ''}",
+        f"{row.psnr:.1f}",
+        f"{row.seconds:.3f}",
+        f"{row.ratio:.1f}",
+        f"{row.processor_ratio:.1f}",
+    ]
 
 
 def figure(report: RenderReport, path: Path) -> None:
     """Seconds per frame against the PSNR reached, one panel per scene (.png, .svg or .pdf)."""
-    from matplotlib.figure import Figure
-
     names = list(dict.fromkeys(row.scene for row in report.rows))
     across, down = min(4, len(names)), math.ceil(len(names) / 4)
-    drawn = Figure(figsize=(3.2 * across, 3.4 * down), layout="constrained")
+    drawn = new_figure(3.2 * across, 3.4 * down)
     panels = np.ravel(drawn.subplots(down, across, sharex=True, sharey=True, squeeze=False))
     for axes in panels[len(names) :]:
         axes.remove()
     for name, axes in zip(names, panels[: len(names)], strict=True):
         rows = [row for row in report.rows if row.scene == name]
-        axes.plot([r.obvious_seconds for r in rows], [r.obvious_psnr for r in rows], "o-", label="obvious loop")
+        axes.plot([r.naive_seconds for r in rows], [r.naive_psnr for r in rows], "o-", label="naive loop")
         axes.plot([r.seconds for r in rows], [r.psnr for r in rows], "s-", label="qsim")
         axes.set(xscale="log", xlabel="seconds per frame", title=name)
         axes.tick_params(labelbottom=True)  # of all: the last row may be shorter
         axes.grid(alpha=0.3)
     drawn.axes[0].set_ylabel("PSNR of the radiance [dB below white]")
     drawn.axes[0].legend(frameon=False)
-    buffer = BytesIO()
-    drawn.savefig(buffer, format=path.suffix.lstrip(".").lower(), dpi=150)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    files.write_bytes(path, buffer.getvalue())
+    write_figure(drawn, path)

@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from io import BytesIO
 from math import expm1, log1p, sqrt
 from pathlib import Path
 from statistics import NormalDist, median
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.figures import new_figure, write_figure
 from qsim.files import Progress
 from qsim.keys import Key
 from qsim.sensor import QIS, BinarySPAD, CountingSPAD, Sensor
@@ -29,6 +29,7 @@ from qsim.sensor.compiled import jit, kernel
 from qsim.sensor.devices import quiver_physical
 from qsim.sensor.sensor import plan_of
 from qsim.studies.validation.edge_cases import Case, hard_cases
+from qsim.tables import text_table
 
 EXPOSURE = 5e-4  # s, 2000 frames per second
 FALSE_ALARM = 1e-6  # of all statistical checks of one report together
@@ -286,7 +287,7 @@ def judged(row: SensorRow, checks: int, require_speed: bool) -> SensorRow:
 def table(report: SensorReport) -> list[str]:
     """Lines for a terminal."""
     header = ("model", "engine", "Mpixel/s", "x NumPy", "(target)", "cdf error", "chi2 p", "z mean", "z var", "ppm", "")
-    lines = [header]
+    lines = []
     for row in report.rows:
         lines.append(
             (
@@ -303,26 +304,24 @@ def table(report: SensorReport) -> list[str]:
                 "OUTSIDE: " + ", ".join(row.wrong) if row.wrong else "",
             )
         )
-    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
-    text = ["  ".join(f"{c:<{w}}" if i < 2 else f"{c:>{w}}" for i, (c, w) in enumerate(zip(line, widths, strict=True)))
-            for line in lines]  # fmt: skip
-    width = max(len(case.name) for case in report.cases)
-    text += ["", *(f"{'ok   ' if case.ok else 'WRONG'}  {case.name:<{width}}  {case.found}" for case in report.cases)]
+    cases = [("ok" if case.ok else "WRONG", case.name, case.found) for case in report.cases]
     verdict = "everything is within its bounds" if report.ok else "OUTSIDE: see the lines marked so"
-    return [line.rstrip() for line in text] + ["", f"{report.pixels} pixels a draw; {verdict}"]
+    return [
+        *text_table(lines, header, left=2),
+        "",
+        *text_table(cases, ("", "hard case", "found"), left=3),
+        "",
+        f"{report.pixels} pixels a draw; {verdict}",
+    ]
 
 
 def _number(value: float | None, style: str) -> str:
     return "-" if value is None else format(value, style)
 
 
-def figure(report: SensorReport, path: str | Path) -> None:
+def figure(report: SensorReport, path: Path) -> None:
     """Speed against error, one mark per row that has both, written to `path` (.png, .svg or .pdf)."""
-    from matplotlib.figure import Figure
-
-    from qsim import files
-
-    drawn = Figure(figsize=(8, 5), layout="constrained")
+    drawn = new_figure(8, 5)
     axes = drawn.add_subplot()
     for engine, marker, colour in (("reference", "o", "#1f5c99"), ("fast", "s", "#c4501b")):
         rows = [row for row in report.rows if row.engine == engine and row.cdf_error is not None]
@@ -335,16 +334,4 @@ def figure(report: SensorReport, path: str | Path) -> None:
     axes.set(xscale="log", yscale="log", xlabel="speed [Mpixel/s]", ylabel="largest error of the cdf")
     axes.set_title("Sensor engines: speed against error; codes near a step are decided in float64", fontsize=10)
     axes.legend(frameon=False)
-    path = Path(path)
-    buffer = BytesIO()
-    drawn.savefig(buffer, format=check_figure(path), dpi=150)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    files.write_bytes(path, buffer.getvalue())
-
-
-def check_figure(path: Path) -> str:
-    """The format that a figure's name asks for; `ValueError` if it is none of ours."""
-    kind = path.suffix.lstrip(".").lower()
-    if kind not in ("png", "svg", "pdf"):
-        raise ValueError(f"{path}: a figure is a .png, .svg or .pdf file")
-    return kind
+    write_figure(drawn, path)
