@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 from qsim.files import lazy_names
 
 if TYPE_CHECKING:
+    from quiver.model.published_weights import from_published
     from quiver.model.quiver import QUIVER
-    from quiver.model.weights import from_published
     from quiver.restoration.api import restore
 
 _HOMES = {
     "QUIVER": "model.quiver",
-    "from_published": "model.weights",
+    "from_published": "model.published_weights",
     "restore": "restoration.api",
 }
 

@@ -50,7 +50,7 @@ def _add_convert_weights(sub: Any) -> None:
 
 
 def _run_convert_weights(args: argparse.Namespace) -> int:
-    from quiver.model.weights import convert_weights
+    from quiver.model.published_weights import convert_weights
 
     if args.force and args.output.exists():
         fresh = args.output.with_name(f".{args.output.stem}.new.safetensors")

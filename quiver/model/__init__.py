@@ -5,13 +5,22 @@ from typing import TYPE_CHECKING
 from qsim.files import lazy_names
 
 if TYPE_CHECKING:
+    from quiver.model.config import Config
+    from quiver.model.folded import FoldedConfig, FoldedQUIVER
+    from quiver.model.published_weights import from_published
     from quiver.model.quiver import QUIVER
+    from quiver.model.unet import UNet, UNetConfig
 
-__all__ = ["QUIVER"]
+_HOMES = {
+    "QUIVER": "quiver",
+    "Config": "config",
+    "FoldedQUIVER": "folded",
+    "FoldedConfig": "folded",
+    "UNet": "unet",
+    "UNetConfig": "unet",
+    "from_published": "published_weights",
+}
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "QUIVER": "quiver",
-    },
-)
+__all__ = ["QUIVER", "Config", "FoldedConfig", "FoldedQUIVER", "UNet", "UNetConfig", "from_published"]
+
+__getattr__ = lazy_names(__name__, _HOMES)

@@ -282,25 +282,25 @@ class RecurrentCell(nn.Module):
 class TemporalAttention(nn.Module):
     """Channel self-attention over the stacked R4 of a window, the centre frame last."""
 
-    def __init__(self, inputs: int, width: int, outputs: int, temperature: float | None) -> None:
+    def __init__(self, inputs: int, width: int, outputs: int) -> None:
         super().__init__()
         self.enter = conv(inputs, width, 3, bias=False)
         self.spread = nn.Conv2d(width, width, 3, padding=1, groups=width, bias=False)
         self.qkv = conv(width, 3 * width, 1, bias=False)
         self.project = conv(width, width, 1, bias=False)
         self.leave = conv(width, outputs, 1, bias=False)
-        self.temperature = None if temperature is None else nn.Parameter(torch.tensor(float(temperature)))
 
     def forward(self, window: Sequence[Tensor]) -> Tensor:
         """R4 [N, 4C, h, w] of the frames in time order, an odd number -> [N, 4C, h, w] for the centre frame."""
         centre = len(window) // 2
         c = self.enter(join(*window[:centre], *window[centre + 1 :], window[centre]))
         q, k, v = self.qkv(self.spread(c)).flatten(2).chunk(3, dim=1)
-        logits = F.normalize(q, dim=2) @ F.normalize(k, dim=2).transpose(1, 2)
-        if self.temperature is not None:
-            logits = logits * self.temperature
-        attended = (logits.softmax(dim=2) @ v).view_as(c)
+        attended = (self.logits(q, k).softmax(dim=2) @ v).view_as(c)
         return self.leave(self.project(attended) + c)
+
+    def logits(self, q: Tensor, k: Tensor) -> Tensor:
+        """Queries and keys [N, D, hw] -> cosines of all pairs [N, D, D], in [-1, 1]."""
+        return F.normalize(q, dim=2) @ F.normalize(k, dim=2).transpose(1, 2)
 
 
 class Refinement(nn.Module):
@@ -308,6 +308,7 @@ class Refinement(nn.Module):
 
     def __init__(self, image: int, channels: int) -> None:
         super().__init__()
+        self.image = image
         c = channels
         self.enter = conv(8 * c, 8 * c, 1)
         self.body = nn.Sequential(conv(8 * c, 8 * c, 1), nn.GELU(), conv(8 * c, 8 * c, 3))

@@ -6,31 +6,14 @@ import torch
 from torch import nn
 
 from quiver.model.config import Config
+from quiver.model.folded import FoldedConfig, FoldedQUIVER
 from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet
 
 PRESETS: dict[str, Config] = {
     "quiver": Config(),
     "quiver-s": Config(channels=16),
-    # Small in everything, on half of the pixels' side; an hourglass over the window, its frames aligned, learns in
-    # minutes, the recurrent part can add to its picture. docs/results/starter.md has what it reaches.
-    "nano": Config(
-        channels=4,
-        deformable_groups=1,
-        deformable_kernel=1,  # sampling nine taps was the largest single cost
-        denoiser_growth=4,
-        denoiser_passes=1,
-        flow_channels=(8, 8),
-        flow_kernel=3,
-        flow_levels=3,
-        cell_blocks=1,
-        attention_width=32,
-        attention_temperature=8.0,
-        fold=2,
-        baseline=32,
-        sweep=7.0,
-        lecun=True,
-    ),
+    "nano": FoldedConfig(),  # small in everything; docs/results/starter.md has what it reaches
 }
 
 # Rows of the paper's ablation (its Table 4, without the pretrained flow): pre-denoiser, flow, multi-scale outputs.
@@ -42,6 +25,11 @@ ABLATIONS: dict[str, tuple[bool, bool, bool]] = {
     "denoiser+scales": (True, False, True),
     "all": (True, True, True),
 }
+
+
+def assemble(config: Config) -> QUIVER:
+    """The network of a configuration, with random weights."""
+    return FoldedQUIVER(config) if isinstance(config, FoldedConfig) else QUIVER(config)
 
 
 def ablated(config: Config, row: str) -> Config:
@@ -66,7 +54,7 @@ def ablated(config: Config, row: str) -> Config:
 def parameter_count(config: Config) -> int:
     """Number of learnt values, counted without allocating them."""
     with torch.device("meta"):
-        return sum(parameter.numel() for parameter in QUIVER(config).parameters())
+        return sum(parameter.numel() for parameter in assemble(config).parameters())
 
 
 def build(name: str) -> nn.Module:
@@ -75,4 +63,4 @@ def build(name: str) -> nn.Module:
         return UNet()
     if name not in PRESETS:
         raise ValueError(f"no network is called {name!r}; known: {', '.join(PRESETS)}, unet")
-    return QUIVER(PRESETS[name])
+    return assemble(PRESETS[name])

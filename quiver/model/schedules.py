@@ -12,13 +12,15 @@ Three schedules, all in memory that does not grow with the clip:
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import torch
 from torch import Tensor, nn
 
 from quiver.model.blocks import NEIGHBOURS, RADIUS, WINDOW, resize
+from quiver.model.folded import FoldedQUIVER
 from quiver.model.quiver import QUIVER, Encoded
 
 REACH = NEIGHBOURS // 2  # frames the extractors see before and after
@@ -28,8 +30,8 @@ REACH = NEIGHBOURS // 2  # frames the extractors see before and after
 class Frame:
     """What a frame contributes wherever it stands in a window."""
 
-    images: tuple[Tensor, ...]  # folded, at scales 1, 2, 4
-    denoised: Tensor  # folded
+    images: tuple[Tensor, ...]  # at scales 1, 2, 4
+    denoised: Tensor
     flows: tuple[Tensor, ...] | None  # into the frame before, at scales 1, 2, 4; None for the first frame of a clip
 
 
@@ -41,10 +43,39 @@ class Features:
     denoised: tuple[Tensor, ...]
 
 
+def exact(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
+    """Frames [B, 1, H, W] one by one -> restored frames 5 .. T-6 [B, 1, H, W], equal to windows from scratch."""
+    return _restored(network, _exact, frames)
+
+
 def stream(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
     """Frames [B, 1, H, W] one by one -> restored frames 5 .. T-6 [B, 1, H, W]; each seven frames late."""
+    return _restored(network, _stream, frames)
+
+
+def _restored(
+    network: QUIVER, schedule: Callable[[QUIVER, Iterable[Tensor]], Iterator[Tensor]], frames: Iterable[Tensor]
+) -> Iterator[Tensor]:
+    """The pictures of a schedule; where the network folds frames, the schedule sees folded ones."""
+    if not isinstance(network, FoldedQUIVER):
+        yield from schedule(network, frames)
+        return
+    kept: deque[Tensor] = deque()  # folded frames from the first of the next window on
+
+    def folded() -> Iterator[Tensor]:
+        for frame in frames:
+            kept.append(network.fold(frame))
+            yield kept[-1]
+
+    for picture in schedule(network, folded()):
+        if network.estimate is not None:
+            picture = picture + network.estimate(list(islice(kept, WINDOW)))
+        yield network.unfold(picture)
+        kept.popleft()
+
+
+def _stream(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
     places: deque[Frame | None] = deque([None] * REACH, maxlen=NEIGHBOURS)  # frames around the encoded one
-    images: deque[Tensor] = deque(maxlen=WINDOW)
     r4: deque[Tensor] = deque(maxlen=WINDOW)
     finest: deque[tuple[Tensor, Tensor]] = deque(maxlen=RADIUS + 1)
     before: Features | None = None
@@ -59,13 +90,11 @@ def stream(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
         before = features
         r4.append(network.cell.step(entry, state))
         finest.append((r1, r2))
-        images.append(current.images[0])
         if len(r4) == WINDOW:
-            yield _picture(network, list(r4), finest[0], images)
+            yield network.restore(list(r4), *finest[0])[0]
 
 
-def exact(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
-    """Frames [B, 1, H, W] one by one -> restored frames 5 .. T-6 [B, 1, H, W], equal to windows from scratch."""
+def _exact(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
     window: deque[Frame] = deque(maxlen=WINDOW)
     inside: deque[Features] = deque(maxlen=WINDOW - 2 * REACH)  # of positions 2 .. 8
     entries: deque[Tensor] = deque(maxlen=WINDOW - 2 * REACH - 1)  # of positions 3 .. 8
@@ -81,7 +110,7 @@ def exact(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
             finest.append((r1, r2))
         if len(window) == WINDOW:
             start, end = _edges(network, window, inside)
-            yield _picture(network, network.recur([*start, *entries, *end]), finest[0], [f.images[0] for f in window])
+            yield network.restore(network.recur([*start, *entries, *end]), *finest[0])[0]
 
 
 def windows(network: nn.Module, frames: Iterable[Tensor]) -> Iterator[Tensor]:
@@ -94,10 +123,9 @@ def windows(network: nn.Module, frames: Iterable[Tensor]) -> Iterator[Tensor]:
 
 
 def _prepare(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Frame]:
-    """Fold, resize, pre-denoise, and find the flow into the frame before."""
+    """Resize, pre-denoise, and find the flow into the frame before."""
     before: Tensor | None = None
-    for raw in frames:
-        image = network.fold(raw)
+    for image in frames:
         denoised = network.denoise(image)
         height, width = image.shape[2:]
         images = (image, *(resize(image, height // k, width // k) for k in (2, 4)))
@@ -140,10 +168,3 @@ def _edges(network: QUIVER, window: Sequence[Frame], inside: Sequence[Features])
     entries = [_encode(network, window[0], None, at[0])[2]]
     entries += [_encode(network, window[p], at[p - 1], at[p])[2] for p in (1, 2, WINDOW - 2, WINDOW - 1)]
     return entries[:3], entries[3:]
-
-
-def _picture(network: QUIVER, r4: list[Tensor], finest: tuple[Tensor, Tensor], frames: Sequence[Tensor]) -> Tensor:
-    """The full-scale picture [B, 1, H, W] of the centre of eleven frames."""
-    picture = network.restore(r4, *finest)[0]
-    base = network.base(frames)
-    return network.unfold(picture if base is None else picture + base)

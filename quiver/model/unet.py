@@ -72,12 +72,12 @@ class UNet(nn.Module):
     def __init__(self, config: UNetConfig | None = None) -> None:
         super().__init__()
         self.config = config or UNetConfig()
-        self.hourglass = SmallUNet(WINDOW, self.config.width)
+        self.body = SmallUNet(WINDOW, self.config.width)
 
     def forward(self, x: Tensor) -> Output:
         """[B, T, 1, H, W] with T >= 11 -> Output for the frames 5 .. T-6; ValueError as for QUIVER."""
         check_input(x, self.multiple)
-        windows = [self.hourglass(x[:, t : t + WINDOW, 0]) for t in range(x.shape[1] - WINDOW + 1)]
+        windows = [self.body(x[:, t : t + WINDOW, 0]) for t in range(x.shape[1] - WINDOW + 1)]
         return Output(None, torch.stack(windows, dim=1), None, None)
 
 

@@ -41,14 +41,15 @@ def network_restorer(path: Path, options: RestoreOptions) -> Restorer:
 
 def network_title(model: nn.Module) -> str:
     """What a network is, for people: `nano (U-Net on aligned frames)`, `QUIVER (quiver-s)`, `U-Net`."""
+    from quiver.model.folded import FoldedQUIVER
     from quiver.model.presets import PRESETS
     from quiver.model.quiver import QUIVER
 
     if not isinstance(model, QUIVER):
         return "U-Net"
     preset = next((name for name, config in PRESETS.items() if config == model.config), None)
-    if model.config.baseline:  # its picture is that of the hourglass; the recurrent part hardly adds to it
-        what = "U-Net on aligned frames" if model.config.sweep else "U-Net with a recurrent part"
+    if isinstance(model, FoldedQUIVER) and model.estimate is not None:  # the recurrent part hardly adds to it
+        what = "U-Net on aligned frames" if model.config.largest_velocity else "U-Net with a recurrent part"
         return what if preset is None else f"{preset} ({what})"
     return "QUIVER" if preset is None else f"QUIVER ({preset})"
 
@@ -94,14 +95,14 @@ def fill_network(
     """
     import torch
 
-    from quiver.model.quiver import QUIVER
+    from quiver.model.folded import FoldedQUIVER
 
     device = next(model.parameters()).device
     dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
     height, width = codes.shape[1:]
     pieces = cut_pieces(model, height, width, options.memory, options.mode)
-    if isinstance(model, QUIVER) and model.baseline is not None:
-        model.baseline.pixels = pieces.hourglass
+    if isinstance(model, FoldedQUIVER) and model.estimate is not None:
+        model.estimate.pixels = pieces.estimate_pixels
     multiple = int(model.multiple)  # type: ignore[arg-type]
     apart, done = Disagreement.nothing(height, width), 0
     for tile in pieces.tiles:

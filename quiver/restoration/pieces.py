@@ -1,9 +1,9 @@
 """What of a frame is computed at a time, so that a network stays within a memory bound without another answer.
 
 A U-Net sees 36 px far: tiles that overlap by twice as much give what the whole frame gives. QUIVER's attention and
-gates average over the frame, and its recurrence carries far: it takes the frame whole, and only the hourglass of its
-baseline, which needs the most memory, runs tile by tile. A frame too large even for that is cut into tiles that are
-blended. These do see less: `fill_network` measures by how much they disagree, and warns.
+gates average over the frame, and its recurrence carries far: it takes the frame whole, and only the initial estimate of
+a FoldedQUIVER, which needs the most memory, runs tile by tile. A frame too large even for that is cut into tiles that
+are blended. These do see less: `fill_network` measures by how much they disagree, and warns.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 BLENDED = 32  # px: half of what neighbouring tiles share where no overlap makes them exact
 STARTING = 60_000_000  # bytes that torch takes for its kernels when it is used first
-HOURGLASS_BYTES = 1_200  # per pixel of the baseline's hourglass of width 32; 930 measured
+ESTIMATE_BYTES = 1_200  # per pixel of an initial estimate of width 32; 930 measured
 COUNTS = 0.1  # weight from which a tile's answer is compared with its neighbours'
 
 
@@ -30,7 +30,7 @@ class Pieces:
     """How a frame is cut."""
 
     tiles: list[Tile]
-    hourglass: int | None = None  # pixels that the baseline's hourglass takes at a time; None: the whole tile
+    estimate_pixels: int | None = None  # that the initial estimate takes at a time; None: the whole tile
     exact: bool = True  # whether the answer is that of the whole frame
     needed: int = 0  # bytes, about, with which it would be
 
@@ -45,6 +45,7 @@ class Pieces:
 
 def cut_pieces(model: nn.Module, height: int, width: int, memory: int, mode: str) -> Pieces:
     """The cut of a frame for a network and so many bytes; `ValueError` if they hold not even a small tile."""
+    from quiver.model.folded import FoldedQUIVER
     from quiver.model.quiver import QUIVER
     from quiver.model.unet import SmallUNet
 
@@ -59,33 +60,36 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int, mode: str
         return Pieces(cut_tiles(height, width, pixels, reach or BLENDED, multiple, blend=blend), exact=not blend)
     padded = [side + -side % multiple for side in (height, width)]
     needed = bytes_per_pixel(model, mode) * height * width
-    if model.baseline is not None:
+    if isinstance(model, FoldedQUIVER) and model.estimate is not None:
         rest = STARTING + frame_bytes(model, mode) * padded[0] * padded[1]
         least = 16 + 2 * SmallUNet.REACH  # below, overlaps are most of the work
-        per_pixel = HOURGLASS_BYTES * model.config.baseline // 32
+        per_pixel = ESTIMATE_BYTES * model.config.estimate_width // 32
         needed = min(needed, rest + per_pixel * min(least, padded[0]) * min(least, padded[1]))
         if memory >= needed:
-            return Pieces(whole.tiles, hourglass=(memory - rest) // per_pixel)
-    step = 2**model.config.flow_levels * model.config.fold
-    return Pieces(cut_tiles(height, width, pixels, BLENDED, max(multiple, step), blend=True), None, False, needed)
+            return Pieces(whole.tiles, estimate_pixels=(memory - rest) // per_pixel)
+    step = max(multiple, model.stride)
+    return Pieces(cut_tiles(height, width, pixels, BLENDED, step, blend=True), None, False, needed)
 
 
 def bytes_per_pixel(model: nn.Module, mode: str) -> int:
     """Working memory of a network per pixel of the tile, float32, about 1.5 times of what `quiver bench` measured."""
+    from quiver.model.folded import FoldedQUIVER
     from quiver.model.quiver import QUIVER
 
     if not isinstance(model, QUIVER):
         return 4_000
     held = 2 if mode == "windows" else 1  # windows of eleven frames at once
-    baseline = 64 * model.config.baseline if model.config.baseline else 0  # at full size
-    return int(held * (4000 + 1200 * model.config.channels) / model.config.fold**2) + baseline
+    stages = held * (4000 + 1200 * model.config.channels)
+    if not isinstance(model, FoldedQUIVER):
+        return stages
+    return int(stages / model.config.fold**2) + 64 * model.config.estimate_width  # the estimate is at full size
 
 
 def frame_bytes(model: nn.Module, mode: str) -> int:
-    """Working memory per pixel of a QUIVER with a baseline beside its hourglass; nano: 1338, measured 1030."""
-    from quiver.model.quiver import QUIVER
+    """Working memory per pixel of a FoldedQUIVER beside its initial estimate; nano: 1338, measured 1030."""
+    from quiver.model.folded import FoldedQUIVER
 
-    assert isinstance(model, QUIVER)
+    assert isinstance(model, FoldedQUIVER)
     held = 2 if mode == "windows" else 1
     return 700 + int(held * (1160 + 348 * model.config.channels) / model.config.fold**2)
 

@@ -2,8 +2,8 @@
 
 for each of six combinations of pre-denoiser, flow and multi-scale outputs: train, then score on held-out clips
 
-`nano` is taken without its hourglass, which makes a picture from aligned frames before any of these parts is asked and
-would hide what they do.
+`nano` is taken without its initial estimate, which makes a picture from aligned frames before any of these parts acts
+and would hide what they do.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import torch
 
 from quiver.evaluation.comparison import Comparison, ComparisonRow, evaluate
 from quiver.model.config import Config
-from quiver.model.presets import ABLATIONS, PRESETS, ablated, parameter_count
-from quiver.model.quiver import QUIVER
+from quiver.model.folded import FoldedConfig
+from quiver.model.presets import ABLATIONS, PRESETS, ablated, assemble, parameter_count
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import pick_device
 from quiver.restoration.restorers import restorer
@@ -29,7 +29,9 @@ def networks(preset: str) -> dict[str, Config]:
     """The six by name; ValueError if the preset has no ablation."""
     if preset not in PRESETS:
         raise ValueError(f"no ablation of {preset!r}; there is one of {', '.join(PRESETS)}")
-    whole = replace(PRESETS[preset], baseline=0, sweep=0.0)
+    whole = PRESETS[preset]
+    if isinstance(whole, FoldedConfig):
+        whole = replace(whole, estimate_width=0, largest_velocity=0.0)
     return {name: ablated(whole, name) for name in ABLATIONS}
 
 
@@ -66,7 +68,7 @@ def _run_ablation(
     out = Path(settings.out)
     for name, config in networks(settings.network).items():
         torch.manual_seed(settings.seed)
-        network = QUIVER(config)
+        network = assemble(config)
         own = replace(settings, out=str(out / name), network=f"{settings.network} {name}")
         train(network, own, device=pick_device(options.device), should_stop=should_stop, progress=progress)
         if should_stop():

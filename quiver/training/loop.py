@@ -290,7 +290,7 @@ def train(
         parallel = (
             nn.parallel.DistributedDataParallel(model, find_unused_parameters=True) if process.world > 1 else model
         )
-        has_baseline = getattr(model, "baseline", None) is not None
+        has_estimate = getattr(model, "estimate", None) is not None
         board = Board(run.folder, settings, state, progress) if process.leads else None
         if board is not None:
             stack.callback(board.close)
@@ -301,9 +301,9 @@ def train(
         for batch in batches(windows, settings, state, process):
             # Forward, backward, step
             rate = learning_rate(settings, state)
-            alone = has_baseline and share_used(settings, state) < settings.head_start
+            alone = has_estimate and share_used(settings, state) < settings.head_start
             with torch.autocast(process.device.type, torch.bfloat16, enabled=low):
-                output = parallel(batch["codes"].to(process.device), **({"baseline_only": True} if alone else {}))
+                output = parallel(batch["codes"].to(process.device), **({"estimate_only": True} if alone else {}))
             loss = training_loss(output, batch["target"].to(process.device), LOSSES[settings.loss], first=RADIUS)
             model.zero_grad(set_to_none=True)
             loss.backward()

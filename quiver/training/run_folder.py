@@ -222,7 +222,10 @@ def _is_entry(entry: Any) -> bool:
 def _load_weights(model: nn.Module, stored: Any) -> None:
     """Put stored weights into the model; ValueError unless they are all there, in their shapes, and finite."""
     own = model.state_dict()
-    if not isinstance(stored, dict) or set(stored) != set(own):
+    if not isinstance(stored, dict) or not all(isinstance(name, str) for name in stored):
+        raise ValueError("weights of another network")
+    stored = weights.current_names(stored)
+    if set(stored) != set(own):
         raise ValueError("weights of another network")
     for name, value in stored.items():
         if not isinstance(value, torch.Tensor) or value.layout != torch.strided or value.shape != own[name].shape:

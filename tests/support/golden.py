@@ -9,10 +9,25 @@ import torch
 from torch import Tensor, nn
 
 from quiver.model.config import Config
+from quiver.model.folded import FoldedConfig
+from quiver.model.published_weights import published_name
 from quiver.model.quiver import QUIVER
-from quiver.model.weights import published_name
 
 DATA = Path(__file__).parents[1] / "data"
+TINY = FoldedConfig(  # the published design with the smallest parts, for tests that need no more
+    channels=2,
+    deformable_kernel=3,
+    denoiser_growth=2,
+    flow_channels=(2,),
+    flow_kernel=7,
+    flow_levels=4,
+    attention_width=4,
+    attention_temperature=None,
+    fold=1,
+    estimate_width=0,
+    largest_velocity=0.0,
+    lecun=False,
+)
 CONSTANTS = {"spynet.mean": 0.449, "spynet.std": 0.226}
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from clips import write_clip, write_dataset
-from golden import fill_by_rule, published_state
+from golden import TINY, fill_by_rule, published_state
 from option_rows import Acts, Refused, Row, Run, check, loudness, names, names_of, options, parser_of, stdout
 from safetensors.numpy import load_file
 
@@ -28,24 +28,12 @@ from quiver.baselines import METHODS
 from quiver.cli import program
 from quiver.evaluation import cost, domain_measurement
 from quiver.model import presets
-from quiver.model.config import Config
 from quiver.model.presets import ABLATIONS, PRESETS
-from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
 from quiver.restoration import domain, restorers
 from quiver.restoration.domain import Cell, Domain
 from quiver.training import loop
-
-SMALL = Config(
-    channels=2,
-    deformable_groups=1,
-    denoiser_growth=2,
-    denoiser_passes=1,
-    flow_channels=(2,),
-    cell_blocks=1,
-    attention_width=4,
-)
 
 # ---- What is compared
 
@@ -484,7 +472,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
 
 
 def tiny(name: str) -> torch.nn.Module:
-    return UNet(UNetConfig(8)) if name == "unet" else QUIVER(PRESETS[name])
+    return UNet(UNetConfig(8)) if name == "unet" else presets.assemble(PRESETS[name])
 
 
 @pytest.fixture(scope="module")  # of this module alone: what it replaces is back for the next one
@@ -518,8 +506,8 @@ def scale() -> Iterator[None]:
     number = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "nano", SMALL)
-        patch.setitem(PRESETS, "quiver-s", replace(SMALL, channels=4))
+        patch.setitem(PRESETS, "nano", TINY)
+        patch.setitem(PRESETS, "quiver-s", replace(TINY, channels=4))
         for name in set(ABLATIONS) - {"all"}:
             patch.delitem(ABLATIONS, name)
         patch.setattr(presets, "build", tiny)
@@ -560,13 +548,13 @@ def work(scale: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "[defects]\ncarry_dead_time = true\n"
     )
     torch.manual_seed(0)
-    small = fill_by_rule(QUIVER(SMALL))
-    save(small, SMALL, folder / "small.safetensors")
+    small = fill_by_rule(presets.assemble(TINY))
+    save(small, TINY, folder / "small.safetensors")
     save(UNet(UNetConfig(2)), UNetConfig(2), folder / "unet.safetensors")
     seen_by = devices.load("quiver-physical", ppp=26, bits=3, exposure=5e-4)
     cell = Cell("quiver-physical", 26, domain.place_of(seen_by, 5e-4, 26), 15.0, "qbp-bm3d", 20.0)
     measured = {domain.KEY: Domain((cell,), {"clips": ["gears"], "seed": 0}).to_json()}
-    save(small, SMALL, folder / "measured.safetensors", measured)
+    save(small, TINY, folder / "measured.safetensors", measured)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         assert program.main(RESUMED.split()) == 0

@@ -7,7 +7,7 @@ import pytest
 import torch
 from golden import DATA, network, published_state, rule, stages
 
-from quiver.model.weights import from_published
+from quiver.model.published_weights import from_published
 
 
 @pytest.fixture(scope="module")

@@ -15,14 +15,25 @@ import torch
 from safetensors.torch import save_file
 
 from qsim.process import peak_memory, reset_peak
-from quiver.model.config import Config
-from quiver.model.quiver import QUIVER
+from quiver.model.folded import FoldedConfig, FoldedQUIVER
 from quiver.model.unet import UNet, UNetConfig
-from quiver.model.weights import load, save
+from quiver.model.weights import RENAMED, load, save
 from quiver.training.optimiser import Optimiser
 from quiver.training.run_folder import Run, Settings, State
 
-TINY = Config(2, 1, 1, 2, 1, (2,), 3, 3, 1, attention_width=4, fold=1, baseline=2, sweep=1.0)
+TINY = FoldedConfig(
+    channels=2,
+    denoiser_growth=2,
+    flow_channels=(2,),
+    attention_width=4,
+    attention_temperature=None,
+    fold=1,
+    estimate_width=2,
+    largest_velocity=1.0,
+    lecun=False,
+)
+OLD = {new: old for old, new in RENAMED.items()}
+EARLIER_TINY = {OLD.get(name, name): value for name, value in TINY.to_dict().items()}
 NUMBERS = (0, -1, 1, 2, 3, 7, 64, 1e300, -1e300, 0.5, 1e-300, 2**31, 2**63, 10**9, 10**400, math.nan, math.inf)
 VALUES: tuple[Any, ...] = (
     *NUMBERS,
@@ -44,7 +55,7 @@ def one_line(error: BaseException, path: Path, cure: str = "") -> None:
 @pytest.fixture(scope="module")
 def tiny() -> dict[str, torch.Tensor]:
     torch.manual_seed(0)
-    return {name: value.contiguous() for name, value in QUIVER(TINY).state_dict().items()}
+    return {name: value.contiguous() for name, value in FoldedQUIVER(TINY).state_dict().items()}
 
 
 def refused_or_loaded(path: Path) -> bool:
@@ -68,9 +79,19 @@ def test_any_value_of_any_key_of_a_configuration(tiny, tmp_path, key):
     path, wanted = tmp_path / "w.safetensors", TINY.to_dict()
     for value in VALUES:
         config = json.dumps(wanted | {key: value})
+        save_file(tiny, path, {"format": "quiver-1", "network": "FoldedQUIVER", "config": config})
+        if not refused_or_loaded(path):
+            assert load(path).config == FoldedConfig.from_dict(wanted | {key: value})
+
+
+@pytest.mark.parametrize("key", sorted(EARLIER_TINY))
+def test_any_value_of_any_key_of_an_earlier_configuration(tiny, tmp_path, key):
+    path = tmp_path / "w.safetensors"
+    for value in VALUES:
+        config = json.dumps(EARLIER_TINY | {key: value})
         save_file(tiny, path, {"format": "quiver-1", "network": "QUIVER", "config": config})
         if not refused_or_loaded(path):
-            assert load(path).config == Config.from_dict(wanted | {key: value})
+            assert load(path).config == FoldedConfig.from_dict(TINY.to_dict() | {RENAMED.get(key, key): value})
 
 
 @pytest.mark.parametrize(
@@ -80,7 +101,7 @@ def test_any_value_of_any_key_of_a_configuration(tiny, tmp_path, key):
 )
 def test_configurations_that_crashed_or_hung(tiny, tmp_path, changes):
     path = tmp_path / "w.safetensors"
-    metadata = {"format": "quiver-1", "network": "QUIVER", "config": json.dumps(TINY.to_dict() | changes)}
+    metadata = {"format": "quiver-1", "network": "QUIVER", "config": json.dumps(EARLIER_TINY | changes)}
     save_file(tiny, path, metadata)
     assert refused_or_loaded(path)
 
@@ -88,7 +109,11 @@ def test_configurations_that_crashed_or_hung(tiny, tmp_path, changes):
 @pytest.mark.parametrize(
     ("network", "config"),
     [
-        *((kind, text) for kind in ("QUIVER", "UNet") for text in ("", "3", "null", "[]", "[" * 5000, "{", '"x"')),
+        *(
+            (kind, text)
+            for kind in ("QUIVER", "FoldedQUIVER", "UNet")
+            for text in ("", "3", "null", "[]", "[" * 5000, "{", '"x"')
+        ),
         *(("UNet", json.dumps({"width": value})) for value in VALUES if value not in (1, 2, 3, 7, 64, True)),
         ("x" * 5000, "{}"),
         ("", "{}"),
@@ -104,15 +129,16 @@ def test_a_configuration_that_is_none(tmp_path, network, config):
 def test_many_wrong_values_at_once(tiny, tmp_path, seed):
     rng, path = random.Random(seed), tmp_path / "w.safetensors"
     for _ in range(25):
-        keys = rng.sample(sorted(TINY.to_dict()), rng.randint(1, 4))
-        config = json.dumps(TINY.to_dict() | {key: rng.choice(VALUES) for key in keys})
-        save_file(tiny, path, {"format": "quiver-1", "network": "QUIVER", "config": config})
+        kind, wanted = rng.choice([("QUIVER", EARLIER_TINY), ("FoldedQUIVER", TINY.to_dict())])
+        keys = rng.sample(sorted(wanted), rng.randint(1, 4))
+        config = json.dumps(wanted | {key: rng.choice(VALUES) for key in keys})
+        save_file(tiny, path, {"format": "quiver-1", "network": kind, "config": config})
         refused_or_loaded(path)
 
 
 def test_tensors_of_another_kind(tiny, tmp_path):
     path = tmp_path / "w.safetensors"
-    notes = {"format": "quiver-1", "network": "QUIVER", "config": json.dumps(TINY.to_dict())}
+    notes = {"format": "quiver-1", "network": "FoldedQUIVER", "config": json.dumps(TINY.to_dict())}
     name = "cell.image1.weight"
     for value in (tiny[name].half(), tiny[name].long(), tiny[name].flatten(), torch.ones(()), torch.ones(0)):
         save_file(tiny | {name: value.contiguous()}, path, notes)
@@ -224,6 +250,6 @@ def test_a_checkpoint_that_unpacks_to_more_than_it_is(tmp_path):
 
 def test_files_of_ours_still_load(tmp_path):
     torch.manual_seed(0)
-    for network in (QUIVER(TINY), UNet(UNetConfig(2))):
+    for network in (FoldedQUIVER(TINY), UNet(UNetConfig(2))):
         save(network, network.config, tmp_path / "w.safetensors")
         assert load(tmp_path / "w.safetensors").config == network.config

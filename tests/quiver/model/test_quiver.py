@@ -6,32 +6,27 @@ from dataclasses import replace
 
 import pytest
 import torch
-from golden import draw, fill_by_rule, network
+from golden import TINY, draw, fill_by_rule, network
 from torch import Tensor
 
 from quiver.model import deformable, schedules
 from quiver.model import quiver as model_module
 from quiver.model.config import Config
-from quiver.model.presets import ABLATIONS, PRESETS, ablated, build, parameter_count
+from quiver.model.folded import FoldedConfig
+from quiver.model.presets import ABLATIONS, PRESETS, ablated, assemble, build, parameter_count
 from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 
-SMALL = Config(
-    channels=4,
-    deformable_groups=2,
-    denoiser_growth=4,
-    denoiser_passes=2,
-    flow_channels=(4, 4),
-    flow_kernel=3,
-    cell_blocks=2,
-)
-FOLDED = replace(SMALL, fold=2, baseline=4, sweep=1.0, attention_width=16, attention_temperature=4.0, flow_levels=3)
-BOTH = pytest.mark.parametrize("config", [SMALL, FOLDED], ids=["published-design", "folded"])
+SMALL = replace(TINY, channels=4, deformable_groups=2, denoiser_growth=4, denoiser_passes=2, flow_channels=(4, 4),
+                flow_kernel=3, cell_blocks=2)  # fmt: skip
+FOLDED = replace(SMALL, fold=2, estimate_width=4, largest_velocity=1.0, attention_width=16, attention_temperature=4.0,
+                 flow_levels=3)  # fmt: skip
+BOTH = pytest.mark.parametrize("config", [SMALL, FOLDED], ids=["small", "folded"])
 
 
 def lively(config: Config, dtype: torch.dtype = torch.float64) -> QUIVER:
     """Weights of natural size everywhere, so that no stage is silent."""
-    network = fill_by_rule(QUIVER(config)).to(dtype).eval()
+    network = fill_by_rule(assemble(config)).to(dtype).eval()
     assert isinstance(network, QUIVER)
     return network
 
@@ -89,16 +84,17 @@ def test_wrong_names_and_settings_say_what_is_right():
     with pytest.raises(ValueError, match="multiple of the 16 deformable groups, got 8"):
         Config(channels=8)
     with pytest.raises(ValueError, match=r"Config\.flow_kernel must be odd, got 4"):
-        Config(flow_kernel=4)
+        FoldedConfig(flow_kernel=4)
     with pytest.raises(ValueError, match=r"Config\.flow_levels must be a whole number from 3 to 10, got 2"):
-        Config(flow_levels=2)
+        FoldedConfig(flow_levels=2)
     with pytest.raises(ValueError, match=r"Config\.cell_blocks must be a whole number from 1 to 64, got 0"):
-        Config(cell_blocks=0)
+        FoldedConfig(cell_blocks=0)
     with pytest.raises(ValueError, match="no field 'chanels'"):
         Config.from_dict({"chanels": 3})
     with pytest.raises(ValueError, match="one field width, got depth"):
         UNetConfig.from_dict({"depth": 3})
-    assert Config.from_dict(FOLDED.to_dict()) == FOLDED
+    assert FoldedConfig.from_dict(FOLDED.to_dict()) == FOLDED
+    assert Config.from_dict(Config(32).to_dict()) == Config(32)
 
 
 @pytest.mark.parametrize(
@@ -112,7 +108,7 @@ def test_wrong_names_and_settings_say_what_is_right():
     ],
 )
 def test_inputs_that_do_not_fit_are_refused(shape, message):
-    for refusing in (QUIVER(SMALL), UNet(UNetConfig(2))):
+    for refusing in (assemble(SMALL), QUIVER(16), UNet(UNetConfig(2))):
         with pytest.raises(ValueError, match=message):
             refusing(torch.zeros(shape))
 
@@ -134,7 +130,7 @@ def test_an_untrained_nano_returns_about_the_mean_of_the_middle_frames():
     network, x = build("nano"), draw(1, 1, 1, 32, 32, dtype=torch.float32).repeat(1, 11, 1, 1, 1)
     with torch.no_grad():
         out = network(x).scale1[:, 0]
-    weights = network.baseline.weights.detach()
+    weights = network.estimate.weights.detach()
     assert float(weights.sum()) == pytest.approx(1)
     mean = torch.einsum("btchw,t->bchw", x, weights)
     assert float((out - mean).square().mean()) < 0.04 * float(x.var())
@@ -145,7 +141,7 @@ def test_an_untrained_nano_returns_about_the_mean_of_the_middle_frames():
 def test_alignment_starts_from_the_flow_alone(kernel, lecun):
     """Offsets of zero and masks of one half: half a convolution of the image moved by the flow."""
     torch.manual_seed(0)
-    alignment = QUIVER(replace(SMALL, deformable_kernel=kernel, lecun=lecun)).double().alignment
+    alignment = assemble(replace(SMALL, deformable_kernel=kernel, lecun=lecun)).double().alignment
     previous, current, flow = draw(1, 4, 8, 8), draw(1, 4, 8, 8, seed=1), torch.zeros(1, 2, 8, 8, dtype=torch.float64)
     moved = torch.nn.functional.pad(previous[..., 1:], (0, 1))
     wanted = torch.nn.functional.conv2d(previous, alignment.weight / 2, padding=kernel // 2)
@@ -162,7 +158,7 @@ def test_the_lecun_start_keeps_the_fused_features_alive():
     for lecun in (False, True):
         for seed in range(4):
             torch.manual_seed(seed)
-            started = QUIVER(replace(FOLDED, lecun=lecun))
+            started = assemble(replace(FOLDED, lecun=lecun))
             fused: list[Tensor] = []
             started.fusions[0].register_forward_hook(lambda _m, _i, out, fused=fused: fused.append(out))
             with torch.no_grad():
@@ -188,6 +184,15 @@ def test_streaming_equals_one_pass_over_the_clip(config):
     with torch.no_grad():
         whole = network(x).scale1
     assert float((run(schedules.stream, network, x) - whole).abs().max()) < 1e-10 * float(whole.std())
+
+
+def test_the_published_network_runs_by_every_schedule():
+    network, x = lively(Config(16)), draw(1, 13, 1, 8, 12)
+    with torch.no_grad():
+        whole = network(x).scale1
+    windows = run(schedules.windows, network, x)
+    assert float((run(schedules.stream, network, x) - whole).abs().max()) < 1e-10 * float(whole.std())
+    assert float((run(schedules.exact, network, x) - windows).abs().max()) < 1e-10 * float(windows.std())
 
 
 def test_streaming_is_not_the_same_as_windows():
@@ -302,8 +307,8 @@ def hard_inputs() -> dict[str, Tensor]:
 def test_outputs_and_gradients_are_finite(name, kind):
     """Constant input makes queries and keys constant or zero, where a norm has no gradient."""
     torch.manual_seed(0)
-    config = PRESETS[name] if name == "nano" else replace(PRESETS[name], cell_blocks=2, attention_width=32)
-    network = QUIVER(config)
+    config = PRESETS[name]
+    network = assemble(config)
     out = network(hard_inputs()[kind])
     for part in (out.denoised, out.scale1, out.scale2, out.scale4, out.flow):
         assert torch.isfinite(part).all()

@@ -1,30 +1,23 @@
-"""Weights in and out: the 335 published entries, our files, and everything that must be refused."""
+"""Weights in and out: our files, those of earlier versions, and everything that must be refused."""
 
-import pickle
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from golden import published_state
+from golden import TINY
 from safetensors import safe_open
 from safetensors.torch import save_file
+from torch import nn
 
 from quiver.model.config import Config
+from quiver.model.folded import FoldedQUIVER
 from quiver.model.presets import PRESETS
 from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
-from quiver.model.weights import ALIAS, convert_weights, from_published, load, published_name, save
-
-TINY = Config(
-    channels=2,
-    deformable_groups=1,
-    denoiser_growth=2,
-    denoiser_passes=1,
-    flow_channels=(2,),
-    cell_blocks=1,
-    attention_width=4,
-)
+from quiver.model.weights import EARLIER, RENAMED, RENAMED_PARTS, load, save
+from quiver.restoration.restorers import weights_path
 
 
 def notes(path: Path) -> dict[str, str]:
@@ -32,120 +25,15 @@ def notes(path: Path) -> dict[str, str]:
         return file.metadata()
 
 
-@pytest.fixture(scope="module")
-def state() -> dict[str, torch.Tensor]:
-    return published_state()
-
-
-def test_every_published_entry_has_one_place_and_nothing_is_left(state):
-    network = QUIVER(PRESETS["quiver-s"])
-    names = [published_name(name) for name in network.state_dict()]
-    aliases = [name for name in state if ALIAS.match(name)]
-    assert len(state) == 335
-    assert len(set(names)) == len(names) == 303  # 301 parameters and 2 buffers
-    assert sorted(names + aliases) == sorted(state)
-    assert len(list(network.parameters())) == 301
-    assert len(aliases) == 32
-
-
-def test_published_weights_arrive_where_their_names_say(state):
-    network = from_published(state)
-    for name, value in network.state_dict().items():
-        assert torch.equal(value, state[published_name(name)]), name
-    assert network.config == PRESETS["quiver-s"]
-    assert all(parameter.requires_grad for parameter in network.parameters())
-
-
-def test_aliases_may_be_absent_but_not_different(state):
-    from_published({name: value for name, value in state.items() if not ALIAS.match(name)})
-    name = "predenoise.rdbs.3.conv1x1.bias"
-    with pytest.raises(ValueError, match=r"predenoise.rdbs.3.conv1x1.bias differs from predenoise.rdbs.0.conv1x1.bias"):
-        from_published(state | {name: state[name] + 1})
-
-
-def without(state: dict, name: str) -> dict:
-    return {key: value for key, value in state.items() if key != name}
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda s: {}, "not a published QUIVER checkpoint: predenoise.sfe1.weight.*missing; found 0 entries"),
-        (lambda s: {"a": torch.ones(1)}, "is missing; found 1 entries: a"),
-        (lambda s: without(s, "recons3.out.7.bias"), "1 entries are missing, among them recons3.out.7.bias"),
-        (lambda s: s | {"head.weight": torch.ones(1)}, "1 entries are unknown, among them head.weight"),
-        (lambda s: s | {"predenoise.rdbs.1.extra": torch.ones(1)}, "unknown, among them predenoise.rdbs.1.extra"),
-        (lambda s: s | {"epoch": 3}, "epoch is a int, not a tensor"),
-        (lambda s: s | {"pa_deform.bias": torch.ones(17)}, r"pa_deform.bias must be \(16,\) at width 16, got \(17,\)"),
-        (lambda s: s | {"pa_deform.bias": torch.full((16,), torch.nan)}, "pa_deform.bias holds values that are not"),
-        (lambda s: s | {"spynet.std": torch.ones(1, 1, 1, 1)}, "spynet.std must be 0.226, got 1.0"),
-    ],
-)
-def test_anything_else_is_refused_by_name(state, change, message):
-    with pytest.raises(ValueError, match=message):
-        from_published(change(state))
-
-
-@pytest.mark.parametrize("wrap", [lambda s: s, lambda s: {"epoch": 7, "state_dict": s}], ids=["bare", "nested"])
-@pytest.mark.parametrize("prefix", ["", "module."])
-def test_a_checkpoint_is_converted(tmp_path: Path, state, wrap, prefix):
-    source, target = tmp_path / "their.pth", tmp_path / "ours.safetensors"
-    torch.save(wrap({prefix + name: value for name, value in state.items()}), source)
-    convert_weights(source, target)
-    ours = load(target)
-    assert ours.config == PRESETS["quiver-s"]
-    assert torch.equal(ours.alignment.weight, state["pa_deform.weight"])
-    assert notes(target)["converted_from"] == "their.pth"
-    with pytest.raises(FileExistsError, match=r"ours\.safetensors exists"):
-        convert_weights(source, target)
-
-
-class Bomb:
-    """Pickled, this writes a file when it is loaded."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple:
-        return (Path.touch, (self.path,))
-
-
-def test_pickled_programs_are_never_run(tmp_path: Path):
-    trace = tmp_path / "executed"
-    for number, write in enumerate((torch.save, lambda value, path: path.write_bytes(pickle.dumps(value)))):
-        source = tmp_path / f"{number}.pth"
-        write({"state_dict": Bomb(trace)}, source)
-        with pytest.raises(ValueError, match="pickled programs are never run"):
-            convert_weights(source, tmp_path / "ours.safetensors")
-    assert not trace.exists()
-    assert not (tmp_path / "ours.safetensors").exists()
-
-
-@pytest.mark.parametrize("content", [b"", b"not weights at all", b"PK\x03\x04 broken"])
-@pytest.mark.parametrize("name", ["x.pth", "x.safetensors"])
-def test_damaged_files_are_named(tmp_path: Path, content, name):
-    source = tmp_path / name
-    source.write_bytes(content)
-    with pytest.raises(ValueError, match=name):
-        convert_weights(source, tmp_path / "ours.safetensors")
-    with pytest.raises(FileNotFoundError, match=r"absent\.pth"):
-        convert_weights(tmp_path / "absent.pth", tmp_path / "ours.safetensors")
-
-
-def test_a_checkpoint_that_is_a_list_is_refused(tmp_path: Path):
-    torch.save([torch.ones(2)], tmp_path / "list.pth")
-    with pytest.raises(ValueError, match="expected a dictionary of named tensors, found list"):
-        convert_weights(tmp_path / "list.pth", tmp_path / "ours.safetensors")
-
-
 @pytest.mark.parametrize(
     "build",
     [
-        lambda: QUIVER(TINY),
-        lambda: QUIVER(replace(TINY, fold=2, baseline=4, attention_temperature=8.0, flow=False)),
+        lambda: QUIVER(Config(16, pre_denoiser=False, cell_growth=3)),
+        lambda: FoldedQUIVER(TINY),
+        lambda: FoldedQUIVER(replace(TINY, fold=2, estimate_width=4, attention_temperature=8.0, flow=False)),
         lambda: UNet(UNetConfig(4)),
     ],
-    ids=["quiver", "extended", "unet"],
+    ids=["quiver", "small", "folded", "unet"],
 )
 def test_saved_networks_come_back_the_same(tmp_path: Path, build):
     network = build()
@@ -160,8 +48,44 @@ def test_saved_networks_come_back_the_same(tmp_path: Path, build):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def earlier(network: nn.Module, config: dict[str, object], path: Path) -> None:
+    """Weights as a program wrote them that had one configuration for QUIVER and FoldedQUIVER."""
+    old = {new: name for name, new in RENAMED_PARTS.items()}
+    parts = ((name.partition("."), value) for name, value in network.state_dict().items())
+    tensors = {old.get(part, part) + dot + rest: value.contiguous() for (part, dot, rest), value in parts}
+    kind = "UNet" if isinstance(network, UNet) else "QUIVER"
+    save_file(tensors, path, {"format": "quiver-1", "network": kind, "config": json.dumps(config)})
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        QUIVER(Config(16, flow=False, cell_growth=3)),
+        FoldedQUIVER(replace(TINY, fold=2, estimate_width=4)),
+        UNet(UNetConfig(2)),
+    ],
+    ids=["quiver", "folded", "unet"],
+)
+def test_weights_of_earlier_versions_are_read(tmp_path: Path, network):
+    """Their configuration named every size of the published design; parts had other names."""
+    config = network.config.to_dict()
+    if not isinstance(network, UNet):
+        old = {new: name for name, new in RENAMED.items()}
+        config = EARLIER | {old.get(name, name): value for name, value in config.items()}
+    earlier(network, config, tmp_path / "w.safetensors")
+    back = load(tmp_path / "w.safetensors")
+    assert type(back) is type(network)
+    assert back.config == network.config
+    for name, value in network.state_dict().items():
+        assert torch.equal(back.state_dict()[name], value), name
+
+
+def test_the_shipped_weights_are_those_of_the_preset():
+    assert load(weights_path("nano")).config == PRESETS["nano"]
+
+
 def test_weights_that_do_not_fit_are_refused(tmp_path: Path):
-    network, path = QUIVER(TINY), tmp_path / "w.safetensors"
+    network, path = FoldedQUIVER(TINY), tmp_path / "w.safetensors"
     with pytest.raises(ValueError, match=r"written as \.safetensors, got w\.pth"):
         save(network, TINY, tmp_path / "w.pth")
     save_file({"a": torch.ones(1)}, path)

@@ -103,16 +103,16 @@ def test_weights_of_overlapping_spans_sum_to_one(length):
         np.testing.assert_allclose(total, 1, atol=1e-6)
 
 
-def test_the_reach_of_the_hourglass_is_what_it_says():
+def test_the_reach_of_the_small_unet_is_what_it_says():
     """A pixel that changes: nothing farther than REACH answers, at any phase of the pooling, and something that far."""
-    hourglass, side, seen = SmallUNet(3, 4).double().eval(), 120, []
+    unet, side, seen = SmallUNet(3, 4).double().eval(), 120, []
     frame = torch.rand(1, 3, side, side, dtype=torch.double)
-    for parameter in hourglass.parameters():
+    for parameter in unet.parameters():
         parameter.data.abs_()  # nothing cancels
     for centre in range(58, 62):
         other = frame.clone()
         other[:, :, centre, centre] += 1
-        changed = (hourglass(other) - hourglass(frame))[0, 0].detach().nonzero()
+        changed = (unet(other) - unet(frame))[0, 0].detach().nonzero()
         seen.append(int((changed - centre).abs().max()))
     assert max(seen) == SmallUNet.REACH
     assert SmallUNet.REACH % SmallUNet.MULTIPLE == 0
@@ -136,21 +136,21 @@ def test_a_convolutional_network_does_not_see_the_tiles():
 
 
 def nano_memory(model: nn.Module, height: int, width: int, mode: str, pixels: int) -> int:
-    """Bytes that hold a frame, and its hourglass with so many pixels at a time."""
+    """Bytes that hold a frame, and its initial estimate with so many pixels at a time."""
     padded = (height + -height % 8) * (width + -width % 8)
     return frame_bytes(model, mode) * padded + 1200 * pixels
 
 
 def same_with_less_memory(name: str, mode: str, seed: int) -> None:
-    """A random size and a bound that holds the frame but not its hourglass: equal to 1e-5 of white, no warning."""
+    """A random size, a bound that holds the frame but not its initial estimate: equal to 1e-5 of white, no warning."""
     path, rng = weights_path(name), np.random.default_rng(seed)
     height, width = (int(n) for n in rng.integers(89, 116, 2))
     codes, network = moving(2, height, width, seed), load(path).eval()
     memory = nano_memory(network, height, width, mode, int(rng.integers(7744, min(9000, height * width))))
     cut = cut_pieces(network, height, width, memory, mode)
     assert cut.exact
-    assert cut.hourglass is not None
-    assert cut.hourglass < height * width  # the hourglass does run in tiles
+    assert cut.estimate_pixels is not None
+    assert cut.estimate_pixels < height * width  # the estimate does run in tiles
     tiled, whole = (quiet(network_restorer(path, RestoreOptions(memory=m, mode=mode)), codes) for m in (memory, 10**10))
     assert np.abs(tiled - whole).max() < 1e-5 * codes.white
 

@@ -22,8 +22,7 @@ from qsim import files
 from quiver.cli.program import main
 from quiver.evaluation import metrics
 from quiver.model.blocks import RADIUS, Output
-from quiver.model.presets import PRESETS
-from quiver.model.quiver import QUIVER
+from quiver.model.presets import PRESETS, assemble
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import load
 from quiver.training import loop as training
@@ -167,7 +166,11 @@ def test_ten_times_the_rate_stays_finite_or_stops(tiny_dataset, tmp_path, networ
     kinds = {"optimiser": optimiser, "learning_rate": 10 * rate, "loss": "scales-l1", "head_start": 0.85}
     fast = settings(tiny_dataset, tmp_path / "r", steps=200, batch=1, validate_every=100, **kinds)
     torch.manual_seed(0)
-    narrow = QUIVER(replace(PRESETS["nano"], baseline=4, attention_width=16)) if network == "nano" else small_network()
+    narrow = (
+        assemble(replace(PRESETS["nano"], estimate_width=4, attention_width=16))
+        if network == "nano"
+        else small_network()
+    )
     try:
         state = train(narrow, fast, progress=False)
     except Diverged:
@@ -383,12 +386,12 @@ def test_two_processes_train_as_one_with_twice_the_batch(tiny_dataset, tmp_path)
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
 
 
-def test_a_head_start_trains_the_baseline_alone(tiny_dataset, tmp_path):
-    """After the first half only the baseline has moved; the second half moves the rest, from its last layers on."""
+def test_a_head_start_trains_the_estimate_alone(tiny_dataset, tmp_path):
+    """After the first half only the estimate has moved; the second half moves the rest, from its last layers on."""
 
     def moved(steps: int, out: str) -> set[str]:
         torch.manual_seed(0)
-        network = QUIVER(replace(PRESETS["nano"], baseline=4, attention_width=16))
+        network = assemble(replace(PRESETS["nano"], estimate_width=4, attention_width=16))
         before = {name: p.detach().clone() for name, p in network.named_parameters()}
         state = State()
 
@@ -400,10 +403,10 @@ def test_a_head_start_trains_the_baseline_alone(tiny_dataset, tmp_path):
         train(network, run, should_stop=half, progress=False)
         return {name.split(".")[0] for name, p in network.named_parameters() if not torch.equal(p, before[name])}
 
-    assert moved(2, "half") == {"baseline"}
-    assert moved(4, "more") >= {"denoiser", "baseline", "flow", "cell", "attention", "refine"}
+    assert moved(2, "half") == {"estimate"}
+    assert moved(4, "more") >= {"denoiser", "estimate", "flow", "cell", "attention", "refine"}
     plain = train(small_network(), settings(tiny_dataset, tmp_path / "unet", head_start=0.5), progress=False)
-    assert plain.finished, "a network without a baseline is trained as always"
+    assert plain.finished, "a network without an initial estimate is trained as always"
 
 
 def test_validation_has_one_peak_for_every_sensor(tiny_dataset, tmp_path):

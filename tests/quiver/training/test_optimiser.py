@@ -69,8 +69,8 @@ def test_muon_moves_every_direction_of_a_kernel_alike():
 @pytest.mark.parametrize("kind", ["adam", "muon"])
 def test_a_weight_without_gradient_stays(kind):
     unet = network()
-    unet.hourglass.bottom.requires_grad_(False)
-    for weight in unet.hourglass.merge1.parameters():
+    unet.body.bottom.requires_grad_(False)
+    for weight in unet.body.merge1.parameters():
         weight.grad = None
     for name, step in steps(unet, kind).items():
         assert bool(step.any()) != ("bottom" in name or "merge1" in name), name
@@ -79,7 +79,7 @@ def test_a_weight_without_gradient_stays(kind):
 def test_kernels_that_are_no_matrices_are_refused():
     """Their copy would be trained in their stead."""
     unet = network().to(memory_format=torch.channels_last)
-    with pytest.raises(ValueError, match=r"hourglass\..*weight: Muon sees kernels as matrices"):
+    with pytest.raises(ValueError, match=r"body\..*weight: Muon sees kernels as matrices"):
         steps(unet, "muon")
     steps(unet, "adam")
 
