@@ -17,24 +17,18 @@ import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files, structure
+from qsim import files
 from qsim.clip import exr
+from qsim.clip.manifest import RELATIVE, TRUTH, camera_of, read_manifest
 from qsim.clip.stream import Stream
-from qsim.clip.writer import FORMAT_VERSION, PHYSICAL, RELATIVE, TRUTH, ClipWriter, camera_of
 from qsim.files import Progress
+from qsim.optics.camera import Camera
 from qsim.optics.radiometry import Crop, check_crop
-
-if TYPE_CHECKING:
-    from qsim.optics.camera import Camera
-
-__all__ = ["FORMAT_VERSION", "PHYSICAL", "RELATIVE", "Clip", "ClipWriter", "Stream"]
-
-_DAMAGED = "the file is damaged; make the clip again, or take clip.json from a copy"
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,22 +45,7 @@ class Clip:
         manifest = path / "clip.json"
         if not manifest.is_file():
             raise FileNotFoundError(_why_not(path))
-        meta = files.read_json(manifest)
-        files.check_version(manifest, meta.get("format_version"), FORMAT_VERSION)
-        structure.structure(manifest, meta, structure.CLIP, _DAMAGED)
-        if meta["radiance_unit"] not in (PHYSICAL, RELATIVE):
-            raise ValueError(
-                f"{manifest}: radiance_unit {meta['radiance_unit']!r}; known are '{PHYSICAL}' and '{RELATIVE}'"
-            )
-        if (meta.get("camera") is None) != (meta["radiance_unit"] == RELATIVE):
-            raise ValueError(
-                f"{manifest}: a clip in {PHYSICAL} needs a camera, and a relative one has none; {_DAMAGED}"
-            )
-        for t in range(meta["shape"][0]):
-            if f"radiance/{t:06d}.exr" not in meta["checksums"]:
-                raise ValueError(f"{manifest}: checksums lack radiance/{t:06d}.exr of frame {t}; {_DAMAGED}")
-        files.check_own(manifest, meta, _DAMAGED)
-        return Clip(path, meta)
+        return Clip(path, read_manifest(manifest))
 
     def __len__(self) -> int:
         return int(self.meta["shape"][0])

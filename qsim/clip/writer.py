@@ -12,36 +12,16 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files, locks
 from qsim.clip import clamped_error, exr
+from qsim.clip.manifest import FORMAT_VERSION, MEASURED, OURS, TRUTH, camera_of, check_new
 from qsim.files import VERSION, check_name
 from qsim.optics import radiometry
-
-if TYPE_CHECKING:
-    from qsim.optics.camera import Camera
-
-FORMAT_VERSION = 1
-PHYSICAL = "W m^-2 sr^-1"
-RELATIVE = "relative"
-MEASURED = (  # in clip.json, beyond what was asked for
-    *("mean_radiance", "mean_photons", "clipped_pixels", "saturated_pixels", "checksums", "software", "checksum"),
-    *("error_per_frame", "error_at_white_per_frame", "white", "psnr_of_truth", "psnr_unclamped", "fireflies_per_frame"),
-)
-OURS = r"clip\.json|(radiance|sharp|truth|saturated)/[0-9]{6,}\.exr|streams/lock|streams/[A-Za-z0-9._-]+\.(npy|json)"
-TRUTH = {  # channel of the EXR file -> quantity
-    "u": "flow",
-    "v": "flow",
-    "bu": "flow_back",
-    "bv": "flow_back",
-    "valid": "valid",
-    "Z": "depth",
-    "id": "body_id",
-}
 
 
 class ClipWriter:
@@ -69,7 +49,7 @@ class ClipWriter:
         if self.path.exists():
             files.check_ours(self.path, OURS)
         self.meta = json.loads(files.to_json({"format_version": FORMAT_VERSION, "name": self.name} | meta))
-        _check_new(self.path, self.meta)
+        check_new(self.path, self.meta)
         self.part = self.path.with_name(self.path.name + ".part")
         self._camera = camera_of(self.meta, self.path)
         self._frames: dict[int, dict[str, Any]] = {}
@@ -265,45 +245,6 @@ class ClipWriter:
             exr.read_half(self.part / "radiance" / f"{t:06d}.exr", height, width)[::step, ::step] for t in range(frames)
         ]
         return float(np.percentile(np.stack(samples), 99.9))
-
-
-def camera_of(meta: dict[str, Any], where: Path) -> Camera | None:
-    """The camera that clip.json describes, without its motion; None for relative radiance."""
-    described = meta.get("camera")
-    if described is None:
-        return None
-    from qsim.optics.camera import Camera
-
-    values = {key: value for key, value in described.items() if key not in ("kind", "motion")}
-    for key in ("origin", "target", "up"):
-        if values.get(key) is None:
-            values.pop(key, None)
-        else:
-            values[key] = tuple(values[key])
-    try:
-        return Camera(**values)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{where}: camera: {error}") from None
-
-
-def _check_new(path: Path, meta: dict[str, Any]) -> None:
-    shape = meta.get("shape")
-    if not (isinstance(shape, list) and len(shape) == 3 and all(isinstance(n, int) for n in shape)):
-        raise ValueError(f"{path}: shape must be [frames, height, width], got {shape!r}")
-    if min(shape) < 1:
-        raise ValueError(
-            f"{path}: a clip needs at least one frame of one pixel, got {shape[0]} of {shape[1]} x {shape[2]}"
-        )
-    for key in ("frame_rate", "exposure"):
-        value = meta.get(key)
-        if not (isinstance(value, int | float) and value > 0):
-            raise ValueError(f"{path}: {key} must be a number above 0, got {value!r}")
-    if meta.get("radiance_unit") not in (PHYSICAL, RELATIVE):
-        raise ValueError(
-            f"{path}: radiance_unit must be '{PHYSICAL}' or '{RELATIVE}', got {meta.get('radiance_unit')!r}"
-        )
-    if (meta.get("camera") is None) != (meta["radiance_unit"] == RELATIVE):
-        raise ValueError(f"{path}: a clip in {PHYSICAL} needs a camera, and a relative one has none")
 
 
 def _truth_channels(truth: dict[str, Array]) -> dict[str, Array]:

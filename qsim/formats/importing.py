@@ -20,8 +20,10 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files
-from qsim.clip.clip import RELATIVE, Clip, ClipWriter
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import RELATIVE
 from qsim.clip.stream import FORMAT_VERSION, Stream
+from qsim.clip.writer import ClipWriter
 from qsim.files import VERSION, Progress
 from qsim.formats.detection import ASSUMED, LAYOUTS, detect
 from qsim.formats.recording import Hints, Marked, Recording, reoriented, with_stated_layout

@@ -7,7 +7,9 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
-from qsim.clip.clip import PHYSICAL, Clip, ClipWriter
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import PHYSICAL
+from qsim.clip.writer import ClipWriter
 from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Crop, Renderer
 from qsim.scene import Scene, describe

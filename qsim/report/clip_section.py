@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from qsim import colour
 from qsim.clip.clamped_error import stated
-from qsim.clip.clip import RELATIVE, Clip, Stream
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import RELATIVE
 from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, MOVING, SLOWEST, largest_motion, moving_mean
 from qsim.clip.photons import clip_photons
+from qsim.clip.stream import Stream
 from qsim.report import html as page
 from qsim.sensor.defects import defect_table, fixed_pattern
 

@@ -18,9 +18,10 @@ import numpy as np
 
 from qsim import colour, files
 from qsim.clip.clamped_error import stated
-from qsim.clip.clip import Clip, Stream
+from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import MOVING
 from qsim.clip.photons import clip_photons
+from qsim.clip.stream import Stream
 from qsim.dataset.checking import Restored
 from qsim.dataset.dataset import Dataset
 from qsim.files import Progress

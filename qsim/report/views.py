@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from qsim import colour, files
 from qsim.checks import check_shape
-from qsim.clip.clip import Clip, Stream
+from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import largest_motion
+from qsim.clip.stream import Stream
 from qsim.files import load_array
 from qsim.formats.recording import checked_codes
 from qsim.sensor import packing

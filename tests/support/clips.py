@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.clip import PHYSICAL, RELATIVE, Clip, ClipWriter
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import PHYSICAL, RELATIVE
+from qsim.clip.writer import ClipWriter
 from qsim.dataset.generation import Options, generate
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe import Recipe

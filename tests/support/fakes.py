@@ -12,7 +12,9 @@ from unittest import mock
 
 import numpy as np
 
-from qsim.clip.clip import PHYSICAL, Clip, ClipWriter
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import PHYSICAL
+from qsim.clip.writer import ClipWriter
 from qsim.dataset.job import Job
 from qsim.dataset.provenance import origin
 from qsim.optics.camera import Camera

@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from qsim.clip.clip import RELATIVE, Clip, ClipWriter
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import RELATIVE
+from qsim.clip.writer import ClipWriter
 
 SIZE = (48, 64)
 

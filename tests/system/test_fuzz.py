@@ -26,8 +26,10 @@ from qsim import files
 from qsim.calibration import sensor_file
 from qsim.cli.program import main
 from qsim.clip import exr
-from qsim.clip.clip import RELATIVE, Clip, ClipWriter
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import RELATIVE
 from qsim.clip.stream import Stream
+from qsim.clip.writer import ClipWriter
 from qsim.dataset import checking, recipe
 from qsim.formats import array_files, detection, images, importing, video
 from qsim.formats.recording import Hints

@@ -61,7 +61,6 @@ MOST_MODULES = 15
 STILL_FORBIDDEN: set[tuple[str, str]] = set()
 STILL_IN_CIRCLES: set[str] = set()
 STILL_LONG: set[str] = {
-    "qsim.clip.writer",
     "qsim.sensor.defects.fixed_pattern",
     "quiver.training.run_folder",
 }

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from qsim import keys
-from qsim.clip.clip import Clip, ClipWriter
+from qsim.clip.clip import Clip
 from qsim.clip.photons import light_level
 from qsim.clip.sensing import Sensing, describe, sense, write_stream
 from qsim.clip.simulation import Draw
+from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.bit_depth.clip_study import check_clip

@@ -17,7 +17,9 @@ import pytest
 
 from qsim.cli import dataset
 from qsim.cli.program import main
-from qsim.clip.clip import RELATIVE, Clip, ClipWriter
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import RELATIVE
+from qsim.clip.writer import ClipWriter
 from qsim.dataset import generation, recipe
 from qsim.dataset.dataset import Dataset
 from qsim.files import Progress

@@ -12,8 +12,10 @@ from forks import killed_at
 
 from qsim import files
 from qsim.clip import exr
-from qsim.clip.clip import PHYSICAL, RELATIVE, Clip, ClipWriter
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import PHYSICAL, RELATIVE
 from qsim.clip.photons import clip_photons, light_level, light_line
+from qsim.clip.writer import ClipWriter
 
 FRAMES, HEIGHT, WIDTH = 5, 10, 7
 CAMERA = {

@@ -17,9 +17,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from qsim.cli.program import main
-from qsim.clip.clip import RELATIVE, Clip, ClipWriter
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import RELATIVE
 from qsim.clip.sensing import Sensing, sense
 from qsim.clip.stream import Stream
+from qsim.clip.writer import ClipWriter
 from qsim.colour import code_levels, from_linear, to_linear
 from qsim.dataset import generation, recipe
 from qsim.dataset.dataset import Dataset

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from qsim.cli.program import main
-from qsim.clip.clip import RELATIVE, Clip, ClipWriter
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import RELATIVE
+from qsim.clip.writer import ClipWriter
 
 SHAPE = (5, 8, 11)
 

@@ -12,9 +12,11 @@ from clips import write_clip, write_dataset
 from stats import mixture_p_value
 
 from qsim.cli.program import main
-from qsim.clip.clip import RELATIVE, Clip, ClipWriter
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import RELATIVE
 from qsim.clip.photons import clip_photons
 from qsim.clip.sensing import Sensing, sense
+from qsim.clip.writer import ClipWriter
 from qsim.report import clip_section, report
 from qsim.studies.validation.reading import ReadingReport
 

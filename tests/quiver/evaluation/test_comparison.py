@@ -15,8 +15,9 @@ from clips import ClipMaker
 from numpy import ndarray as Array
 
 from qsim import files
-from qsim.clip.clip import RELATIVE, ClipWriter
+from qsim.clip.manifest import RELATIVE
 from qsim.clip.sensing import Sensing, sense
+from qsim.clip.writer import ClipWriter
 from quiver.data.clips import open_clips, truth
 from quiver.data.codes import Codes, array_codes, sensed
 from quiver.data.illumination import Illumination, ideal_counter

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from qsim.clip.clip import PHYSICAL, RELATIVE, Clip, ClipWriter
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import PHYSICAL, RELATIVE
+from qsim.clip.writer import ClipWriter
 from qsim.optics.camera import Camera
 from qsim.optics.radiometry import photons_per_lux
 from qsim.studies.bit_depth import paper_figures

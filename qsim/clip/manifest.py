@@ -1,0 +1,82 @@
+"""clip.json: its version, units and field names, the checks of a new clip and of one that is opened."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from qsim import files, structure
+from qsim.optics.camera import Camera
+
+FORMAT_VERSION = 1
+PHYSICAL = "W m^-2 sr^-1"
+RELATIVE = "relative"
+MEASURED = (  # in clip.json, beyond what was asked for
+    *("mean_radiance", "mean_photons", "clipped_pixels", "saturated_pixels", "checksums", "software", "checksum"),
+    *("error_per_frame", "error_at_white_per_frame", "white", "psnr_of_truth", "psnr_unclamped", "fireflies_per_frame"),
+)
+OURS = r"clip\.json|(radiance|sharp|truth|saturated)/[0-9]{6,}\.exr|streams/lock|streams/[A-Za-z0-9._-]+\.(npy|json)"
+TRUTH = {  # channel of the EXR file -> quantity
+    "u": "flow",
+    "v": "flow",
+    "bu": "flow_back",
+    "bv": "flow_back",
+    "valid": "valid",
+    "Z": "depth",
+    "id": "body_id",
+}
+_DAMAGED = "the file is damaged; make the clip again, or take clip.json from a copy"
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """Return clip.json; `ValueError` names file and key if it is not that of a complete clip of this version."""
+    meta = files.read_json(path)
+    files.check_version(path, meta.get("format_version"), FORMAT_VERSION)
+    structure.structure(path, meta, structure.CLIP, _DAMAGED)
+    if meta["radiance_unit"] not in (PHYSICAL, RELATIVE):
+        raise ValueError(f"{path}: radiance_unit {meta['radiance_unit']!r}; known are '{PHYSICAL}' and '{RELATIVE}'")
+    if (meta.get("camera") is None) != (meta["radiance_unit"] == RELATIVE):
+        raise ValueError(f"{path}: a clip in {PHYSICAL} needs a camera, and a relative one has none; {_DAMAGED}")
+    for t in range(meta["shape"][0]):
+        if f"radiance/{t:06d}.exr" not in meta["checksums"]:
+            raise ValueError(f"{path}: checksums lack radiance/{t:06d}.exr of frame {t}; {_DAMAGED}")
+    files.check_own(path, meta, _DAMAGED)
+    return meta
+
+
+def camera_of(meta: dict[str, Any], where: Path) -> Camera | None:
+    """The camera that clip.json describes, without its motion; None for relative radiance."""
+    described = meta.get("camera")
+    if described is None:
+        return None
+    values = {key: value for key, value in described.items() if key not in ("kind", "motion")}
+    for key in ("origin", "target", "up"):
+        if values.get(key) is None:
+            values.pop(key, None)
+        else:
+            values[key] = tuple(values[key])
+    try:
+        return Camera(**values)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: camera: {error}") from None
+
+
+def check_new(path: Path, meta: dict[str, Any]) -> None:
+    """`ValueError` unless `meta` holds what a new clip needs: shape, rates, unit and camera."""
+    shape = meta.get("shape")
+    if not (isinstance(shape, list) and len(shape) == 3 and all(isinstance(n, int) for n in shape)):
+        raise ValueError(f"{path}: shape must be [frames, height, width], got {shape!r}")
+    if min(shape) < 1:
+        raise ValueError(
+            f"{path}: a clip needs at least one frame of one pixel, got {shape[0]} of {shape[1]} x {shape[2]}"
+        )
+    for key in ("frame_rate", "exposure"):
+        value = meta.get(key)
+        if not (isinstance(value, int | float) and value > 0):
+            raise ValueError(f"{path}: {key} must be a number above 0, got {value!r}")
+    if meta.get("radiance_unit") not in (PHYSICAL, RELATIVE):
+        raise ValueError(
+            f"{path}: radiance_unit must be '{PHYSICAL}' or '{RELATIVE}', got {meta.get('radiance_unit')!r}"
+        )
+    if (meta.get("camera") is None) != (meta["radiance_unit"] == RELATIVE):
+        raise ValueError(f"{path}: a clip in {PHYSICAL} needs a camera, and a relative one has none")
