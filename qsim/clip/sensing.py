@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy import ndarray as Array
 
-from qsim import locks
+from qsim import files, locks
 from qsim.clip.clip import Clip
 from qsim.clip.photons import light_level, light_line
 from qsim.clip.simulation import Draw, plane_of, stored
@@ -213,6 +213,8 @@ def write_stream(clip: Clip, name: str, codes_iter: Iterable[Array], sensor: Sen
 def _write(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
     """Store packed blocks as a stream of the clip; the caller holds the lock of its streams."""
     path = clip.path / "streams" / f"{check_name(name)}.npy"
+    for file in (path.with_suffix(".json"), path):
+        files.remove_leftovers(file)
     return write_packed(path, blocks, sensor, {"orientation": orientation(clip.meta)} | meta)
 
 

@@ -191,8 +191,6 @@ def write_packed(path: Path, blocks: Iterable[Array], sensor: Sensor, meta: dict
     bits = sensor.bits
     row = packing.packed_width(width, bits)
     json_path = path.with_suffix(".json")
-    for file in (json_path, path):
-        files.remove_leftovers(file)
     done, digest = 0, hashlib.sha256()
     with files.replacing_described(path, json_path) as (stored, described):
         head = _header(frames, height, row)

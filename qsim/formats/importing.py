@@ -22,11 +22,14 @@ from numpy import ndarray as Array
 from qsim import files
 from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
-from qsim.clip.stream import FORMAT_VERSION, Stream
+from qsim.clip.stream import Stream, write_packed
 from qsim.clip.writer import ClipWriter
-from qsim.files import VERSION, Progress
+from qsim.files import Progress
 from qsim.formats.detection import ASSUMED, LAYOUTS, detect
 from qsim.formats.recording import Hints, Marked, Recording, reoriented, with_stated_layout
+from qsim.sensor import devices, packing
+from qsim.sensor.sensor import Sensor
+from qsim.sensor.spad import BinarySPAD
 
 
 def read(path: Path, hints: Hints | None = None, *, compared: tuple[str, ...] = ()) -> Recording:
@@ -154,8 +157,6 @@ def to_stream(
         raise ValueError(f"{path}: --split is stored in clips, and {recording.source} becomes a stream; leave it out")
     if capture.ppp is not None and capture.sensor is None:
         raise ValueError(f"{path}: --ppp sets the gain of a named sensor; name it with --sensor, or leave --ppp out")
-    from qsim.sensor import devices, packing
-
     stem = path.with_suffix("") if path.suffix in (".npy", ".json") else path
     npy, description = stem.with_suffix(".npy"), stem.with_suffix(".json")
     for file in (npy, description):
@@ -166,28 +167,22 @@ def to_stream(
                 f"{file}: is not a stream, which is all that --force replaces; move it away, or name another"
             )
     frames, height, width = recording.shape
-    sensor = _sensor(recording, capture, devices)
+    sensor = _sensor(recording, capture)
     npy.parent.mkdir(parents=True, exist_ok=True)
-    with files.replacing(npy) as target:
-        packed = (frames, height, packing.packed_width(width, recording.bits))
-        np.lib.format.write_array_header_1_0(target, {"descr": "|u1", "fortran_order": False, "shape": packed})
+
+    def packed() -> Iterator[Array]:
         for start, block in blocks(recording):
-            target.write(packing.pack(block, recording.bits).tobytes())
+            yield packing.pack(block, sensor.bits)
             if progress is not None:
                 progress(start + len(block), frames)
-        description.unlink(missing_ok=True)  # the old stream is accepted until the new one is whole
+
     meta = {
-        "format_version": FORMAT_VERSION,
         "shape": [frames, height, width],
-        "width": width,
-        "bits": recording.bits,
-        "bit_order": "msb",
         "orientation": recording.meta.get("orientation", "unknown"),  # never upright unless a reader says so
         "code_model": recording.code_model,
         "planes_per_code": 2**recording.bits - 1 if recording.code_model == "binary_sum" else 1,
         "frame_rate": capture.frame_rate,
         "exposure": capture.seconds,
-        "sensor": sensor.to_dict(),
         "sensor_name": capture.sensor,
         "ppp_target": None,
         "ppp_factor": None,
@@ -195,11 +190,8 @@ def to_stream(
         "transfer": "linear",
         "seed": None,
         "source": {"format": recording.source} | recording.meta,
-        "sha256": files.sha256(npy),
-        "software": {"qsim": VERSION},
     }
-    files.write_description(description, meta)
-    return Stream.open(description)
+    return write_packed(npy, packed(), sensor, meta)
 
 
 def blocks(recording: Recording) -> Iterator[tuple[int, Array]]:
@@ -216,9 +208,7 @@ def _ranges(recording: Recording) -> Iterator[tuple[int, int]]:
         yield start, min(start + step, frames)
 
 
-def _sensor(recording: Recording, capture: Import, devices: Any) -> Any:
+def _sensor(recording: Recording, capture: Import) -> Sensor:
     if capture.sensor is not None:
         return devices.load(capture.sensor, ppp=capture.ppp, bits=recording.bits, exposure=capture.seconds)
-    from qsim.sensor.spad import BinarySPAD
-
     return BinarySPAD(pde=1.0, dark_count_rate=0.0, bits=recording.bits or 1)
