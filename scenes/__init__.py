@@ -16,6 +16,7 @@ import numpy as np
 from qsim.checks import suggest
 from qsim.scene import Scene
 from scenes import (
+    asset_folder,
     crowd,
     drums,
     fan,
@@ -25,7 +26,6 @@ from scenes import (
     glass,
     glossy,
     lamp,
-    own,
     pellets,
     plain,
     room,
@@ -58,11 +58,11 @@ FAMILIES: dict[str, Family] = {
 
 
 def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
-    """The scene of a family by name, of a Python file with `scene(seed, *, speed)`, a folder of assets, or Mitsuba XML.
+    """Return the scene of a family, a Python file with `scene(seed, *, speed)`, a folder of assets, or Mitsuba XML.
 
-    What a folder may hold is in `own.py`. An XML scene stands still and knows no seed: a Python file that calls
-    `qsim.read_mitsuba` moves its shapes. Raises ValueError for a name that is none of these, FileNotFoundError for a
-    missing file, and for a speed other than 1 that changes no motion of a .py or .xml scene.
+    `asset_folder.py` states what a folder may hold. An XML scene stands still and has no seed: a Python file that calls
+    `qsim.read_mitsuba` moves its shapes. `FileNotFoundError` for a missing file; `ValueError` for a name that is none
+    of these, and for a speed other than 1 that changes no motion of a .py or .xml scene.
     """
     if str(name) in FAMILIES:
         return FAMILIES[str(name)](seed, speed=speed)
@@ -83,7 +83,7 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
     if (Path(name) / "clip.json").is_file():
         raise ValueError(f"{name}: is a clip, made from a scene already; name a family, a .py or .xml file or a folder")
     if Path(name).is_dir():
-        return own.scene(seed, speed=speed, folder=name)
+        return asset_folder.scene(seed, speed=speed, folder=name)
     raise ValueError(
         f"no scene family {str(name)!r}{suggest(str(name), FAMILIES)}; there are {', '.join(FAMILIES)}, "
         "or give a .py or .xml file or a folder"

@@ -16,9 +16,7 @@ from PIL import Image, ImageDraw
 
 import scenes
 from qsim.colour import tone
-from qsim.rendering.budget import Budget
-from qsim.rendering.renderer import Renderer
-from scenes.stage import FRAME_RATE, HEIGHT
+from scenes.common import FRAME_RATE, HEIGHT
 
 FRAME = 8  # of the clip
 MOVES = 0.05  # px/frame at 512 x 1024; slower pixels count as still
@@ -26,6 +24,8 @@ MOVES = 0.05  # px/frame at 512 x 1024; slower pixels count as still
 
 def picture(family: str, seed: int, height: int, samples: int) -> tuple[NDArray[np.uint8], float, float, float]:
     """(tone-mapped frame, mean and largest motion of moving pixels [px/frame], their share); motion at 512 x 1024."""
+    from qsim.rendering import Budget, Renderer
+
     renderer = Renderer(
         scenes.load(family, seed).resized(height, 2 * height), frame_rate=FRAME_RATE, budget=Budget(samples=samples)
     )

@@ -7,18 +7,18 @@ import numpy as np
 from qsim.scene import Body, Diffuse, Mesh, Oscillation, Scene, Spin, Translation
 from qsim.scene.rotation import vector
 from qsim.scene.shapes import ball, blob, box, cylinder, polyhedron
-from scenes import stage
-from scenes.stage import any_angle, between, pick, sign
+from scenes import common
+from scenes.common import any_angle, between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     """Sixty to ninety bodies of 3 to 5 cm in three streams of 1.5 to 4 m/s at speed 1."""
     rng = np.random.default_rng([seed, 16])
     bodies = [
-        stage.floor(Diffuse(stage.backdrop(rng)), 2.4, y=0.0, z=-0.3),
-        stage.wall(Diffuse(stage.backdrop(rng)), 2.8, 1.4, z=-0.9),
+        common.floor(Diffuse(common.backdrop(rng)), 2.4, y=0.0, z=-0.3),
+        common.wall(Diffuse(common.backdrop(rng)), 2.8, 1.4, z=-0.9),
     ]
-    coats = [stage.paint(rng, stage.surface(rng)) for _ in range(8)]
+    coats = [common.paint(rng, common.surface(rng)) for _ in range(8)]
     headings = any_angle(rng) + np.array([0.0, 2.1, 4.2]) + rng.normal(0, 0.3, 3)
     rates = rng.uniform(2.2, 3.8, 3)
     for i in range(int(rng.integers(60, 91))):
@@ -28,12 +28,12 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         solid = shape(rng, between(rng, 0.012, 0.024))
         ground = -float(solid.vertices[:, 1].min()) + 0.008
         middle = np.array([rng.uniform(-0.42, 0.42), ground, rng.uniform(-0.6, 0.2)])
-        walk = Translation(vector(velocity), vector(middle - velocity * stage.CLIP / 2))
+        walk = Translation(vector(velocity), vector(middle - velocity * common.CLIP / 2))
         hop = Oscillation((0.0, 0.008, 0.0), speed * between(rng, 4, 12), any_angle(rng))
         turn = Spin((0, 1, 0), speed * between(rng, 5, 30) * sign(rng), any_angle(rng))
         bodies.append(Body(f"body {i}", solid, pick(rng, coats), walk @ hop @ turn))
-    view = stage.camera((between(rng, -0.15, 0.15), between(rng, 0.25, 0.4), 0.5), (0, 0.02, -0.12), 0.5)
-    return Scene("crowd", seed, view, (stage.sun(rng, 0.6, 1.0),), tuple(bodies), speed)
+    view = common.camera((between(rng, -0.15, 0.15), between(rng, 0.25, 0.4), 0.5), (0, 0.02, -0.12), 0.5)
+    return Scene("crowd", seed, view, (common.sun(rng, 0.6, 1.0),), tuple(bodies), speed)
 
 
 def shape(rng: np.random.Generator, size: float) -> Mesh:

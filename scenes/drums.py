@@ -8,15 +8,15 @@ from qsim.scene import Body, Diffuse, Oscillation, Scene, Spin, Still, Texture, 
 from qsim.scene.rotation import vector
 from qsim.scene.shapes import ball, cylinder
 from qsim.scene.textures import Picture
-from scenes import stage
-from scenes.stage import between, pick, sign
+from scenes import common
+from scenes.common import between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     """Four or five drums, 6 to 11 turns per second at speed 1; the lattice behind slides to and fro."""
     rng = np.random.default_rng([seed, 8])
     slide = speed * between(rng, 10, 14)
-    back = stage.wall(Diffuse(Texture(pattern(rng), (6.0, 3.0))), 1.8, 0.9)
+    back = common.wall(Diffuse(Texture(pattern(rng), (6.0, 3.0))), 1.8, 0.9)
     bodies = [
         Body(
             "lattice",
@@ -36,9 +36,9 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         place = Still((float(x), between(rng, -0.03, 0.03), between(rng, -0.06, 0.06)), vector(rng.normal(0, 0.35, 3)))
         rate = speed * between(rng, 38, 70) * sign(rng)
         repeat = (float(rng.integers(1, 3)), float(rng.integers(1, 3)))
-        bodies.append(Body(f"drum {i}", solid, stage.paint(rng, pattern(rng), repeat), place @ Spin((0, 1, 0), rate)))
-    view = stage.camera((between(rng, -0.1, 0.1), between(rng, 0.0, 0.15), 0.7), (0, 0, 0), 0.5)
-    return Scene("drums", seed, view, (stage.studio(rng), stage.lamp(rng, (0, 0, 0), 0.9, 1.5)), tuple(bodies), speed)
+        bodies.append(Body(f"drum {i}", solid, common.paint(rng, pattern(rng), repeat), place @ Spin((0, 1, 0), rate)))
+    view = common.camera((between(rng, -0.1, 0.1), between(rng, 0.0, 0.15), 0.7), (0, 0, 0), 0.5)
+    return Scene("drums", seed, view, (common.studio(rng), common.lamp(rng, (0, 0, 0), 0.9, 1.5)), tuple(bodies), speed)
 
 
 def pattern(rng: np.random.Generator) -> Picture:

@@ -8,15 +8,15 @@ from qsim.scene import Body, Conductor, Constant, Diffuse, Mesh, RoughPlastic, S
 from qsim.scene.props import rotor
 from qsim.scene.rotation import exponential, pose_matrix
 from qsim.scene.shapes import ball, cylinder, merged, moved, wire
-from scenes import stage
-from scenes.stage import any_angle, between, sign
+from scenes import common
+from scenes.common import any_angle, between, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     """About 5 to 9 turns per second at speed 1."""
     rng = np.random.default_rng([seed, 1])
     radius = between(rng, 0.36, 0.43)
-    place = Still((between(rng, -0.06, 0.06), between(rng, -0.03, 0.03), 0.45), stage.upright(rng.uniform(-0.5, 0.5)))
+    place = Still((between(rng, -0.06, 0.06), between(rng, -0.03, 0.03), 0.45), common.upright(rng.uniform(-0.5, 0.5)))
     rate = speed * between(rng, 30, 55) * sign(rng)
     spin = place @ Spin((0, 0, 1), rate, phase=any_angle(rng))
     blades = rotor(
@@ -31,15 +31,15 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     cap = moved(ball(0.12 * radius, 40), pose_matrix(None, (0, 0, 0.05)))
     hub = merged([moved(cylinder(0.19 * radius, 0.1, 40), facing), cap])
     bodies = [
-        stage.wall(Diffuse(stage.backdrop(rng, 0.06, 0.45)), 4.4, 2.2, z=-0.25),
-        Body("blades", blades, stage.paint(rng, stage.surface(rng, 0.15, 0.9)), spin),
-        Body("hub", hub, RoughPlastic(Texture(stage.surface(rng, 0.1, 0.6)), 0.2), spin),
+        common.wall(Diffuse(common.backdrop(rng, 0.06, 0.45)), 4.4, 2.2, z=-0.25),
+        Body("blades", blades, common.paint(rng, common.surface(rng, 0.15, 0.9)), spin),
+        Body("hub", hub, RoughPlastic(Texture(common.surface(rng, 0.1, 0.6)), 0.2), spin),
         Body("motor", moved(cylinder(0.24 * radius, 0.2, 40), behind), Conductor(roughness=0.35), place),
     ]
     if rng.random() < 0.5:
         bodies.append(Body("guard", guard(1.08 * radius, int(rng.integers(3, 6))), Conductor(roughness=0.3), place))
-    lights = (Constant(between(rng, 0.3, 0.7)), stage.lamp(rng, (0, 0, 0.3)))
-    view = stage.camera((between(rng, -0.3, 0.3), between(rng, -0.2, 0.25), 2.6), (0, 0, 0.3), 0.45)
+    lights = (Constant(between(rng, 0.3, 0.7)), common.lamp(rng, (0, 0, 0.3)))
+    view = common.camera((between(rng, -0.3, 0.3), between(rng, -0.2, 0.25), 2.6), (0, 0, 0.3), 0.45)
     return Scene("fan", seed, view, lights, tuple(bodies), speed)
 
 

@@ -7,14 +7,14 @@ import numpy as np
 from qsim.scene import Body, Conductor, Diffuse, Flag, Motion, Oscillation, Ripple, Scene, Still, Texture
 from qsim.scene.rotation import pose_matrix
 from qsim.scene.shapes import cylinder, moved, sheet
-from scenes import stage
-from scenes.stage import any_angle, between, sign
+from scenes import common
+from scenes.common import any_angle, between, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     """Waves of 5 to 40 cm run along the cloth at 2 to 6 m/s at speed 1; the poles tremble."""
     rng = np.random.default_rng([seed, 15])
-    bodies = [stage.wall(Diffuse(stage.backdrop(rng, 0.08, 0.45)), 2.4, 1.2, z=-0.5)]
+    bodies = [common.wall(Diffuse(common.backdrop(rng, 0.08, 0.45)), 2.4, 1.2, z=-0.5)]
     count = int(rng.integers(1, 3))
     for i in range(count):
         width = between(rng, 0.42, 0.5) if count == 1 else between(rng, 0.3, 0.36)
@@ -25,14 +25,14 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         x = middle - 0.5 * width * np.cos(yaw)
         tremble = Oscillation((0.02, 0.004, 0.0), speed * between(rng, 12, 18), any_angle(rng))
         pole: Motion = tremble @ Still(
-            (x, between(rng, -0.02, 0.02), 0.5 * width * np.sin(yaw) - 0.06), stage.upright(yaw)
+            (x, between(rng, -0.02, 0.02), 0.5 * width * np.sin(yaw) - 0.06), common.upright(yaw)
         )
         cloth = moved(sheet(width, height, 64, 32), pose_matrix(None, (width / 2, 0, 0)))
         flag = Flag(cloth.vertices, ripples(rng, width, speed), pole)
-        bodies.append(Body(f"flag {i}", cloth, Diffuse(Texture(stage.surface(rng, 0.1, 0.9))), flag))
+        bodies.append(Body(f"flag {i}", cloth, Diffuse(Texture(common.surface(rng, 0.1, 0.9))), flag))
         bodies.append(Body(f"pole {i}", cylinder(0.005, 0.8, 24), Conductor(roughness=0.3), pole))
-    view = stage.camera((between(rng, -0.08, 0.08), between(rng, -0.05, 0.12), 0.65), (0, 0, 0), 0.5)
-    return Scene("flag", seed, view, (stage.sun(rng, 0.5, 0.9),), tuple(bodies), speed)
+    view = common.camera((between(rng, -0.08, 0.08), between(rng, -0.05, 0.12), 0.65), (0, 0, 0), 0.5)
+    return Scene("flag", seed, view, (common.sun(rng, 0.5, 0.9),), tuple(bodies), speed)
 
 
 def ripples(rng: np.random.Generator, width: float, speed: float) -> tuple[Ripple, ...]:

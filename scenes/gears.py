@@ -8,8 +8,8 @@ from qsim.scene import Body, Conductor, Diffuse, Material, RoughPlastic, Scene, 
 from qsim.scene.props import gear
 from qsim.scene.rotation import exponential, pose_matrix
 from qsim.scene.shapes import cylinder, moved
-from scenes import stage
-from scenes.stage import between, sign
+from scenes import common
+from scenes.common import between, sign
 
 MODULE = 0.0042  # m of pitch radius per tooth
 
@@ -19,7 +19,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     rng = np.random.default_rng([seed, 3])
     drive = speed * between(rng, 900, 1500) * sign(rng)  # tooth-radians per second
     plate = textures.levels(textures.speckles(rng, 3000, 768, 0.012) + 0.5 * textures.noise(rng, (768, 768)), 0.1, 0.5)
-    bodies = [stage.wall(Diffuse(Texture(plate, (3.0, 1.5))), 1.4, 0.7, z=-0.03)]
+    bodies = [common.wall(Diffuse(Texture(plate, (3.0, 1.5))), 1.4, 0.7, z=-0.03)]
     for i, (teeth, x, y, phase) in enumerate(train(rng, int(rng.integers(6, 10)))):
         radius = MODULE * teeth * 1.08
         solid = gear(teeth, radius, 0.016, depth=0.20 * 12 / teeth, spokes=int(rng.integers(3, 7)) if teeth > 13 else 0)
@@ -29,8 +29,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         axle = moved(cylinder(0.12 * radius, 0.05, 24), pose_matrix(exponential((np.pi / 2, 0, 0)), (x, y, 0.0)))
         bodies.append(Body(f"axle {i}", axle, Conductor(roughness=0.25)))
     tilt = rng.uniform(-0.2, 0.2, 2)
-    view = stage.camera((tilt[0], tilt[1], 0.62), (0, 0, 0), 0.5)
-    return Scene("gears", seed, view, (stage.studio(rng), stage.lamp(rng, (0, 0, 0), 0.9, 1.5)), tuple(bodies), speed)
+    view = common.camera((tilt[0], tilt[1], 0.62), (0, 0, 0), 0.5)
+    return Scene("gears", seed, view, (common.studio(rng), common.lamp(rng, (0, 0, 0), 0.9, 1.5)), tuple(bodies), speed)
 
 
 def train(rng: np.random.Generator, count: int) -> list[tuple[int, float, float, float]]:
@@ -57,4 +57,4 @@ def finish(rng: np.random.Generator) -> Material:
         return Conductor(roughness=between(rng, 0.2, 0.4))
     if kind == 1:
         return Conductor(0.42, 2.35, between(rng, 0.25, 0.4))
-    return RoughPlastic(Texture(stage.surface(rng, 0.1, 0.8)), 0.25)
+    return RoughPlastic(Texture(common.surface(rng, 0.1, 0.8)), 0.25)

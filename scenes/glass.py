@@ -7,31 +7,31 @@ import numpy as np
 from qsim.scene import Body, Dielectric, Diffuse, Mesh, Scene, Spin, Translation
 from qsim.scene.rotation import vector
 from qsim.scene.shapes import ball, blob, box, cylinder, polyhedron, torus
-from scenes import stage
-from scenes.stage import any_angle, between, sign
+from scenes import common
+from scenes.common import any_angle, between, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     """Four to six of glass and two of paint, 4 to 10 cm, at 1.5 to 4 m/s and 1 to 5 turns a second at speed 1."""
     rng = np.random.default_rng([seed, 10])
-    bodies = [stage.wall(Diffuse(stage.backdrop(rng, 0.05, 0.85)), 1.6, 0.8, z=-0.25)]
+    bodies = [common.wall(Diffuse(common.backdrop(rng, 0.05, 0.85)), 1.6, 0.8, z=-0.25)]
     clear = int(rng.integers(4, 7))
     depths = rng.permutation(np.linspace(-0.1, 0.12, clear + 2))
     for i, z in enumerate(depths):
         velocity = speed * np.array([sign(rng) * rng.uniform(1.5, 4.0), rng.normal(0, 0.7), 0.0])
         middle = np.array([rng.uniform(-0.26, 0.26) * (0.35 if i < 3 else 1.0), rng.uniform(-0.09, 0.09), z])
-        flight = Translation(vector(velocity), vector(middle - velocity * stage.CLIP / 2))
-        turn = Spin(stage.direction(rng), speed * between(rng, 8, 30), any_angle(rng))
+        flight = Translation(vector(velocity), vector(middle - velocity * common.CLIP / 2))
+        turn = Spin(common.direction(rng), speed * between(rng, 8, 30), any_angle(rng))
         size = between(rng, 0.028, 0.05)
         if i < clear:
             roughness = 0.0 if rng.random() < 0.7 else between(rng, 0.05, 0.15)
             glass = Dielectric(between(rng, 1.33, 1.7), roughness)
             bodies.append(Body(f"glass {i}", shape(rng, size), glass, flight @ turn))
         else:
-            painted = stage.paint(rng, stage.surface(rng))
+            painted = common.paint(rng, common.surface(rng))
             bodies.append(Body(f"painted {i}", shape(rng, 0.7 * size), painted, flight @ turn))
-    view = stage.camera((between(rng, -0.12, 0.12), between(rng, -0.06, 0.12), 0.65), (0, 0, 0), 0.5)
-    return Scene("glass", seed, view, (stage.studio(rng, 0.8),), tuple(bodies), speed)
+    view = common.camera((between(rng, -0.12, 0.12), between(rng, -0.06, 0.12), 0.65), (0, 0, 0), 0.5)
+    return Scene("glass", seed, view, (common.studio(rng, 0.8),), tuple(bodies), speed)
 
 
 def shape(rng: np.random.Generator, size: float) -> Mesh:

@@ -8,8 +8,8 @@ from qsim.scene import Body, Conductor, Material, Mesh, RoughPlastic, Scene, Spi
 from qsim.scene.props import gear
 from qsim.scene.rotation import exponential, pose_matrix
 from qsim.scene.shapes import ball, blob, box, cylinder, moved, polyhedron, torus
-from scenes import stage
-from scenes.stage import any_angle, between, pick, sign
+from scenes import common
+from scenes.common import any_angle, between, pick, sign
 
 TABLE = -0.09  # m, height of its top
 
@@ -17,10 +17,10 @@ TABLE = -0.09  # m, height of its top
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     """Six to nine things of 6 to 10 cm slide at 1.5 to 4 m/s and turn 2 to 8 times a second at speed 1."""
     rng = np.random.default_rng([seed, 9])
-    top = RoughPlastic(stage.backdrop(rng, 0.05, 0.5), between(rng, 0.08, 0.2))
+    top = RoughPlastic(common.backdrop(rng, 0.05, 0.5), between(rng, 0.08, 0.2))
     bodies = [
-        stage.floor(top, 1.8, y=TABLE, z=-0.3),
-        stage.wall(RoughPlastic(stage.backdrop(rng, 0.1, 0.6), 0.3), 2.4, 1.2, z=-0.7),
+        common.floor(top, 1.8, y=TABLE, z=-0.3),
+        common.wall(RoughPlastic(common.backdrop(rng, 0.1, 0.6), 0.3), 2.4, 1.2, z=-0.7),
     ]
     count = int(rng.integers(6, 10))
     lanes = rng.permutation(np.linspace(-0.3, 0.2, count))
@@ -29,11 +29,11 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         velocity = speed * between(rng, 1.5, 4.0) * sign(rng)
         middle = between(rng, -0.22, 0.22) * (0.3 if i < 2 else 1.0)
         height = TABLE - float(solid.vertices[:, 1].min())
-        slide = Translation((velocity, 0.0, 0.0), (middle - velocity * stage.CLIP / 2, height, float(z)))
+        slide = Translation((velocity, 0.0, 0.0), (middle - velocity * common.CLIP / 2, height, float(z)))
         turn = Spin((0, 1, 0), speed * between(rng, 12, 50) * sign(rng), any_angle(rng))
         bodies.append(Body(f"thing {i}", solid, finish(rng), slide @ turn))
-    view = stage.camera((between(rng, -0.15, 0.15), between(rng, 0.14, 0.3), 0.65), (0, -0.03, -0.05), 0.5)
-    return Scene("glossy", seed, view, (stage.studio(rng),), tuple(bodies), speed)
+    view = common.camera((between(rng, -0.15, 0.15), between(rng, 0.14, 0.3), 0.65), (0, -0.03, -0.05), 0.5)
+    return Scene("glossy", seed, view, (common.studio(rng),), tuple(bodies), speed)
 
 
 def shape(rng: np.random.Generator, size: float) -> Mesh:
@@ -57,4 +57,4 @@ def finish(rng: np.random.Generator) -> Material:
     if rng.random() < 0.5:
         eta, k = pick(rng, ((0.96, 6.70), (3.12, 3.31), (0.42, 2.35), (1.04, 2.59)))
         return Conductor(eta, k, between(rng, 0.04, 0.2))
-    return RoughPlastic(Texture(stage.surface(rng, 0.03, 0.8)), between(rng, 0.04, 0.12))
+    return RoughPlastic(Texture(common.surface(rng, 0.03, 0.8)), between(rng, 0.04, 0.12))

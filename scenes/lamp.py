@@ -21,8 +21,8 @@ from qsim.scene import (
     Translation,
 )
 from qsim.scene.rotation import vector
-from scenes import stage, tumble
-from scenes.stage import any_angle, between, sign
+from scenes import common, tumble
+from scenes.common import any_angle, between, sign
 
 TABLE = -0.09  # m
 
@@ -31,8 +31,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     """Things on a table, half of them turning, and two that fly through at 2 to 4 m/s at speed 1."""
     rng = np.random.default_rng([seed, 12])
     bodies = [
-        stage.floor(Diffuse(stage.backdrop(rng, 0.1, 0.7)), 1.8, y=TABLE, z=-0.3),
-        stage.wall(Diffuse(stage.backdrop(rng, 0.1, 0.7)), 2.0, 1.0, z=-0.45),
+        common.floor(Diffuse(common.backdrop(rng, 0.1, 0.7)), 1.8, y=TABLE, z=-0.3),
+        common.wall(Diffuse(common.backdrop(rng, 0.1, 0.7)), 2.0, 1.0, z=-0.45),
     ]
     count = int(rng.integers(5, 8))
     xs = rng.permutation(np.linspace(-0.24, 0.24, count)) + rng.normal(0, 0.015, count)
@@ -44,10 +44,10 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     for i in range(2):
         velocity = speed * np.array([sign(rng) * rng.uniform(2.0, 4.0), rng.normal(0, 0.5), 0.0])
         middle = np.array([rng.uniform(-0.12, 0.12), rng.uniform(0.02, 0.09), rng.uniform(-0.1, 0.1)])
-        flight = Translation(vector(velocity), vector(middle - velocity * stage.CLIP / 2))
-        turn = Spin(stage.direction(rng), speed * between(rng, 15, 40), any_angle(rng))
+        flight = Translation(vector(velocity), vector(middle - velocity * common.CLIP / 2))
+        turn = Spin(common.direction(rng), speed * between(rng, 15, 40), any_angle(rng))
         bodies.append(Body(f"flyer {i}", tumble.shape(rng), finish(rng), flight @ turn))
-    view = stage.camera((between(rng, -0.15, 0.15), between(rng, 0.08, 0.2), 0.65), (0, -0.02, 0), 0.5)
+    view = common.camera((between(rng, -0.15, 0.15), between(rng, 0.08, 0.2), 0.65), (0, -0.02, 0), 0.5)
     lights = (Constant(between(rng, 0.001, 0.003)), swinging(rng, speed))
     return Scene("lamp", seed, view, lights, tuple(bodies), speed)
 
@@ -66,4 +66,4 @@ def finish(rng: np.random.Generator) -> Material:
     """Paint mostly, some metal."""
     if rng.random() < 0.2:
         return Conductor(roughness=between(rng, 0.2, 0.35))
-    return RoughPlastic(Texture(stage.surface(rng, 0.08, 0.85)), between(rng, 0.2, 0.4))
+    return RoughPlastic(Texture(common.surface(rng, 0.08, 0.85)), between(rng, 0.2, 0.4))

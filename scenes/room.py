@@ -7,8 +7,8 @@ import numpy as np
 from qsim.scene import Body, Constant, Diffuse, Motion, Scene, Shake, Spin, Texture, Translation, Wave
 from qsim.scene.rotation import exponential, pose_matrix, vector
 from qsim.scene.shapes import ball, box, cylinder, moved, sheet
-from scenes import stage
-from scenes.stage import any_angle, between, pick, sign
+from scenes import common
+from scenes.common import any_angle, between, pick, sign
 
 WIDTH, HEIGHT, DEPTH = 4.0, 2.6, 5.0  # m
 
@@ -19,15 +19,15 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     bodies = [*walls(rng), *furniture(rng)]
     origin = np.array([between(rng, -0.3, 0.3), between(rng, 1.2, 1.6), 2.2])
     target = np.array([between(rng, -0.4, 0.4), between(rng, 0.9, 1.2), -1.5])
-    view = stage.camera(origin, target, between(rng, 0.6, 0.8), (pan, shake, flight)[seed % 3](rng, speed))
-    lights = (Constant(between(rng, 0.3, 0.6)), stage.lamp(rng, (0, 1, -1), 3.0, 12.0))
+    view = common.camera(origin, target, between(rng, 0.6, 0.8), (pan, shake, flight)[seed % 3](rng, speed))
+    lights = (Constant(between(rng, 0.3, 0.6)), common.lamp(rng, (0, 1, -1), 3.0, 12.0))
     return Scene("room", seed, view, lights, tuple(bodies), speed)
 
 
 def pan(rng: np.random.Generator, speed: float) -> Motion:
     """A turn about an axis near the vertical, through the lens; it passes its middle at half of a clip."""
     rate = speed * between(rng, 4.0, 9.0) * sign(rng)
-    return Spin((float(rng.normal(0, 0.3)), 1.0, 0.0), rate, -rate * stage.CLIP / 2)
+    return Spin((float(rng.normal(0, 0.3)), 1.0, 0.0), rate, -rate * common.CLIP / 2)
 
 
 def shake(rng: np.random.Generator, speed: float) -> Motion:
@@ -41,7 +41,7 @@ def shake(rng: np.random.Generator, speed: float) -> Motion:
 def flight(rng: np.random.Generator, speed: float) -> Motion:
     """Forward and sideways, as a drone."""
     velocity = speed * np.array([between(rng, 8, 14) * sign(rng), between(rng, -1, 1), between(rng, 4, 12)])
-    return Translation(vector(velocity), vector(-velocity * stage.CLIP / 2))
+    return Translation(vector(velocity), vector(-velocity * common.CLIP / 2))
 
 
 def walls(rng: np.random.Generator) -> list[Body]:
@@ -54,7 +54,7 @@ def walls(rng: np.random.Generator) -> list[Body]:
         "right": (DEPTH, HEIGHT, exponential((0, -quarter, 0)), (WIDTH / 2, HEIGHT / 2, 0.0)),
     }
     return [
-        Body(name, moved(sheet(width, height), pose_matrix(turn, place)), Diffuse(stage.backdrop(rng, 0.1, 0.75)))
+        Body(name, moved(sheet(width, height), pose_matrix(turn, place)), Diffuse(common.backdrop(rng, 0.1, 0.75)))
         for name, (width, height, turn, place) in sides.items()
     ]
 
@@ -72,9 +72,9 @@ def furniture(rng: np.random.Generator) -> list[Body]:
         )[kind]
         place = (between(rng, -1.5, 1.5), -float(solid.vertices[:, 1].min()), between(rng, -2.2, 0.4))
         at = pose_matrix(exponential((0, any_angle(rng), 0)), place)
-        bodies.append(Body(f"piece {i}", moved(solid, at), stage.paint(rng, stage.surface(rng))))
+        bodies.append(Body(f"piece {i}", moved(solid, at), common.paint(rng, common.surface(rng))))
     for i, x in enumerate((-1.2, 0.0, 1.2)):
         frame = moved(box(0.7, 0.7, 0.03, 0.7), pose_matrix(None, (x, between(rng, 1.2, 1.6), -DEPTH / 2 + 0.03)))
-        picture = Texture(stage.textures.photograph(pick(rng, stage.PHOTOGRAPHS)))
+        picture = Texture(common.textures.photograph(pick(rng, common.PHOTOGRAPHS)))
         bodies.append(Body(f"picture {i}", frame, Diffuse(picture)))
     return bodies

@@ -8,8 +8,8 @@ from qsim.scene import Body, Diffuse, Mesh, Motion, Oscillation, Scene, Spin, St
 from qsim.scene.props import rotor
 from qsim.scene.rotation import pose_matrix, rotation_between, vector
 from qsim.scene.shapes import blob, box, merged, moved, polyhedron
-from scenes import stage
-from scenes.stage import any_angle, between, pick, sign
+from scenes import common
+from scenes.common import any_angle, between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
@@ -23,11 +23,11 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
             np.cos(sun.elevation) * np.cos(sun.azimuth),
         ]
     )
-    bodies = [stage.wall(Diffuse(stage.backdrop(rng, 0.1, 0.75)), 1.6, 0.8)]
+    bodies = [common.wall(Diffuse(common.backdrop(rng, 0.1, 0.75)), 1.6, 0.8)]
     for i in range(3):  # what stands on the wall, at rest
         place = pose_matrix(None, (between(rng, -0.28, 0.28), between(rng, -0.12, 0.12), 0.02))
         thing = moved(blob(rng, between(rng, 0.015, 0.03), 0.2), place)
-        bodies.append(Body(f"stone {i}", thing, stage.paint(rng, stage.surface(rng))))
+        bodies.append(Body(f"stone {i}", thing, common.paint(rng, common.surface(rng))))
     facing = Still.turned(rotation_between((0, 0, 1), towards))
     for i, aside in enumerate(rng.permutation([-0.16, 0.02, 0.2])[: int(rng.integers(2, 4))]):
         at = Translation((0, 0, 0), vector(np.array([aside, 0.0, 0.0]) + between(rng, 0.42, 0.55) * towards))
@@ -35,11 +35,11 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         bodies.append(Body(f"caster {i}", solid, Diffuse(0.3), at @ facing @ motion))
     velocity = speed * np.array([sign(rng) * rng.uniform(1.5, 3.5), rng.normal(0, 0.8), 0.0])
     middle = np.array([rng.uniform(-0.1, 0.1), rng.uniform(-0.06, 0.06), 0.08])
-    flight = Translation(vector(velocity), vector(middle - velocity * stage.CLIP / 2))
-    turn = Spin(stage.direction(rng), speed * between(rng, 15, 40), any_angle(rng))
+    flight = Translation(vector(velocity), vector(middle - velocity * common.CLIP / 2))
+    turn = Spin(common.direction(rng), speed * between(rng, 15, 40), any_angle(rng))
     flyer = polyhedron(rng, between(rng, 0.018, 0.03), 8, 0.04)
-    bodies.append(Body("flyer", flyer, stage.paint(rng, stage.surface(rng)), flight @ turn))
-    view = stage.camera((between(rng, -0.08, 0.08), between(rng, -0.08, 0.02), 0.65), (0, 0, 0), 0.5)
+    bodies.append(Body("flyer", flyer, common.paint(rng, common.surface(rng)), flight @ turn))
+    view = common.camera((between(rng, -0.08, 0.08), between(rng, -0.08, 0.02), 0.65), (0, 0, 0), 0.5)
     return Scene("shadow", seed, view, (sun,), tuple(bodies), speed)
 
 

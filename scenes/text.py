@@ -20,8 +20,8 @@ from qsim.scene import (
 from qsim.scene.props import letters
 from qsim.scene.rotation import pose_matrix, vector
 from qsim.scene.shapes import box, moved, sheet
-from scenes import stage
-from scenes.stage import any_angle, between, pick
+from scenes import common
+from scenes.common import any_angle, between, pick
 
 WORDS = (
     "QUANTA",
@@ -52,15 +52,15 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     print_ = textures.lines_of_text(random_lines(rng), 1024, 512, *((0.8, 0.04) if dark else (0.06, 0.8)))
     back = moved(box(width, height, 0.006, 0.1), pose_matrix(None, (0, 0, -0.004)))
     bodies = [
-        stage.wall(Diffuse(stage.backdrop(rng)), 1.4, 0.7, z=-0.15),
+        common.wall(Diffuse(common.backdrop(rng)), 1.4, 0.7, z=-0.15),
         Body("plate", back, RoughPlastic(0.4, 0.2), motion),
         Body("print", sheet(width, height), RoughPlastic(Texture(print_), 0.3), motion),
     ]
     word = letters(pick(rng, WORDS), 0.05, 0.012)
     word = moved(word, pose_matrix(np.eye(3) * min(1.0, 0.34 / float(np.ptp(word.vertices[:, 0]))), (0, 0.055, 0.006)))
     bodies.append(Body("letters", word, RoughPlastic(0.75 if dark else 0.05, 0.2), motion))
-    view = stage.camera((between(rng, -0.12, 0.12), between(rng, -0.06, 0.1), 0.6), (0, 0, 0), 0.45)
-    return Scene("text", seed, view, (stage.studio(rng), stage.lamp(rng, (0, 0, 0), 0.9, 1.5)), tuple(bodies), speed)
+    view = common.camera((between(rng, -0.12, 0.12), between(rng, -0.06, 0.1), 0.6), (0, 0, 0), 0.45)
+    return Scene("text", seed, view, (common.studio(rng), common.lamp(rng, (0, 0, 0), 0.9, 1.5)), tuple(bodies), speed)
 
 
 def carrier(rng: np.random.Generator, speed: float) -> Motion:
@@ -69,7 +69,7 @@ def carrier(rng: np.random.Generator, speed: float) -> Motion:
     if kind == 0:
         angle, rate = any_angle(rng), between(rng, 1.2, 2.5) * speed
         velocity = np.array([rate * np.cos(angle), 0.6 * rate * np.sin(angle), 0.3 * rng.normal() * speed])
-        return Translation(vector(velocity), vector(-velocity * stage.CLIP / 2))
+        return Translation(vector(velocity), vector(-velocity * common.CLIP / 2))
     if kind == 1:
         return Pendulum((0.0, 0.35, 0.0), (0, 0, 1), 0.25, speed * between(rng, 3, 5), any_angle(rng))
     amplitude = (between(rng, 0.02, 0.05), between(rng, 0.005, 0.02), 0.0)

@@ -8,8 +8,8 @@ from qsim.scene import Ballistic, Body, Diffuse, Mesh, Scene
 from qsim.scene.props import gear
 from qsim.scene.rotation import vector
 from qsim.scene.shapes import ball, blob, box, cylinder, polyhedron, torus
-from scenes import stage
-from scenes.stage import any_angle, between, pick
+from scenes import common
+from scenes.common import any_angle, between, pick
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
@@ -17,14 +17,14 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     rng = np.random.default_rng([seed, 2])
     count = int(rng.integers(6, 10))
     bodies = [
-        stage.floor(Diffuse(stage.backdrop(rng)), 2.4, y=-0.18, z=-0.2),
-        stage.wall(Diffuse(stage.backdrop(rng)), 2.4, 1.2, z=-0.6, y=0.35),
+        common.floor(Diffuse(common.backdrop(rng)), 2.4, y=-0.18, z=-0.2),
+        common.wall(Diffuse(common.backdrop(rng)), 2.4, 1.2, z=-0.6, y=0.35),
     ]
     for i, place in enumerate(spread(rng, count)):
         motion = thrown(rng, place, speed)
-        bodies.append(Body(f"toy {i}", shape(rng), stage.paint(rng, stage.surface(rng)), motion))
-    view = stage.camera((0.0, between(rng, 0.02, 0.14), 0.65), (0, 0, 0), 0.5)
-    return Scene("tumble", seed, view, (stage.sun(rng),), tuple(bodies), speed)
+        bodies.append(Body(f"toy {i}", shape(rng), common.paint(rng, common.surface(rng)), motion))
+    view = common.camera((0.0, between(rng, 0.02, 0.14), 0.65), (0, 0, 0), 0.5)
+    return Scene("tumble", seed, view, (common.sun(rng),), tuple(bodies), speed)
 
 
 def spread(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -62,9 +62,9 @@ def thrown(rng: np.random.Generator, place: np.ndarray, speed: float) -> Ballist
     """A throw that passes `place` in the middle of a clip, at 1 to 4 m/s, 3 to 8 turns per second at speed 1."""
     velocity = rng.standard_normal(3) * (1.8, 1.4, 0.3) * speed
     return Ballistic(
-        vector(place - velocity * stage.CLIP / 2),
+        vector(place - velocity * common.CLIP / 2),
         vector(velocity),
-        axis=stage.direction(rng),
+        axis=common.direction(rng),
         rate=speed * between(rng, 20, 50),
         phase=any_angle(rng),
     )

@@ -8,14 +8,14 @@ from qsim.scene import Body, Conductor, Diffuse, Material, Mesh, Motion, Oscilla
 from qsim.scene.props import spring
 from qsim.scene.rotation import exponential, pose_matrix, vector
 from qsim.scene.shapes import merged, moved, torus, wire
-from scenes import stage
-from scenes.stage import any_angle, between, pick, sign
+from scenes import common
+from scenes.common import any_angle, between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     """A wheel in the middle, globes and springs beside it, spinning 3 to 8 times a second at speed 1."""
     rng = np.random.default_rng([seed, 6])
-    bodies = [stage.wall(Diffuse(stage.backdrop(rng, 0.15, 0.7)), 1.5, 0.75, z=-0.2)]
+    bodies = [common.wall(Diffuse(common.backdrop(rng, 0.15, 0.7)), 1.5, 0.75, z=-0.2)]
     places = [(0.0, 0.0), (-0.21, 0.03), (0.21, -0.02), (-0.33, -0.06), (0.33, 0.06)]
     for i, (x, y) in enumerate(places):
         place = Still(
@@ -29,8 +29,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         if kind == "spring":
             motion = Oscillation((0.0, 0.03, 0.0), speed * between(rng, 10, 20), any_angle(rng)) @ motion
         bodies.append(Body(f"{kind} {i}", MAKERS[kind](rng, size), metal(rng), motion))
-    view = stage.camera((between(rng, -0.1, 0.1), between(rng, -0.05, 0.1), 0.65), (0, 0, 0), 0.45)
-    return Scene("wires", seed, view, (stage.studio(rng), stage.lamp(rng, (0, 0, 0), 0.9, 1.8)), tuple(bodies), speed)
+    view = common.camera((between(rng, -0.1, 0.1), between(rng, -0.05, 0.1), 0.65), (0, 0, 0), 0.45)
+    return Scene("wires", seed, view, (common.studio(rng), common.lamp(rng, (0, 0, 0), 0.9, 1.8)), tuple(bodies), speed)
 
 
 def wheel(rng: np.random.Generator, radius: float) -> Mesh:

@@ -17,7 +17,7 @@ from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
 from qsim.scene import AreaLamp, Body, Constant, EnvironmentImage, PointLight, Scene, SunSky, Translation
 from qsim.scene.shapes import sheet
-from scenes.stage import FRAME_RATE, HEIGHT, WIDTH
+from scenes.common import FRAME_RATE, HEIGHT, WIDTH
 
 SEEDS = (0, 1, 2)
 EVERY_SEED = [

@@ -16,8 +16,8 @@ import numpy as np
 from qsim.scene import Body, Diffuse, EnvironmentImage, Light, Material, Mesh, RoughPlastic, Scene, Texture
 from qsim.scene.shapes import MESH_SUFFIXES, mesh_file
 from qsim.scene.textures import PICTURE_SUFFIXES
-from scenes import stage, tumble
-from scenes.stage import any_angle, between, pick
+from scenes import common, tumble
+from scenes.common import any_angle, between, pick
 
 ENVIRONMENT_SUFFIXES = frozenset({".hdr", ".exr"})
 
@@ -30,13 +30,13 @@ def scene(seed: int = 0, *, speed: float = 1.0, folder: str | Path) -> Scene:
     meshes, pictures, environments = assets(folder)
     rng = np.random.default_rng([seed, 17])
     bodies = [
-        stage.floor(_material(rng, pictures), 2.4, y=-0.18, z=-0.2),
-        stage.wall(_material(rng, pictures), 2.4, 1.2, z=-0.6, y=0.35),
+        common.floor(_material(rng, pictures), 2.4, y=-0.18, z=-0.2),
+        common.wall(_material(rng, pictures), 2.4, 1.2, z=-0.6, y=0.35),
     ]
     for i, place in enumerate(tumble.spread(rng, int(rng.integers(4, 8)))):
         motion = tumble.thrown(rng, place, speed)
         bodies.append(Body(f"body {i}", _mesh(rng, meshes), _material(rng, pictures), motion))
-    view = stage.camera((0.0, between(rng, 0.02, 0.14), 0.65), (0, 0, 0), 0.5)
+    view = common.camera((0.0, between(rng, 0.02, 0.14), 0.65), (0, 0, 0), 0.5)
     return Scene(Path(folder).resolve().name, seed, view, (_light(rng, environments),), tuple(bodies), speed)
 
 
@@ -58,12 +58,12 @@ def _mesh(rng: np.random.Generator, meshes: list[Path]) -> Mesh:
 def _material(rng: np.random.Generator, pictures: list[Path]) -> Material:
     """Matt or slightly glossy; a picture is taken as it is, white at 0.9 of the light at most."""
     if not pictures:
-        return stage.paint(rng, stage.surface(rng))
+        return common.paint(rng, common.surface(rng))
     texture = Texture(0.9 * Texture(str(pick(rng, pictures))).pixels())
     return Diffuse(texture) if rng.random() < 0.5 else RoughPlastic(texture, roughness=between(rng, 0.15, 0.4))
 
 
 def _light(rng: np.random.Generator, environments: list[Path]) -> Light:
     if not environments:
-        return stage.sun(rng)
+        return common.sun(rng)
     return EnvironmentImage(str(pick(rng, environments)), rotation=any_angle(rng))
