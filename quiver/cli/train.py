@@ -71,7 +71,8 @@ def _run_train(args: argparse.Namespace) -> int:
     from quiver.model.presets import build
     from quiver.restoration.networks import pick_device
     from quiver.training.loop import Diverged, train
-    from quiver.training.run_folder import PROTOCOLS, draw_curve
+    from quiver.training.run_folder import draw_curve
+    from quiver.training.settings import PROTOCOLS
 
     if args.validate_every is not None and args.steps is None and "steps" not in PROTOCOLS[args.protocol]:
         raise ValueError("--validate-every: counts steps of a run with --steps; one that --minutes ends is validated "
@@ -111,7 +112,7 @@ def _run_train(args: argparse.Namespace) -> int:
 
 def _settings(args: argparse.Namespace) -> Any:
     """The protocol's settings, overridden by the options that were given."""
-    from quiver.training.run_folder import PROTOCOLS, Settings
+    from quiver.training.settings import PROTOCOLS, Settings
 
     given = {field.name: getattr(args, field.name, None) for field in fields(Settings)}
     given |= {"data": args.data, "out": args.output, "network": args.preset}

@@ -22,7 +22,8 @@ from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import pick_device
 from quiver.restoration.restorers import restorer
 from quiver.training.loop import train
-from quiver.training.run_folder import Settings, alone_in, settled
+from quiver.training.run_folder import alone_in
+from quiver.training.settings import Settings, settled
 
 
 def networks(preset: str) -> dict[str, Config]:

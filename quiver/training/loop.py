@@ -32,12 +32,12 @@ from quiver.model.blocks import RADIUS, WINDOW
 from quiver.training.loss import PRESETS as LOSSES
 from quiver.training.loss import training_loss
 from quiver.training.optimiser import Optimiser
-from quiver.training.run_folder import Run, Settings, State, settled
+from quiver.training.run_folder import Run
+from quiver.training.schedule import State, learning_rate, note_plateau, share_used, time_is_up, validation_due
+from quiver.training.settings import Settings, settled
 
 CHECKPOINT_SECONDS = 120.0
 FOREVER = 10**9  # steps of a run that is limited by time
-WARMUP_SHARE = 0.05  # of a run; no warm-up is longer
-PLATEAU_GAIN = 1e-4  # relative gain of PSNR that counts
 VALIDATION_SIDE = 128  # px, at most
 
 
@@ -90,49 +90,6 @@ def joined(device: str) -> Iterator[Process]:
     finally:
         if world > 1:
             torch.distributed.destroy_process_group()
-
-
-def share_used(settings: Settings, state: State) -> float:
-    """How much of the run is over, 0 to 1, by steps or by time, whichever is further."""
-    steps = state.step / settings.steps if settings.steps else 0.0
-    minutes = state.elapsed / (60 * settings.minutes) if settings.minutes else 0.0
-    return min(1.0, max(steps, minutes))
-
-
-def learning_rate(settings: Settings, state: State) -> float:
-    """The rate of the next step: linear rise, then a cosine over the share of steps or time used up, or halvings.
-
-    The rise ends after `warmup` steps, or after a twentieth of a run so short that this comes first.
-    """
-    share = share_used(settings, state)
-    rise = max((state.step + 1) / max(1, settings.warmup), share / WARMUP_SHARE)
-    rate = settings.learning_rate * min(1.0, rise)
-    if settings.schedule == "plateau":
-        return rate * 0.5**state.halvings
-    return rate * max(0.01, 0.5 * (1 + math.cos(math.pi * share)))
-
-
-def validation_due(settings: Settings, state: State) -> bool:
-    """Every `validate_every` steps; in a run that only time limits, after every tenth of it."""
-    if settings.steps is not None:
-        return state.step % settings.validate_every == 0
-    before, state.tenths = state.tenths, int(10 * share_used(settings, state))
-    return state.tenths > before
-
-
-def time_is_up(settings: Settings, state: State, validation: float) -> bool:
-    """Whether the last validation, as long as the one before, would no longer fit into the time limit."""
-    return settings.minutes is not None and state.elapsed + validation >= 60 * settings.minutes
-
-
-def note_plateau(patience: int, state: State, psnr: float) -> None:
-    """After more than `patience` validations in a row without a relative gain of 1e-4 the rate is halved."""
-    if state.plateau_best == -math.inf or psnr > state.plateau_best * (1 + PLATEAU_GAIN):
-        state.plateau_best, state.plateau_bad = psnr, 0
-        return
-    state.plateau_bad += 1
-    if state.plateau_bad > patience:
-        state.halvings, state.plateau_bad = state.halvings + 1, 0
 
 
 def make_windows(settings: Settings, multiple: int) -> tuple[Windows, Subset[dict[str, Any]]]:

@@ -20,7 +20,7 @@ from quiver import threads
 from quiver.cli import program
 from quiver.model.unet import UNet, UNetConfig
 from quiver.training.loop import train
-from quiver.training.run_folder import Settings
+from quiver.training.settings import Settings
 
 ROOT = Path(__file__).parents[2]
 two_cores = pytest.mark.skipif(threads.cores() < 2, reason="needs two cores")

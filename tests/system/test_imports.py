@@ -62,7 +62,6 @@ STILL_FORBIDDEN: set[tuple[str, str]] = set()
 STILL_IN_CIRCLES: set[str] = set()
 STILL_LONG: set[str] = {
     "qsim.sensor.defects.fixed_pattern",
-    "quiver.training.run_folder",
 }
 
 

@@ -33,7 +33,7 @@ from quiver.data.windows import TRAINING, Windows, WindowSettings, turned
 from quiver.model.unet import UNet, UNetConfig
 from quiver.restoration.restorers import restorer
 from quiver.training.loop import train
-from quiver.training.run_folder import Settings, settled
+from quiver.training.settings import Settings, settled
 
 FILES = {  # model -> [sensor] of a file
     "SPAD": 'model = "BinarySPAD"\npde = 0.4\ndark_count_rate = 200.0\n',

@@ -19,7 +19,9 @@ from quiver.model.folded import FoldedConfig, FoldedQUIVER
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import RENAMED, load, save
 from quiver.training.optimiser import Optimiser
-from quiver.training.run_folder import Run, Settings, State
+from quiver.training.run_folder import Run
+from quiver.training.schedule import State
+from quiver.training.settings import Settings
 
 TINY = FoldedConfig(
     channels=2,

@@ -26,9 +26,11 @@ from quiver.model.presets import PRESETS, assemble
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import load
 from quiver.training import loop as training
-from quiver.training.loop import Diverged, learning_rate, make_windows, note_plateau, time_is_up, train
+from quiver.training.loop import Diverged, make_windows, train
 from quiver.training.optimiser import Optimiser
-from quiver.training.run_folder import PROTOCOLS, Run, Settings, State, settled
+from quiver.training.run_folder import Run
+from quiver.training.schedule import State, learning_rate, note_plateau, time_is_up
+from quiver.training.settings import PROTOCOLS, Settings, settled
 
 ROOT = Path(__file__).parents[3]
 
@@ -235,7 +237,9 @@ FILLED = """
 import resource, signal, sys
 from pathlib import Path
 from quiver.training.optimiser import Optimiser
-from quiver.training.run_folder import Run, Settings, State
+from quiver.training.run_folder import Run
+from quiver.training.schedule import State
+from quiver.training.settings import Settings
 from quiver.model.unet import UNet, UNetConfig
 
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -366,7 +370,7 @@ def test_two_processes_train_as_one_with_twice_the_batch(tiny_dataset, tmp_path)
     program = tmp_path / "run.py"
     program.write_text(
         "import torch\n"
-        "from quiver.training.run_folder import Settings\nfrom quiver.training.loop import train\n"
+        "from quiver.training.settings import Settings\nfrom quiver.training.loop import train\n"
         "from quiver.model.unet import UNet, UNetConfig\n"
         "torch.set_num_threads(1)\ntorch.manual_seed(0)\n"
         f"train(UNet(UNetConfig(4)), Settings({str(tiny_dataset)!r}, {str(tmp_path / 'b')!r}, steps=3, crop=16,"

@@ -1,0 +1,99 @@
+"""What changes during a run, and what follows from it: learning rate, validations, the end."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from quiver.training.settings import Settings
+
+WARMUP_SHARE = 0.05  # of a run; no warm-up is longer
+PLATEAU_GAIN = 1e-4  # relative gain of PSNR that counts
+
+
+@dataclass
+class State:
+    """What changes during a run, apart from weights and optimiser."""
+
+    step: int = 0
+    elapsed: float = 0.0  # s
+    best: float = -math.inf  # validation PSNR, dB
+    plateau_best: float = -math.inf
+    plateau_bad: int = 0
+    halvings: int = 0
+    tenths: int = 0  # of a timed run, validated so far
+    finished: bool = False
+    history: list[dict[str, float]] = field(default_factory=list)  # one entry per validation
+
+    @classmethod
+    def from_dict(cls, values: Any) -> State:
+        """What `asdict` gave; strict, ValueError."""
+        kinds = {field.name: field.type for field in fields(cls)}
+        if not isinstance(values, dict) or set(values) != set(kinds):
+            raise ValueError(f"a state has {', '.join(kinds)}")
+        for name, value in values.items():
+            kind = type(value).__name__
+            if name == "history":
+                good = isinstance(value, list) and all(_is_entry(entry) for entry in value)
+            elif kinds[name] == "int":
+                good = kind == "int" and 0 <= value < 2**53
+            else:
+                good = kind == kinds[name] and value == value  # nothing is NaN
+            if not good:
+                raise ValueError(f"{name} is {repr(value)[:60]}")
+        if values["elapsed"] < 0 or math.isinf(values["elapsed"]):
+            raise ValueError(f"elapsed is {values['elapsed']}")
+        return cls(**values)
+
+
+def _is_entry(entry: Any) -> bool:
+    """Whether this is one validation's numbers, as `train` writes them."""
+    return (
+        isinstance(entry, dict)
+        and {"step", "elapsed", "loss", "psnr", "psnr_matched"} <= entry.keys()
+        and all(isinstance(v, int | float) and not isinstance(v, bool) for v in entry.values())
+    )
+
+
+def share_used(settings: Settings, state: State) -> float:
+    """How much of the run is over, 0 to 1, by steps or by time, whichever is further."""
+    steps = state.step / settings.steps if settings.steps else 0.0
+    minutes = state.elapsed / (60 * settings.minutes) if settings.minutes else 0.0
+    return min(1.0, max(steps, minutes))
+
+
+def learning_rate(settings: Settings, state: State) -> float:
+    """The rate of the next step: linear rise, then a cosine over the share of steps or time used up, or halvings.
+
+    The rise ends after `warmup` steps, or after a twentieth of a run so short that this comes first.
+    """
+    share = share_used(settings, state)
+    rise = max((state.step + 1) / max(1, settings.warmup), share / WARMUP_SHARE)
+    rate = settings.learning_rate * min(1.0, rise)
+    if settings.schedule == "plateau":
+        return rate * 0.5**state.halvings
+    return rate * max(0.01, 0.5 * (1 + math.cos(math.pi * share)))
+
+
+def validation_due(settings: Settings, state: State) -> bool:
+    """Every `validate_every` steps; in a run that only time limits, after every tenth of it."""
+    if settings.steps is not None:
+        return state.step % settings.validate_every == 0
+    before, state.tenths = state.tenths, int(10 * share_used(settings, state))
+    return state.tenths > before
+
+
+def time_is_up(settings: Settings, state: State, validation: float) -> bool:
+    """Whether the last validation, as long as the one before, would no longer fit into the time limit."""
+    return settings.minutes is not None and state.elapsed + validation >= 60 * settings.minutes
+
+
+def note_plateau(patience: int, state: State, psnr: float) -> None:
+    """After more than `patience` validations in a row without a relative gain of 1e-4 the rate is halved."""
+    if state.plateau_best == -math.inf or psnr > state.plateau_best * (1 + PLATEAU_GAIN):
+        state.plateau_best, state.plateau_bad = psnr, 0
+        return
+    state.plateau_bad += 1
+    if state.plateau_bad > patience:
+        state.halvings, state.plateau_bad = state.halvings + 1, 0
