@@ -16,7 +16,7 @@ from functools import partial
 
 from numpy import ndarray as Array
 
-from quiver.baselines import likelihood, moment, naive_mean, qbp, qbp_bm3d, transform_denoise
+from quiver.baselines import likelihood, moment, naive_mean, qbp, transform_denoise
 from quiver.baselines.sliding_window import look_ahead
 
 
@@ -46,7 +46,13 @@ METHODS: dict[str, Method] = {
             "transform-denoise", transform_denoise.restore, 3, "variance stabilised, BM3D, exact unbiased inverse", 1800
         ),
         Method("qbp", qbp.restore, 11, "align, Wiener merge, exact inverse response", 600),
-        Method("qbp-bm3d", qbp_bm3d.restore, 11, "align, Wiener merge, stabilise, BM3D, exact unbiased inverse", 1800),
+        Method(
+            "qbp-bm3d",
+            partial(qbp.restore, excess=qbp.EXCESS),
+            11,
+            "align, Wiener merge, stabilise, BM3D, exact unbiased inverse",
+            1800,
+        ),
         Method(
             "transform-denoise-published",
             partial(transform_denoise.restore, kind="binomial"),

@@ -58,22 +58,22 @@ def denoise(image: Array, sigma: float, *, peak: float = 1.0, profile: Profile =
         return image.astype(np.float32)
     grey = 255.0 / peak
     level = float(image.mean(dtype=np.float64))  # taken off for the sake of float32
-    noisy = torch.from_numpy(_pad((image - level) * grey).astype(np.float32))
+    noisy = torch.from_numpy(pad((image - level) * grey).astype(np.float32))
     with torch.no_grad():
-        coefficients = _transform(noisy)
-        basic = _aggregate(*_first(coefficients, noisy.shape, sigma * grey, profile), noisy.shape)
-        final = _aggregate(*_second(coefficients, basic, sigma * grey, profile), noisy.shape)
+        coefficients = block_table(noisy)
+        basic = aggregate(*threshold_step(coefficients, noisy.shape, sigma * grey, profile), noisy.shape)
+        final = aggregate(*wiener_step(coefficients, basic, sigma * grey, profile), noisy.shape)
     height, width = image.shape
     return (final[:height, :width] / grey + level).numpy()
 
 
-def _pad(image: Array) -> Array:
+def pad(image: Array) -> Array:
     """Reflect bottom and right until reference blocks, STEP apart, end exactly at the border."""
     extra = [max(BLOCK - side, 0) or -(side - BLOCK) % STEP for side in image.shape]
     return np.pad(image, [(0, extra[0]), (0, extra[1])], mode="symmetric")
 
 
-def _dct() -> Tensor:
+def dct_matrix() -> Tensor:
     """The orthonormal 2-D DCT-II of a block as a matrix [64 coefficients, 64 pixels]."""
     n = np.arange(BLOCK)
     one = np.cos(np.pi * (2 * n[None, :] + 1) * n[:, None] / (2 * BLOCK)) * np.sqrt(2 / BLOCK)
@@ -81,7 +81,7 @@ def _dct() -> Tensor:
     return torch.from_numpy(np.kron(one, one).astype(np.float32))
 
 
-def _wavelet() -> Tensor:
+def wavelet_matrix() -> Tensor:
     """The periodic biorthogonal 1.5 wavelet transform of a block, rows of unit length: [64 coefficients, 64 pixels]."""
     low = np.array([3, -3, -22, 22, 128, 128, 22, -22, -3, 3]) / (128 * np.sqrt(2))
     one, size = np.eye(BLOCK), BLOCK
@@ -96,7 +96,7 @@ def _wavelet() -> Tensor:
     return torch.from_numpy(np.kron(one, one).astype(np.float32))
 
 
-def _haar(size: int) -> Tensor:
+def haar_matrix(size: int) -> Tensor:
     """The orthonormal Haar transform over `size` (a power of two) blocks, [size, size]."""
     matrix = np.ones((1, 1))
     while len(matrix) < size:
@@ -105,42 +105,42 @@ def _haar(size: int) -> Tensor:
     return torch.from_numpy(matrix.astype(np.float32))
 
 
-def _grid(shape: torch.Size) -> tuple[int, int, int, int]:
+def table_size(shape: torch.Size) -> tuple[int, int, int, int]:
     """Tiles down and across, and height and width of the table of positions: the image's, bordered for the search."""
     down, across = (-(-((side - BLOCK) // STEP + 1) // TILE) for side in shape)
     return down, across, STEP * TILE * (down - 1) + REACH, STEP * TILE * (across - 1) + REACH
 
 
-def _transform(image: Tensor) -> Tensor:
+def block_table(image: Tensor) -> Tensor:
     """DCT of the block at every position: rows [table height * table width, 64]; zeros outside the image."""
-    _, _, height, width = _grid(image.shape)
+    _, _, height, width = table_size(image.shape)
     table = torch.zeros(height, width, AREA)
     blocks = image.unfold(0, BLOCK, 1).unfold(1, BLOCK, 1)  # [positions down, across, 8, 8], a view
-    basis = _dct().T
+    basis = dct_matrix().T
     for y, row in enumerate(blocks):
         table[y + RADIUS, RADIUS : RADIUS + len(row)] = row.reshape(-1, AREA) @ basis
     return table.view(-1, AREA)
 
 
-def _inside(shape: torch.Size) -> Tensor:
+def inside_image(shape: torch.Size) -> Tensor:
     """Which positions of the table [height, width] hold a block of the image."""
-    _, _, height, width = _grid(shape)
+    _, _, height, width = table_size(shape)
     inside = torch.zeros(height, width, dtype=torch.bool)
     inside[RADIUS : RADIUS + shape[0] - BLOCK + 1, RADIUS : RADIUS + shape[1] - BLOCK + 1] = True
     return inside
 
 
 @dataclass(frozen=True)
-class _Matches:
+class Matches:
     """The stacks of one row of tiles."""
 
     position: Tensor  # [references, stack], rows of the table, nearest first: the reference itself leads
     size: Tensor  # [references], blocks of the stack that count: a power of two
 
 
-def _match(table: Tensor, norm: Tensor, tile_row: int, shape: torch.Size, stack: int, limit: float) -> _Matches:
+def match_blocks(table: Tensor, norm: Tensor, tile_row: int, shape: torch.Size, stack: int, limit: float) -> Matches:
     """The most similar blocks within the search window of every reference block in one row of tiles."""
-    _, across, _, width = _grid(shape)
+    _, across, _, width = table_size(shape)
     top, jump = tile_row * TILE * STEP, TILE * STEP
     view = table.as_strided((across, REACH, REACH, AREA), (jump * AREA, width * AREA, AREA, 1), top * width * AREA)
     candidates = view.reshape(across, REACH * REACH, AREA)
@@ -165,68 +165,68 @@ def _match(table: Tensor, norm: Tensor, tile_row: int, shape: torch.Size, stack:
     similar = (best + own[..., None] <= limit * AREA).sum(-1)
     exists = own < FAR
     size = 2 ** torch.log2(similar.clamp(min=1).float()).floor().long()
-    return _Matches(position[exists], size[exists])
+    return Matches(position[exists], size[exists])
 
 
-def _norms(table: Tensor, shape: torch.Size) -> Tensor:
+def norms(table: Tensor, shape: torch.Size) -> Tensor:
     """Squared length of every row [table height, width]; FAR outside the image."""
-    inside = _inside(shape)
+    inside = inside_image(shape)
     return table.square().sum(1).view(inside.shape).masked_fill_(~inside, FAR)
 
 
-def _stacks(table: Tensor, shape: torch.Size, stack: int, limit: float) -> list[Tensor]:
+def similar_blocks(table: Tensor, shape: torch.Size, stack: int, limit: float) -> list[Tensor]:
     """All stacks as positions [n, size], sorted into one tensor per size and row of tiles."""
-    norm, found = _norms(table, shape), []
-    for tile_row in range(_grid(shape)[0]):
-        matches = _match(table, norm, tile_row, shape, stack, limit)
+    norm, found = norms(table, shape), []
+    for tile_row in range(table_size(shape)[0]):
+        matches = match_blocks(table, norm, tile_row, shape, stack, limit)
         for size in matches.size.unique().tolist():
             found.append(matches.position[matches.size == size][:, :size])
     return found
 
 
-def _first(table: Tensor, shape: torch.Size, sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
+def threshold_step(table: Tensor, shape: torch.Size, sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
     """Hard thresholding: sums of weighted filtered rows [positions, 64] and of their weights [positions]."""
     total, weights = torch.zeros_like(table), torch.zeros(len(table))
-    to_wavelet = _wavelet() @ _dct().T
+    to_wavelet = wavelet_matrix() @ dct_matrix().T
     wavelets = table @ to_wavelet.T
-    for position in _stacks(table, shape, profile.stack, profile.limit + 2 * sigma**2):
-        haar = _haar(position.shape[1])
+    for position in similar_blocks(table, shape, profile.stack, profile.limit + 2 * sigma**2):
+        haar = haar_matrix(position.shape[1])
         stack = torch.einsum("ab,nbk->nak", haar, wavelets[position])
         mean = stack[:, 0, 0].clone()
         stack.masked_fill_(stack.abs() < profile.threshold * sigma, 0)
         stack[:, 0, 0] = mean
         weight = 1 / (sigma**2 * torch.count_nonzero(stack, (1, 2)).clamp(min=1))
-        _add(total, weights, position, torch.einsum("ab,nak->nbk", haar, stack), weight)
+        add_blocks(total, weights, position, torch.einsum("ab,nak->nbk", haar, stack), weight)
     return total @ torch.linalg.inv(to_wavelet).T, weights
 
 
-def _second(table: Tensor, basic: Tensor, sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
-    """Empirical Wiener filter, the spectrum taken from the basic estimate; returns what `_first` returns."""
+def wiener_step(table: Tensor, basic: Tensor, sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
+    """Empirical Wiener filter, the spectrum taken from the basic estimate; returns what `threshold_step` returns."""
     total, weights = torch.zeros_like(table), torch.zeros(len(table))
-    pilot_table = _transform(basic)
-    for position in _stacks(pilot_table, basic.shape, profile.second_stack, profile.second_limit):
-        haar = _haar(position.shape[1])
+    pilot_table = block_table(basic)
+    for position in similar_blocks(pilot_table, basic.shape, profile.second_stack, profile.second_limit):
+        haar = haar_matrix(position.shape[1])
         power = torch.einsum("ab,nbk->nak", haar, pilot_table[position]).square_()
         gain = power / (power + sigma**2)
         gain[:, 0, 0] = 1
         weight = 1 / (sigma**2 * gain.square().sum((1, 2)))
         stack = gain.mul_(torch.einsum("ab,nbk->nak", haar, table[position]))
-        _add(total, weights, position, torch.einsum("ab,nak->nbk", haar, stack), weight)
+        add_blocks(total, weights, position, torch.einsum("ab,nak->nbk", haar, stack), weight)
     return total, weights
 
 
-def _add(total: Tensor, weights: Tensor, position: Tensor, stack: Tensor, weight: Tensor) -> None:
+def add_blocks(total: Tensor, weights: Tensor, position: Tensor, stack: Tensor, weight: Tensor) -> None:
     """Add weighted stacks [n, size, 64] to the running sums, at their positions."""
     total.index_add_(0, position.flatten(), (stack * weight[:, None, None]).flatten(0, 1))
     weights.index_add_(0, position.flatten(), weight[:, None].expand_as(position).flatten())
 
 
-def _aggregate(total: Tensor, weights: Tensor, shape: torch.Size) -> Tensor:
+def aggregate(total: Tensor, weights: Tensor, shape: torch.Size) -> Tensor:
     """Weighted mean of all overlapping filtered blocks: an image of this shape."""
-    height, width = _grid(shape)[2:]
+    height, width = table_size(shape)[2:]
     kaiser = torch.from_numpy(np.kaiser(BLOCK, KAISER).astype(np.float32))
     kaiser = torch.outer(kaiser, kaiser).flatten()
-    pixels = (_dct().T @ total.T).mul_(kaiser[:, None]).view(AREA, height, width)
+    pixels = (dct_matrix().T @ total.T).mul_(kaiser[:, None]).view(AREA, height, width)
     weight = weights.view(height, width)
     above, below = torch.zeros(2, height + BLOCK - 1, width + BLOCK - 1).unbind()
     for k in range(AREA):

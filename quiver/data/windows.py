@@ -134,7 +134,7 @@ class Windows(Dataset[dict[str, Any]]):
     def __getitem__(self, n: int) -> dict[str, Any]:
         place = self.place(n)
         clip, noise, draw = self.clips[place.clip], self.noise.noises[place.light], self._draw(place)
-        photons, sharp = self._photons(place)
+        photons, sharp = self.photons_of(place)
         scale = 1.0
         if self.settings.force_exposure and noise.ppp is not None:
             scale = noise.ppp / max(float(photons.mean()), 1e-9)
@@ -158,7 +158,7 @@ class Windows(Dataset[dict[str, Any]]):
             f"{'backwards, ' if place.backwards else ''}{noise.label}, {place.key}",
         }
 
-    def _photons(self, place: WindowPlace) -> tuple[Array, Array]:
+    def photons_of(self, place: WindowPlace) -> tuple[Array, Array]:
         """Expected photons of the exposed and of the sharp window, [T, h, w], turned."""
         clip, side = self.clips[place.clip], self.settings.crop
         (dy, dx), draw = place.drift, self._draw(place)

@@ -22,9 +22,9 @@ def photograph(name):
 
 def test_transforms_are_what_they_are_called():
     """The DCT and Haar matrices are orthonormal; the wavelet has rows of unit length and one constant row."""
-    for matrix in (bm3d._dct(), *(bm3d._haar(2**k) for k in range(6))):
+    for matrix in (bm3d.dct_matrix(), *(bm3d.haar_matrix(2**k) for k in range(6))):
         np.testing.assert_allclose(matrix @ matrix.T, np.eye(len(matrix)), atol=1e-6)
-    wavelet = bm3d._wavelet().numpy()
+    wavelet = bm3d.wavelet_matrix().numpy()
     np.testing.assert_allclose(np.linalg.norm(wavelet, axis=1), 1, atol=1e-6)
     flat = wavelet @ np.ones(64)
     assert abs(flat[0]) > 1
@@ -36,11 +36,11 @@ def test_transforms_are_what_they_are_called():
 def test_matching_is_an_exhaustive_search():
     """Every reference block of a small image: its stack is the nearest blocks of its search window, nearest first."""
     image = torch.from_numpy(np.random.default_rng(3).normal(0, 30, (26, 41)).astype(np.float32))
-    table = bm3d._transform(image)
-    _, _, _, width = bm3d._grid(image.shape)
+    table = bm3d.block_table(image)
+    _, _, _, width = bm3d.table_size(image.shape)
     blocks = image.unfold(0, 8, 1).unfold(1, 8, 1)
     seen = set()
-    for position in bm3d._stacks(table, image.shape, 16, 4000.0):
+    for position in bm3d.similar_blocks(table, image.shape, 16, 4000.0):
         for stack in position:
             at = [(int(p) // width - bm3d.RADIUS, int(p) % width - bm3d.RADIUS) for p in stack]
             seen.add(at[0])

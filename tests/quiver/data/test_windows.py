@@ -135,8 +135,8 @@ def test_turns_move_codes_and_target_together(make_clip: ClipMaker, turn: int, b
     """At a million photons noise is invisible: codes are the clipped target, whatever the turn."""
     data = windows(make_clip, lights=(Illumination("quiver-paper", ppp=3.25),))
     place = replace(data.place(0), turn=turn, backwards=backwards)
-    exposed, sharp = data._photons(place)
-    plain, _ = data._photons(replace(place, turn=0, backwards=False))
+    exposed, sharp = data.photons_of(place)
+    plain, _ = data.photons_of(replace(place, turn=0, backwards=False))
     np.testing.assert_array_equal(exposed, sharp)
     assert sorted(exposed.ravel()) == sorted(plain.ravel())
     if turn or backwards:
@@ -159,7 +159,7 @@ def test_a_drifting_crop_is_the_clip_under_a_moving_window(make_clip: ClipMaker)
     assert_mean(np.array([drift == (0, 0) for drift in drifts]), still, still * (1 - still))
     place = next(place for place in places if place.drift == (-2, 1))
     factor = light_level(clip, ppp=3.25).factor
-    for i, frame in enumerate(data._photons(place)[0]):
+    for i, frame in enumerate(data.photons_of(place)[0]):
         crop = (place.y - 2 * i, place.x + i, 16, 16)
         np.testing.assert_array_equal(frame, clip_photons(clip, place.start + i, factor, crop))
     narrow = Windows([make_clip("narrow", height=16, width=27)], WindowSettings(crop=16, drift=9))
