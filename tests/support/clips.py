@@ -78,3 +78,16 @@ def write_dataset(path: Path, splits: dict[str, int], **options: object) -> Path
 
     generate(Recipe("tiny", jobs, {}), path, Options(workers=0), make=make)
     return path
+
+
+def square_clip(path, frames: int = 5, size: tuple[int, int] = (24, 33)) -> Clip:
+    """A bright square that moves one pixel per frame, with its flow."""
+    meta = {"shape": [frames, *size], "frame_rate": 2000.0, "exposure": 5e-4, "radiance_unit": RELATIVE}
+    with ClipWriter(path, meta) as writer:
+        for t in range(frames):
+            radiance = np.full(size, 0.1, np.float32)
+            radiance[6:12, 4 + t : 10 + t] = 1.0
+            flow = np.zeros((2, *size), np.float32)
+            flow[0, 6:12, 4 + t : 10 + t] = 1.0
+            writer.add(t, radiance, truth={"flow": flow, "flow_back": -flow, "valid": np.ones(size, bool)}, error=0.01)
+    return Clip.open(path)

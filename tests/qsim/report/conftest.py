@@ -1,7 +1,10 @@
-"""The clip of noise that previews show."""
+"""The clip of noise that previews show, and a folder of all that a page shows."""
+
+import json
 
 import numpy as np
 import pytest
+from clips import square_clip
 
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
@@ -26,3 +29,30 @@ def clip(tmp_path_factory) -> Clip:
             writer.add(t, radiance, truth={"flow": flow, "depth": depth}, error=0.01)
     assert main(["sense", str(path), "--ppp", "3.25", "--bits", "3", "-o", "mine"]) == 0
     return Clip.open(path)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A clip with a stream, a restored video of it, a training curve and an evaluation."""
+    top = tmp_path_factory.mktemp("report")
+    clip = square_clip(top / "square")
+    assert main(["sense", str(clip.path), "--ppp", "3.25", "--bits", "3"]) == 0
+    stream = Clip.open(clip.path).stream(Clip.open(clip.path).streams[0])
+    restored = {
+        "format": "quiver-restored-1",
+        "method": "moment",
+        "description": "moment inverse",
+        "seconds_per_frame": 0.1,
+        "source": str(stream.path),
+    }
+    np.save(top / "video.npy", np.full(clip.shape, 3.25, np.float32))
+    (top / "video.json").write_text(json.dumps(restored))
+    entry = {"step": 10, "elapsed": 60.0, "psnr_matched": 21.5}
+    (top / "history.json").write_text(json.dumps({"settings": {}, "history": [entry, entry | {"elapsed": 120.0}]}))
+    interval = {"mean": 20.0, "half_width": 1.0, "scenes": 2}
+    line = {"method": "<moment>", "light": "3.25 PPP", "seconds_per_frame": 0.1, "truth_psnr": None}
+    line["scores"] = {"psnr": interval, "psnr_matched": interval, "ssim_matched": interval | {"half_width": None}}
+    evaluation = {"format": "quiver-evaluation-1", "table": [line], "not_built_yet": ["RVRT"]}
+    (top / "evaluation.json").write_text(json.dumps(evaluation))
+    (top / "unknown.json").write_text("[1, 2]")
+    return top

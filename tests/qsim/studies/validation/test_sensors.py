@@ -40,11 +40,6 @@ def test_the_report_holds_a_row_for_every_engine_and_is_well(report):
     json.dumps(report.to_dict())
 
 
-def test_every_hard_case_comes_out_right(report):
-    assert len(report.cases) > 8
-    assert [case.name for case in report.cases if not case.ok] == []
-
-
 def test_the_table_names_what_is_outside(report):
     text = "\n".join(sensors.table(report))
     assert "everything is within its bounds" in text

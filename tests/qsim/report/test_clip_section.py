@@ -1,0 +1,115 @@
+"""A clip on a page: its light, motion, codes beside their exact distribution, what was modelled, its error."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from clips import square_clip, write_clip
+from stats import mixture_p_value
+
+from qsim.cli.program import main
+from qsim.clip.clip import Clip
+from qsim.clip.photons import clip_photons
+from qsim.clip.sensing import Sensing, sense
+from qsim.report import clip_section, report
+
+DEVICES = {
+    "dark map": '[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 900.0\nbits = 2\n'
+    "[defects]\ndevice_seed = 3\ndead = 0.05\ndark = { hot_share = 0.2 }\n",
+    "QIS": '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 400.0\nread_noise = 0.2\nbits = 3\n'
+    "[defects]\ndevice_seed = 4\nprnu = 0.3\ndead = 0.1\noffset = 0.6\nread_noise = 0.5\n",
+    "measured": '[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 1.0\nbits = 1\n'
+    '[defects]\ndark_map = "rates.npy"\n',
+}
+
+
+@pytest.mark.parametrize("name", DEVICES)
+def test_the_expected_codes_include_the_maps(tmp_path, name):
+    """The drawn histogram against the marks, by chi-square; the sensor's own distribution without the maps fails it."""
+    (tmp_path / "device.toml").write_text(DEVICES[name])
+    rates = np.random.default_rng(5).lognormal(7, 1, (40, 60))
+    np.save(tmp_path / "rates.npy", rates)
+    clip = square_clip(tmp_path / "clip", frames=6, size=(24, 33))
+    stream, _ = sense(clip, Sensing(str(tmp_path / "device.toml"), ppp=2.0, name="mine"))
+    clip = Clip.open(clip.path)
+    assert clip_section.unexpected(clip, stream) is None
+    expected = clip_section.expected_codes(clip, stream, len(stream))
+    codes = stream.codes()
+    assert mixture_p_value(codes, np.tile(expected, (codes.size, 1))) > 1e-6
+    photons = np.stack([clip_photons(clip, t, stream.photons_factor) for t in range(6)])
+    blind = stream.sensor.pmf(photons, stream.exposure).reshape(-1, 2**stream.bits)
+    assert mixture_p_value(codes, blind) < 1e-6
+    section = clip_section.clip_section(clip)
+    assert "exact distribution and its map of defects" in section
+    assert "; defects: " in section
+    if name == "measured":
+        assert "dark_map rates.npy" in section
+        np.save(tmp_path / "rates.npy", rates * 2)
+        assert "rates.npy has changed since the stream was drawn" in clip_section.clip_section(clip)
+
+
+def test_marks_are_left_out_where_nothing_exact_is_known(tmp_path):
+    text = '[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 900.0\nbits = 1\n[defects]\n'
+    clip = square_clip(tmp_path / "clip", frames=3, size=(12, 14))
+    for cause in ("crosstalk", "afterpulse"):
+        (tmp_path / "device.toml").write_text(f"{text}{cause} = 0.05\n")
+        stream, _ = sense(clip, Sensing(str(tmp_path / "device.toml"), ppp=2.0, name=cause))
+        assert "crosstalk and afterpulses" in str(clip_section.unexpected(clip, stream))
+        words = clip_section.code_histogram(clip, stream)
+        assert "no expectation is shown: crosstalk and afterpulses" in words
+        assert f"defects: {cause} 0.05" in clip_section.stream_line(stream)
+    grouped, _ = sense(clip, Sensing("spad-320x240", bits=2, ppp=2.0, name="grouped", group=True))
+    assert "sums planes" in str(clip_section.unexpected(clip, grouped))
+    unknown = replace(stream, meta=stream.meta | {"ppp_factor": None, "defects": {}})
+    assert "light is not known" in str(clip_section.unexpected(clip, unknown))
+
+
+def test_average_is_the_mean_of_the_codes_around(folder):
+    stream = Clip.open(folder / "square").stream(Clip.open(folder / "square").streams[0])
+    codes = stream.codes(0, 5)
+    shown = clip_section.stream_panels(stream, range(5))[1].frames
+    mean = codes.mean(axis=0) / 7  # five frames: every window of eleven holds all of them
+    assert np.array_equal(shown[0], shown[4])
+    brightest = np.unravel_index(np.argmax(mean), mean.shape)
+    assert shown[2][brightest] == 255
+
+
+def test_clip_section_says_light_motion_model_and_error(tmp_path):
+    """Numbers of the page are those of the clip: photons, factor, lux, motion, findings, error of every frame."""
+    clip = write_clip(
+        tmp_path / "lit", frames=4, height=20, width=24,
+        render={"findings": [{"effect": "bounces", "chosen": "2", "size": "later ones <1 %"}]},
+    )  # fmt: skip
+    assert main(["sense", str(clip.path), "--ppp", "3.25", "--bits", "3"]) == 0
+    stream = clip.stream(clip.streams[0])
+    page = report.build(clip.path)
+    assert f"{clip.mean_photons:.4g} photons per pixel and exposure as it is" in page
+    assert f"3.25 photons per pixel (the clip&#39;s light × {stream.photons_factor:.4g}), as much as 1.313 lx" in page
+    assert "2.6 e⁻ per pixel; 3 bit, QIS (multibit): quantum_efficiency 0.8 e-/photon" in page
+    assert "<td>bounces</td><td>2</td><td>later ones &lt;1 %</td>" in page
+    assert "Error of a frame (noise, blur, bounces left out): 0.01 rms in the unit of the radiance, worst 0.01" in page
+    for words in ("light of the truth", "drawn, and expected from the light", "error of every frame"):
+        assert words in page, words
+
+
+def test_motion_is_that_of_the_pixels_that_move(folder):
+    """The square moves 1 px, all else stands; half of the pixels unknown changes nothing."""
+    assert clip_section.motion(Clip.open(folder / "square"), range(5)) == (1.0, 1.0)
+    page = report.build(folder / "square")
+    assert (
+        "what moves (more than 0.1 px/frame) moves 1 px/frame on average; 99.9 % of all pixels at most 1 px/frame"
+        in page
+    )
+    assert "rim = 1 px/frame" in page
+
+
+def test_expected_histogram_is_the_mean_of_the_exact_distribution(tmp_path):
+    """Even light: the expected shares are the sensor's pmf, and the drawn ones lie around them."""
+    clip = write_clip(tmp_path / "even", radiance=np.full((4, 40, 50), 1.0))
+    assert main(["sense", str(clip.path), "--ppp", "3.25", "--bits", "3", "-o", "mine"]) == 0
+    stream = clip.stream("mine")
+    expected = clip_section.expected_codes(clip, stream, 4)
+    light = np.stack([clip_photons(clip, t, stream.photons_factor) for t in range(4)])
+    exact = stream.sensor.pmf(light, stream.exposure).mean(axis=(0, 1, 2))
+    np.testing.assert_allclose(expected, exact, atol=2e-3)  # every n-th pixel of light that falls off as cos^4
+    assert expected.sum() == pytest.approx(1)

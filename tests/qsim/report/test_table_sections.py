@@ -1,0 +1,48 @@
+"""Tables of a page: evaluations, studies, costs and validations as their files have them."""
+
+import json
+
+from qsim.report import report
+from qsim.studies.validation.reading import ReadingReport
+
+
+def test_an_evaluation_says_what_its_scores_mean(folder):
+    """Before format 2 the peak was the sensor's white and the factor unclamped; a page never mixes the two."""
+    assert "peak = the sensor&#39;s white" in report.build(folder, title="All")
+    path = folder / "evaluation.json"
+    found = json.loads(path.read_text()) | {"peak": "2.5 x the stream's mean light", "remarks": ["<nano> was never"]}
+    line = found["table"][0] | {"above_peak": 0.0961, "truth_psnr": 21.0, "near_truth": ["psnr_matched"]}
+    path.write_text(json.dumps(found | {"table": [line]}))
+    page = report.build(folder, title="All")
+    for words in ("behind the clamp", "9.6 %", "20.00 ± 1.00 †", "within 3 dB of the truth", "&lt;nano&gt; was never"):
+        assert words in page, words
+    assert "as they were defined before" not in page
+
+
+def test_studies_costs_and_validations_have_their_sections(tmp_path):
+    rows = [{"model": "planes", "bits": 3, "psnr_db": 21.25}, {"model": "multibit", "bits": 3, "psnr_db": None}]
+    study = {"clip": "fan", "ppp": 0.65, "rows": rows, "structure_function": [0.0, 1.0]}
+    sweep = {"cells": [{"speed": 2.0, "best_bits": 3}], "studies": [study]}
+    figure = {"figure": 1, "rows": [{"clip": "fan", "panels": [{"label": "CMOS 60 fps", "psnr_db": 18.9}]}]}
+    cost = {"method": "nano", "seconds_per_frame": 0.25, "psnr_matched": None, "failure": None}
+    checked = {"model": "QIS", "engine": "fast", "megapixels_per_second": 99.5, "times_numpy": 25.0, "cdf_error": 1e-7}
+    checked |= dict.fromkeys(("p_value", "z_mean", "z_variance", "mismatches_per_million"))
+    sensor = {"ok": False, "pixels": 9, "rows": [checked], "cases": [{"name": "ties", "found": "right", "ok": False}]}
+    frame = {"scene": "drums", "level": 40.0, "psnr": 40.5, "stated_psnr": 40.25, "samples": 16, "bounces": 4}
+    frame |= {"seconds": 0.5, "obvious_seconds": 6.0, "obvious_psnr": 40.0, "ratio": 12.0}
+    render = {"ok": True, "median_ratio": 12.0, "height": 8, "width": 10, "engine": "llvm", "rows": [frame]}
+    reading = ReadingReport(clip=250.5, mp4=20.0, clip_processor=300.0, mp4_processor=9.0, difference=0.01).to_dict()
+    files = {"s/tradeoff": study, "w/tradeoff": sweep, "f/figure1": figure, "sensor": sensor, "render": render}
+    files["reading"] = reading
+    for name, content in (files | {"b/bench": {"setting": {"height": 64}, "costs": [cost]}}).items():
+        path = tmp_path / f"{name}.json"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps(content))
+    page = report.build(tmp_path)
+    for words in ("Study: s", "Study: w", "Study: f", "Cost of a frame: b", "21.25", "CMOS 60 fps", "best bits"):
+        assert words in page, words
+    assert "sensors, 9 pixels a draw: something is OUTSIDE its bounds" in page
+    assert "rendering, frames of 8 × 10, llvm: everything is within its bounds" in page
+    assert "windows of 11 × 128 × 128 in a clip of 65 × 512 × 1024: as quick as wanted (100/s, 5 times)" in page
+    assert "250.5" in page
+    assert "<td>ties</td><td>right</td><td>wrong</td>" in page
