@@ -4,8 +4,10 @@ Here and not in a test module, so that worker processes can import it by name.
 """
 
 import os
+import shutil
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -15,6 +17,9 @@ import numpy as np
 from qsim.clip.clip import Clip
 from qsim.clip.manifest import PHYSICAL
 from qsim.clip.writer import ClipWriter
+from qsim.dataset import recipe
+from qsim.dataset.dataset import Dataset
+from qsim.dataset.generation import Options
 from qsim.dataset.job import Job
 from qsim.dataset.provenance import origin
 from qsim.optics.camera import Camera
@@ -42,6 +47,10 @@ sensor = "quiver-physical"
 bits = [1, 3]
 ppp = 3.25
 """
+
+SMALL = recipe.parse(RECIPE)
+HERE = Options(workers=0)
+SUPPORT = f"{Path(__file__).parents[2]}{os.pathsep}{Path(__file__).parent}"  # PYTHONPATH of children; packages first
 
 
 def make(job: Job, path: Path) -> Clip:
@@ -125,3 +134,38 @@ def make_with_pause(job: Job, path: Path) -> Clip:
 
     with mock.patch.object(ClipWriter, "add", add_and_wait):
         return make(job, path)
+
+
+def damage(path: Path, kind: str) -> None:
+    """Damage a file: "missing", "truncated" or "bit-flipped"."""
+    content = bytearray(path.read_bytes())
+    if kind == "missing":
+        path.unlink()
+    elif kind == "truncated":
+        path.write_bytes(content[: len(content) // 2])
+    else:
+        content[len(content) // 2] ^= 4
+        path.write_bytes(content)
+
+
+def problems_of(folder: Path) -> list[str]:
+    """What `qsim check` says."""
+    try:
+        return Dataset.open(folder).verify()
+    except (ValueError, OSError) as error:
+        return [str(error)]
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    """Wait for a condition; an assertion fails when it does not come."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+
+
+def moved(folder: Path, name: str, place: Path) -> Path:
+    """The clip on another disk, with a link in its place."""
+    shutil.move(folder / "clips" / name, place)
+    (folder / "clips" / name).symlink_to(place)
+    return folder / "clips" / name

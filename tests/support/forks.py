@@ -6,6 +6,7 @@ import itertools
 import os
 import signal
 import sys
+import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +27,21 @@ def forked(action: Callable[[], Any]) -> int:
         os._exit(code)
     gc.unfreeze()
     return child
+
+
+def in_child(action: Callable[[], Any], seconds: float) -> bool:
+    """Run `action` in a fork and kill it after so many seconds; True if it came to its end before."""
+    child = forked(action)
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        found, status = os.waitpid(child, os.WNOHANG)
+        if found:
+            assert os.waitstatus_to_exitcode(status) == 0
+            return True
+        time.sleep(0.001)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return False
 
 
 def killed_at(step: int, place: Path, action: Callable[[], Any]) -> bool:

@@ -6,14 +6,13 @@ import shlex
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fakes import RECIPE, fail_on_tumble, make, make_slowly, make_with_pause, tree
+from fakes import RECIPE, SUPPORT, fail_on_tumble, make, make_slowly, make_with_pause, tree, wait_for
 
 import qsim.cli.program
 from qsim.dataset import generation, recipe
@@ -25,13 +24,12 @@ from qsim.dataset.worker_pool import Limits
 distributed = pytest.importorskip("distributed", reason="the extra [cluster] is not installed")
 TESTS = Path(__file__).parents[2]
 PAGE = TESTS.parent / "docs" / "cluster.md"
-PYTHONPATH = f"{TESTS.parent}{os.pathsep}{TESTS / 'support'}"  # the package first: tests/qsim is no package
 THREE = recipe.parse(RECIPE)
 SMALL = recipe.parse(RECIPE.replace("seeds = [0, 1]", "seeds = [0, 1, 2, 3, 4, 5]"))
 PATIENCE = 300.0  # seconds; on a busy machine a worker needs half a minute to start
 
 
-class Crew:
+class LocalCluster:
     """A scheduler and workers of this test."""
 
     def __init__(self, folder: Path) -> None:
@@ -46,7 +44,7 @@ class Crew:
     def start(self, *command: str) -> subprocess.Popen[bytes]:
         place = self.folder / f"process{len(self.processes)}"
         place.mkdir()
-        env = os.environ | {"PYTHONPATH": PYTHONPATH}
+        env = os.environ | {"PYTHONPATH": SUPPORT}
         with open(place / "log", "wb") as log:
             line = [sys.executable, "-m", "dask", *command]
             process = subprocess.Popen(line, cwd=place, env=env, stdout=log, stderr=log)
@@ -63,19 +61,12 @@ class Crew:
 
 
 @pytest.fixture
-def crew(tmp_path: Path) -> Iterator[Crew]:
-    started = Crew(tmp_path)
+def cluster(tmp_path: Path) -> Iterator[LocalCluster]:
+    started = LocalCluster(tmp_path)
     yield started
     for process in started.processes:
         process.kill()
         process.wait()
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = PATIENCE) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 def processes(folder: Path) -> dict[str, list[int]]:
@@ -94,15 +85,17 @@ def half_done(folder: Path) -> dict[int, str]:
 
 
 @pytest.mark.slow
-def test_a_killed_workers_job_is_finished_by_the_other_and_gives_the_files_of_a_local_run(tmp_path: Path, crew: Crew):
+def test_a_killed_workers_job_is_finished_by_the_other_and_gives_the_files_of_a_local_run(
+    tmp_path: Path, cluster: LocalCluster
+):
     generate(SMALL, tmp_path / "local", Options(workers=0), make=make)
-    first, second = crew.worker(), crew.worker()
+    first, second = cluster.worker(), cluster.worker()
     folder = tmp_path / "far"
     folder.mkdir()
     with ThreadPoolExecutor() as pool:
-        far = pool.submit(generate, SMALL, folder, make=make_with_pause, run=Cluster(crew.address, timeout=PATIENCE))
+        far = pool.submit(generate, SMALL, folder, make=make_with_pause, run=Cluster(cluster.address, timeout=PATIENCE))
         try:
-            wait_for(lambda: first.pid in half_done(folder))
+            wait_for(lambda: first.pid in half_done(folder), PATIENCE)
             job = half_done(folder)[first.pid]
             frame = (folder / "work" / f"{job}.part" / "radiance" / "000000.exr").stat()
             first.kill()
@@ -119,10 +112,10 @@ def test_a_killed_workers_job_is_finished_by_the_other_and_gives_the_files_of_a_
 
 
 @pytest.mark.slow
-def test_folders_of_one_name_on_one_scheduler_do_not_get_each_others_results(tmp_path: Path, crew: Crew):
+def test_folders_of_one_name_on_one_scheduler_do_not_get_each_others_results(tmp_path: Path, cluster: LocalCluster):
     """The second client comes while the first one still holds all of its jobs, which have the same names."""
-    crew.worker()
-    run = Cluster(crew.address, timeout=PATIENCE)
+    cluster.worker()
+    run = Cluster(cluster.address, timeout=PATIENCE)
     later = []
 
     def start_the_second(_: Result) -> None:
@@ -147,19 +140,19 @@ def test_a_key_names_folder_and_job_and_differs_with_the_whole_path_and_the_sett
 
 
 @pytest.mark.slow
-def test_failures_on_the_cluster_are_listed(tmp_path: Path, crew: Crew):
-    crew.worker()
-    summary = generate(SMALL, tmp_path / "d", make=fail_on_tumble, run=Cluster(crew.address, timeout=PATIENCE))
+def test_failures_on_the_cluster_are_listed(tmp_path: Path, cluster: LocalCluster):
+    cluster.worker()
+    summary = generate(SMALL, tmp_path / "d", make=fail_on_tumble, run=Cluster(cluster.address, timeout=PATIENCE))
     assert summary.failed == {"tumble_0004": "scene tumble: no light and no glowing body"}
     assert summary.done == 6
 
 
 @pytest.mark.slow
-def test_a_worker_without_the_resource_gets_no_job(tmp_path: Path, crew: Crew):
+def test_a_worker_without_the_resource_gets_no_job(tmp_path: Path, cluster: LocalCluster):
     """It is there and idle all the time, while the other has more than it can do at once."""
-    plain, gifted = crew.worker(), crew.worker("--resources", "GPU=1")
-    crew.wait_for_workers(2)
-    run = Cluster(crew.address, gpus=1, timeout=PATIENCE)
+    plain, gifted = cluster.worker(), cluster.worker("--resources", "GPU=1")
+    cluster.wait_for_workers(2)
+    run = Cluster(cluster.address, gpus=1, timeout=PATIENCE)
     assert generate(SMALL, tmp_path / "d", make=make_slowly, run=run).made == 7
     assert plain.poll() is None
     assert processes(tmp_path / "d") == {job.name: [gifted.pid] * 2 for job in SMALL.jobs}
@@ -173,24 +166,24 @@ def page_options() -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_worker_started_as_the_page_says_is_replaced_and_its_jobs_are_done(tmp_path: Path, crew: Crew):
+def test_a_worker_started_as_the_page_says_is_replaced_and_its_jobs_are_done(tmp_path: Path, cluster: LocalCluster):
     """Its first job does not end before its lifetime does, so that the others are for the process that replaces it."""
     options = page_options()
     assert "--memory-limit" in options
     assert "--lifetime-restart" in options
     short = {"1h": "5s", "10m": "0s"}
     assert short.keys() <= set(options)
-    crew.start("worker", crew.address, "--no-dashboard", *(short.get(word, word) for word in options))
+    cluster.start("worker", cluster.address, "--no-dashboard", *(short.get(word, word) for word in options))
     log = tmp_path / "process1" / "log"
     folder = tmp_path / "far"
     folder.mkdir()
     with ThreadPoolExecutor() as pool:
-        far = pool.submit(generate, THREE, folder, make=make_with_pause, run=Cluster(crew.address, timeout=PATIENCE))
+        far = pool.submit(generate, THREE, folder, make=make_with_pause, run=Cluster(cluster.address, timeout=PATIENCE))
         try:
-            wait_for(lambda: bool(half_done(folder)))
+            wait_for(lambda: bool(half_done(folder)), PATIENCE)
             ((process, held),) = half_done(folder).items()
             ends = log.read_text().count("lifetime-reached")
-            wait_for(lambda: log.read_text().count("lifetime-reached") > ends)
+            wait_for(lambda: log.read_text().count("lifetime-reached") > ends, PATIENCE)
         finally:
             (folder / "go").touch()
         summary = far.result(timeout=PATIENCE)

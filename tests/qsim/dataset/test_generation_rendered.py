@@ -7,32 +7,14 @@ import sys
 import time
 from pathlib import Path
 
+import fakes
 import pytest
 from fakes import tree
 
 from qsim.dataset.dataset import Dataset
 
-RECIPE = """[recipe]
-name = "real"
-frames = 3
-height = 24
-width = 32
-frame_rate = 2000.0
-psnr = 25.0
-
-[[scenes]]
-family = "fan"
-seeds = [0, 1]
-
-[[scenes]]
-family = "tumble"
-split = "test"
-
-[[streams]]
-sensor = "quiver-physical"
-bits = 3
-ppp = [3.25, 26.0]
-"""
+RECIPE = fakes.RECIPE.replace("height = 8\nwidth = 10\n", "height = 24\nwidth = 32\npsnr = 25.0\n")
+RECIPE = RECIPE.replace("bits = [1, 3]\nppp = 3.25", "bits = 3\nppp = [3.25, 26.0]")
 
 
 def generate(recipe: Path, folder: Path, *options: str) -> subprocess.Popen[bytes]:

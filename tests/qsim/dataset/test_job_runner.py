@@ -1,0 +1,120 @@
+"""Jobs beside each other, jobs whose clip is a link, and the words of a failed job."""
+
+import errno
+import itertools
+import os
+import random
+import shutil
+from pathlib import Path
+
+import pytest
+from fakes import HERE, RECIPE, make, moved, tree
+
+from qsim.dataset import job_runner, recipe
+from qsim.dataset.dataset import Dataset
+from qsim.dataset.generation import Options, generate
+from qsim.dataset.job import Job
+
+ALIKE = RECIPE.replace("seeds = [0, 1]", "seeds = [0, 1000, 10000]\nspeed = [1.0, 2.0, 2.5]").replace("[1, 3]", "[3]")
+ALIKE = ALIKE.replace("frames = 3", "frames = 1")
+
+
+def halting(outer: Job, inner: Job, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch):
+    """An `os.fsync` that does the job `inner` while `outer` syncs its record, and once after so many other syncs."""
+    sync, left = os.fsync, [count]
+
+    def halted(descriptor: int) -> None:
+        place = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        sync(descriptor)
+        left[0] -= 1
+        recording = place.parent.name == "jobs" and place.name.startswith(f"{outer.name}.json.tmp-")
+        if recording or left[0] == 0:
+            with monkeypatch.context() as other:  # another process, with another number
+                other.setattr(os, "fsync", sync)
+                other.setattr(os, "getpid", lambda: 100_000)
+                assert job_runner.run_job(inner, folder, make).state == "done"
+
+    return halted
+
+
+def test_no_job_tidies_up_what_another_one_is_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Names that begin alike (fan_0000, fan_0000_x2; fan_1000, fan_10000): every job starts inside every other's write.
+
+    One is halted while it syncs its record or another of its files, drawn at random, and the other is done meanwhile.
+    """
+    wanted = recipe.parse(ALIKE)
+    alike = ("fan_0000", "fan_0000_x2", "fan_0000_x2.5", "fan_1000", "fan_10000")
+    chosen = [job for job in wanted.jobs if job.name in alike]
+    assert len(chosen) == len(alike)
+    folder, rng = tmp_path / "d", random.Random(0)
+    generate(wanted, folder, HERE, make=make)
+    expected = tree(folder)
+    (folder / "clips").rename(tmp_path / "clips")
+    for outer, inner in itertools.permutations(chosen, 2):
+        shutil.rmtree(folder / "clips", ignore_errors=True)
+        (folder / "clips").mkdir()
+        for job in (outer, inner):
+            (folder / "jobs" / f"{job.name}.json").unlink(missing_ok=True)
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", halting(outer, inner, folder, rng.randrange(12), monkeypatch))
+            assert job_runner.run_job(outer, folder, make) == job_runner.Result(outer.name, "done")
+    shutil.rmtree(folder / "clips")
+    (tmp_path / "clips").rename(folder / "clips")
+    assert tree(folder) == expected
+
+
+def test_a_link_whose_disk_is_not_there(tmp_path: Path):
+    """The job is listed, not rendered for nothing; when the disk is back, --retry is enough."""
+    wanted, folder, place = recipe.parse(RECIPE), tmp_path / "d", tmp_path / "disk2"
+    generate(wanted, folder, HERE, make=make)
+    moved(folder, "fan_0000", place)
+    place.rename(tmp_path / "unplugged")
+    (folder / "jobs" / "fan_0000.json").unlink()
+    found = generate(wanted, folder, HERE, make=make)
+    assert "is a symbolic link to" in found.failed["fan_0000"]
+    assert "which is not there; mount or move it back, or delete the link" in found.failed["fan_0000"]
+    (tmp_path / "unplugged").rename(place)
+    assert generate(wanted, folder, Options(workers=0, retry=True), make=make).failed == {}
+    assert Dataset.open(folder).verify() == []
+
+
+def test_a_leftover_link_of_an_earlier_version_does_not_stop_the_job(tmp_path: Path):
+    wanted, folder, place = recipe.parse(RECIPE), tmp_path / "d", tmp_path / "disk2"
+    generate(wanted, folder, HERE, make=make)
+    moved(folder, "fan_0000", place).rename(folder / "clips" / "fan_0000.removed-77")
+    (folder / "jobs" / "fan_0000.json").unlink()
+    assert generate(wanted, folder, HERE, make=make).failed == {}
+    assert (place / "clip.json").is_file(), "only the link goes"
+    assert Dataset.open(folder).verify() == []
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.ENOENT, errno.EXDEV])
+def test_a_systems_error_is_worded_with_its_file_and_nothing_else(tmp_path: Path, number: int, monkeypatch):
+    """Wherever a job's write fails, failed/ says `FILE: reason`: no number, no quotes, no '-> None'."""
+    wanted = recipe.parse(RECIPE)
+    for name, step in itertools.product(("fsync", "replace"), (0, 11)):
+        folder = tmp_path / f"{name}-{step}"
+        found = generate(wanted, folder, HERE, make=make, run=failing(name, step, number, monkeypatch))
+        (message,) = found.failed.values()
+        assert message.startswith(str(folder)), message
+        assert message.endswith(f": {os.strerror(number)}"), message
+        assert not any(word in message for word in (".tmp-", "None", "'")), message
+        assert generate(wanted, folder, Options(workers=0, retry=True), make=make).failed == {}
+
+
+def failing(name: str, step: int, number: int, monkeypatch: pytest.MonkeyPatch):
+    """Runs one job, in which the so-many-th call of os.NAME fails."""
+    action, left = getattr(os, name), [step]
+
+    def fail(*args, **kwargs):
+        left[0] -= 1
+        if left[0] == -1:
+            raise OSError(number, os.strerror(number), *([None] if name == "fsync" else args[:1]))
+        return action(*args, **kwargs)
+
+    def run(chosen, place, maker):
+        with monkeypatch.context() as patch:
+            patch.setattr(os, name, fail)
+            yield job_runner.run_job(chosen[0], place, maker)
+
+    return run

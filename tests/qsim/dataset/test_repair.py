@@ -1,0 +1,117 @@
+"""Repair: every damaged file is named, and only what is damaged is made again; links are not replaced."""
+
+from pathlib import Path
+
+import pytest
+from fakes import (
+    HERE,
+    RECIPE,
+    SMALL,
+    damage,
+    fail_on_tumble,
+    make,
+    moved,
+    problems_of,
+    tree,
+)
+
+from qsim.clip.sensing import Sensing, sense
+from qsim.dataset import recipe
+from qsim.dataset.dataset import Dataset
+from qsim.dataset.generation import Options, generate
+
+
+@pytest.mark.parametrize("kind", ["missing", "truncated", "bit-flipped"])
+def test_every_damaged_file_is_named_and_only_it_is_made_again(
+    tmp_path: Path, undisturbed: dict[str, bytes], kind: str
+):
+    folder = tmp_path / "d"
+    generate(SMALL, folder, HERE, make=make)
+    for name in undisturbed:
+        damage(folder / name, kind)
+        # a clip whose record is gone does not count as made
+        named = name.replace("jobs/", "clips/").removesuffix(".json") if kind == "missing" and "jobs" in name else name
+        assert any(f"{folder / named}: " in problem for problem in problems_of(folder)), name
+        kept = {path: path.stat().st_ino for path in folder.glob("clips/*") if path.name not in name}
+        summary = generate(SMALL, folder, Options(workers=0, repair=True), make=make)
+        assert summary.made == (name != "dataset.json"), name
+        assert tree(folder) == undisturbed, name
+        assert kept == {path: path.stat().st_ino for path in kept}
+
+
+def test_a_damaged_record_costs_no_rendering_but_vouches_for_nothing(tmp_path: Path, undisturbed: dict[str, bytes]):
+    """The clip behind it stays if the manifest still knows it, and goes if its clip.json has changed too."""
+    folder = tmp_path / "d"
+    generate(SMALL, folder, HERE, make=make)
+    damage(folder / "jobs" / "tumble_0004.json", "bit-flipped")
+    summary = generate(SMALL, folder, Options(workers=0, repair=True), make=fail_on_tumble)
+    assert summary.made == 1
+    damage(folder / "jobs" / "tumble_0004.json", "bit-flipped")
+    about = folder / "clips" / "tumble_0004" / "clip.json"
+    about.write_text(about.read_text().replace('"exposure": 0.0005', '"exposure": 0.0004'))
+    summary = generate(SMALL, folder, Options(workers=0, repair=True), make=make)
+    assert (summary.made, tree(folder)) == (1, undisturbed)
+
+
+def test_repair_names_the_streams_that_go_with_a_clip(tmp_path: Path):
+    """What `qsim sense` has added is in no recipe: it cannot come back by itself."""
+    folder = tmp_path / "d"
+    generate(SMALL, folder, HERE, make=make)
+    for damaged in ("radiance/000000.exr", "streams/own.npy"):
+        drawn, _ = sense(Dataset.open(folder).clips()[0], Sensing("quiver-physical", bits=2, name="own"))
+        damage(drawn.path.parents[1] / damaged, "bit-flipped")
+        repaired = generate(SMALL, folder, Options(workers=0, repair=True), make=make).repaired
+        assert f"{drawn.path}: was added by `qsim sense` and is gone; sense it again" in repaired
+        assert not drawn.path.exists()
+        assert problems_of(folder) == []
+
+
+def test_repair_does_not_take_the_clips_of_another_recipe(tmp_path: Path):
+    folder = tmp_path / "d"
+    generate(SMALL, folder, HERE, make=make)
+    before = tree(folder)
+    other = recipe.parse(RECIPE.replace("frames = 3", "frames = 4").replace("frames = 2", "frames = 3"))
+    for kind in ("bit-flipped", "missing"):
+        damage(folder / "dataset.json", kind)
+        with pytest.raises(ValueError, match="none of its 3 finished clips is of this recipe"):
+            generate(other, folder, Options(workers=0, repair=True), make=make)
+    assert {name: content for name, content in before.items() if name != "dataset.json"} == tree(folder)
+
+
+def test_repairing_a_stream_does_not_render(tmp_path: Path, undisturbed: dict[str, bytes]):
+    folder = tmp_path / "d"
+    generate(SMALL, folder, HERE, make=make)
+    damage(next((folder / "clips" / "fan_0001" / "streams").glob("*.npy")), "bit-flipped")
+    summary = generate(SMALL, folder, Options(workers=0, repair=True), make=fail_on_tumble)
+    assert (summary.made, len(summary.repaired)) == (1, 1)
+    assert "rendering" not in (folder / "logs" / "fan_0001.log").read_text().split("done on")[1]
+    assert tree(folder) == undisturbed
+
+
+def test_a_clip_that_was_moved_and_linked(tmp_path: Path):
+    """It is read and its streams are mended through the link; what needs a new clip is refused, and nothing changes."""
+    wanted, folder, place = recipe.parse(RECIPE), tmp_path / "d", tmp_path / "disk2"
+    generate(wanted, folder, HERE, make=make)
+    expected = tree(folder)
+    link = moved(folder, "fan_0000", place)
+    assert generate(wanted, folder, Options(workers=0, repair=True), make=make).repaired == ()
+    codes = next(place.glob("streams/*.npy"))
+    codes.write_bytes(b"damaged")
+    assert generate(wanted, folder, Options(workers=0, repair=True), make=make).made == 1
+    assert link.is_symlink()
+    assert Dataset.open(folder).verify() == []
+    frame = next(place.glob("radiance/*.exr"))
+    whole = frame.read_bytes()
+    frame.write_bytes(b"damaged")
+    for again in ({"repair": True}, {"repair": True, "retry": True}):
+        with pytest.raises(ValueError, match=r"fan_0000 is a symbolic link to .*disk2, and --repair replaces no links"):
+            generate(wanted, folder, Options(workers=0, **again), make=make)
+        assert link.is_symlink()
+        assert frame.read_bytes() == b"damaged"
+    assert generate(wanted, folder, HERE, make=make).failed == {}
+    frame.write_bytes(whole)
+    assert Dataset.open(folder).verify() == []
+    frame.unlink()
+    link.unlink()  # as the message says: the clip is made here
+    assert generate(wanted, folder, Options(workers=0, repair=True), make=make).failed == {}
+    assert tree(folder) == expected

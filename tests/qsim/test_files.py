@@ -1,0 +1,60 @@
+"""Files: leftovers of interrupted writes, links, and the words of the system's errors."""
+
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fakes import (
+    RECIPE,
+    make,
+)
+
+from qsim import files
+from qsim.clip.writer import ClipWriter
+from qsim.dataset import recipe
+
+
+@pytest.mark.parametrize("name", ["fan", "fan_x2", "fan.tmp-1", "fan.removed-7x"])
+def test_only_exact_leftovers_are_swept(tmp_path: Path, name: str):
+    """Of `fan` only fan.tmp-N and fan.removed-N, with a whole number; links go, what they point to stays."""
+    target = tmp_path / "elsewhere"
+    target.mkdir()
+    (target / "precious").touch()
+    leftovers = [f"{name}.tmp-12", f"{name}.removed-3"]
+    others = ["fan0.tmp-1", "fan_x2.json.tmp-1", f"{name}.tmp-", f"{name}.tmp-1_0000", f"{name}.part", name, "x.tmp-1"]
+    for kept in others:
+        (tmp_path / kept).mkdir()
+    (tmp_path / leftovers[0]).touch()
+    (tmp_path / leftovers[1]).symlink_to(target)
+    files.remove_leftovers(tmp_path / name)
+    assert sorted(os.listdir(tmp_path)) == sorted({*others, "elsewhere"})
+    assert (target / "precious").exists()
+
+
+def test_force_writes_through_a_link(tmp_path: Path):
+    """`qsim render -o LINK --force`: the clip at the other place is replaced, the link stays."""
+    job = recipe.parse(RECIPE).jobs[0]
+    make(job, tmp_path / "disk2" / "far")
+    (tmp_path / "near").symlink_to(tmp_path / "disk2" / "far")
+    meta = {
+        "shape": [1, 2, 3], "frame_rate": 1000.0, "exposure": 1e-3, "radiance_unit": "relative", "camera": None
+    }  # fmt: skip
+    with ClipWriter(tmp_path / "near", meta, force=True) as writer:
+        writer.add(0, np.ones((2, 3)))
+    assert (tmp_path / "near").is_symlink()
+    assert files.read_json(tmp_path / "disk2" / "far" / "clip.json")["name"] == "near"
+    assert sorted(os.listdir(tmp_path)) == ["disk2", "near"]
+    assert os.listdir(tmp_path / "disk2") == ["far"]
+
+
+def test_wordings():
+    two = OSError(errno.EXDEV, "Invalid cross-device link", "a", None, "b")
+    assert files.wording(two) == "a: Invalid cross-device link"
+    assert files.wording(OSError(errno.EIO, "Input/output error")) == "Input/output error"
+    assert files.wording(OSError("two\nlines")) == "two lines"
+    assert files.wording(ValueError()) == "ValueError"
+    with pytest.raises(OSError) as caught, files.replacing(Path("/nowhere/x")):
+        pass
+    assert "None" not in str(caught.value)
