@@ -19,29 +19,45 @@ from qsim.sensor.distribution import Distribution
 
 _DECADES, _PER_DECADE = 8, 128  # of the grid: linear interpolation between its points is good to 4e-5
 _FLAT = 1e-14  # change of the cdf per doubling of light at which a sensor is taken as saturated
-_DOUBLINGS = 44  # of light above white in which a sensor must saturate
+_DOUBLINGS = 44  # of light in which a sensor must saturate, or its mean code must end to rise
 _NEVER = -1e290  # stands for log 0 where it may be multiplied by 0
+POINTS = 4096  # of a response; linear interpolation then errs by less than 1e-6 of the full scale
+_ENDED = 1e-7  # a response this close to its top (relative to the full scale) has ended
+_TOGETHER = 1 << 22  # probabilities of a response held at a time
 _STEPS = 100  # of root finding; 10 are usual
 _CHUNK = 1 << 12  # different histograms at a time
 
 
 @dataclass(frozen=True)
 class Response:
-    """A sensor's answer to light, as a table; all arrays [G], photons ascending from 0."""
+    """Exact mean and variance of one code over a grid of photons, evenly spaced in sqrt(photons), rising in mean."""
 
-    photons: Array
-    mean: Array  # of the code
-    variance: Array  # of the code
-    stabilised: Array  # s(mean) = integral of dmean / sqrt(variance): codes mapped by s have a variance near 1
-    expected: Array  # E[s(code)], for the exact unbiased inverse
+    photons: Array  # [G], expected photons per pixel and exposure, from 0
+    mean: Array  # [G], codes, strictly rising
+    variance: Array  # [G], codes^2
+    top: int  # the largest code of the sensor
+    sensor: str  # in words
 
-    def stabilise(self, codes: Array) -> Array:
-        """s(code): codes, or means of codes -> float64 of the same shape."""
-        return np.interp(codes, self.mean, self.stabilised)
+    def cap(self, samples: int) -> float:
+        """The largest estimate [photons] from the mean of `samples` codes: half a count below saturation.
 
-    def invert(self, stabilised: Array) -> Array:
-        """Photons whose expected stabilised code is this: exact for noiseless input, clamped to the table's ends."""
-        return np.interp(stabilised, self.expected, self.photons)
+        `ValueError` where that is no light at all.
+        """
+        if self.mean[-1] - 0.5 / samples <= self.mean[0]:
+            raise ValueError(
+                f"{self.sensor}: its mean code rises from {self.mean[0]:.4g} in the dark to {self.mean[-1]:.4g} at "
+                f"{self.photons[-1]:.4g} photons, which the mean of {samples} codes does not resolve; use a longer "
+                "window, or the method naive"
+            )
+        return float(np.interp(self.mean[-1] - 0.5 / samples, self.mean, self.photons))
+
+    def invert(self, mean_code: Array, samples: int) -> Array:
+        """Photons whose mean code is this; 0 below the mean of a dark pixel, cap(samples) at saturation. Any shape.
+
+        `ValueError` as for `cap`.
+        """
+        self.cap(samples)
+        return np.interp(np.minimum(mean_code, self.mean[-1] - 0.5 / samples), self.mean, self.photons)
 
 
 @dataclass(frozen=True)
@@ -86,19 +102,50 @@ def _grid(sensor: Distribution, exposure: float) -> _Grid:
     return _Grid(photons, np.maximum(sensor.log_pmf(photons, exposure), _NEVER), saturates)
 
 
-def response(sensor: Distribution, exposure: float) -> Response:
-    """The tables of `Response` from no light to saturation (or to where the mean code begins to fall)."""
-    grid = _grid(sensor, exposure)
-    codes, pmf = np.arange(sensor.levels, dtype=float), np.exp(grid.log_pmf)
-    mean = np.maximum.accumulate(pmf @ codes)
-    variance = (pmf * (codes - (pmf @ codes)[:, None]) ** 2).sum(axis=1)
-    deviation = np.sqrt(variance)
-    # A step is 2 (change of the mean) / (sigma + next sigma): exact where the variance is linear in the mean
-    width = deviation[1:] + deviation[:-1]
-    steps = np.divide(2 * np.diff(mean), width, out=np.zeros_like(width), where=width > 0)
-    stabilised = np.append(0.0, np.cumsum(steps))
-    expected = np.maximum.accumulate(pmf @ np.interp(codes, mean, stabilised))
-    return Response(grid.photons, mean, variance, stabilised, expected)
+def _end_of_rise(sensor: Distribution, exposure: float) -> float:
+    """Photons at which the mean code stops rising: at the top code, or before (full well, dead time).
+
+    `ValueError` for a sensor whose mean code does not rise from darkness.
+    """
+    top, limit = sensor.levels - 1, sensor.brightest(exposure)
+
+    def mean_at(photons: float) -> float:
+        return float(sensor.mean(np.array([photons]), exposure)[0])
+
+    dark, photons = mean_at(0.0), sensor.white(exposure) / 16
+    here = mean_at(photons) if photons < limit else dark
+    for _ in range(_DOUBLINGS):  # one by one: the brightest light takes the longest tables
+        if 2 * photons >= limit:
+            if mean_at(max(limit, 0.0)) > dark:
+                return limit
+            break
+        there = mean_at(2 * photons)
+        risen = here - dark > _ENDED * top  # a high threshold keeps codes dark for long
+        if top - here < _ENDED * top or (risen and there - here < _ENDED * top):
+            if here > dark:
+                return photons
+            break
+        photons, here = 2 * photons, there
+    raise ValueError(f"{sensor}: its mean code is {dark:.4g} in the dark and does not rise with light")
+
+
+def pieces(photons: Array, values: int) -> list[Array]:
+    """Photons in pieces whose distributions, of this many values each, fit into memory together."""
+    return np.array_split(photons, -(-len(photons) * values // _TOGETHER))
+
+
+def response(sensor: Distribution, exposure: float, points: int = POINTS) -> Response:
+    """Tabulate a sensor's response from darkness to the end of its rise.
+
+    Where the response falls again (a paralyzable counter) the table holds its rising branch only. `ValueError` for a
+    sensor whose mean code does not rise.
+    """
+    photons = np.linspace(0, np.sqrt(_end_of_rise(sensor, exposure)), points) ** 2
+    parts = pieces(photons, sensor.levels)
+    mean = np.concatenate([sensor.mean(part, exposure) for part in parts])
+    variance = np.concatenate([sensor.variance(part, exposure) for part in parts])
+    rising = np.concatenate([[True], mean[1:] > np.maximum.accumulate(mean)[:-1]])
+    return Response(photons[rising], mean[rising], variance[rising], sensor.levels - 1, str(sensor))
 
 
 def maximum_likelihood(sensor: Distribution, histogram: Array, exposure: float, confidence: float = 0.95) -> Estimate:

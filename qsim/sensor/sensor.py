@@ -63,9 +63,9 @@ class Sensor(Distribution):
         """
         return estimation.maximum_likelihood(self, histogram, exposure, confidence)
 
-    def response(self, exposure: float) -> Response:
-        """Tables of mean, variance and variance-stabilised code over light, and their inverses."""
-        return estimation.response(self, exposure)
+    def response(self, exposure: float, points: int = estimation.POINTS) -> Response:
+        """Mean and variance of the code over light, and the inverse: a table of `points` levels of light."""
+        return estimation.response(self, exposure, points)
 
     def kernel_plan(self, exposure: float) -> Plan | None:
         """How a compiled kernel draws the codes of this sensor; None where only the reference draws them.

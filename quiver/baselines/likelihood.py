@@ -16,7 +16,6 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.sensor.sensor import Sensor
-from quiver.baselines.response_table import response_table
 from quiver.baselines.sliding_window import check_codes, check_window, in_units, window_frames
 
 CHUNK = 1 << 22  # entries of the histograms solved at a time
@@ -38,7 +37,7 @@ def restore(
     """
     check_codes(codes, sensor)
     check_window(window)
-    cap = response_table(sensor, exposure).cap(window)
+    cap = sensor.response(exposure).cap(window)
     names = outcome_names(sensor.levels, window)
     known, answers = np.empty(0, np.uint64), np.empty(0, np.float32)
     frames = range(len(codes)) if frames is None else frames

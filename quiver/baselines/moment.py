@@ -11,7 +11,6 @@ from __future__ import annotations
 from numpy import ndarray as Array
 
 from qsim.sensor.sensor import Sensor
-from quiver.baselines.response_table import response_table
 from quiver.baselines.sliding_window import restore_by_mean
 
 
@@ -28,7 +27,7 @@ def restore(
 
     Raises ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
     """
-    table = response_table(sensor, exposure)
+    table = sensor.response(exposure)
 
     def photons_of(mean_code: Array) -> Array:
         return table.invert(mean_code, window)

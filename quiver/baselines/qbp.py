@@ -28,9 +28,9 @@ import torch
 from numpy import ndarray as Array
 from torch import Tensor
 
+from qsim.sensor.estimation import Response
 from qsim.sensor.sensor import Sensor
 from quiver.baselines import bm3d, patch_alignment
-from quiver.baselines.response_table import ResponseTable, response_table
 from quiver.baselines.sliding_window import check_codes, check_window, in_units, window_frames
 from quiver.baselines.vst import stabiliser
 
@@ -75,7 +75,7 @@ def restore(
     """
     check_codes(codes, sensor)
     check_window(window)
-    table = response_table(sensor, exposure)
+    table = sensor.response(exposure)
     transform = None if excess is None else stabiliser(sensor, exposure, window)
     frames = range(len(codes)) if frames is None else frames
     restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
@@ -89,7 +89,7 @@ def restore(
     return in_units(restored, photons_per_unit)
 
 
-def merge(codes: Array, frame: int, table: ResponseTable, window: int, settings: Settings = CALIBRATED) -> Array:
+def merge(codes: Array, frame: int, table: Response, window: int, settings: Settings = CALIBRATED) -> Array:
     """The mean code [H, W], float32, of the window around one frame after alignment and Wiener merging."""
     check_window(window)
     if window % settings.block:
@@ -156,7 +156,7 @@ def _warp_block(frames: Tensor, shifts: Tensor, corner: Tensor, smooth: bool) ->
     return torch.where(count > 0, total / count.clamp(min=1), edge / len(frames))
 
 
-def _merge_patches(frames: Tensor, shifts: Tensor, table: ResponseTable, settings: Settings) -> Tensor:
+def _merge_patches(frames: Tensor, shifts: Tensor, table: Response, settings: Settings) -> Tensor:
     """Steps from aligned patches to the merged image: spectra, Wiener weights, overlap-add."""
     corner = patch_alignment.grid(frames.shape[2:], patch_alignment.LEVELS[0])[0]
     size, count = patch_alignment.LEVELS[0].patch, len(frames)
@@ -176,7 +176,7 @@ def _merge_patches(frames: Tensor, shifts: Tensor, table: ResponseTable, setting
     return overlap_add(patches, corner, frames.shape[2:]).clamp_(min=0)
 
 
-def _noise(reference: Tensor, table: ResponseTable, settings: Settings) -> Tensor:
+def _noise(reference: Tensor, table: Response, settings: Settings) -> Tensor:
     """Variance of a pixel of each reference patch [N], in units of the top code squared."""
     if settings.wiener_variance == "patch":
         return reference.flatten(0, 1).var(0).clamp(min=float(np.finfo(np.float32).eps))

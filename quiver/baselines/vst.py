@@ -20,8 +20,8 @@ from typing import Literal
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.sensor.estimation import pieces
 from qsim.sensor.sensor import Sensor
-from quiver.baselines.response_table import pieces, response_table
 
 Kind = Literal["table", "binomial", "poisson"]
 
@@ -75,7 +75,7 @@ def sum_pmf(pmf: Array, samples: int) -> Array:
 
 def stabiliser(sensor: Sensor, exposure: float, samples: int, kind: Kind = "table") -> Stabiliser:
     """Tables for the mean of `samples` codes of this sensor; ValueError for an unknown kind."""
-    table = response_table(sensor, exposure)
+    table = sensor.response(exposure)
     top = sensor.levels - 1
     mean_code = np.linspace(0, top, max(4096, samples * top + 1))
     match kind:

@@ -12,7 +12,6 @@ from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from quiver.baselines import METHODS, moment
-from quiver.baselines.response_table import response_table
 
 EXPOSURE = 5e-4
 DEAD_TIMES = (0.0, 35e-9, 1e-6, 1e-4, 4e-4, 2e-3)
@@ -108,7 +107,7 @@ def test_a_flat_field_keeps_its_light_where_codes_are_rare(name, bits, photons):
 )
 def test_tables_reach_the_light_of_every_sensor(sensor):
     """From darkness to the end of the rise, far above white or at the peak of a paralyzable pixel."""
-    table = response_table(sensor, EXPOSURE, points=64)
+    table = sensor.response(EXPOSURE, points=64)
     far = min(sensor.brightest(EXPOSURE), 30 * table.photons[-1])
     here, there = sensor.mean(np.array([table.photons[-1], far]), EXPOSURE)
     assert there - here < 1e-5 * (sensor.levels - 1)

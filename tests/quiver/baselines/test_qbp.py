@@ -12,7 +12,6 @@ from qsim.keys import Key
 from qsim.sensor.devices import quiver_physical
 from qsim.sensor.spad import BinarySPAD
 from quiver.baselines import METHODS, moment, patch_alignment, qbp
-from quiver.baselines.response_table import response_table
 
 EXPOSURE = 5e-4
 BALL = Path(__file__).parents[2] / "data" / "ball_12bit.npz"
@@ -150,9 +149,7 @@ def moving(photons, frames, speed, shape=(72, 88)):
 def test_merging_beats_both_one_frame_and_a_plain_mean_when_things_move(settings, gain):
     light, sensor = moving(3.25, 11, 2.0), quiver_physical(3.25)
     codes = sensor.sample(light, EXPOSURE, key=Key(7, 7), engine="reference")
-    merged = response_table(sensor, EXPOSURE).invert(
-        qbp.merge(codes, 5, response_table(sensor, EXPOSURE), 11, settings), 11
-    )
+    merged = sensor.response(EXPOSURE).invert(qbp.merge(codes, 5, sensor.response(EXPOSURE), 11, settings), 11)
     errors = [
         np.mean((restored - light[5]) ** 2)
         for restored in (
@@ -169,7 +166,7 @@ def test_a_scene_at_rest_is_nearly_averaged():
     sensor = quiver_physical(3.25)
     light = np.repeat(moving(3.25, 1, 0.0), 11, axis=0)
     codes = sensor.sample(light, EXPOSURE, key=Key(1, 9), engine="reference")
-    merged = qbp.merge(codes, 5, response_table(sensor, EXPOSURE), 11)
+    merged = qbp.merge(codes, 5, sensor.response(EXPOSURE), 11)
     truth = sensor.mean(light[5], EXPOSURE)
     ratio = np.std(merged - truth) / np.std(codes.mean(axis=0) - truth)
     assert 0.7 < ratio < 1.3
@@ -180,7 +177,7 @@ def test_the_other_frames_are_not_trusted_where_they_differ():
     sensor = quiver_physical(3.25)
     codes = np.full((3, 64, 64), 6, np.uint8)
     codes[1] = 1
-    merged = qbp.merge(codes, 1, response_table(sensor, EXPOSURE), 3, qbp.Settings(wiener=0.01))
+    merged = qbp.merge(codes, 1, sensor.response(EXPOSURE), 3, qbp.Settings(wiener=0.01))
     np.testing.assert_allclose(merged, 1, atol=0.01)
 
 
@@ -190,7 +187,7 @@ def test_one_bit_streams(block):
     frames = 11 * block
     light, sensor = moving(0.5, frames, 1.5 / block), BinarySPAD(0.4, 25.0, 1)
     codes = sensor.sample(light, EXPOSURE, key=Key(4, 4), engine="reference")
-    table, settings = response_table(sensor, EXPOSURE), qbp.Settings(block=block)
+    table, settings = sensor.response(EXPOSURE), qbp.Settings(block=block)
     restored = table.invert(qbp.merge(codes, frames // 2, table, frames, settings), frames)
     plain = moment.restore(codes, sensor, EXPOSURE, window=frames)[frames // 2]
     middle = light[frames // 2]

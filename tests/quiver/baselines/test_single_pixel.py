@@ -13,7 +13,6 @@ from qsim.sensor.devices import quiver_paper, quiver_physical
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from quiver.baselines import METHODS, likelihood, moment, naive_mean
-from quiver.baselines.response_table import response_table
 from quiver.baselines.sliding_window import look_ahead, reflect, window_frames, window_sums
 
 EXPOSURE = 5e-4
@@ -70,7 +69,7 @@ def test_a_flat_field_is_recovered_within_four_standard_errors(method, photons):
     middle = METHODS[method].restore(codes, sensor, EXPOSURE, window=2 * frames - 1)[0]
     information = float(sensor.fisher_information(np.array([photons]), EXPOSURE)[0])
     standard_error = 1 / np.sqrt(frames * middle.size * information)
-    cap = response_table(sensor, EXPOSURE).cap(2 * frames - 1)
+    cap = sensor.response(EXPOSURE).cap(2 * frames - 1)
     if photons < 0.6 * cap:
         assert abs(middle.mean() - photons) < 4 * standard_error
     else:
@@ -93,7 +92,7 @@ def test_the_light_a_gain_is_made_for_is_recovered(ppp):
 
 
 def test_caps_and_dark_level_worked_by_hand():
-    table = response_table(quiver_physical(3.25), EXPOSURE)
+    table = quiver_physical(3.25).response(EXPOSURE)
     np.testing.assert_allclose([table.cap(n) for n in (1, 3, 5, 11)], [10.326, 12.873, 13.969, 15.584], atol=6e-4)
     np.testing.assert_allclose(table.mean[0], 0.010941, atol=1e-6)
     np.testing.assert_allclose(table.invert(2.696241, 100), 3.25, rtol=1e-5)

@@ -6,6 +6,7 @@ from stats import assert_mean
 
 from qsim.keys import Key
 from qsim.sensor.devices import quiver_physical
+from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from quiver.baselines import moment, transform_denoise
 from quiver.baselines.vst import stabiliser, sum_pmf
@@ -85,3 +86,22 @@ def test_a_flat_field_denoises_to_its_light(photons):
 def test_stabilisers_have_names():
     with pytest.raises(ValueError, match="table, binomial or poisson, got 'anscombe'"):
         stabiliser(SENSOR, EXPOSURE, 3, "anscombe")
+
+
+def test_stabilised_counts_are_those_of_anscombe():
+    """For a Poisson counter f(code) = 2 sqrt(code) but for a constant: exact in the limit of a fine table."""
+    transform = stabiliser(QIS(1.0, 0.0, 0.0, 8), EXPOSURE, 1)
+    codes = np.array([1.0, 4.0, 25.0, 100.0])
+    np.testing.assert_allclose(np.diff(transform.forward(codes)), np.diff(2 * np.sqrt(codes)), rtol=2e-3)
+
+
+def test_stabilised_means_have_variance_one():
+    """Sums of 31 planes: the delta method leaves 3 / (8 mean) of the variance, 4 % at mean codes of 10 to 22."""
+    sensor = BinarySPAD(0.4, 0.0, 5)
+    transform = stabiliser(sensor, EXPOSURE, 1)
+    for light in (30.0, 60.0, 100.0):
+        pmf = sensor.pmf(light, EXPOSURE)
+        stabilised = transform.forward(np.arange(32))
+        mean = pmf @ stabilised
+        assert pmf @ (stabilised - mean) ** 2 == pytest.approx(1.0, abs=0.08)
+        assert transform.inverse(mean) == pytest.approx(light, rel=1e-3)
