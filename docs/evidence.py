@@ -20,6 +20,7 @@ from typing import Any
 
 import scenes
 from qsim.studies.validation import rendering as validate_render
+from qsim.tables import markdown_table
 
 HERE = Path(__file__).parent
 NUMBERS = HERE / "evidence.json"
@@ -260,8 +261,7 @@ def _number(value: float | None, style: str) -> str:
 
 
 def _table(header: list[str], rows: list[list[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return "\n".join(markdown_table(rows, header))
 
 
 def main(words: list[str]) -> int:

@@ -143,7 +143,7 @@ def _run_report(args: argparse.Namespace) -> int:
         raise ValueError(f"{target}: a page is a .html file, as in -o {target.stem}.html")
     refuse_existing(target, args.force)
     with bar("drawing", "thing") as progress:
-        page = report.build(args.path, title=args.title, notes=args.note, progress=progress).encode()
+        page = report.build_page(args.path, title=args.title, notes=args.note, progress=progress).encode()
     target.parent.mkdir(parents=True, exist_ok=True)
     files.write_bytes(target, page)
     found = {"page": str(target), "bytes": len(page)}

@@ -1,1 +1,13 @@
 """Results on disk as pages and previews. Nothing is computed here that is not in the files."""
+
+from typing import TYPE_CHECKING
+
+from qsim.files import lazy_names
+
+if TYPE_CHECKING:
+    from qsim.report.report import build_page
+    from qsim.report.views import open_source
+
+__all__ = ["build_page", "open_source"]
+
+__getattr__ = lazy_names(__name__, {"build_page": "report", "open_source": "views"})

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 INSIDE_CLIPS = {"streams", "truth", "radiance", "sharp", "jobs", "failed", "logs", "locks", "work"}
 
 
-def build(
+def build_page(
     path: Path, *, title: str | None = None, notes: list[str] | None = None, progress: Progress | None = None
 ) -> str:
     """The page for `path` as HTML text, with `notes` on top. `ValueError` if nothing under it is ours.

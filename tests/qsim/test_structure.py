@@ -191,8 +191,8 @@ def use_clip(folder: Path) -> None:
 
 
 def use_report(folder: Path) -> None:
-    report.build(folder / "clip")
-    report.build(folder / "video.json")
+    report.build_page(folder / "clip")
+    report.build_page(folder / "video.json")
 
 
 def use_rest(folder: Path) -> None:

@@ -326,7 +326,7 @@ def test_a_full_disk(folder, tmp_path, monkeypatch, capsys, line, target):
 def test_a_folder_that_is_not_ours(folder, monkeypatch, capsys):
     """A page that has no place to go is not drawn first."""
     monkeypatch.chdir(folder)
-    monkeypatch.setattr("qsim.report.report.build", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("qsim.report.report.build_page", lambda *_, **__: 1 / 0)
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != Path("empty"))
     said = told(capsys, "qsim report lit -o empty/deep/x.html")
     assert "nothing may be written into empty; name another with -o" in said

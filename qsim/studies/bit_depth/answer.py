@@ -115,15 +115,15 @@ def marked(found: Study, model: str) -> str:
     return f"{at_edge(found, model)} {found.best(model).bits}".strip()
 
 
-def widened(clip: Clip, settings: StudySettings, tell: Callable[[str], None] | None = None) -> Study:
+def widened(clip: Clip, settings: StudySettings, note: Callable[[str], None] | None = None) -> Study:
     """The study, with one more bit after the other while the deepest is best, up to 7 bits and the clip's length."""
     found = study(clip, settings)
     while any(at_edge(found, model) == ">=" for model in MODELS) and settings.bits[-1] < WIDEST:
         settings = replace(settings, bits=(*settings.bits, settings.bits[-1] + 1))
         if len(clip) < settings.longest:
             break
-        if tell is not None:
-            tell(f"the deepest tried is best: {settings.bits[-1]} bits are tried too")
+        if note is not None:
+            note(f"the deepest tried is best: {settings.bits[-1]} bits are tried too")
         found = study(clip, settings)
     return found
 

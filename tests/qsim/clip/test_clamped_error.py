@@ -126,7 +126,7 @@ def test_a_clip_of_an_earlier_version_is_named_in_its_own_unit(tmp_path):
     (clip.path / "clip.json").write_text(json.dumps(meta | {"psnr_of_truth": 38.25}))
     found = stated(Clip.open(clip.path).meta)
     assert found.line == "38.2 dB below the 99.9th percentile (a clip of an earlier version)"
-    assert found.line in report.build(clip.path)
+    assert found.line in report.build_page(clip.path)
     assert stated({"mean_radiance": 1.0}) is None
 
 

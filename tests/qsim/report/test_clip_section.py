@@ -82,7 +82,7 @@ def test_clip_section_says_light_motion_model_and_error(tmp_path):
     )  # fmt: skip
     assert main(["sense", str(clip.path), "--ppp", "3.25", "--bits", "3"]) == 0
     stream = clip.stream(clip.streams[0])
-    page = report.build(clip.path)
+    page = report.build_page(clip.path)
     assert f"{clip.mean_photons:.4g} photons per pixel and exposure as it is" in page
     assert f"3.25 photons per pixel (the clip&#39;s light × {stream.photons_factor:.4g}), as much as 1.313 lx" in page
     assert "2.6 e⁻ per pixel; 3 bit, QIS (multibit): quantum_efficiency 0.8 e-/photon" in page
@@ -95,7 +95,7 @@ def test_clip_section_says_light_motion_model_and_error(tmp_path):
 def test_motion_is_that_of_the_pixels_that_move(folder):
     """The square moves 1 px, all else stands; half of the pixels unknown changes nothing."""
     assert clip_section.motion(Clip.open(folder / "square"), range(5)) == (1.0, 1.0)
-    page = report.build(folder / "square")
+    page = report.build_page(folder / "square")
     assert (
         "what moves (more than 0.1 px/frame) moves 1 px/frame on average; 99.9 % of all pixels at most 1 px/frame"
         in page

@@ -14,7 +14,7 @@ from qsim.report import report
 
 
 def test_page_shows_everything_and_loads_nothing(folder):
-    page = report.build(folder, title="All", notes=["a note"])
+    page = report.build_page(folder, title="All", notes=["a note"])
     for words in ("Clip square", "Restored: video", "Training", "Methods compared", "20.00 ± 1.00", "a note", "RVRT"):
         assert words in page, words
     assert "&lt;moment&gt;" in page
@@ -26,7 +26,7 @@ def test_page_shows_everything_and_loads_nothing(folder):
 
 
 def test_one_clip_alone(folder):
-    assert report.build(folder / "square").count("<h2>") == 1
+    assert report.build_page(folder / "square").count("<h2>") == 1
 
 
 def test_command_writes_and_does_not_overwrite(folder, tmp_path, capsys):
@@ -53,7 +53,7 @@ def test_nothing_to_show_is_said(tmp_path, capsys, what):
 def test_a_data_set_is_a_table_and_a_clip_of_each_split(tmp_path):
     data = write_dataset(tmp_path / "tiny", {"train": 2, "val": 1, "test": 1})
     told: list[tuple[int, int]] = []
-    page = report.build(data, progress=lambda done, total: told.append((done, total)))
+    page = report.build_page(data, progress=lambda done, total: told.append((done, total)))
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert page.count('class="player"') == 3
     assert re.findall(r"<h2>(.*?)</h2>", page) == ["Data set tiny", "Clip test_0", "Clip train_0", "Clip val_0"]
@@ -114,7 +114,7 @@ def test_page_works_in_a_real_browser(folder, tmp_path, dark):
     import html
 
     page = tmp_path / "page.html"
-    page.write_text(report.build(folder).replace("<head>", "<head>" + DRIVE, 1))
+    page.write_text(report.build_page(folder).replace("<head>", "<head>" + DRIVE, 1))
     words = ["--window-size=500,900", "--dump-dom", page.as_uri()]
     dom = chromium(*(["--blink-settings=preferredColorScheme=0"] if dark else []), *words, profile=tmp_path / "p")
     found = json.loads(html.unescape(re.search(r"<title>(\{.*?)</title>", dom)[1]))
@@ -140,7 +140,7 @@ def test_a_screenshot_is_not_blank(folder, tmp_path):
     from PIL import Image
 
     page, picture = tmp_path / "page.html", tmp_path / "page.png"
-    page.write_text(report.build(folder))
+    page.write_text(report.build_page(folder))
     chromium(f"--screenshot={picture}", page.as_uri(), profile=tmp_path / "profile")
     pixels = np.asarray(Image.open(picture).convert("L"))
     assert (pixels < 60).mean() > 0.005

@@ -8,12 +8,12 @@ from qsim.studies.validation.reading import ReadingReport
 
 def test_an_evaluation_says_what_its_scores_mean(folder):
     """Before format 2 the peak was the sensor's white and the factor unclamped; a page never mixes the two."""
-    assert "peak = the sensor&#39;s white" in report.build(folder, title="All")
+    assert "peak = the sensor&#39;s white" in report.build_page(folder, title="All")
     path = folder / "evaluation.json"
     found = json.loads(path.read_text()) | {"peak": "2.5 x the stream's mean light", "remarks": ["<nano> was never"]}
     line = found["table"][0] | {"above_peak": 0.0961, "truth_psnr": 21.0, "near_truth": ["psnr_matched"]}
     path.write_text(json.dumps(found | {"table": [line]}))
-    page = report.build(folder, title="All")
+    page = report.build_page(folder, title="All")
     for words in ("behind the clamp", "9.6 %", "20.00 ± 1.00 †", "within 3 dB of the truth", "&lt;nano&gt; was never"):
         assert words in page, words
     assert "as they were defined before" not in page
@@ -38,7 +38,7 @@ def test_studies_costs_and_validations_have_their_sections(tmp_path):
         path = tmp_path / f"{name}.json"
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps(content))
-    page = report.build(tmp_path)
+    page = report.build_page(tmp_path)
     for words in ("Study: s", "Study: w", "Study: f", "Cost of a frame: b", "21.25", "CMOS 60 fps", "best bits"):
         assert words in page, words
     assert "sensors, 9 pixels a draw: something is OUTSIDE its bounds" in page

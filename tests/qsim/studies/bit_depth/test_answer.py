@@ -70,9 +70,9 @@ def test_an_optimum_at_the_edge_is_marked(clip):
 
 
 def test_the_range_is_widened_until_the_best_is_inside(clip):
-    told = []
-    found = answer.widened(clip, StudySettings(bits=(1, 2), ppp=0.65, instants=2), told.append)
-    assert len(told) == len(found.bits) - 2
+    notes = []
+    found = answer.widened(clip, StudySettings(bits=(1, 2), ppp=0.65, instants=2), notes.append)
+    assert len(notes) == len(found.bits) - 2
     edges = [answer.at_edge(found, model) for model in MODELS]
     assert ">=" not in edges or 2 ** (found.bits[-1] + 1) - 1 > len(clip) or found.bits[-1] == answer.WIDEST
     assert found.bits == tuple(range(1, found.bits[-1] + 1))
