@@ -1,0 +1,101 @@
+"""The wheel holds every room, and its commands work from an installation alone, outside the source tree."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SOURCES = ("qsim", "quiver", "scenes")
+PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
+
+
+def run(*command: str | Path, cwd: Path, **variables: str) -> str:
+    """The output of a command; a failure shows it."""
+    inherited = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONWARNINGS")}
+    found = subprocess.run(
+        command,
+        cwd=cwd,
+        env=inherited | variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stdout
+    return found.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of the source tree, built from a copy: building leaves files beside the sources."""
+    folder = tmp_path_factory.mktemp("build")
+    copy = folder / "copy"
+    copy.mkdir()
+    for name in SOURCES:
+        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, copy / name)
+    run(*PIP, "wheel", "--no-deps", "--no-build-isolation", "--no-index", "--wheel-dir", folder, copy, cwd=folder)
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that holds nothing but the installed wheel."""
+    target = tmp_path_factory.mktemp("installed")
+    run(*PIP, "install", "--no-deps", "--no-index", "--target", target, wheel, cwd=target)
+    return target
+
+
+def missing(wheel: Path, tree: Path) -> set[str]:
+    """Files of the packages in `tree` that the wheel lacks; the pages of a folder (README.md) stay behind."""
+    found = {p.relative_to(tree).as_posix() for name in SOURCES for p in (tree / name).rglob("*") if p.is_file()}
+    wanted = {name for name in found if "__pycache__" not in name and not name.endswith("README.md")}
+    with zipfile.ZipFile(wheel) as archive:
+        return wanted - set(archive.namelist())
+
+
+def test_the_wheel_holds_every_file_of_every_room(wheel: Path):
+    assert not missing(wheel, ROOT)
+
+
+def test_a_missing_room_would_be_noticed(wheel: Path, tmp_path: Path):
+    (tmp_path / "qsim" / "attic").mkdir(parents=True)
+    (tmp_path / "qsim" / "attic" / "__init__.py").touch()
+    assert missing(wheel, tmp_path) == {"qsim/attic/__init__.py"}
+
+
+def test_an_installation_renders_senses_and_restores(installed: Path, tmp_path: Path):
+    """Every file that these commands import must come from the installation, not from this tree."""
+
+    def command(program: str, *words: str) -> str:
+        code = (
+            "import sys, pathlib, qsim.cli, quiver.cli\n"
+            f"ended = {program}.cli.main({list(words)!r})\n"
+            "names = [n for n in sys.modules if n.split('.')[0] in ('qsim', 'quiver', 'scenes')]\n"
+            "files = [getattr(sys.modules[n], '__file__', None) for n in names]\n"
+            f"strange = [f for f in files if f and not f.startswith({str(installed)!r})]\n"
+            "sys.exit(ended or (str(strange) if strange else 0))"
+        )
+        return run(sys.executable, "-c", code, cwd=tmp_path, PYTHONPATH=str(installed))
+
+    assert "variant" in command("qsim", "doctor")
+    size = ("--height", "16", "--width", "24", "--frames", "11")
+    command("qsim", "render", "fan", "-o", "fan", *size, "--psnr", "20")
+    command("qsim", "sense", "fan", "--ppp", "3.25", "--bits", "3")
+    command("quiver", "restore", "fan", "-o", "fan.npy")
+    assert (tmp_path / "fan.npy").is_file()
+
+
+def test_the_commands_are_installed(installed: Path, tmp_path: Path):
+    for program in ("qsim", "quiver"):
+        said = run(sys.executable, installed / "bin" / program, "--version", cwd=tmp_path, PYTHONPATH=str(installed))
+        assert said.startswith(f"{program} ")
