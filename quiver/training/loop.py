@@ -183,34 +183,85 @@ class Board:
         self.writer.close()
 
 
-def record(run: Run, model: nn.Module, state: State, score: metrics.Score, loss: float, rate: float) -> None:
-    """Put a validation into the state and its files; keep the weights if they are the best so far."""
-    entry = {"step": state.step, "elapsed": state.elapsed, "loss": loss, "learning_rate": rate} | score.to_dict()
-    state.history.append(entry)
-    note_plateau(run.settings.patience, state, score.psnr_matched)
-    if score.psnr_matched > state.best:
-        state.best = score.psnr_matched
-        run.save_weights("best", model, state)
-    run.save_history(state)
+class Trainer:
+    """A model in training: steps, validations when they are due, and checkpoints."""
 
+    def __init__(self, model: nn.Module, run: Run, fixed: Subset[dict[str, Any]], process: Process) -> None:
+        settings = run.settings
+        self.model, self.run, self.fixed, self.process = model.to(process.device).train(), run, fixed, process
+        self.optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)
+        self.state = run.load(model, self.optimiser, process.device)
+        self.parallel = (
+            nn.parallel.DistributedDataParallel(model, find_unused_parameters=True) if process.world > 1 else model
+        )
+        self.has_estimate = getattr(model, "estimate", None) is not None
+        self.low = settings.precision == "bfloat16" or (settings.precision == "auto" and process.device.type == "cuda")
+        self.board: Board | None = None
+        self.started, self.saved = time.monotonic() - self.state.elapsed, time.monotonic()
+        self.loss, self.rate = math.nan, math.nan  # of the last step
+        self.validation = 0.0  # s, that the last one took
 
-def fail(
-    run: Run,
-    model: nn.Module,
-    optimiser: Optimiser,
-    state: State,
-    batch: dict[str, Any],
-    loss: float,
-    norm: float,
-    rank: int,
-) -> NoReturn:
-    """Save the state before the bad step and stop, naming the samples."""
-    path = run.folder / ("failed.pt" if rank == 0 else f"failed-{rank}.pt")
-    run.save(path, model, optimiser, state, samples=batch["sample"].tolist(), keys=list(batch["key"]))
-    raise Diverged(
-        f"step {state.step}: loss {loss:g}, gradient norm {norm:g}; samples {batch['sample'].tolist()} "
-        f"({batch['key'][0]}; ...); state before the step: {path}; lower the learning rate and start anew with --force"
-    )
+    def step(self, batch: dict[str, Any]) -> None:
+        """Change the weights by one batch; `Diverged` if its loss or gradient is not finite."""
+        settings, state, device = self.run.settings, self.state, self.process.device
+        self.rate = learning_rate(settings, state)
+        alone = self.has_estimate and share_used(settings, state) < settings.head_start
+        with torch.autocast(device.type, torch.bfloat16, enabled=self.low):
+            output = self.parallel(batch["codes"].to(device), **({"estimate_only": True} if alone else {}))
+        loss = training_loss(output, batch["target"].to(device), LOSSES[settings.loss], first=RADIUS)
+        self.model.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_norm).item()
+        self.loss = loss.item()
+        if self.process.any(not math.isfinite(self.loss + norm)):
+            self._fail(batch, norm)
+        self.optimiser.step(self.rate)
+        state.step, state.elapsed = state.step + 1, time.monotonic() - self.started
+        if self.board is not None:
+            self.board.step(state, self.loss, norm, self.rate)
+
+    def _fail(self, batch: dict[str, Any], norm: float) -> NoReturn:
+        """Save the state before the bad step and stop, naming the samples."""
+        rank, samples = self.process.rank, batch["sample"].tolist()
+        path = self.run.folder / ("failed.pt" if rank == 0 else f"failed-{rank}.pt")
+        self.run.save(path, self.model, self.optimiser, self.state, samples=samples, keys=list(batch["key"]))
+        raise Diverged(
+            f"step {self.state.step}: loss {self.loss:g}, gradient norm {norm:g}; samples {samples} "
+            f"({batch['key'][0]}; ...); state before the step: {path}; lower the learning rate and start again with "
+            "--force"
+        )
+
+    def validate_if_due(self) -> None:
+        """Find out whether the run ends here; validate then, and whenever a validation is due."""
+        settings, state = self.run.settings, self.state
+        out_of_time = self.process.any(time_is_up(settings, state, self.validation))
+        state.finished = state.step == settings.steps or out_of_time
+        if not self.process.any(validation_due(settings, state)) and not state.finished:
+            return
+        began = time.monotonic()
+        if self.board is not None:
+            score, picture = validate(self.model, self.fixed, self.process.device)
+            self.board.validation(state, score, picture)
+            self._record(score)
+        state.halvings = self.process.from_leader(state.halvings)
+        self.validation = time.monotonic() - began
+
+    def _record(self, score: metrics.Score) -> None:
+        """Put a validation into the state and its files; keep the weights if they are the best so far."""
+        state = self.state
+        entry = {"step": state.step, "elapsed": state.elapsed, "loss": self.loss, "learning_rate": self.rate}
+        state.history.append(entry | score.to_dict())
+        note_plateau(self.run.settings.patience, state, score.psnr_matched)
+        if score.psnr_matched > state.best:
+            state.best = score.psnr_matched
+            self.run.save_weights("best", self.model, state)
+        self.run.save_history(state)
+
+    def save(self, *, now: bool) -> None:
+        """Write the checkpoint now, or if the last one is old."""
+        if self.process.leads and (now or time.monotonic() - self.saved > CHECKPOINT_SECONDS):
+            self.run.save(self.run.checkpoint, self.model, self.optimiser, self.state)
+            self.saved = time.monotonic()
 
 
 def train(
@@ -223,7 +274,7 @@ def train(
     force: bool = False,
     note: Callable[[str], None] = lambda line: None,
 ) -> State:
-    """Train `model` in place until the end that the settings name, or until `should_stop`; returns the state reached.
+    """Train `model` in place until the end that the settings name, or until `should_stop`; return the state reached.
 
     Resumes the run in `settings.out` if there is one; `force` begins it again. `note` gets a line or two on the noise
     that windows are drawn with. Raises ValueError and OSError for settings and folders that do not fit, `Diverged` for
@@ -239,56 +290,20 @@ def train(
         if process.leads:
             stack.enter_context(run.open(force=force))
         process.wait()
-        model.to(process.device).train()
-        optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)
-        state = run.load(model, optimiser, process.device)
-        for line in lines if process.leads else ():
-            note(line)
-        parallel = (
-            nn.parallel.DistributedDataParallel(model, find_unused_parameters=True) if process.world > 1 else model
-        )
-        has_estimate = getattr(model, "estimate", None) is not None
-        board = Board(run.folder, settings, state, progress) if process.leads else None
-        if board is not None:
-            stack.callback(board.close)
-        low = settings.precision == "bfloat16" or (settings.precision == "auto" and process.device.type == "cuda")
-        started, saved = time.monotonic() - state.elapsed, time.monotonic()
-        validation = 0.0  # s, that the last one took
-
-        for batch in batches(windows, settings, state, process):
-            # Forward, backward, step
-            rate = learning_rate(settings, state)
-            alone = has_estimate and share_used(settings, state) < settings.head_start
-            with torch.autocast(process.device.type, torch.bfloat16, enabled=low):
-                output = parallel(batch["codes"].to(process.device), **({"estimate_only": True} if alone else {}))
-            loss = training_loss(output, batch["target"].to(process.device), LOSSES[settings.loss], first=RADIUS)
-            model.zero_grad(set_to_none=True)
-            loss.backward()
-            norm, value = nn.utils.clip_grad_norm_(model.parameters(), settings.clip_norm).item(), loss.item()
-            if process.any(not math.isfinite(value + norm)):
-                fail(run, model, optimiser, state, batch, value, norm, process.rank)
-            optimiser.step(rate)
-            state.step, state.elapsed = state.step + 1, time.monotonic() - started
-            if board is not None:
-                board.step(state, value, norm, rate)
-
-            # Now and then: validation, files, the end
+        trainer = Trainer(model, run, fixed, process)
+        if process.leads:
+            for line in lines:
+                note(line)
+            trainer.board = Board(run.folder, settings, trainer.state, progress)
+            stack.callback(trainer.board.close)
+        for batch in batches(windows, settings, trainer.state, process):
+            trainer.step(batch)
             interrupted = process.any(should_stop())
-            out_of_time = process.any(time_is_up(settings, state, validation))
-            ended = state.finished = state.step == settings.steps or out_of_time
-            if process.any(validation_due(settings, state)) or ended:
-                began = time.monotonic()
-                if board is not None:
-                    score, picture = validate(model, fixed, process.device)
-                    board.validation(state, score, picture)
-                    record(run, model, state, score, value, rate)
-                state.halvings = process.from_leader(state.halvings)
-                validation = time.monotonic() - began
-            if process.leads and (ended or interrupted or time.monotonic() - saved > CHECKPOINT_SECONDS):
-                run.save(run.checkpoint, model, optimiser, state)
-                saved = time.monotonic()
-            if ended or interrupted:
+            trainer.validate_if_due()
+            ended = trainer.state.finished or interrupted
+            trainer.save(now=ended)
+            if ended:
                 break
         if process.leads:
-            run.save_weights("last", model, state)
-        return state
+            run.save_weights("last", model, trainer.state)
+        return trainer.state
