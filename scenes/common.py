@@ -23,7 +23,6 @@ from qsim.scene import (
 )
 from qsim.scene.rotation import UP, exponential, pose_matrix, unit, vector
 from qsim.scene.shapes import moved, sheet
-from qsim.scene.textures import Picture
 
 HEIGHT, WIDTH = 512, 1024  # pixels; other sizes by Scene.resized, which keeps the height of the view
 FRAME_RATE = 2000.0  # Hz, for which speed = 1 is meant
@@ -74,23 +73,23 @@ def direction(rng: np.random.Generator) -> tuple[float, float, float]:
     return vector(unit(rng.standard_normal(3)))
 
 
-def surface(rng: np.random.Generator, low: float = 0.05, high: float = 0.85) -> Picture:
+def surface(rng: np.random.Generator, low: float = 0.05, high: float = 0.85) -> Texture:
     """A texture for a thing: one of many kinds, its range stretched to `low` .. `high`."""
     kind = int(rng.integers(8))
     if kind == 0:
-        return textures.checker(2 * int(rng.integers(2, 6)), 2 * int(rng.integers(2, 6)), low, high)
+        return Texture(textures.checker(2 * int(rng.integers(2, 6)), 2 * int(rng.integers(2, 6)), low, high))
     if kind == 1:
-        return textures.stripes(int(rng.integers(6, 20)), low, high)
+        return Texture(textures.stripes(int(rng.integers(6, 20)), low, high))
     if kind == 2:
-        return textures.dots(int(rng.integers(5, 14)), low, high)
+        return Texture(textures.dots(int(rng.integers(5, 14)), low, high))
     if kind == 3:
-        return textures.levels(textures.speckles(rng, 900), low, high)
+        return Texture(textures.levels(textures.speckles(rng, 900), low, high))
     if kind == 4:
-        return textures.levels(textures.rings(rng), low, high)
+        return Texture(textures.levels(textures.rings(rng), low, high))
     if kind == 5:
-        return textures.levels(textures.cells(rng, 60), low, high)
+        return Texture(textures.levels(textures.cells(rng, 60), low, high))
     if kind == 6:
-        return textures.levels(textures.noise(rng, slope=rng.uniform(0.7, 1.3)), low, high, contrast=2.0)
+        return Texture(textures.levels(textures.noise(rng, slope=rng.uniform(0.7, 1.3)), low, high, contrast=2.0))
     return textures.photograph(
         pick(rng, ("cat", "coffee", "astronaut", "rocket", "coins", "moon", "camera")), low, high
     )
@@ -107,7 +106,7 @@ def backdrop(rng: np.random.Generator, low: float = 0.08, high: float = 0.75) ->
         return Texture(textures.levels(textures.speckles(rng, 2500, 768), low, high), repeat=(2.0, 1.0))
     if kind == 3:
         return Texture(textures.levels(textures.noise(rng, (1024, 1024), 1.1), low, high, 1.5), repeat=(2.0, 1.0))
-    return Texture(textures.photograph(("brick", "gravel", "grass")[kind - 4], low, high), repeat=(2.0, 1.0))
+    return textures.photograph(("brick", "gravel", "grass")[kind - 4], low, high, repeat=(2.0, 1.0))
 
 
 def wall(material: Material, width: float = 6.0, height: float = 3.0, z: float = 0.0, y: float = 0.0) -> Body:
@@ -120,9 +119,8 @@ def floor(material: Material, size: float = 6.0, y: float = 0.0, z: float = 0.0)
     return Body("floor", moved(sheet(size, size), pose_matrix(exponential((-np.pi / 2, 0, 0)), (0.0, y, z))), material)
 
 
-def paint(rng: np.random.Generator, picture: Picture, repeat: tuple[float, float] = (1.0, 1.0)) -> Material:
-    """Matt or slightly glossy, by chance."""
-    texture = Texture(picture, repeat)
+def paint(rng: np.random.Generator, texture: Texture) -> Material:
+    """Return a matt or slightly glossy material, by chance."""
     return Diffuse(texture) if rng.random() < 0.5 else RoughPlastic(texture, roughness=between(rng, 0.15, 0.4))
 
 

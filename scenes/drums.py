@@ -36,7 +36,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         place = Still((float(x), between(rng, -0.03, 0.03), between(rng, -0.06, 0.06)), vector(rng.normal(0, 0.35, 3)))
         rate = speed * between(rng, 38, 70) * sign(rng)
         repeat = (float(rng.integers(1, 3)), float(rng.integers(1, 3)))
-        bodies.append(Body(f"drum {i}", solid, common.paint(rng, pattern(rng), repeat), place @ Spin((0, 1, 0), rate)))
+        coat = common.paint(rng, Texture(pattern(rng), repeat))
+        bodies.append(Body(f"drum {i}", solid, coat, place @ Spin((0, 1, 0), rate)))
     view = common.camera((between(rng, -0.1, 0.1), between(rng, 0.0, 0.15), 0.7), (0, 0, 0), 0.5)
     return Scene("drums", seed, view, (common.studio(rng), common.lamp(rng, (0, 0, 0), 0.9, 1.5)), tuple(bodies), speed)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene import Body, Conductor, Constant, Diffuse, Mesh, RoughPlastic, Scene, Spin, Still, Texture
+from qsim.scene import Body, Conductor, Constant, Diffuse, Mesh, RoughPlastic, Scene, Spin, Still
 from qsim.scene.props import rotor
 from qsim.scene.rotation import exponential, pose_matrix
 from qsim.scene.shapes import ball, cylinder, merged, moved, wire
@@ -33,7 +33,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     bodies = [
         common.wall(Diffuse(common.backdrop(rng, 0.06, 0.45)), 4.4, 2.2, z=-0.25),
         Body("blades", blades, common.paint(rng, common.surface(rng, 0.15, 0.9)), spin),
-        Body("hub", hub, RoughPlastic(Texture(common.surface(rng, 0.1, 0.6)), 0.2), spin),
+        Body("hub", hub, RoughPlastic(common.surface(rng, 0.1, 0.6), 0.2), spin),
         Body("motor", moved(cylinder(0.24 * radius, 0.2, 40), behind), Conductor(roughness=0.35), place),
     ]
     if rng.random() < 0.5:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene import Body, Conductor, Diffuse, Flag, Motion, Oscillation, Ripple, Scene, Still, Texture
+from qsim.scene import Body, Conductor, Diffuse, Flag, Motion, Oscillation, Ripple, Scene, Still
 from qsim.scene.rotation import pose_matrix
 from qsim.scene.shapes import cylinder, moved, sheet
 from scenes import common
@@ -29,7 +29,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         )
         cloth = moved(sheet(width, height, 64, 32), pose_matrix(None, (width / 2, 0, 0)))
         flag = Flag(cloth.vertices, ripples(rng, width, speed), pole)
-        bodies.append(Body(f"flag {i}", cloth, Diffuse(Texture(common.surface(rng, 0.1, 0.9))), flag))
+        bodies.append(Body(f"flag {i}", cloth, Diffuse(common.surface(rng, 0.1, 0.9)), flag))
         bodies.append(Body(f"pole {i}", cylinder(0.005, 0.8, 24), Conductor(roughness=0.3), pole))
     view = common.camera((between(rng, -0.08, 0.08), between(rng, -0.05, 0.12), 0.65), (0, 0, 0), 0.5)
     return Scene("flag", seed, view, (common.sun(rng, 0.5, 0.9),), tuple(bodies), speed)

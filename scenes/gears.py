@@ -57,4 +57,4 @@ def finish(rng: np.random.Generator) -> Material:
         return Conductor(roughness=between(rng, 0.2, 0.4))
     if kind == 1:
         return Conductor(0.42, 2.35, between(rng, 0.25, 0.4))
-    return RoughPlastic(Texture(common.surface(rng, 0.1, 0.8)), 0.25)
+    return RoughPlastic(common.surface(rng, 0.1, 0.8), 0.25)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene import Body, Conductor, Material, Mesh, RoughPlastic, Scene, Spin, Texture, Translation
+from qsim.scene import Body, Conductor, Material, Mesh, RoughPlastic, Scene, Spin, Translation
 from qsim.scene.props import gear
 from qsim.scene.rotation import exponential, pose_matrix
 from qsim.scene.shapes import ball, blob, box, cylinder, moved, polyhedron, torus
@@ -57,4 +57,4 @@ def finish(rng: np.random.Generator) -> Material:
     if rng.random() < 0.5:
         eta, k = pick(rng, ((0.96, 6.70), (3.12, 3.31), (0.42, 2.35), (1.04, 2.59)))
         return Conductor(eta, k, between(rng, 0.04, 0.2))
-    return RoughPlastic(Texture(common.surface(rng, 0.03, 0.8)), between(rng, 0.04, 0.12))
+    return RoughPlastic(common.surface(rng, 0.03, 0.8), between(rng, 0.04, 0.12))

@@ -17,7 +17,6 @@ from qsim.scene import (
     Scene,
     Spin,
     Still,
-    Texture,
     Translation,
 )
 from qsim.scene.rotation import vector
@@ -66,4 +65,4 @@ def finish(rng: np.random.Generator) -> Material:
     """Paint mostly, some metal."""
     if rng.random() < 0.2:
         return Conductor(roughness=between(rng, 0.2, 0.35))
-    return RoughPlastic(Texture(common.surface(rng, 0.08, 0.85)), between(rng, 0.2, 0.4))
+    return RoughPlastic(common.surface(rng, 0.08, 0.85), between(rng, 0.2, 0.4))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from qsim.scene import Body, Constant, Diffuse, Motion, Scene, Shake, Spin, Texture, Translation, Wave
+from qsim.scene import Body, Constant, Diffuse, Motion, Scene, Shake, Spin, Translation, Wave, textures
 from qsim.scene.rotation import exponential, pose_matrix, vector
 from qsim.scene.shapes import ball, box, cylinder, moved, sheet
 from scenes import common
@@ -75,6 +75,6 @@ def furniture(rng: np.random.Generator) -> list[Body]:
         bodies.append(Body(f"piece {i}", moved(solid, at), common.paint(rng, common.surface(rng))))
     for i, x in enumerate((-1.2, 0.0, 1.2)):
         frame = moved(box(0.7, 0.7, 0.03, 0.7), pose_matrix(None, (x, between(rng, 1.2, 1.6), -DEPTH / 2 + 0.03)))
-        picture = Texture(common.textures.photograph(pick(rng, common.PHOTOGRAPHS)))
+        picture = textures.photograph(pick(rng, common.PHOTOGRAPHS))
         bodies.append(Body(f"picture {i}", frame, Diffuse(picture)))
     return bodies

@@ -55,9 +55,8 @@ def assets(described: Any) -> list[str]:
 
 
 def photographs(scene: Any) -> list[str]:
-    """`photograph NAME` for every photograph of textures.py in a scene: in whatever range, it is the same."""
+    """Return `photograph NAME` for every texture of a scene that states its source, whatever its range."""
     from qsim.scene import Texture
-    from qsim.scene.textures import photograph_in
 
-    pictures = [item.pixels() for item in nested(scene) if isinstance(item, Texture)]
-    return sorted({f"photograph {name}" for name in map(photograph_in, pictures) if name is not None})
+    sources = {item.source for item in nested(scene) if isinstance(item, Texture)}
+    return sorted(f"photograph {name}" for name in sources if name is not None)

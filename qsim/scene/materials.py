@@ -19,6 +19,7 @@ class Texture:
     image: np.ndarray | str  # float [H, W] linear, or a path; a path's colours become linear luminance (Rec. 709)
     repeat: tuple[float, float] = (1.0, 1.0)  # how often the picture fits into u, v = 0..1
     nearest: bool = False  # nearest texel instead of bilinear
+    source: str | None = None  # the photograph that the picture shows, in whatever range; recorded with a clip
 
     def pixels(self) -> np.ndarray:
         """Linear values, float32 [H, W]; raises FileNotFoundError or ValueError naming the file."""

@@ -7,7 +7,6 @@ is ever downloaded.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -32,7 +31,6 @@ PHOTOGRAPHS = {  # name -> file in the scikit-image wheel; all are CC0 or public
     "page": "page.png",
     "rocket": "rocket.jpg",
 }
-GRID, ALIKE = 24, 0.7  # blocks per side; their correlation: over 0.87 in one photograph, under 0.25 between two
 PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"})
 
 
@@ -48,42 +46,17 @@ def levels(picture: NDArray[np.floating], low: float = 0.1, high: float = 0.8, c
     return (low + (high - low) * scaled).astype(np.float32)
 
 
-def photograph(name: str, low: float = 0.03, high: float = 0.85) -> Picture:
-    """One of `PHOTOGRAPHS` as linear luminance, stretched to `low` .. `high`; `ValueError` for other names."""
+def photograph(name: str, low: float = 0.03, high: float = 0.85, repeat: tuple[float, float] = (1.0, 1.0)) -> Texture:
+    """Return one of `PHOTOGRAPHS` as linear luminance, stretched to `low` .. `high`; `ValueError` for other names.
+
+    The texture names its source, so that a data set finds the same photograph in two splits.
+    """
     if name not in PHOTOGRAPHS:
         raise ValueError(f"photograph {name!r} is not one of {', '.join(sorted(PHOTOGRAPHS))}")
     import skimage
 
-    return levels(Texture(str(Path(skimage.__file__).parent / "data" / PHOTOGRAPHS[name])).pixels(), low, high)
-
-
-def photograph_in(picture: NDArray[np.floating]) -> str | None:
-    """The photograph that a picture was made of by `levels`, whatever its range; None if of none.
-
-    By looks, so that no caller has to say it: the means of GRID x GRID blocks correlate.
-    """
-    if min(picture.shape) < GRID:
-        return None
-    shape, looks = _looks(picture)
-    for name in PHOTOGRAPHS:
-        known_shape, known = _photograph_looks(name)
-        if shape == known_shape and float((looks * known).sum()) > ALIKE:
-            return name
-    return None
-
-
-@functools.cache
-def _photograph_looks(name: str) -> tuple[tuple[int, ...], NDArray[np.float64]]:
-    return _looks(photograph(name))
-
-
-def _looks(picture: NDArray[np.floating]) -> tuple[tuple[int, ...], NDArray[np.float64]]:
-    """Shape, and block means of mean 0 and length 1 (all 0 where nothing is to be seen)."""
-    rows, columns = (side // GRID for side in picture.shape)
-    blocks = np.asarray(picture[: rows * GRID, : columns * GRID], np.float64).reshape(GRID, rows, GRID, columns)
-    means = blocks.mean((1, 3))
-    means -= means.mean()
-    return picture.shape, means / max(float(np.linalg.norm(means)), 1e-12)
+    pixels = Texture(str(Path(skimage.__file__).parent / "data" / PHOTOGRAPHS[name])).pixels()
+    return Texture(levels(pixels, low, high), repeat, source=name)
 
 
 def pictures_in(folder: str | Path) -> list[Path]:

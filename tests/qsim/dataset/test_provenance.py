@@ -3,7 +3,7 @@
 import small_scenes
 
 from qsim.dataset import provenance
-from qsim.scene import Body, Diffuse, Texture, textures
+from qsim.scene import Body, Diffuse, textures
 
 
 def test_assets_of_a_scene():
@@ -17,7 +17,7 @@ def test_a_photograph_in_another_range_is_the_same_photograph():
     """One picture stretched two ways has two checksums: splits that share it must still be told."""
     made = []
     for high in (0.45, 0.7):
-        material = Diffuse(Texture(textures.photograph("gravel", 0.15, high)))
+        material = Diffuse(textures.photograph("gravel", 0.15, high))
         made.append(small_scenes.scene(Body("plate", small_scenes.square(), material)))
     first, second = (set(provenance.assets(scene.to_dict())) for scene in made)
     assert first
