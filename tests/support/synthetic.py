@@ -13,6 +13,19 @@ from qsim.calibration.spad import calibrate_spad
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.spad import BinarySPAD
 
+PLANE = (12, 14)  # height and width of `draw_planes`
+
+
+def draw_planes(rng: np.random.Generator, planes: int, rate: float, prnu: float = 0.0) -> np.ndarray:
+    """Planes [T, 12, 14] of a SPAD array with a spread of dark counts."""
+    arrivals = rate * np.maximum(1 + prnu * rng.standard_normal(PLANE), 0) * rng.lognormal(0, 0.3, PLANE)
+    return rng.random((planes, *PLANE)) < -np.expm1(-arrivals)
+
+
+def statistics_of(codes: np.ndarray, bits: int = 3, photons: float | None = 0.0) -> FrameStatistics:
+    """Statistics of frames of 1 ms."""
+    return measure([codes], bits=bits, exposure=1e-3, photons=photons)
+
 
 @dataclass(frozen=True)
 class QISCase:

@@ -1,83 +1,14 @@
-"""Sums of binary planes: the same answer as from the planes, and no other reading of them without a word."""
+"""`qsim calibrate`: sums of planes from every kind of file, and options that cannot act."""
 
 import json
 
 import numpy as np
 import pytest
+from synthetic import PLANE, draw_planes
 
-from qsim.calibration.frame_statistics import measure, measure_sums
-from qsim.calibration.spad import calibrate_spad
 from qsim.cli.program import main
-from qsim.formats import importing
-from qsim.formats.mat_files import mat_array
-from qsim.formats.recording import Hints
 
-H, W = 12, 14
-
-
-def draw(rng: np.random.Generator, planes: int, rate: float, prnu: float = 0.0) -> np.ndarray:
-    """Planes [T, H, W] of a SPAD array with a spread of dark counts."""
-    arrivals = rate * np.maximum(1 + prnu * rng.standard_normal((H, W)), 0) * rng.lognormal(0, 0.3, (H, W))
-    return rng.random((planes, H, W)) < -np.expm1(-arrivals)
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_sums_are_calibrated_exactly_as_their_planes(seed):
-    """Random numbers of planes, sums, light and dark: every value, interval and map is equal to the last bit.
-
-    Afterpulsing alone needs the order of the planes, which sums do not keep.
-    """
-    rng = np.random.default_rng(seed)
-    planes = int(rng.integers(1, 40))
-    stacks = []
-    for rate, photons in ((0.01, 0.0), (float(rng.uniform(0.05, 3)), 0.8), (float(rng.uniform(0.05, 3)), 1.6)):
-        frames = int(rng.integers(2, 9))
-        bits = draw(rng, frames * planes, rate, 0.1)
-        exposure = 1e-5
-        sums = bits.reshape(frames, planes, H, W).sum(axis=1)
-        kind = rng.choice([np.uint16, np.float64, np.int64])
-        one = measure([bits], bits=1, exposure=exposure, photons=photons)
-        stacks.append((one, measure_sums([sums[:1].astype(kind), sums[1:].astype(kind)], planes=planes,
-                                         exposure=exposure, photons=photons)))  # fmt: skip
-    for one, many in stacks:
-        assert np.array_equal(one.total, many.total)
-        assert np.array_equal(one.square, many.square)
-        assert np.array_equal(one.histogram, many.histogram)
-        assert one.frames == many.frames
-    found = [calibrate_spad([pair[i] for pair in stacks[:1]], [pair[i] for pair in stacks[1:]], bits=1) for i in (0, 1)]
-    kept = {name: value for name, value in found[0].values.items() if name != "afterpulsing"}
-    assert found[1].values == kept
-    assert np.array_equal(found[0].maps["dark_count_rate"], found[1].maps["dark_count_rate"])
-    assert any("afterpulsing is not measured" in words for words in found[1].warnings)
-
-
-def test_one_frame_of_sums_is_enough():
-    ones = np.random.default_rng(0).binomial(4096, 0.3, (H, W))
-    one = measure_sums([ones], planes=4096, exposure=1e-5, photons=None)
-    assert np.array_equal(one.total, ones)
-    assert one.frames == 4096
-    assert one.histogram.tolist() == [4096 * ones.size - ones.sum(), ones.sum()]
-
-
-def test_another_number_of_planes_is_noticed():
-    """4096 planes at 30 %: taken as 8192 the binomial would be 0.70 / 0.85 of what it is."""
-    sums = np.random.default_rng(1).binomial(4096, 0.3, (30, H, W))
-    right, wrong = (measure_sums([sums], planes=n, exposure=1e-5, photons=None) for n in (4096, 8192))
-    sigma = np.sqrt(2 / (29 * H * W))
-    assert abs(right.dispersion - 1) < 5 * sigma
-    assert abs(wrong.dispersion - 0.7 / 0.85) < 5 * sigma
-    assert not any("scatter" in words for words in calibrate_spad([], [right], bits=1).warnings)
-    assert any("scatter 0.8" in words for words in calibrate_spad([], [wrong], bits=1).warnings)
-
-
-def test_values_above_the_planes_name_their_place():
-    with pytest.raises(ValueError, match=r"5 at \(t, y, x\) = \(1, 0, 0\) is no sum of 4 planes, 0..4"):
-        measure_sums([np.zeros((1, H, W), int), np.full((1, H, W), 5)], planes=4, exposure=1e-5, photons=None)
-    with pytest.raises(ValueError, match="sums of N binary planes are calibrated with --planes N"):
-        measure([np.full((1, H, W), 19)], bits=1, exposure=1e-5, photons=None)
-
-
-# The command
+H, W = PLANE
 
 
 @pytest.fixture
@@ -87,7 +18,7 @@ def folder(tmp_path, monkeypatch):
 
     rng = np.random.default_rng(3)
     monkeypatch.chdir(tmp_path)
-    dark, flat = draw(rng, 300, 0.01), draw(rng, 300, 0.5, 0.1)
+    dark, flat = draw_planes(rng, 300, 0.01), draw_planes(rng, 300, 0.5, 0.1)
     for name, planes in (("dark", dark), ("flat", flat)):
         np.save(f"{name}_planes.npy", planes.astype(np.uint8))
         sums = planes.reshape(6, 50, H, W).sum(axis=1)
@@ -170,45 +101,6 @@ def test_each_option_changes_the_answer(folder, capsys):
     assert calibrated(capsys, f"--planes 50 {pair} -o e.toml") != plain
     both = [calibrated(capsys, f"--planes 50 --variable {name} --dark two.mat 1e-5 -o of_{name}.toml") for name in "ab"]
     assert both[0] != both[1]
-
-
-# Arrays of .mat files
-
-
-@pytest.mark.parametrize("level", ["5", "7.3"])
-def test_the_only_array_of_a_mat_is_taken(tmp_path, level):
-    codes = np.random.default_rng(0).integers(0, 9, (4, 5, 7)).astype(np.uint16)
-    path = tmp_path / "a.mat"
-    if level == "5":
-        from scipy.io import savemat
-
-        savemat(path, {"counts": codes.transpose(1, 2, 0), "gate": 3.0})
-    else:
-        h5py = pytest.importorskip("h5py")
-        with h5py.File(path, "w", userblock_size=512) as file:
-            file["counts"] = codes.transpose(0, 2, 1)
-            file["gate"] = np.ones((1, 1))
-    assert np.array_equal(mat_array(path), codes)
-    assert np.array_equal(mat_array(path, "counts"), codes)
-    recording = importing.read(path, Hints(bits=4))
-    assert np.array_equal(recording.read(0, 4), codes)
-    with pytest.raises(ValueError, match="has no array OUTPUT; it holds"):
-        mat_array(path, "OUTPUT")
-
-
-def test_a_name_of_an_array_is_refused_elsewhere(tmp_path):
-    np.save(tmp_path / "a.npy", np.zeros((2, 3, 4), bool))
-    with pytest.raises(ValueError, match="--variable changes nothing for codes; leave it out"):
-        importing.read(tmp_path / "a.npy", Hints(variable="x"))
-
-
-def test_values_that_are_no_counts_are_refused(tmp_path):
-    from scipy.io import savemat
-
-    for name, value in (("half", 0.5), ("negative", -1.0), ("nothing", np.nan)):
-        savemat(tmp_path / f"{name}.mat", {"x": np.full((3, 4), value)})
-        with pytest.raises(ValueError, match="expected whole numbers from 0 up"):
-            mat_array(tmp_path / f"{name}.mat")
 
 
 def test_an_efficiency_that_cannot_be_is_not_written_without_a_word(folder, capsys):

@@ -1,0 +1,102 @@
+"""Calibration of a SPAD array: dark counts, hot pixels, sums of planes, real detectors."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic import COUNTER, PLANE, draw_planes, statistics_of
+
+from qsim.calibration.frame_statistics import measure, measure_sums
+from qsim.calibration.spad import calibrate_spad
+
+DATA = Path(__file__).parents[2] / "data"
+
+
+H, W = PLANE
+
+
+def test_no_dark_count_gives_a_one_sided_bound():
+    """No event in time t: the rate is below -ln(0.025)/t with 97.5 %."""
+    found = calibrate_spad([statistics_of(np.zeros((100, 6, 7), int), 1)], [], bits=1)
+    rate = found.values["dark_count_rate"]
+    assert (rate.value, rate.low) == (0.0, 0.0)
+    assert rate.high == pytest.approx(-np.log(0.025) / (100 * 1e-3 * 42))
+
+
+def test_one_hot_pixel_a_hundred_thousand_times_the_median():
+    """It stands in the map and in the share of hot pixels, and leaves the median alone."""
+    rng = np.random.default_rng(0)
+    rate = np.full((20, 20), 1e-2)
+    rate[3, 4] = 1e3  # per frame: always on
+    planes = rng.random((400, 20, 20)) < -np.expm1(-rate)
+    found = calibrate_spad([statistics_of(planes, 1)], [], bits=1)
+    assert np.unravel_index(np.argmax(found.maps["dark_count_rate"]), (20, 20)) == (3, 4)
+    assert found.values["dark_count_rate_median"].value < 3e-2 / 1e-3
+    assert found.values["hot_pixels"].value == pytest.approx(1 / 400)
+
+
+def test_ignored_dead_time_is_flagged_and_the_right_model_is_not():
+    rng = np.random.default_rng(3)
+    right, _ = COUNTER.calibrate(rng)
+    wrong, _ = COUNTER.calibrate(rng, ignore_dead_time=True)
+    assert right.p_value > 1e-4
+    assert wrong.p_value < 1e-6
+    assert any("the model is wrong" in words for words in wrong.warnings)
+
+
+def test_real_dark_counts():
+    """50 x 50 SPADs, 7650 planes of 10.3 us: median 127 counts/s, 1.0 % of the pixels above ten medians."""
+    path = Path(__file__).parents[4] / "shared" / "data" / "spad512_darkcounts_YX.npy"
+    if not path.exists():
+        pytest.skip(f"{path.name} is not part of this repository")
+    ones = np.rint(-np.expm1(-np.load(path)) * 7650)
+    found = calibrate_spad([measure_sums([ones], planes=7650, exposure=10.3e-6, photons=0.0)], [], bits=1)
+    median = found.values["dark_count_rate_median"]
+    assert median.low < median.value
+    assert median.value == pytest.approx(127, abs=1)
+    for percent, known in ((1, 0.00039), (90, 0.00196), (99, 0.01343)):  # per frame, from the data's description
+        found_there = found.values[f"dark_count_rate_p{percent}"]
+        assert found_there.value * 10.3e-6 == pytest.approx(known, rel=0.02)
+        assert found_there.low <= found_there.value <= found_there.high
+    assert found.values["hot_pixels"].value == pytest.approx(0.010, abs=0.002)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_sums_are_calibrated_exactly_as_their_planes(seed):
+    """Random numbers of planes, sums, light and dark: every value, interval and map is equal to the last bit.
+
+    Afterpulsing alone needs the order of the planes, which sums do not keep.
+    """
+    rng = np.random.default_rng(seed)
+    planes = int(rng.integers(1, 40))
+    stacks = []
+    for rate, photons in ((0.01, 0.0), (float(rng.uniform(0.05, 3)), 0.8), (float(rng.uniform(0.05, 3)), 1.6)):
+        frames = int(rng.integers(2, 9))
+        bits = draw_planes(rng, frames * planes, rate, 0.1)
+        exposure = 1e-5
+        sums = bits.reshape(frames, planes, H, W).sum(axis=1)
+        kind = rng.choice([np.uint16, np.float64, np.int64])
+        one = measure([bits], bits=1, exposure=exposure, photons=photons)
+        stacks.append((one, measure_sums([sums[:1].astype(kind), sums[1:].astype(kind)], planes=planes,
+                                         exposure=exposure, photons=photons)))  # fmt: skip
+    for one, many in stacks:
+        assert np.array_equal(one.total, many.total)
+        assert np.array_equal(one.square, many.square)
+        assert np.array_equal(one.histogram, many.histogram)
+        assert one.frames == many.frames
+    found = [calibrate_spad([pair[i] for pair in stacks[:1]], [pair[i] for pair in stacks[1:]], bits=1) for i in (0, 1)]
+    kept = {name: value for name, value in found[0].values.items() if name != "afterpulsing"}
+    assert found[1].values == kept
+    assert np.array_equal(found[0].maps["dark_count_rate"], found[1].maps["dark_count_rate"])
+    assert any("afterpulsing is not measured" in words for words in found[1].warnings)
+
+
+def test_another_number_of_planes_is_noticed():
+    """4096 planes at 30 %: taken as 8192 the binomial would be 0.70 / 0.85 of what it is."""
+    sums = np.random.default_rng(1).binomial(4096, 0.3, (30, H, W))
+    right, wrong = (measure_sums([sums], planes=n, exposure=1e-5, photons=None) for n in (4096, 8192))
+    sigma = np.sqrt(2 / (29 * H * W))
+    assert abs(right.dispersion - 1) < 5 * sigma
+    assert abs(wrong.dispersion - 0.7 / 0.85) < 5 * sigma
+    assert not any("scatter" in words for words in calibrate_spad([], [right], bits=1).warnings)
+    assert any("scatter 0.8" in words for words in calibrate_spad([], [wrong], bits=1).warnings)

@@ -1,0 +1,44 @@
+"""Arrays of .mat files: the only one is taken, others by name, and only counts."""
+
+import numpy as np
+import pytest
+
+from qsim.formats import importing
+from qsim.formats.mat_files import mat_array
+from qsim.formats.recording import Hints
+
+
+@pytest.mark.parametrize("level", ["5", "7.3"])
+def test_the_only_array_of_a_mat_is_taken(tmp_path, level):
+    codes = np.random.default_rng(0).integers(0, 9, (4, 5, 7)).astype(np.uint16)
+    path = tmp_path / "a.mat"
+    if level == "5":
+        from scipy.io import savemat
+
+        savemat(path, {"counts": codes.transpose(1, 2, 0), "gate": 3.0})
+    else:
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w", userblock_size=512) as file:
+            file["counts"] = codes.transpose(0, 2, 1)
+            file["gate"] = np.ones((1, 1))
+    assert np.array_equal(mat_array(path), codes)
+    assert np.array_equal(mat_array(path, "counts"), codes)
+    recording = importing.read(path, Hints(bits=4))
+    assert np.array_equal(recording.read(0, 4), codes)
+    with pytest.raises(ValueError, match="has no array OUTPUT; it holds"):
+        mat_array(path, "OUTPUT")
+
+
+def test_a_name_of_an_array_is_refused_elsewhere(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((2, 3, 4), bool))
+    with pytest.raises(ValueError, match="--variable changes nothing for codes; leave it out"):
+        importing.read(tmp_path / "a.npy", Hints(variable="x"))
+
+
+def test_values_that_are_no_counts_are_refused(tmp_path):
+    from scipy.io import savemat
+
+    for name, value in (("half", 0.5), ("negative", -1.0), ("nothing", np.nan)):
+        savemat(tmp_path / f"{name}.mat", {"x": np.full((3, 4), value)})
+        with pytest.raises(ValueError, match="expected whole numbers from 0 up"):
+            mat_array(tmp_path / f"{name}.mat")
