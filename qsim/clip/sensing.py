@@ -10,21 +10,24 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from numpy import ndarray as Array
 
-from qsim import files, locks
+from qsim import files, keys, locks
 from qsim.clip.clip import Clip
 from qsim.clip.photons import light_level, light_line
 from qsim.clip.simulation import Draw, plane_of, stored
 from qsim.clip.stream import Stream, orientation, write_packed, writing
 from qsim.files import Progress, check_name
-from qsim.sensor import packing
-
-if TYPE_CHECKING:
-    from qsim.sensor.defects.defect_table import Flaws
-    from qsim.sensor.sensor import Sensor
+from qsim.sensor import devices, packing
+from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.defects import defect_table
+from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.defects.event_simulation import TOLERANCE
+from qsim.sensor.defects.pixel_array import PixelArray
+from qsim.sensor.sensor import Sensor
+from qsim.sensor.spad import BinarySPAD
 
 
 @dataclass(frozen=True)
@@ -58,18 +61,13 @@ class Sensing:
 
 def prepare(clip: Clip, sensing: Sensing) -> Draw:
     """The sensor, light factor and key for one clip; `ValueError` if they do not fit it."""
-    from qsim.sensor.defects import defect_table as flaws
 
     source = sensing.defects or (sensing.sensor if sensing.sensor.endswith(".toml") else None)
-    return assemble(clip, sensing, None if source is None else flaws.from_toml(source))
+    return assemble(clip, sensing, None if source is None else defect_table.from_toml(source))
 
 
-def assemble(clip: Clip, sensing: Sensing, found: Flaws | None, own: Sensor | None = None) -> Draw:
+def assemble(clip: Clip, sensing: Sensing, found: Defects | None, own: Sensor | None = None) -> Draw:
     """As `prepare`, with these defects, and with this sensor in place of the one that `sensing` names."""
-    from qsim import keys
-    from qsim.sensor import devices
-    from qsim.sensor.defects import defect_table as flaws
-
     planes = sensing.slices
     if sensing.group:
         if sensing.bits is None:
@@ -86,7 +84,7 @@ def assemble(clip: Clip, sensing: Sensing, found: Flaws | None, own: Sensor | No
         sensing.sensor, ppp=level.ppp * planes, bits=sensing.bits, exposure=clip.exposure * planes
     )
     if found is not None:  # measured dark counts take the place of the sensor's
-        sensor = flaws.of_sensor(found, sensor, *clip.shape[1:]).sensor
+        sensor = PixelArray.of(found, sensor, *clip.shape[1:]).sensor
     _check_planes(sensor, sensing, clip)
     key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
     return Draw(sensor, plane_of(sensor, planes), level, key, planes, sensing.diffraction, found)
@@ -94,9 +92,6 @@ def assemble(clip: Clip, sensing: Sensing, found: Flaws | None, own: Sensor | No
 
 def _check_planes(sensor: Sensor, sensing: Sensing, clip: Clip) -> None:
     """`ValueError` for sums of planes and for slices of exposures that this sensor or this clip does not have."""
-    from qsim.sensor.counting import CountingSPAD
-    from qsim.sensor.spad import BinarySPAD
-
     kind = type(sensor).__name__
     if sensing.group and not isinstance(sensor, BinarySPAD):
         raise ValueError(f"{sensing.sensor}: only a clocked SPAD (BinarySPAD) sums planes, this is a {kind}")
@@ -128,7 +123,7 @@ def describe(clip: Clip, sensing: Sensing, draw: Draw) -> dict[str, Any]:
         "exposure": clip.exposure * draw.planes,
         "planes_per_code": draw.planes,
         "drawn_by": draw.law,
-    } | ({} if draw.flaws is None else {"defects": draw.flaws.to_dict()})
+    } | ({} if draw.defects is None else {"defects": draw.defects.to_dict()})
 
 
 def sense(
@@ -149,8 +144,6 @@ def sense(
     line = light_line(clip, draw.level, draw.planes * draw.sensor.efficiency)
     missed = draw.missed(clip)
     if missed is not None:
-        from qsim.sensor.defects.event_simulation import TOLERANCE
-
         draw = dataclasses.replace(draw, followed=missed if missed.largest > TOLERANCE else None)
         meta["drawn_by"] = draw.law
         meta["dead_time_effects"] = dataclasses.asdict(missed)

@@ -11,23 +11,25 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
-from qsim.optics import radiometry
+from qsim.clip.stream import Stream
+from qsim.files import Progress
+from qsim.keys import Key
+from qsim.optics.radiometry import LightLevel
 from qsim.sensor import packing
-
-if TYPE_CHECKING:
-    from qsim.clip.clip import Clip
-    from qsim.clip.stream import Stream
-    from qsim.files import Progress
-    from qsim.keys import Key
-    from qsim.sensor.defects.defect_table import Flawed, Flaws, Light
-    from qsim.sensor.defects.event_simulation import Effects
-    from qsim.sensor.sensor import Sensor
+from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.defects import defect_table, event_simulation
+from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.defects.event_simulation import Effects, IncidentLight
+from qsim.sensor.defects.pixel_array import PixelArray
+from qsim.sensor.qis import QIS
+from qsim.sensor.sensor import Sensor
+from qsim.sensor.spad import BinarySPAD, PlaneByPlane
 
 LAWS = ("table", "process", "planes", "closed form", "events")  # of `Draw.law`
 _BLOCK_PIXELS = 1 << 22  # photons held in memory at a time while sensing: 32 MiB of float64
@@ -39,11 +41,11 @@ class Draw:
 
     sensor: Sensor
     plane: Sensor  # draws one clip frame; the same as `sensor` unless planes are summed
-    level: radiometry.LightLevel  # per clip frame
+    level: LightLevel  # per clip frame
     key: Key
     planes: int  # clip frames per code
     diffraction: bool
-    flaws: Flaws | None = None
+    defects: Defects | None = None
     followed: Effects | None = None  # counting pixels: what the closed form misses, where photons have to be followed
     engine: str = "auto"
 
@@ -54,20 +56,17 @@ class Draw:
         "table": one number against the cdf. "process": step by step, or the sum of all planes at once. "planes": one by
         one. "closed form" and "events": counting pixels, by their cdf and photon by photon.
         """
-        from qsim.sensor.qis import QIS
-        from qsim.sensor.spad import BinarySPAD, PlaneByPlane
-
         if self.followed is not None:
             return "events"
         few = self.sensor.bits <= 8
         if isinstance(self.sensor, QIS):
-            pattern = None if self.flaws is None else self.flaws.pattern
-            maps = {} if self.flaws is None else self.flaws.maps
+            pattern = None if self.defects is None else self.defects.pattern
+            maps = {} if self.defects is None else self.defects.maps
             read_out = pattern is not None and (pattern.offset or pattern.read_noise)
             return "process" if not few or read_out or {"offset_map", "read_noise_map"} & set(maps) else "table"
         if not isinstance(self.sensor, BinarySPAD):
             return "closed form"
-        disturbed = self.flaws is not None and (self.flaws.afterpulse or self.flaws.crosstalk)
+        disturbed = self.defects is not None and (self.defects.afterpulse or self.defects.crosstalk)
         return "planes" if few or self.sums or disturbed or isinstance(self.sensor, PlaneByPlane) else "process"
 
     def light(self, clip: Clip, start: int, stop: int) -> Array:
@@ -78,10 +77,10 @@ class Draw:
 
     def frames(self, clip: Clip, start: int, stop: int) -> Array:
         """Codes of stream frames start ... stop - 1, [stop - start, H, W]; a memory is followed from the first one."""
-        flawed = self._flawed(clip)
+        array = self._array(clip)
         if self.followed is not None:
             return self._follow(clip, stop)[start:]
-        first = 0 if flawed is not None and flawed.memory else start
+        first = 0 if array is not None and array.memory else start
         blocks = self.blocks(clip, first, stop, stop - first if first == start else 1)
         return np.concatenate([block for n, block in enumerate(blocks, first) if n >= start])
 
@@ -92,9 +91,9 @@ class Draw:
             return
         places = [(t * self.planes, min(t + step, stop) * self.planes) for t in range(start, stop, step)]
         light = (self._exposed(self.light(clip, *place)) for place in places)
-        flawed = self._flawed(clip)
-        if flawed is not None:
-            drawn: Iterator[Array] = flawed.blocks(
+        array = self._array(clip)
+        if array is not None:
+            drawn: Iterator[Array] = array.blocks(
                 light, self._exposure(clip), self.key.at(self._number(start)), engine=self.engine
             )
         else:
@@ -108,7 +107,7 @@ class Draw:
     def packed(self, clip: Clip, frames: int, progress: Progress | None = None) -> Iterator[Array]:
         """All codes of a stream, packed row by row, some frames at a time."""
         step = max(1, _BLOCK_PIXELS // (clip.shape[1] * clip.shape[2] * self.planes))
-        if self.followed is not None or self.flaws is not None or self.planes > 1:
+        if self.followed is not None or self.defects is not None or self.planes > 1:
             blocks: Iterator[Array] = (
                 packing.pack(block, self.sensor.bits) for block in self.blocks(clip, 0, frames, step)
             )
@@ -148,15 +147,14 @@ class Draw:
         grouped = drawn.reshape(-1, self.planes, *drawn.shape[1:])
         return grouped.sum(axis=1).astype(packing.code_dtype(self.sensor.bits))
 
-    def _flawed(self, clip: Clip) -> Flawed | None:
-        from qsim.sensor.defects import defect_table as flaws
+    def _array(self, clip: Clip) -> PixelArray | None:
 
         counts = self.followed is not None
-        if self.flaws is None and not counts:
+        if self.defects is None and not counts:
             return None
-        return flaws.of_sensor(self.flaws or flaws.Flaws(), self.plane, *clip.shape[1:])
+        return PixelArray.of(self.defects or Defects(), self.plane, *clip.shape[1:])
 
-    def _slices(self, clip: Clip) -> Light:
+    def _slices(self, clip: Clip) -> IncidentLight:
         """Light [slices, rows, W] of a stream's frame and some of its rows."""
 
         def read(frame: int, row: int, rows: int) -> Array:
@@ -172,35 +170,28 @@ class Draw:
 
     def missed(self, clip: Clip) -> Effects | None:
         """What the closed form of counting pixels misses in this clip; None where nothing can be missed."""
-        from qsim.sensor.counting import CountingSPAD
-        from qsim.sensor.defects import defect_table as flaws
-
         if not isinstance(self.plane, CountingSPAD):
             return None
-        memory = flaws.memory_of(self.flaws)
+        memory = event_simulation.memory_of(self.defects)
         if self.planes == 1 and not (memory.carry or memory.afterpulse):
             return None
-        flawed = flaws.of_sensor(self.flaws or flaws.Flaws(), self.plane, *clip.shape[1:])
+        array = PixelArray.of(self.defects or Defects(), self.plane, *clip.shape[1:])
         shape = (len(clip) // self.planes, *clip.shape[1:])
-        return flaws.effects(flawed, self._slices(clip), shape, self._exposure(clip), self.planes / clip.frame_rate)
+        return event_simulation.clip_effects(
+            array, self._slices(clip), shape, self._exposure(clip), self.planes / clip.frame_rate
+        )
 
     def _follow(self, clip: Clip, frames: int) -> Array:
-        from qsim.sensor.defects import defect_table as flaws
 
-        flawed = self._flawed(clip)
-        assert flawed is not None
+        array = self._array(clip)
+        assert array is not None
         shape = (frames, *clip.shape[1:])
         exposure, frame_time = self._exposure(clip), self.planes / clip.frame_rate
-        return flaws.follow(flawed, self._slices(clip), shape, exposure, frame_time, self.key)
+        return event_simulation.follow(array, self._slices(clip), shape, exposure, frame_time, self.key)
 
 
 def stored(stream: Stream) -> Draw:
     """What drew a stream, from its json alone, by the law of its time; `ValueError` if it was not drawn here."""
-    from qsim.keys import Key
-    from qsim.sensor.defects import defect_table as flaws
-    from qsim.sensor.defects import event_simulation
-    from qsim.sensor.spad import BinarySPAD, PlaneByPlane
-
     meta = stream.meta
     for name in ("seed", "clip_key", "ppp", "mean_photons_before", "ppp_factor"):
         if meta.get(name) is None:
@@ -213,12 +204,10 @@ def stored(stream: Stream) -> Draw:
     sensor = stream.sensor
     if law in (None, "planes") and isinstance(sensor, BinarySPAD):
         sensor = PlaneByPlane(**vars(sensor))
-    level = radiometry.LightLevel(
-        stream.photons_factor, meta["ppp"] / planes, meta["mean_photons_before"] / planes, None
-    )
+    level = LightLevel(stream.photons_factor, meta["ppp"] / planes, meta["mean_photons_before"] / planes, None)
     key = Key(seed=meta["seed"], clip=meta["clip_key"])
     where = f"{stream.path.with_suffix('.json')}: defects"
-    found = flaws.from_dict(meta["defects"], where) if "defects" in meta else None
+    found = defect_table.from_dict(meta["defects"], where) if "defects" in meta else None
     followed = event_simulation.Effects(**meta["dead_time_effects"]) if law == "events" else None
     diffraction = bool(meta.get("diffraction", False))
     return Draw(sensor, plane_of(sensor, planes), level, key, planes, diffraction, found, followed)
@@ -226,6 +215,4 @@ def stored(stream: Stream) -> Draw:
 
 def plane_of(sensor: Sensor, planes: int) -> Sensor:
     """What draws the clip frames of a code: one plane of a clocked SPAD, any other sensor as it is."""
-    from qsim.sensor.spad import BinarySPAD
-
     return dataclasses.replace(sensor, bits=1) if planes > 1 and isinstance(sensor, BinarySPAD) else sensor

@@ -18,6 +18,7 @@ from qsim.clip.photons import clip_photons
 from qsim.clip.stream import Stream
 from qsim.report import html as page
 from qsim.sensor.defects import defect_table, fixed_pattern
+from qsim.sensor.defects.pixel_array import PixelArray
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -244,7 +245,7 @@ def expected_codes(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64
     sensor, maps = stream.sensor, fixed_pattern.PERFECT
     if "defects" in stream.meta:
         found = defect_table.from_dict(stream.meta["defects"], f"{stream.name}: defects")
-        device = defect_table.of_sensor(found, sensor, height, width)
+        device = PixelArray.of(found, sensor, height, width)
         thinned = {name: None if m is None else m[::step, ::step] for name, m in vars(device.maps).items()}
         sensor, maps = device.sensor, fixed_pattern.Maps(**thinned)
     probabilities = fixed_pattern.pmf(sensor, np.stack(light), stream.exposure, maps)

@@ -15,7 +15,7 @@ photons" means that light has to be given as photons that this sensor detects. A
     bits = 3
     [sources]                    # optional: one sentence per field
     read_noise = "photon transfer of 2026-05-03, 25 C"
-    [defects]                    # optional: hot and dead pixels, PRNU, afterpulses, crosstalk ...: see flaws.py
+    [defects]                    # optional: hot and dead pixels, PRNU, afterpulses, crosstalk ...: see defect_table.py
     prnu = 0.01
 """
 
@@ -227,11 +227,11 @@ def load(name: str | Path, *, ppp: float | None = None, bits: int | None = None,
 
 
 def from_toml(path: str | Path) -> Sensor:
-    """The sensor of a TOML file with a table [sensor] and, optionally, [sources] and [defects] (flaws.py); strict."""
+    """The sensor of a TOML file with a table [sensor] and, optionally, [sources] and [defects]; strict."""
     path = Path(path)
     tables = files.read_toml(path, "sensor file")
     for key in tables:
-        if key not in ("sensor", "sources", "defects"):  # [defects] is read by flaws.py
+        if key not in ("sensor", "sources", "defects"):  # [defects] is read by defect_table.py
             raise ValueError(f"{path}: unknown table [{key}]{suggest(key, ('sensor', 'sources', 'defects'))}")
     if not isinstance(tables.get("sensor"), dict):
         raise ValueError(f"{path}: a table [sensor] with model, bits and the model's fields is missing")

@@ -10,7 +10,7 @@ read_noise).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import ceil, floor, inf
 from typing import ClassVar
@@ -67,6 +67,9 @@ class QIS(Sensor):
     @property
     def dark_rate(self) -> float:
         return self.dark_current
+
+    def with_dark_rate(self, rate: float) -> QIS:
+        return replace(self, dark_current=rate)
 
     def white(self, exposure: float) -> float:
         """Photons at which x = 1: top code / (gain QE); neither offset, dark current nor full well enters."""
@@ -162,6 +165,33 @@ class QIS(Sensor):
         below, above = uniform_pair(w[2], w[3])
         electrons = electrons + self.read_noise * noise * np.where(below < 0.5, ndtri(below), -ndtri(above))
         return self.codes_of(electrons + offset / self.gain)
+
+    def read_out_pmf(
+        self, photons: Array, exposure: float, noise: Array | float = 1.0, offset: Array | float = 0.0
+    ) -> Array:
+        """P(code) of `read_out`: photons [..., H, W] -> [..., H, W, levels], noise and offset as there.
+
+        Sum over electrons n of Pois(n) P(code | n).
+        """
+        from scipy.special import ndtr, pdtr, pdtrik
+
+        mean = self.arrivals(photons, exposure)
+        spread = np.broadcast_to(self.read_noise * noise, mean.shape)
+        shift = np.broadcast_to(offset / self.gain, mean.shape)
+        steps = (np.arange(self.levels - 1) + 0.5 - self.offset) / self.gain
+        last = int(np.ceil(pdtrik(1 - 1e-12, max(float(mean.max()), 1e-6)))) + 1
+        below, cdf = np.zeros_like(mean), np.zeros((*mean.shape, self.levels))
+        for n in range(last + 1):
+            up_to = pdtr(n, mean) if n < last else np.ones_like(mean)
+            electrons = n if self.full_well is None else min(n, self.full_well)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                passed = ndtr((steps - (electrons + shift)[..., None]) / spread[..., None])
+            exact = self.codes_of(electrons + shift)[..., None] <= np.arange(self.levels - 1)
+            passed = np.where(spread[..., None] > 0, passed, exact)
+            cdf[..., :-1] += (up_to - below)[..., None] * passed
+            below = up_to
+        cdf[..., -1] = 1.0
+        return np.diff(cdf, axis=-1, prepend=0.0)
 
 
 def table_length(sensor: QIS) -> float:

@@ -67,6 +67,10 @@ class Sensor(Distribution):
         """Mean and variance of the code over light, and the inverse: a table of `points` levels of light."""
         return estimation.response(self, exposure, points)
 
+    def with_dark_rate(self, rate: float) -> Sensor:
+        """Return this sensor with another dark rate [1/s], for maps of it; a model overrides this."""
+        raise ValueError(f"{type(self).__name__}: has no dark rate that a map could change")
+
     def kernel_plan(self, exposure: float) -> Plan | None:
         """How a compiled kernel draws the codes of this sensor; None where only the reference draws them.
 

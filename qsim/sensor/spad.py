@@ -7,7 +7,7 @@ expected in an exposure.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy import ndarray as Array
@@ -41,6 +41,9 @@ class SPAD(Sensor):
     @property
     def dark_rate(self) -> float:
         return self.dark_count_rate
+
+    def with_dark_rate(self, rate: float) -> Self:
+        return replace(self, dark_count_rate=rate)
 
     def white(self, exposure: float) -> float:
         """(2^bits - 1) / PDE: light that would fill the code if every plane could count, or nothing were dead."""

@@ -14,7 +14,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.sensing import Sensing, prepare
 from qsim.clip.simulation import Draw
 from qsim.sensor import devices
-from qsim.sensor.defects.defect_table import Flaws, from_toml
+from qsim.sensor.defects.defect_table import Defects, from_toml
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 
@@ -50,7 +50,7 @@ class Illumination:
         )
 
 
-def read_sensor(source: str | Mapping[str, Any], bits: int | None = None) -> tuple[Sensor, Flaws | None]:
+def read_sensor(source: str | Mapping[str, Any], bits: int | None = None) -> tuple[Sensor, Defects | None]:
     """The sensor of a file with its defects, or of the record of one; `ValueError` if it has other bits."""
     if isinstance(source, str):
         return devices.load(source, bits=bits), from_toml(source)

@@ -12,7 +12,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.sensing import Sensing, assemble
 from qsim.clip.simulation import Draw
 from qsim.clip.stream import Stream
-from qsim.sensor.defects.defect_table import Flaws
+from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.defect_table import from_dict as read_defects
 from qsim.sensor.sensor import Sensor
 from quiver.data.illumination import Illumination, read_sensor
@@ -34,13 +34,13 @@ class Noise(Illumination):
             return light
         if not light.sensor.endswith(".toml"):
             return cls(light.sensor, light.ppp, light.bits)
-        sensor, flaws = read_sensor(light.sensor, light.bits)
+        sensor, found = read_sensor(light.sensor, light.bits)
         return cls(
             light.sensor,
             light.ppp,
             sensor.bits,
             record=as_text(sensor.to_dict()),
-            defects=None if flaws is None else as_text(flaws.to_dict()),
+            defects=None if found is None else as_text(found.to_dict()),
         )
 
     @classmethod
@@ -137,7 +137,7 @@ def _sensor(text: str) -> Sensor:
 
 
 @lru_cache(maxsize=64)
-def stored_defects(text: str) -> Flaws:
+def stored_defects(text: str) -> Defects:
     return read_defects(json.loads(text))
 
 

@@ -19,7 +19,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
 from qsim.clip.simulation import Draw
 from qsim.keys import Key
-from qsim.sensor.defects.defect_table import Flawed, of_sensor
+from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.sensor import Sensor
 from quiver.data.code_table import draw_codes
 from quiver.data.noise import Noise, stored_defects
@@ -43,16 +43,16 @@ class WindowPlace:
 
 
 @lru_cache(maxsize=16)
-def _defective(flaws: str, sensor: Sensor, shape: tuple[int, int]) -> Flawed:
-    return of_sensor(stored_defects(flaws), sensor, *shape)
+def _pixel_array(defects: str, sensor: Sensor, shape: tuple[int, int]) -> PixelArray:
+    return PixelArray.of(stored_defects(defects), sensor, *shape)
 
 
 def check_windows(noise: Noise, clip: Clip) -> None:
     """`ValueError` if windows of this clip cannot be drawn with this noise, each on its own."""
     draw = noise.draw(clip)
     if noise.defects is not None:
-        flawed = _defective(noise.defects, draw.plane, clip.shape[1:])
-        if flawed.follows_photons:
+        array = _pixel_array(noise.defects, draw.plane, clip.shape[1:])
+        if array.follows_photons:
             raise ValueError(
                 f"{noise.sensor}: carry_dead_time and afterpulse of counting pixels reach from exposure to exposure, "
                 "which training windows cannot follow; give --sensor with a file without them"
@@ -69,11 +69,11 @@ def window_codes(
     the sensor does not.
     """
     assert noise.defects is not None
-    flawed = _defective(noise.defects, draw.plane, clip.shape[1:])
+    array = _pixel_array(noise.defects, draw.plane, clip.shape[1:])
     length, height, width = clip.shape
     before = length - place.start - frames if place.backwards else place.start
-    lead = min(flawed.lead(NEGLIGIBLE), before)
-    (dy, dx), last, reach = place.drift, frames - 1, flawed.reach
+    lead = min(array.lead(NEGLIGIBLE), before)
+    (dy, dx), last, reach = place.drift, frames - 1, array.reach
     y, x = (sorted((first, first + last * way)) for first, way in zip((place.y, place.x), (dy, dx), strict=True))
     top, left = min(reach, y[0]), min(reach, x[0])
     rows = top + side + min(reach, height - y[1] - side)
@@ -87,7 +87,7 @@ def window_codes(
     order = range(last + lead, -1, -1) if place.backwards else range(-lead, frames)
     stack = np.stack([light(i) for i in order])
     origin = (place.y - top, place.x - left)
-    part = flawed.crop(*origin, rows, columns)
+    part = array.crop(*origin, rows, columns)
     key = place.key.at(place.start - lead if not place.backwards else 0)
     codes = next(part.blocks([stack], clip.exposure, key, origin, draw_codes))
     return codes[lead:, top : top + side, left : left + side]

@@ -36,6 +36,7 @@ from qsim.formats.recording import Hints
 from qsim.process import peak_memory
 from qsim.sensor import devices
 from qsim.sensor.defects import defect_table
+from qsim.sensor.defects.pixel_array import PixelArray
 from quiver.data.illumination import Illumination
 from quiver.data.photon_cubes import cube_codes
 
@@ -170,7 +171,7 @@ def make_map(folder: Path) -> None:
 def read_map(folder: Path) -> None:
     found = defect_table.from_toml(folder / "d.toml")
     if found is not None:
-        defect_table.of_sensor(found, devices.load("quiver-physical", ppp=3.25), H, W)
+        PixelArray.of(found, devices.load("quiver-physical", ppp=3.25), H, W)
 
 
 def make_video(folder: Path) -> None:

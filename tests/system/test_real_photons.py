@@ -15,7 +15,8 @@ from stats import assert_share, critical_z
 from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.event_simulation import Memory, simulate
-from qsim.sensor.defects.fixed_pattern import DarkSpread, Defects, draw_maps, measured_dark_map, sample
+from qsim.sensor.defects.fixed_pattern import DarkSpread, FixedPattern, Maps, draw_maps, measured_dark_map
+from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.qis import QIS
 
 HERE = Path(__file__)
@@ -192,7 +193,9 @@ def test_the_body_of_the_dark_model_is_the_measured_one():
     measured = dark_counts().ravel()
     body = measured[measured < 3 * np.median(measured)]
     model = DarkSpread()
-    rates = body.mean() / np.exp(model.spread**2 / 2) * draw_maps(Defects(dark=model), (100, 100)).dark * model.mean
+    rates = (
+        body.mean() / np.exp(model.spread**2 / 2) * draw_maps(FixedPattern(dark=model), (100, 100)).dark * model.mean
+    )
     drawn = np.random.default_rng(0).binomial(FRAMES, -np.expm1(-rates / FRAMES)).ravel()
     drawn = drawn[drawn < 3 * np.median(measured)]
     assert ks_2samp(body, drawn).pvalue > 1e-3
@@ -207,14 +210,15 @@ def test_the_body_of_the_dark_model_is_the_measured_one():
 
 def test_a_measured_dark_map_serves_as_a_sensor():
     """Planes drawn with the measured map fire as often, pixel by pixel, as the camera did."""
-    from qsim.sensor.defects.fixed_pattern import Maps
     from qsim.sensor.spad import BinarySPAD
 
     rates = -np.log1p(-dark_counts() / FRAMES)
     mean, relative = measured_dark_map(rates)
     exposure, planes = 10.3e-6, 800
     sensor = BinarySPAD(0.5, mean / exposure)
-    codes = sample(sensor, np.zeros((planes, 50, 50), np.float32), exposure, key=Key(1, 2), maps=Maps(dark=relative))
+    codes = PixelArray(sensor, Maps(dark=relative)).sample(
+        np.zeros((planes, 50, 50), np.float32), exposure, key=Key(1, 2)
+    )
     p = dark_counts() / FRAMES
     fired = codes.sum(axis=0)
     assert (fired[p == 0] == 0).all()
@@ -230,7 +234,7 @@ def test_bad_pixels_are_placed_independently_like_the_measured_ones():
     measured = shared("swissspad2_badpixels_YX.npy")
     share = measured.mean()
     assert share == pytest.approx(0.03963, abs=5e-6)
-    ours = draw_maps(Defects(dead=float(share), device_seed=1), measured.shape).dead
+    ours = draw_maps(FixedPattern(dead=float(share), device_seed=1), measured.shape).dead
     assert_share(int(ours.sum()), ours.size, share, false_alarm=1e-4)
 
     def blobs(mask: np.ndarray) -> tuple[int, int]:

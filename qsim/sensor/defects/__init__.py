@@ -1,1 +1,23 @@
-"""ROOM"""
+"""What sets pixels apart: fixed-pattern noise, correlated noise, the [defects] table, photon-by-photon simulation."""
+
+from typing import TYPE_CHECKING
+
+from qsim.files import lazy_names
+
+if TYPE_CHECKING:
+    from qsim.sensor.defects.defect_table import Defects
+    from qsim.sensor.defects.fixed_pattern import FixedPattern, Maps, draw_maps
+    from qsim.sensor.defects.pixel_array import PixelArray
+
+__all__ = ["Defects", "FixedPattern", "Maps", "PixelArray", "draw_maps"]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "Defects": "defect_table",
+        "FixedPattern": "fixed_pattern",
+        "Maps": "fixed_pattern",
+        "PixelArray": "pixel_array",
+        "draw_maps": "fixed_pattern",
+    },
+)

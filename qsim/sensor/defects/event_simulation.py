@@ -15,7 +15,9 @@ other and may leave its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import reduce
 from heapq import heapify, heappop, heappush
 
 import numpy as np
@@ -23,8 +25,14 @@ from numpy import ndarray as Array
 
 from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.defects.fixed_pattern import lit
+from qsim.sensor.defects.pixel_array import PixelArray
 
 TOLERANCE = 1e-3  # relative change of the mean count that a closed form may miss
+_STRIP_BYTES = 1 << 25  # of light in memory while single pixels are followed through a clip
+
+IncidentLight = Callable[[int, int, int], Array]  # (frame, first row, rows) -> photons [slices, rows, W]
 
 
 @dataclass(frozen=True)
@@ -78,11 +86,10 @@ def sample(
     key: Key,
     memory: Memory = Memory(),
     origin: tuple[int, int] = (0, 0),
-    tolerance: float = TOLERANCE,
 ) -> tuple[Array, Effects, str]:
     """Codes [T, H, W] for photons [T, S, H, W] in S equal slices of each exposure, the effects, and who drew the codes.
 
-    "closed form" draws where no effect exceeds `tolerance`; else "events", photon by photon. Each pixel has a stream of
+    "closed form" draws where no effect exceeds TOLERANCE; else "events", photon by photon. Each pixel has a stream of
     its own, so crops agree with the whole; frames do not, unless they start with the clip: a memory is replayed.
     """
     if photons.ndim != 4 or not photons.size:
@@ -91,16 +98,28 @@ def sample(
         raise ValueError(f"frame_time {frame_time!r} s is at least the exposure {exposure!r} s, both above 0")
     sensor.arrivals(photons, exposure)  # refuses what is no light level
     found = effects(sensor, photons, exposure, frame_time, memory)
-    if found.largest <= tolerance:
+    if found.largest <= TOLERANCE:
         return sensor.sample(photons.sum(axis=1), exposure, key=key, origin=origin), found, "closed form"
+    return _follow_pixels(sensor, photons, exposure, frame_time, memory, key, origin), found, "events"
+
+
+def _follow_pixels(
+    sensor: CountingSPAD,
+    photons: Array,
+    exposure: float,
+    frame_time: float,
+    memory: Memory,
+    key: Key,
+    origin: tuple[int, int],
+) -> Array:
+    """Codes [T, H, W] of photons [T, S, H, W], each pixel with its own stream of random numbers."""
     frames, _, height, width = photons.shape
     codes = np.empty((frames, height, width), sensor.dtype)
-    for y in range(height):
-        for x in range(width):
-            rng = pixel_stream(key, y + origin[0], x + origin[1])
-            counts = simulate(sensor, photons[:, :, y, x], exposure, frame_time, memory, rng)
-            codes[:, y, x] = np.minimum(counts, sensor.levels - 1)
-    return codes, found, "events"
+    for y, x in np.ndindex(height, width):
+        rng = pixel_stream(key, y + origin[0], x + origin[1])
+        counts = simulate(sensor, photons[:, :, y, x], exposure, frame_time, memory, rng)
+        codes[:, y, x] = np.minimum(counts, sensor.levels - 1)
+    return codes
 
 
 def effects(sensor: CountingSPAD, photons: Array, exposure: float, frame_time: float, memory: Memory) -> Effects:
@@ -175,3 +194,56 @@ def expose(
 def pixel_stream(key: Key, row: int, column: int) -> np.random.Generator:
     """The generator of one pixel of the full frame; events take as many numbers as they need."""
     return np.random.Generator(np.random.Philox(key=[key.philox_key, row << 32 | column], counter=[0, 0, 0, key.frame]))
+
+
+# ---- Clips of a pixel array
+
+
+def memory_of(defects: Defects | None) -> Memory:
+    """What counting pixels remember."""
+    if defects is None:
+        return Memory()
+    return Memory(defects.carry_dead_time, defects.afterpulse, defects.afterpulse_delay)
+
+
+def clip_effects(
+    array: PixelArray, light: IncidentLight, shape: tuple[int, int, int], exposure: float, frame_time: float
+) -> Effects:
+    """The largest effects of a clip [T, H, W] that a closed form would miss."""
+    frames, height, _ = shape
+    each = (
+        effects(sensor, photons[None], exposure, frame_time, memory_of(array.defects))
+        for sensor, photons in (_lit(array, light(t, 0, height), 0, exposure) for t in range(frames))
+    )
+    return reduce(_largest, each)
+
+
+def _largest(a: Effects, b: Effects) -> Effects:
+    return Effects(*(max(getattr(a, f.name), getattr(b, f.name)) for f in fields(Effects)))
+
+
+def _lit(array: PixelArray, photons: Array, row: int, exposure: float) -> tuple[CountingSPAD, Array]:
+    """Light [slices, rows, W] of rows from `row` on, with the pixels' own efficiencies and dark rates in it."""
+    slices, rows, width = photons.shape
+    sensor, light = lit(array.sensor, photons, exposure / slices, array.maps.crop(row, 0, rows, width))
+    assert isinstance(sensor, CountingSPAD)
+    return sensor, light
+
+
+def follow(
+    array: PixelArray, light: IncidentLight, shape: tuple[int, int, int], exposure: float, frame_time: float, key: Key
+) -> Array:
+    """Codes [T, H, W] of a clip, every pixel followed photon by photon from the first frame on; slow."""
+    frames, height, width = shape
+    codes = np.empty(shape, array.sensor.dtype)
+    memory = memory_of(array.defects)
+    slices = len(light(0, 0, 1))
+    step = max(1, _STRIP_BYTES // (8 * frames * slices * width))
+    for y in range(0, height, step):
+        rows = min(step, height - y)
+        parts = [_lit(array, light(t, y, rows), y, exposure) for t in range(frames)]
+        sensor, photons = parts[0][0], np.stack([part for _, part in parts])
+        codes[:, y : y + rows] = _follow_pixels(sensor, photons, exposure, frame_time, memory, key, (y, 0))
+    if array.maps.dead is not None:
+        codes[:, array.maps.dead] = 0
+    return codes

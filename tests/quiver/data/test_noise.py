@@ -19,9 +19,9 @@ from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons, light_level
 from qsim.clip.sensing import Sensing, sense
 from qsim.keys import Key
-from qsim.sensor.defects import defect_table
-from qsim.sensor.defects.defect_table import Flaws
-from qsim.sensor.defects.fixed_pattern import DarkSpread, Defects
+from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.defects.fixed_pattern import DarkSpread, FixedPattern
+from qsim.sensor.defects.pixel_array import PixelArray
 from quiver.cli.program import main
 from quiver.data.clips import open_clips
 from quiver.data.code_table import draw_codes
@@ -157,10 +157,10 @@ def test_every_window_is_normalised_by_its_own_sensor(make_clip: ClipMaker):
 # Defects in windows
 
 
-def random_flaws(rng: random.Random, qis: bool, spad: bool) -> Flaws:
+def random_defects(rng: random.Random, qis: bool, spad: bool) -> Defects:
     """One or more defects that a window can have."""
     some = lambda value: value if rng.random() < 0.5 else 0.0  # noqa: E731
-    pattern = Defects(
+    pattern = FixedPattern(
         device_seed=rng.randrange(100),
         prnu=some(0.2),
         dark=DarkSpread() if rng.random() < 0.5 else None,
@@ -168,14 +168,14 @@ def random_flaws(rng: random.Random, qis: bool, spad: bool) -> Flaws:
         offset=some(0.4) if qis else 0.0,
         read_noise=some(0.3) if qis else 0.0,
     )
-    return Flaws(pattern, crosstalk=0.0 if qis else some(0.1), afterpulse=some(0.2) if spad else 0.0)
+    return Defects(pattern, crosstalk=0.0 if qis else some(0.1), afterpulse=some(0.2) if spad else 0.0)
 
 
 def whole_frames(noise: Noise, clip: Clip, key: Key, light: Array) -> Array:
     """Codes of whole frames from the first one on, by the reference engine: what `qsim sense` stores."""
     draw = noise.draw(clip)
-    flawed = defect_table.of_sensor(draw.flaws, draw.plane, *clip.shape[1:])
-    return next(flawed.blocks([light], clip.exposure, key, engine="reference"))
+    array = PixelArray.of(draw.defects, draw.plane, *clip.shape[1:])
+    return next(array.blocks([light], clip.exposure, key, engine="reference"))
 
 
 @pytest.mark.parametrize("cases", [12, pytest.param(200, marks=pytest.mark.slow)])
@@ -188,7 +188,7 @@ def test_a_window_is_the_crop_of_the_sensed_frames(make_clip: ClipMaker, tmp_pat
     rng, clip = random.Random(cases), make_clip(frames=16, height=20, width=26)
     for number in range(cases):
         model, bits = rng.choice([(SPAD, 1), (SPAD, 2), (QIS, 3), (COUNTER, 3)])
-        found = random_flaws(rng, model is QIS, model is SPAD)
+        found = random_defects(rng, model is QIS, model is SPAD)
         if found.none or (bits == 2 and not (found.crosstalk or found.afterpulse)):
             continue
         file = sensor_file(tmp_path, model, bits)

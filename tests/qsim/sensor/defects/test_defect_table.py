@@ -15,6 +15,7 @@ from qsim.keys import Key, hash_name
 from qsim.sensor import devices, packing
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table, event_simulation, fixed_pattern
+from qsim.sensor.defects.pixel_array import PixelArray
 
 BINARY = '[sensor]\nmodel = "BinarySPAD"\npde = 0.5\ndark_count_rate = 200.0\nbits = 1\n'
 COUNTING = '[sensor]\nmodel = "CountingSPAD"\npde = 0.5\ndark_count_rate = 10.0\ndead_time = 5e-5\nbits = 3\n'
@@ -46,20 +47,15 @@ def test_what_is_off_changes_no_bit_and_is_not_mentioned(clip, tmp_path, sensor,
 
 
 def test_a_stream_holds_the_codes_that_the_device_draws(clip, tmp_path):
-    """Maps, dead pixels and crosstalk: as `defects.sample`, in one block or in many, and drawn again alone."""
+    """Maps, dead pixels and crosstalk: as `PixelArray.sample`, in one block or in many, and drawn again alone."""
     table = "device_seed = 4\nprnu = 0.2\ndark = { spread = 0.3, hot_share = 0.1 }\ndead = 0.1\ncrosstalk = 0.05"
     sensor = device(tmp_path, BINARY, table)
     stream, _ = drawn(clip, sensor)
-    found = fixed_pattern.Defects(4, 0.2, fixed_pattern.DarkSpread(spread=0.3, hot_share=0.1), 0.1)
+    found = fixed_pattern.FixedPattern(4, 0.2, fixed_pattern.DarkSpread(spread=0.3, hot_share=0.1), 0.1)
     light = np.stack([clip_photons(clip, t, stream.photons_factor) for t in range(6)])
-    expected = fixed_pattern.sample(
-        devices.load(sensor),
-        light,
-        clip.exposure,
-        key=Key(0, hash_name(clip.name)),
-        maps=fixed_pattern.draw_maps(found, (10, 13)),
-        crosstalk=0.05,
-    )
+    maps = fixed_pattern.draw_maps(found, (10, 13))
+    array = PixelArray(devices.load(sensor), maps, defect_table.Defects(crosstalk=0.05))
+    expected = array.sample(light, clip.exposure, key=Key(0, hash_name(clip.name)))
     np.testing.assert_array_equal(stream.codes(), expected)
     assert (expected != devices.load(sensor).sample(light, clip.exposure, key=Key(0, hash_name(clip.name)))).any()
     for frame in (0, 3):
@@ -148,9 +144,9 @@ def test_dead_pixels_of_counters_stay_dead_when_followed(tmp_path):
     clip = write_clip(tmp_path / "lit", radiance=np.ones((3, 4, 5)))
     maps = fixed_pattern.Maps(dead=np.arange(20).reshape(4, 5) % 2 == 0)
     sensor = CountingSPAD(0.5, 10.0, 1e-4, 3)
-    flawed = defect_table.Flawed(sensor, maps, defect_table.Flaws(carry_dead_time=True))
-    counts = defect_table.follow(
-        flawed, lambda t, y, rows: np.full((1, rows, 5), 20.0), (3, 4, 5), 5e-4, 5e-4, Key(0, 0)
+    array = PixelArray(sensor, maps, defect_table.Defects(carry_dead_time=True))
+    counts = event_simulation.follow(
+        array, lambda t, y, rows: np.full((1, rows, 5), 20.0), (3, 4, 5), 5e-4, 5e-4, Key(0, 0)
     )
     assert not counts[:, maps.dead].any()
     assert counts[:, ~maps.dead].all()
@@ -161,7 +157,7 @@ def test_dead_pixels_of_counters_stay_dead_when_followed(tmp_path):
     ("sensor", "table", "message"),
     [
         (BINARY, "prnuu = 0.1", "unknown key 'prnuu' (did you mean 'prnu'?)"),
-        (BINARY, "prnu = -1", "Defects.prnu is a number"),
+        (BINARY, "prnu = -1", "[defects]: prnu is a number"),
         (BINARY, "crosstalk = 1.0", "crosstalk is a probability below 1, got 1.0"),
         (BINARY, 'dark_map = "none.npy"', "none.npy: no such file"),
         (BINARY, "dark = { spreed = 1.0 }", "unknown key 'spreed' of dark"),

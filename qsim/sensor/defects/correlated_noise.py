@@ -1,0 +1,89 @@
+"""Noise correlated in time and space: afterpulses of clocked pixels and optical crosstalk. Off by default.
+
+    codes of independent pixels [T, H, W] --disturb--> codes
+
+Afterpulses have a memory: they need the clip from its first frame. Crosstalk has neighbours: it needs a margin of one
+pixel around a crop. Afterpulses of counting pixels are followed in event_simulation.py.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.keys import Key, uniform, words
+
+_AFTERPULSE, _CROSSTALK = 101, 102  # stages of a clip's key; crosstalk takes one per direction
+_DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))  # from a pixel to the neighbour that it disturbs
+
+
+@dataclass(frozen=True)
+class CorrelatedNoise:
+    """Probabilities of additional detections."""
+
+    afterpulse: float = 0.0  # of a detection in plane n + 1 caused by one in plane n
+    crosstalk: float = 0.0  # that an avalanche causes one in a given neighbour of the four
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 <= value < 1:
+                raise ValueError(f"{name} is a probability below 1, got {value!r}")
+
+    def disturb(
+        self, before: Array | None, codes: Array, top: int, key: Key, dead: Array | None, origin: tuple[int, int]
+    ) -> tuple[Array, Array | None]:
+        """Codes [T, H, W] up to `top` with afterpulses and crosstalk, and the memory [H, W] for the frame after them.
+
+        `before` is the memory of the frame before them, None at the clip's first; pixels that are `dead` [H, W] stay 0.
+        """
+        if not (self.afterpulse or self.crosstalk):
+            return codes, None
+        result = np.empty_like(codes)
+        for t, frame in enumerate(codes):
+            at = key.at(key.frame + t)
+            fired, before = _afterpulses(frame, before, at, dead, self.afterpulse, origin)
+            result[t] = _crosstalk(fired, top, at, dead, self.crosstalk, origin)
+        return result, before
+
+
+def _afterpulses(
+    plane: Array, before: Array | None, key: Key, dead: Array | None, probability: float, origin: tuple[int, int]
+) -> tuple[Array, Array]:
+    """The plane with afterpulses of the one before, and itself as the memory of the next (before any crosstalk).
+
+    At constant light, P(fire) = p / (1 - a (1 - p)) after some planes: p alone, a the probability.
+    """
+    if not probability or before is None:
+        return plane, plane
+    released = uniform(words(replace(key, stage=_AFTERPULSE), plane.shape, origin)) < probability
+    after = plane | (before & released.astype(plane.dtype))
+    after = after if dead is None else np.where(dead, plane.dtype.type(0), after)
+    return after, after
+
+
+def _crosstalk(
+    codes: Array, top: int, key: Key, dead: Array | None, probability: float, origin: tuple[int, int]
+) -> Array:
+    """Each avalanche of a pixel sets off each of its four neighbours with this probability; those go no further.
+
+    A code n brings Binomial(n, probability) avalanches to a neighbour, drawn under the key of the pixel they come from.
+    At constant light a plane fires with 1 - (1 - p) (1 - p probability)^4.
+    """
+    if not probability:
+        return codes
+    from scipy.special import bdtr
+
+    total = codes.astype(np.int64)
+    height, width = codes.shape
+    for number, (dy, dx) in enumerate(_DIRECTIONS):
+        u = uniform(words(replace(key, stage=_CROSSTALK + number), codes.shape, origin))
+        sent, j = np.zeros(codes.shape, np.int64), 0
+        while (more := (j < codes) & (u >= bdtr(j, np.maximum(codes, 1), probability))).any():
+            sent, j = sent + more, j + 1
+        target = (slice(max(dy, 0), height + min(dy, 0)), slice(max(dx, 0), width + min(dx, 0)))
+        source = (slice(max(-dy, 0), height + min(-dy, 0)), slice(max(-dx, 0), width + min(-dx, 0)))
+        total[target] += sent[source]
+    total = np.minimum(total, top)
+    return (total if dead is None else np.where(dead, 0, total)).astype(codes.dtype)

@@ -1,0 +1,216 @@
+"""A sensor with one value per pixel and correlated noise: the draw of its codes.
+
+Defects --PixelArray.of--> PixelArray: a sensor and its maps --sample, blocks--> codes
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from math import ceil, log
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import files
+from qsim.keys import Key
+from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.defects.correlated_noise import CorrelatedNoise
+from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.defects.fixed_pattern import PERFECT, Maps, draw_maps, lit, measured_dark_map
+from qsim.sensor.qis import QIS
+from qsim.sensor.sensor import Sensor
+from qsim.sensor.spad import BinarySPAD
+
+Sampler = Callable[[Sensor, Array, float, Key, tuple[int, int]], Array]  # photons, exposure, key, origin -> codes
+
+
+@dataclass(frozen=True, eq=False)
+class PixelArray:
+    """A sensor model with one value per pixel: its record, the maps of one frame size, and its correlated noise."""
+
+    sensor: Sensor
+    maps: Maps = PERFECT
+    defects: Defects = field(default_factory=Defects)
+
+    @classmethod
+    def of(cls, defects: Defects, sensor: Sensor, height: int, width: int) -> PixelArray:
+        """The maps of the device for frames of this size; `ValueError` where they do not fit the sensor or the size.
+
+        Measured maps may be larger: frames lie in their upper left corner.
+        """
+        _check_model(defects, sensor)
+        drawn = draw_maps(defects.pattern, (height, width))
+        measured: dict[str, Array] = {}
+        for key, path in defects.maps.items():
+            whole = _read_map(path, key)
+            if whole.shape[0] < height or whole.shape[1] < width:
+                raise ValueError(
+                    f"{path}: the {key} has {whole.shape[0]} x {whole.shape[1]} pixels, the frames {height} x {width}; "
+                    "a map covers the whole sensor"
+                )
+            name = key.removesuffix("_map")
+            if name == "dark":
+                rate, whole = measured_dark_map(whole)
+                sensor = sensor.with_dark_rate(rate)
+            elif name == "read_noise" and isinstance(sensor, QIS):
+                if not sensor.read_noise:
+                    raise ValueError(f"{path}: a map of read noise needs a sensor whose read_noise is above 0")
+                whole = whole / sensor.read_noise
+            measured[name] = whole[:height, :width] != 0 if name == "dead" else whole[:height, :width]
+        return cls(sensor, replace(drawn, **measured), defects)
+
+    @property
+    def memory(self) -> bool:
+        """Whether a frame depends on those before it."""
+        return bool(self.defects.afterpulse and isinstance(self.sensor, BinarySPAD))
+
+    @property
+    def follows_photons(self) -> bool:
+        """Whether a counting pixel remembers the exposure before."""
+        return isinstance(self.sensor, CountingSPAD) and bool(self.defects.carry_dead_time or self.defects.afterpulse)
+
+    @property
+    def reach(self) -> int:
+        """Pixels beyond a crop that its codes depend on."""
+        return 1 if self.defects.crosstalk else 0
+
+    def lead(self, chance: float) -> int:
+        """Frames before a frame after which what went before matters with this chance at most."""
+        if not (self.memory and isinstance(self.sensor, BinarySPAD)):
+            return 0
+        return ceil(log(chance) / log(self.defects.afterpulse) / self.sensor.planes)
+
+    def crop(self, y: int, x: int, height: int, width: int) -> PixelArray:
+        """A part of the frame, with the maps of its pixels."""
+        return replace(self, maps=self.maps.crop(y, x, height, width))
+
+    def sample(
+        self, photons: Array, exposure: float, *, key: Key, origin: tuple[int, int] = (0, 0), engine: str = "auto"
+    ) -> Array:
+        """Codes of photons [T, H, W] as `Sensor.sample`, with defects; without any the same bits.
+
+        `ValueError` for afterpulses of a counting pixel (event_simulation.py), or of a clip that does not start at
+        frame 0.
+        """
+        if self.defects.afterpulse and key.frame:
+            raise ValueError(f"afterpulse has a memory: sample the clip from frame 0, not from frame {key.frame}")
+        if self.defects.afterpulse and not isinstance(self.sensor, BinarySPAD):
+            raise ValueError(
+                "afterpulse: defined per binary plane; for counting pixels use event_simulation, a QIS has none"
+            )
+        return self._after(None, photons, exposure, key, origin, engine)[0]
+
+    def blocks(
+        self,
+        photons: Iterable[Array],
+        exposure: float,
+        key: Key,
+        origin: tuple[int, int] = (0, 0),
+        engine: str | Sampler = "auto",
+    ) -> Iterator[Array]:
+        """Codes of successive blocks of photons [t, H, W], the first of which is frame key.frame.
+
+        `origin` (y, x) places a crop in the full frame. `engine` is that of `Sensor.sample`, or a function that draws
+        the codes of pixels without defects in its place.
+        """
+        before = None
+        for block in photons:
+            codes, before = self._after(before, block, exposure, key, origin, engine)
+            key = key.at(key.frame + len(block)) if key.frame + len(block) < 2**32 else key
+            yield codes
+
+    def _after(
+        self,
+        before: Array | None,
+        photons: Array,
+        exposure: float,
+        key: Key,
+        origin: tuple[int, int],
+        engine: str | Sampler,
+    ) -> tuple[Array, Array | None]:
+        """Codes of a block, and the memory for the next; `before` is that of the block before, None at the first."""
+        clocked = isinstance(self.sensor, BinarySPAD)
+        noise = CorrelatedNoise(self.defects.afterpulse if clocked else 0.0, self.defects.crosstalk)
+        stack = np.asarray(photons)
+        if stack.ndim != 3:
+            raise ValueError(f"photons have the shape [T, H, W], got {list(stack.shape)}")
+        if noise.crosstalk and isinstance(self.sensor, QIS):
+            raise ValueError("crosstalk: a QIS has no avalanches; blur the light instead")
+        if clocked and self.sensor.bits > 1 and (noise.afterpulse or noise.crosstalk):
+            return self._sum_of_planes(before, noise, stack, exposure, key, origin, engine)
+        codes = self._independent(stack, exposure, key, origin, engine)
+        return noise.disturb(before, codes, self.sensor.levels - 1, key, self.maps.dead, origin)
+
+    def _sum_of_planes(
+        self,
+        before: Array | None,
+        noise: CorrelatedNoise,
+        photons: Array,
+        exposure: float,
+        key: Key,
+        origin: tuple[int, int],
+        engine: str | Sampler,
+    ) -> tuple[Array, Array | None]:
+        """A code as its M planes one after the other, as BinarySPAD draws them, each disturbed by the one before."""
+        assert isinstance(self.sensor, BinarySPAD)
+        m, plane = self.sensor.planes, replace(self, sensor=replace(self.sensor, bits=1))
+        codes = np.zeros(photons.shape, self.sensor.dtype)
+        for p in range(len(photons) * m):
+            at = key.at(key.frame * m + p)
+            fired = plane._independent(photons[p // m][None] / m, exposure / m, at, origin, engine)
+            fired, before = noise.disturb(before, fired, 1, at, self.maps.dead, origin)
+            codes[p // m] += fired[0]
+        return codes, before
+
+    def _independent(
+        self, photons: Array, exposure: float, key: Key, origin: tuple[int, int], engine: str | Sampler
+    ) -> Array:
+        """Codes [T, H, W] of pixels that differ from each other and do not disturb each other."""
+        maps = self.maps
+        sensor, light = lit(self.sensor, photons, exposure, maps)
+        if maps.offset is None and maps.read_noise is None:
+            codes = (
+                sensor.sample(light, exposure, key=key, origin=origin, engine=engine)
+                if isinstance(engine, str)
+                else engine(sensor, light, exposure, key, origin)
+            )
+        elif isinstance(sensor, QIS):
+            noise = 1.0 if maps.read_noise is None else maps.read_noise
+            offset = 0.0 if maps.offset is None else maps.offset
+            codes = np.stack(
+                [
+                    sensor.read_out(frame, exposure, key.at(key.frame + t), origin, noise, offset)
+                    for t, frame in enumerate(light)
+                ]
+            )
+        else:
+            raise ValueError(f"{type(sensor).__name__} has no read-out: maps of offset and read noise are for a QIS")
+        return codes if maps.dead is None else np.where(maps.dead, sensor.dtype(0), codes)
+
+
+def _check_model(defects: Defects, sensor: Sensor) -> None:
+    """`ValueError` for what this model of sensor cannot have."""
+    name = type(sensor).__name__
+    read_out = (
+        defects.pattern.offset or defects.pattern.read_noise or {"offset_map", "read_noise_map"} & set(defects.maps)
+    )
+    if read_out and not isinstance(sensor, QIS):
+        raise ValueError(f"defects: a {name} has no read-out; offset and read_noise are for a QIS")
+    if isinstance(sensor, QIS) and (defects.afterpulse or defects.crosstalk):
+        raise ValueError("defects: a QIS has no avalanches, so neither afterpulse nor crosstalk")
+    counting = isinstance(sensor, CountingSPAD)
+    if (defects.carry_dead_time or defects.afterpulse_delay) and not counting:
+        raise ValueError(f"defects: carry_dead_time and afterpulse_delay are for a CountingSPAD, this is a {name}")
+    if counting and defects.afterpulse and not defects.afterpulse_delay:
+        raise ValueError("defects: afterpulse of a counting pixel needs afterpulse_delay in seconds")
+
+
+def _read_map(path: str, key: str) -> Array:
+    array = np.array(files.load_array(Path(path)))
+    if array.ndim != 2 or not array.size or array.dtype.kind not in "fuib" or not np.isfinite(array).all():
+        raise ValueError(f"{path}: a {key} is [H, W] of finite numbers, found {array.dtype} {list(array.shape)}")
+    if key != "offset_map" and (array < 0).any():
+        raise ValueError(f"{path}: a {key} has no negative values")
+    return array
