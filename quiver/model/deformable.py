@@ -29,7 +29,7 @@ def warp(image: Tensor, flow: Tensor, padding: Literal["zeros", "border"] = "zer
         height, width = image.shape[2:]
         x = torch.arange(width, dtype=flow.dtype, device=flow.device) + flow[:, 0]
         y = torch.arange(height, dtype=flow.dtype, device=flow.device)[:, None] + flow[:, 1]
-        return _sample(image, x, y, padding)
+        return sample_at(image, x, y, padding)
 
 
 def deform_conv2d(
@@ -121,7 +121,7 @@ def _tap_samples(image: Tensor, y: Tensor, x: Tensor) -> Tensor:
     count, groups, taps, height, width = y.shape
     folded = image.reshape(count * groups, image.shape[1] // groups, *image.shape[2:])
     rows, columns = (p.reshape(count * groups, taps * height, width) for p in (y, x))
-    return _sample(folded, columns, rows, "zeros").view(count, groups, -1, taps, height, width)
+    return sample_at(folded, columns, rows, "zeros").view(count, groups, -1, taps, height, width)
 
 
 def _contract(samples: Tensor, weight: Tensor, part: slice) -> Tensor:
@@ -135,7 +135,7 @@ def _contract(samples: Tensor, weight: Tensor, part: slice) -> Tensor:
     return torch.matmul(kernel, columns).view(count, out, height, width)
 
 
-def _sample(image: Tensor, x: Tensor, y: Tensor, padding: str) -> Tensor:
+def sample_at(image: Tensor, x: Tensor, y: Tensor, padding: str) -> Tensor:
     """image [N, C, H, W] at pixel positions x, y [N, h, w] -> [N, C, h, w]."""
     height, width = image.shape[2:]
     grid = torch.stack(((2 * x + 1) / width - 1, (2 * y + 1) / height - 1), dim=-1)

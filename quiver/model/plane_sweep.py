@@ -52,7 +52,7 @@ def paths(window: Tensor, largest: float) -> tuple[Tensor, Tensor]:
     frames = window[:, middle - reach : middle + reach + 1].float().clamp(min=0)
     half = F.avg_pool2d(frames, 2, ceil_mode=True, count_include_pad=False)
     weights = time_weights(2 * reach + 1, frames.device)
-    velocity = 2 * _resize(_median(_coarse(_stable(half), weights, largest / 2)), frames.shape[2:])
+    velocity = 2 * _resize(_median(best_of_grid(_stable(half), weights, largest / 2)), frames.shape[2:])
     frames = _stable(frames)
     path = _corrected(frames, torch.cat([velocity, torch.zeros_like(velocity)], 1))
     for distance in NEIGHBOURS:
@@ -89,7 +89,7 @@ def aligned(window: Tensor, velocity: Tensor, acceleration: Tensor) -> Tensor:
     return moved.view(count, length, height, width)
 
 
-def _coarse(frames: Tensor, weights: Tensor, largest: float) -> Tensor:
+def best_of_grid(frames: Tensor, weights: Tensor, largest: float) -> Tensor:
     """The best velocity of the grid; frames are shifted by whole pixels, rows and columns apart."""
     count, length, height, width = frames.shape
     reach, n = length // 2, int(largest / STEP)
@@ -111,7 +111,7 @@ def _coarse(frames: Tensor, weights: Tensor, largest: float) -> Tensor:
         variance = squares.addcmul_(total, total, value=-1)
         grid = torch.stack([along, along[row].expand_as(along)])  # x, y
         unlikely = (1 + PREFERENCE * torch.hypot(*grid))[:, None, None, None]
-        price, at = (_means(variance, SIDE + 1, 2).clamp_(min=0).add_(FLOOR) * unlikely).min(0)
+        price, at = (means_at(variance, SIDE + 1, 2).clamp_(min=0).add_(FLOOR) * unlikely).min(0)
         found = grid[:, at]
         if best is None or lowest is None:
             best, lowest = found, price
@@ -183,10 +183,10 @@ def _resize(field: Tensor, size: torch.Size) -> Tensor:
 
 def _mean_around(image: Tensor, side: int) -> Tensor:
     """Means over side x side pixels, of those that exist."""
-    return _means(image, side, 1)
+    return means_at(image, side, 1)
 
 
-def _means(image: Tensor, side: int, stride: int) -> Tensor:
+def means_at(image: Tensor, side: int, stride: int) -> Tensor:
     """The same at every `stride`-th pixel."""
     height, width = image.shape[2:]
     before = (side - 1) // 2

@@ -2,6 +2,7 @@
 
 import math
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 
 from quiver.model.config import Config
 from quiver.model.folded import FoldedConfig
+from quiver.model.presets import assemble
 from quiver.model.published_weights import published_name
 from quiver.model.quiver import QUIVER
 
@@ -28,6 +30,10 @@ TINY = FoldedConfig(  # the published design with the smallest parts, for tests 
     largest_velocity=0.0,
     lecun=False,
 )
+SMALL = replace(TINY, channels=4, deformable_groups=2, denoiser_growth=4, denoiser_passes=2, flow_channels=(4, 4),
+                flow_kernel=3, cell_blocks=2)  # fmt: skip
+FOLDED = replace(SMALL, fold=2, estimate_width=4, largest_velocity=1.0, attention_width=16, attention_temperature=4.0,
+                 flow_levels=3)  # fmt: skip
 CONSTANTS = {"spynet.mean": 0.449, "spynet.std": 0.226}
 
 
@@ -74,6 +80,13 @@ def fill_by_rule(model: nn.Module) -> nn.Module:
 def draw(*shape: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> Tensor:
     """Codes 0..7 as the network sees them."""
     return torch.randint(0, 8, shape, generator=torch.Generator().manual_seed(seed)).to(dtype) / 7
+
+
+def lively(config: Config, dtype: torch.dtype = torch.float64) -> QUIVER:
+    """Weights of natural size everywhere, so that no stage is silent."""
+    network = fill_by_rule(assemble(config)).to(dtype).eval()
+    assert isinstance(network, QUIVER)
+    return network
 
 
 @torch.no_grad()

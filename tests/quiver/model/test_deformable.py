@@ -162,8 +162,8 @@ def test_large_inputs_take_the_tap_loop_only_without_gradients(monkeypatch):
     import quiver.model.deformable as ops
 
     drawn = []
-    sample = ops._sample
-    monkeypatch.setattr(ops, "_sample", lambda *a: drawn.append(a[1].shape[1]) or sample(*a))
+    sample = ops.sample_at
+    monkeypatch.setattr(ops, "sample_at", lambda *a: drawn.append(a[1].shape[1]) or sample(*a))
     monkeypatch.setattr(ops, "TAP_LOOP_ABOVE", 100)
     image, offset, weight = draw(1, 1, 6, 6), draw(1, 18, 6, 6), draw(1, 1, 3, 3)
     with torch.no_grad():

@@ -75,7 +75,7 @@ def test_the_grid_is_searched_as_the_obvious_loop_does():
                 box = variance[max(0, 2 * r - 3) : 2 * r + 5, max(0, 2 * c - 3) : 2 * c + 5]
                 costs[i, r, c] = (box.mean() + plane_sweep.FLOOR) * (1 + plane_sweep.PREFERENCE * np.hypot(vx, vy))
     frames = torch.tensor(window, dtype=torch.float32)[None]
-    found = plane_sweep._coarse(frames, torch.tensor(weights, dtype=torch.float32), 1.0)[0, :, ::2, ::2].numpy()
+    found = plane_sweep.best_of_grid(frames, torch.tensor(weights, dtype=torch.float32), 1.0)[0, :, ::2, ::2].numpy()
     chosen = [grid.index((float(x), float(y))) for x, y in found.reshape(2, -1).T]
     paid = np.take_along_axis(costs.reshape(len(grid), -1), np.array([chosen]), 0)[0]
     np.testing.assert_allclose(paid, costs.min(0).ravel(), rtol=1e-3, atol=1e-7)  # the best, or its equal in float32
@@ -130,7 +130,7 @@ def test_aligning_passes_gradients_to_the_frames():
 @pytest.mark.parametrize("size", [(1, 1), (2, 7), (31, 40)])
 def test_means_are_those_of_what_exists(side, stride, size):
     image = torch.rand(2, 1, *size, dtype=torch.float64)
-    means = plane_sweep._means(image, side, stride)
+    means = plane_sweep.means_at(image, side, stride)
     before = (side - 1) // 2
     for i in range(means.shape[2]):
         for j in range(means.shape[3]):

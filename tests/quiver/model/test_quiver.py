@@ -1,49 +1,21 @@
-"""QUIVER beyond the golden numbers: presets, reuse across windows, ablations, hard inputs."""
+"""QUIVER beyond the golden numbers: parts, shapes, batches, hard inputs."""
 
-import time
-from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import pytest
 import torch
-from golden import TINY, draw, fill_by_rule, network
+from golden import FOLDED, SMALL, draw, lively, network
 from torch import Tensor
 
-from quiver.model import deformable, schedules
+from quiver.model import deformable
 from quiver.model import quiver as model_module
 from quiver.model.config import Config
 from quiver.model.folded import FoldedConfig
-from quiver.model.presets import ABLATIONS, PRESETS, ablated, assemble, build, parameter_count
+from quiver.model.presets import PRESETS, assemble, build
 from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 
-SMALL = replace(TINY, channels=4, deformable_groups=2, denoiser_growth=4, denoiser_passes=2, flow_channels=(4, 4),
-                flow_kernel=3, cell_blocks=2)  # fmt: skip
-FOLDED = replace(SMALL, fold=2, estimate_width=4, largest_velocity=1.0, attention_width=16, attention_temperature=4.0,
-                 flow_levels=3)  # fmt: skip
 BOTH = pytest.mark.parametrize("config", [SMALL, FOLDED], ids=["small", "folded"])
-
-
-def lively(config: Config, dtype: torch.dtype = torch.float64) -> QUIVER:
-    """Weights of natural size everywhere, so that no stage is silent."""
-    network = fill_by_rule(assemble(config)).to(dtype).eval()
-    assert isinstance(network, QUIVER)
-    return network
-
-
-@torch.no_grad()
-def run(schedule: Callable[[QUIVER, Iterable[Tensor]], Iterator[Tensor]], network: QUIVER, x: Tensor) -> Tensor:
-    """[B, T, 1, H, W] -> [B, T-10, 1, H, W]."""
-    return torch.stack(list(schedule(network, x.unbind(1))), dim=1)
-
-
-# Presets
-
-
-def test_the_published_sizes_to_the_last_parameter():
-    assert parameter_count(PRESETS["quiver"]) == 156_755_311
-    assert parameter_count(PRESETS["quiver-s"]) == 10_866_583
-    assert parameter_count(Config(channels=32)) == 40_091_487
 
 
 def test_the_width_can_be_given_by_name_or_alone():
@@ -62,20 +34,6 @@ def test_the_parts_have_the_published_sizes():
         "alignment": 434_992, "fusions": 3 * 41_280, "cell": 27_951_904, "attention": 103_834_368,
         "refine4": 11_546_891, "refine": 11_546_891,
     }  # fmt: skip
-
-
-def test_nano_fits_its_file():
-    """The shipped weights may take 5 MB of float32; the control is of the same kind of size."""
-    assert 4 * parameter_count(PRESETS["nano"]) < 5e6
-    assert sum(p.numel() for p in UNet().parameters()) == 911_841
-
-
-@pytest.mark.parametrize("name", ["nano", "unet"])
-def test_networks_by_name(name):
-    network = build(name)
-    side = 2 * int(network.multiple)  # type: ignore[call-overload]
-    out = network(draw(2, 12, 1, side, side + int(network.multiple), dtype=torch.float32))  # type: ignore[call-overload]
-    assert out.scale1.shape == (2, 2, 1, side, side + int(network.multiple))  # type: ignore[call-overload]
 
 
 def test_wrong_names_and_settings_say_what_is_right():
@@ -124,18 +82,6 @@ def test_output_shapes_and_units(config):
     assert out.flow.shape == (2, 12, 2, 16, 24)
 
 
-def test_an_untrained_nano_returns_about_the_mean_of_the_middle_frames():
-    """Where nothing moves; the random layers add less than a fifth of the noise of one frame (rms)."""
-    torch.manual_seed(0)
-    network, x = build("nano"), draw(1, 1, 1, 32, 32, dtype=torch.float32).repeat(1, 11, 1, 1, 1)
-    with torch.no_grad():
-        out = network(x).scale1[:, 0]
-    weights = network.estimate.weights.detach()
-    assert float(weights.sum()) == pytest.approx(1)
-    mean = torch.einsum("btchw,t->bchw", x, weights)
-    assert float((out - mean).square().mean()) < 0.04 * float(x.var())
-
-
 @pytest.mark.parametrize("lecun", [False, True])
 @pytest.mark.parametrize("kernel", [1, 3])
 def test_alignment_starts_from_the_flow_alone(kernel, lecun):
@@ -150,76 +96,6 @@ def test_alignment_starts_from_the_flow_alone(kernel, lecun):
     inside = (slice(None), slice(None), slice(1, -1), slice(1, -2))
     wanted = torch.nn.functional.conv2d(moved, alignment.weight / 2, padding=kernel // 2)
     assert torch.allclose(alignment(previous, current, flow)[inside], wanted[inside])
-
-
-def test_the_lecun_start_keeps_the_fused_features_alive():
-    """Spread over space, four starts together: default weights leave little, as two faded signals are multiplied."""
-    x, spread = draw(1, 11, 1, 32, 32, dtype=torch.float32), {False: 0.0, True: 0.0}
-    for lecun in (False, True):
-        for seed in range(4):
-            torch.manual_seed(seed)
-            started = assemble(replace(FOLDED, lecun=lecun))
-            fused: list[Tensor] = []
-            started.fusions[0].register_forward_hook(lambda _m, _i, out, fused=fused: fused.append(out))
-            with torch.no_grad():
-                started(x)
-            spread[lecun] += float(fused[1].flatten(2).std(dim=2).mean())
-    assert spread[True] > 10 * spread[False], spread
-
-
-# The same numbers by other roads
-
-
-@BOTH
-def test_exact_reuse_equals_windows_from_scratch(config):
-    network, x = lively(config), draw(2, 15, 1, 16, 24)
-    windows = run(schedules.windows, network, x)
-    assert windows.shape == (2, 5, 1, 16, 24)
-    assert float((run(schedules.exact, network, x) - windows).abs().max()) < 1e-10 * float(windows.std())
-
-
-@BOTH
-def test_streaming_equals_one_pass_over_the_clip(config):
-    network, x = lively(config), draw(2, 15, 1, 16, 24)
-    with torch.no_grad():
-        whole = network(x).scale1
-    assert float((run(schedules.stream, network, x) - whole).abs().max()) < 1e-10 * float(whole.std())
-
-
-def test_the_published_network_runs_by_every_schedule():
-    network, x = lively(Config(16)), draw(1, 13, 1, 8, 12)
-    with torch.no_grad():
-        whole = network(x).scale1
-    windows = run(schedules.windows, network, x)
-    assert float((run(schedules.stream, network, x) - whole).abs().max()) < 1e-10 * float(whole.std())
-    assert float((run(schedules.exact, network, x) - windows).abs().max()) < 1e-10 * float(windows.std())
-
-
-def test_streaming_is_not_the_same_as_windows():
-    """The carried state and the missing zeros are visible: the difference is real, and it is not large."""
-    network, x = lively(SMALL), draw(1, 16, 1, 16, 24)
-    windows, stream = run(schedules.windows, network, x), run(schedules.stream, network, x)
-    difference = (windows - stream).square().mean().sqrt() / windows.std()
-    assert 1e-6 < float(difference) < 0.5
-
-
-@pytest.mark.parametrize("schedule", [schedules.exact, schedules.stream])
-def test_frames_are_taken_one_by_one_and_denoised_once(schedule, monkeypatch):
-    network = lively(SMALL, torch.float32)
-    taken, denoised = [], []
-
-    def frames() -> Iterator[Tensor]:
-        for t in range(16):
-            taken.append(t)
-            yield draw(1, 1, 8, 8, dtype=torch.float32, seed=t)
-
-    monkeypatch.setattr(network, "denoise", lambda x: denoised.append(1) or QUIVER.denoise(network, x))
-    with torch.no_grad():
-        results = schedule(network, frames())
-        next(results)
-        assert len(taken) <= 13
-        assert len([*results]) == 16 - 10 - 1
-    assert len(denoised) == 16
 
 
 def test_inference_in_small_pieces_gives_the_same_numbers(monkeypatch):
@@ -237,58 +113,6 @@ def test_clips_of_a_batch_do_not_see_each_other(config):
     network, x = lively(config), draw(2, 11, 1, 16, 16)
     with torch.no_grad():
         assert torch.allclose(network(x).scale1[1:], network(x[1:]).scale1, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_reuse_saves_the_promised_time():
-    """CPU time of one thread per restored frame, width 16, 64 x 64: exact >= 1.5 times less, streaming >= 3 times."""
-    network16, x = network(16, torch.float32), draw(1, 26, 1, 64, 64, dtype=torch.float32)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    seconds = {}
-    try:
-        for schedule in (schedules.windows, schedules.exact, schedules.stream):
-            run(schedule, network16, x[:, :11])
-            start = time.process_time()
-            run(schedule, network16, x)
-            seconds[schedule] = time.process_time() - start
-    finally:
-        torch.set_num_threads(threads)
-    assert seconds[schedules.windows] / seconds[schedules.exact] > 1.5, seconds
-    assert seconds[schedules.windows] / seconds[schedules.stream] > 3, seconds
-
-
-# Ablations
-
-
-@pytest.mark.parametrize("row", ABLATIONS)
-@pytest.mark.parametrize("preset", ["quiver", "nano"])
-def test_ablations_keep_the_capacity(preset, row):
-    wanted = parameter_count(PRESETS[preset])
-    assert abs(parameter_count(ablated(PRESETS[preset], row)) / wanted - 1) < 0.005
-
-
-@pytest.mark.parametrize("row", ABLATIONS)
-def test_ablations_lack_what_they_say(row):
-    pre_denoiser, flow, multi_scale = ABLATIONS[row]
-    config = ablated(FOLDED, row)
-    network = lively(config)
-    assert (network.denoiser is None, network.flow is None) == (not pre_denoiser, not flow)
-    out = network(draw(1, 11, 1, 16, 16))
-    assert (out.denoised is None, out.flow is None) == (not pre_denoiser, not flow)
-    assert (out.scale2 is None, out.scale4 is None) == (not multi_scale, not multi_scale)
-    assert torch.isfinite(out.scale1).all()
-    x = draw(1, 13, 1, 16, 16)
-    assert torch.allclose(run(schedules.windows, network, x), run(schedules.exact, network, x), atol=1e-10)
-
-
-def test_an_unknown_ablation_is_named():
-    assert ablated(SMALL, "all") == SMALL
-    with pytest.raises(ValueError, match="no ablation is called 'some'; known: none, "):
-        ablated(SMALL, "some")
-
-
-# Hard inputs
 
 
 def hard_inputs() -> dict[str, Tensor]:

@@ -1,23 +1,43 @@
-"""Weights in and out: our files, those of earlier versions, and everything that must be refused."""
+"""Weights in and out: our files, those of earlier versions, and files with anything in them."""
+
+from __future__ import annotations
 
 import json
+import random
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from golden import TINY
+from hostile import MEMORY, VALUES, one_line, patience
 from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import nn
 
+from qsim.process import peak_memory, reset_peak
 from quiver.model.config import Config
-from quiver.model.folded import FoldedQUIVER
+from quiver.model.folded import FoldedConfig, FoldedQUIVER
 from quiver.model.presets import PRESETS
 from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import EARLIER, RENAMED, RENAMED_PARTS, load, save
 from quiver.restoration.restorers import weights_path
+
+SMALLEST = FoldedConfig(
+    channels=2,
+    denoiser_growth=2,
+    flow_channels=(2,),
+    attention_width=4,
+    attention_temperature=None,
+    fold=1,
+    estimate_width=2,
+    largest_velocity=1.0,
+    lecun=False,
+)
+OLD = {new: old for old, new in RENAMED.items()}
+EARLIER_TINY = {OLD.get(name, name): value for name, value in SMALLEST.to_dict().items()}
 
 
 def notes(path: Path) -> dict[str, str]:
@@ -102,3 +122,108 @@ def test_weights_that_do_not_fit_are_refused(tmp_path: Path):
     save_file(network.state_dict(), path, metadata | {"network": "GAN"})
     with pytest.raises(ValueError, match="no network is called 'GAN'"):
         load(path)
+
+
+# Files with anything in them
+
+
+@pytest.fixture(scope="module")
+def tiny() -> dict[str, torch.Tensor]:
+    torch.manual_seed(0)
+    return {name: value.contiguous() for name, value in FoldedQUIVER(SMALLEST).state_dict().items()}
+
+
+def refused_or_loaded(path: Path) -> bool:
+    """Whether the file is refused; asserts that the answer comes in bounded time and memory."""
+    before, started = reset_peak(), time.process_time()
+    try:
+        load(path)
+    except Exception as error:
+        one_line(error, path)
+        refused = True
+    else:
+        refused = False
+    assert time.process_time() - started < patience()
+    assert peak_memory() - before < MEMORY
+    return refused
+
+
+@pytest.mark.parametrize("key", sorted(SMALLEST.to_dict()))
+def test_any_value_of_any_key_of_a_configuration(tiny, tmp_path, key):
+    """What is loaded after all has a configuration that says the same thing."""
+    path, wanted = tmp_path / "w.safetensors", SMALLEST.to_dict()
+    for value in VALUES:
+        config = json.dumps(wanted | {key: value})
+        save_file(tiny, path, {"format": "quiver-1", "network": "FoldedQUIVER", "config": config})
+        if not refused_or_loaded(path):
+            assert load(path).config == FoldedConfig.from_dict(wanted | {key: value})
+
+
+@pytest.mark.parametrize("key", sorted(EARLIER_TINY))
+def test_any_value_of_any_key_of_an_earlier_configuration(tiny, tmp_path, key):
+    path = tmp_path / "w.safetensors"
+    for value in VALUES:
+        config = json.dumps(EARLIER_TINY | {key: value})
+        save_file(tiny, path, {"format": "quiver-1", "network": "QUIVER", "config": config})
+        if not refused_or_loaded(path):
+            assert load(path).config == FoldedConfig.from_dict(SMALLEST.to_dict() | {RENAMED.get(key, key): value})
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"deformable_groups": 0}, {"flow_channels": []}, {"fold": 1e300}, {"flow_levels": 10**9}, {"cell_blocks": 10**9}],
+    ids=str,
+)
+def test_configurations_that_crashed_or_hung(tiny, tmp_path, changes):
+    path = tmp_path / "w.safetensors"
+    metadata = {"format": "quiver-1", "network": "QUIVER", "config": json.dumps(EARLIER_TINY | changes)}
+    save_file(tiny, path, metadata)
+    assert refused_or_loaded(path)
+
+
+@pytest.mark.parametrize(
+    ("network", "config"),
+    [
+        *(
+            (kind, text)
+            for kind in ("QUIVER", "FoldedQUIVER", "UNet")
+            for text in ("", "3", "null", "[]", "[" * 5000, "{", '"x"')
+        ),
+        *(("UNet", json.dumps({"width": value})) for value in VALUES if value not in (1, 2, 3, 7, 64, True)),
+        ("x" * 5000, "{}"),
+        ("", "{}"),
+    ],
+)
+def test_a_configuration_that_is_none(tmp_path, network, config):
+    path = tmp_path / "w.safetensors"
+    save_file({"a": torch.ones(1)}, path, {"format": "quiver-1", "network": network, "config": config})
+    assert refused_or_loaded(path)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_many_wrong_values_at_once(tiny, tmp_path, seed):
+    rng, path = random.Random(seed), tmp_path / "w.safetensors"
+    for _ in range(25):
+        kind, wanted = rng.choice([("QUIVER", EARLIER_TINY), ("FoldedQUIVER", SMALLEST.to_dict())])
+        keys = rng.sample(sorted(wanted), rng.randint(1, 4))
+        config = json.dumps(wanted | {key: rng.choice(VALUES) for key in keys})
+        save_file(tiny, path, {"format": "quiver-1", "network": kind, "config": config})
+        refused_or_loaded(path)
+
+
+def test_tensors_of_another_kind(tiny, tmp_path):
+    path = tmp_path / "w.safetensors"
+    notes = {"format": "quiver-1", "network": "FoldedQUIVER", "config": json.dumps(SMALLEST.to_dict())}
+    name = "cell.image1.weight"
+    for value in (tiny[name].half(), tiny[name].long(), tiny[name].flatten(), torch.ones(()), torch.ones(0)):
+        save_file(tiny | {name: value.contiguous()}, path, notes)
+        assert refused_or_loaded(path)
+    save_file({key: value for key, value in tiny.items() if key != name}, path, notes)
+    assert refused_or_loaded(path)
+
+
+def test_files_of_ours_still_load(tmp_path):
+    torch.manual_seed(0)
+    for network in (FoldedQUIVER(SMALLEST), UNet(UNetConfig(2))):
+        save(network, network.config, tmp_path / "w.safetensors")
+        assert load(tmp_path / "w.safetensors").config == network.config

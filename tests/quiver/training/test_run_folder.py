@@ -1,0 +1,232 @@
+"""The folder of a run: its files, its lock, a full disk, and states with anything in them."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import random
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hostile import MEMORY, one_line, patience
+from runs import settings, small_network
+from safetensors import safe_open
+
+from qsim import files
+from qsim.process import peak_memory, reset_peak
+from quiver.cli.program import main
+from quiver.model.unet import UNet, UNetConfig
+from quiver.training.loop import train
+from quiver.training.optimiser import Optimiser
+from quiver.training.run_folder import Run
+from quiver.training.schedule import State
+from quiver.training.settings import Settings
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_files_of_a_run(tiny_dataset, tmp_path):
+    train(small_network(), settings(tiny_dataset, tmp_path / "r"), progress=False)
+    names = {path.name for path in (tmp_path / "r").iterdir()}
+    assert {"settings.json", "checkpoint.pt", "best.safetensors", "last.safetensors", "history.json"} <= names
+    assert any(name.startswith("events.out.tfevents") for name in names)
+    with safe_open(tmp_path / "r/best.safetensors", framework="pt") as file:
+        assert json.loads(file.metadata()["settings"])["ppp"] == [3.25]
+    history = json.loads((tmp_path / "r/history.json").read_text())["history"]
+    assert [entry["step"] for entry in history] == [4, 6]
+
+
+def test_other_settings_are_refused(tiny_dataset, tmp_path):
+    opened(settings(tiny_dataset, tmp_path / "r"))
+    opened(settings(tiny_dataset, tmp_path / "r", workers=3))  # decides nothing
+    with pytest.raises(FileExistsError, match="holds a run with seed 0, now it is 1"):
+        opened(settings(tiny_dataset, tmp_path / "r", seed=1))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/file").write_text("mine")
+    for force in (False, True):
+        with pytest.raises(FileExistsError, match=r"is no training run|removes only what this command made"):
+            opened(settings(tiny_dataset, tmp_path / "other"), force=force)
+    assert (tmp_path / "other/file").read_text() == "mine"
+
+
+def opened(wanted: Settings, *, force: bool = False) -> None:
+    with Run(wanted).open(force=force):
+        pass
+
+
+def test_one_process_at_a_time_trains_in_a_folder(tiny_dataset, tmp_path):
+    """A second command, with --force or without, is refused in one line; the folder stays as it is, and free after."""
+    mine = settings(tiny_dataset, tmp_path / "r")
+    words = [sys.executable, "-m", "quiver", "train", tiny_dataset, "-o", mine.out, "--steps", 6, "--crop", 16]
+    words += ["--preset", "unet"]
+    with Run(mine).open():
+        before = {path.name: path.read_bytes() for path in Path(mine.out).iterdir()}
+        done = subprocess.run([str(w) for w in words], cwd=ROOT, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert f"{mine.out}: another process trains here; wait for it to end" in done.stderr
+        assert done.stderr.count("\n") == 1
+        assert main([str(w) for w in [*words[3:], "--force"]]) == 2
+        assert {path.name: path.read_bytes() for path in Path(mine.out).iterdir()} == before
+    opened(mine)
+
+
+def test_a_full_disk_inside_a_checkpoint(tiny_dataset, tmp_path, monkeypatch):
+    """The system's error with the file's name, and nothing half-written: every file of the folder is whole."""
+    mine = settings(tiny_dataset, tmp_path / "r", steps=2)
+    train(small_network(), mine, progress=False)
+    whole = (tmp_path / "r/checkpoint.pt").read_bytes()
+
+    def full(number: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(files.os, "fsync", full)
+    network = small_network()
+    with pytest.raises(OSError, match="No space left") as error:
+        Run(mine).save(tmp_path / "r/checkpoint.pt", network, Optimiser(network, "adam", 1e-3, (0.9, 0.99)), State())
+    assert error.value.filename == str(tmp_path / "r/checkpoint.pt")
+    assert (tmp_path / "r/checkpoint.pt").read_bytes() == whole
+    assert not list((tmp_path / "r").glob("*.tmp-*"))
+
+
+FILLED = """
+import resource, signal, sys
+from pathlib import Path
+from quiver.training.optimiser import Optimiser
+from quiver.training.run_folder import Run
+from quiver.training.schedule import State
+from quiver.training.settings import Settings
+from quiver.model.unet import UNet, UNetConfig
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+run, network = Run(Settings("d", sys.argv[1], steps=2)), UNet(UNetConfig(4))
+optimiser = Optimiser(network, "adam", 1e-3, (0.9, 0.99))
+run.save(run.checkpoint, network, optimiser, State())
+whole = run.checkpoint.read_bytes()
+for share in (0.9, 0.5, 0.1, 0.0):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * len(whole)), -1))
+    try:
+        run.save(run.checkpoint, network, optimiser, State(step=1))
+    except OSError as error:
+        print(error.filename, run.checkpoint.read_bytes() == whole, len(list(run.folder.iterdir())))
+"""
+
+
+def test_a_disk_that_is_full_after_some_bytes_of_a_checkpoint(tmp_path):
+    """The write itself fails halfway, at the system's limit on a file's size: its error, and the old file stays."""
+    words = [sys.executable, "-c", FILLED, str(tmp_path)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == 4 * [f"{tmp_path / 'checkpoint.pt'} True 1"]
+
+
+def test_a_damaged_state_is_named(tiny_dataset, tmp_path):
+    small = settings(tiny_dataset, tmp_path / "r", steps=2)
+    train(small_network(), small, progress=False)
+    (tmp_path / "r/checkpoint.pt").write_bytes(b"PK\x03\x04 half a file")
+    with pytest.raises(ValueError, match=r"checkpoint\.pt: not a state of this run"):
+        train(small_network(), small, progress=False)
+
+
+def trained(folder: Path) -> tuple[Run, dict[str, Any]]:
+    """A run with a state after one step."""
+    run = Run(Settings("data", str(folder), steps=3))
+    with run.open():
+        pass
+    model = UNet(UNetConfig(1))
+    optimiser = Optimiser(model, "muon", 1e-3, (0.9, 0.99))
+    model(torch.rand(1, 11, 1, 8, 8)).scale1.sum().backward()
+    optimiser.step(1e-3)
+    entry = {"step": 1, "elapsed": 1.0, "loss": 0.5, "psnr": 20.0, "psnr_matched": 21.0}
+    run.save(run.checkpoint, model, optimiser, State(step=1, elapsed=1.0, best=21.0, history=[entry]))
+    return run, torch.load(run.checkpoint, weights_only=True)
+
+
+def resumed(run: Run) -> State:
+    model = UNet(UNetConfig(1))
+    optimiser = Optimiser(model, "muon", 1e-3, (0.9, 0.99))
+    state = run.load(model, optimiser, torch.device("cpu"))
+    model(torch.rand(1, 11, 1, 8, 8)).scale1.sum().backward()
+    optimiser.step(1e-3)  # what was taken in can be worked with
+    return state
+
+
+ODD: tuple[Any, ...] = (
+    *(0, -1, 1e300, math.nan, 10**30, None, True, "x" * 5000, [], {}, {1: 2}, [1], torch.ones(3), torch.ones(0)),
+    torch.ones(1).expand(10**12),
+    torch.ones(2, dtype=torch.int64),
+    torch.full((2, 2), math.nan),
+    torch.ones(2, 2).to_sparse(),
+)
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Where something can be replaced in nested dictionaries and lists."""
+    found = [path] if path else []
+    if isinstance(value, dict | list):
+        for key in value if isinstance(value, dict) else range(len(value)):
+            found += places(value[key], (*path, key))
+    return found
+
+
+def replaced(value: Any, path: tuple[Any, ...], new: Any) -> Any:
+    if not path:
+        return new
+    copy = dict(value) if isinstance(value, dict) else list(value)
+    copy[path[0]] = replaced(value[path[0]], path[1:], new)
+    return copy
+
+
+@pytest.mark.parametrize("cases", [60, pytest.param(600, marks=pytest.mark.slow)])
+def test_any_value_at_any_place_of_a_checkpoint(tmp_path, cases):
+    """Refused in one line that says what to do, or a state that training can go on from.
+
+    What stands for the optimiser's settings is not read: the run has its own.
+    """
+    run, content = trained(tmp_path / "r")
+    assert asdict(resumed(run)) == content["state"]
+    rng, refusals = random.Random(cases), 0
+    spots = [(), *(spot for spot in places(content) if "param_groups" not in spot)]
+    for _ in range(cases):
+        torch.save(replaced(content, rng.choice(spots), rng.choice(ODD)), run.checkpoint)
+        before, started = reset_peak(), time.process_time()
+        try:
+            resumed(run)
+        except Exception as error:
+            one_line(error, run.checkpoint, "start again with --force")
+            refusals += 1
+        assert time.process_time() - started < patience()
+        assert peak_memory() - before < MEMORY
+    assert refusals > 0.8 * cases  # the others hold a number that could have been
+
+
+@pytest.mark.parametrize("content", [{"model": {1: 2}}, {}, [], None, 3, {"state": {}}, {"state": None, "model": {}}])
+def test_a_checkpoint_of_something_else(tmp_path, content):
+    run, _ = trained(tmp_path / "r")
+    torch.save(content, run.checkpoint)
+    with pytest.raises(ValueError, match="not a state of this run") as caught:
+        resumed(run)
+    one_line(caught.value, run.checkpoint)
+
+
+def test_a_checkpoint_that_unpacks_to_more_than_it_is(tmp_path):
+    """Torch stores its parts as they are; a compressed part of zeros could fill the memory."""
+    import zipfile
+
+    run, _ = trained(tmp_path / "r")
+    torch.save({"state": torch.zeros(50_000_000, dtype=torch.uint8)}, tmp_path / "whole.pt")
+    with (
+        zipfile.ZipFile(tmp_path / "whole.pt") as whole,
+        zipfile.ZipFile(run.checkpoint, "w", zipfile.ZIP_DEFLATED) as packed,
+    ):
+        for name in whole.namelist():
+            packed.writestr(name, whole.read(name))
+    with pytest.raises(ValueError, match=r"parts of \d+ bytes in a file of") as caught:
+        resumed(run)
+    one_line(caught.value, run.checkpoint)
