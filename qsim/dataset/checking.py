@@ -1,7 +1,7 @@
-"""Checks what `qsim` and `quiver` made against its checksums: data sets, clips, streams and restored video.
+"""Compares data sets, clips, streams and restored video with their checksums.
 
-A description holds the checksum of its own keys, those of its frames or codes, or both. One made by an earlier version
-holds none of its own: what has no other voucher is counted, so that nobody takes it for checked.
+A description holds the checksum of its keys, the checksums of its frames or codes, or both. Descriptions of earlier
+versions hold none of their keys: those that no other file covers are counted and reported as unchecked.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from qsim.files import Progress, load_array
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is wrong below a path, and which descriptions nothing vouches for."""
+    """The problems below a path, and the descriptions that no checksum covers."""
 
     problems: list[str]
     unsealed: list[Path]
 
     def lines(self, names: str) -> list[str]:
-        """One line per problem, or one that says that there is none; and one for what could not be checked."""
+        """Return one line per problem, or one that reports none, and a line for what could not be checked."""
         lines = self.problems or [f"{names}: every file is what was written"]
         if self.unsealed:
             count = f"{len(self.unsealed)} description{'s' if len(self.unsealed) > 1 else ''}"
@@ -37,9 +37,9 @@ class Verdict:
 
 
 def check(path: Path, progress: Progress | None = None) -> Verdict:
-    """Compare everything below a data set, a clip, a stream or a restored video with its checksums.
+    """Compare every file below a data set, a clip, a stream or a restored video with its checksum.
 
-    `FileNotFoundError` or `ValueError` if there is no such thing. `progress` is called with (done, total).
+    `FileNotFoundError` or `ValueError` if the path is none of them. `progress` is called with (done, total).
     """
     if (path / "dataset.json").is_file() or (path / "jobs").is_dir():
         dataset = Dataset.open(path)
@@ -64,7 +64,7 @@ class Restored:
 
     @staticmethod
     def open(description: Path) -> Restored:
-        """`ValueError` if the description is damaged."""
+        """Open a restored video by its description; `ValueError` if that is damaged."""
         cure = "restore the video again"
         meta = files.read_json(description)
         structure.structure(description, meta, structure.RESTORED, cure)
@@ -72,7 +72,7 @@ class Restored:
         return Restored(description.with_suffix(".npy"), meta)
 
     def frames(self) -> Array:
-        """The video as a memory map; `ValueError` if the file does not fit its description."""
+        """Return the video, float32 photons [T, H, W], as a memory map; `ValueError` if it differs from its .json."""
         array = load_array(self.path)
         check_shape(self.path, array.shape)
         if array.dtype.kind != "f" or self.meta.get("shape", list(array.shape)) != list(array.shape):
@@ -80,18 +80,18 @@ class Restored:
         return array
 
     def verify(self, progress: Progress | None = None) -> list[str]:
-        """Problems of the two files; a video of an earlier version without a checksum has to be there, no more."""
+        """Return the problems of the two files; a video without a checksum (earlier versions) must only exist."""
         if "sha256" in self.meta or not self.path.is_file():
             return files.differs(self.path, self.meta.get("sha256"))
         return []
 
     def unsealed(self) -> list[Path]:
-        """The description, if it holds no checksum of its own or none of its video."""
+        """Return the description if its checksum or that of the video is missing."""
         return [] if {"checksum", "sha256"} <= self.meta.keys() else [self.path.with_suffix(".json")]
 
 
 def _checked(open_it: Any, description: Path, progress: Progress | None) -> Verdict:
-    """The verdict on one thing; a damaged description is a problem, one that is missing an error."""
+    """Return the verdict on one object; a damaged description is a problem, a missing one an error."""
     try:
         opened = open_it()
     except ValueError as error:

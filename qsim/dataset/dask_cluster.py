@@ -1,21 +1,22 @@
-"""The same jobs on a Dask cluster: a scheduler somewhere, workers that see the data set's folder.
+"""Runs the jobs of a data set on a Dask cluster whose workers share the data set's folder.
 
     dask scheduler                                      # prints tcp://HOST:8786
     dask worker tcp://HOST:8786 --nthreads 1 LIMITS     # on every machine; LIMITS as below
     dask worker tcp://HOST:8786 --nthreads 1 LIMITS --resources GPU=1
     qsim generate scenes/i2_2000fps.toml -o /shared/i2 --cluster tcp://HOST:8786
 
-On SLURM let dask-jobqueue start the workers and hand its address over:
+On SLURM, dask-jobqueue starts the workers and gives the address of the scheduler:
 
     from dask_jobqueue import SLURMCluster
     cluster = SLURMCluster(cores=1, memory="4GB", walltime="04:00:00"); cluster.scale(40)
     print(cluster.scheduler_address)                    # for --cluster
 
-The folder must have the same path on all machines; a scene file or a sensor file likewise. A worker that dies gives its
-job back to the others, who go on with the frames it had finished. The files are those of a local run.
+The folder must have the same path on all machines, and so must a scene file or a sensor file. When a worker crashes,
+another one resumes its job after the last complete frame. The files are those of a local run.
 
-Renderers grow, and `workers.Limits` is for local processes only, so a worker gets its LIMITS where it is started:
-`--memory-limit 4GiB --lifetime 1h --lifetime-stagger 10m --lifetime-restart`; docs/cluster.md says what they do.
+The memory of a renderer grows, and `worker_pool.Limits` holds for local processes only. A worker therefore gets its
+LIMITS where it is started: `--memory-limit 4GiB --lifetime 1h --lifetime-stagger 10m --lifetime-restart`
+(docs/cluster.md explains them).
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ from qsim import files
 from qsim.dataset.job import Job
 from qsim.dataset.job_runner import RenderJob, Result, mark_failed, run_job
 
-RETRIES = 3  # of a job whose worker raised; deaths of workers are counted by the scheduler (its allowed-failures)
+RETRIES = 3  # of a job that raised; the scheduler counts the workers that crashed (its allowed-failures)
 
 
 class Cluster:
-    """A running scheduler, as something that runs jobs: `generate(..., run=Cluster("tcp://..."))`.
+    """Executor on a running scheduler: `generate(..., run=Cluster("tcp://..."))`.
 
-    `gpus` of the resource GPU are asked for per job, if above 0. `ValueError` if nobody answers at the address.
+    Each job takes `gpus` of the resource GPU, if above 0. `ValueError` if no scheduler answers at the address.
     """
 
     def __init__(self, address: str, *, gpus: float = 0, timeout: float = 10.0) -> None:
@@ -49,7 +50,7 @@ class Cluster:
         except (OSError, TimeoutError, ValueError) as error:
             raise ValueError(f"{self.address}: no Dask scheduler answers there ({_short(error)})") from None
         with client:
-            # One future per job; pure=False because a job's result is files, not its return value.
+            # One future per job. pure=False: the result of a job is its files, not the value that is returned.
             futures = {
                 client.submit(run_job, job, folder, make, key=task_key(folder, job), pure=False,
                               retries=RETRIES, resources=resources): job
@@ -64,19 +65,19 @@ class Cluster:
 
 
 def task_key(folder: Path, job: Job) -> str:
-    """The name of a job at the scheduler: `FOLDER-JOB-HASH`.
+    """Return the name of a job at the scheduler: `FOLDER-JOB-HASH`.
 
-    Dask hands the result of a key that it knows to whoever asks for it, another client with another folder included.
-    The hash is of the whole resolved path and of all that decides the job's files.
+    Dask returns the stored result of a known key to every client, also to one with another folder. The hash therefore
+    covers the resolved path and the job's digest.
     """
-    whole = os.fsencode(folder.resolve()) + b"\0" + job.digest.encode()
-    return f"{folder.name}-{job.name}-{files.sha256(whole)[:32]}"
+    hashed = os.fsencode(folder.resolve()) + b"\0" + job.digest.encode()
+    return f"{folder.name}-{job.name}-{files.sha256(hashed)[:32]}"
 
 
 def _result(future: Any, job: Job, folder: Path) -> Result:
     try:
         found = future.result()
-    except Exception as error:  # the worker's: whatever it may be, it belongs to this job
+    except Exception as error:  # any error of the worker counts as a failure of this job
         message = f"on the cluster: {type(error).__name__}: {_short(error)}"
         mark_failed(folder, job, message)
         return Result(job.name, "crashed", message)

@@ -1,10 +1,8 @@
-"""Data sets: a folder of clips made from one recipe, whole, resumable, checkable.
+"""Reads and checks a data set: a folder of clips that generation.py makes from one recipe.
 
-    dataset.json   recipe, splits by scene, state of every job, its own checksum; rewritten when a generation ends
-    clips/NAME     clip folders with their streams                       (clip.py)
-    jobs/NAME.json records with checksums; a clip counts from the moment its record is there (jobs.py)
-
-Here a data set is read and checked; generation.py makes it.
+dataset.json   recipe, splits by scene, state of every job, its own checksum; rewritten when a generation ends
+clips/NAME     clip folders with their streams           (clip/clip.py)
+jobs/NAME.json records with checksums; a clip counts as finished when its record exists (job_runner.py)
 """
 
 from __future__ import annotations
@@ -25,19 +23,19 @@ FORMAT_VERSION = 1
 
 
 class Damaged(ValueError):
-    """dataset.json is there but is not what was written; `qsim generate --repair` writes it again."""
+    """dataset.json differs from what was written; `qsim generate --repair` writes it again."""
 
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A data set folder; only clips whose record is there are seen."""
+    """A data set folder; only clips that have a record are listed."""
 
     path: Path
     meta: dict[str, Any]  # dataset.json
 
     @staticmethod
     def open(path: str | os.PathLike[str]) -> Dataset:
-        """`FileNotFoundError` or `ValueError` if this is not a data set of our version."""
+        """Open a data set; `FileNotFoundError` or `ValueError` if the folder is not one of this version."""
         path = Path(path)
         manifest = path / "dataset.json"
         remedy = f"`qsim generate RECIPE -o {path} --repair` writes it again"
@@ -71,33 +69,34 @@ class Dataset:
 
     @property
     def name(self) -> str:
+        """Return the name that the recipe gives."""
         return str(self.meta["name"])
 
     @property
     def recipe(self) -> dict[str, Any]:
-        """The recipe as it was written."""
+        """Return the recipe as it was written."""
         return dict(self.meta["recipe"])
 
     def names(self, split: str | None = None) -> list[str]:
-        """Names of the finished clips of one split, or of all. `ValueError` for an unknown split."""
+        """Return the names of the finished clips of one split, or of all. `ValueError` for an unknown split."""
         if split is not None and split not in SPLITS:
             raise ValueError(f"{self.path}: unknown split {split!r}; there are {', '.join(SPLITS)}")
         chosen = [name for name, job in self.meta["jobs"].items() if split in (None, job["split"])]
         return [name for name in chosen if record_path(self.path, name).is_file()]
 
     def clips(self, split: str | None = None) -> list[Clip]:
-        """The finished clips of one split, or of all."""
+        """Return the finished clips of one split, or of all."""
         return [Clip.open(self.path / "clips" / name) for name in self.names(split)]
 
     @property
     def missing(self) -> list[str]:
-        """Names of the clips that the recipe asks for and that are not finished."""
+        """Return the names of the clips that the recipe asks for and that are not finished."""
         return [name for name in self.meta["jobs"] if not record_path(self.path, name).is_file()]
 
     def verify(self, progress: Progress | None = None) -> list[str]:
-        """Problems of all files in words, one per file; clips not made yet are problems too.
+        """Return the problems of all files, one per file; clips not made yet are problems too.
 
-        `progress` hears (clips checked, clips in all).
+        `progress(done, total)` is called after each clip.
         """
         problems = [f"{self.path / 'clips' / name}: not made yet; run `qsim generate` again" for name in self.missing]
         if "checksum" not in self.meta:
@@ -112,22 +111,22 @@ class Dataset:
         return problems + self.shared_between_splits()
 
     def unsealed(self) -> list[Path]:
-        """Descriptions of clips and streams that hold no checksum of their own and that no record vouches for."""
+        """Return the descriptions of clips and streams whose content no checksum covers, their own or a record's."""
         found = []
         for name in self.names():
             try:
                 clip = Clip.open(self.path / "clips" / name)
                 record = _read_record(record_path(self.path, name))
-            except (ValueError, OSError):  # a problem that `verify` names
+            except (ValueError, OSError):  # `verify` names the problem
                 continue
             vouched = {clip.path / "streams" / f"{stream}.json" for stream in record["streams"]}
             found += [path for path in clip.unsealed() if path not in vouched | {clip.path / "clip.json"}]
         return found
 
     def shared_between_splits(self) -> list[str]:
-        """Scenes, meshes and textures of the test split that another split has too, in words; empty if it is honest.
+        """Return one line per scene, mesh and texture of the test split that another split holds too.
 
-        By content: a mesh is its vertices, a texture its pixels or its file.
+        They are compared by content: a mesh by its vertices, a texture by its pixels or its file.
         """
         elsewhere: dict[str, str] = {}
         for name in self.names("train") + self.names("val"):
@@ -141,7 +140,7 @@ class Dataset:
 
 
 def _seen_in(path: Path) -> list[str]:
-    """Scene, meshes and textures of a clip; nothing if it cannot be read."""
+    """Return scene, meshes and textures of a clip; nothing if it cannot be read."""
     try:
         meta = Clip.open(path).meta
         return [f"scene {meta['scene']['family']}:{meta['scene']['seed']}", *meta.get("assets", [])]
@@ -157,9 +156,9 @@ def _read_record(path: Path) -> dict[str, Any]:
 
 
 def verify_job(folder: Path, name: str, expected: dict[str, Any]) -> list[str]:
-    """Problems of one finished job's files in words; `expected` is its entry in the manifest.
+    """Return the problems of one finished job's files; `expected` is its entry in the manifest.
 
-    Each file vouches for the next: manifest, record, clip.json and the streams' json, frames and codes.
+    Each file holds the checksums of the next: manifest, record, clip.json and the streams' json, frames and codes.
     """
     path = record_path(folder, name)
     problems = files.differs(path, expected["record"]) if "record" in expected else []
@@ -173,7 +172,7 @@ def verify_job(folder: Path, name: str, expected: dict[str, Any]) -> list[str]:
         return [*problems, files.wording(error)]
     if not problems and any(record.get(key) != expected[key] for key in ("digest", "split")):
         problems = [f"{path}: is the record of another job"]
-    if problems:  # then nothing that it says can be used
+    if problems:  # nothing that a damaged record holds is used
         return problems + clip.verify()
     problems = clip.verify() + files.differs(about, record.get("clip"))
     for stream, digest in record.get("streams", {}).items():
@@ -182,10 +181,10 @@ def verify_job(folder: Path, name: str, expected: dict[str, Any]) -> list[str]:
 
 
 def unproven(folder: Path, job: Job) -> str | None:
-    """Why a job that a worker calls done is not done, or None.
+    """Return why a job that a worker reports as done is not done, or None.
 
-    The record must be that of this job and vouch for clip.json and the json of each stream as they are; every file that
-    they name must be there, and the codes must have the size that their json says. Contents are left to `verify_job`.
+    The record must be that of this job, with the checksums of clip.json and of each stream's json. Every file that
+    they name must exist, and the codes must have the size in their json. `verify_job` checks the contents.
     """
     path, place = record_path(folder, job.name), folder / "clips" / job.name
     try:

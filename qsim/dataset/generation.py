@@ -1,7 +1,7 @@
-"""Jobs to data set: `generate` does what is missing of a recipe, atomically, resumably.
+"""Generates a data set: runs the unfinished jobs of a recipe; an interrupted run resumes.
 
-After a kill, in shards, on a cluster, or with nothing left to do: the finished folder (dataset.py) has the same bytes
-in all these cases (logs/ apart), on machines of one kind.
+After a kill, in shards, on a cluster, or with nothing left to do, the finished folder (dataset.py) has the same bytes,
+apart from logs/, on machines of one kind.
 """
 
 from __future__ import annotations
@@ -36,15 +36,16 @@ from qsim.locks import Lock
 Executor = Callable[[list[Job], Path, RenderJob], Generator[Result]]
 
 
-_ELSEWHERE = "a worker says that it is done, but it is not here; does every worker have this folder at this path?"
+_REPORTED = "a worker reports that it is done, but "
+_ELSEWHERE = f"{_REPORTED}its record is missing; does every worker have this folder at this path?"
 
 
 @dataclass(frozen=True)
 class Options:
-    """How to generate; nothing here changes a byte of the result."""
+    """Options of a generation; none changes a byte of the result."""
 
-    workers: int = 1  # processes; 0: in this one
-    shard: tuple[int, int] | None = None  # (i, n): the i-th of n parts, i = 1 ... n
+    workers: int = 1  # processes; 0: run the jobs in this process
+    shard: tuple[int, int] | None = None  # (i, n): the i-th of n shards, i = 1 ... n
     retry: bool = False  # try failed jobs again
     repair: bool = False  # check all files first and make damaged ones again
     wait: bool = False  # wait for another generator on the folder instead of refusing
@@ -53,14 +54,14 @@ class Options:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a generation did."""
+    """Results of a generation."""
 
     jobs: int  # of this shard
     done: int  # finished now or before
     made: int  # finished now
-    failed: dict[str, str]  # name -> why, now or before
+    failed: dict[str, str]  # name -> reason, now or before
     repaired: tuple[str, ...]  # problems that led to jobs done again
-    shared: tuple[str, ...] = ()  # what training sees of the test split, in words
+    shared: tuple[str, ...] = ()  # assets of the test split that other splits hold too
 
 
 def generate(
@@ -72,10 +73,10 @@ def generate(
     run: Executor | None = None,
     on_result: Callable[[Result], None] | None = None,
 ) -> Summary:
-    """Make what is missing of a recipe's data set in folder `path`.
+    """Make the missing clips of a recipe's data set in folder `path`.
 
-    `run` does the jobs (default: local processes; cluster.py has another), `make` renders one clip. `ValueError` if
-    the folder belongs to another recipe or another generator is at work, `OSError` if the disk is full.
+    `run` executes the jobs (default: local processes; dask_cluster.py has another executor), `make` renders one clip.
+    `ValueError` if the folder belongs to another recipe or another generator uses it, `OSError` if the disk is full.
     """
     options = options or Options()
     folder = Path(path).resolve()
@@ -113,22 +114,22 @@ def generate(
 
 
 def _unproven(folder: Path, jobs: list[Job], made: list[str]) -> dict[str, str]:
-    """The jobs that a worker calls done and that are not, with the reason; their records go: no reader sees them."""
+    """Return the jobs that a worker reports as done and that are not, with the reason; delete their records."""
     by_name, failed = {job.name: job for job in jobs}, {}
     for name in made:
         if name not in by_name:
-            failed[name] = "a worker says that it is done, but it was given to none"
+            failed[name] = f"{_REPORTED}no worker was given it"
         elif not record_path(folder, name).is_file():
             failed[name] = _ELSEWHERE
         elif problem := unproven(folder, by_name[name]):
-            failed[name] = f"a worker says that it is done, but {problem}"
+            failed[name] = f"{_REPORTED}{problem}"
             mark_failed(folder, by_name[name], failed[name])
             record_path(folder, name).unlink()
     return failed
 
 
 def shard(jobs: tuple[Job, ...], part: tuple[int, int] | None) -> list[Job]:
-    """Every n-th job from the i-th on, so that expensive families spread over the shards."""
+    """Return every n-th job from the i-th on, so that expensive families spread over the shards."""
     if part is None:
         return list(jobs)
     i, n = part
@@ -138,7 +139,7 @@ def shard(jobs: tuple[Job, ...], part: tuple[int, int] | None) -> list[Job]:
 
 
 def frames_done(folder: Path, jobs: list[Job]) -> int:
-    """Frames rendered so far, whoever renders them: finished clips and the journals of those at work."""
+    """Return the number of rendered frames, by any process: of finished clips and in the journals of others."""
     total = 0
     for job in jobs:
         if (folder / "clips" / job.name).is_dir():
@@ -150,7 +151,7 @@ def frames_done(folder: Path, jobs: list[Job]) -> int:
 
 
 def write_manifest(recipe: Recipe, folder: Path) -> None:
-    """dataset.json from the recipe and the records that are there now."""
+    """Write dataset.json from the recipe and the existing records."""
     lock = Lock(folder / "locks" / "manifest")
     lock.acquire(wait=True)
     with lock:
@@ -176,7 +177,7 @@ def write_manifest(recipe: Recipe, folder: Path) -> None:
 
 
 def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
-    """Folders and manifest; what had to be repaired of the manifest. `ValueError` if it is another recipe's."""
+    """Make folders and manifest; return the repairs of the manifest. `ValueError` if it is another recipe's."""
     for name in FOLDERS:
         (folder / name).mkdir(exist_ok=True)
     if not (folder / "dataset.json").is_file():
@@ -214,9 +215,9 @@ def _of_earlier_version(folder: Path) -> str:
 
 
 def _check_reads(recipe: Recipe, folder: Path) -> None:
-    """`ValueError` if a file that an own scene reads is not what it was when a clip was rendered.
+    """`ValueError` if a file that a scene of the user reads has changed since a clip was rendered.
 
-    Clips of earlier versions do not say what they read: for these the scene's own file decides, by the job's digest.
+    Clips of earlier versions do not list these files: for them the digest of the job covers the scene's file alone.
     """
     from qsim.dataset import scene_files
 
@@ -226,7 +227,7 @@ def _check_reads(recipe: Recipe, folder: Path) -> None:
             continue
         for about in (folder / "clips" / job.name / "clip.json", folder / "work" / job.name / "clip.json"):
             read = None
-            with contextlib.suppress(OSError, ValueError):  # none, or damaged: a check finds it
+            with contextlib.suppress(OSError, ValueError):  # missing or damaged: a check finds it
                 read = files.read_json(about).get("reads")
             entries = read.items() if isinstance(read, dict) else ()
             for name, digest in sorted(entries, key=lambda entry: "*" in entry[0]):  # single files first
@@ -241,7 +242,7 @@ def _check_reads(recipe: Recipe, folder: Path) -> None:
 
 
 def _check_records(recipe: Recipe, folder: Path) -> None:
-    """Without a manifest the records say whose folder this is: `ValueError` if there are some and none is of ours."""
+    """`ValueError` if a folder without manifest has records, and none of them is of this recipe."""
     digests = {}
     for path in (folder / "jobs").glob("*.json"):
         with contextlib.suppress(ValueError):
@@ -255,7 +256,7 @@ def _check_records(recipe: Recipe, folder: Path) -> None:
 
 @contextlib.contextmanager
 def _locked(folder: Path, options: Options) -> Iterator[None]:
-    """One generator per folder, or any number of different shards."""
+    """Lock the folder: one generator, or any number of different shards."""
     if folder.exists() and not _is_data_set(folder):
         raise ValueError(f"{folder}: is not empty and not a data set; use another folder")
     (folder / "locks").mkdir(parents=True, exist_ok=True)
@@ -273,14 +274,14 @@ def _locked(folder: Path, options: Options) -> Iterator[None]:
 
 
 def _is_data_set(folder: Path) -> bool:
-    """Whether a folder is a data set, what is left of one, or empty."""
+    """Return whether a folder is a data set, the rest of one, or empty."""
     if (folder / "locks").is_dir() or (folder / "dataset.json").is_file():
         return True
     return all(item.name in FOLDERS and item.is_dir() for item in folder.iterdir())
 
 
 def _failures(folder: Path, jobs: Sequence[Job]) -> dict[str, str]:
-    """Why jobs failed before; a note that cannot be read counts as one, and --retry makes the job again."""
+    """Return why jobs failed before. A note that cannot be read counts as a failure, which --retry tries again."""
     found = {}
     for job in jobs:
         path = failure_path(folder, job.name)
@@ -304,7 +305,7 @@ def _runner(options: Options) -> Executor:
 
 @contextlib.contextmanager
 def watching(folder: Path, jobs: list[Job], report: Progress, every: float = 0.5) -> Iterator[None]:
-    """Report (frames done, frames in all), whatever process or machine does them, while the block runs."""
+    """Call `report(frames done, frames in all)` while the block runs, whichever process or machine renders them."""
     total = sum(job.settings.frames for job in jobs)
     stop = threading.Event()
 

@@ -1,4 +1,4 @@
-"""Defines one job of a data set: a clip with its streams, and the digest of all that decides its files."""
+"""Describes one job of a data set: a clip, its streams, and a digest of everything that decides their files."""
 
 from __future__ import annotations
 
@@ -15,63 +15,66 @@ from qsim.files import to_json
 
 @dataclass(frozen=True)
 class Settings:
-    """How a clip is rendered."""
+    """Settings that a clip is rendered with."""
 
     frames: int
     height: int  # pixels
     width: int  # pixels
     frame_rate: float  # Hz
-    shutter: float = 0.0  # open share of a frame
-    psnr: float = 40.0  # dB below white, wanted error of the radiance
+    shutter: float = 0.0  # open share of a frame, 0..1
+    psnr: float = 40.0  # wanted error of the radiance, dB below white
 
 
 @dataclass(frozen=True)
 class Job:
-    """One clip with its streams: a pure description; the same job gives the same files."""
+    """Description of one clip and its streams; the same job gives the same files."""
 
     name: str
-    family: str
+    family: str  # of the library, or the absolute path of a scene file or folder
     scene_seed: int
-    speed: float
+    speed: float  # factor on all motions
     split: str
     settings: Settings
-    seed: int
+    seed: int  # of the samples
     streams: tuple[Sensing, ...]
 
     @property
     def stem(self) -> str:
-        """The family's name without folder and ending."""
+        """Return the family's name without folder and ending."""
         return Path(self.family).stem
 
     @property
     def scene(self) -> str:
-        """What splits are made by: family and seed."""
+        """Return FAMILY:SEED, the unit by which splits are made."""
         return f"{self.stem}:{self.scene_seed}"
 
     @property
     def digest(self) -> str:
-        """SHA-256 of everything that decides the job's files."""
+        """Return the SHA-256 of everything that decides the job's files."""
         return self.digest_with(psnr_unit="below white")
 
     def digest_with(self, **more: str) -> str:
-        """The same with what else decides; without any, that of versions whose psnr was below the 99.9th percentile."""
+        """Return the digest with more keys.
+
+        Without any, it is the digest of earlier versions, whose psnr was in dB below the 99.9th percentile.
+        """
         described = dataclasses.asdict(self) | {"family": Path(self.family).stem}
         described["streams"] = [stream | {"sensor": Path(stream["sensor"]).name} for stream in described["streams"]]
-        for stream in described["streams"]:  # what is off stays out, so that data sets of earlier versions go on
+        for stream in described["streams"]:  # options that are off stay out: data sets of earlier versions resume
             for key, off in (("defects", None), ("slices", 1)):
                 if stream[key] == off:
                     del stream[key]
         own = [path for path in (self.family, *(stream.sensor for stream in self.streams)) if Path(path).is_absolute()]
-        if own:  # by content: what a file says decides, not what it is called
+        if own:  # the content of a file decides, not its name
             described["own"] = [_contents(path) for path in own]
         return hashlib.sha256(to_json(described | more)).hexdigest()
 
 
 def _contents(path: str) -> str:
-    """SHA-256 of a scene or sensor file, or of all files in a folder with their names."""
+    """Return the SHA-256 of a scene or sensor file, or of all files in a folder with their names."""
     root = Path(path)
     parts = sorted(part for part in root.rglob("*") if part.is_file()) if root.is_dir() else [root]
-    # With the time of the last change of the inode, which nobody can set back.
+    # The state includes the time of the inode's last change, which no program can set back.
     states = [(str(part.relative_to(root)), part.stat()) for part in parts]
     state = tuple((name, (of.st_mtime_ns, of.st_ctime_ns, of.st_ino, of.st_size)) for name, of in states)
     return _read_contents(path, state)
@@ -79,6 +82,6 @@ def _contents(path: str) -> str:
 
 @functools.lru_cache(maxsize=64)
 def _read_contents(path: str, state: tuple[tuple[str, tuple[int, ...]], ...]) -> str:
-    """The same, read once as long as no file changes."""
+    """Return the same; the files are read again only after `state` has changed."""
     listed = [(name, files.sha256(Path(path) / name)) for name, _ in state]
     return files.sha256(to_json(listed))

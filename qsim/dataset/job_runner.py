@@ -1,12 +1,12 @@
-"""One job of a data set: render a clip, sense its streams, write its record.
+"""Runs one job of a data set: renders a clip, senses its streams, writes its record.
 
     work/NAME[.part]   the clip while it is rendered          (resumable, never read)
     clips/NAME         the finished clip with its streams
     jobs/NAME.json     the record: checksums of clip.json and of every stream's json; written last
-    failed/NAME.json   why the job failed; gone when it succeeds
-    logs/NAME.log      when, where, how long, how much memory; the only files that differ between two runs
+    failed/NAME.json   the reason of a failure; removed when the job succeeds
+    logs/NAME.log      date, machine, duration and memory; the only files that differ between two runs
 
-A job is done when its record is there. Everything before can be killed at any moment and done again.
+A job is done when its record exists. A job killed before that is repeated from its last complete frame.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     from qsim.rendering.budget import Budget
     from qsim.scene import Scene
 
-RenderJob = Callable[[Job, Path], object]  # renders a job's clip to a path; tests hand in a quick one
+RenderJob = Callable[[Job, Path], object]  # renders a job's clip to a path; tests use a quick one
 
-FOLDERS = ("clips", "jobs", "failed", "logs", "locks", "work")  # of a data set
+FOLDERS = ("clips", "jobs", "failed", "logs", "locks", "work")  # inside a data set
 
 
 @dataclass(frozen=True)
 class Result:
-    """What became of one job."""
+    """Result of one job."""
 
     name: str
     # "done", "failed", "full" (no space left), "gone" (the data set's folder) or "crashed" (the worker process)
@@ -48,7 +48,7 @@ class Result:
 
 
 def render_job(job: Job, path: Path) -> object:
-    """Render a job's clip with the budget that its wanted error and its brightest stream ask for."""
+    """Render a job's clip with the budget that its wanted error and its brightest stream need."""
     from qsim.rendering.clip_rendering import render_clip
 
     settings = job.settings
@@ -62,17 +62,17 @@ def render_job(job: Job, path: Path) -> object:
         seed=render_seed(job),
         budget=choose_budget(job, scene),
         extra=origin(job, read) | {"assets": sorted(assets(scene.to_dict()) + photographs(scene))},
-        force=True,  # what an earlier version of the program began is nobody's
+        force=True,  # replaces an unfinished clip of an earlier version
     )
 
 
 def load_scene(job: Job) -> Scene:
-    """The job's scene at its size."""
+    """Return the job's scene at its size."""
     return load_traced(job)[0]
 
 
 def load_traced(job: Job) -> tuple[Scene, dict[str, str]]:
-    """The job's scene at its size, and the SHA-256 of each file of the user's that it read."""
+    """Return the job's scene at its size, and the SHA-256 of each file of the user that it read."""
     from qsim.dataset import scene_files
 
     scene, read = scene_files.load(job.family, seed=job.scene_seed, speed=job.speed)
@@ -80,16 +80,16 @@ def load_traced(job: Job) -> tuple[Scene, dict[str, str]]:
 
 
 def render_seed(job: Job) -> int:
-    """Seed of the job's samples: no two clips share theirs."""
+    """Return the seed of the job's samples, which differs from clip to clip."""
     from qsim import keys
 
     return (keys.hash_name(job.name) ^ job.seed) & 0x7FFFFFFF
 
 
 def choose_budget(job: Job, scene: Scene) -> Budget:
-    """What the scene needs for the wanted error, and for the noise of the stream that collects most electrons.
+    """Choose the budget for the wanted error and for the noise of the stream that collects most electrons.
 
-    Streams whose light is given in lux or as it is do not count: their photons are known only after rendering.
+    Streams in lux or with absolute light do not count: their photons are known only after rendering.
     """
     from qsim.rendering import fidelity
     from qsim.sensor import devices
@@ -115,26 +115,26 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
 
 
 def record_path(folder: Path, name: str) -> Path:
-    """The record whose presence means that the job is done."""
+    """Return the path of the record; the job is done when it exists."""
     return folder / "jobs" / f"{name}.json"
 
 
 def failure_path(folder: Path, name: str) -> Path:
-    """Why the job failed, if it did."""
+    """Return the path of the file that holds the reason of a failure."""
     return folder / "failed" / f"{name}.json"
 
 
 def removed(folder: Path) -> str:
-    """Which part of a data set's folder is no longer there, and what to do; empty if all are."""
+    """Return which part of a data set's folder was removed, and what to do; empty if none was."""
     gone = [place for place in (folder, *(folder / name for name in FOLDERS)) if not place.is_dir()]
     return f"{gone[0]}: was removed while the data set was being made; run the same command again" if gone else ""
 
 
 def run_job(job: Job, folder: Path, make: RenderJob = render_job) -> Result:
-    """Do whatever of a job is not done yet. Failures are written to failed/ and returned, not raised."""
+    """Run the missing steps of a job. Failures are written to failed/ and returned, not raised."""
     lock = locks.Lock(folder / "locks" / job.name)
     try:
-        lock.acquire(wait=True)  # another process may still be dying over this job
+        lock.acquire(wait=True)  # another process may still be ending with this job
         if record_path(folder, job.name).is_file():
             return Result(job.name, "done")
         try:
@@ -159,7 +159,7 @@ def run_job(job: Job, folder: Path, make: RenderJob = render_job) -> Result:
 
 
 def _do(job: Job, folder: Path, make: RenderJob) -> Result:
-    """Clip, streams, record: each whole before the next begins."""
+    """Make clip, streams and record; each is complete before the next begins."""
     started, worked = time.monotonic(), time.process_time()
     for path in (record_path(folder, job.name), failure_path(folder, job.name), folder / "clips" / job.name):
         files.remove_leftovers(path)
@@ -178,7 +178,7 @@ def _do(job: Job, folder: Path, make: RenderJob) -> Result:
 
 
 def make_record(job: Job, clip: Path) -> dict[str, Any]:
-    """What vouches for a clip and the job's streams; `FileNotFoundError` if one is missing."""
+    """Return the record: checksums of clip.json and of each stream's json. `FileNotFoundError` if one is missing."""
     streams = {
         sensing.stream_name: files.sha256(clip / "streams" / f"{sensing.stream_name}.json") for sensing in job.streams
     }
@@ -187,12 +187,12 @@ def make_record(job: Job, clip: Path) -> dict[str, Any]:
 
 
 def mark_failed(folder: Path, job: Job, message: str) -> None:
-    """Remember a failure; `generate` lists it until it is retried."""
+    """Write the reason of a failure; `generate` lists it until the job is retried."""
     files.write_json(failure_path(folder, job.name), {"name": job.name, "digest": job.digest, "error": message})
 
 
 def _clip(job: Job, folder: Path, make: RenderJob) -> Clip:
-    """The job's finished clip, rendered if it is not there."""
+    """Return the job's finished clip, rendered if it does not exist."""
     path, work = folder / "clips" / job.name, folder / "work" / job.name
     if path.is_symlink() and not path.is_dir():
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Records where a clip comes from: its job, and the pictures, meshes and photographs of its scene."""
+"""Records the origin of a clip: its job, and the pictures, meshes and photographs of its scene."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from qsim.dataset.job import Job
 
-_ASSETS = {  # record of scene.py -> its array or file, and what it is
+_ASSETS = {  # kind of a scene's record -> the key of its array or file, and the kind of asset
     "Texture": ("image", "texture"),
     "NormalMap": ("image", "texture"),
     "EnvironmentImage": ("image", "texture"),
@@ -18,9 +18,9 @@ _ASSETS = {  # record of scene.py -> its array or file, and what it is
 
 
 def origin(job: Job, read: dict[str, str] | None = None) -> dict[str, Any]:
-    """What a job's clip.json says beside what the renderer knows: which job it is, its scene and split.
+    """Return the keys that a job adds to clip.json: its name and digest, its scene and split.
 
-    `read` are the files of the user's that the scene was made from (reads.py).
+    `read` maps the user's files that the scene reads to their SHA-256 (scene_files.py).
     """
     scene = {"family": Path(job.family).stem, "seed": job.scene_seed, "speed": job.speed}
     return {"name": job.name, "job": job.digest, "split": job.split, "scene": scene} | ({"reads": read} if read else {})
@@ -41,7 +41,7 @@ def nested(value: Any) -> Iterator[Any]:
 
 
 def assets(described: Any) -> list[str]:
-    """The pictures and meshes in a scene's description, as `texture SHA-256`, `texture FILE` or `mesh SHA-256`."""
+    """Return the pictures and meshes of a described scene: `texture SHA-256`, `texture FILE` or `mesh SHA-256`."""
     found: set[str] = set()
     for item in nested(described):
         if isinstance(item, dict):

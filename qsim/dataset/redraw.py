@@ -1,6 +1,6 @@
-"""`qsim check --redraw`: stored streams drawn again by the reference engine, from their description and clip alone.
+"""Draws stored streams again with the reference engine, from description and clip alone (`qsim check --redraw`).
 
-A checksum says that codes are those that were written. Whether they are the right ones only another draw says.
+A checksum shows that codes are those that were written; a second draw shows whether they are right.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
+from qsim import files
 from qsim.clip.clip import Clip
 from qsim.clip.simulation import stored
 from qsim.clip.stream import Stream
@@ -22,22 +23,22 @@ _BLOCK_PIXELS = 1 << 20
 
 @dataclass(frozen=True)
 class Redrawn:
-    """What a second draw of one stream found; `why` it could not be drawn, else None."""
+    """Result of drawing one stream again."""
 
     path: Path  # streams/NAME.npy
-    codes: int
-    differ: int = 0
+    codes: int  # compared
+    differ: int = 0  # codes
     first: int | None = None  # frame with a difference
-    why: str | None = None
+    why: str | None = None  # the stream could not be drawn again
     cure: str = ""
 
     @property
     def wrong(self) -> bool:
-        """More codes differ than the compiled engine may."""
+        """Return whether more codes differ than the compiled engine may."""
         return self.differ > PROMISED * self.codes
 
     def line(self) -> str | None:
-        """What to say of this stream; None where every code is the reference's."""
+        """Return the line about this stream; None where every code equals the reference's."""
         if self.why is not None:
             return f"{self.path}: not drawn again: {self.why}"
         if not self.differ:
@@ -49,9 +50,9 @@ class Redrawn:
 
 
 def redraw(path: Path, progress: Progress | None = None) -> list[Redrawn]:
-    """Every stream of a data set or a clip, or one stream, drawn again; damaged ones are named by `check`.
+    """Draw one stream again, or every stream of a clip or a data set; `check` names the damaged ones.
 
-    `progress` hears (streams drawn, streams in all). `FileNotFoundError` or `ValueError` if there is nothing to draw.
+    `progress(done, total)` is called after each stream. `FileNotFoundError` or `ValueError` if there is none.
     """
     found = _streams(path)
     if not found:
@@ -65,7 +66,7 @@ def redraw(path: Path, progress: Progress | None = None) -> list[Redrawn]:
 
 
 def _redrawn(place: Path, json_path: Path, dataset: Path | None) -> Redrawn:
-    """One stream of the clip at `place` drawn again; `dataset` is whose recipe made it, if one did."""
+    """Draw one stream of the clip at `place` again; `dataset` is the data set whose recipe made it, if any."""
     path = json_path.with_suffix(".npy")
     try:
         clip, stream = Clip.open(place), Stream.open(json_path)
@@ -86,17 +87,17 @@ def _redrawn(place: Path, json_path: Path, dataset: Path | None) -> Redrawn:
 
 
 def _cure(stream: Stream, dataset: Path | None) -> str:
-    """What to do about wrong codes, so that afterwards `check` is content."""
+    """Return what to do about wrong codes, so that `check` passes afterwards."""
     if dataset is None:
         return "sense it again with --force"
     if "drawn_by" in stream.meta:
         return f"delete the file and run `qsim generate RECIPE -o {dataset} --repair`"
-    # `generate` continues no data set of the versions whose psnr was another
+    # `generate` does not resume data sets of the versions with another psnr
     return f"the right one: `qsim sense {dataset} --name NEW` with its settings, or generate all in another folder"
 
 
 def _streams(path: Path) -> list[tuple[Path, Path, Path | None]]:
-    """Clip, description and, where its recipe made it, data set of every stream below a path."""
+    """Return clip, description and, where its recipe made it, data set of every stream below a path."""
     if (path / "dataset.json").is_file():
         names = Dataset.open(path).names()
         return [each for name in names for each in _of_clip(path / "clips" / name, record_path(path, name), path)]
@@ -118,8 +119,7 @@ def _of_clip(
 
 
 def _made_by_recipe(record: Path) -> set[str]:
-    from qsim import files
-
+    """Return the names of the streams in a record."""
     try:
         return set(files.read_json(record).get("streams", {}))
     except (ValueError, OSError):  # `check` names it
@@ -127,11 +127,11 @@ def _made_by_recipe(record: Path) -> set[str]:
 
 
 def lines(found: list[Redrawn]) -> list[str]:
-    """A line per stream of which there is something to say, and one that counts them."""
-    said = [line for one in found if (line := one.line()) is not None]
+    """Return a line per stream that differs or could not be drawn, and one with the totals."""
+    found_lines = [line for one in found if (line := one.line()) is not None]
     drawn = [one for one in found if one.why is None]
     wrong = sum(one.wrong for one in drawn)
     total = sum(one.codes for one in drawn)
     right = "all hold the reference's codes" if drawn else "so nothing is known of them"
     verdict = f"{wrong} hold wrong codes" if wrong else right
-    return [*said, f"drawn again: {len(drawn)} of {len(found)} streams, {total} codes; {verdict}"]
+    return [*found_lines, f"drawn again: {len(drawn)} of {len(found)} streams, {total} codes; {verdict}"]

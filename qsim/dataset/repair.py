@@ -1,4 +1,4 @@
-"""Takes back the finished jobs of a data set whose files are damaged, so that they are done again."""
+"""Removes the damaged files and records of finished jobs, so that these jobs are done again."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from qsim.dataset.job_runner import make_record, record_path
 
 
 def repair_jobs(folder: Path, jobs: list[Job]) -> tuple[str, ...]:
-    """Check the finished jobs and take back those with damage, so that they are made again; returns the problems.
+    """Check the finished jobs, remove what is damaged, and return the problems.
 
-    A damaged stream is drawn again, a damaged record written again, without rendering; anything else is rendered again.
-    What `qsim sense` added to a clip that goes, goes with it, and is named.
+    The next run draws a damaged stream again and writes a damaged record again; every other damage costs a rendering.
+    Streams that `qsim sense` added to a removed clip are lost, and each is named.
     """
     entries = Dataset.open(folder).meta["jobs"]
     checked = [_damage(folder, job, entries[job.name]) for job in jobs if record_path(folder, job.name).is_file()]
     taken = [damage for damage in checked if damage.problems]
-    for damage in taken:  # before anything is deleted
+    for damage in taken:  # refused before anything is deleted
         clip = folder / "clips" / damage.job.name
         if clip.is_symlink() and not damage.light:
             raise ValueError(
@@ -34,12 +34,12 @@ def repair_jobs(folder: Path, jobs: list[Job]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Damage:
-    """What is wrong with a finished job."""
+    """The damage of a finished job."""
 
     job: Job
     problems: list[str]
     paths: set[Path]  # the damaged files
-    light: bool  # mended without rendering: only streams, or only the record
+    light: bool  # repaired without rendering: only streams, or only the record
 
 
 def _damage(folder: Path, job: Job, entry: dict[str, Any]) -> _Damage:
@@ -55,7 +55,7 @@ def _damage(folder: Path, job: Job, entry: dict[str, Any]) -> _Damage:
 
 
 def _take_back(folder: Path, damage: _Damage) -> list[str]:
-    """Delete the record and what is damaged; returns the problems and what else is gone."""
+    """Delete the record and what is damaged; return the problems and the added streams that are lost."""
     record, clip = record_path(folder, damage.job.name), folder / "clips" / damage.job.name
     streams, wanted = clip / "streams", {sensing.stream_name for sensing in damage.job.streams}
     record.unlink()
@@ -72,7 +72,7 @@ def _take_back(folder: Path, damage: _Damage) -> list[str]:
 
 
 def _vouched_for(job: Job, clip: Path, digest: str | None) -> bool:
-    """Whether a clip would get the record that the manifest knows."""
+    """Return whether the record of a clip would have the checksum in the manifest."""
     try:
         return files.sha256(files.to_json(make_record(job, clip))) == digest
     except FileNotFoundError:

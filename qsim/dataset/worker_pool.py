@@ -1,4 +1,4 @@
-"""Processes that do jobs: each has its own renderer, is replaced before it has grown, and ends when its parent does."""
+"""Runs jobs in worker processes, each with its own renderer, a memory limit, and an end with its parent."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ MEMORY_EXIT, ORPHAN_EXIT = 70, 71  # exit codes of worker processes
 
 @dataclass(frozen=True)
 class Limits:
-    """What a worker process may use."""
+    """Limits of a worker process."""
 
-    memory: float = 4.0  # GiB of resident memory, then the process gives up its job
-    jobs: int = 8  # per process: a fresh one replaces it, because renderers grow
+    memory: float = 4.0  # GiB of resident memory; above it the process ends and its job counts as crashed
+    jobs: int = 8  # per process, which is then replaced, because the memory of a renderer grows
 
 
 def run_here(jobs: list[Job], folder: Path, make: RenderJob) -> Generator[Result]:
-    """The jobs one after the other in this process."""
+    """Run the jobs one after the other in this process."""
     for job in jobs:
         yield run_job(job, folder, make)
 
 
 def run_local(jobs: list[Job], folder: Path, make: RenderJob, workers: int, limits: Limits) -> Generator[Result]:
-    """The jobs in `workers` fresh processes, each with its own renderer; one that dies takes down only its job."""
+    """Run the jobs in `workers` new processes; a process that crashes loses only its job."""
     queue = collections.deque(jobs)
     crashes: collections.Counter[str] = collections.Counter()
     pool: list[_Worker] = []
@@ -54,7 +54,7 @@ def run_local(jobs: list[Job], folder: Path, make: RenderJob, workers: int, limi
             for connection in multiprocessing.connection.wait([w.pipe for w in pool if w.job]):
                 worker = next(w for w in pool if w.pipe is connection)
                 job, result = worker.take()
-                if result is None:  # the process died
+                if result is None:  # the process crashed
                     pool.remove(worker)
                     crashes[job.name] += 1
                     if crashes[job.name] < MAX_CRASHES:
@@ -74,14 +74,14 @@ def run_local(jobs: list[Job], folder: Path, make: RenderJob, workers: int, limi
 
 
 class _Worker:
-    """A process of its own that does one job after the other; it ends when the parent does."""
+    """A process that runs one job after the other and ends with its parent."""
 
     def __init__(self, folder: Path, make: RenderJob, memory: float) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs, folder, make, memory, os.getpid()), daemon=True)
-        # The child inherits the mask: Ctrl-C in a terminal reaches all of its processes, and is the parent's business.
-        # The first start of a child starts the tracker too, which unblocks SIGINT again: have it running before.
+        # Ctrl-C in a terminal reaches all processes, and only the parent handles it: the child inherits this mask.
+        # The first start of a child also starts the tracker, which unblocks SIGINT again: start the tracker before.
         multiprocessing.resource_tracker.ensure_running()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
@@ -93,13 +93,14 @@ class _Worker:
         self.jobs = 0
 
     def give(self, job: Job) -> None:
+        """Send a job to the process."""
         self.job = job
         self.jobs += 1
-        with contextlib.suppress(BrokenPipeError):  # it died idle: `take` will see it
+        with contextlib.suppress(BrokenPipeError):  # the idle process has crashed: `take` returns None
             self.pipe.send(job)
 
     def take(self) -> tuple[Job, Result | None]:
-        """The job and its result; None if the process died over it."""
+        """Wait for the result and return it with the job; None in its place if the process crashed."""
         assert self.job is not None
         job, self.job = self.job, None
         try:
@@ -110,7 +111,7 @@ class _Worker:
 
     @property
     def exit_reason(self) -> str:
-        """Why the process is gone, in words."""
+        """Return why the process ended."""
         code = self.process.exitcode
         if code == MEMORY_EXIT:
             return "it needed more memory than --memory allows"
@@ -127,7 +128,7 @@ class _Worker:
 
 
 def _work(pipe: Connection, folder: Path, make: RenderJob, memory: float, parent: int) -> None:
-    """A worker process: jobs in, results out, until the pipe closes."""
+    """Run in a worker process the jobs that arrive, and send their results, until the pipe closes."""
     threading.Thread(target=_watch, args=(parent, memory), daemon=True).start()
     with contextlib.suppress(EOFError):
         while True:
@@ -135,7 +136,7 @@ def _work(pipe: Connection, folder: Path, make: RenderJob, memory: float, parent
 
 
 def _watch(parent: int, memory: float) -> None:
-    """End this process when its parent is gone, or when it has grown beyond `memory` GiB."""
+    """End this process when its parent has ended, or when it holds more than `memory` GiB."""
     while os.getppid() == parent:
         if resident_memory() > memory * 2**30:
             os._exit(MEMORY_EXIT)

@@ -267,7 +267,7 @@ def test_an_answer_counts_only_when_its_files_agree(tmp_path: Path, lie: str):
 
     found = generate(wanted, folder, HERE, make=make, run=run)
     assert (found.done, found.made, set(found.failed)) == (2, 2, {"fan_0000"})
-    assert found.failed["fan_0000"].startswith("a worker says that it is done, but ")
+    assert found.failed["fan_0000"].startswith("a worker reports that it is done, but ")
     opened = Dataset.open(folder)
     assert opened.names() == ["fan_0001", "tumble_0004"]
     assert opened.meta["jobs"]["fan_0000"]["state"] == "failed"
@@ -280,5 +280,5 @@ def test_an_answer_for_a_job_that_nobody_asked_for(tmp_path: Path):
 
     found = generate(recipe.parse(RECIPE), tmp_path / "d", HERE, make=make, run=run)
     assert (found.done, found.made) == (0, 0)
-    assert "given to none" in found.failed["fan_0099"]
-    assert "it is not here" in found.failed["fan_0000"]
+    assert "no worker was given it" in found.failed["fan_0099"]
+    assert "its record is missing" in found.failed["fan_0000"]
