@@ -8,85 +8,13 @@ import numpy as np
 import pytest
 import torch
 from clips import ClipMaker, sliding_pattern
-from numpy import ndarray as Array
-from stats import assert_histogram, assert_mean
+from stats import assert_mean
 from torch.utils.data import DataLoader
 
 from qsim.clip.photons import clip_photons, light_level
-from qsim.keys import Key
-from qsim.sensor.counting import CountingSPAD
-from qsim.sensor.qis import QIS
-from qsim.sensor.sensor import Sensor
-from qsim.sensor.spad import BinarySPAD
-from quiver.data.clips import open_clips, truth
-from quiver.data.code_table import CodeTable, draw_codes
-from quiver.data.codes import array_codes, sensed
+from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
-from quiver.data.photon_cubes import cube_codes
-from quiver.data.windows import Batches, Windows, WindowSettings, as_input
-
-EXPOSURE = 5e-4
-SENSORS = (
-    QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25),
-    QIS(0.8, 3200.0, 0.0, 2),
-    QIS(0.8, 1.6, 2.0, 5, gain=0.3, full_well=20.0),
-    BinarySPAD(0.4, 100.0, bits=1),
-    CountingSPAD(0.5, 25.0, 5e-5, 3),
-)
-
-
-@pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: f"{type(s).__name__}-{s.bits}")
-def test_table_draws_are_the_reference_draws(sensor: Sensor):
-    """Every code, from darkness to far beyond saturation, equals the sensor's own slow draw."""
-    photons = np.random.default_rng(0).choice([0, 1e-6, 0.3, 1, 3.25, 7, 20, 300, 1e6], (3, 40, 50))
-    photons = photons * np.random.default_rng(1).uniform(0.5, 1.5, photons.shape)
-    key = Key(seed=3, clip=5, frame=2)
-    expected = sensor.sample(photons, EXPOSURE, key=key, engine="reference")
-    np.testing.assert_array_equal(draw_codes(sensor, photons, EXPOSURE, key), expected)
-
-
-def test_sums_of_planes_have_the_exact_distribution():
-    """A clocked SPAD draws plane by plane; its table draws the sum: the same binomial law."""
-    sensor = BinarySPAD(1.0, 0.0, bits=3)
-    for level in (0.5, 4.9, 20.0):
-        codes = draw_codes(sensor, np.full((5, 80, 100), level), EXPOSURE, Key(1, int(level)))
-        assert_histogram(codes, np.exp(sensor.log_pmf(np.array([level]), EXPOSURE)[0]), checks=3)
-
-
-def test_the_table_decides_most_pixels_itself():
-    """Otherwise it would be exact for a dull reason: 3 bits leave 1 to 2 % of the cells open."""
-    table = CodeTable(SENSORS[0], EXPOSURE)
-    assert 0.003 < np.mean(table.table == CodeTable.UNDECIDED) < 0.03
-    assert set(np.unique(table.table)) == {0, 1, 2, 3, 4, 5, 6, 7, 255}
-
-
-def test_a_table_asks_for_second_words_where_one_does_not_decide():
-    sensor = SENSORS[0]
-    photons = np.full((1, 1), 3.25)
-    edge = np.array([[int(sensor.cdf(photons, EXPOSURE)[0, 0, 2] * 2**32)]], dtype=np.uint32)
-    table = CodeTable(sensor, EXPOSURE)
-    with pytest.raises(LookupError, match="second words"):
-        table.draw(photons, edge)
-    least, most = (table.draw(photons, edge, np.full((1, 1), w, np.uint32)) for w in (0, 2**32 - 1))
-    assert (least, most) == (2, 3)
-
-
-def test_sensors_that_fit_no_table_are_drawn_by_themselves():
-    """A paralyzable counter's codes fall again at high light; ten bits have too many thresholds."""
-    photons = np.full((2, 5, 7), 30.0)
-    for sensor in (CountingSPAD(0.5, 25.0, 5e-5, 3, paralyzable=True), QIS(0.8, 1.6, 5.1, 10, offset=32.0)):
-        expected = sensor.sample(photons, EXPOSURE, key=Key(1, 2), engine="reference")
-        np.testing.assert_array_equal(draw_codes(sensor, photons, EXPOSURE, Key(1, 2)), expected)
-    with pytest.raises(ValueError, match="do not grow with light"):
-        CodeTable(CountingSPAD(0.5, 25.0, 5e-5, 3, paralyzable=True), EXPOSURE)
-
-
-@pytest.mark.parametrize("bad", [-1.0, np.nan, np.inf])
-def test_bad_photons_are_named(bad: float):
-    photons = np.ones((2, 5, 7))
-    photons[1, 4, 2] = bad
-    with pytest.raises(ValueError, match="photons"):
-        draw_codes(SENSORS[0], photons, EXPOSURE, Key(1, 2))
+from quiver.data.windows import Batches, Windows, WindowSettings
 
 
 def windows(make_clip: ClipMaker, **settings: object) -> Windows:
@@ -230,52 +158,6 @@ def test_clips_that_hold_no_window_are_named(make_clip: ClipMaker):
         Windows([make_clip("short", frames=5)], WindowSettings(crop=16))
     with pytest.raises(ValueError, match="no complete clip"):
         Windows([], WindowSettings())
-
-
-def test_sensed_codes_and_truth(make_clip: ClipMaker):
-    """Drawn frame by frame or at once, the codes are the same; truth has the asked light level."""
-    clip = make_clip()
-    codes, factor = sensed(clip, Illumination(), seed=2)
-    whole = codes.read(0, 14)
-    np.testing.assert_array_equal(np.concatenate([codes.read(t, t + 1) for t in range(14)]), whole)
-    assert truth(clip, factor, 0, 14).mean() == pytest.approx(3.25, rel=1e-6)
-    assert codes.white == pytest.approx(8.125)
-    assert (sensed(clip, Illumination(), seed=3)[0].read(0, 1) != whole[:1]).any()
-
-
-def test_photon_cubes(tmp_path, rng_planes: Array):
-    """Packed planes, seven to a code; a width that is no multiple of eight; leftover planes are dropped."""
-    np.save(tmp_path / "cube.npy", np.packbits(rng_planes, axis=2))
-    light = Illumination("spad-320x240", None, 3)
-    codes = cube_codes(tmp_path / "cube.npy", light, 1428.0, planes=7, width=13)
-    assert codes.shape == (2, 5, 13)
-    np.testing.assert_array_equal(codes.read(0, 2), rng_planes[:14].reshape(2, 7, 5, 13).sum(axis=1))
-    assert codes.white == pytest.approx(7.0)
-    with pytest.raises(ValueError, match=r"no cube of packed planes 30 px wide"):
-        cube_codes(tmp_path / "cube.npy", light, 1428.0, planes=7, width=30)
-    with pytest.raises(ValueError, match="fewer than the 31 of one code"):
-        cube_codes(tmp_path / "cube.npy", Illumination("spad-320x240", None, 5), 300.0, planes=31, width=13)
-
-
-@pytest.fixture
-def rng_planes() -> Array:
-    return np.random.default_rng(0).integers(0, 2, (16, 5, 13), dtype=np.uint8)
-
-
-def test_codes_in_memory_are_checked():
-    sensor = SENSORS[0]
-    codes = np.zeros((3, 4, 5), np.uint8)
-    codes[2, 1, 3] = 8
-    with pytest.raises(ValueError, match=r"code 8 at \(t, y, x\) = \(2, 1, 3\); a 3-bit sensor has 0\.\.7"):
-        array_codes(codes, sensor, EXPOSURE).read(1, 3)
-    with pytest.raises(ValueError, match=r"expected integer codes \[T, H, W\]"):
-        array_codes(np.zeros((0, 4, 5), np.uint8), sensor, EXPOSURE)
-    assert as_input(np.full((1, 2, 2), 7, np.uint8), sensor).max() == 1.0
-
-
-def test_splits(tiny_dataset):
-    assert [len(open_clips(tiny_dataset, split)) for split in ("train", "val", "test", None)] == [3, 2, 2, 7]
-    assert open_clips(open_clips(tiny_dataset)[0].path)[0].shape == (14, 36, 44)
 
 
 def test_the_pattern_moves():

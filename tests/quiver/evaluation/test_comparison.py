@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,9 +17,8 @@ from qsim.clip.manifest import RELATIVE
 from qsim.clip.sensing import Sensing, sense
 from qsim.clip.writer import ClipWriter
 from quiver.data.clips import open_clips, truth
-from quiver.data.codes import Codes, array_codes, sensed
-from quiver.data.illumination import Illumination, ideal_counter
-from quiver.data.photon_counts import Counts, read_counts
+from quiver.data.codes import Codes, sensed
+from quiver.data.illumination import Illumination
 from quiver.evaluation import summary
 from quiver.evaluation.comparison import (
     Comparison,
@@ -33,11 +30,8 @@ from quiver.evaluation.comparison import (
     scored_frames,
     truth_psnr,
 )
-from quiver.evaluation.static_object import evaluate_static, markdown, mean_square, reference
 from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer
-
-HAZELNUT = Path(__file__).parents[2] / "data" / "hazelnut_gates6.npz"
 
 
 def method(name: str, restore: object, learned: bool = False) -> Restorer:
@@ -152,28 +146,6 @@ def test_a_failure_keeps_its_row_and_reason(tiny_dataset, tmp_path):
     assert [row.method for row in finished((tmp_path / "t/rows.jsonl").read_text().splitlines())] == ["moment:1"] * 2
 
 
-def test_the_table_holds_what_was_promised(tiny_dataset, tmp_path):
-    comparison = Comparison(str(tiny_dataset), lights=(Illumination(), Illumination(ppp=26.0)))
-    methods = [restorer("naive"), restorer("moment:3")]
-    rows = evaluate(comparison, methods, tmp_path / "t")
-    summary.write(tmp_path / "t", comparison, methods, rows)
-    found = json.loads((tmp_path / "t/evaluation.json").read_text())
-    assert len(found["rows"]) == 2 * 2 * 2
-    assert "RVRT" in found["not_built_yet"]
-    line = found["table"][1]
-    assert (line["method"], line["light"], line["scores"]["psnr"]["scenes"]) == ("moment:3", "3.25 PPP, 3 bit", 2)
-    assert line["scores"]["psnr"]["half_width"] > 0
-    assert line["truth_psnr"] == pytest.approx(rows[0].truth_psnr, abs=3)
-    text = (tmp_path / "t/evaluation.md").read_text()
-    assert "| moment:3 | 3 (1) | 26 PPP, 3 bit |" in text
-    assert "| sliding:400 | 3.25 PPP, 3 bit |" in text
-    assert f"The paper also compares with {', '.join(summary.PAPER_METHODS)}: not built yet." in text
-    assert "By motion" not in text  # these clips have no flow
-    assert all(row.peak_bytes is not None and 0 <= row.peak_bytes < 2e9 for row in rows)
-    for picture in ("evaluation.png", "crops_3.25PPP_3bit.png", "crops_26PPP_3bit.png"):
-        assert (tmp_path / "t" / picture).read_bytes().startswith(b"\x89PNG")
-
-
 def test_truth_psnr_is_the_radiance_error_in_units_of_white(make_clip: ClipMaker):
     """Relative clip, mean 1 by construction of the factor: rms 0.01 of radiance is 0.01 * 3.25 / mean of 8.125."""
     clip = make_clip(relative=True, error=0.01)
@@ -209,36 +181,6 @@ def test_every_sensor_is_scored_at_one_peak(make_clip: ClipMaker):
         above = np.mean([clip.sharp(t) > 2.5 * light for t in range(len(clip))])
         assert rows[0].score.above_peak == pytest.approx(above)
         assert all(math.isfinite(row.score.psnr) and row.score.psnr_matched >= row.score.psnr for row in rows)
-
-
-def test_a_one_bit_sensor_in_much_light_is_not_perfect(make_clip: ClipMaker):
-    """At 10 PPP every pixel of a 1-bit code lies above its own white: there all guesses were perfect, `moment` inf."""
-    comparison = Comparison(
-        str(make_clip().path), None, (Illumination("spad-320x240", 1.0, 1), Illumination("spad-320x240", 10.0, 1))
-    )
-    dim, bright = evaluate(comparison, [restorer("moment")])
-    assert bright.score.psnr < dim.score.psnr < 40
-    hidden = evaluate(replace(comparison, peak=1.0), [restorer("moment")])[1]
-    assert hidden.score.above_peak > 0.9
-    assert not math.isinf(hidden.score.psnr)
-    text = summary.markdown(replace(comparison, peak=1.0), [restorer("moment")], [dim, hidden])
-    assert "peak = 1 photons per pixel" in text
-    assert "Warning: 100.0 % of the pixels of sliding_0 at 10 PPP, 1 bit lie above the peak" in text
-    assert " inf " not in text
-
-
-@pytest.mark.parametrize("peak", [1e-6, 1e9])
-def test_an_extreme_peak_has_a_table_and_no_foreign_warning(peak, tiny_dataset, tmp_path):
-    comparison = Comparison(str(tiny_dataset), peak=peak)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        methods = [restorer("naive")]
-        rows = evaluate(comparison, methods, tmp_path / "out")
-        summary.write(tmp_path / "out", comparison, methods, rows)
-    assert all(row.failure is None for row in rows)
-    crops = list((tmp_path / "out/crops").glob("*.npy"))
-    assert crops
-    assert all(np.isfinite(np.load(crop)).all() for crop in crops)
 
 
 def test_another_peak_moves_scores_by_its_ratio(make_clip: ClipMaker):
@@ -279,28 +221,6 @@ def test_saturated_pixels_count_nowhere(tmp_path):
     rows = evaluate(Comparison(str(clip.path), None), [spoilt, method("whole", lambda codes: exact + 0.1 * noise)])
     assert rows[0].score == rows[1].score
     assert rows[0].score.psnr > 35
-
-
-def test_scores_near_the_truth_are_marked(make_clip: ClipMaker):
-    """A truth with an error of 3 % of its mean is worth 38.4 dB; an answer of 36 dB is marked, one of 20 dB is not."""
-    clip = make_clip("rough", error=0.03 * make_clip().mean_radiance)
-    rng = np.random.default_rng(11)
-
-    def wrong(psnr: float) -> Restorer:
-        sigma = 2.5 * 3.25 * 10 ** (-psnr / 20)
-        exact = truth(clip, sensed(clip, Illumination())[1], 0, len(clip))
-        return method(f"at {psnr:g}", lambda codes: exact + rng.normal(0, sigma, exact.shape))
-
-    comparison, methods = Comparison(str(clip.path), None), [wrong(36.0), wrong(20.0)]
-    rows = evaluate(comparison, methods)
-    assert rows[0].truth_psnr == pytest.approx(20 * math.log10(2.5 / 0.03), abs=0.01)
-    near, far = summary.summarise(rows)
-    assert near.near_truth == ("psnr", "psnr_matched")
-    assert far.near_truth == ()
-    text = summary.markdown(comparison, methods, rows)
-    assert f"{near.scores['psnr'].mean:.2f} † |" in text
-    assert f"{far.scores['psnr'].mean:.2f} |" in text
-    assert "† In one clip or more within 3 dB of the truth's own PSNR" in text
 
 
 def test_published_windows_are_counted_as_published():
@@ -361,105 +281,3 @@ def test_rows_survive_json(tmp_path):
 
 
 # Static real photons
-
-
-def static_counts(light: float, shares: Array, seed: int = 0) -> tuple[Counts, Array]:
-    rng = np.random.default_rng(seed)
-    true = light * rng.uniform(0.2, 1.6, (60, 70))
-    return Counts(rng.poisson(shares[:, None, None] * true), shares, "synthetic"), true
-
-
-def test_the_reference_takes_off_its_own_noise():
-    """An oracle's error against 19 noisy frames is all reference noise: what is left is zero within its own spread."""
-    shares = np.tile([1.2, 0.9, 0.9], 10)
-    left, measured = [], []
-    for seed in range(40):
-        counts, true = static_counts(5.0, shares, seed)
-        estimate, variance = reference(counts, np.arange(11, 30))
-        left.append(mean_square(true / 7, estimate / 7, variance / 49))
-        measured.append(mean_square(true / 7, estimate / 7, np.zeros_like(variance)))
-    sigma = np.std(left, ddof=1) / math.sqrt(40)
-    assert abs(np.mean(left)) < 5 * sigma  # includes the clamp: a fifth of the pixels is above white
-    assert np.mean(measured) > 100 * sigma
-
-
-def test_flicker_is_divided_out():
-    """Frames of unequal light: the mean of eleven, divided by their shares, is unbiased."""
-    shares = np.tile([1.5, 0.5], 15)
-    counts, _ = static_counts(2.0, shares)
-    found = evaluate_static(counts, [restorer("moment")], splits=4)[0]
-    assert found.scale == pytest.approx(1.0, abs=0.05)
-    flat = evaluate_static(replace(counts, shares=np.ones(30)), [restorer("moment")], splits=4)[0]
-    assert flat.psnr < found.psnr
-
-
-def test_real_photons():
-    """The hazelnut: 30 frames of 3.08 photons; eleven averaged beat three, and shares are the gates' means."""
-    counts = read_counts(HAZELNUT)
-    assert counts.frames.shape[0] == 30
-    assert counts.shares[:6] == pytest.approx(
-        np.array([3.5431, 3.1394, 2.7712, 2.6510, 2.9083, 3.4963]) / 3.0849, rel=0.05
-    )
-    eleven, three, bad = evaluate_static(counts, [restorer("moment"), restorer("moment:3"), method("bad", broken)])
-    assert eleven.psnr_matched > three.psnr_matched + 3
-    assert eleven.psnr_matched > eleven.psnr_as_measured > 20
-    assert bad.failure == "RuntimeError: no road leads there"
-    text = markdown(counts, [eleven, three, bad], 11, 3)
-    assert "| bad | failed: RuntimeError" in text
-
-
-def test_bad_counts_are_named(tmp_path):
-    np.save(tmp_path / "float.npy", np.ones((3, 4, 5)))
-    with pytest.raises(ValueError, match=r"expected whole counts \[N, H, W\] or \[T, K, H, W\], got float64"):
-        read_counts(tmp_path / "float.npy")
-    dark = np.ones((3, 4, 5), np.uint8)
-    dark[1] = 0
-    np.save(tmp_path / "dark.npy", dark)
-    with pytest.raises(ValueError, match="frame or gate 1 holds no photon"):
-        read_counts(tmp_path / "dark.npy")
-    (tmp_path / "text.npy").write_text("hello")
-    with pytest.raises(ValueError, match="not readable as an array"):
-        read_counts(tmp_path / "text.npy")
-    np.savez(tmp_path / "two.npz", a=dark, b=dark)
-    with pytest.raises(ValueError, match=r"two.npz: not readable .*holds 2 arrays \(a, b\); one is read"):
-        read_counts(tmp_path / "two.npz")
-    with pytest.raises(ValueError, match="codes of 1 to 8 bits, got 9"):
-        evaluate_static(Counts(dark, np.ones(3), "x"), [restorer("moment")], frames=1, bits=9)
-    with pytest.raises(ValueError, match="leave none of 3 for the reference"):
-        evaluate_static(Counts(dark, np.ones(3), "x"), [restorer("moment")], frames=3)
-
-
-@pytest.mark.parametrize("name", ["counts.npz", "counts.npy"])
-def test_a_damaged_file_of_counts_is_one_line(tmp_path, name):
-    """Cut anywhere, any byte changed, or foreign bytes: read as whole counts, or one `ValueError` with the name."""
-    counts = np.random.default_rng(12).poisson(3.0, (6, 5, 4)).astype(np.uint16)
-    path = tmp_path / name
-    np.savez_compressed(path, counts) if name.endswith("npz") else np.save(path, counts)
-    good, rng, refused = path.read_bytes(), np.random.default_rng(13), 0
-    cases = [b"", b"PK\3\4", b"PK\5\6" + bytes(18), b"\x93NUMPY", good[:1]]
-    for _ in range(250):
-        content = bytearray(good[: rng.integers(1, len(good) + 1)] if rng.random() < 0.4 else good)
-        for _ in range(int(rng.integers(1, 4))):
-            content[rng.integers(len(content))] = rng.integers(256)
-        cases.append(bytes(content))
-    for content in cases:
-        path.write_bytes(content)
-        with contextlib.suppress(ValueError):
-            read_counts(path)
-            continue
-        with pytest.raises(ValueError, match=f"^{path}: [^\n]*$"):
-            read_counts(path)
-        refused += 1
-    assert refused > 100
-    with pytest.raises(FileNotFoundError, match="no such file"):
-        read_counts(tmp_path / f"none{name}")
-    with pytest.raises(ValueError, match=r"photon counts are a .npy, or a .npz"):
-        read_counts(tmp_path / "counts.txt")
-
-
-def test_an_ideal_counter_counts():
-    """White is the top code; codes up to it are the counts themselves."""
-    sensor = ideal_counter(3)
-    assert sensor.white(1.0) == 7
-    codes = array_codes(np.full((1, 4, 4), 3, np.uint8), sensor, 1.0)
-    np.testing.assert_allclose(restorer("naive:1").restore(codes), 3.0)

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from clips import ClipMaker
 from numpy import ndarray as Array
-from torch import Tensor, nn
 
 from qsim.sensor.qis import QIS
 from quiver.baselines import METHODS
@@ -22,13 +16,12 @@ from quiver.data.clips import truth
 from quiver.data.codes import Codes, array_codes, sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
-from quiver.model.blocks import Output
 from quiver.model.presets import build
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
 from quiver.restoration import restored_file
 from quiver.restoration.interface import RestoreOptions, Restorer
-from quiver.restoration.networks import fill_network, network_restorer
+from quiver.restoration.networks import network_restorer
 from quiver.restoration.restored_file import restore_to_file
 from quiver.restoration.restorers import method_names, restorer, restorers, weights_path
 
@@ -40,75 +33,6 @@ SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
 def random_codes(frames: int, height: int, width: int, seed: int = 0) -> Codes:
     drawn = np.random.default_rng(seed).integers(0, 8, (frames, height, width), dtype=np.uint8)
     return array_codes(drawn, SENSOR, EXPOSURE)
-
-
-class CentreFrame(nn.Module):
-    """Returns the centre of its window untouched: whatever padding and tiling do, the codes must come back."""
-
-    multiple = 8
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.unused = nn.Parameter(torch.zeros(1))
-        self.seen: list[tuple[int, ...]] = []
-
-    def forward(self, x: Tensor) -> Output:
-        self.seen.append(tuple(x.shape))
-        centre = x[:, 5:6]
-        return Output(x, centre, centre, centre)
-
-
-class WindowMean(CentreFrame):
-    """The mean of its window: shows which frames a window held."""
-
-    def forward(self, x: Tensor) -> Output:
-        mean = x.mean(dim=1, keepdim=True)
-        return Output(x, mean, mean, mean)
-
-
-def run(
-    model: nn.Module, codes: Codes, options: RestoreOptions | None = None, first: int = 0, count: int | None = None
-) -> Array:
-    out = np.zeros((count or codes.shape[0], *codes.shape[1:]), np.float32)
-    fill_network(model, codes, out, first, options or RestoreOptions(), None)
-    return out
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 3, 5), (8, 10, 7), (13, 33, 18)])
-def test_every_frame_of_any_size_comes_back(shape):
-    codes, model = random_codes(*shape), CentreFrame()
-    expected = codes.read(0, shape[0]) * (codes.white / 7)
-    np.testing.assert_allclose(run(model, codes), expected, rtol=1e-6)
-    assert all(seen[3] % 8 == seen[4] % 8 == 0 for seen in model.seen)
-
-
-@pytest.mark.parametrize("frames", [1, 2, 4, 14])
-def test_time_is_continued_by_reflection(frames):
-    """Frame 0 sees frames 5 4 3 2 1 0 1 2 3 4 5 (folded again where the clip is shorter)."""
-    codes = random_codes(frames, 4, 4)
-    period = max(1, 2 * frames - 2)
-    for t in (0, frames - 1):
-        folded = [min(i % period, period - i % period) for i in range(t - 5, t + 6)]
-        mean = np.mean([codes.read(i, i + 1)[0] for i in folded], axis=0) * (codes.white / 7)
-        np.testing.assert_allclose(run(WindowMean(), codes)[t], mean, rtol=1e-5)
-
-
-def test_a_range_of_frames_equals_that_part_of_the_whole():
-    codes = random_codes(14, 10, 7)
-    np.testing.assert_array_equal(run(WindowMean(), codes, first=4, count=3), run(WindowMean(), codes)[4:7])
-    moment = restorer("moment")
-    np.testing.assert_array_equal(moment.restore(codes, 4, 7), moment.restore(codes)[4:7])
-
-
-def test_modes_of_the_network():
-    """Exact equals windows recomputed; streaming is another schedule; bfloat16 stays near float32."""
-    torch.manual_seed(0)
-    codes, model = random_codes(4, 16, 16), build("nano").eval()
-    windows = run(model, codes, RestoreOptions(mode="windows"))
-    np.testing.assert_allclose(run(model, codes, RestoreOptions(mode="exact")), windows, atol=2e-4)
-    assert np.isfinite(run(model, codes, RestoreOptions(mode="streaming"))).all()
-    low = run(model, codes, RestoreOptions(mode="windows", precision="bfloat16"))
-    assert 0 < np.abs(low - windows).max() < 0.1 * codes.white
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -220,61 +144,3 @@ def test_an_interrupted_restoration_goes_on(tmp_path, monkeypatch):
         restore_to_file(codes, slow, path)
     restore_to_file(random_codes(14, 5, 6), replace(slow, description="another"), path)
     assert starts[3:] == [0, 4, 8, 12]  # another method does not go on with the frames of this one
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"mode": "fast"}, "mode 'fast'; known are exact, streaming, windows"),
-        ({"precision": "float16"}, "precision 'float16'"),
-        ({"memory": 0}, "memory is a number of bytes"),
-    ],
-)
-def test_bad_options_are_named(changes, message):
-    with pytest.raises(ValueError, match=message):
-        RestoreOptions(**changes)
-
-
-def test_cuda_is_asked_for_by_name(tmp_path: Path):
-    if torch.cuda.is_available():
-        pytest.skip("this machine has CUDA")
-    network = UNet(UNetConfig(2))
-    save(network, network.config, tmp_path / "w.safetensors")
-    with pytest.raises(ValueError, match="--device cuda: torch finds no CUDA"):
-        restorer(str(tmp_path / "w.safetensors"), RestoreOptions(device="cuda"))
-
-
-MEMORY_PROGRAM = """
-import numpy as np
-from qsim.process import peak_memory, reset_peak
-from quiver.data.codes import array_codes
-from quiver.data.illumination import Illumination
-from quiver.model.presets import build
-from quiver.restoration.interface import RestoreOptions
-from quiver.restoration.networks import wrap_network
-sensor = Illumination().device(5e-4)
-codes = array_codes(np.random.default_rng(0).integers(0, 8, (1, 320, 320), dtype=np.uint8), sensor, 5e-4)
-method = wrap_network(build("nano"), "nano", "", RestoreOptions(memory={memory}, mode="{mode}"))
-before = reset_peak()
-method.restore(codes)
-print(peak_memory() - before)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", ["exact", "windows"])
-def test_the_memory_bound_holds(mode):
-    """80 MB for a frame that takes more in one piece; peak of resident pages, in a process of its own."""
-    tiled, whole = (
-        int(
-            subprocess.run(
-                [sys.executable, "-c", MEMORY_PROGRAM.format(memory=memory, mode=mode)],
-                capture_output=True,
-                text=True,
-                check=True,
-                env=os.environ | {"OMP_NUM_THREADS": "1"},
-            ).stdout
-        )
-        for memory in (80_000_000, 1_000_000_000)
-    )
-    assert tiled < 1.1 * 80_000_000 < whole

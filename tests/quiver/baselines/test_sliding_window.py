@@ -1,0 +1,36 @@
+"""Sums over sliding windows are sums over reflected frames; wrong codes and windows are named."""
+
+import numpy as np
+import pytest
+
+from qsim.sensor.devices import quiver_physical
+from quiver.baselines import moment, naive_mean
+from quiver.baselines.sliding_window import look_ahead, reflect, window_frames, window_sums
+
+EXPOSURE = 5e-4
+
+
+@pytest.mark.parametrize("window", [1, 2, 3, 4, 11])
+@pytest.mark.parametrize("length", [1, 2, 7])
+def test_running_sums_are_sums_over_reflected_windows(window, length):
+    codes = np.random.default_rng(1).integers(0, 256, (length, 8, 10), dtype=np.uint8)
+    index = np.pad(np.arange(length), 40, mode="reflect" if length > 1 else "edge")
+    for t, total in enumerate(window_sums(codes, window, 255)):
+        frames = index[40 + t - window // 2 : 40 + t + look_ahead(window) + 1]
+        np.testing.assert_array_equal(frames, window_frames(t, window, length))
+        np.testing.assert_array_equal(total, codes[frames].astype(int).sum(axis=0))
+
+
+def test_reflection_goes_on_and_on():
+    np.testing.assert_array_equal(reflect(np.arange(-5, 8), 3), [1, 0, 1, 2, 1, 0, 1, 2, 1, 0, 1, 2, 1])
+
+
+def test_wrong_codes_and_windows_are_named():
+    sensor, codes = quiver_physical(3.25), np.zeros((4, 8, 10), np.uint8)
+    codes[2, 3, 5] = 9
+    with pytest.raises(ValueError, match=r"0\.\.7 for a 3-bit sensor, found 9 at \(t, y, x\) = \(2, 3, 5\)"):
+        moment.restore(codes, sensor, EXPOSURE)
+    with pytest.raises(ValueError, match="expected integers"):
+        naive_mean.restore(codes.astype(float), sensor, EXPOSURE)
+    with pytest.raises(ValueError, match="window is a number of frames, got 0"):
+        moment.restore(codes[:1], sensor, EXPOSURE, window=0)

@@ -1,0 +1,52 @@
+"""Codes from memory and from clips: checked, and with their truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from clips import ClipMaker
+
+from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.qis import QIS
+from qsim.sensor.spad import BinarySPAD
+from quiver.data.clips import open_clips, truth
+from quiver.data.codes import array_codes, sensed
+from quiver.data.illumination import Illumination
+from quiver.data.windows import as_input
+
+EXPOSURE = 5e-4
+
+SENSORS = (
+    QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25),
+    QIS(0.8, 3200.0, 0.0, 2),
+    QIS(0.8, 1.6, 2.0, 5, gain=0.3, full_well=20.0),
+    BinarySPAD(0.4, 100.0, bits=1),
+    CountingSPAD(0.5, 25.0, 5e-5, 3),
+)
+
+
+def test_sensed_codes_and_truth(make_clip: ClipMaker):
+    """Drawn frame by frame or at once, the codes are the same; truth has the asked light level."""
+    clip = make_clip()
+    codes, factor = sensed(clip, Illumination(), seed=2)
+    whole = codes.read(0, 14)
+    np.testing.assert_array_equal(np.concatenate([codes.read(t, t + 1) for t in range(14)]), whole)
+    assert truth(clip, factor, 0, 14).mean() == pytest.approx(3.25, rel=1e-6)
+    assert codes.white == pytest.approx(8.125)
+    assert (sensed(clip, Illumination(), seed=3)[0].read(0, 1) != whole[:1]).any()
+
+
+def test_codes_in_memory_are_checked():
+    sensor = SENSORS[0]
+    codes = np.zeros((3, 4, 5), np.uint8)
+    codes[2, 1, 3] = 8
+    with pytest.raises(ValueError, match=r"code 8 at \(t, y, x\) = \(2, 1, 3\); a 3-bit sensor has 0\.\.7"):
+        array_codes(codes, sensor, EXPOSURE).read(1, 3)
+    with pytest.raises(ValueError, match=r"expected integer codes \[T, H, W\]"):
+        array_codes(np.zeros((0, 4, 5), np.uint8), sensor, EXPOSURE)
+    assert as_input(np.full((1, 2, 2), 7, np.uint8), sensor).max() == 1.0
+
+
+def test_splits(tiny_dataset):
+    assert [len(open_clips(tiny_dataset, split)) for split in ("train", "val", "test", None)] == [3, 2, 2, 7]
+    assert open_clips(open_clips(tiny_dataset)[0].path)[0].shape == (14, 36, 44)

@@ -1,0 +1,130 @@
+"""The noise of training windows follows the streams of the data set, and options replace it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clips import ClipMaker
+from sensor_files import COUNTER, QIS, sensor_file
+
+from qsim.clip.photons import clip_photons, light_level
+from qsim.clip.sensing import Sensing, sense
+from quiver.cli.program import main
+from quiver.data.clips import open_clips
+from quiver.data.illumination import Illumination
+from quiver.data.mixture import choose, describe
+from quiver.data.noise import Noise
+from quiver.data.windows import Windows, WindowSettings
+from quiver.training.settings import Settings, settled
+
+
+def lines(data: Path, out: Path, **asked: object) -> list[str]:
+    return settled(Settings(str(data), str(out), steps=1, **asked))[1]
+
+
+def test_the_streams_say_sensor_bits_light_and_defects(data, tmp_path):
+    mixture = choose(open_clips(data, "train"))
+    assert mixture.lines == ["noise: spad-320x240, 1 bit, 1 and 10 PPP, dark-count map"]
+    assert lines(data, tmp_path / "r") == mixture.lines
+    assert [(n.sensor, n.bits, n.ppp) for n in mixture.noises] == [("spad-320x240", 1, 1.0), ("spad-320x240", 1, 10.0)]
+    assert "noise: spad-320x240, 1 bit, 1 and 10 PPP, dark-count map" in repr(
+        Windows(open_clips(data, "train"), WindowSettings(crop=16))
+    )
+
+
+def test_a_data_set_without_streams_has_the_default_and_says_so(tiny_dataset, tmp_path):
+    default = "noise: quiver-physical, 3 bits, 3.25 PPP (the default; the data set has no streams)"
+    assert lines(tiny_dataset, tmp_path / "r") == [default]
+
+
+@pytest.mark.parametrize(
+    ("asked", "noise"),
+    [
+        ({"ppp": (5.0,)}, "spad-320x240, 1 bit, 5 PPP, dark-count map"),
+        ({"bits": (1, 3)}, "spad-320x240, 1 and 3 bits, 1 and 10 PPP, dark-count map"),
+        ({"sensor": "quiver-paper"}, "quiver-paper, 1 bit, 1 and 10 PPP"),
+        (
+            {"sensor": ("spad-320x240", "quiver-paper"), "bits": (2,), "ppp": (3.0,)},
+            "spad-320x240, 2 bits, 3 PPP, dark-count map; quiver-paper, 2 bits, 3 PPP",
+        ),
+    ],
+)
+def test_options_replace_what_the_streams_say(data, tmp_path, asked, noise):
+    found = lines(data, tmp_path / "r", **asked)
+    other = "this differs from the data set's streams: spad-320x240, 1 bit, 1 and 10 PPP, dark-count map"
+    assert found == [f"noise: {noise} (as asked for)", other]
+
+
+def test_two_sensors_among_the_streams_are_kept_apart(data, tmp_path):
+    for clip in open_clips(data):
+        sense(clip, Sensing("quiver-physical", bits=3, ppp=3.25))
+    both = "noise: quiver-physical, 3 bits, 3.25 PPP; spad-320x240, 1 bit, 1 and 10 PPP, dark-count map"
+    assert lines(data, tmp_path / "r") == [both]
+    assert lines(data, tmp_path / "r", sensor="quiver-physical")[0].startswith(
+        "noise: quiver-physical, 3 bits, 3.25 PPP (as"
+    )
+
+
+def test_a_sensor_file_brings_its_bits_and_defects(tiny_dataset, tmp_path):
+    file = sensor_file(tmp_path, QIS + "prnu = 0.02\ndead = 0.01\ndark = {{ spread = 0.3 }}\n", 4)
+    found = "noise: mine, 4 bits, 3.25 PPP, dark-current spread, PRNU 2 %, 1 % dead pixels (as asked for)"
+    assert lines(tiny_dataset, tmp_path / "r", sensor=file) == [found]
+    with pytest.raises(ValueError, match="the file says bits = 4, asked for 2"):
+        lines(tiny_dataset, tmp_path / "r", sensor=file, bits=(2,))
+
+
+def test_what_windows_cannot_have_is_refused(make_clip: ClipMaker, tmp_path):
+    counter = sensor_file(tmp_path, COUNTER + "carry_dead_time = true\n", 3)
+    with pytest.raises(ValueError, match=r"carry_dead_time and afterpulse of counting pixels.*without them"):
+        Windows([make_clip()], WindowSettings(crop=16, lights=(Illumination(counter, 3.0, 3),)))
+    sums = make_clip("sums")
+    sense(sums, Sensing("spad-320x240", bits=2, ppp=3.0, group=True))
+    with pytest.raises(ValueError, match="a code takes 3 clip frames, a training window one for each; give --sensor"):
+        choose([sums])
+    assert choose([sums], ["spad-320x240"], [1.0], [2]).lines[0].startswith("noise: spad-320x240, 2 bits, 1 PPP")
+
+
+def test_every_window_is_normalised_by_its_own_sensor(make_clip: ClipMaker):
+    """Codes over their top code, targets over the white of the sensor that drew them, mixed in one batch."""
+    lights = (
+        Illumination("quiver-paper", 3.0, 2),
+        Illumination("spad-320x240", 1.0, 1),
+        Illumination("quiver-physical", 9.0, 5),
+    )
+    data = Windows([make_clip()], WindowSettings(crop=16, lights=lights, flips=False, reverse=False))
+    seen = set()
+    for n in range(12):
+        sample, place = data[n], data.place(n)
+        light, clip = lights[place.light], data.clips[0]
+        sensor = light.device(clip.exposure)
+        codes = sample["codes"].numpy() * (2**light.bits - 1)
+        assert np.allclose(codes, np.rint(codes), atol=1e-5)
+        assert sample["white"] == sensor.white(clip.exposure)
+        factor = light_level(clip, ppp=light.ppp).factor
+        crop = (place.y, place.x, 16, 16)
+        sharp = np.stack([clip_photons(clip, place.start + i, factor, crop, sharp=True) for i in range(11)])
+        expected = np.minimum(sharp / sample["white"], 2.0)
+        np.testing.assert_allclose(sample["target"][:, 0], expected, rtol=1e-6)
+        seen.add(place.light)
+    assert seen == {0, 1, 2}
+
+
+def test_the_command_says_its_noise_in_one_line(data, tmp_path, capsys):
+    words = ["train", data, "-o", tmp_path / "r", "--steps", 1, "--crop", 16, "--batch", 1, "--preset", "unet"]
+    assert main([str(word) for word in [*words, "--json"]]) == 0
+    assert capsys.readouterr().err.splitlines() == ["noise: spad-320x240, 1 bit, 1 and 10 PPP, dark-count map"]
+
+
+def test_describe_says_every_effect():
+    table = {"dark_map": "a", "gain_map": "b", "dead_map": "c", "crosstalk": 0.1, "afterpulse": 0.01}
+    noise = Noise("spad512s", 2.0, 1, defects=json.dumps(table))
+    said = "spad512s, 1 bit, 2 PPP, dark-count map, gain map, map of dead pixels, crosstalk, afterpulses"
+    assert describe([noise]) == said
+    assert (
+        describe([replace(noise, defects=None, ppp=None, lux=5.0, diffraction=True)])
+        == "spad512s, 1 bit, 5 lx, diffraction"
+    )

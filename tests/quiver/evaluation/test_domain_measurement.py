@@ -1,0 +1,106 @@
+"""Cells of a domain are measured once, stored with the weights, and kept."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from domains import run, tensors_digest, weights
+
+from quiver.data.clips import open_clips
+from quiver.data.illumination import Illumination
+from quiver.evaluation import domain_measurement
+from quiver.model.weights import metadata_of
+from quiver.restoration import domain
+from quiver.restoration.interface import RestoreOptions
+from quiver.restoration.networks import network_restorer
+from quiver.restoration.restorers import restorer
+
+
+def test_cells_are_measured_stored_and_kept(tiny_dataset, tmp_path, monkeypatch):
+    path = weights(tmp_path)
+    before = tensors_digest(path)
+    clips = domain_measurement.clips_of([tiny_dataset], "test")
+    lights = (Illumination(ppp=3.25), Illumination("spad-320x240", 1.0, 1))
+    settings = domain_measurement.DomainSettings(clips, lights, ("naive", "moment:3"))
+    asked: list[Illumination] = []
+    measured = domain_measurement.measure_cell
+
+    def noted(network, methods, settings, light):
+        asked.append(light)
+        return measured(network, methods, settings, light)
+
+    monkeypatch.setattr(domain_measurement, "measure_cell", noted)
+    found = domain_measurement.measure(path, settings, RestoreOptions(device="cpu"))
+    assert asked == list(lights)
+    assert tensors_digest(path) == before
+    assert found == domain.read_scope(path, metadata_of(path)).domain
+    assert found.measured["clips"] == [clip.name for clip in clips]
+    best = max(
+        np.mean([domain_measurement.score(restorer(m), c, lights[0], 0) for c in clips]) for m in settings.methods
+    )
+    own = next(c for c in found.cells if c.place.model == "QIS")
+    assert own.classical_psnr == pytest.approx(best, abs=6e-4)
+    assert (own.network < own.classical_psnr) != own.wins  # random weights
+
+    assert (
+        domain_measurement.measure(path, settings, RestoreOptions(device="cpu")) == found
+    )  # nothing is left to measure
+    assert len(asked) == 2
+    domain_measurement.measure(path, replace(settings, lights=lights[:1]), RestoreOptions(device="cpu"), force=True)
+    assert len(asked) == 3
+    other_seed = replace(settings, seed=1, lights=lights[:1])
+    with pytest.raises(ValueError, match=r"measured otherwise \(not the same: seed"):
+        domain_measurement.measure(path, other_seed, RestoreOptions(device="cpu"))
+    other = domain_measurement.measure(path, other_seed, RestoreOptions(device="cpu"), force=True)
+    assert len(other.cells) == 1  # cells of another noise do not stand beside these
+    assert not list(tmp_path.glob("*.lock"))
+    with pytest.raises(ValueError, match="measured against classical methods, got nano"):
+        domain_measurement.measure(path, replace(settings, methods=("nano",)), RestoreOptions(device="cpu"))
+    with pytest.raises(ValueError, match="unknown split 'none'"):
+        domain_measurement.clips_of([tiny_dataset], "none")
+
+
+def test_a_classical_method_that_fails_does_not_compete(tiny_dataset, tmp_path):
+    network = network_restorer(weights(tmp_path), RestoreOptions(device="cpu"))
+
+    def fails(*_: object) -> None:
+        raise ValueError("no road leads there")
+
+    broken = replace(restorer("naive"), name="broken", fill=fails)
+    settings = domain_measurement.DomainSettings(domain_measurement.clips_of([tiny_dataset], "test"), (Illumination(),))
+    assert (
+        domain_measurement.measure_cell(network, [broken, restorer("moment:3")], settings, Illumination()).classical
+        == "moment:3"
+    )
+    with pytest.raises(ValueError, match=r"3\.25 PPP, 3 bit: the network, or every classical method, fails"):
+        domain_measurement.measure_cell(network, [broken], settings, Illumination())
+    with pytest.raises(ValueError, match="no road leads there"):
+        domain_measurement.measure_cell(replace(network, fill=fails), [restorer("naive")], settings, Illumination())
+
+
+def test_the_command_shows_and_measures(capsys, tiny_dataset, tmp_path):
+    path = weights(tmp_path)
+    code, _, err = run(capsys, "domain", path)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "was never measured; name clips" in err
+    for option in (
+        ("--bits", 1),
+        ("--seed", 3),
+        ("--split", "val"),
+        ("--methods", "naive"),
+        ("--memory", "1GB"),
+        ("--force",),
+    ):
+        code, _, err = run(capsys, "domain", path, *option)
+        assert (code, err.count("\n")) == (2, 1)
+        assert f"{option[0]}: is of measuring, and no clips are named" in err
+    clip = open_clips(tiny_dataset, "test")[0].path
+    code, text, _ = run(capsys, "domain", path, clip, "--methods", "naive", "--bits", "1,3", "--ppp", 2)
+    assert code == 0
+    assert "| quiver-physical | 1 | 2 |" in text
+    assert "of 2 cells" in text
+    code, text, _ = run(capsys, "domain", path, "--json")
+    assert [c["place"]["bits"] for c in json.loads(text)["domain"]["cells"]] == [1, 3]

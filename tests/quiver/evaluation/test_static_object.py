@@ -1,0 +1,86 @@
+"""Real photons of a static object: the noise of the reference is subtracted, flicker divided out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy import ndarray as Array
+
+from quiver.data.codes import Codes, array_codes
+from quiver.data.illumination import ideal_counter
+from quiver.data.photon_counts import Counts, read_counts
+from quiver.evaluation.static_object import evaluate_static, markdown, mean_square, reference
+from quiver.restoration.interface import Restorer
+from quiver.restoration.restorers import restorer
+
+HAZELNUT = Path(__file__).parents[2] / "data" / "hazelnut_gates6.npz"
+
+
+def method(name: str, restore: object, learned: bool = False) -> Restorer:
+    """A restorer from a function of (codes) -> photons [T, H, W]."""
+
+    def fill(codes: Codes, out: Array, first: int, progress: object) -> None:
+        out += restore(codes)[first : first + len(out)]
+
+    return Restorer(name, 1, 0, learned, f"test {name}", fill)
+
+
+def broken(codes: Codes) -> Array:
+    raise RuntimeError("no road\nleads there")
+
+
+def static_counts(light: float, shares: Array, seed: int = 0) -> tuple[Counts, Array]:
+    rng = np.random.default_rng(seed)
+    true = light * rng.uniform(0.2, 1.6, (60, 70))
+    return Counts(rng.poisson(shares[:, None, None] * true), shares, "synthetic"), true
+
+
+def test_the_reference_takes_off_its_own_noise():
+    """An oracle's error against 19 noisy frames is all reference noise: what is left is zero within its own spread."""
+    shares = np.tile([1.2, 0.9, 0.9], 10)
+    left, measured = [], []
+    for seed in range(40):
+        counts, true = static_counts(5.0, shares, seed)
+        estimate, variance = reference(counts, np.arange(11, 30))
+        left.append(mean_square(true / 7, estimate / 7, variance / 49))
+        measured.append(mean_square(true / 7, estimate / 7, np.zeros_like(variance)))
+    sigma = np.std(left, ddof=1) / math.sqrt(40)
+    assert abs(np.mean(left)) < 5 * sigma  # includes the clamp: a fifth of the pixels is above white
+    assert np.mean(measured) > 100 * sigma
+
+
+def test_flicker_is_divided_out():
+    """Frames of unequal light: the mean of eleven, divided by their shares, is unbiased."""
+    shares = np.tile([1.5, 0.5], 15)
+    counts, _ = static_counts(2.0, shares)
+    found = evaluate_static(counts, [restorer("moment")], splits=4)[0]
+    assert found.scale == pytest.approx(1.0, abs=0.05)
+    flat = evaluate_static(replace(counts, shares=np.ones(30)), [restorer("moment")], splits=4)[0]
+    assert flat.psnr < found.psnr
+
+
+def test_real_photons():
+    """The hazelnut: 30 frames of 3.08 photons; eleven averaged beat three, and shares are the gates' means."""
+    counts = read_counts(HAZELNUT)
+    assert counts.frames.shape[0] == 30
+    assert counts.shares[:6] == pytest.approx(
+        np.array([3.5431, 3.1394, 2.7712, 2.6510, 2.9083, 3.4963]) / 3.0849, rel=0.05
+    )
+    eleven, three, bad = evaluate_static(counts, [restorer("moment"), restorer("moment:3"), method("bad", broken)])
+    assert eleven.psnr_matched > three.psnr_matched + 3
+    assert eleven.psnr_matched > eleven.psnr_as_measured > 20
+    assert bad.failure == "RuntimeError: no road leads there"
+    text = markdown(counts, [eleven, three, bad], 11, 3)
+    assert "| bad | failed: RuntimeError" in text
+
+
+def test_an_ideal_counter_counts():
+    """White is the top code; codes up to it are the counts themselves."""
+    sensor = ideal_counter(3)
+    assert sensor.white(1.0) == 7
+    codes = array_codes(np.full((1, 4, 4), 3, np.uint8), sensor, 1.0)
+    np.testing.assert_allclose(restorer("naive:1").restore(codes), 3.0)

@@ -1,0 +1,107 @@
+"""Tables of an evaluation: complete, marked where the truth limits a score, and readable at any peak."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from clips import ClipMaker
+from numpy import ndarray as Array
+
+from quiver.data.clips import truth
+from quiver.data.codes import Codes, sensed
+from quiver.data.illumination import Illumination
+from quiver.evaluation import summary
+from quiver.evaluation.comparison import (
+    Comparison,
+    evaluate,
+)
+from quiver.restoration.interface import Restorer
+from quiver.restoration.restorers import restorer
+
+
+def method(name: str, restore: object, learned: bool = False) -> Restorer:
+    """A restorer from a function of (codes) -> photons [T, H, W]."""
+
+    def fill(codes: Codes, out: Array, first: int, progress: object) -> None:
+        out += restore(codes)[first : first + len(out)]
+
+    return Restorer(name, 1, 0, learned, f"test {name}", fill)
+
+
+def test_the_table_holds_what_was_promised(tiny_dataset, tmp_path):
+    comparison = Comparison(str(tiny_dataset), lights=(Illumination(), Illumination(ppp=26.0)))
+    methods = [restorer("naive"), restorer("moment:3")]
+    rows = evaluate(comparison, methods, tmp_path / "t")
+    summary.write(tmp_path / "t", comparison, methods, rows)
+    found = json.loads((tmp_path / "t/evaluation.json").read_text())
+    assert len(found["rows"]) == 2 * 2 * 2
+    assert "RVRT" in found["not_built_yet"]
+    line = found["table"][1]
+    assert (line["method"], line["light"], line["scores"]["psnr"]["scenes"]) == ("moment:3", "3.25 PPP, 3 bit", 2)
+    assert line["scores"]["psnr"]["half_width"] > 0
+    assert line["truth_psnr"] == pytest.approx(rows[0].truth_psnr, abs=3)
+    text = (tmp_path / "t/evaluation.md").read_text()
+    assert "| moment:3 | 3 (1) | 26 PPP, 3 bit |" in text
+    assert "| sliding:400 | 3.25 PPP, 3 bit |" in text
+    assert f"The paper also compares with {', '.join(summary.PAPER_METHODS)}: not built yet." in text
+    assert "By motion" not in text  # these clips have no flow
+    assert all(row.peak_bytes is not None and 0 <= row.peak_bytes < 2e9 for row in rows)
+    for picture in ("evaluation.png", "crops_3.25PPP_3bit.png", "crops_26PPP_3bit.png"):
+        assert (tmp_path / "t" / picture).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_one_bit_sensor_in_much_light_is_not_perfect(make_clip: ClipMaker):
+    """At 10 PPP every pixel of a 1-bit code lies above its own white: there all guesses were perfect, `moment` inf."""
+    comparison = Comparison(
+        str(make_clip().path), None, (Illumination("spad-320x240", 1.0, 1), Illumination("spad-320x240", 10.0, 1))
+    )
+    dim, bright = evaluate(comparison, [restorer("moment")])
+    assert bright.score.psnr < dim.score.psnr < 40
+    hidden = evaluate(replace(comparison, peak=1.0), [restorer("moment")])[1]
+    assert hidden.score.above_peak > 0.9
+    assert not math.isinf(hidden.score.psnr)
+    text = summary.markdown(replace(comparison, peak=1.0), [restorer("moment")], [dim, hidden])
+    assert "peak = 1 photons per pixel" in text
+    assert "Warning: 100.0 % of the pixels of sliding_0 at 10 PPP, 1 bit lie above the peak" in text
+    assert " inf " not in text
+
+
+@pytest.mark.parametrize("peak", [1e-6, 1e9])
+def test_an_extreme_peak_has_a_table_and_no_foreign_warning(peak, tiny_dataset, tmp_path):
+    comparison = Comparison(str(tiny_dataset), peak=peak)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        methods = [restorer("naive")]
+        rows = evaluate(comparison, methods, tmp_path / "out")
+        summary.write(tmp_path / "out", comparison, methods, rows)
+    assert all(row.failure is None for row in rows)
+    crops = list((tmp_path / "out/crops").glob("*.npy"))
+    assert crops
+    assert all(np.isfinite(np.load(crop)).all() for crop in crops)
+
+
+def test_scores_near_the_truth_are_marked(make_clip: ClipMaker):
+    """A truth with an error of 3 % of its mean is worth 38.4 dB; an answer of 36 dB is marked, one of 20 dB is not."""
+    clip = make_clip("rough", error=0.03 * make_clip().mean_radiance)
+    rng = np.random.default_rng(11)
+
+    def wrong(psnr: float) -> Restorer:
+        sigma = 2.5 * 3.25 * 10 ** (-psnr / 20)
+        exact = truth(clip, sensed(clip, Illumination())[1], 0, len(clip))
+        return method(f"at {psnr:g}", lambda codes: exact + rng.normal(0, sigma, exact.shape))
+
+    comparison, methods = Comparison(str(clip.path), None), [wrong(36.0), wrong(20.0)]
+    rows = evaluate(comparison, methods)
+    assert rows[0].truth_psnr == pytest.approx(20 * math.log10(2.5 / 0.03), abs=0.01)
+    near, far = summary.summarise(rows)
+    assert near.near_truth == ("psnr", "psnr_matched")
+    assert far.near_truth == ()
+    text = summary.markdown(comparison, methods, rows)
+    assert f"{near.scores['psnr'].mean:.2f} † |" in text
+    assert f"{far.scores['psnr'].mean:.2f} |" in text
+    assert "† In one clip or more within 3 dB of the truth's own PSNR" in text

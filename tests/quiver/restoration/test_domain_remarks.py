@@ -1,0 +1,154 @@
+"""A network that restores outside of what it was measured for warns in one line, and is refused with strict."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from clips import ClipMaker
+from domains import MEASURED, run, stream, weights
+
+import quiver
+from qsim.sensor import devices
+from qsim.sensor.qis import QIS
+from quiver.baselines import METHODS
+from quiver.data.clips import open_clips
+from quiver.data.codes import array_codes
+from quiver.data.illumination import Illumination
+from quiver.data.noise import Noise
+from quiver.model.weights import metadata_of
+from quiver.restoration import domain, domain_remarks
+from quiver.restoration.domain import Scope
+
+
+def test_inside_nothing_is_said_and_outside_the_better_method():
+    scope = Scope(MEASURED)
+    assert domain_remarks.remark("nano", scope, stream()) is None
+    assert domain_remarks.remark("nano", scope, stream(ppp=4.0)) is None
+    dim = domain_remarks.remark("nano", scope, stream(ppp=1.2))
+    assert dim == (
+        "nano is worse than qbp-bm3d on quiver-physical, 3 bit, 1.2 PPP: qbp-bm3d 20.0 dB, network 15.0 dB "
+        "at quiver-physical, 3 bit, 1 PPP"
+    )
+    for far in (stream(ppp=0.5), stream(ppp=100.0), stream(bits=1), stream("quiver-paper", 1.0), stream("spad512s", 1)):
+        said = domain_remarks.remark("nano", scope, far)
+        assert said is not None
+        assert "was never measured near" in said
+        assert "qbp-bm3d is mostly the best classical method" in said
+
+
+def test_light_that_is_not_told_is_estimated():
+    """From 12 x 256 codes at 3.25 PPP: the mean is known to a percent or so, the nearest cell surely."""
+    told, untold = stream(), stream(told=False)
+    assert untold.ppp is None
+    assert domain_remarks.light_of(told) == 3.25
+    assert domain_remarks.light_of(untold) == pytest.approx(3.25, rel=0.1)
+    assert domain_remarks.remark("nano", Scope(MEASURED), untold) is None
+    assert "is worse than" in str(domain_remarks.remark("nano", Scope(MEASURED), stream(ppp=26.0, told=False)))
+
+
+def test_weights_without_cells_say_what_they_were_trained_on(tmp_path):
+    path = weights(tmp_path, settings={"sensor": "quiver-physical", "bits": [1, 3], "ppp": [3.25, 9.75]})
+    scope = domain.read_scope(path, metadata_of(path))
+    assert scope.trained == tuple(Illumination("quiver-physical", p, b) for b in (1, 3) for p in (3.25, 9.75))
+    same, other = (
+        domain_remarks.remark("mine", scope, stream()),
+        domain_remarks.remark("mine", scope, stream("spad512s", 2, 1)),
+    )
+    assert same == (
+        "mine was never measured against the classical methods; it was trained on such streams "
+        "(quiver-physical, 3 bit, 3.25 PPP)"
+    )
+    assert "it was trained on quiver-physical, 1, 3 bit, 3.25, 9.75 PPP, this stream is spad512s, 1 bit" in str(other)
+    assert "does not say what it was trained on" in str(domain_remarks.remark("old", Scope(), stream()))
+    own = Noise("mine.toml", 2.0, 1, record=json.dumps(devices.load("spad512s", bits=1).to_dict()), lux=None)
+    path = weights(tmp_path, settings={"sensor": None, "noise": [own.to_dict(), Noise().to_dict()]})
+    scope = domain.read_scope(path, metadata_of(path))
+    assert [light.sensor for light in scope.trained] == ["mine.toml", "quiver-physical"]
+    assert "trained on such streams" in str(domain_remarks.remark("mine", scope, stream("spad512s", 2, 1)))
+    assert "trained on such streams" in str(domain_remarks.remark("mine", scope, stream()))
+    assert "this stream is" in str(domain_remarks.remark("mine", scope, stream(bits=2)))
+    several = {"sensor": ["quiver-physical", "none.toml"], "bits": [3], "ppp": [1]}
+    path = weights(tmp_path, settings=several)
+    assert len(domain.read_scope(path, metadata_of(path)).trained) == 2
+    assert "none.toml" in str(
+        domain_remarks.remark("m", domain.read_scope(path, metadata_of(path)), stream("spad512s", 2, 1))
+    )
+
+
+def test_restore_warns_in_one_line_and_refuses_with_strict(capsys, tiny_dataset, tmp_path):
+    path, clip = weights(tmp_path, MEASURED), open_clips(tiny_dataset, "test")[0].path
+    words = ("restore", clip, "-o", tmp_path / "r.npy", "--method", path, "--ppp")
+    code, _, err = run(capsys, *words, 26, "--strict")
+    assert code == 2
+    assert err.startswith("quiver: small is worse than qbp-bm3d on quiver-physical, 3 bit, 26 PPP")
+    assert err.count("\n") == 1
+    assert not list(tmp_path.glob("r.*"))
+    code, _, err = run(capsys, *words, 26)
+    assert code == 0
+    assert err.count("quiver: warning: small is worse than qbp-bm3d") == 1
+    code, _, err = run(capsys, *words, 26, "--force", "-q")
+    assert (code, err) == (0, "")
+    code, _, err = run(capsys, *words, 3.25, "--force", "--strict")
+    assert code == 0
+    assert "warning" not in err
+    code, _, err = run(capsys, *words, 3.25, "--force", "-v")
+    assert "small was measured at quiver-physical, 3 bit, 3.25 PPP: qbp-bm3d 20.0 dB, network 25.0 dB" in err
+    code, _, err = run(capsys, "restore", clip, "-o", tmp_path / "s.npy", "--method", "naive", "--ppp", 3, "--strict")
+    assert code == 2
+    assert "strict: acts on networks, and naive is classical" in err
+
+
+def test_restore_checks_a_bare_array_with_its_sensor(capsys, tmp_path):
+    path = weights(tmp_path, MEASURED)
+    np.save(tmp_path / "codes.npy", stream("spad-320x240", 1.0, 1).read(0, 12))
+    words = ("restore", tmp_path / "codes.npy", "-o", tmp_path / "r.npy", "--method", path, "--bits", 1)
+    code, _, err = run(capsys, *words, "--sensor", "spad-320x240", "--strict")
+    assert code == 2
+    assert "small was never measured near spad-320x240, 1 bit, " in err
+    assert not (tmp_path / "r.npy").exists()
+
+
+def test_evaluate_warns_in_its_table_and_refuses_with_strict(capsys, tiny_dataset, tmp_path):
+    path, out = weights(tmp_path, MEASURED), tmp_path / "table"
+    words = ("evaluate", tiny_dataset, "-o", out, "--methods", f"naive,{path}", "--ppp", "3.25,26")
+    code, _, err = run(capsys, *words, "--strict")
+    assert code == 2
+    assert not out.exists()
+    code, text, err = run(capsys, *words)
+    assert code == 0
+    assert err.count("quiver: warning: small is worse than qbp-bm3d on quiver-physical, 3 bit, 26 PPP") == 1
+    assert "small is worse than qbp-bm3d" in text
+    assert "small is worse than qbp-bm3d" in (out / "evaluation.md").read_text()
+    assert json.loads((out / "evaluation.json").read_text())["remarks"][0].startswith("small is worse")
+    counts = np.random.default_rng(3).poisson(1.0, (14, 16, 16))
+    np.save(tmp_path / "counts.npy", counts)
+    static = ("evaluate", "--static", tmp_path / "counts.npy", "--methods", path, "--splits", 1)
+    code, _, err = run(capsys, *static, "--strict")
+    assert code == 2
+    assert "small was never measured near ideal counter, 3 bit, 0.9" in err or "3 bit, 1" in err
+    assert run(capsys, *static)[0] == 0
+
+
+def test_the_call_in_python_warns_and_refuses_with_strict(tmp_path, make_clip: ClipMaker):
+    path, codes = weights(tmp_path, MEASURED), stream(ppp=26.0)
+    array, known = codes.read(0, 12), {"sensor": codes.sensor, "exposure": codes.exposure}
+    with pytest.warns(UserWarning, match="small is worse than qbp-bm3d on QIS, 3 bit"):
+        found = quiver.restore(array, str(path), **known)
+    assert found.shape == array.shape
+    with pytest.raises(ValueError, match="small is worse than qbp-bm3d"):
+        quiver.restore(array, str(path), strict=True, **known)
+    inside = stream()
+    quiver.restore(inside.read(0, 12), str(path), strict=True, sensor=inside.sensor, exposure=5e-4)
+    with pytest.raises(ValueError, match="strict: acts on networks"):
+        quiver.restore(array, "naive", strict=True, **known)
+
+
+def test_a_sensor_whose_codes_tell_no_light_still_has_a_remark():
+    """A full well of a hundredth of an electron: the moment inverse refuses, the warning must not."""
+    sensor = QIS(0.8, 1.6, 0.2, 3, gain=0.5, full_well=0.01)
+    codes = array_codes(np.zeros((3, 8, 8), np.uint8), sensor, 5e-4)
+    with pytest.raises(ValueError, match="does not"):
+        METHODS["moment"].restore(codes.read(0, 3), sensor, 5e-4)
+    assert domain_remarks.light_of(codes) > 0
