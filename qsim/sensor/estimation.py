@@ -24,7 +24,8 @@ _NEVER = -1e290  # stands for log 0 where it may be multiplied by 0
 POINTS = 4096  # of a response; linear interpolation then errs by less than 1e-6 of the full scale
 _ENDED = 1e-7  # a response this close to its top (relative to the full scale) has ended
 _TOGETHER = 1 << 22  # probabilities of a response held at a time
-_STEPS = 100  # of root finding; 10 are usual
+_STEPS = 200  # of root finding; 10 are usual
+_HUGE = 1e300  # stands for infinity in root finding
 _CHUNK = 1 << 12  # different histograms at a time
 
 
@@ -251,23 +252,20 @@ def _crossing(likelihood: _Likelihood, grid: _Grid, table: Array, start: Array, 
 
 
 def _root(function: Callable[[Array, Array], Array], low: Array, high: Array, rows: Array) -> Array:
-    """Where a function that falls from low to high is 0, each row in its own bracket: false position (Illinois)."""
-    low, high = low.copy(), high.copy()
-    f_low, f_high = function(low, rows), function(high, rows)
+    """Where a function that falls from low to high is 0, each row in its own bracket; else the end nearest to a 0."""
+    from scipy.optimize.elementwise import find_root
+
+    def bounded(x: Array, which: Array) -> Array:  # the library gives up at infinity, and passes 64-bit floats
+        found = function(x.ravel(), rows[which.ravel().astype(np.intp)]).reshape(x.shape)
+        return np.nan_to_num(found, nan=-_HUGE, posinf=_HUGE, neginf=-_HUGE)
+
+    which = np.arange(len(rows))
+    f_low, f_high = bounded(low, which), bounded(high, which)
     low, high = np.where(f_high >= 0, high, low), np.where(f_low <= 0, low, high)
-    for step in range(_STEPS):
-        todo = np.flatnonzero(high - low > 1e-13 * high)
-        if todo.size == 0:
-            break
-        a, b, fa, fb = low[todo], high[todo], f_low[todo], f_high[todo]
-        with np.errstate(invalid="ignore"):
-            x = b - fb * (b - a) / (fb - fa)
-        x = np.where((x > a) & (x < b) & (step % 4 < 3), x, (a + b) / 2)
-        f = function(x, rows[todo])
-        rises = f > 0
-        low[todo], high[todo] = np.where(rises, x, a), np.where(rises, b, x)
-        # The end that stays counts half next time, so that it does not stay for ever
-        f_low[todo], f_high[todo] = np.where(rises, f, fa / 2), np.where(rises, fb / 2, f)
-        exact = todo[f == 0]
-        low[exact] = high[exact]
-    return (low + high) / 2
+    open_ = low < high
+    result = low.copy()
+    if open_.any():
+        tolerances = {"xrtol": 1e-13, "xatol": 0.0, "frtol": 0.0, "fatol": 0.0}
+        bracket = (low[open_], high[open_])
+        result[open_] = find_root(bounded, bracket, args=(which[open_],), tolerances=tolerances, maxiter=_STEPS).x
+    return result
