@@ -173,7 +173,7 @@ def denoised_samples(
         if errors[-1] <= share:
             break
     where = f"{'' if len(windows) == 1 else 'four windows of '}frame {t}"
-    needed, size = _needed(tried, errors, share), f"tried in {where}"
+    needed, size = needed_samples(tried, errors, share), f"tried in {where}"
     most = MOST_DENOISED * count
     if needed > most:
         if not wanted:
@@ -194,7 +194,7 @@ def _windows(camera: Camera) -> list[tuple[int, int, int, int]]:
     return [(height * i // 4 - rows // 2, width * j // 4 - columns // 2, rows, columns) for i in (1, 3) for j in (1, 3)]
 
 
-def _needed(tried: list[int], errors: list[float], target: float) -> float:
+def needed_samples(tried: list[int], errors: list[float], target: float) -> float:
     """Samples with which a falling error reaches the target: a power of them between the last two trials and beyond.
 
     `errors` are those of the first so many counts; inf where they do not fall.

@@ -132,7 +132,7 @@ class Renderer:
     def _means(self, instants: list[float], budget: Budget, key: Key) -> Array:
         """Those estimates, and the same of every third and of the middle instant alone, float64 [3, 2, H, W]."""
         n, samples = len(instants), budget.grid(len(instants))
-        parts = self._parts(2 * samples)
+        parts = self.parts(2 * samples)
         seeds = words(key, (2, n * len(parts))).reshape(2, n, len(parts))
         sums = np.zeros((3, 2, math.prod(self.shape)))
         for i, instant in enumerate(instants):
@@ -154,7 +154,7 @@ class Renderer:
                 sums[2] = drawn
         return sums.reshape(3, 2, *self.shape)
 
-    def _parts(self, samples: int) -> list[range]:
+    def parts(self, samples: int) -> list[range]:
         """The window's pixels, row by row, in ranges of about MAX_LANES samples or less, `samples` to a pixel.
 
         Pixels are shared among the passes, not samples: the error of a whole grid falls faster than that of its parts.
@@ -198,7 +198,7 @@ class Renderer:
 
         mi = self.mi
         samples = grid_samples(max(2, SURFACE_SAMPLES // len(instants)))
-        parts = self._parts(samples)
+        parts = self.parts(samples)
         seeds = words(key, (len(instants), len(parts)), redraw=1)
         sums = np.zeros((4, math.prod(self.shape)))
         for instant, row in zip(instants, seeds, strict=True):

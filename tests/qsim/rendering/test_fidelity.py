@@ -10,44 +10,11 @@ import pytest
 from small_scenes import CAMERA, plate, renderer, scene, square
 
 from qsim.clip.clamped_error import Errors, Stated, decibels, error_at, white_in
-from qsim.rendering import fidelity, pilot
-from qsim.rendering.budget import Allowed, Budget, blur_error, blur_left, explain, grid_samples
-from qsim.rendering.denoiser import available, mixture
+from qsim.rendering import fidelity
+from qsim.rendering.budget import Allowed, Budget, blur_error, explain
 from qsim.rendering.fidelity import Noise, choose_budget, shortfall
 from qsim.rendering.renderer import Renderer
-from qsim.scene import Body, Diffuse, Glow, Oscillation, PointLight, Scene, Spin, SunSky, Texture, Translation
-
-
-def test_sample_counts_are_those_of_the_sampler(capfd):
-    """Mitsuba warns on its console when it rounds a count that its grid cannot hold."""
-    for samples in range(1, 60):
-        count = grid_samples(samples)
-        assert samples <= count <= (math.sqrt(samples) + 2) ** 2
-        assert grid_samples(count) == count
-    from qsim.rendering import engine
-
-    engine.select()
-    import mitsuba as mi
-
-    for samples in (1, 2, 3, 5, 7, 11, 13, 17, 23, 31, 32, 60, 127):
-        mi.load_dict({"type": "multijitter", "sample_count": grid_samples(samples)})
-    assert "rounded" not in capfd.readouterr().out
-
-
-@pytest.mark.parametrize(("travel", "instants"), [(0.5, 1), (3.0, 5), (3.0, 9), (4.2, 7), (1.0, 1)])
-def test_the_blur_error_bounds_the_midpoint_rule_at_an_edge(travel, instants):
-    """A pixel whose coverage grows while an edge passes it: exact integral against K instants, at any offset."""
-    offsets = np.linspace(-travel, 1 + travel, 801)
-    fine = (np.arange(4000) + 0.5) / 4000
-    coarse = (np.arange(instants) + 0.5) / instants
-
-    def mean(times):
-        return np.clip(offsets[:, None] + travel * (times - 0.5), 0, 1).mean(axis=1)
-
-    worst = np.abs(mean(fine) - mean(coarse)).max()
-    # Two kinks of the coverage may fall into the exposure: at most twice the error of one.
-    assert worst <= 2 * blur_error(travel, instants) + 1e-6
-    assert worst >= 0.3 * blur_error(travel, instants)
+from qsim.scene import Body, Diffuse, Glow, PointLight, Scene, Spin, SunSky, Translation
 
 
 def test_no_motion_needs_one_instant():
@@ -152,38 +119,6 @@ def test_a_body_that_no_pilot_frame_shows_is_found():
     assert 0.5 < stated / real < 4
 
 
-def test_frames_are_added_in_which_things_go_that_rest_in_the_others():
-    """A slat out of view that stands still in frames 0, 10 and 20, and runs in 5 and 15."""
-    swing = Oscillation((1.0, 0.0, 0.0), 100.0, math.pi / 2, (0.0, 50.0, 0.0))
-    made = scene(Body("wall", square(12, -1), Diffuse(0.2)), Body("slat", square(0.5), Diffuse(0.9), swing))
-    seen = pilot.Pilot.of(made, 2000.0, 1.0, 21, 0)
-    assert {0, 10, 20} < set(seen.times)
-    assert {5, 15} & set(seen.times)
-    assert pilot.Pilot.of(made, 2000.0, 0.0, 21, 0).times == (0, 10, 20)
-    assert not pilot.rests(made)
-    assert pilot.rests(plate(None))
-
-
-@pytest.mark.parametrize(("count", "edges"), [(9, 0.5), (9, 6.0), (33, 0.5), (33, 20.0), (3, 0.3)])
-def test_every_third_instant_tells_the_error_of_all(count, edges):
-    """An edge runs over pixels at random places by so many px a step.
-
-    Within a factor of three of the error, or, where the steps are below a pixel and those of the thirds above, of what
-    `blur_error` allows for.
-    """
-    places = np.random.default_rng(3).uniform(-0.5, 0.5, 40000)
-
-    def mean(times):
-        return np.mean([np.clip((t - places) * edges * count + 0.5, 0, 1) for t in times], axis=0)
-
-    times = (np.arange(count) + 0.5) / count - 0.5
-    means = np.array([mean(times), mean(times[1::3]), mean(times[count // 2 : count // 2 + 1])])
-    real = np.sqrt(np.mean((means[0] - mean((np.arange(4000) + 0.5) / 4000 - 0.5)) ** 2))
-    assert (
-        real / 3 < blur_left(np.stack([means, means], axis=1), count) < 3 * max(real, blur_error(edges * count, count))
-    )
-
-
 def test_instants_are_foretold_beyond_the_trials_and_their_limit_is_said():
     rest = np.zeros((1, 8, 8))
     count, left, finding = fidelity.fewest_instants(rest, 1.0, lambda k: 27 / k)
@@ -203,12 +138,6 @@ def test_a_lucky_small_pilot_is_not_believed():
     samples, finding = fidelity.fewest_samples(Noise.of(halves, 100.0), 1, allowed, 1.0)
     assert samples >= 128 * (0.03 / 0.0025) ** (1 / 0.75) * 0.99
     assert "expected" in finding.size
-
-
-def test_an_error_that_hardly_falls_asks_for_more_samples_than_there_are():
-    assert pilot._needed([8, 32, 128], [1.0, 0.99999], 0.1) > 1e30
-    assert pilot._needed([8, 32, 128], [1.0, 1.1], 0.1) == math.inf
-    assert pilot._needed([8, 32, 128], [1.0, 0.5], 0.25) == pytest.approx(128)
 
 
 def test_later_bounces_are_part_of_the_stated_error():
@@ -249,114 +178,6 @@ def test_a_lamp_behind_a_wall_is_said():
 def test_an_error_nobody_can_ask_for_is_refused(psnr):
     with pytest.raises(ValueError, match="10 to 80 dB"):
         choose_budget(plate(None), psnr=psnr)
-
-
-def test_a_budget_of_nothing_is_refused():
-    with pytest.raises(ValueError, match=r"Budget.samples: at least 1, got 0"):
-        Budget(samples=0)
-
-
-def test_samples_are_shared_among_halves_and_instants():
-    assert Budget(samples=72).grid(1) == 36
-    assert Budget(samples=72).grid(9) == 4
-    assert Budget(samples=1).grid(5) == 4
-
-
-@pytest.mark.parametrize("bias", [0.0, 0.3, 2.0])
-def test_the_best_mixture_is_known_without_the_truth(bias):
-    """A filter that adds a bias to the truth, raw noise of 0.5: A - B knows nothing of the bias, D(A) - B does.
-
-    The shares are as 1 / variance, that of the mean of two halves 0.125: w = 0.125 / (0.125 + bias^2), and
-    error^2 = w bias^2. Over 40 000 pixels the estimate has a sigma of 0.001 or less (0.125 sqrt(2) / 200; with the bias
-    of 2, w is 0.03 and bias Z w as large), of which one is added.
-    """
-    rng = np.random.default_rng(3)
-    truth = rng.random((200, 200))
-    halves = truth + 0.5 * rng.standard_normal((2, 200, 200))
-    mixed = mixture(halves, np.stack([truth + bias] * 2))
-    share, error = mixed.share, mixed.error
-    best = 0.125 / (0.125 + bias**2)
-    assert share.mean() == pytest.approx(best, abs=0.05)
-    assert error**2 == pytest.approx(max(best * bias**2, 0.00125), abs=0.006)
-
-
-def test_halves_whose_noise_the_filter_keeps_are_known_for_it():
-    """A filter that keeps the share k of the noise, without bias: E (C - truth)^2 is k^2 of the raw one.
-
-    The best w is the whole (only C), its error k sqrt(V / 2); a naive half difference of D(A) and D(B) says the same
-    here, which the test above denies it. 160 000 pixels: sigma of the square below 0.4 %.
-    """
-    rng = np.random.default_rng(5)
-    noise = rng.standard_normal((2, 400, 400))
-    mixed = mixture(1 + noise, 1 + 0.6 * noise)
-    share, error = mixed.share, mixed.error
-    assert share.mean() > 0.9
-    assert error**2 == pytest.approx(0.36 / 2, rel=0.03)
-
-
-def test_each_part_of_a_picture_is_mixed_by_its_own_errors():
-    """A filter that is right on the left and far off on the right: denoised there, raw here, away from the border.
-
-    The left share is a ratio of two sums of 33 x 33 squares: 6 % of noise, 9 % at a border, which mirrors half of them,
-    and nothing above 1. The right one is 0.005, known far better.
-    """
-    rng = np.random.default_rng(6)
-    truth = np.ones((120, 300))
-    cleaned = truth + np.where(np.arange(300) < 150, 0.0, 3.0)
-    share = mixture(truth + 0.3 * rng.standard_normal((2, 120, 300)), np.stack([cleaned] * 2)).share
-    assert share[:, :120].min() > 0.6
-    assert share[:, :120].mean() > 0.95
-    assert share[:, 180:].max() < 0.05
-
-
-def test_a_filter_that_does_nothing_is_not_trusted():
-    halves = np.random.default_rng(4).standard_normal((2, 100, 100))
-    assert mixture(halves, halves).error == pytest.approx(math.sqrt(0.5), rel=0.05)
-
-
-@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
-def test_denoising_helps_where_it_says_so():
-    """A matt plate under sun and sky: the stated error of a denoised frame covers its distance from the truth."""
-    made = plate(Spin((0, 0, 1), 200.0), light=SunSky(), camera=CAMERA.resized(96, 132))
-    raw, clean = (renderer(made, budget=Budget(8, 2, denoise=on)).frame(0, with_truth=False) for on in (False, True))
-    converged = renderer(made, seed=9, budget=Budget(512, 2)).frame(0, with_truth=False).radiance
-    distance = math.sqrt(np.mean((clean.radiance - converged) ** 2))
-    assert distance < 0.7 * raw.error
-    assert clean.error == pytest.approx(distance, rel=0.2)
-
-
-@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
-def test_the_denoiser_is_tried_beside_the_middle_of_a_large_frame():
-    """A lamp fills the middle, which has no noise at all: the error asked for holds for the whole frame."""
-    camera = CAMERA.resized(256, 512)
-    lamp = Body("lamp", square(200 / camera.focal_pixels * 4), Glow(0.3))
-    leaves = Texture(np.random.default_rng(1).random((96, 96)), nearest=True)
-    made = scene(Body("wall", square(12, -1), Diffuse(leaves)), lamp, light=SunSky(), camera=camera)
-    chosen = choose_budget(made, psnr=42, denoise=True)
-    frame = Renderer(made, budget=chosen).frame(3, with_truth=False)
-    white = white_in(frame.radiance)
-    assert decibels(white, error_at(white, frame.errors_at)) > 41
-
-
-@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
-def test_a_denoised_trial_with_far_less_noise_than_the_pilots_is_not_believed():
-    """Its windows have missed the rare, bright paths that the pilots found; denoising knows of none."""
-    made = plate(None, light=SunSky(), camera=replace(CAMERA, height=48, width=64))
-    loaded, allowed = pilot.Pilot.of(made, 2000.0, 0.0, 1, 0), Allowed(white=10.0, target=0.02)
-    lucky, plain = (
-        pilot.denoised_samples(loaded, 1, 2, allowed, 1.0, 5000, None, lambda n, noise=noise: Errors(noise, noise))[0]
-        for noise in (100.0, 0.0)
-    )
-    assert lucky is None
-    assert plain is not None
-
-
-def test_denoising_without_the_package_is_refused(monkeypatch):
-    from qsim.rendering import denoiser
-
-    monkeypatch.setattr(denoiser, "available", lambda: False)
-    with pytest.raises(ValueError, match="Open Image Denoise is missing"):
-        renderer(plate(None), budget=Budget(2, 1, denoise=True)).frame(0)
 
 
 def test_effects_left_out_are_listed_with_their_size():

@@ -1,0 +1,47 @@
+"""Clips: interrupted ones resume with the same bytes, and fireflies are counted."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from small_scenes import CHEAP, plate, renderer, scene, square
+
+from qsim.rendering.budget import Budget
+from qsim.rendering.clip_rendering import render_clip
+from qsim.scene import Body, Conductor, RoughPlastic, Spin, Still, SunSky
+
+
+def test_a_clip_goes_on_after_an_interruption_with_the_same_bytes(tmp_path):
+    made = plate(Spin((0, 0, 1), 200.0))
+
+    class Stop(Exception):
+        pass
+
+    def stop(done, frames):
+        if done == 2:
+            raise Stop
+
+    whole = render_clip(made, tmp_path / "whole", frames=4, budget=CHEAP)
+    with pytest.raises(Stop):
+        render_clip(made, tmp_path / "broken", frames=4, budget=CHEAP, progress=stop)
+    assert not (tmp_path / "broken").exists()
+    resumed = render_clip(made, tmp_path / "broken", frames=4, budget=CHEAP)
+    assert resumed.meta["checksums"] == whole.meta["checksums"]
+    assert len(resumed.meta["error_per_frame"]) == 4
+    assert resumed.flow(1).shape == (2, 24, 33)
+    with pytest.raises(ValueError, match="at least one frame"):
+        render_clip(made, tmp_path / "none", frames=0, budget=CHEAP)
+
+
+def test_a_clip_counts_its_fireflies(tmp_path):
+    """Frame by frame in clip.json, beside the measured errors and the choice."""
+    mirror = Body("mirror", square(4), Conductor(roughness=0.02), Still((0, -1, 1), (-math.pi / 2, 0, 0)))
+    rough = Body("wall", square(9, -1), RoughPlastic(0.5))
+    made = scene(rough, mirror, light=SunSky())
+    clip = render_clip(made, tmp_path / "mirror", frames=2, budget=Budget(8, 4))
+    counted = [renderer(made, budget=Budget(8, 4)).frame(t, with_truth=False).fireflies for t in range(2)]
+    assert clip.meta["fireflies_per_frame"] == counted
+    assert sum(counted) > 0
+    assert len(clip.meta["error_per_frame"]) == 2
+    assert clip.meta["render"]["bounces"] == 4

@@ -1,0 +1,84 @@
+"""The denoiser: its mixture with raw samples, and the error that is stated for it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from small_scenes import CAMERA, plate, renderer
+
+from qsim.rendering.budget import Budget
+from qsim.rendering.denoiser import available, mixture
+from qsim.scene import Spin, SunSky
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.3, 2.0])
+def test_the_best_mixture_is_known_without_the_truth(bias):
+    """A filter that adds a bias to the truth, raw noise of 0.5: A - B knows nothing of the bias, D(A) - B does.
+
+    The shares are as 1 / variance, that of the mean of two halves 0.125: w = 0.125 / (0.125 + bias^2), and
+    error^2 = w bias^2. Over 40 000 pixels the estimate has a sigma of 0.001 or less (0.125 sqrt(2) / 200; with the bias
+    of 2, w is 0.03 and bias Z w as large), of which one is added.
+    """
+    rng = np.random.default_rng(3)
+    truth = rng.random((200, 200))
+    halves = truth + 0.5 * rng.standard_normal((2, 200, 200))
+    mixed = mixture(halves, np.stack([truth + bias] * 2))
+    share, error = mixed.share, mixed.error
+    best = 0.125 / (0.125 + bias**2)
+    assert share.mean() == pytest.approx(best, abs=0.05)
+    assert error**2 == pytest.approx(max(best * bias**2, 0.00125), abs=0.006)
+
+
+def test_halves_whose_noise_the_filter_keeps_are_known_for_it():
+    """A filter that keeps the share k of the noise, without bias: E (C - truth)^2 is k^2 of the raw one.
+
+    The best w is the whole (only C), its error k sqrt(V / 2); a naive half difference of D(A) and D(B) says the same
+    here, which the test above denies it. 160 000 pixels: sigma of the square below 0.4 %.
+    """
+    rng = np.random.default_rng(5)
+    noise = rng.standard_normal((2, 400, 400))
+    mixed = mixture(1 + noise, 1 + 0.6 * noise)
+    share, error = mixed.share, mixed.error
+    assert share.mean() > 0.9
+    assert error**2 == pytest.approx(0.36 / 2, rel=0.03)
+
+
+def test_each_part_of_a_picture_is_mixed_by_its_own_errors():
+    """A filter that is right on the left and far off on the right: denoised there, raw here, away from the border.
+
+    The left share is a ratio of two sums of 33 x 33 squares: 6 % of noise, 9 % at a border, which mirrors half of them,
+    and nothing above 1. The right one is 0.005, known far better.
+    """
+    rng = np.random.default_rng(6)
+    truth = np.ones((120, 300))
+    cleaned = truth + np.where(np.arange(300) < 150, 0.0, 3.0)
+    share = mixture(truth + 0.3 * rng.standard_normal((2, 120, 300)), np.stack([cleaned] * 2)).share
+    assert share[:, :120].min() > 0.6
+    assert share[:, :120].mean() > 0.95
+    assert share[:, 180:].max() < 0.05
+
+
+def test_a_filter_that_does_nothing_is_not_trusted():
+    halves = np.random.default_rng(4).standard_normal((2, 100, 100))
+    assert mixture(halves, halves).error == pytest.approx(math.sqrt(0.5), rel=0.05)
+
+
+@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
+def test_denoising_helps_where_it_says_so():
+    """A matt plate under sun and sky: the stated error of a denoised frame covers its distance from the truth."""
+    made = plate(Spin((0, 0, 1), 200.0), light=SunSky(), camera=CAMERA.resized(96, 132))
+    raw, clean = (renderer(made, budget=Budget(8, 2, denoise=on)).frame(0, with_truth=False) for on in (False, True))
+    converged = renderer(made, seed=9, budget=Budget(512, 2)).frame(0, with_truth=False).radiance
+    distance = math.sqrt(np.mean((clean.radiance - converged) ** 2))
+    assert distance < 0.7 * raw.error
+    assert clean.error == pytest.approx(distance, rel=0.2)
+
+
+def test_denoising_without_the_package_is_refused(monkeypatch):
+    from qsim.rendering import denoiser
+
+    monkeypatch.setattr(denoiser, "available", lambda: False)
+    with pytest.raises(ValueError, match="Open Image Denoise is missing"):
+        renderer(plate(None), budget=Budget(2, 1, denoise=True)).frame(0)

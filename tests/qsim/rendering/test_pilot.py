@@ -1,0 +1,62 @@
+"""The pilot: it finds every body and every fast frame, and does not rely on chance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_scenes import CAMERA, plate, scene, square
+
+from qsim.clip.clamped_error import Errors, decibels, error_at, white_in
+from qsim.rendering import pilot
+from qsim.rendering.budget import Allowed
+from qsim.rendering.denoiser import available
+from qsim.rendering.fidelity import choose_budget
+from qsim.rendering.renderer import Renderer
+from qsim.scene import Body, Diffuse, Glow, Oscillation, SunSky, Texture
+
+
+def test_frames_are_added_in_which_things_go_that_rest_in_the_others():
+    """A slat out of view that stands still in frames 0, 10 and 20, and runs in 5 and 15."""
+    swing = Oscillation((1.0, 0.0, 0.0), 100.0, math.pi / 2, (0.0, 50.0, 0.0))
+    made = scene(Body("wall", square(12, -1), Diffuse(0.2)), Body("slat", square(0.5), Diffuse(0.9), swing))
+    seen = pilot.Pilot.of(made, 2000.0, 1.0, 21, 0)
+    assert {0, 10, 20} < set(seen.times)
+    assert {5, 15} & set(seen.times)
+    assert pilot.Pilot.of(made, 2000.0, 0.0, 21, 0).times == (0, 10, 20)
+    assert not pilot.rests(made)
+    assert pilot.rests(plate(None))
+
+
+def test_an_error_that_hardly_falls_asks_for_more_samples_than_there_are():
+    assert pilot.needed_samples([8, 32, 128], [1.0, 0.99999], 0.1) > 1e30
+    assert pilot.needed_samples([8, 32, 128], [1.0, 1.1], 0.1) == math.inf
+    assert pilot.needed_samples([8, 32, 128], [1.0, 0.5], 0.25) == pytest.approx(128)
+
+
+@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
+def test_the_denoiser_is_tried_beside_the_middle_of_a_large_frame():
+    """A lamp fills the middle, which has no noise at all: the error asked for holds for the whole frame."""
+    camera = CAMERA.resized(256, 512)
+    lamp = Body("lamp", square(200 / camera.focal_pixels * 4), Glow(0.3))
+    leaves = Texture(np.random.default_rng(1).random((96, 96)), nearest=True)
+    made = scene(Body("wall", square(12, -1), Diffuse(leaves)), lamp, light=SunSky(), camera=camera)
+    chosen = choose_budget(made, psnr=42, denoise=True)
+    frame = Renderer(made, budget=chosen).frame(3, with_truth=False)
+    white = white_in(frame.radiance)
+    assert decibels(white, error_at(white, frame.errors_at)) > 41
+
+
+@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
+def test_a_denoised_trial_with_far_less_noise_than_the_pilots_is_not_believed():
+    """Its windows have missed the rare, bright paths that the pilots found; denoising knows of none."""
+    made = plate(None, light=SunSky(), camera=replace(CAMERA, height=48, width=64))
+    loaded, allowed = pilot.Pilot.of(made, 2000.0, 0.0, 1, 0), Allowed(white=10.0, target=0.02)
+    lucky, plain = (
+        pilot.denoised_samples(loaded, 1, 2, allowed, 1.0, 5000, None, lambda n, noise=noise: Errors(noise, noise))[0]
+        for noise in (100.0, 0.0)
+    )
+    assert lucky is None
+    assert plain is not None
