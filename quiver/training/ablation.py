@@ -14,6 +14,7 @@ from pathlib import Path
 
 import torch
 
+from qsim.tables import markdown_table
 from quiver.evaluation.comparison import Comparison, ComparisonRow, evaluate
 from quiver.model.config import Config
 from quiver.model.folded import FoldedConfig
@@ -24,6 +25,8 @@ from quiver.restoration.restorers import restorer
 from quiver.training.loop import train
 from quiver.training.run_folder import alone_in
 from quiver.training.settings import Settings, settled
+
+HEADER = ("pre-denoiser", "flow", "multi-scale", "parameters", "PSNR matched", "SSIM")
 
 
 def networks(preset: str) -> dict[str, Config]:
@@ -80,7 +83,7 @@ def _run_ablation(
 
 def markdown(preset: str, rows: Sequence[ComparisonRow]) -> str:
     """The paper's table: what is built in, parameters, PSNR after the best factor and SSIM."""
-    text = ["| pre-denoiser | flow | multi-scale | parameters | PSNR matched | SSIM |", "|---|---|---|---|---|---|"]
+    lines = []
     for name, config in networks(preset).items():
         scores = [row.score for row in rows if row.method == name and row.score is not None]
         cells = ["yes" if part else "no" for part in ABLATIONS[name]]
@@ -90,5 +93,5 @@ def markdown(preset: str, rows: Sequence[ComparisonRow]) -> str:
             cells += [f"{sum(s.ssim for s in scores) / len(scores):.3f}"]
         else:
             cells += ["failed", ""]
-        text.append("| " + " | ".join(cells) + " |")
-    return "\n".join(text) + "\n"
+        lines.append(cells)
+    return "\n".join(markdown_table(lines, HEADER)) + "\n"

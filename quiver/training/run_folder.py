@@ -21,7 +21,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from qsim.files import check_ours, read_json, replacing, write_bytes, write_json
+from qsim.figures import new_figure, write_figure
+from qsim.files import check_ours, read_json, write_bytes, write_json
 from qsim.locks import Lock
 from quiver.model import weights
 from quiver.training.optimiser import Optimiser
@@ -169,14 +170,11 @@ class Run:
 
 def draw_curve(folder: Path, history: Sequence[Mapping[str, float]]) -> Path | None:
     """curve.png of a run: validation PSNR and loss over minutes; None before any validation."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     if not history:
         return None
     minutes = [entry["elapsed"] / 60 for entry in history]
-    canvas = FigureCanvasAgg(Figure(figsize=(6, 3.5), layout="constrained"))
-    axes = canvas.figure.subplots()
+    figure = new_figure(6, 3.5)
+    axes = figure.subplots()
     axes.plot(minutes, [entry["psnr_matched"] for entry in history], "o-", label="PSNR after the best factor")
     axes.plot(minutes, [entry["psnr"] for entry in history], ".--", label="PSNR raw")
     axes.set_xlabel("minutes")
@@ -185,6 +183,5 @@ def draw_curve(folder: Path, history: Sequence[Mapping[str, float]]) -> Path | N
     losses.plot(minutes, [entry["loss"] for entry in history], ":", color="grey")
     losses.set_ylabel("training loss of one batch (dotted)")
     axes.legend(fontsize="small", loc="lower right")
-    with replacing(folder / "curve.png") as file:
-        canvas.figure.savefig(file, format="png", dpi=120)
+    write_figure(figure, folder / "curve.png")
     return folder / "curve.png"
