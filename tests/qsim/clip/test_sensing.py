@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from clips import write_clip
 
-from qsim import locks
 from qsim.clip import stream
 from qsim.clip.clip import Clip
 from qsim.clip.sensing import Sensing, sense
@@ -130,20 +129,6 @@ def test_what_a_failed_sensing_leaves(tmp_path: Path, monkeypatch: pytest.Monkey
         stream.write_packed(clip.path / "streams" / "same.npy", blocks, old.sensor, old.meta)
     assert clip.verify() == []
     assert clip.stream("same").meta == old.meta
-
-
-def test_a_lock_whose_file_is_deleted_is_taken_on_the_new_one(tmp_path: Path):
-    """Who waited for a deleted file must not believe to be alone."""
-    first, second, third = (locks.Lock(tmp_path / "lock") for _ in range(3))
-    assert first.acquire()
-    (tmp_path / "lock").unlink()
-    assert second.acquire(), "the name is free"
-    first.release()
-    assert not third.acquire()
-    second.delete()
-    assert third.acquire()
-    third.delete()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_two_light_levels_share_their_random_numbers_and_another_seed_does_not(tmp_path: Path):

@@ -1,0 +1,55 @@
+"""clip.json: impossible clips, other versions and damage are refused and named."""
+
+import json
+from pathlib import Path
+
+import pytest
+from tiny_clip import meta, write
+
+from qsim import files
+from qsim.clip.clip import Clip
+from qsim.clip.writer import ClipWriter
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"shape": [0, 8, 10]}, "at least one frame"),
+        ({"shape": [3, 0, 10]}, "at least one frame"),
+        ({"shape": [3, 8]}, "shape must be"),
+        ({"exposure": 0}, "exposure must be a number above 0"),
+        ({"frame_rate": None}, "frame_rate must be a number above 0"),
+        ({"radiance_unit": "nits"}, "radiance_unit must be"),
+        ({"camera": None}, "needs a camera"),
+    ],
+)
+def test_impossible_clips_are_refused_before_anything_is_written(tmp_path: Path, changes: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        ClipWriter(tmp_path / "a", meta(**changes))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_format_versions_are_refused_with_both_numbers(tmp_path: Path):
+    clip = write(tmp_path / "a")
+    for version, advice in [(2, "newer qsim"), (0, "make it again"), (None, "make it again")]:
+        files.write_json(clip.path / "clip.json", clip.meta | {"format_version": version})
+        with pytest.raises(ValueError, match=rf"format version {version}, this qsim reads version 1; .*{advice}"):
+            Clip.open(clip.path)
+
+
+def test_a_damaged_manifest_is_named(tmp_path: Path):
+    clip = write(tmp_path / "a")
+    manifest = clip.path / "clip.json"
+    whole = manifest.read_bytes()
+    for content in (whole[:50], b"[]", b"\xff\xfe"):
+        manifest.write_bytes(content)
+        with pytest.raises(ValueError, match=r"clip\.json"):
+            Clip.open(clip.path)
+    for key in ("shape", "exposure", "checksums"):
+        manifest.write_text(json.dumps({k: v for k, v in clip.meta.items() if k != key}))
+        with pytest.raises(ValueError, match=f"key '{key}' is missing"):
+            Clip.open(clip.path)
+    with pytest.raises(FileNotFoundError, match="no such clip"):
+        Clip.open(tmp_path / "b")
+    with pytest.raises(FileNotFoundError, match="not a clip folder"):
+        Clip.open(tmp_path)

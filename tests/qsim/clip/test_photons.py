@@ -1,0 +1,40 @@
+"""Photons of a clip: crops, light levels, relative radiance."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_clip import FRAMES, write
+
+from qsim.clip.manifest import RELATIVE
+from qsim.clip.photons import clip_photons, light_level, light_line
+
+
+def test_photons_of_a_crop_are_the_crop_of_the_photons(tmp_path: Path):
+    clip = write(tmp_path / "a")
+    whole = clip_photons(clip, 1, 2.0)
+    np.testing.assert_array_equal(clip_photons(clip, 1, 2.0, (3, 2, 4, 5)), whole[3:7, 2:7])
+    level = light_level(clip, ppp=3.25)
+    mean = np.mean([clip_photons(clip, t, level.factor).mean() for t in range(FRAMES)])
+    assert mean == pytest.approx(3.25, rel=1e-12)
+
+
+def test_light_levels(tmp_path: Path):
+    clip = write(tmp_path / "a")
+    as_is = light_level(clip)
+    assert as_is.factor == 1
+    assert as_is.ppp == clip.mean_photons
+    same = light_level(clip, lux=as_is.lux)
+    assert same.factor == pytest.approx(1, rel=1e-12)
+    with pytest.raises(ValueError, match="not both"):
+        light_level(clip, ppp=1.0, lux=1.0)
+    assert "3.25 PPP" in light_line(clip, light_level(clip, ppp=3.25), 0.8)
+
+
+def test_relative_radiance_needs_a_target(tmp_path: Path):
+    clip = write(tmp_path / "r", radiance_unit=RELATIVE, camera=None)
+    with pytest.raises(ValueError, match=r"r: its radiance is relative .* --ppp 3.25"):
+        light_level(clip)
+    level = light_level(clip, ppp=3.25)
+    mean = np.mean([clip_photons(clip, t, level.factor).mean() for t in range(FRAMES)])
+    assert mean == pytest.approx(3.25, rel=1e-12)

@@ -1,0 +1,182 @@
+"""Writing clips: interruptions at every step, other settings, two writers, and what is refused."""
+
+import functools
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from forks import killed_at
+from tiny_clip import FRAMES, HEIGHT, WIDTH, meta, radiance, write
+
+from qsim.clip.clip import Clip
+from qsim.clip.writer import ClipWriter
+
+
+def interrupted(path: Path, *frames: int, force: bool = False, **changes: Any) -> list[int]:
+    """A writer that is stopped after some frames; returns those which it found done."""
+    found: list[int] = []
+    try:
+        with ClipWriter(path, meta(**changes), force=force) as writer:
+            found += [t for t in range(FRAMES) if writer.has(t)]
+            for t in frames:
+                writer.add(t, radiance(t))
+            raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        return found
+
+
+def test_an_interrupted_writer_leaves_nothing_readable_and_goes_on(tmp_path: Path):
+    path = tmp_path / "a"
+    interrupted(path, 1, 0)
+    with pytest.raises(FileNotFoundError, match=r"unfinished \(only a.part is there\)"):
+        Clip.open(path)
+    # Death in the middle of a journal line and of a temporary file.
+    with open(tmp_path / "a.part" / "journal.jsonl", "ab") as journal:
+        journal.write(b'{"t": 2, "che')
+    with ClipWriter(path, meta()) as writer:
+        assert [t for t in range(FRAMES) if writer.has(t)] == [0, 1]
+        for t in range(2, FRAMES):
+            writer.add(t, radiance(t))
+    whole = tmp_path / "b" / "a"
+    with ClipWriter(whole, meta()) as writer:
+        for t in range(FRAMES):
+            writer.add(t, radiance(t))
+    assert (path / "clip.json").read_bytes() == (whole / "clip.json").read_bytes()
+    assert not (tmp_path / "a.part").exists()
+    assert sorted(p.name for p in path.iterdir()) == ["clip.json", "radiance"]
+
+
+@pytest.mark.parametrize(
+    ("left", "replaced", "force"),
+    [
+        (None, False, False),
+        ({}, False, False),
+        ({}, False, True),
+        ({"frame_rate": 1000.0}, False, True),
+        ({}, True, True),
+    ],
+)
+def test_a_writer_killed_at_every_step_can_begin_again(
+    tmp_path: Path, left: dict[str, Any] | None, replaced: bool, force: bool
+):
+    """Before each file it opens, removes or renames: in an empty folder, going on, clearing, replacing a clip."""
+    killed, steps = True, 0
+    while killed:
+        path = tmp_path / str(steps) / "a"
+        path.parent.mkdir()
+        if replaced:
+            write(path, frame_rate=500.0)
+        if left is not None:
+            interrupted(path, 0, force=force, **left)
+        steps += 1
+        killed = killed_at(steps, path, functools.partial(write, path, force=force))
+        if not path.exists() or Clip.open(path).frame_rate == 500.0:
+            write(path, force=force)
+        clip = Clip.open(path)
+        assert (clip.frame_rate, clip.verify()) == (2000.0, [])
+        assert [item.name for item in path.parent.iterdir()] == ["a"]
+        assert sorted(item.name for item in path.iterdir()) == ["clip.json", "radiance", "sharp", "truth"]
+    assert steps > 50
+
+
+@pytest.mark.parametrize("gone", [(), ("begun.json",), ("begun.json", "journal.jsonl"), ("begun.json", "lock")])
+def test_a_clip_that_lacks_only_its_name_is_not_made_again(tmp_path: Path, monkeypatch, gone: tuple[str, ...]):
+    """Killed after clip.json was written: no frame is lost, and other settings do not get it."""
+    part = tmp_path / "a.part"
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", lambda a, b: killed() if Path(a) == part else os.rename(a, b))
+        patch.setattr(Path, "unlink", lambda self, **_: os.remove(self) if self.name in gone else None)
+        with pytest.raises(KeyboardInterrupt):
+            write(tmp_path / "a")
+    frame = part / "radiance" / "000000.exr"
+    made, kept = frame.stat().st_ino, frame.read_bytes()
+    with pytest.raises(ValueError, match=r"a\.part: 5 frames are there, asked for with other settings"):
+        write(tmp_path / "a", shape=[FRAMES - 1, HEIGHT, WIDTH])
+    assert interrupted(tmp_path / "a") == list(range(FRAMES))
+    clip = write(tmp_path / "a")
+    assert clip.verify() == []
+    assert (clip.path / "radiance" / "000000.exr").stat().st_ino == made
+    assert clip.meta == write(tmp_path / "b" / "a").meta
+    clip.path.rename(part)
+    frame.write_bytes(kept[:-1])  # and what is damaged is not taken for whole
+    assert interrupted(tmp_path / "a") == []
+
+
+def test_a_damaged_frame_of_an_interrupted_writer_is_done_again(tmp_path: Path):
+    interrupted(tmp_path / "a", 0)
+    frame = tmp_path / "a.part" / "radiance" / "000000.exr"
+    frame.write_bytes(frame.read_bytes()[:-1])
+    assert interrupted(tmp_path / "a") == []
+
+
+def test_other_settings_are_refused_or_start_again(tmp_path: Path):
+    interrupted(tmp_path / "a", 0)
+    assert interrupted(tmp_path / "a", 1) == [0]
+    with pytest.raises(ValueError, match=r"a\.part: 2 frames are there, asked for with other settings"):
+        interrupted(tmp_path / "a", frame_rate=1000.0)
+    assert interrupted(tmp_path / "a") == [0, 1]
+    assert interrupted(tmp_path / "a", force=True, frame_rate=1000.0) == []
+
+
+def test_two_writers_of_one_clip(tmp_path: Path):
+    with ClipWriter(tmp_path / "a", meta()) as writer:
+        writer.add(0, radiance(0))
+        with pytest.raises(ValueError, match="another process is writing"), ClipWriter(tmp_path / "a", meta()):
+            pass
+        for t in range(1, FRAMES):
+            writer.add(t, radiance(t))
+    assert Clip.open(tmp_path / "a").verify() == []
+
+
+def test_nothing_is_overwritten_without_force(tmp_path: Path):
+    write(tmp_path / "a")
+    with pytest.raises(FileExistsError, match="--force"):
+        ClipWriter(tmp_path / "a", meta())
+    with ClipWriter(tmp_path / "a", meta(), force=True) as writer:
+        for t in range(FRAMES):
+            writer.add(t, radiance(t) + 1)
+    clip = Clip.open(tmp_path / "a")
+    assert clip.mean_radiance > 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a"]
+
+
+def test_what_is_no_clip_is_never_replaced(tmp_path: Path):
+    """Not a folder, not a file, not somebody's folder that has the name of the unfinished one."""
+    (tmp_path / "thesis").mkdir()
+    for path in (tmp_path / "thesis" / "a.txt", tmp_path / "b", tmp_path / "c.part" / "notes.txt"):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("years of work")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    for name in ("thesis", "b"):
+        with pytest.raises(FileExistsError, match="exists and is no clip"):
+            ClipWriter(tmp_path / name, meta(), force=True)
+    with pytest.raises(ValueError, match=r"c\.part: holds files of somebody else"):
+        ClipWriter(tmp_path / "c", meta()).__enter__()
+    left = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and path.name != "lock"}
+    assert left == before
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e-3])
+def test_impossible_radiance_is_named_and_leaves_nothing(tmp_path: Path, value: float):
+    image = radiance(0).copy()
+    image[4, 3] = value
+    with pytest.raises(ValueError, match=r"radiance of frame 0 is .* at \(y, x\) = \(4, 3\)"):  # noqa: SIM117
+        with ClipWriter(tmp_path / "a", meta()) as writer:
+            writer.add(0, image)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_frame_is_not_a_clip(tmp_path: Path):
+    writer = ClipWriter(tmp_path / "a", meta()).__enter__()
+    for t in (0, 1, 2, 4):
+        writer.add(t, radiance(t))
+    with pytest.raises(ValueError, match=r"frame 3 was never written \(1 of 5"):
+        writer.__exit__(None, None, None)
+    with pytest.raises(FileNotFoundError):
+        Clip.open(tmp_path / "a")

@@ -1,0 +1,19 @@
+"""Locks: whoever waited for a deleted file is not alone with the new one."""
+
+from pathlib import Path
+
+from qsim import locks
+
+
+def test_a_lock_whose_file_is_deleted_is_taken_on_the_new_one(tmp_path: Path):
+    """Who waited for a deleted file must not believe to be alone."""
+    first, second, third = (locks.Lock(tmp_path / "lock") for _ in range(3))
+    assert first.acquire()
+    (tmp_path / "lock").unlink()
+    assert second.acquire(), "the name is free"
+    first.release()
+    assert not third.acquire()
+    second.delete()
+    assert third.acquire()
+    third.delete()
+    assert list(tmp_path.iterdir()) == []
