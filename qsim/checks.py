@@ -19,6 +19,13 @@ def suggest(word: str, known: Iterable[str]) -> str:
     return f" (did you mean '{close[0]}'?)" if close else ""
 
 
+def shown(value: Any) -> str:
+    """Return a value for a message, at most 60 characters."""
+    if isinstance(value, int) and abs(value) >= 10**30:  # Python refuses to print thousands of digits
+        return "a number of more than 30 digits"
+    return repr(value)[:60]
+
+
 def text(value: Any) -> str:
     if not isinstance(value, str) or not value:
         raise ValueError(f"expected a text in quotes, got {value!r}")
@@ -33,8 +40,14 @@ def flag(value: Any) -> bool:
 
 def real(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"expected a number, got {value!r}")
+        raise ValueError(f"expected a number, got {shown(value)}")
     return float(value)
+
+
+def integer(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"expected a whole number, got {shown(value)}")
+    return value
 
 
 def positive(value: Any) -> float:

@@ -1,55 +1,116 @@
-"""Checks the JSON descriptions of clips, streams, data sets and restored video: one table per kind of file.
+"""Checks tables of TOML and JSON files, and makes dataclasses of them: keys, kinds and ranges, by one function.
 
-    table: {key: kind}      "key" must be there, "key, if any" may be missing or null, "key or null" is null or good
-    kind:  a `Kind` (what is expected, and a test), or a table of its own for a JSON object
+    table:  {key: check}; "key" must be there, "key, if any" may be missing or null, "key or null" may be null
+    check:  a function that returns the value or raises `ValueError("expected ..., got ...")`, or a table of its own
 
-Keys that no table knows are kept: a writer may add its own. Numbers are finite; NaN never passes.
+Every message names the place (a file, and in recipes the line), the key, what is expected and what was found. Numbers
+are finite; NaN never passes.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
-from qsim.checks import SPLITS
+from qsim import checks
+from qsim.checks import SPLITS, shown, suggest
 from qsim.files import NAME
 
 SMALLEST, LARGEST = 1e-30, 1e30  # of numbers above 0 in SI units: whatever lies outside overflows in the next product
 
-
-@dataclass(frozen=True)
-class Kind:
-    """What a value has to be, for a message and as a test."""
-
-    what: str
-    good: Callable[[Any], bool]
+Check = Callable[[Any], Any]
+Table = Mapping[str, "Check | Table"]
+Where = str | Callable[[str | None], str]  # the place of a table, or of a key in it (None: of the table)
+Made = TypeVar("Made")
 
 
-Table = Mapping[str, "Kind | Table"]
+def structure(
+    found: Any, table: Table, where: Where, *, of: str = "", closed: bool = True, cure: str = "", inside: str = ""
+) -> dict[str, Any]:
+    """Return the values as their checks return them; `ValueError` if `found` is not as the table says.
 
-
-def structure(path: Path, found: Mapping[str, Any], table: Table, cure: str, inside: str = "") -> None:
-    """`ValueError` that names file, key and cure if `found` is not as the table says."""
-    for entry, kind in table.items():
-        optional, nullable = entry.endswith(", if any"), entry.endswith(" or null")
-        key = entry.removesuffix(", if any").removesuffix(" or null")
+    `of` names the table in messages and `cure` says what to do. A closed table refuses keys that it does not list.
+    """
+    place = where if callable(where) else lambda _: where
+    title, advice = of and f" in {of}", cure and f"; {cure}"
+    if not isinstance(found, Mapping):
+        raise ValueError(
+            f"{place(None)}: {inside and f'{inside[:-1]}: '}expected a table of values, got {shown(found)}{advice}"
+        )
+    known = {entry.removesuffix(", if any").removesuffix(" or null"): entry for entry in table}
+    for key in found if closed else ():
+        if key not in known:
+            meant = f"{suggest(key, known)}; known are {', '.join(known)}"
+            raise ValueError(f"{place(key)}: unknown key '{inside}{key:.60}'{title}{meant}")
+    values = dict(found)
+    for key, entry in known.items():
         if key not in found:
-            if not optional:
-                raise ValueError(f"{path}: key '{inside}{key}' is missing; {cure}")
+            if not entry.endswith(", if any"):
+                raise ValueError(f"{place(None)}: key '{inside}{key}' is missing{title}{advice}")
             continue
-        value = found[key]
-        if value is None and (optional or nullable):
+        if found[key] is None and entry != key:
             continue
-        if isinstance(kind, Kind):
-            if not kind.good(value):
-                raise ValueError(f"{path}: {inside}{key} must be {kind.what}, found {value!r:.60}; {cure}")
-        elif isinstance(value, dict):
-            structure(path, value, kind, cure, f"{inside}{key}.")
-        else:
-            raise ValueError(f"{path}: {inside}{key} must be a JSON object, found {value!r:.60}; {cure}")
+        check = table[entry]
+        if isinstance(check, Mapping):
+            below = f"{inside}{key}."
+            values[key] = structure(found[key], check, where, of=of, closed=closed, cure=cure, inside=below)
+            continue
+        try:
+            values[key] = check(found[key])
+        except (ValueError, OverflowError) as error:
+            raise ValueError(f"{place(key)}: {inside}{key}: {error}{advice}") from None
+    return values
+
+
+def description(path: Path, found: Mapping[str, Any], table: Table, cure: str) -> None:
+    """`ValueError` if the JSON description in a file is not as the table says; further keys are a writer's own."""
+    structure(found, table, str(path), closed=False, cure=cure)
+
+
+def make(kind: type[Made], found: Any, where: str) -> Made:
+    """Return the dataclass that the table `found` describes; `ValueError` with the place, also from its own checks."""
+    values = structure(found, table_of(kind), where, of=kind.__name__)
+    try:
+        return kind(**values)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def table_of(kind: Any) -> Table:
+    """Return the table of a dataclass: its fields by their types; a field that has a default may be missing."""
+    hints = get_type_hints(kind)
+    given = {field.name: field.default is MISSING and field.default_factory is MISSING for field in fields(kind)}
+    return {name if needed else f"{name}, if any": _check_of(hints[name]) for name, needed in given.items()}
+
+
+def _check_of(hint: Any) -> Check | Table:
+    """Return the check of a field's type: bool, int, float, tuple[int, ...], a dataclass, or one of them or None."""
+    if isinstance(hint, UnionType):
+        (hint,) = set(get_args(hint)) - {NoneType}
+    if is_dataclass(hint):
+        return table_of(hint)
+    if get_origin(hint) is tuple:
+        item, several = _CHECKS[get_args(hint)[0]], expected("a list", lambda value: isinstance(value, list | tuple))
+        return lambda value: tuple(item(one) for one in several(value))
+    return _CHECKS[hint]
+
+
+_CHECKS: dict[Any, Check] = {bool: checks.flag, int: checks.integer, float: checks.real}
+
+
+def expected(what: str, good: Callable[[Any], bool]) -> Check:
+    """Return the check that passes what is `good` and says `what` is expected otherwise."""
+
+    def check(value: Any) -> Any:
+        if not good(value):
+            raise ValueError(f"expected {what}, got {shown(value)}")
+        return value
+
+    return check
 
 
 def is_number(value: Any) -> bool:
@@ -58,6 +119,10 @@ def is_number(value: Any) -> bool:
 
 def is_positive(value: Any) -> bool:
     return is_number(value) and value >= SMALLEST
+
+
+def is_light(value: Any) -> bool:
+    return is_number(value) and value >= 0
 
 
 def is_count(value: Any) -> bool:
@@ -81,6 +146,10 @@ def mapping_of(key: str, good: Callable[[Any], bool]) -> Callable[[Any], bool]:
     )
 
 
+def is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
 def is_digest(value: Any) -> bool:
     return isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None
 
@@ -89,18 +158,19 @@ def is_name(value: Any) -> bool:
     return isinstance(value, str) and NAME.fullmatch(value) is not None
 
 
-TEXT = Kind("a text", lambda value: isinstance(value, str))
-FLAG = Kind("true or false", lambda value: isinstance(value, bool))
-NAMED = Kind("a name of letters, digits, '.', '_' and '-'", is_name)
-DIGEST = Kind("a SHA-256 of 64 hexadecimal digits", is_digest)
-NUMBER = Kind(f"a number within {LARGEST:g}", is_number)
-POSITIVE = Kind(f"a number from {SMALLEST:g} to {LARGEST:g}", is_positive)
-LIGHT = Kind(f"a number from 0 to {LARGEST:g}", lambda value: is_number(value) and value >= 0)
-COUNT = Kind("a whole number from 0", is_count)
-WHOLE = Kind("a whole number from 1", is_whole)
-SHAPE = Kind("[frames, height, width] of at least 1", list_of(is_whole, 3))
-VECTOR = Kind("three numbers", list_of(is_number, 3))
-SPLIT = Kind(f"one of {', '.join(SPLITS)}", lambda value: value in SPLITS)
+TEXT = expected("a text", is_text)
+FLAG = expected("true or false", lambda value: isinstance(value, bool))
+NAMED = expected("a name of letters, digits, '.', '_' and '-'", is_name)
+DIGEST = expected("a SHA-256 of 64 hexadecimal digits", is_digest)
+NUMBER = expected(f"a number within {LARGEST:g}", is_number)
+POSITIVE = expected(f"a number from {SMALLEST:g} to {LARGEST:g}", is_positive)
+LIGHT = expected(f"a number from 0 to {LARGEST:g}", is_light)
+LIGHTS = expected("a list of numbers from 0", list_of(is_light))
+COUNT = expected("a whole number from 0", is_count)
+WHOLE = expected("a whole number from 1", is_whole)
+SHAPE = expected("[frames, height, width] of at least 1", list_of(is_whole, 3))
+VECTOR = expected("three numbers", list_of(is_number, 3))
+SPLIT = expected(f"one of {', '.join(SPLITS)}", lambda value: value in SPLITS)
 OBJECT: Table = {}
 
 CAMERA: Table = {
@@ -126,37 +196,37 @@ CLIP: Table = {
     "exposure": POSITIVE,
     "radiance_unit": TEXT,
     "mean_radiance": LIGHT,
-    "checksums": Kind("the SHA-256 of each frame's files", mapping_of(_FRAME, is_digest)),
+    "checksums": expected("the SHA-256 of each frame's files", mapping_of(_FRAME, is_digest)),
     "name, if any": NAMED,
     "split, if any": SPLIT,
     "camera, if any": CAMERA,
-    "origin, if any": Kind("[y, x] in pixels", list_of(is_count, 2)),
+    "origin, if any": expected("[y, x] in pixels", list_of(is_count, 2)),
     "mean_photons, if any": LIGHT,
     "shutter, if any": LIGHT,
     "clipped_pixels, if any": COUNT,
     "saturated_pixels, if any": COUNT,
     "saturation, if any": {"white or null": LIGHT, "assumed": FLAG},
-    "error_per_frame, if any": Kind("a list of numbers from 0", list_of(lambda v: is_number(v) and v >= 0)),
-    "error_at_white_per_frame, if any": Kind("a list of numbers from 0", list_of(lambda v: is_number(v) and v >= 0)),
+    "error_per_frame, if any": LIGHTS,
+    "error_at_white_per_frame, if any": LIGHTS,
     "white, if any": LIGHT,
     "psnr_of_truth, if any": NUMBER,
     "psnr_unclamped, if any": NUMBER,
-    "fireflies_per_frame, if any": Kind("a list of whole numbers from 0", list_of(is_count)),
+    "fireflies_per_frame, if any": expected("a list of whole numbers from 0", list_of(is_count)),
     "scene, if any": OBJECT,
-    "assets, if any": Kind("a list of texts", list_of(TEXT.good)),
+    "assets, if any": expected("a list of texts", list_of(is_text)),
     "job, if any": TEXT,
     "source, if any": OBJECT,
     "orientation, if any": TEXT,
     "render, if any": {
-        "findings, if any": Kind(
+        "findings, if any": expected(
             "a list of texts by effect, chosen, size",
-            list_of(lambda v: mapping_of("effect|chosen|size", TEXT.good)(v) and len(v) == 3),
+            list_of(lambda v: mapping_of("effect|chosen|size", is_text)(v) and len(v) == 3),
         )
     },
 }
 STREAM: Table = {
     "shape": SHAPE,
-    "bits": Kind("a whole number from 1 to 16", lambda value: type(value) is int and 1 <= value <= 16),
+    "bits": expected("a whole number from 1 to 16", lambda value: type(value) is int and 1 <= value <= 16),
     "width": WHOLE,
     "sensor": {"model": TEXT},
     "ppp_factor or null": POSITIVE,
@@ -187,7 +257,7 @@ RECORD: Table = {
     "clip": DIGEST,
     "digest": TEXT,
     "split": SPLIT,
-    "streams": Kind("the SHA-256 of each stream's description", mapping_of(NAME.pattern, is_digest)),
+    "streams": expected("the SHA-256 of each stream's description", mapping_of(NAME.pattern, is_digest)),
 }
 RESTORED: Table = {
     "method": TEXT,

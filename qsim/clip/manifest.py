@@ -32,7 +32,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
     """Return clip.json; `ValueError` names file and key if it is not that of a complete clip of this version."""
     meta = files.read_json(path)
     files.check_version(path, meta.get("format_version"), FORMAT_VERSION)
-    structure.structure(path, meta, structure.CLIP, _DAMAGED)
+    structure.description(path, meta, structure.CLIP, _DAMAGED)
     if meta["radiance_unit"] not in (PHYSICAL, RELATIVE):
         raise ValueError(f"{path}: radiance_unit {meta['radiance_unit']!r}; known are '{PHYSICAL}' and '{RELATIVE}'")
     if (meta.get("camera") is None) != (meta["radiance_unit"] == RELATIVE):

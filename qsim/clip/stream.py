@@ -45,7 +45,7 @@ class Stream:
             raise FileNotFoundError(f"{json_path}: no such stream")
         meta = files.read_json(json_path)
         files.check_version(json_path, meta.get("format_version"), FORMAT_VERSION)
-        structure.structure(json_path, meta, structure.STREAM, _DAMAGED)
+        structure.description(json_path, meta, structure.STREAM, _DAMAGED)
         bits, width = meta["sensor"].get("bits", meta["bits"]), meta["shape"][2]
         if (bits, width) != (meta["bits"], meta["width"]):
             raise ValueError(f"{json_path}: bits or width contradict the sensor or the shape; {_DAMAGED}")

@@ -67,7 +67,7 @@ class Restored:
         """Open a restored video by its description; `ValueError` if that is damaged."""
         cure = "restore the video again"
         meta = files.read_json(description)
-        structure.structure(description, meta, structure.RESTORED, cure)
+        structure.description(description, meta, structure.RESTORED, cure)
         files.check_own(description, meta, cure)
         return Restored(description.with_suffix(".npy"), meta)
 

@@ -50,10 +50,10 @@ class Dataset:
             raise Damaged(f"{error}; {remedy}") from None
         files.check_version(manifest, meta.get("format_version"), FORMAT_VERSION)
         try:
-            structure.structure(manifest, meta, structure.DATASET, remedy)
+            structure.description(manifest, meta, structure.DATASET, remedy)
             if odd := [name for name in meta["jobs"] if not structure.is_name(name)]:
                 raise ValueError(f"{manifest}: jobs holds {odd[0]!r:.60}, which is not the name of a clip; {remedy}")
-            structure.structure(manifest, meta["jobs"], dict.fromkeys(meta["jobs"], structure.JOB), remedy, "jobs.")
+            structure.description(manifest, meta, {"jobs": dict.fromkeys(meta["jobs"], structure.JOB)}, remedy)
             files.check_own(manifest, meta, remedy)
         except ValueError as error:
             raise Damaged(str(error)) from None
@@ -151,7 +151,7 @@ def _seen_in(path: Path) -> list[str]:
 def _read_record(path: Path) -> dict[str, Any]:
     record = files.read_json(path)
     cure = "`qsim generate RECIPE -o FOLDER --repair` makes it again"
-    structure.structure(path, record, structure.RECORD, cure)
+    structure.description(path, record, structure.RECORD, cure)
     return record
 
 

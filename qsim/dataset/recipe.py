@@ -29,7 +29,6 @@ no other split.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,6 +39,7 @@ from qsim.clip.sensing import Sensing
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe_toml import Section, Text
 from qsim.files import check_name
+from qsim.structure import Check, Table
 
 SPLITS = checks.SPLITS
 MAX_STEM = 180  # characters of a scene's name: with seed, speed and a temporary ending it must be a file's name
@@ -75,14 +75,13 @@ def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
     """A recipe from the text of a TOML file; `path` names it in errors and is where relative files are looked for."""
     written = Text(path, text)
     whole = Section(written, None, 0, written.content())
-    whole.check_keys(("recipe", "scenes", "streams"))
+    whole.values({"recipe, if any": _kept, "scenes, if any": _kept, "streams, if any": _kept})
     if not isinstance(whole.table.get("recipe"), dict):
         raise ValueError(f"{path}: the section [recipe] is missing")
     head = Section(written, "recipe", 0, whole.table["recipe"])
-    head.check_keys(("name", "seed", *_SETTINGS), needed=("name", "frames", "height", "width"))
-    name = head.value("name", _name)
-    seed = head.value("seed", checks.seed, 0)
-    defaults = {"frame_rate": 2000.0} | _settings(head)
+    given = head.values(_HEAD)
+    name, seed = given["name"], given.get("seed", 0)
+    defaults = {"frame_rate": 2000.0} | _settings(given)
     streams: list[Sensing] = []
     taken: set[str] = set()
     for section in whole.sections("streams"):
@@ -131,17 +130,16 @@ def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
 
 def _jobs(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[Sensing, ...]) -> list[Job]:
     """One job per seed and speed."""
-    keys = ("family", "seeds", "count", "first", "speed", "split", *_SETTINGS)
-    section.check_keys(keys, needed=("family",))
-    family = _family(section)
-    seeds = _seeds(section)
-    speeds = section.value("speed", checks.list_of(checks.speed), [1.0])
+    given = section.values(_SCENES)
+    family = _family(section, given["family"])
+    seeds = _seeds(section, given)
+    speeds = given.get("speed", [1.0])
     if family.endswith(".xml") and speeds != [1.0]:
         raise ValueError(
             f"{section.where('speed')}: an .xml scene stands still, its speed changes nothing; leave it out"
         )
-    split = section.value("split", checks.split, "train")
-    settings = Settings(**(defaults | _settings(section)))
+    split = given.get("split", "train")
+    settings = Settings(**(defaults | _settings(given)))
     if settings.height * settings.width > MAX_PIXELS:
         raise ValueError(
             f"{section.where()}: frames of {settings.height} x {settings.width} pixels; at most "
@@ -173,14 +171,13 @@ def _jobs(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[
     ]
 
 
-def _settings(section: Section) -> dict[str, Any]:
-    """The fields of `Settings` that the section gives."""
-    return {key: section.value(key, check) for key, check in _SETTINGS.items() if key in section}
+def _settings(given: dict[str, Any]) -> dict[str, Any]:
+    """The fields of `Settings` that a section gives."""
+    return {key: given[key] for key in _SETTINGS if key in given}
 
 
-def _family(section: Section) -> str:
+def _family(section: Section, family: str) -> str:
     """A family of the library, or the path of a scene file or folder that is there."""
-    family: str = section.value("family", checks.text)
     file = (section.text.path.parent / family).resolve()
     if "/" in family and file.is_dir():
         return str(file)
@@ -199,16 +196,15 @@ def _family(section: Section) -> str:
     return family
 
 
-def _seeds(section: Section) -> list[int]:
-    if "seeds" in section:
+def _seeds(section: Section, given: dict[str, Any]) -> list[int]:
+    if "seeds" in given:
         for key in ("count", "first"):
-            if key in section:
+            if key in given:
                 raise ValueError(f"{section.where(key)}: give either seeds or count, not both")
-        return list(section.value("seeds", checks.list_of(checks.seed)))
-    first = section.value("first", checks.seed, 0)
-    count = section.value("count", checks.whole, 1)
+        return list(given["seeds"])
+    first, count = given.get("first", 0), given.get("count", 1)
     if first + count > 2**31:
-        key = "count" if "count" in section else "first"
+        key = "count" if "count" in given else "first"
         raise ValueError(f"{section.where(key)}: seeds {first} to {first + count - 1}; the largest is 2^31 - 1")
     return list(range(first, first + count))
 
@@ -218,14 +214,11 @@ def _seeds(section: Section) -> list[int]:
 
 def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
     """One stream per bits and light level, under names that are not taken; they are added to `taken`."""
-    keys = ("sensor", "bits", "ppp", "lux", "absolute", "seed", "name", "group", "diffraction")
-    section.check_keys(keys, needed=("sensor",))
-    unit, levels = _light(section)
-    bits = section.value("bits", checks.list_of(checks.bits), [None])
-    group, diffraction = (section.value(key, checks.flag, False) for key in ("group", "diffraction"))
-    sensor = _sensor(section, bits, group)
-    own = section.value("seed", checks.seed, seed)
-    name = section.value("name", _name, None)
+    given = section.values(_STREAMS)
+    unit, levels = _light(section, given)
+    bits, name = given.get("bits", [None]), given.get("name")
+    group, diffraction = given.get("group", False), given.get("diffraction", False)
+    sensor = _sensor(section, given["sensor"], bits, group)
     if name is not None and len(bits) * len(levels) > 1:
         raise ValueError(f"{section.where('name')}: one name for {len(bits) * len(levels)} streams")
     found = [
@@ -234,7 +227,7 @@ def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
             bits=b,
             ppp=level if unit == "ppp" else None,
             lux=level if unit == "lux" else None,
-            seed=own,
+            seed=given.get("seed", seed),
             name=name,
             group=group,
             diffraction=diffraction,
@@ -253,28 +246,27 @@ def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
     return found
 
 
-def _light(section: Section) -> tuple[str, list[float | None]]:
+def _light(section: Section, given: dict[str, Any]) -> tuple[str, list[float | None]]:
     """("ppp" | "lux" | "absolute", levels); absolute light has one level, as it is."""
-    given = [key for key in ("ppp", "lux", "absolute") if key in section]
-    if len(given) != 1:
+    units = [key for key in ("ppp", "lux", "absolute") if key in given]
+    if len(units) != 1:
         raise ValueError(
             f"{section.where()}: give one light level, ppp = ..., lux = ... or absolute = true; "
-            f"{' and '.join(given) or 'none'} given"
+            f"{' and '.join(units) or 'none'} given"
         )
-    unit = given[0]
+    unit = units[0]
     if unit != "absolute":
-        return unit, section.value(unit, checks.list_of(checks.light))
-    if not section.value("absolute", checks.flag):
+        return unit, given[unit]
+    if not given["absolute"]:
         raise ValueError(f"{section.where('absolute')}: absolute can only be true; or give a ppp")
     return unit, [None]
 
 
-def _sensor(section: Section, bits: list[int | None], group: bool) -> str:
+def _sensor(section: Section, sensor: str, bits: list[int | None], group: bool) -> str:
     """The sensor's name or file, if it exists with all these bits, and its planes can be summed where asked."""
     from qsim.sensor import devices
     from qsim.sensor.spad import BinarySPAD
 
-    sensor: str = section.value("sensor", checks.text)
     if sensor.endswith(".toml"):
         sensor = str((section.text.path.parent / sensor).resolve())
     for depth in bits:
@@ -293,11 +285,41 @@ def _name(value: Any) -> str:
     return check_name(checks.text(value))
 
 
-_SETTINGS: dict[str, Callable[[Any], Any]] = {
+def _kept(value: Any) -> Any:
+    """Whatever there is: sections are checked one by one."""
+    return value
+
+
+_SETTINGS: dict[str, Check] = {
     "frames": checks.whole,
     "height": checks.whole,
     "width": checks.whole,
     "frame_rate": checks.frame_rate,
     "shutter": checks.shutter,
     "psnr": checks.psnr,
+}
+_HEAD: Table = {
+    "name": _name,
+    "seed, if any": checks.seed,
+    **{key if key in ("frames", "height", "width") else f"{key}, if any": check for key, check in _SETTINGS.items()},
+}
+_SCENES: Table = {
+    "family": checks.text,
+    "seeds, if any": checks.list_of(checks.seed),
+    "count, if any": checks.whole,
+    "first, if any": checks.seed,
+    "speed, if any": checks.list_of(checks.speed),
+    "split, if any": checks.split,
+    **{f"{key}, if any": check for key, check in _SETTINGS.items()},
+}
+_STREAMS: Table = {
+    "sensor": checks.text,
+    "bits, if any": checks.list_of(checks.bits),
+    "ppp, if any": checks.list_of(checks.light),
+    "lux, if any": checks.list_of(checks.light),
+    "absolute, if any": checks.flag,
+    "seed, if any": checks.seed,
+    "name, if any": _name,
+    "group, if any": checks.flag,
+    "diffraction, if any": checks.flag,
 }

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qsim.checks import suggest
 from qsim.parsing import parse_toml
-
-_NEEDED = object()  # the default of a key that has none
+from qsim.structure import Table, structure
 
 
 @dataclass(frozen=True)
@@ -73,29 +70,9 @@ class Section:
         """`FILE:LINE` of a key, or of the section's head."""
         return self.text.where(self.name, self.i, key)
 
-    def __contains__(self, key: str) -> bool:
-        return key in self.table
-
-    def check_keys(self, known: tuple[str, ...], needed: tuple[str, ...] = ()) -> None:
-        """`ValueError` for a key that is not known, and for one that is needed and not there."""
-        for key in self.table:
-            if key not in known:
-                raise ValueError(
-                    f"{self.where(key)}: unknown key '{key}' in {self.title}{suggest(key, known)}; "
-                    f"known are {', '.join(known)}"
-                )
-        for key in needed:
-            if key not in self.table:
-                raise ValueError(f"{self.where()}: key '{key}' is missing in {self.title}")
-
-    def value(self, key: str, check: Callable[[Any], Any], default: Any = _NEEDED) -> Any:
-        """A key's value as `check` returns it; `ValueError` with its line for one that `check` refuses."""
-        if key not in self.table and default is not _NEEDED:
-            return default
-        try:
-            return check(self.table[key])
-        except ValueError as error:
-            raise ValueError(f"{self.where(key)}: {key}: {error}") from None
+    def values(self, table: Table) -> dict[str, Any]:
+        """The values as their checks return them; `ValueError` with the line of the key that is wrong."""
+        return structure(self.table, table, self.where, of=self.title)
 
     def sections(self, key: str) -> list[Section]:
         """The tables [[key]] of the file, in their order."""

@@ -22,7 +22,7 @@ photons" means that light has to be given as photons that this sensor detects. A
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import MappingProxyType
 
@@ -32,6 +32,7 @@ from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
+from qsim.structure import make
 
 MODELS: Mapping[str, type[Sensor]] = MappingProxyType(
     {"QIS": QIS, "BinarySPAD": BinarySPAD, "CountingSPAD": CountingSPAD}
@@ -248,20 +249,8 @@ def from_dict(settings: Mapping[str, object], where: str = "sensor") -> Sensor:
     name = settings.get("model")
     if not isinstance(name, str) or name not in MODELS:
         raise ValueError(f"{where}: model is one of {', '.join(MODELS)}, got {name!r}{suggest(str(name), MODELS)}")
-    model = MODELS[name]
-    wanted = {field.name: field for field in fields(model)}  # type: ignore[arg-type]  # every model is a dataclass
     values = {key: value for key, value in settings.items() if key != "model"}
-    for key, value in values.items():
-        if key not in wanted:
-            raise ValueError(f"{where}: unknown key {key!r} for {name}{suggest(key, wanted)}")
-        values[key] = _typed(where, key, value, str(wanted[key].type))
-    missing = [key for key, field in wanted.items() if key not in values and field.default is MISSING]
-    if missing:
-        raise ValueError(f"{where}: {name} needs {', '.join(missing)}")
-    try:
-        return model(**values)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+    return make(MODELS[name], values, where)
 
 
 def listing() -> list[dict[str, object]]:
@@ -279,18 +268,3 @@ def listing() -> list[dict[str, object]]:
             }
         )
     return rows
-
-
-def _typed(where: str, key: str, value: object, annotation: str) -> object:
-    """`value` as the type of its field: whole numbers may stand for real ones, truth values for nothing else."""
-    if "None" in annotation and value is None:
-        return None
-    if annotation == "bool":
-        good, kind = isinstance(value, bool), "true or false"
-    elif annotation == "int":
-        good, kind = isinstance(value, int) and not isinstance(value, bool), "a whole number"
-    else:
-        good, kind = isinstance(value, int | float) and not isinstance(value, bool), "a number"
-    if not good:
-        raise ValueError(f"{where}: {key} is {kind}, got {value!r}")
-    return float(value) if annotation.startswith("float") else value  # type: ignore[arg-type]

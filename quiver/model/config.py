@@ -1,7 +1,10 @@
 """The configuration of QUIVER: its width, and the switches of the paper's ablation."""
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Self
+
+from qsim.checks import shown
+from qsim.structure import make
 
 GROUPS = 16  # groups of channels with offsets of their own in the published alignment
 
@@ -9,26 +12,19 @@ GROUPS = 16  # groups of channels with offsets of their own in the published ali
 def whole_number(name: str, value: object, least: int, most: int) -> None:
     """`ValueError` unless the value is an integer in least ... most."""
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise ValueError(f"{name} must be a whole number from {least} to {most}, got {short(value)}")
+        raise ValueError(f"{name} must be a whole number from {least} to {most}, got {shown(value)}")
 
 
 def real_number(name: str, value: object, low: float, high: float) -> None:
     """`ValueError` unless the value is a number in low ... high."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise ValueError(f"{name} must be a number from {low:g} to {high:g}, got {short(value)}")
+        raise ValueError(f"{name} must be a number from {low:g} to {high:g}, got {shown(value)}")
 
 
 def flag(name: str, value: object) -> None:
     """`ValueError` unless the value is true or false."""
     if not isinstance(value, bool):
-        raise ValueError(f"{name} must be true or false, got {short(value)}")
-
-
-def short(value: object) -> str:
-    """A value for a message, at most 60 characters."""
-    if isinstance(value, int) and abs(value) >= 10**30:
-        return "a number of more than 30 digits"
-    return repr(value)[:60]
+        raise ValueError(f"{name} must be true or false, got {shown(value)}")
 
 
 @dataclass(frozen=True)
@@ -64,10 +60,4 @@ class Config:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> Self:
         """Inverse of `to_dict`; ValueError for anything else."""
-        names = {field.name for field in fields(cls)}
-        if not isinstance(values, dict):
-            raise ValueError(f"QUIVER Config is a table of values, got {short(values)}")
-        for name in values:
-            if name not in names:
-                raise ValueError(f"QUIVER Config has no field {name[:60]!r}; known: {', '.join(sorted(names))}")
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})  # type: ignore[arg-type]
+        return make(cls, values, "QUIVER")

@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from qsim.checks import shown
 from quiver.model.blocks import (
     RADIUS,
     WINDOW,
@@ -29,7 +30,7 @@ from quiver.model.blocks import (
     check_input,
     resize,
 )
-from quiver.model.config import Config, flag, real_number, short, whole_number
+from quiver.model.config import Config, flag, real_number, whole_number
 from quiver.model.initial_estimate import InitialEstimate
 from quiver.model.quiver import QUIVER
 
@@ -82,7 +83,7 @@ class FoldedConfig(Config):
         flag("Config.lecun", self.lecun)
         if not isinstance(self.flow_channels, tuple) or not 1 <= len(self.flow_channels) <= _FLOW_LAYERS:
             raise ValueError(
-                f"Config.flow_channels must be 1 to {_FLOW_LAYERS} widths, got {short(self.flow_channels)}"
+                f"Config.flow_channels must be 1 to {_FLOW_LAYERS} widths, got {shown(self.flow_channels)}"
             )
         for value in self.flow_channels:
             whole_number("Config.flow_channels", value, 1, 1024)

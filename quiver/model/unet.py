@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from qsim.structure import make
 from quiver.model.blocks import WINDOW, Output, check_input, conv, join
 from quiver.model.config import whole_number
 
@@ -31,9 +32,7 @@ class UNetConfig:
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> "UNetConfig":
         """Inverse of `to_dict`; ValueError for anything but a width."""
-        if not isinstance(values, dict) or set(values) != {"width"}:
-            raise ValueError(f"UNetConfig has the one field width, got {', '.join(sorted(values))[:60] or 'none'}")
-        return cls(values["width"])  # type: ignore[arg-type]  # checked there
+        return make(cls, values, "UNet")
 
 
 class SmallUNet(nn.Module):

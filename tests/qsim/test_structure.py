@@ -2,9 +2,11 @@
 
 import json
 import random
+import re
 import shutil
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ import numpy as np
 import pytest
 from clips import write_clip
 
-from qsim import files
+from qsim import checks, files
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
 from qsim.clip.sensing import Sensing, replay, sense
@@ -24,6 +26,7 @@ from qsim.formats import exporting, importing
 from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints
 from qsim.report import report, views
+from qsim.structure import make, structure
 from quiver.data import codes as data
 from quiver.restoration.restored_file import restore_to_file
 from quiver.restoration.restorers import restorer
@@ -266,3 +269,56 @@ def test_every_value_of_another_kind_is_one_line(made: Path, tmp_path: Path):
 @pytest.mark.slow
 def test_reports_of_values_of_another_kind(made: Path, tmp_path: Path):
     hostile_descriptions(made, tmp_path, 400, use_report)
+
+
+@dataclass(frozen=True)
+class Inner:
+    rate: float
+    names: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Outer:
+    bits: int
+    inner: Inner | None = None
+    gain: float | None = None
+    on: bool = False
+
+    def __post_init__(self) -> None:
+        if self.bits > 16:
+            raise ValueError(f"Outer.bits is at most 16, got {self.bits}")
+
+
+def test_a_dataclass_is_made_by_the_types_of_its_fields():
+    assert make(Outer, {"bits": 3, "gain": 2}, "a.toml") == Outer(3, gain=2.0)
+    assert make(Inner, {"rate": 1, "names": [2, 3]}, "a.toml") == Inner(1.0, (2, 3))
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        ({"bit": 3}, "a.toml: unknown key 'bit' in Outer (did you mean 'bits'?); known are bits, inner, gain, on"),
+        ({"on": True}, "a.toml: key 'bits' is missing in Outer"),
+        ({"bits": 3.0}, "a.toml: bits: expected a whole number, got 3.0"),
+        ({"bits": 3, "on": 1}, "a.toml: on: expected true or false, got 1"),
+        ({"bits": 3, "gain": 10**5000}, "a.toml: gain: int too large to convert to float"),
+        ({"bits": 3, "inner": {"rates": 1}}, "a.toml: unknown key 'inner.rates' in Outer (did you mean 'rate'?)"),
+        ({"bits": 3, "inner": 4}, "a.toml: inner: expected a table of values, got 4"),
+        ({"bits": 17}, "a.toml: Outer.bits is at most 16, got 17"),
+        ([], "a.toml: expected a table of values, got []"),
+    ],
+)
+def test_what_a_dataclass_refuses_is_named_with_place_and_key(found: Any, words: str):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        make(Outer, found, "a.toml")
+
+
+def test_the_place_of_a_key_can_be_its_line():
+    def where(key: str | None) -> str:
+        return f"a.toml:{ {None: 1, 'x': 2}[key] }"
+
+    with pytest.raises(ValueError, match=r"^a\.toml:2: x: expected a number, got 'y'; do this$"):
+        structure({"x": "y"}, {"x": checks.real}, where, cure="do this")
+    with pytest.raises(ValueError, match=r"^a\.toml:1: key 'x' is missing in it$"):
+        structure({}, {"x": checks.real}, where, of="it")
+    assert structure({"x": None, "z": 1}, {"x or null": checks.real}, "a", closed=False) == {"x": None, "z": 1}

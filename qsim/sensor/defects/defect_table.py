@@ -26,19 +26,26 @@ closed form draws.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from qsim import files
-from qsim.checks import suggest
+from qsim import checks, files
 from qsim.sensor.defects.fixed_pattern import DarkSpread, FixedPattern
+from qsim.structure import Table, expected, structure, table_of
 
 _MAPS = {"gain_map": "prnu", "dark_map": "dark", "dead_map": "dead", "offset_map": "offset",
          "read_noise_map": "read_noise"}  # fmt: skip
 _PATTERN = ("device_seed", "prnu", "dead", "offset", "read_noise")
 _DISTURBANCES = ("crosstalk", "afterpulse", "afterpulse_delay")
-_KEYS = (*_PATTERN, "dark", *_MAPS, *_DISTURBANCES, "carry_dead_time")
+_NOT_NEGATIVE = expected("a number of at least 0", lambda v: type(v) in (int, float) and 0 <= v < float("inf"))
+_FILE = expected("the name of a .npy file", lambda v: isinstance(v, str | Mapping))
+_TABLE: Table = {
+    **table_of(FixedPattern),
+    **{f"{key}, if any": _FILE for key in _MAPS},
+    **{f"{key}, if any": _NOT_NEGATIVE for key in _DISTURBANCES},
+    "carry_dead_time, if any": checks.flag,
+}
 
 
 @dataclass(frozen=True)
@@ -83,42 +90,21 @@ def from_toml(path: str | Path) -> Defects | None:
 
 def from_dict(table: Mapping[str, Any], where: str = "defects") -> Defects:
     """Defects of a table, or of what `to_dict` wrote, whose maps have to be unchanged; strict, `ValueError`."""
-    for key in table:
-        if key not in _KEYS:
-            meant = suggest(key, _KEYS) or f"; known are {', '.join(_KEYS)}"
-            raise ValueError(f"{where}: unknown key {key!r}{meant}")
+    structure(table, _TABLE, where)
     for name, pattern in _MAPS.items():
         if name in table and pattern in table:
             raise ValueError(f"{where}: {pattern} and {name} say the same thing twice; leave one out")
-    dark = table.get("dark")
-    if dark is not None and not isinstance(dark, Mapping):
-        raise ValueError(f"{where}: dark is a table of {', '.join(f.name for f in fields(DarkSpread))}, got {dark!r}")
-    for key in dark or {}:
-        if key not in {f.name for f in fields(DarkSpread)}:
-            raise ValueError(f"{where}: unknown key {key!r} of dark")
-    if not isinstance(table.get("carry_dead_time", False), bool):
-        raise ValueError(f"{where}: carry_dead_time is true or false, got {table['carry_dead_time']!r}")
-    seed = table.get("device_seed", 0)
-    if isinstance(seed, bool) or not isinstance(seed, int):
-        raise ValueError(f"{where}: device_seed is a whole number, got {seed!r}")
-    numbers = {key: table[key] for key in _PATTERN if key in table}
-    disturbances = {key: _number(table[key], key, where) for key in _DISTURBANCES if key in table}
     try:
-        spread = None if dark is None else DarkSpread(**dark)
-        pattern_of_device = FixedPattern(**numbers, dark=spread)
+        spread = DarkSpread(**table["dark"]) if "dark" in table else None
+        pattern_of_device = FixedPattern(**{key: table[key] for key in _PATTERN if key in table}, dark=spread)
     except ValueError as error:
         raise ValueError(f"{where}: {str(error).removeprefix('FixedPattern.')}") from None
     maps = {key: _map_file(table[key], key, where) for key in _MAPS if key in table}
+    disturbances = {key: float(table[key]) for key in _DISTURBANCES if key in table}
     for key in ("crosstalk", "afterpulse"):
-        if not 0 <= disturbances.get(key, 0.0) < 1:
+        if not disturbances.get(key, 0.0) < 1:
             raise ValueError(f"{where}: {key} is a probability below 1, got {table[key]!r}")
     return Defects(pattern_of_device, maps, **disturbances, carry_dead_time=table.get("carry_dead_time", False))
-
-
-def _number(value: Any, key: str, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < float("inf"):
-        raise ValueError(f"{where}: {key} is a number of at least 0, got {value!r}")
-    return float(value)
 
 
 def _map_file(value: Any, key: str, where: str) -> str:

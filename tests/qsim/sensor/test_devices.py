@@ -120,12 +120,12 @@ GOOD = {"model": '"BinarySPAD"', "pde": "0.3", "dark_count_rate": "25", "bits": 
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"pdee": "0.3"}, "mine.toml: [sensor]: unknown key 'pdee' for BinarySPAD (did you mean 'pde'?)"),
+        ({"pdee": "0.3"}, "mine.toml: [sensor]: unknown key 'pdee' in BinarySPAD (did you mean 'pde'?)"),
         ({"model": '"BinarySpad"'}, "got 'BinarySpad' (did you mean 'BinarySPAD'?)"),
-        ({"pde": None}, "mine.toml: [sensor]: BinarySPAD needs pde"),
-        ({"pde": '"0.3"'}, "pde is a number, got '0.3'"),
-        ({"bits": "1.0"}, "bits is a whole number, got 1.0"),
-        ({"bits": "true"}, "bits is a whole number, got True"),
+        ({"pde": None}, "mine.toml: [sensor]: key 'pde' is missing in BinarySPAD"),
+        ({"pde": '"0.3"'}, "pde: expected a number, got '0.3'"),
+        ({"bits": "1.0"}, "bits: expected a whole number, got 1.0"),
+        ({"bits": "true"}, "bits: expected a whole number, got True"),
         ({"pde": "1.5"}, "BinarySPAD.pde"),
         ({"pde": "nan"}, "BinarySPAD.pde"),
         ({"[source]\nx": "1"}, "unknown table [source] (did you mean 'sources'?)"),
