@@ -110,7 +110,7 @@ def test_python_blocks_run(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for block in blocks(path):
         if block.language == "python" and block.directive != "not run":
-            exec(compile(block.as_run, path.name, "exec"), {"__name__": path.name})
+            exec(compile(block.as_run, path.name, "exec", dont_inherit=True), {"__name__": path.name})
 
 
 @pytest.mark.parametrize("words", commands(), ids=" ".join)
