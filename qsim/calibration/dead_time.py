@@ -1,9 +1,10 @@
-"""Dead time from any static scene: pixels of similar light take the place of flat fields.
+"""Measures the dead time of a counting SPAD from flat fields, or from any static scene.
 
-    counts [T, H, W] of something that does not move -> classes of pixels by their mean -> Fano factors -> dead time
+    counts [T, H, W] of a static scene -> classes of pixels by their mean -> Fano factors -> dead time
 
-A class is chosen by the pixel's total, which says nothing about how that total is spread over the frames (for Poisson
-counts, given the total, E[variance] = mean), so the choice does not bias the Fano factor.
+In a static scene, classes of pixels with similar light replace flat fields. A class is chosen by the pixels' totals.
+A total is independent of its spread over the frames (for Poisson counts, given the total, E[variance] = mean). The
+choice therefore does not bias the Fano factor.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from qsim.calibration.results import Calibration, Value, normal_interval
 from qsim.sensor.counting import CountingSPAD
 
 CLASSES = 8
-LEAST_MEAN = 1.0  # counts; darker pixels say nothing about dead time
-LEAST_PIXELS = 50  # of a class
+LEAST_MEAN = 1.0  # counts; darker pixels hold no information about dead time
+LEAST_PIXELS = 50  # in a class
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,10 @@ class Ratio:
 
 
 def fitted_dead_time(flats: Sequence[FrameStatistics], bits: int, paralyzable: bool) -> Ratio | None:
-    """tau/T from the time variance of every flat against its mean: weighted least squares on exact moments."""
+    """Fit tau/T to the variance over time of every flat against its mean; None without a usable flat.
+
+    The fit is a weighted least squares on exact moments. `ValueError` if the flats have different exposures.
+    """
     from scipy.optimize import minimize_scalar
 
     usable = [flat for flat in flats if flat.frames > 1 and flat.mean > 0]
@@ -63,7 +67,7 @@ def fitted_dead_time(flats: Sequence[FrameStatistics], bits: int, paralyzable: b
 
 
 def _fano_residuals(flats: Sequence[FrameStatistics], bits: int, ratio: float, paralyzable: bool) -> list[float]:
-    """(observed variance - that of a dead-time pixel of the same mean) / sigma, per flat.
+    """Return (observed variance - variance of a dead-time pixel of the same mean) / sigma, per flat.
 
     Sigma comes from the model's moments: those of the data would count the pattern of the pixels as noise.
     """
@@ -83,9 +87,9 @@ def _fano_residuals(flats: Sequence[FrameStatistics], bits: int, ratio: float, p
 
 
 def matched_variance(mean: float, bits: int, ratio: float, paralyzable: bool) -> tuple[float, float, float]:
-    """(arrivals, variance, d variance / d mean) of a counting pixel of this mean code; tau/T = `ratio`.
+    """Return (arrivals, variance, d variance / d mean) of a counting pixel of this mean code; tau/T = `ratio`.
 
-    Newton on the rising branch; where no light gives this mean the variance is 0, which no data match.
+    Newton's method on the rising branch. If no light gives this mean, the variance is 0, which no data match.
     """
     sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
     arrivals = mean
@@ -93,7 +97,7 @@ def matched_variance(mean: float, bits: int, ratio: float, paralyzable: bool) ->
         at = np.array(arrivals)
         slope = -float(np.sum(sensor.dcdf(at, 1.0)[:-1]))
         excess = float(sensor.mean(at, 1.0)) - mean
-        if slope < 0.02:  # the mean hardly rises or falls again: no light gives it with this dead time
+        if slope < 0.02:  # the mean is near its maximum or falls: no light gives it with this dead time
             return arrivals, 0.0, 0.0
         step = float(np.clip(excess / slope, -0.5 * arrivals - 0.1, 0.5 * arrivals))
         arrivals -= step
@@ -108,7 +112,10 @@ def matched_variance(mean: float, bits: int, ratio: float, paralyzable: bool) ->
 def classes_of(
     counts: Array, *, bits: int, exposure: float, edges: Sequence[float] | None = None
 ) -> list[FrameStatistics]:
-    """Stacks [T, 1, n] of pixels whose mean lies between neighbouring `edges` (default: 8 steps of equal ratio)."""
+    """Group the pixels of counts [T, H, W] by their mean; return the statistics of each class.
+
+    `edges` are the limits of the classes in counts (default: 8 steps of equal ratio). Small classes are left out.
+    """
     mean = counts.mean(axis=0)
     if not edges:
         if not mean.max() > LEAST_MEAN:
@@ -123,7 +130,7 @@ def classes_of(
 
 
 def fano(stack: FrameStatistics) -> Value:
-    """Variance over mean in time with its 95 % interval; the size of the mean is known far better than the variance."""
+    """Return variance over mean in time with its 95 % interval; the error of the mean is negligible."""
     n = stack.pixels * (stack.frames - 1)
     poisson_fourth = stack.mean + 3 * stack.mean**2
     spread = (poisson_fourth - stack.mean**2) / n / stack.mean**2
@@ -133,9 +140,9 @@ def fano(stack: FrameStatistics) -> Value:
 def calibrate_static(
     counts: Array, *, bits: int, exposure: float, edges: Sequence[float] | None = None, paralyzable: bool = False
 ) -> Calibration:
-    """Effective dead time [s] and the Fano factor of every class of light, from counts [T, H, W] of a static scene.
+    """Estimate the effective dead time [s] and the Fano factor of every class, from counts [T, H, W] of a static scene.
 
-    `ValueError` for fewer than two frames, or if no class has enough pixels.
+    `exposure` in seconds. `ValueError` for fewer than two frames, or if no class has enough pixels.
     """
     counts = np.asarray(counts)
     if counts.ndim != 3 or len(counts) < 2:
@@ -159,12 +166,12 @@ def calibrate_static(
 
 
 def _sigma(stack: FrameStatistics) -> float:
-    """Standard error of the mean variance, Poisson fourth moment."""
+    """Return the standard error of the mean variance, from the fourth moment of Poisson counts."""
     return sqrt((stack.mean + 2 * stack.mean**2) / (stack.pixels * (stack.frames - 1)))
 
 
 def _p_value(residuals: tuple[Array, ...]) -> float:
-    """Chi-square of the classes' variances against the fitted curve, one parameter fitted."""
+    """Return the p-value of the classes' variances against the fitted curve: chi-square, one fitted parameter."""
     from scipy.stats import chi2
 
     freedom = len(residuals) - 1

@@ -1,4 +1,4 @@
-"""Flat fields of either readout, the dark level of every pixel taken off: what calibrate_pattern.py measures PRNU from.
+"""Subtracts each pixel's dark level from flat fields of a SPAD array or a QIS; prnu.py measures PRNU in them.
 
 SPAD: arrivals = inverse of the exact mean code; dark rate of every pixel from all dark frames
 QIS:  mean codes; dark level of every pixel from the dark frames of the flat's exposure, or a line through them
@@ -21,14 +21,14 @@ from qsim.sensor.qis import QIS
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Mean code against arrivals of one pixel, and back: exact, with the dead time found."""
+    """Exact curve of mean code against arrivals of one pixel, with the measured dead time, and its inverse."""
 
     bits: int
     ratio: float  # dead time in exposures; 0 for 1-bit planes
     paralyzable: bool
 
     def table(self, largest: float) -> tuple[Array, Array]:
-        """(arrivals, mean code), rising, up to a mean of `largest` or to where the mean stops rising."""
+        """Return (arrivals, mean code) [G], rising, up to a mean of `largest` or to the maximum of the mean."""
         top = 2 * largest + 10
         for _ in range(12):
             arrivals = np.linspace(0, np.sqrt(top), 1500) ** 2
@@ -40,15 +40,15 @@ class Response:
         return arrivals[: end + 1], codes[: end + 1]
 
     def mean(self, arrivals: Array) -> Array:
-        """Expected code, exact."""
+        """Return the exact expected code at arrivals per exposure, any shape."""
         if self.bits == 1:
             return -np.expm1(-arrivals)
         return CountingSPAD(1.0, 0.0, self.ratio, self.bits, self.paralyzable).mean(arrivals, 1.0)
 
     def of_stack(self, stack: FrameStatistics) -> tuple[Array, Array, float]:
-        """Arrivals per exposure of every pixel and their variance, both [H, W], and d code / d arrivals.
+        """Return arrivals per exposure of every pixel and their variance, both [H, W], and d code / d arrivals.
 
-        The bias of a curved inverse, f''/2 times the variance of the pixel's mean, is taken off.
+        The bias of a curved inverse, f''/2 times the variance of the pixel's mean, is subtracted.
         """
         t = stack.frames
         mean = stack.total / t
@@ -67,7 +67,7 @@ class Response:
 
 
 def dark_rates(darks: Sequence[FrameStatistics], response: Response) -> tuple[Array, Array]:
-    """DCR of every pixel [1/s] from all exposures, and its variance, both [H, W]."""
+    """Return the DCR of every pixel [1/s] from all exposures, and its variance, both [H, W]."""
     weight = np.array([stack.frames * stack.exposure for stack in darks])
     weight = weight / weight.sum()
     rate, variance = np.zeros(darks[0].total.shape), np.zeros(darks[0].total.shape)
@@ -81,7 +81,7 @@ def dark_rates(darks: Sequence[FrameStatistics], response: Response) -> tuple[Ar
 def spad_flats(
     flats: Sequence[FrameStatistics], darks: Sequence[FrameStatistics], response: Response
 ) -> tuple[list[Flat], Array | None]:
-    """Flats of a SPAD array, and the hot pixels [H, W] by the dark frames; None without them."""
+    """Return the flats of a SPAD array, and the hot pixels [H, W] by the dark frames; None without dark frames."""
     shape = flats[0].total.shape
     rate, of_rate = dark_rates(darks, response) if darks else (np.zeros(shape), np.zeros(shape))
     hot = hot_by_rate(rate * sum(s.frames * s.exposure for s in darks)) if darks else None
@@ -109,9 +109,9 @@ def spad_flats(
 def qis_flats(
     flats: Sequence[FrameStatistics], darks: Sequence[FrameStatistics], sensor: QIS
 ) -> tuple[list[Flat], Array]:
-    """Flats of a QIS, and the hot pixels [H, W] by the dark frames of longest exposure.
+    """Return the flats of a QIS, and the hot pixels [H, W] by the dark frames of longest exposure.
 
-    `sensor` gives the curve of mean code against electrons (fitted gain and read noise), without its dark current.
+    `sensor` gives the curve of mean code against electrons (fitted gain and read noise), without dark current.
     """
     longest = max(darks, key=lambda stack: stack.exposure)
     hot = hot_by_level(
@@ -134,17 +134,17 @@ def qis_flats(
 
 
 def _above(mean: Callable[[Array], Array], dark: float, light: Array) -> Array:
-    """Mean code of light above a dark level in arrivals."""
+    """Return the mean code of light above a dark level in arrivals."""
     return mean(dark + light)
 
 
 def _electrons(sensor: QIS, shift: float, light: Array) -> Array:
-    """Mean code at so many electrons, moved so that no light gives the measured dark level."""
+    """Return the mean code at a number of electrons, shifted to the measured dark level at 0."""
     return sensor.mean(light, 1.0) + shift
 
 
 def _table(mean: Array, good: Array, curve: Callable[[Array], Array], largest: float) -> tuple[Array, Array]:
-    """(light, mean code) up to `WIDEST` times the light of the brightest place of the flat's smooth surface."""
+    """Return (light, mean code) [G] up to `WIDEST` times the brightest light of the flat's smooth surface."""
     basis = surface(mean.shape, int(good.sum()))
     fitted = basis @ np.linalg.lstsq(basis[good.ravel()], mean[good], rcond=None)[0]
     light = np.linspace(0, np.sqrt(max(largest, 1e-9)), 600) ** 2
@@ -156,9 +156,9 @@ def _table(mean: Array, good: Array, curve: Callable[[Array], Array], largest: f
 
 
 def _dark_level(darks: Sequence[FrameStatistics], exposure: float) -> tuple[Array, Array]:
-    """Dark code of every pixel at this exposure and its variance, [H, W].
+    """Return the dark code of every pixel at this exposure and its variance, both [H, W].
 
-    From the darks of this exposure; else from a straight line through all; else from the only exposure there is.
+    It comes from the darks of this exposure, else from a straight line through all, else from the only exposure.
     """
     same = [s for s in darks if abs(s.exposure / exposure - 1) < 1e-6]
     used = same or list(darks)

@@ -1,8 +1,8 @@
-"""Statistics of a stack of frames, one block at a time: everything that a calibration needs, in constant memory.
+"""Measures the statistics of a stack of frames, block by block in constant memory.
 
     codes [t, H, W], block after block  ->  histogram, per-pixel sums of x, x^2 and x_t x_(t+1)
 
-A million frames cost the same memory as one. Codes are integers; float arrays are taken if every value is one.
+A million frames need as much memory as one. Codes are integers; float arrays are accepted if every value is integer.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 
 @dataclass(frozen=True, eq=False)
 class FrameStatistics:
-    """What is kept of T frames at one exposure and one light level."""
+    """Statistics of T frames at one exposure and one light level."""
 
     frames: int
     exposure: float  # s
@@ -27,51 +27,61 @@ class FrameStatistics:
     lagged: Array  # float64 [H, W], sum of code(t) code(t + 1)
     first: Array  # float64 [H, W], the first and the last frame
     last: Array
-    dispersion: float = float("nan")  # of sums of planes: variance in time over that of a binomial; 1 is right
+    dispersion: float = float("nan")  # of sums of planes: variance in time over that of a binomial; 1 is expected
     sums: int = 0  # frames of sums that the planes came in
 
     @property
     def pixels(self) -> int:
+        """Return H * W."""
         return self.total.size
 
     @property
     def mean(self) -> float:
-        """Mean code over pixels and frames."""
+        """Return the mean code over pixels and frames."""
         return float(self.total.sum()) / (self.pixels * self.frames)
 
     @property
     def pixel_variance(self) -> Array:
-        """Unbiased variance over time of every pixel, [H, W]; NaN for a single frame."""
+        """Return the unbiased variance over time of every pixel, codes^2 [H, W]; NaN for a single frame."""
         if self.frames < 2:
             return np.full(self.total.shape, np.nan)
         return np.maximum(self.square - self.total**2 / self.frames, 0) / (self.frames - 1)
 
     @property
     def variance(self) -> float:
-        """Mean over pixels of the variance over time, codes^2: free of the fixed pattern; NaN for a single frame."""
+        """Return the mean over pixels of the variance over time, codes^2; NaN for a single frame.
+
+        The fixed pattern does not enter.
+        """
         return float(self.pixel_variance.mean())
 
     @property
     def fixed_pattern(self) -> float:
-        """Variance between the pixels' expected codes: spread of means less what time noise explains; may be < 0."""
+        """Return the variance between the pixels' expected codes, codes^2; may be negative by noise.
+
+        It is the variance of the pixels' means less the part that noise in time explains.
+        """
         if self.pixels < 2 or self.frames < 2:
             return float("nan")
         return float((self.total / self.frames).var(ddof=1)) - self.variance / self.frames
 
     def central_moment(self, order: int) -> float:
-        """Pooled central moment of the codes over pixels and frames."""
+        """Return the central moment of the codes, pooled over pixels and frames, codes^order."""
         codes = np.arange(self.histogram.size, dtype=float)
         share = self.histogram / self.histogram.sum()
         return float(share @ (codes - share @ codes) ** order)
 
     @property
     def saturated(self) -> float:
-        """Share of codes at the top level."""
+        """Return the share of codes at the top level."""
         return float(self.histogram[-1] / self.histogram.sum())
 
     @property
     def lag_covariance(self) -> float:
-        """Mean over pixels of the covariance of neighbouring frames, corrected for the fitted means; NaN below 3."""
+        """Return the mean over pixels of the covariance of neighbouring frames, codes^2; NaN below 3 frames.
+
+        It is corrected for the fitted means.
+        """
         t = self.frames
         if t < 3:
             return float("nan")
@@ -83,10 +93,11 @@ class FrameStatistics:
 def measure(
     blocks: Iterable[Array], *, bits: int, exposure: float, photons: float | None, name: str = "stack"
 ) -> FrameStatistics:
-    """Statistics of frames [t, H, W] or [H, W] that come block by block.
+    """Return the statistics of blocks of frames, each [t, H, W] or [H, W].
 
-    `ValueError` naming the stack, the frame and the pixel for codes that are no integers 0 ... 2^bits - 1, for frames
-    of different sizes, and for a stack without frames.
+    `exposure` in seconds; `photons` per pixel and exposure, 0 for dark frames, None if unknown. `ValueError` naming the
+    stack, the frame and the pixel for codes other than integers 0 ... 2^bits - 1. Frames of different sizes and a
+    stack without frames are refused too.
     """
     _check_light(exposure, photons, name)
     frames, sums = 0, None
@@ -116,11 +127,11 @@ def measure(
 def measure_sums(
     blocks: Iterable[Array], *, planes: int, exposure: float, photons: float | None, name: str = "stack"
 ) -> FrameStatistics:
-    """Frames [t, H, W] or [H, W] of which each value sums `planes` binary planes: the stack of all these planes.
+    """Return the statistics of binary planes from frames [t, H, W] or [H, W] whose values sum `planes` planes.
 
-    `exposure` and `photons` are those of one plane. All but the order of the planes is known, so every statistic is
-    that of the planes themselves except `lag_covariance`. Several sums also tell their `dispersion`. `ValueError` as
-    `measure`; values are 0 ... `planes`.
+    `exposure` and `photons` are those of one plane. Only the order of the planes is unknown, so every statistic except
+    `lag_covariance` equals that of the planes. `dispersion` needs at least 2 frames. `ValueError` as `measure`; values
+    are 0 ... `planes`.
     """
     if planes < 1:
         raise ValueError(f"{name}: sums hold at least 1 plane, got {planes}")
@@ -155,12 +166,12 @@ def _check_light(exposure: float, photons: float | None, name: str) -> None:
 
 
 def _as_codes(block: Array, bits: int, name: str, frame: int) -> Array:
-    """A block as integers [t, H, W]."""
+    """Return a block as integers [t, H, W]."""
     return _as_values(block, (1 << bits) - 1, f"code of {bits} bits", name, frame)
 
 
 def _as_values(block: Array, top: int, what: str, name: str, frame: int) -> Array:
-    """A block of values 0 ... `top` as integers [t, H, W]."""
+    """Return a block of values 0 ... `top` as integers [t, H, W]."""
     block = np.asarray(block)
     block = block[None] if block.ndim == 2 else block
     if block.ndim != 3 or block.size == 0:
@@ -176,7 +187,7 @@ def _as_values(block: Array, top: int, what: str, name: str, frame: int) -> Arra
         if top == 1 and block[t, y, x] > 1:
             cure = "; sums of N binary planes are calibrated with --planes N"
         raise ValueError(
-            f"{name}: {block[t, y, x]} at (t, y, x) = ({frame + t}, {y}, {x}) is no {what}, 0..{top}{cure}"
+            f"{name}: {block[t, y, x]} at (t, y, x) = ({frame + t}, {y}, {x}) is not a {what}, 0..{top}{cure}"
         )
     return block.astype(np.int64)
 

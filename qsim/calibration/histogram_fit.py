@@ -1,8 +1,8 @@
 """Fits the photon-counting histograms of a QIS by maximum likelihood, and tests the fit by chi-square.
 
-Model of a flat field of one light level: pixel p expects lambda (1 + s x_p) electrons, x_p normal with variance 1 (the
-PRNU s), plus dark electrons D t. All frames of a pixel share x_p, so codes of one pixel are not independent: the
-covariance of the fit is the sandwich I^-1 J I^-1, whose J holds that term (White, Econometrica 50, 1982).
+Model of a flat field at one light level: pixel p expects lambda (1 + s x_p) electrons and D t dark electrons. x_p is
+normal with variance 1, and s is the PRNU. All frames of a pixel share x_p, so codes of one pixel are not independent.
+The covariance of the fit is therefore the sandwich I^-1 J I^-1, whose J holds that term (White, Econometrica 50, 1982).
 Left out of the fit: a spread of the dark current, of the offset and of the read noise between pixels; lag between
 frames.
 """
@@ -22,14 +22,17 @@ from qsim.calibration.prnu import normal_nodes
 from qsim.sensor.qis import QIS
 
 NODES, WEIGHTS = normal_nodes(5)  # of the PRNU
-LONGEST_STEP = np.array([0.3, 5.0, 1.5])  # of ln gain, offset and ln read noise in one iteration
+LONGEST_STEP = np.array([0.3, 5.0, 1.5])  # in one iteration, of ln gain, offset [codes] and ln read noise
 
 
 @dataclass(frozen=True, eq=False)
 class HistogramFit:
-    """Parameters (ln gain, offset, ln read noise, dark current, light of every flat [e-]) and what is known of them."""
+    """Fitted parameters [m], their covariance, and the fitted histograms.
 
-    parameters: Array
+    Parameters: ln gain [codes/e-], offset [codes], ln read noise [e-], dark current [e-/s], light of every flat [e-].
+    """
+
+    parameters: Array  # [m]
     information: Array  # [m, m], of the pooled histograms
     covariance: Array  # [m, m], with the pixels' common factor
     log_likelihood: float
@@ -39,7 +42,10 @@ class HistogramFit:
 def fit_histograms(
     darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], bits: int, start: Array, prnu_value: float
 ) -> HistogramFit:
-    """Maximum likelihood of the pooled histograms of all stacks by Fisher scoring with step control."""
+    """Maximise the likelihood of the pooled histograms of all stacks, by Fisher scoring with step control.
+
+    `start` [m] holds the first parameters, `prnu_value` is s of the model.
+    """
     stacks = [*darks, *flats]
     parameters = start.copy()
     shares, jacobians, overdispersion = _model(stacks, len(darks), bits, parameters, prnu_value)
@@ -67,13 +73,13 @@ def fit_histograms(
     inverse = np.linalg.pinv(information, rcond=1e-13, hermitian=True)
     meat = information.copy()
     for stack, jacobian, extra in zip(stacks, jacobians, overdispersion, strict=True):
-        push = jacobian @ extra  # how the common factor of a pixel moves the score
+        push = jacobian @ extra  # derivative of the score by the common factor of a pixel
         meat += stack.pixels * stack.frames * (stack.frames - 1) * np.outer(push, push)
     return HistogramFit(parameters, information, inverse @ meat @ inverse, best, tuple(shares))
 
 
 def _lower_bounds(size: int) -> Array:
-    """ln gain and offset are free, read noise stays above 0.01 e-, dark current and light do not fall below 0."""
+    """Return the lower bounds: none for ln gain and offset, 0.01 e- of read noise, 0 for dark current and light."""
     return np.array([-inf, -inf, log(0.01), *[0.0] * (size - 3)])
 
 
@@ -82,7 +88,7 @@ def sensor_at(parameters: Array, bits: int) -> QIS:
 
 
 def _arrivals(stacks: Sequence[FrameStatistics], darks: int, parameters: Array, s: float) -> tuple[Array, Array, Array]:
-    """Expected electrons at the nodes of the PRNU [stack, node], the nodes' weights, and what light adds per unit."""
+    """Return expected electrons at the nodes of the PRNU [stack, node], the weights and the factors of the light."""
     dark = np.array([parameters[3] * stack.exposure for stack in stacks])
     light = np.concatenate([np.zeros(darks), parameters[4:]])
     nodes, weights = (NODES, WEIGHTS) if s > 0 else (np.zeros(1), np.ones(1))
@@ -90,12 +96,12 @@ def _arrivals(stacks: Sequence[FrameStatistics], darks: int, parameters: Array, 
 
 
 def _mix(table: Array, weights: Array) -> Array:
-    """[stack, node, levels] -> [stack, levels]."""
+    """Return the weighted mean over nodes: [stack, node, levels] -> [stack, levels]."""
     return np.tensordot(table, weights, axes=([1], [0]))
 
 
 def _shares(stacks: Sequence[FrameStatistics], darks: int, bits: int, parameters: Array, s: float) -> Array:
-    """P(code) of every stack, [stack, levels]."""
+    """Return P(code) of every stack, [stack, levels]."""
     arrivals, weights, _ = _arrivals(stacks, darks, parameters, s)
     return _mix(np.exp(sensor_at(parameters, bits).log_pmf(arrivals, 1.0)), weights)
 
@@ -103,7 +109,7 @@ def _shares(stacks: Sequence[FrameStatistics], darks: int, bits: int, parameters
 def _model(
     stacks: Sequence[FrameStatistics], darks: int, bits: int, parameters: Array, s: float
 ) -> tuple[Array, list[Array], list[Array]]:
-    """Per stack: P(code) [levels], d log P / d parameters [m, levels], and s lambda dP/dlambda [levels]."""
+    """Return per stack: P(code) [levels], d log P / d parameters [m, levels], and s lambda dP/dlambda [levels]."""
     shares = _shares(stacks, darks, bits, parameters, s)
     arrivals, weights, factors = _arrivals(stacks, darks, parameters, s)
     derivatives = np.zeros((parameters.size, *shares.shape))
@@ -132,7 +138,7 @@ def _log_likelihood(stacks: Sequence[FrameStatistics], shares: Sequence[Array] |
 def _information(
     stacks: Sequence[FrameStatistics], shares: Sequence[Array] | Array, jacobians: Sequence[Array]
 ) -> tuple[Array, Array]:
-    """Fisher information of the pooled histograms [m, m] and the score [m]."""
+    """Return the Fisher information of the pooled histograms [m, m] and the score [m]."""
     size = jacobians[0].shape[0]
     information, score = np.zeros((size, size)), np.zeros(size)
     for stack, p, jacobian in zip(stacks, shares, jacobians, strict=True):
@@ -145,9 +151,10 @@ def _information(
 def goodness(
     stacks: Sequence[FrameStatistics], shares: Sequence[Array], fitted: int
 ) -> tuple[float, tuple[Array, ...]]:
-    """Chi-square p-value of histograms against fitted shares, bins expected below 5 pooled, and residuals per level.
+    """Return the chi-square p-value of histograms against fitted shares, and residuals per level in sigmas.
 
-    The common factor of a pixel moves the codes like a change of light, which is fitted, so the test keeps its level.
+    Bins with an expectation below 5 are pooled. The common factor of a pixel acts on the codes like a change of light,
+    which is fitted; the test therefore keeps its level.
     """
     from scipy.stats import chi2
 
@@ -162,7 +169,7 @@ def goodness(
 
 
 def _pooled(observed: Array, expected: Array, least: float = 5.0) -> tuple[Array, Array]:
-    """Neighbouring bins joined until each expects at least `least`."""
+    """Join neighbouring bins until each expects at least `least`; return observed and expected counts."""
     group = np.minimum(np.floor(np.cumsum(expected) / least), max(np.floor(expected.sum() / least) - 1, 0)).astype(int)
     _, group = np.unique(group, return_inverse=True)
     return np.bincount(group, observed), np.bincount(group, expected)
@@ -171,7 +178,7 @@ def _pooled(observed: Array, expected: Array, least: float = 5.0) -> tuple[Array
 def best_fit(
     darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], bits: int, transfer: Transfer, s: float
 ) -> HistogramFit:
-    """The fit from the likeliest of a few starts: with resolved peaks a gain off by one peak is a local maximum."""
+    """Fit from the likeliest of a few starts: with resolved peaks, a gain off by one peak is a local maximum."""
     reach = min(3 * sqrt(transfer.gain_variance) / transfer.gain, 0.3)
     read = sqrt(max(transfer.read_variance, 0.05**2))
     stacks = [*darks, *flats]

@@ -14,7 +14,7 @@ from qsim.calibration.frame_statistics import FrameStatistics
 
 @dataclass(frozen=True)
 class Transfer:
-    """Gain, read noise, dark current and offset from means and variances, and the variance of gain and read noise^2."""
+    """Gain, read noise, dark current and offset from means and variances, with the variances of the estimates."""
 
     gain: float  # codes/e-
     offset: float  # codes
@@ -26,12 +26,13 @@ class Transfer:
 
 
 def photon_transfer(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics]) -> Transfer:
-    """Weighted straight line of variance over mean: slope = gain, height at the darkest stack = read noise + ADC noise.
+    """Fit a weighted straight line to variance over mean; its slope is the gain.
 
-    Mean and variance of one stack are correlated through the third moment: the residual v - g m of a stack has the
-    variance (mu4 - v^2 + g^2 v - 2 g mu3) / n. Means count from the darkest stack, whose own mean therefore enters all
-    the others, while its residual is that of v alone: generalised least squares with these covariances. The ADC adds
-    1/12 codes^2 (Janesick, Photon Transfer, SPIE 2007).
+    Its height at the darkest stack is read noise plus ADC noise; the ADC adds 1/12 codes^2 (Janesick, Photon Transfer,
+    SPIE 2007). Mean and variance of one stack are correlated through the third moment: the residual v - g m of a stack
+    has the variance (mu4 - v^2 + g^2 v - 2 g mu3) / n. Means are measured from that of the darkest stack. Its noise
+    therefore enters all others, while its own residual is that of v alone. The fit is a generalised least squares with
+    these covariances.
     """
     base = min(darks, key=lambda stack: stack.exposure)
     stacks = [base, *[s for s in darks if s is not base], *flats]
@@ -51,7 +52,7 @@ def photon_transfer(darks: Sequence[FrameStatistics], flats: Sequence[FrameStati
         covariance = np.linalg.inv(design.T @ weighted)
         height, slope = covariance @ (weighted.T @ variance)
         gain = max(float(slope), 1e-9)
-    # The dark mean grows with exposure: offset + gain D t. Its noise is also in the residuals that gave the gain
+    # The dark mean grows with exposure: offset + gain D t. Its noise also enters the residuals that gave the gain.
     dark_slope, dark_offset, slope_variance, levers = _dark_line(stacks[: len(darks)])
     dark_current = dark_slope / gain
     shared = np.diag((third - gain * variance) / n)
@@ -74,7 +75,10 @@ def photon_transfer(darks: Sequence[FrameStatistics], flats: Sequence[FrameStati
 
 
 def _dark_line(darks: Sequence[FrameStatistics]) -> tuple[float, float, float, Array]:
-    """Dark mean over exposure: slope [codes/s], offset [codes], variance of the slope, weights of the means in it."""
+    """Fit the dark mean over exposure.
+
+    Return the slope [codes/s], the offset [codes], the variance of the slope and the weights of the means in it.
+    """
     time = np.array([s.exposure for s in darks])
     mean = np.array([s.mean for s in darks])
     spread = np.array([s.central_moment(2) / (s.pixels * s.frames) for s in darks]) + 1e-18
@@ -89,7 +93,10 @@ def _dark_line(darks: Sequence[FrameStatistics]) -> tuple[float, float, float, A
 
 
 def spread_of_means(flats: Sequence[FrameStatistics], dark_mean: float) -> float:
-    """Relative variance between **all** pixels' means, shading and hot pixels included: what widens the histograms."""
+    """Return the relative variance between the means of **all** pixels, with shading and hot pixels.
+
+    This variance widens the histograms.
+    """
     best = (0.0, inf)
     for flat in flats:
         signal = flat.mean - dark_mean

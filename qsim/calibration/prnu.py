@@ -1,4 +1,4 @@
-"""PRNU of the good pixels: what the light's shading, noise, dark counts and hot pixels leave of the spread of a flat.
+"""Measures the PRNU of a flat field, without shading of the light, noise, dark counts and hot pixels.
 
     mean code of every pixel - its own dark level  --smooth surface (shading of the light)-->  residuals
     residuals^2 - noise = spread that a PRNU s would cause, by the sensor's own curve of mean code against light -> s
@@ -6,9 +6,9 @@
 Model: pixel p gets the light L_p (1 + s x_p); L is smooth over the field, x_p is normal with variance 1. The interval
 is that of a difference of two variances (Ting et al., J. Stat. Comput. Simul. 35, 1990, without the cross term).
 
-Hot pixels do not take part. With dark frames they are told by their dark level (`hot_by_rate`, `hot_by_level`), without
-by a flat level above `OUTLIER` robust standard deviations. What varies more slowly over the field than a polynomial of
-fourth degree counts as light, not as PRNU.
+Hot pixels are left out. With dark frames they are found by their dark level (`hot_by_rate`, `hot_by_level`). Without,
+they are found by a flat level above `OUTLIER` robust standard deviations. Variations slower than a polynomial of fourth
+degree over the field count as light, not as PRNU.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from qsim.calibration.results import Value
 
 HOT = 10.0  # times the median dark rate
 OUTLIER = 6.0  # robust standard deviations (1.4826 times the median absolute deviation)
-CERTAIN = 5.0  # standard errors by which a hot pixel exceeds the median at least
-WIDEST = 3.5  # the response is tabled up to so many times the brightest light of a flat
-STEEPEST = 1.0  # largest PRNU that is looked for
+CERTAIN = 5.0  # standard errors; a hot pixel exceeds the median by more
+WIDEST = 3.5  # the table of the response ends at this multiple of the brightest light of a flat
+STEEPEST = 1.0  # largest PRNU that is searched for
 BY_DARK = "by the dark frames"
 BY_FLAT = f"by the flat: {OUTLIER:g} robust sigmas above its smooth surface"
 
@@ -42,27 +42,27 @@ NODES, WEIGHTS = normal_nodes(9)
 
 @dataclass(frozen=True, eq=False)
 class Flat:
-    """One flat field, dark levels taken off: per pixel the mean code, the variance of that mean, and the response."""
+    """One flat field without dark levels: per pixel the mean code, the variance of that mean, and the response."""
 
     mean: Array  # [H, W] codes; the mean dark level of the good pixels is left in
-    noise: Array  # [H, W] codes^2, variance of `mean` by noise, of flat and dark
+    noise: Array  # [H, W] codes^2, variance of `mean` by the noise of flat and dark frames
     light: Array  # [G] rising light, in electrons or avalanches per exposure, from 0
     codes: Array  # [G] mean code of a pixel of average dark level at that light
-    raw: Array  # [H, W] codes, the mean before its dark level was taken off
+    raw: Array  # [H, W] codes, the mean with its dark level
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """PRNU of the good pixels, of all pixels, and which pixels were left out."""
+    """PRNU of the good pixels and of all pixels, and the pixels left out."""
 
     prnu: Value
     with_hot: Value
     left_out: Array  # bool [H, W]
     rule: str  # by which pixels were left out
-    shading: float  # rms of the smooth part of the light, relative
+    shading: float  # rms of the smooth part of the light, relative to its mean
 
     def values(self) -> dict[str, Value]:
-        """As values of a calibration; the PRNU of all pixels only where some were left out."""
+        """Return the values of a calibration; the PRNU of all pixels is one of them if some were left out."""
         count = float(self.left_out.sum())
         found = {"prnu": self.prnu}
         if count:
@@ -75,24 +75,27 @@ class Pattern:
 
 
 def robust_sigma(values: Array) -> float:
-    """1.4826 times the median absolute deviation: the standard deviation of a normal sample with outliers."""
+    """Return 1.4826 times the median absolute deviation: the standard deviation of a normal sample with outliers."""
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
 def hot_by_rate(counts: Array) -> Array:
-    """Hot pixels of dark counts [H, W] (expected counts over all dark frames): above 10 medians, and surely so."""
+    """Return the hot pixels by their expected counts over all dark frames [H, W]: significantly above 10 medians."""
     median = float(np.median(counts))
     return np.asarray(counts > np.maximum(HOT * median, median + CERTAIN * sqrt(median + 1)))
 
 
 def hot_by_level(level: Array, error: float) -> Array:
-    """Hot pixels of dark levels [H, W] with an offset: above the median by 6 robust sigmas and 5 standard errors."""
+    """Return the hot pixels by dark levels with an offset [H, W].
+
+    They exceed the median by 6 robust sigmas and 5 standard errors.
+    """
     median = float(np.median(level))
     return np.asarray(level > median + max(OUTLIER * robust_sigma(level), CERTAIN * error))
 
 
 def surface(shape: tuple[int, int], pixels: int) -> Array:
-    """Polynomials over the field [H * W, terms]: fourth degree, second below 100 pixels, a constant below 20."""
+    """Return polynomials over the field [H * W, terms]: fourth degree, second below 100 pixels, constant below 20."""
     degree = 4 if pixels >= 100 else 2 if pixels >= 20 else 0
     y, x = (np.linspace(-1, 1, n) if n > 1 else np.zeros(1) for n in shape)
     terms = [
@@ -104,7 +107,7 @@ def surface(shape: tuple[int, int], pixels: int) -> Array:
 
 
 def outliers(flat: Flat) -> Array:
-    """Pixels of a flat [H, W] that exceed its smooth surface by 6 robust sigmas: hot ones, if no darks tell."""
+    """Return the pixels of a flat [H, W] above its smooth surface by 6 robust sigmas: hot ones, without dark frames."""
     values = flat.mean.ravel()
     basis = surface(flat.mean.shape, values.size)
     good = np.abs(values - np.median(values)) <= OUTLIER * robust_sigma(values)
@@ -121,7 +124,7 @@ def outliers(flat: Flat) -> Array:
 
 
 def relative_noise(flat: Flat, good: Array) -> float:
-    """Variance of a pixel's mean over the square of what a relative change of the light moves: small is best."""
+    """Return the variance of a pixel's mean over the square of its slope by relative light; the smallest is best."""
     level = float(flat.mean[good].mean())
     light = float(np.interp(level, flat.codes, flat.light))
     slope = float(np.interp(light, flat.light, np.gradient(flat.codes, flat.light)))
@@ -130,9 +133,9 @@ def relative_noise(flat: Flat, good: Array) -> float:
 
 
 def measure_pattern(flats: Sequence[Flat], hot: Array | None) -> Pattern | None:
-    """PRNU from the flat that tells it best (all share one pattern); None where no flat tells anything.
+    """Measure PRNU in the flat with the least relative noise; None if no flat has light above its dark level.
 
-    `hot` [H, W] is by the dark frames; None: the outliers of the flat.
+    All flats share one pattern. `hot` [H, W] are the hot pixels by the dark frames; if None, outliers of the flat.
     """
     best: tuple[float, Flat, Array] | None = None
     for flat in flats:
@@ -150,7 +153,7 @@ def measure_pattern(flats: Sequence[Flat], hot: Array | None) -> Pattern | None:
 
 
 def _of_all(flat: Flat, good: Array) -> Value:
-    """Spread of all pixels about the smooth surface of the good ones, in the light of the good ones."""
+    """Return the spread of all pixels about the smooth surface of the good ones, relative to their light."""
     basis = surface(flat.raw.shape, int(good.sum()))
     fitted = basis @ np.linalg.lstsq(basis[good.ravel()], flat.raw[good], rcond=None)[0]
     residual = flat.raw.ravel() - fitted
@@ -163,7 +166,7 @@ def _of_all(flat: Flat, good: Array) -> Value:
 
 
 def _of_good(flat: Flat, good: Array) -> tuple[Value, float]:
-    """PRNU of the good pixels with its interval, and the rms of the shading."""
+    """Return the PRNU of the good pixels with its interval, and the rms of the shading."""
     basis = surface(flat.mean.shape, int(good.sum()))[good.ravel()]
     level, noise = flat.mean[good], flat.noise[good]
     model = _Model(flat)
@@ -175,7 +178,7 @@ def _of_good(flat: Flat, good: Array) -> tuple[Value, float]:
         fitted = (orthonormal @ (orthonormal.T @ (root * level))) / root
         squares = (level - fitted) ** 2 / (1 - leverage)
         share = np.maximum(fitted - flat.codes[0], 1e-12)
-        even = float(noise.mean()) * share / float(share.mean())  # smooth: a pixel's own noise estimate would bias
+        even = float(noise.mean()) * share / float(share.mean())  # smooth, because each pixel's estimate would bias
         shape = np.maximum(model.variance(fitted, max(s, 0.01)), 1e-30)
         total = shape + even
         gain = shape / total**2
@@ -196,11 +199,11 @@ def _of_good(flat: Flat, good: Array) -> tuple[Value, float]:
 
 
 def difference_interval(first: float, of_first: float, second: float, of_second: float) -> tuple[float, float]:
-    """95 % interval of the difference of two variance estimates with the variances `of_first` and `of_second`."""
+    """Return the 95 % interval of a difference of two variance estimates; `of_...` are their variances."""
     from scipy.stats import chi2
 
     def reach(value: float, variance: float) -> tuple[float, float]:
-        """How far chi-square lets the true value lie below and above, relative."""
+        """Return how far the true value may lie below and above by chi-square, relative."""
         if variance <= 0 or value <= 0:
             return 0.0, 0.0
         freedom = max(2 * value**2 / variance, 1.0)
@@ -209,26 +212,26 @@ def difference_interval(first: float, of_first: float, second: float, of_second:
 
     (down, up), (down_noise, up_noise) = reach(first, of_first), reach(second, of_second)
     low = first - second - sqrt((down * first) ** 2 + (up_noise * second) ** 2)
-    most = max(first, second)  # the upper end is never below what data without any pattern would leave open
+    most = max(first, second)  # the upper end is at least that of data without any pattern
     return low, most - second + sqrt((up * most) ** 2 + (down_noise * second) ** 2)
 
 
 class _Model:
-    """Variance between pixels of one expected code that a PRNU causes, by the response curve."""
+    """Variance between pixels of one expected code that a PRNU causes, from the response curve."""
 
     def __init__(self, flat: Flat) -> None:
         self.light, self.codes = flat.light, flat.codes
         self.grid = np.linspace(0, np.sqrt(flat.light[-1] / WIDEST), 400) ** 2
 
     def variance(self, expected: Array, s: float) -> Array:
-        """At expected codes [N]: variance between pixels [N], codes^2."""
+        """Return the variance between pixels [N], codes^2, at expected codes [N] for a PRNU `s`."""
         light = self.grid[:, None] * np.maximum(1 + s * NODES, 0)
         codes = np.interp(light, self.light, self.codes)
         mean = codes @ WEIGHTS
         return np.interp(expected, mean, np.maximum(codes**2 @ WEIGHTS - mean**2, 0))
 
     def inverse(self, expected: Array, gain: Array, wanted: float) -> float:
-        """The PRNU at which sum gain x variance is `wanted`, 0 ... STEEPEST."""
+        """Return the PRNU, 0 ... STEEPEST, at which the sum of gain x variance is `wanted`."""
         if wanted <= 0:
             return 0.0
         edges = np.linspace(float(expected.min()), float(expected.max()), 65)

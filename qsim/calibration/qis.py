@@ -1,9 +1,9 @@
 """Calibrates a QIS: dark and flat frames -> its parameters, each with a 95 % interval.
 
     stacks (frame_statistics.py) --histogram_fit.py: maximum likelihood with the sensor's exact cdf--> QIS
-                                 --photon_transfer.py: mean and variance against light-----------> a second opinion
+                                 --photon_transfer.py: mean and variance against light-----------> a second estimate
 
-The PRNU that is reported comes from prnu.py: without hot pixels, without a gradient of the light.
+The reported PRNU comes from prnu.py, without hot pixels and without a gradient of the light.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from qsim.calibration.photon_transfer import photon_transfer, spread_of_means
 from qsim.calibration.prnu import measure_pattern
 from qsim.calibration.results import Calibration, Value, log_interval, normal_interval, odd_efficiency, root_interval
 
-HIDDEN_PEAKS = 0.5  # e-: above this read noise the histogram has no separate electron peaks
+HIDDEN_PEAKS = 0.5  # e-; above this read noise the histogram has no separate electron peaks
 
 
 def calibrate_qis(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics], *, bits: int) -> Calibration:
-    """Gain, offset, read noise, dark current, PRNU and, where the flats' photons are known, QE of a QIS.
+    """Estimate gain, offset, read noise, dark current, PRNU and, if the flats' photons are known, QE of a QIS.
 
     Values named `..._transfer` come from means and variances, the others from the histograms. `ValueError` if there is
-    no dark or no flat stack, or if nothing varies.
+    no dark or no flat stack, or if a stack is constant.
     """
     check_stacks(darks, flats)
     if bits < 2:
@@ -42,7 +42,10 @@ def calibrate_qis(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatist
         if np.count_nonzero(stack.histogram) < 2:
             where = f"dark {i}" if i < len(darks) else f"flat {i - len(darks)}"
             code = int(np.argmax(stack.histogram))
-            raise ValueError(f"calibrate: every code of {where} is {code}: nothing varies, nothing can be told")
+            raise ValueError(
+                f"calibrate: every code of {where} is {code}; calibration needs codes that vary: change the light or "
+                "the exposure"
+            )
     warnings = _advice(darks, flats)
     transfer = photon_transfer(darks, flats)
     if not (isfinite(transfer.gain) and transfer.gain > 1e-8):
@@ -87,7 +90,7 @@ def calibrate_qis(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatist
 
 
 def _efficiency(flats: Sequence[FrameStatistics], fit: HistogramFit) -> dict[str, Value]:
-    """Electrons per photon, where a light standard gave the photons of the flats."""
+    """Return the electrons per photon, if a light standard gave the photons of the flats."""
     known = [i for i, flat in enumerate(flats) if flat.photons]
     if not known:
         return {}
@@ -102,7 +105,7 @@ def _efficiency(flats: Sequence[FrameStatistics], fit: HistogramFit) -> dict[str
 
 
 def _advice(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics]) -> list[str]:
-    """What these data cannot tell."""
+    """Return warnings about parameters that these data determine badly."""
     words = []
     if any(stack.frames < 2 for stack in (*darks, *flats)):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What a calibration answers with: values, their 95 % intervals, and the record of all that was found."""
+"""Holds the results of a calibration: values with 95 % intervals, warnings, residuals and maps."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class Value:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What was found: `values` by name, what the data cannot tell in `warnings`, and the fit's goodness."""
+    """Results of a calibration: `values` by name, the limits of the data in `warnings`, and the goodness of the fit."""
 
     model: str  # QIS, BinarySPAD or CountingSPAD
     bits: int
     values: Mapping[str, Value]
-    p_value: float  # of the fitted histograms; small means: the model is wrong. NaN where nothing is left to test
+    p_value: float  # of the fitted histograms; if small, the model is wrong; NaN without degrees of freedom
     warnings: tuple[str, ...] = ()
     residuals: tuple[Array, ...] = field(default=(), repr=False)  # per stack, (observed - fitted) / sigma per level
     maps: Mapping[str, Array] = field(default_factory=dict, repr=False)  # [H, W]
@@ -41,26 +41,26 @@ class Calibration:
 
 
 def normal_interval(value: float, variance: float, unit: str, method: str, *, floor: float = -inf) -> Value:
-    """value +- 1.96 sigma, cut at `floor`."""
+    """Return value +- 1.96 sigma, cut at `floor`."""
     reach = Z95 * sqrt(max(variance, 0.0))
     return Value(max(value, floor), max(value - reach, floor), max(value + reach, floor), unit, method)
 
 
 def log_interval(value: float, log_variance: float, unit: str, method: str) -> Value:
-    """value times e^(+-1.96 sigma): the interval of a positive scale."""
+    """Return value times e^(+-1.96 sigma): the interval of a positive scale."""
     factor = exp(min(Z95 * sqrt(max(log_variance, 0.0)), 700.0))
     return Value(value, value / factor, value * factor, unit, method)
 
 
 def root_interval(square: float, variance: float, unit: str, method: str) -> Value:
-    """Interval of a standard deviation from that of its square; the square may be below 0 by noise."""
+    """Return the interval of a standard deviation from that of its square, which noise may make negative."""
     reach = Z95 * sqrt(variance)
     low, middle, high = (sqrt(max(x, 0.0)) for x in (square - reach, square, square + reach))
     return Value(middle, low, high, unit, method)
 
 
 def odd_efficiency(found: Value) -> list[str]:
-    """A warning if an efficiency is surely above 1, which the sensor file cannot hold; `ValueError` if it is 0."""
+    """Return a warning if an efficiency is significantly above 1, which no sensor file holds; `ValueError` if 0."""
     if found.value <= 0:
         raise ValueError(
             "calibrate: the flats of known light hold no more counts than the dark frames; are --dark and --flat "

@@ -1,6 +1,6 @@
-"""A calibration in files: frames in; a sensor file with its sources, all values, a residual plot and maps out.
+"""Reads frames for a calibration, and writes its sensor file, values, residual plot and map of dark counts.
 
-SENSOR.toml         a device that `--sensor SENSOR.toml` takes
+SENSOR.toml         a device for `--sensor SENSOR.toml`, each number with its source
 SENSOR.json         every value with its interval, the warnings and the goodness of the fit
 SENSOR.png          residuals of the histograms, in sigmas
 SENSOR_dark.npy     DCR map [1/s], float32 [H, W] (SPAD)
@@ -43,10 +43,11 @@ def read_stack(
     planes: int | None = None,
     variable: str | None = None,
 ) -> FrameStatistics:
-    """Statistics of frames: `.npy` of codes (floats too, if they are whole), TIFF, or any capture of `convert`.
+    """Return the statistics of the frames in a file: `.npy` of integer values, TIFF, or any recording of `convert`.
 
-    `width` says that an `.npy` is a photon cube of packed planes, `planes` that every value is the sum of so many
-    binary planes, `variable` which array of a `.mat` to take. `ValueError` or `FileNotFoundError` naming the file.
+    `exposure` in seconds, `photons` per pixel and exposure. With `width` an `.npy` is a photon cube of packed planes;
+    with `planes` every value sums this number of binary planes; `variable` names an array of a `.mat`. `ValueError` or
+    `FileNotFoundError` naming the file.
     """
     if planes is None:
         blocks = _blocks(path, bits, width, variable)
@@ -71,7 +72,10 @@ def _blocks(path: Path, bits: int, width: int | None, variable: str | None) -> I
 
 
 def read_counts(path: Path, variable: str | None = None) -> Array:
-    """Frames [T, H, W] of an `.npy`, mapped, or of a `.mat`; `ValueError` or `FileNotFoundError` naming the file."""
+    """Return the frames [T, H, W] of an `.npy`, mapped, or of a `.mat`.
+
+    `ValueError` or `FileNotFoundError` naming the file.
+    """
     if path.suffix == ".mat":
         return mat_array(path, variable)
     if variable is not None:
@@ -90,7 +94,7 @@ def _array_blocks(array: Array) -> Iterator[Array]:
 
 
 def sensor_of(found: Calibration) -> Sensor:
-    """The sensor that a calibration describes; an efficiency that was not measured is 1 (light in detected photons)."""
+    """Return the sensor that a calibration describes; an unmeasured efficiency is 1 (light in detected photons)."""
     value = {name: v.value for name, v in found.values.items()}
     if found.model == "QIS":
         efficiency = min(value.get("quantum_efficiency", 1.0), 1.0)
@@ -107,9 +111,9 @@ _FIELDS = {"quantum_efficiency": ("quantum_efficiency",), "pde": ("pde_fill",)}
 
 
 def to_toml(found: Calibration, title: str, dark_map: str | None = None) -> str:
-    """The sensor as a device file, each number with its interval and method as its source.
+    """Return the sensor as a device file, each number with its interval and method as its source.
 
-    The map of dark counts is offered in a comment: it fits frames that are no larger than it.
+    The map of dark counts stands in a comment, because it fits only frames that are not larger.
     """
     lines = [f"# {title}", "[sensor]"]
     described = sensor_of(found).to_dict()
@@ -134,7 +138,7 @@ def _toml(value: object) -> str:
 
 
 def as_dict(found: Calibration) -> dict[str, Any]:
-    """Values, warnings and goodness for programs; NaN becomes null."""
+    """Return values, warnings and goodness for JSON; NaN becomes null."""
     return {
         "model": found.model,
         "bits": found.bits,
@@ -145,7 +149,7 @@ def as_dict(found: Calibration) -> dict[str, Any]:
 
 
 def figure(found: Calibration) -> bytes:
-    """Residuals of every stack's histogram in sigmas, as PNG; a good fit scatters between -2 and 2."""
+    """Return the residuals of every stack's histogram in sigmas as PNG; those of a good fit lie between -2 and 2."""
     drawing = new_figure(7, 3.2)
     axes = drawing.subplots()
     for i, residual in enumerate(found.residuals):
@@ -161,7 +165,7 @@ def figure(found: Calibration) -> bytes:
 
 
 def write(found: Calibration, path: Path, title: str) -> list[Path]:
-    """All files of a calibration; the sensor file comes last. Returns their paths."""
+    """Write all files of a calibration, the sensor file last; return their paths."""
     written = [path.with_suffix(".json"), path.with_suffix(".png")]
     dark_map = path.with_name(f"{path.stem}_dark.npy") if "dark_count_rate" in found.maps else None
     files.write_json(written[0], as_dict(found))

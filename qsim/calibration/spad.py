@@ -1,12 +1,12 @@
-"""Dark and flat counts of a SPAD array -> dark-count map, detection efficiency, PRNU, dead time, afterpulsing.
+"""Calibrates a SPAD array: dark and flat counts -> dark-count map, efficiency, PRNU, dead time, afterpulsing.
 
     1-bit planes:  arrivals of a pixel = -ln(1 - ones/frames)          counts: arrivals = counts, dead time corrected
 
 Every number describes this array: DCR and PDE are means over its pixels, so their intervals hold shot noise alone.
-Detection efficiency times fill factor is found up to the light standard that gave the photons of the flats.
-Dead time comes from the Fano factor against flux: counts spread less than Poisson where avalanches block their
-followers. Afterpulsing comes from the correlation of neighbouring frames. Left out: a spread of dead time between
-pixels, crosstalk, afterpulses within one frame.
+Detection efficiency times fill factor is measured relative to the light standard that gave the photons of the flats.
+Dead time comes from the Fano factor against flux: the variance of counts is below Poisson where an avalanche blocks the
+next. Afterpulsing comes from the correlation of neighbouring frames. Left out: a spread of dead time between pixels,
+crosstalk, afterpulses within one frame.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from qsim.calibration.prnu import BY_FLAT, HOT, measure_pattern
 from qsim.calibration.results import Z95, Calibration, Value, normal_interval, odd_efficiency
 from qsim.sensor.counting import CountingSPAD
 
-NO_EVENT_BOUND = -log(0.025)  # expected events that give none in 2.5 % of the cases: bound of a two-sided 95 %
-PERCENTILES = (1, 10, 25, 75, 90, 99, 99.9)  # of the DCR map, beside the median
+NO_EVENT_BOUND = -log(0.025)  # expected events at which none occurs in 2.5 % of the cases: end of a two-sided 95 %
+PERCENTILES = (1, 10, 25, 75, 90, 99, 99.9)  # of the DCR map, in addition to the median
 
 
 def calibrate_spad(
@@ -37,10 +37,10 @@ def calibrate_spad(
     dead_time: bool = True,
     paralyzable: bool = False,
 ) -> Calibration:
-    """DCR (and its map), PDE x fill, PRNU, afterpulsing and, for counts of more than one bit, dead time.
+    """Estimate DCR (and its map), PDE x fill, PRNU, afterpulsing and, for counts of more than one bit, dead time.
 
-    `dead_time=False` takes the counts as Poisson; the p-value tells whether that holds. `darks` may be missing (DCR is
-    then taken as 0 and said so), and so may `flats`. `ValueError` if both are.
+    `dead_time=False` assumes Poisson counts; the p-value shows whether that holds. Without `darks` the DCR is assumed
+    to be 0, with a warning. `flats` may be missing; `ValueError` if both are.
     """
     check_stacks(darks, flats)
     warnings = _dispersed([*darks, *flats])
@@ -74,7 +74,7 @@ def calibrate_spad(
             if not darks and pattern.left_out.any():
                 warnings.append(f"{pattern.left_out.sum()} pixels left out of PRNU as hot {BY_FLAT}")
         else:
-            warnings.append("PRNU: one frame, or no light above the dark counts, tells nothing of it")
+            warnings.append("PRNU is not measured: the flats have one frame, or no light above the dark counts")
     if fano is not None:
         exposure = flats[0].exposure
         method = "Fano factor against flux" + (", paralyzable" if paralyzable else "")
@@ -94,7 +94,7 @@ def calibrate_spad(
 
 
 def _distribution(rates: Array) -> dict[str, Value]:
-    """Median and percentiles of the DCR map (order statistics), and the share of hot pixels (Wilson's interval)."""
+    """Return median and percentiles of a DCR map [H, W] (order statistics), and the share of hot pixels (Wilson)."""
     from scipy.stats import binomtest
 
     ordered = np.sort(rates.ravel())
@@ -124,9 +124,9 @@ def _distribution(rates: Array) -> dict[str, Value]:
 def _efficiency(
     flats: Sequence[FrameStatistics], darks: Sequence[FrameStatistics], response: Response, ratio_variance: float
 ) -> dict[str, Value]:
-    """PDE x fill: avalanches per photon of the light standard, flats weighed by their certainty.
+    """Return PDE x fill: avalanches per photon of the light standard, weighted mean of the flats.
 
-    The dead time's own uncertainty moves all flats together.
+    The uncertainty of the dead time is common to all flats.
     """
     known = [(flat, flat.photons) for flat in flats if flat.photons]
     if not known:
@@ -157,7 +157,7 @@ def _efficiency(
 
 
 def _spread(flats: Sequence[FrameStatistics], darks: Sequence[FrameStatistics], response: Response) -> float:
-    """Relative spread of the light over **all** pixels, shading and hot ones included: widens the histograms."""
+    """Return the relative spread of light over **all** pixels, with shading and hot pixels; it widens histograms."""
     rate = dark_rates(darks, response)[0] if darks else np.zeros(1)
     dark_spread = sum(max(s.fixed_pattern, 0.0) / s.exposure**2 for s in darks if s.frames > 1) / max(len(darks), 1)
     best = (0.0, inf)
@@ -175,14 +175,14 @@ def _spread(flats: Sequence[FrameStatistics], darks: Sequence[FrameStatistics], 
 
 
 def _dispersed(stacks: Sequence[FrameStatistics]) -> list[str]:
-    """Sums of planes that scatter in time more or less than a binomial: wrong number of planes, or unsteady light."""
+    """Return warnings about sums of planes whose variance in time is not binomial."""
     words = []
     for i, stack in enumerate(stacks):
         error = sqrt(2 / (stack.pixels * max(stack.sums - 1, 1)))
         if isfinite(stack.dispersion) and abs(stack.dispersion - 1) > max(5 * error, 0.02):
             words.append(
-                f"stack {i}: its sums scatter {stack.dispersion:.2f} times as much in time as so many planes would: "
-                "another number of planes, light that is not steady, or afterpulses"
+                f"stack {i}: its sums scatter {stack.dispersion:.2f} times as much in time as this number of planes "
+                "would: another number of planes, light that is not steady, or afterpulses"
             )
     if stacks and all(stack.sums or (stack.frames and not isfinite(stack.lag_covariance)) for stack in stacks):
         words.append("sums of planes do not keep their order: afterpulsing is not measured")
@@ -190,7 +190,7 @@ def _dispersed(stacks: Sequence[FrameStatistics]) -> list[str]:
 
 
 def _saturation(flats: Sequence[FrameStatistics]) -> list[str]:
-    """Flats in which some pixels never leave the top code."""
+    """Return warnings about flats in which some pixels hold the top code in every frame."""
     words = []
     for i, flat in enumerate(flats):
         full = float((flat.total >= flat.frames * (flat.histogram.size - 1)).mean())
@@ -203,7 +203,7 @@ def _saturation(flats: Sequence[FrameStatistics]) -> list[str]:
 
 
 def _afterpulsing(stacks: Sequence[FrameStatistics], bits: int) -> dict[str, Value]:
-    """Chance that a count is followed by an extra one in the next frame, from neighbouring frames, all stacks together.
+    """Return the probability that a count causes another one in the next frame, from neighbouring frames of all stacks.
 
     Counts: Cov(x_t, x_t+1) = a Var(x). Planes: P(1 | 1 before) - P(1 | 0 before) = a (1 - P(1 | 0 before)).
     """
@@ -226,7 +226,7 @@ def _afterpulsing(stacks: Sequence[FrameStatistics], bits: int) -> dict[str, Val
 def _goodness(
     flats: Sequence[FrameStatistics], bits: int, ratio: float, s: float, paralyzable: bool, fitted: int
 ) -> tuple[float, tuple[Array, ...]]:
-    """Flats' histograms against the model at each flat's own mean and PRNU `s`; NaN for 1-bit planes."""
+    """Compare the flats' histograms with the model at each flat's own mean and PRNU `s`; NaN for 1-bit planes."""
     if bits == 1 or not flats:
         return nan, ()
     sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)

@@ -1,10 +1,10 @@
-"""What a recipe will cost: one tiny job of each kind is rendered here, and the whole is multiplied out.
+"""Forecasts the cost of a recipe: measures a few frames of each kind of job and multiplies.
 
-A kind is a family with its render settings. Of each, a job's scene is loaded, its budget chosen, and a few frames are
-rendered, sensed and stored in a temporary folder. Scenes of one family differ, some in samples per pixel by ten times:
-the budgets of a few more jobs are chosen too, and a frame of theirs is taken to cost as much more as its samples say.
-Both clocks are read: wall time is what to wait for on a machine as busy as it is now, processor time is what the work
-needs, and what a real run can fairly be compared with (every job's log says both).
+A kind is a family with its render settings. For one job of each kind the scene is loaded, the budget chosen, and a few
+frames are rendered, sensed and stored in a temporary folder. Scenes of one family differ by up to ten times in samples
+per pixel. The budgets of a few more jobs are therefore chosen too, and the time of a frame is scaled by its samples.
+Two clocks are read. Wall time tells how long to wait on a machine as busy as now; processor time is what the work
+needs, and can be compared with a real run, whose logs hold both.
 """
 
 from __future__ import annotations
@@ -29,41 +29,43 @@ from qsim.rendering.budget import Budget
 from qsim.rendering.denoiser import DENOISE_COST
 from qsim.tables import text_table
 
-START = 3.0  # s, a fresh worker process with its renderer; measured on two cores, shared by Limits.jobs jobs
-LOOKED_AT = 5  # jobs of a kind whose budgets are chosen, at most
+START = 3.0  # s, start of a worker process with its renderer, once per Limits.jobs jobs; measured on two cores
+LOOKED_AT = 5  # largest number of jobs of a kind whose budgets are chosen
 
 
 class Seconds(NamedTuple):
-    """The same work on two clocks."""
+    """Time of the same work on two clocks [s]."""
 
     wall: float
     processor: float  # of all threads
 
     @staticmethod
     def now() -> Seconds:
+        """Return the reading of both clocks."""
         return Seconds(time.perf_counter(), time.process_time())
 
     def since(self, before: Seconds) -> Seconds:
+        """Return the time between two readings."""
         return Seconds(self.wall - before.wall, self.processor - before.processor)
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What one kind of job was measured to cost, and how often it is asked for."""
+    """Measured cost of one kind of job, and the number of its clips and frames."""
 
     family: str
     size: tuple[int, int]  # height, width
     clips: int
     frames: int  # of all clips together
-    setup: Seconds  # per clip: scene, budget, first frame's compilation
-    samples: tuple[int, int]  # per pixel, the fewest and the most of the budgets that were looked at
-    per_frame: Seconds  # rendering and storing, the mean of those
+    setup: Seconds  # per clip: scene, budget, compilation with the first frame
+    samples: tuple[int, int]  # per pixel, the fewest and the most of the chosen budgets
+    per_frame: Seconds  # rendering and storing, mean over the chosen budgets
     sensing: Seconds  # per frame, all streams
-    frame_bytes: float  # of radiance, truth and streams
+    frame_bytes: float  # radiance, ground truth and streams [bytes]
 
     @property
     def seconds(self) -> Seconds:
-        """Of all clips together."""
+        """Return the time of all clips together."""
         wall, processor = (
             self.clips * setup + self.frames * (per_frame + sensing)
             for setup, per_frame, sensing in zip(self.setup, self.per_frame, self.sensing, strict=True)
@@ -72,40 +74,45 @@ class Cost:
 
     @property
     def hours(self) -> float:
+        """Return the wall time of all clips together [h]."""
         return self.seconds.wall / 3600
 
     @property
     def gigabytes(self) -> float:
+        """Return the size of all clips together [GB]."""
         return self.frames * self.frame_bytes / 1e9
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """A forecast for this machine, one worker process."""
+    """Forecast for this machine and one worker process."""
 
     costs: tuple[Cost, ...]
-    engine: str  # what rendered here
+    engine: str  # backend and variant that rendered
     peak_memory: float  # GiB of one worker
 
     @property
     def starts(self) -> float:
-        """Seconds that starting worker processes takes, on either clock."""
+        """Return the time that starting worker processes takes, on either clock [s]."""
         return START * sum(cost.clips for cost in self.costs) / Limits().jobs
 
     @property
     def hours(self) -> float:
+        """Return the wall time of everything [h]."""
         return (sum(cost.seconds.wall for cost in self.costs) + self.starts) / 3600
 
     @property
     def processor_hours(self) -> float:
+        """Return the processor time of everything [h]."""
         return (sum(cost.seconds.processor for cost in self.costs) + self.starts) / 3600
 
     @property
     def gigabytes(self) -> float:
+        """Return the size of everything [GB]."""
         return sum(cost.gigabytes for cost in self.costs)
 
     def to_dict(self) -> dict[str, Any]:
-        """For --json."""
+        """Return the forecast for --json."""
         rows = []
         for cost in self.costs:
             clocks = ("setup", "per_frame", "sensing")
@@ -116,7 +123,7 @@ class Forecast:
         return totals | {"peak_memory_gib": self.peak_memory, "engine": self.engine, "kinds": rows}
 
     def lines(self, machines: int) -> list[str]:
-        """The forecast as text."""
+        """Return the forecast as lines of text, for this many equal machines."""
         header = ("family", "size", "clips", "frames", "samples", "s/clip", "s/frame", "hours", "GB")
         rows = [
             (
@@ -151,11 +158,11 @@ def _machines(count: int) -> str:
 
 
 def forecast(recipe: Recipe, *, frames: int = 5, progress: Progress | None = None) -> Forecast:
-    """Measure one job of each kind with so many frames (at least 2: the first one compiles)."""
+    """Measure one job of each kind with `frames` frames, at least 2 because the first one compiles."""
     from qsim import backend
 
     if frames < 2:
-        raise ValueError(f"plan: at least 2 frames are needed to tell the first from the others, got {frames}")
+        raise ValueError(f"plan: got {frames} frames; at least 2 frames are needed, because the first one compiles")
     kinds: dict[tuple[Any, ...], list[Job]] = {}
     for job in recipe.jobs:
         kinds.setdefault((job.family, job.settings, job.streams), []).append(job)
@@ -170,7 +177,10 @@ def forecast(recipe: Recipe, *, frames: int = 5, progress: Progress | None = Non
 
 
 def measure_kind(members: list[Job], folder: Path, frames: int) -> Cost:
-    """Every job is met for the first time, as in a run: a scene has kernels of its own, which its pilot compiles."""
+    """Measure the cost of a kind from some of its jobs, each met for the first time as in a run.
+
+    Each scene has its own kernels, which its pilot compiles.
+    """
     looked_at = evenly_spaced(members)
     budgets, choosing = zip(*map(_budget, looked_at), strict=True)
     work = [_work(budget) for budget in budgets]
@@ -180,7 +190,7 @@ def measure_kind(members: list[Job], folder: Path, frames: int) -> Cost:
     settings = job.settings
     started = Seconds.now()
     clip, moments = render_first_frames(job, budgets[middle], folder, min(frames, settings.frames))
-    # The first frame carries scene and compilation; the others are what each further frame costs.
+    # The first frame includes scene and compilation; the others give the cost of each further frame.
     first, more = moments[0].since(started), moments[-1].since(moments[0])
     if len(moments) > 1:
         per_frame = Seconds(*(seconds / (len(moments) - 1) for seconds in more))
@@ -204,24 +214,24 @@ def measure_kind(members: list[Job], folder: Path, frames: int) -> Cost:
 
 
 def evenly_spaced(members: list[Job]) -> list[Job]:
-    """At most LOOKED_AT of them, evenly spaced, from the first to the last."""
+    """Return at most LOOKED_AT jobs, evenly spaced from the first to the last."""
     count = min(LOOKED_AT, len(members))
     return [members[round(i * (len(members) - 1) / max(1, count - 1))] for i in range(count)]
 
 
 def _budget(job: Job) -> tuple[Budget, Seconds]:
-    """A job's budget, and what its choice took."""
+    """Return a job's budget, and the time that its choice took."""
     scene, started = job_runner.load_scene(job), Seconds.now()
     return job_runner.choose_budget(job, scene), Seconds.now().since(started)
 
 
 def _work(budget: Budget) -> float:
-    """What a frame costs, in samples per pixel: nearly everything else that a frame needs is small beside them."""
+    """Return the cost of a frame in samples per pixel; the rest of its cost is small."""
     return budget.samples + (DENOISE_COST if budget.denoise else 0.0)
 
 
 def render_first_frames(job: Job, budget: Budget, path: Path, frames: int) -> tuple[Clip, list[Seconds]]:
-    """The first frames of a job's clip, and when each was done."""
+    """Render the first frames of a job's clip; return the clip and the time at the end of each frame."""
     from qsim.rendering.clip_rendering import render_clip
 
     settings = job.settings
@@ -240,7 +250,7 @@ def render_first_frames(job: Job, budget: Budget, path: Path, frames: int) -> tu
 
 
 def sense_streams(job: Job, clip: Clip) -> tuple[Seconds, float]:
-    """Seconds and bytes per frame of all streams together; the second drawing counts, the first one compiles."""
+    """Return the time and the bytes per frame of all streams together; the second draw counts, the first compiles."""
     wall = processor = size = 0.0
     for sensing in job.streams:
         sense(clip, sensing)

@@ -1,14 +1,14 @@
-"""The files that a scene of the user's own reads, so that an edit of any of them is noticed when a run is resumed.
+"""Loads a scene and finds the user's files that it reads, so that a resumed run notices an edit of any of them.
 
     load(family, seed, speed) -> the scene, and {file: SHA-256}
 
 * Mitsuba XML: each file that an attribute names, in this file and in those that it includes.
-* Python: what it imports and opens while the scene is made, and the files that the scene names. Where it lists a folder
-  and opens files of it, the names of all files with these endings count too (`meshes/*.obj`).
+* Python: modules that it imports, files that it opens while the scene is made, and files that the scene names. Where
+  it lists a folder and opens files in it, the names of all files with these endings count too (`meshes/*.obj`).
 * A folder of assets: every file in it.
 
-Files are named relative to the scene's own, absolute where they lie elsewhere. Installed packages, this program, caches
-and the system's /proc, /sys and /dev are left out. Families of the library read nothing.
+Names are relative to the scene's file; files outside its folder have absolute names. Installed packages, this program,
+caches and the system's /proc, /sys and /dev are left out. Families of the library read no files of the user.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _PARTS_LEFT_OUT = frozenset({".cache", "site-packages", "dist-packages"})
 
 
 def load(family: str | Path, seed: int = 0, speed: float = 1.0) -> tuple[Scene, dict[str, str]]:
-    """As `scenes.load`, with the SHA-256 of each file that was read; empty for a family of the library."""
+    """Load a scene as `scenes.load` does, with the SHA-256 of each file read; empty for a family of the library."""
     path = Path(family).resolve()
     if str(family) in scenes.FAMILIES or not path.exists():
         return scenes.load(family, seed, speed), {}
@@ -65,7 +65,7 @@ def load(family: str | Path, seed: int = 0, speed: float = 1.0) -> tuple[Scene, 
 
 
 def change(family: str, name: str, digest: str) -> str | None:
-    """What happened to a file since its scene was rendered, or None if it is the same; `name` as `load` gives it."""
+    """Return how a file changed since its scene was rendered, or None if it is the same; `name` as `load` gives it."""
     path = Path(family) if Path(family).is_dir() else Path(family).parent
     file = path / name
     if "*" in file.name:
@@ -76,9 +76,9 @@ def change(family: str, name: str, digest: str) -> str | None:
 
 
 def of_xml(path: Path) -> set[Path]:
-    """Every file that a Mitsuba scene names, itself and included scenes too.
+    """Return every file that a Mitsuba scene names, with itself and the scenes that it includes.
 
-    Mitsuba looks beside the scene, in the folders of <path> and in the working folder; all that are there count.
+    Mitsuba looks beside the scene, in the folders of <path> and in the working folder; all existing files count.
     """
     found: set[Path] = set()
     _follow(path, [path.parent, Path.cwd()], {}, found)
@@ -86,14 +86,14 @@ def of_xml(path: Path) -> set[Path]:
 
 
 def _follow(path: Path, folders: list[Path], defaults: dict[str, str], found: set[Path]) -> None:
-    """Add a scene file and what it names; `folders` and `defaults` hold for what it includes, too."""
+    """Add a scene file and the files that it names; `folders` and `defaults` hold for included scenes, too."""
     if path in found:
         return
     found.add(path)
     try:
         elements = list(ElementTree.parse(path).iter())
     except (ElementTree.ParseError, OSError, ValueError):
-        return  # Mitsuba says what is wrong with it
+        return  # Mitsuba reports the error
     folders.append(path.parent)
     for element in elements:
         if element.tag == "default":
@@ -104,7 +104,7 @@ def _follow(path: Path, folders: list[Path], defaults: dict[str, str], found: se
         for value in element.attrib.values():
             written = re.sub(r"\$(\w+)", lambda match: defaults.get(match[1], match[0]), value)
             for folder in dict.fromkeys(folders):
-                with contextlib.suppress(OSError, ValueError):  # no name of a file
+                with contextlib.suppress(OSError, ValueError):  # the value is not the name of a file
                     file = (folder / written).resolve()
                     if file.is_file() and element.tag == "include":
                         _follow(file, folders, defaults, found)
@@ -114,19 +114,20 @@ def _follow(path: Path, folders: list[Path], defaults: dict[str, str], found: se
 
 @dataclasses.dataclass
 class _Trace:
-    """Files opened for reading and folders listed by this process, in Python."""
+    """Files that Python code of this process opened for reading, and folders that it listed."""
 
     opened: set[Path] = dataclasses.field(default_factory=set)
     listed: set[Path] = dataclasses.field(default_factory=set)
 
 
 _active: ContextVar[_Trace | None] = ContextVar("active", default=None)
-_hooks: list[object] = []  # a hook cannot be taken away, so there is one
-_own_modules: set[str] = set()  # imported by own scenes: imported again by the next, which is traced like the first
+_hooks: list[object] = []  # an audit hook cannot be removed, so only one is added
+_own_modules: set[str] = set()  # imported by scenes of the user; the next scene imports them again, and is traced
 
 
 @contextlib.contextmanager
 def _tracing() -> Iterator[_Trace]:
+    """Record what a scene opens, lists and imports inside the block."""
     if not _hooks:
         _hooks.append(_see)
         sys.addaudithook(_see)
@@ -146,7 +147,7 @@ def _tracing() -> Iterator[_Trace]:
 
 
 def _see(event: str, arguments: tuple[Any, ...]) -> None:
-    """The audit hook: what a scene opens or lists while it is made, without imports of packages and the engine."""
+    """Audit hook: record what a scene opens or lists while it is made, except for imports and the renderer."""
     if event not in ("open", "os.listdir", "os.scandir") or (trace := _active.get()) is None:
         return
     with contextlib.suppress(Exception):  # a hook that raises would stop the scene
@@ -160,7 +161,7 @@ def _see(event: str, arguments: tuple[Any, ...]) -> None:
 
 
 def _for_itself() -> bool:
-    """Whether Python's importer or our choice of an engine opens the file, and not the user's scene."""
+    """Return whether Python's importer or the choice of a backend opens the file, not the user's scene."""
     frame = sys._getframe(2)
     while frame is not None:
         name = frame.f_code.co_filename
@@ -173,14 +174,14 @@ def _for_itself() -> bool:
 
 
 def _counts(path: Path) -> bool:
-    """Whether a file is the user's."""
+    """Return whether a file belongs to the user."""
     if str(path).startswith(_LEFT_OUT) or not _PARTS_LEFT_OUT.isdisjoint(path.parts):
         return False
     return "__pycache__" not in path.parts and not (path.parent == _LIBRARY and path.suffix == ".py")
 
 
 def _imported(path: Path, found: set[Path] | None = None) -> set[Path]:
-    """A Python file and the modules that it imports, if they are the user's: those that were there before, too."""
+    """Return a Python file and the modules of the user that it imports, also those imported before."""
     found = set() if found is None else found
     if path in found:
         return found
@@ -198,7 +199,7 @@ def _imported(path: Path, found: set[Path] | None = None) -> set[Path]:
 
 
 def _named_in(scene: Any) -> set[Path]:
-    """The files whose names a scene's records hold: pictures are read when it is rendered."""
+    """Return the files whose names a scene's records hold: pictures are read only during rendering."""
     found: set[Path] = set()
     for item in nested(scene):
         if isinstance(item, str) and 0 < len(item) < 4096:
@@ -208,7 +209,7 @@ def _named_in(scene: Any) -> set[Path]:
 
 
 def _digest(file: Path) -> str:
-    """SHA-256 of a file, or of the names that match a pattern."""
+    """Return the SHA-256 of a file, or of the names that match a pattern."""
     if "*" in file.name:
         return files.sha256(files.to_json(sorted(path.name for path in file.parent.glob(file.name))))
     return files.sha256(file)

@@ -27,7 +27,7 @@ def test_float_frames_are_taken_if_whole():
     assert np.array_equal(
         measure([codes.astype(np.float32)], bits=3, exposure=1.0, photons=0.0).total, codes.sum(axis=0)
     )
-    with pytest.raises(ValueError, match=r"dark.npy: 0.5 at \(t, y, x\) = \(0, 0, 0\) is no code of 3 bits"):
+    with pytest.raises(ValueError, match=r"dark.npy: 0.5 at \(t, y, x\) = \(0, 0, 0\) is not a code of 3 bits"):
         measure([np.full((1, 2, 2), 0.5, np.float32)], bits=3, exposure=1.0, photons=0.0, name="dark.npy")
 
 
@@ -60,7 +60,7 @@ def test_one_frame_of_sums_is_enough():
 
 
 def test_values_above_the_planes_name_their_place():
-    with pytest.raises(ValueError, match=r"5 at \(t, y, x\) = \(1, 0, 0\) is no sum of 4 planes, 0..4"):
+    with pytest.raises(ValueError, match=r"5 at \(t, y, x\) = \(1, 0, 0\) is not a sum of 4 planes, 0..4"):
         measure_sums([np.zeros((1, H, W), int), np.full((1, H, W), 5)], planes=4, exposure=1e-5, photons=None)
     with pytest.raises(ValueError, match="sums of N binary planes are calibrated with --planes N"):
         measure([np.full((1, H, W), 19)], bits=1, exposure=1e-5, photons=None)
