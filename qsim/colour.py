@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 TRANSFERS = ("linear", "srgb", "gamma 2.2")
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue: ITU-R BT.709
 GAMMA = 2.2  # the one tone curve of every picture
-AVERAGE = 11  # frames of a plain average, the window of QUIVER
+AVERAGE = 11  # frames of a naive mean, the window of QUIVER
 
 
 def to_linear(values: NDArray[Any], transfer: str, top: float) -> NDArray[Any]:

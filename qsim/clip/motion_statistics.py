@@ -1,7 +1,6 @@
-"""How far things move in a clip, from its flow: per frame, and per frame of a bit-depth study.
+"""Measures the motion of a clip from its flow: per frame, and per frame of a bit-depth study.
 
-A **plane** is one clip frame read with one bit; a frame of b bits is 2^b - 1 planes. Clip pages and studies use these
-definitions.
+A **plane** is one clip frame read with one bit; a frame of b bits is 2^b - 1 planes.
 """
 
 from __future__ import annotations
@@ -9,23 +8,22 @@ from __future__ import annotations
 import numpy as np
 from numpy import ndarray as Array
 
-MOVING = 0.1  # px per frame; what moves farther counts as moving
-SLOWEST = 10_000.0  # clip frames per second: below, a "plane" is too long to stand for an instant
+MOVING = 0.1  # px per frame: a pixel that moves farther counts as moving
+SLOWEST = 10_000.0  # clip frames per second: in slower clips, a plane is too long to count as an instant
 CODE_BITS = 3  # motion is stated per frame of 3 bits, whatever depths are compared
 CODE_PLANES = 2**CODE_BITS - 1
 
 
 def largest_motion(length: Array) -> float:
-    """The 99.9th percentile of the known lengths of a flow, in their unit; 0 if none is known."""
+    """Return the 99.9th percentile of the known lengths of a flow, in their unit; 0 if none is known."""
     known = length[np.isfinite(length)]
     return float(np.percentile(known, 99.9)) if known.size else 0.0
 
 
 def moving_mean(length: Array, frames: int = 1) -> float | None:
-    """Mean motion [px] of the pixels that move more than `MOVING` in so many clip frames; None if none does.
+    """Return the mean motion [px] of pixels that move more than `MOVING` in `frames` clip frames; None if none does.
 
-    `length` is that of the flow in px per clip frame, of any shape, NaN where unknown. The answer is for `frames` clip
-    frames.
+    `length` is that of the flow [px per clip frame], of any shape, NaN where unknown.
     """
     travel = length[np.isfinite(length)] * frames
     moving = travel[travel > MOVING]

@@ -1,4 +1,4 @@
-"""A clip on a report page: its moving pictures, its light, its motion, its codes, what was modelled and its error."""
+"""Builds the section of a clip: moving pictures, light, motion, codes, modelled effects and error."""
 
 from __future__ import annotations
 
@@ -23,34 +23,34 @@ from qsim.sensor.defects.pixel_array import PixelArray
 if TYPE_CHECKING:
     from markupsafe import Markup
 
-FRAMES = 48  # of a player
-WIDTH = 512  # columns of a panel; wider pictures are shown smaller by a whole factor
-_PIXELS = 4096  # of a frame, at most, for the expected histogram of codes
+FRAMES = 48  # largest number in a player
+WIDTH = 512  # columns of a panel; wider pictures are reduced by a whole factor
+_PIXELS = 4096  # largest number of a frame in the expected histogram of codes
 
 
 def chosen_frames(count: int) -> range:
-    """At most FRAMES frames from the start, without gaps: gaps would show another motion."""
+    """Return at most FRAMES frames from the start, without gaps, which would change the motion."""
     return range(min(count, FRAMES))
 
 
 def fit(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Every n-th row and column so that a panel stays within WIDTH."""
+    """Return every n-th row and column of [T, H, W] or [T, H, W, 3], so that a panel has at most WIDTH columns."""
     step = -(-frames.shape[2] // WIDTH)
     return frames[:, ::step, ::step]
 
 
 def light_name(clip: Clip) -> str:
-    """What a clip's light is called: rendered light is the truth, an imported video has its camera's errors."""
+    """Return the name of a clip's light: "truth" if rendered; an imported video has the errors of its camera."""
     return "recorded video" if clip.meta["radiance_unit"] == RELATIVE else "truth"
 
 
 def truth_stack(clip: Clip, frames: range) -> NDArray[np.float32]:
-    """Sharp radiance [T, H, W] of these frames."""
+    """Return the sharp radiance of these frames, float32 [T, H, W], in the unit of the clip."""
     return np.stack([clip.sharp(t) for t in frames])
 
 
 def stream_panels(stream: Stream, frames: range) -> list[page.Panel]:
-    """Codes as they are, and the plain average of up to 11 frames around each."""
+    """Return panels of the codes, and of the naive mean of up to 11 frames around each."""
     reach = colour.AVERAGE // 2
     first, last = max(frames.start - reach, 0), min(frames.stop + reach, len(stream))
     codes = stream.codes(first, last)
@@ -62,12 +62,12 @@ def stream_panels(stream: Stream, frames: range) -> list[page.Panel]:
     shown_average = colour.tone(averages, colour.peak(averages))
     return [
         page.Panel(f"codes, {bits} bit ({stream.name})", fit(colour.code_levels(shown, bits))),
-        page.Panel(f"plain average of {colour.AVERAGE} frames, white at its own peak", fit(shown_average)),
+        page.Panel(f"naive mean of {colour.AVERAGE} frames, white at its peak", fit(shown_average)),
     ]
 
 
 def flow_panel(clip: Clip, frames: range) -> tuple[page.Panel, float, NDArray[np.floating]]:
-    """Flow in colour, the motion [px/frame] of the full colour, and the length of the flow [T, H, W]."""
+    """Return the flow as colours, the motion of the full colour [px/frame], and the lengths [px/frame], [T, H, W]."""
     flow = np.stack([clip.flow(t) for t in frames])
     speed = np.hypot(flow[:, 0], flow[:, 1])
     largest = max(largest_motion(speed), 0.5)
@@ -76,19 +76,19 @@ def flow_panel(clip: Clip, frames: range) -> tuple[page.Panel, float, NDArray[np
 
 
 def legend(largest: float) -> Markup:
-    """The colour wheel of the flow."""
+    """Return the colour wheel of the flow, whose rim is `largest` [px/frame]."""
     words = f"direction and length of the flow: rim = {largest:.2g} px/frame, white = still, grey = unknown"
     return page.picture(colour.flow_legend(72), words)
 
 
 def motion(clip: Clip, frames: Sequence[int]) -> tuple[float | None, float]:
-    """Mean motion of the pixels that move (None if none does) and the 99.9th percentile of all, in px/frame."""
+    """Return the mean motion of pixels that move (None if none does) and the 99.9th percentile of all [px/frame]."""
     speed = np.stack([np.hypot(*clip.flow(t)) for t in frames])
     return moving_mean(speed), largest_motion(speed)
 
 
 def clip_section(clip: Clip) -> Markup:
-    """Truth, streams and flow of a clip, its light, its motion, what was modelled, and the error of its frames."""
+    """Return truth, streams and flow of a clip, its light, motion, modelled effects, and the error of its frames."""
     frames = chosen_frames(len(clip))
     truth = truth_stack(clip, frames)
     white = colour.peak(truth)
@@ -118,10 +118,10 @@ def clip_section(clip: Clip) -> Markup:
 
 
 def light_line(clip: Clip) -> str:
-    """Size, rate and light of a clip in one sentence."""
+    """Return size, rate and light of a clip as one line."""
     frames, height, width = clip.shape
     unit = "(relative)" if clip.camera is None else "W m⁻² sr⁻¹"
-    photons = "" if clip.camera is None else f", {clip.mean_photons:.4g} photons per pixel and exposure as it is"
+    photons = "" if clip.camera is None else f", {clip.mean_photons:.4g} photons per pixel and exposure"
     return (
         f"{frames} frames of {height} × {width} at {clip.frame_rate:g} fps, exposure {clip.exposure * 1e6:.4g} µs, "
         f"mean radiance {clip.mean_radiance:.4g} {unit}{photons}"
@@ -129,17 +129,17 @@ def light_line(clip: Clip) -> str:
 
 
 def stream_line(stream: Stream) -> str:
-    """Sensor and light level of a stream in one sentence."""
+    """Return sensor and light level of a stream as one line."""
     meta = stream.meta
     ppp, lux = meta.get("ppp"), meta.get("equivalent_lux_555nm")
     light = "" if ppp is None else f": {ppp:.4g} photons per pixel (the clip's light × {stream.photons_factor:.4g})"
-    light += "" if lux is None else f", as much as {lux:.4g} lx at 555 nm"
+    light += "" if lux is None else f", equal to {lux:.4g} lx at 555 nm"
     light += "" if ppp is None else f", {ppp * stream.sensor.efficiency:.3g} e⁻ per pixel"
     return f"Stream {stream.name}{light}; {stream.bits} bit, {stream.sensor}{defects_words(stream)}"
 
 
 def defects_words(stream: Stream) -> str:
-    """`; defects: prnu 0.01, dark_map my_dark.npy`; empty without any."""
+    """Return "; defects: prnu 0.01, dark_map my_dark.npy", or "" without defects."""
     words = []
     for name, value in stream.meta.get("defects", {}).items():
         text = f"{value:g}" if isinstance(value, float) else str(value)
@@ -151,12 +151,12 @@ def defects_words(stream: Stream) -> str:
 
 
 def motion_line(clip: Clip, frames: range) -> str:
-    """Motion in one sentence."""
+    """Return the motion of a clip as one line."""
     mean, largest = motion(clip, frames)
     moving = (
         "nothing moves"
         if mean is None
-        else f"what moves (more than {MOVING:g} px/frame) moves {mean:.3g} px/frame on average"
+        else f"moving pixels (more than {MOVING:g} px/frame) move {mean:.3g} px/frame on average"
     )
     if mean is not None and clip.frame_rate >= SLOWEST:  # frames of a bit-depth study
         speed = np.stack([np.hypot(*clip.flow(t)) for t in frames])
@@ -165,13 +165,13 @@ def motion_line(clip: Clip, frames: range) -> str:
 
 
 def error_lines(meta: dict[str, Any]) -> list[str]:
-    """The stated error of the frames, as lines."""
+    """Return the stated error of the frames as lines."""
     lines = []
     errors = meta.get("error_per_frame")
     if errors:
         rms = float(np.sqrt(np.mean(np.square(errors))))
         lines.append(
-            f"Error of a frame (noise, blur, bounces left out): {rms:.3g} rms in the unit of the radiance, "
+            f"Error of a frame (noise, blur, omitted bounces): {rms:.3g} rms in the unit of the radiance, "
             f"worst {max(errors):.3g}"
         )
     found = stated(meta)
@@ -181,18 +181,18 @@ def error_lines(meta: dict[str, Any]) -> list[str]:
 
 
 def modelled(meta: dict[str, Any]) -> Markup | None:
-    """What a renderer says it modelled and left out, and how large that is, as a table; None for other clips."""
+    """Return a table of the effects that were modelled or omitted, with their sizes; None for clips without it."""
     findings = meta.get("render", {}).get("findings", [])
     if not findings:
         return None
     rows = [[found["effect"], found["chosen"], found["size"]] for found in findings]
     return page.table(
-        page.Table("What was modelled, what was left out, and how large it is", ["effect", "chosen", "size"], rows)
+        page.Table("Effects that were modelled or omitted, and their size", ["effect", "chosen", "size"], rows)
     )
 
 
 def code_histogram(clip: Clip, stream: Stream) -> Markup:
-    """How often each code was drawn in up to FRAMES frames, and what the exact distribution expects from the light."""
+    """Return the histogram of the codes of up to FRAMES frames, with the exact expectation from the light."""
     count = min(len(stream), FRAMES)
     levels = 2**stream.bits
     drawn = np.bincount(stream.codes(0, count).ravel(), minlength=levels) / (count * stream.shape[1] * stream.shape[2])
@@ -204,12 +204,12 @@ def code_histogram(clip: Clip, stream: Stream) -> Markup:
     if missing is None:
         try:
             expected = expected_codes(clip, stream, count)
-        except (ValueError, OSError) as error:  # a measured map that has gone or changed
+        except (ValueError, OSError) as error:  # a measured map is missing or has changed
             missing = str(error)
         else:
             axes.plot(np.arange(levels), expected, "k_", markersize=14, label="expected")
             mixed = " and its map of defects" if "defects" in stream.meta else ""
-            words += f", and expected from the light by the sensor's exact distribution{mixed}"
+            words += f", and expected from the light by the exact distribution of the sensor{mixed}"
     if missing is not None:
         words += f"; no expectation is shown: {missing}"
     axes.legend()
@@ -217,14 +217,14 @@ def code_histogram(clip: Clip, stream: Stream) -> Markup:
 
 
 def unexpected(clip: Clip, stream: Stream) -> str | None:
-    """Why nothing can be expected of a stream's codes; None if it can."""
+    """Return why the codes of a stream have no exact expectation; None if they have one."""
     own = stream.meta.get("defects", {})
     if 2**stream.bits > 64:
         return "more than 64 codes"
     if int(stream.meta.get("planes_per_code", 1)) > 1 or len(stream) != len(clip):
         return "a code sums planes of several frames of the clip"
     if stream.meta["ppp_factor"] is None:
-        return "its light is not known"
+        return "its light is unknown"
     if own.get("crosstalk") or own.get("afterpulse"):
         return "crosstalk and afterpulses make a code depend on its neighbours or on the frame before"
     if stream.meta.get("drawn_by") == "events":
@@ -233,9 +233,9 @@ def unexpected(clip: Clip, stream: Stream) -> str | None:
 
 
 def expected_codes(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64]:
-    """Mean probability of each code over the light of some frames (every n-th pixel of a few of them).
+    """Return the mean probability of each code over every n-th pixel of some frames, float64 [2^bits].
 
-    Mixed over the stream's maps of defects; `ValueError` or `OSError` where a measured map has changed or gone.
+    It includes the maps of defects. Raise `ValueError` or `OSError` if a measured map has changed or is missing.
     """
     chosen = np.unique(np.linspace(0, count - 1, min(count, 6)).astype(int))
     height, width = clip.shape[1:]
@@ -258,7 +258,7 @@ def _motion_histogram(speed: NDArray[np.floating]) -> Markup:
     known = speed[np.isfinite(speed)]
     axes.hist(known, bins=48, weights=np.full(known.size, 1 / max(known.size, 1)), color="tab:blue")
     axes.set_yscale("log")
-    return page.figure(save(), "motion between neighbouring frames, all pixels")
+    return page.figure(save(), "motion between successive frames, all pixels")
 
 
 def _light_histogram(truth: NDArray[np.floating], clip: Clip) -> Markup:
@@ -270,8 +270,8 @@ def _light_histogram(truth: NDArray[np.floating], clip: Clip) -> Markup:
 
 
 def error_curve(errors: Sequence[float]) -> Markup:
-    """The measured error of every frame."""
+    """Return the measured error of every frame as a figure."""
     axes, save = page.axes("frame", "rms error of the radiance")
     axes.plot(errors, ".-")
     axes.set_ylim(0, 1.15 * max(max(errors), 1e-30))
-    return page.figure(save(), "error of every frame: noise from independent halves, blur, bounces left out")
+    return page.figure(save(), "error of every frame: noise from independent halves, blur, omitted bounces")

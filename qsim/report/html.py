@@ -1,7 +1,6 @@
-"""The parts of a report: players, tables, figures, text -> one self-contained HTML page.
+"""Builds the parts of a page (players, tables, figures, text) and the self-contained HTML page from templates/.
 
-Nothing here knows clips or sensors: frames come as uint8 arrays, text is escaped by templates/, and `report.py` decides
-what to show.
+Frames are uint8 arrays, and the templates escape all text. This module imports nothing of clips and sensors.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Panel:
-    """One moving picture: uint8 frames [T, H, W] or [T, H, W, 3], and the words below it."""
+    """One moving picture: uint8 frames [T, H, W] or [T, H, W, 3], and the caption below it."""
 
     caption: str
     frames: NDArray[np.uint8]
@@ -34,7 +33,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text or numbers under their headers; `best` marks rows to be shown bold."""
+    """Rows of text or numbers under their headers; rows in `best` are bold."""
 
     caption: str
     headers: Sequence[str]
@@ -43,7 +42,7 @@ class Table:
 
 
 def picture_uri(pixels: NDArray[np.uint8], *, quality: int | None = None) -> str:
-    """A data: address of a grey or colour picture: PNG, or JPEG where `quality` is given."""
+    """Return a picture, uint8 [H, W] or [H, W, 3], as data: address; JPEG if `quality` is given, else PNG."""
     from PIL import Image
 
     buffer = io.BytesIO()
@@ -55,19 +54,21 @@ def picture_uri(pixels: NDArray[np.uint8], *, quality: int | None = None) -> str
     return f"data:image/{kind};base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
-MAX_STRIP = 32_000  # rows: browsers stop drawing taller pictures
+MAX_STRIP = 32_000  # rows; browsers do not draw taller pictures
 
 
 def strip(frames: NDArray[np.uint8]) -> str:
-    """All frames below each other as one picture: PNG up to 256 columns, JPEG above."""
+    """Return all frames below each other as the address of one picture: PNG up to 256 columns, JPEG above."""
     tall = frames.reshape(-1, *frames.shape[2:])
     if len(tall) > MAX_STRIP:
-        raise ValueError(f"a strip of {len(tall)} rows is too tall for browsers ({MAX_STRIP}): show fewer frames")
+        raise ValueError(
+            f"a strip of {len(tall)} rows is too tall for browsers, which draw {MAX_STRIP} at most: show fewer frames"
+        )
     return picture_uri(tall, quality=None if frames.shape[2] <= 256 else 88)
 
 
 def player(panels: Sequence[Panel], *, left: int = -1, milliseconds: int = 120) -> Markup:
-    """Panels that play together, a scrubber, and a slider that reveals panel `left` over the first one."""
+    """Return panels that play together, with a scrubber and a slider that reveals panel `left` over the first."""
     count = len(panels[0].frames)
     for panel in panels:
         if len(panel.frames) != count:
@@ -77,7 +78,7 @@ def player(panels: Sequence[Panel], *, left: int = -1, milliseconds: int = 120) 
 
 
 def table(content: Table) -> Markup:
-    """A table; numbers are shown to four digits and aligned to the right."""
+    """Return a table; numbers have four digits and are aligned to the right."""
     numeric = [
         bool(content.rows) and all(isinstance(row[i], int | float) or row[i] is None for row in content.rows)
         for i in range(len(content.headers))
@@ -87,29 +88,29 @@ def table(content: Table) -> Markup:
 
 
 def number_text(value: object) -> str:
-    """Four significant digits for floats, a dash for nothing, text as it is."""
+    """Return a float with four significant digits, None as a dash, and anything else as text."""
     if value is None:
         return "–"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def text(words: str) -> Markup:
-    """A paragraph."""
+    """Return a paragraph."""
     return _parts().text(words)
 
 
 def bullets(lines: Sequence[str]) -> Markup:
-    """A list of lines."""
+    """Return a list of lines."""
     return _parts().bullets(lines)
 
 
 def figure(png: bytes, caption: str) -> Markup:
-    """A PNG figure with its caption."""
+    """Return a PNG figure with its caption."""
     return _parts().figure("data:image/png;base64," + base64.b64encode(png).decode(), caption)
 
 
 def axes(x_label: str, y_label: str) -> tuple[Any, Callable[[], bytes]]:
-    """One small set of axes, and a function that gives its picture as PNG bytes."""
+    """Return small axes, and a function that returns their figure as PNG bytes."""
     drawing = new_figure(6.4, 3.0)
     own = drawing.subplots()
     own.set_xlabel(x_label)
@@ -119,29 +120,29 @@ def axes(x_label: str, y_label: str) -> tuple[Any, Callable[[], bytes]]:
 
 
 def picture(pixels: NDArray[np.uint8], caption: str) -> Markup:
-    """A small picture with its caption, in its own size."""
+    """Return a small picture, uint8 [H, W] or [H, W, 3], at its original size with its caption."""
     return _parts().picture(picture_uri(pixels), caption)
 
 
 def grid(figures: Sequence[Markup]) -> Markup:
-    """Figures side by side where there is room."""
+    """Return figures side by side where the page is wide enough."""
     return _parts().grid(figures)
 
 
 def section(title: str, *parts: Markup | None) -> Markup:
-    """A section with its heading; parts that are None are left out."""
+    """Return a section with its heading; parts that are None are omitted."""
     return _parts().section(title, parts)
 
 
 def together(sections: Sequence[Markup]) -> Markup:
-    """Several sections as one piece."""
+    """Return several sections as one."""
     from markupsafe import Markup
 
     return Markup("\n").join(sections)
 
 
 def page(title: str, subtitle: str, sections: Sequence[Markup]) -> str:
-    """The whole page as text; it loads nothing from anywhere."""
+    """Return the complete page as text; it loads nothing from elsewhere."""
     return _templates().get_template("page.html").render(title=title, subtitle=subtitle, sections=sections)
 
 
@@ -155,5 +156,5 @@ def _templates() -> Environment:
 
 @cache
 def _parts() -> Any:
-    """The macros of parts.html; each returns `Markup`."""
+    """Return the macros of parts.html; each of them returns `Markup`."""
     return _templates().get_template("parts.html").module

@@ -1,8 +1,8 @@
-"""Pictures with a caption that says how numbers became grey or colour: files, and half blocks in a terminal.
+"""Writes views as PNG, GIF or mp4 with captions that state their scales, or as text for a terminal.
 
     views -> Sheet (side by side, with captions) -> PNG, GIF, mp4; or a view -> text for a terminal
 
-Nothing is computed from these pictures. A terminal gets two pixels per character in true colour, or shades of text.
+Nothing is computed from these pictures. A terminal shows two pixels per character in true colour, or shades of text.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from qsim.report.views import CURVE, Picture, View, declaration
 
 @dataclass(frozen=True)
 class Sheet:
-    """Views side by side, each enlarged by a whole factor, with their captions and legends below."""
+    """Views side by side, each enlarged by a whole factor, above their captions and legends."""
 
     views: list[View]
     scale: int
-    caption: Picture  # drawn once: it is the same under every frame
+    caption: Picture  # drawn once, the same for all frames
 
     def frame(self, t: int) -> Picture:
-        """One picture, of an even number of rows and columns as video codecs want them."""
+        """Return frame t, uint8 [H, W, 3], with an even number of rows and columns, as video codecs require."""
         enlarged = [v.picture(t).repeat(self.scale, axis=0).repeat(self.scale, axis=1) for v in self.views]
         column = (self.caption.shape[1] + GAP) // len(self.views)
         row = [np.pad(p, ((0, 0), (0, column - p.shape[1]), (0, 0)), constant_values=PAPER) for p in enlarged]
@@ -40,12 +40,12 @@ class Sheet:
 
 
 GAP, PAPER, INK = 6, 250, (40, 40, 44)
-SMALLEST = 224  # columns of an enlarged picture, so that its caption can be read
-NARROWEST = 112  # columns of a caption and its legend
+SMALLEST = 224  # least columns of an enlarged picture
+NARROWEST = 112  # least columns of a caption and its legend
 
 
 def sheet(views: list[View], scale: int | None = None) -> Sheet:
-    """Lay out views; `scale` is the enlargement (default: so that a picture is at least SMALLEST columns wide)."""
+    """Lay out views; `scale` is the enlargement (default: the least that gives SMALLEST columns)."""
     width = views[0].picture(0).shape[1]
     scale = scale or max(1, -(-SMALLEST // width))
     captions = [_caption(view, max(width * scale, NARROWEST)) for view in views]
@@ -55,7 +55,7 @@ def sheet(views: list[View], scale: int | None = None) -> Sheet:
 
 
 def _caption(view: View, width: int) -> Picture:
-    """The declaration in lines that fit `width`, with the legend below it."""
+    """Return the declaration in lines of at most `width` pixels, with the legend below it."""
     from PIL import Image, ImageDraw, ImageFont
 
     font = ImageFont.load_default(size=11)
@@ -83,9 +83,9 @@ def _caption(view: View, width: int) -> Picture:
 def write(
     path: Path, page: Sheet, frames: range, fps: float, about: dict[str, Any], progress: Progress | None = None
 ) -> None:
-    """PNG (the first of `frames`), GIF or mp4 by the name of `path`, and beside it .json: `about` and what is declared.
+    """Write PNG (the first of `frames`), GIF or mp4 by the suffix of `path`, and a sidecar with `about` and the scales.
 
-    The sidecar of OUT.mp4 is OUT.mp4.json. Both are whole or absent.
+    The sidecar of OUT.mp4 is OUT.mp4.json. Both are written atomically.
     """
     declared = {"format": "qsim-preview-1", "curve": CURVE, "views": [declaration(view) for view in page.views]}
     drawn = _drawn(page, frames, progress)
@@ -128,12 +128,12 @@ def _write_gif(path: Path, frames: Iterator[Picture], fps: float) -> None:
 
 # Terminals
 
-HALF = "▀"  # upper half block: its foreground is the upper pixel, its background the lower one
+HALF = "▀"  # upper half block: the foreground is the upper pixel, the background the lower one
 SHADES = " .:-=+*#%@"  # dark to light, for outputs without colour
 
 
 def fit_terminal(picture: NDArray[np.uint8], columns: int, rows: int) -> NDArray[np.uint8]:
-    """A picture [H, W, 3] made smaller (by areas) to at most `columns` x 2 `rows` pixels; small ones stay."""
+    """Return a picture [H, W, 3] reduced (by areas) to at most `columns` x 2 `rows` pixels; smaller ones stay."""
     from PIL import Image
 
     height, width = picture.shape[:2]
@@ -143,7 +143,7 @@ def fit_terminal(picture: NDArray[np.uint8], columns: int, rows: int) -> NDArray
 
 
 def half_blocks(picture: NDArray[np.uint8]) -> str:
-    """Lines of half blocks in 24-bit colour; an odd last row is drawn over the terminal's own background."""
+    """Return a picture [H, W, 3] as lines of half blocks in 24-bit colour; an odd last row has no lower half."""
     lines = []
     for upper, lower in zip(picture[::2], _lower(picture), strict=True):
         cells = []
@@ -160,12 +160,12 @@ def _lower(picture: NDArray[np.uint8]) -> list[NDArray[np.uint8] | None]:
 
 
 def shades(picture: NDArray[np.uint8]) -> str:
-    """The same in ten shades of plain text: every second row, as characters are twice as high as wide."""
+    """Return every second row of a picture [H, W, 3] in ten shades of text; characters are twice as high as wide."""
     grey = luminance(picture[::2])
     steps = np.minimum((grey / 256 * len(SHADES)).astype(int), len(SHADES) - 1)
     return "\n".join("".join(SHADES[i] for i in row) for row in steps)
 
 
 def cursor_up(text: str) -> str:
-    """The escape that puts the next picture over `text`; print it as a line of its own."""
+    """Return the escape sequence that moves the cursor above `text`; print it as a separate line."""
     return f"\x1b[{text.count(chr(10)) + 2}A"

@@ -1,11 +1,11 @@
-"""One self-contained HTML page for whatever lies under a path: clips, data sets, training runs, restored video, scores.
+"""Builds one self-contained HTML page for the clips, data sets, runs, restored video and scores under a path.
 
-    clip.json            -> truth, codes, plain average, flow as moving pictures; light, motion, error (report_clip.py)
-    dataset.json         -> a table of the clips, and one of each split as a clip
-    restored .json       -> restored video beside its codes and, where the clip is at hand, its truth and flow
-    runs, scores, studies, validations -> tables and curves (report_tables.py)
+    clip.json            -> truth, codes, naive mean and flow as moving pictures; light, motion, error (clip_section.py)
+    dataset.json         -> a table of the clips, and one clip of each split
+    restored .json       -> restored video beside its codes and, if the clip is there, its truth and flow
+    runs, scores, studies, validations -> tables and curves (table_sections.py)
 
-Nothing is computed here that is not in the files. A player shows at most `report_clip.FRAMES` frames.
+The page shows stored results only; nothing is recomputed. A player shows at most `clip_section.FRAMES` frames.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ INSIDE_CLIPS = {"streams", "truth", "radiance", "sharp", "jobs", "failed", "logs
 def build_page(
     path: Path, *, title: str | None = None, notes: list[str] | None = None, progress: Progress | None = None
 ) -> str:
-    """The page for `path` as HTML text, with `notes` on top. `ValueError` if nothing under it is ours.
+    """Return the page for `path` as HTML, with `notes` on top; raise `ValueError` if nothing under it is known.
 
-    `progress` is told how many of the things there are were drawn; a clip of a data set is one of them.
+    `progress(done, total)` is called after each result; each clip of a data set counts as one.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
@@ -80,7 +80,7 @@ def build_page(
 
 
 def _known_files(path: Path) -> list[Path]:
-    """JSON files at or below `path` that may be ours: not the insides of clips, not the clips of a data set."""
+    """Return the JSON files at or below `path`, without those inside clips and the clips of a data set."""
     if path.is_file():
         return [path]
     candidates = [p for p in sorted(path.rglob("*.json")) if not INSIDE_CLIPS & set(p.relative_to(path).parts[:-1])]
@@ -89,7 +89,7 @@ def _known_files(path: Path) -> list[Path]:
 
 
 def _kind(path: Path) -> str | None:
-    """What a JSON file describes: its name tells for folders, its contents for single files; None if it is not ours."""
+    """Return the kind of result in a JSON file, by its name for folders, else by its contents; None if unknown."""
     names = {"clip.json": "clip", "dataset.json": "dataset", "history.json": "training"}
     if path.name in names:
         return names[path.name]
@@ -103,7 +103,7 @@ def _kind(path: Path) -> str | None:
     return next((kind for kind, keys in _KEYS if keys <= found.keys()), None)
 
 
-# Kinds of files without a format of their own -> keys that they have
+# Kinds of files without a format field, and the keys that identify them
 _KEYS = (
     ("bench", {"setting", "costs"}),
     ("validation", {"rows", "ok"}),
@@ -115,12 +115,12 @@ _KEYS = (
 
 
 def _steps(kind: str, file: Path) -> int:
-    """Things to draw for one file: the clips of a data set, otherwise one."""
+    """Return the number of steps for one file: the clips of a data set, otherwise one."""
     return len(Dataset.open(file.parent).names()) if kind == "dataset" else 1
 
 
 def dataset_section(path: Path, step: Callable[[], None] = lambda: None) -> Markup:
-    """A table of the clips of a data set, `step` after each, and the first clip of each split in pictures."""
+    """Return a table of the clips of a data set and the first clip of each split; call `step` after each clip."""
     data = Dataset.open(path.parent)
     rows, below = [], set()
     for name in data.names():
@@ -138,7 +138,7 @@ def dataset_section(path: Path, step: Callable[[], None] = lambda: None) -> Mark
         "clip", "split", "frames × rows × columns", "mean radiance", "photons per pixel",
         "motion of what moves [px/frame]", "largest", f"radiance's PSNR [dB below {unit}]",
     ]  # fmt: skip
-    missing = f"; not made yet: {', '.join(data.missing)}" if data.missing else ""
+    missing = f"; missing: {', '.join(data.missing)}" if data.missing else ""
     caption = f"{len(rows)} clips{missing}; motion in the middle frame, of pixels that move more than {MOVING:g} px"
     overview = page.section(f"Data set {data.name}", page.table(page.Table(caption, headers, rows)))
     shown = [clip for split in ("test", "train", "val") for clip in data.clips(split)[:1]]
@@ -146,7 +146,7 @@ def dataset_section(path: Path, step: Callable[[], None] = lambda: None) -> Mark
 
 
 def restored_section(path: Path) -> Markup:
-    """Restored video beside its codes and truth, all at one white."""
+    """Return restored video beside its codes and truth, all with one white."""
     video = Restored.open(path)
     meta, restored = video.meta, video.frames()
     frames = chosen_frames(len(restored))
@@ -172,7 +172,7 @@ def restored_section(path: Path) -> Markup:
 
 
 def _source(meta: dict[str, Any]) -> tuple[Clip | None, Stream | None]:
-    """The clip and stream that a restored video came from, where they are still at hand."""
+    """Return the clip and stream of a restored video, or (None, None) if they are no longer there."""
     stream = Path(str(meta.get("source", "")))
     try:
         return Clip.open(stream.parents[1]), Stream.open(stream.with_suffix(".json"))

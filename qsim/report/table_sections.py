@@ -1,12 +1,12 @@
-"""Sections of a report page that hold numbers: training runs, evaluations, studies, validations.
+"""Builds the sections of a page that hold numbers: training runs, evaluations, studies, validations.
 
     history.json     -> the learning curve of a training run
     evaluation.json  -> the table of methods; a measured static object likewise; speed against error
-    tradeoff.json    -> bit depth against motion; figureN.json -> a figure of the paper; with the pictures beside them
-    bench.json       -> what a restored frame costs
+    tradeoff.json    -> bit depth against motion; figureN.json -> a figure of the paper; with their stored pictures
+    bench.json       -> the cost of a restored frame
     the JSON of `qsim validate` -> speed against error of sensors and rendering; windows read per second
 
-Nothing is computed here that is not in the files.
+The sections show stored results only; nothing is recomputed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def training_section(path: Path) -> Markup:
-    """The learning curve: PSNR of the validation clips against minutes."""
+    """Return the learning curve: PSNR of the validation clips against minutes."""
     history = files.read_json(path)["history"]
     axes, save = page.axes("minutes of training", "validation PSNR, matched [dB]")
     axes.plot([entry["elapsed"] / 60 for entry in history], [entry["psnr_matched"] for entry in history], ".-")
@@ -32,7 +32,7 @@ def training_section(path: Path) -> Markup:
 
 
 def evaluation_section(path: Path) -> Markup:
-    """Methods on held-out clips: means and 95 % intervals over scenes, best matched PSNR of each light level bold."""
+    """Return the scores of methods on held-out clips: means and 95 % intervals over scenes, best matched PSNR bold."""
     found = files.read_json(path)
     rows = [
         [
@@ -62,9 +62,7 @@ def evaluation_section(path: Path) -> Markup:
     ]
     caption = f"mean ± half of the 95 % interval over scenes; {_definition(found)}"
     if any(line.get("near_truth") for line in found["table"]):
-        caption += (
-            "; † in one clip or more within 3 dB of the truth's own PSNR, whose error is a large part of this score"
-        )
+        caption += "; † within 3 dB of the truth's own PSNR in at least one clip, so its error is a large part"
     missing = f"Not built yet: {', '.join(found['not_built_yet'])}." if found.get("not_built_yet") else ""
     table = page.table(page.Table(caption, headers, rows, frozenset(best)))
     remarks = [page.text(remark) for remark in (*found.get("remarks", []), missing)]
@@ -72,11 +70,11 @@ def evaluation_section(path: Path) -> Markup:
 
 
 def _definition(found: dict[str, Any]) -> str:
-    """What the scores of an evaluation mean; before format 2 they were others."""
+    """Return the definition of the scores of an evaluation, which changed with format 2."""
     if "peak" not in found:
         return (
-            "scores as they were defined before (peak = the sensor's white, matched = after the factor of least "
-            "squares without the clamp); they do not compare with later ones"
+            "scores of the earlier definition (peak = the sensor's white, matched = after the factor of least "
+            "squares without the clamp); they cannot be compared with later ones"
         )
     return f"peak = {found['peak']}; matched = after the one factor that is best behind the clamp at the peak"
 
@@ -90,7 +88,7 @@ def _percent(share: object) -> str | None:
 
 
 def _pm(interval: dict[str, Any], digits: int) -> str:
-    """`23.45 ± 0.67`, without the half-width where there is one scene."""
+    """Return "23.45 ± 0.67", without the half-width if there is one scene."""
     mean, half = interval["mean"], interval["half_width"]
     if not isinstance(mean, int | float):
         return "n/a" if interval.get("scenes") else "failed"
@@ -98,21 +96,21 @@ def _pm(interval: dict[str, Any], digits: int) -> str:
 
 
 def static_section(path: Path) -> Markup:
-    """Measured photons of a static object: restored from some frames, scored against the others."""
+    """Return the scores on measured photons of a static object: some frames are restored, the others the reference."""
     found = files.read_json(path)
     headers = ["method", "PSNR [dB]", "PSNR matched [dB]", "spread over splits [dB]", "with the reference's noise [dB]"]
     keys = ("method", "psnr", "psnr_matched", "psnr_matched_spread", "psnr_as_measured")
     rows = [[score[key] for key in keys] for score in found["scores"]]
     caption = (
         f"{Path(found['counts']).name}: real photons clipped to {found['bits']} bits, restored from {found['frames']} "
-        "frames, scored against the others; the reference's own variance is taken off; "
-        + (f"peak = {found['peak']:.4g} photons" if "peak" in found else "peak = the largest code, as it was before")
+        "frames, scored against the others; the variance of the reference is subtracted; "
+        + (f"peak = {found['peak']:.4g} photons" if "peak" in found else "peak = the largest code (earlier definition)")
     )
     return page.section("Real photons", page.table(page.Table(caption, headers, rows)))
 
 
 def _speed_against_error(found: dict[str, Any]) -> Markup | None:
-    """PSNR against seconds per frame, one mark per method and light level; None if there is no time."""
+    """Return PSNR against seconds per frame, one mark per method and light level; None if no time is stored."""
     axes, save = page.axes("seconds per frame", "PSNR matched [dB]")
     lights = list(dict.fromkeys(line["light"] for line in found["table"]))
     drawn = 0
@@ -130,13 +128,13 @@ def _speed_against_error(found: dict[str, Any]) -> Markup | None:
     if not drawn:
         return None
     axes.set_xscale("log")
-    axes.margins(0.15)  # for the names
+    axes.margins(0.15)  # space for the names
     axes.legend(fontsize=7)
     return page.figure(save(), "speed against error: up and to the left is better")
 
 
 def study_section(path: Path) -> Markup:
-    """Bit depth against motion: the rows of a study or the cells of a sweep, with the figure that was drawn of them."""
+    """Return the rows of a bit-depth study, or the cells of a sweep, with their stored figures."""
     found = files.read_json(path)
     rows = found.get("rows") or found.get("cells") or []
     if path.stem.startswith("figure"):
@@ -154,7 +152,7 @@ def study_section(path: Path) -> Markup:
 
 
 def bench_section(path: Path) -> Markup:
-    """What a restored frame costs, beside its PSNR."""
+    """Return the cost of a restored frame beside its PSNR."""
     found = files.read_json(path)
     keys = list(dict.fromkeys(key for cost in found["costs"] for key in cost if not isinstance(cost[key], list | dict)))
     rows = [[cost.get(key) for key in keys] for cost in found["costs"]]
@@ -166,7 +164,7 @@ def bench_section(path: Path) -> Markup:
 
 
 def validation_section(path: Path) -> Markup:
-    """Speed against error of sensor models or of rendering, as `qsim validate --json` printed it."""
+    """Return speed against error of sensor models or of rendering, from the JSON of `qsim validate`."""
     found = files.read_json(path)
     verdict = "everything is within its bounds" if found["ok"] else "something is OUTSIDE its bounds"
     if "median_ratio" in found:
@@ -196,10 +194,10 @@ def validation_section(path: Path) -> Markup:
 
 
 def reading_section(path: Path) -> Markup:
-    """Windows read per second, from a clip and from video, as `qsim validate reading --json` printed it."""
+    """Return the windows read per second from a clip and from video, from the JSON of `qsim validate reading`."""
     found = files.read_json(path)
     window, clip = (" × ".join(map(str, found[key])) for key in ("window_shape", "clip_shape"))
-    verdict = "as quick as wanted" if found["ok"] else "NOT as quick as wanted"
+    verdict = "as fast as wanted" if found["ok"] else "NOT as fast as wanted"
     what = (
         f"windows of {window} in a clip of {clip}: {verdict} ({found['wanted']:g}/s, {found['wanted_ratio']:g} times)"
     )
@@ -210,7 +208,7 @@ def reading_section(path: Path) -> Markup:
 
 
 def _heading(key: str) -> str:
-    """A key of a file as words; files call the naive loop "obvious"."""
+    """Return a key of a file as a heading; in files, keys of the naive loop begin with "obvious"."""
     return key.replace("obvious", "naive").replace("_", " ")
 
 

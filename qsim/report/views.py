@@ -1,8 +1,8 @@
-"""What a clip, a stream or an array can be shown as: views, each a declared function of the numbers.
+"""Opens clips, streams and arrays as views: pictures whose relation to the numbers is declared.
 
-    path -> Source (views: what a picture shows, and how) -> View.picture(t), uint8 [H, W, 3]
+    path -> Source -> View.picture(t), uint8 [H, W, 3]
 
-Whites and colour scales are those of the whole clip (from at most SAMPLES frames), so that frames can be compared.
+One white and one colour scale apply to all frames (measured on at most SAMPLES of them), so frames can be compared.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from qsim.formats.recording import checked_codes
 from qsim.sensor import packing
 
 Picture = NDArray[np.uint8]  # [H, W, 3]
-SAMPLES = 16  # frames that decide the scales of a clip
-KINDS = ("sharp", "radiance", "codes", "average", "flow", "depth")  # that --what knows
+SAMPLES = 16  # frames on which the scales of a clip are measured
+KINDS = ("sharp", "radiance", "codes", "average", "flow", "depth")  # the values of --what
 CURVE = f"(value / white)^(1/{colour.GAMMA:g})"
 
 
 @dataclass(frozen=True)
 class View:
-    """One thing to look at."""
+    """One kind of picture of a source."""
 
     kind: str  # of KINDS, or "values"
-    declared: str  # what it is and how numbers became colours, for caption and sidecar
+    declared: str  # quantity and scale, for caption and sidecar
     picture: Callable[[int], Picture]
     legend: Picture | None = None
     scale: dict[str, float] = field(default_factory=dict)  # the numbers of the declaration
@@ -43,7 +43,7 @@ class View:
 
 @dataclass(frozen=True)
 class Source:
-    """What a path holds."""
+    """The views of a path, with its length and rate."""
 
     name: str
     length: int  # frames
@@ -52,22 +52,22 @@ class Source:
 
 
 def open_source(path: Path, *, bits: int | None = None, width: int | None = None, stream: str | None = None) -> Source:
-    """The views of a clip folder, a stream (.npy or .json) or an array [T, H, W] or [H, W] in a .npy.
+    """Open a clip folder, a stream (.npy or .json) or an array [T, H, W] or [H, W] in a .npy.
 
-    `bits` and `width` tell what a bare array of whole numbers holds: codes, or packed binary planes of so many columns;
-    `stream` chooses one of a clip's streams (default: the first). `FileNotFoundError` or `ValueError` with the cure.
+    For an array of whole numbers, `bits` means codes and `width` packed binary planes of so many columns. `stream`
+    selects one of a clip's streams (default: the first). Raise `FileNotFoundError` or `ValueError` for other paths.
     """
     if (path / "dataset.json").is_file():
         raise ValueError(f"{path}: is a data set; name one of its clips, as in {path / 'clips'}/NAME")
     if path.is_dir() or not path.exists():
         clip = Clip.open(path)
-        _refuse(path, "a clip, whose streams know their bits", bits=bits, width=width)
+        _refuse(path, "a clip, whose streams state their bits", bits=bits, width=width)
         return _clip_source(clip, stream)
-    _refuse(path, "no clip", stream=stream)
+    _refuse(path, "not a clip", stream=stream)
     sidecar = path.with_suffix(".json")
     described = files.read_json(sidecar) if sidecar.is_file() else {}
     if "ppp_factor" in described:
-        _refuse(path, "a stream, which knows its bits", bits=bits, width=width)
+        _refuse(path, "a stream, which states its bits", bits=bits, width=width)
         return _stream_source(Stream.open(sidecar))
     if path.suffix != ".npy":
         raise ValueError(f"{path}: expected a clip folder, a stream or a .npy array; `qsim convert` reads other files")
@@ -75,7 +75,7 @@ def open_source(path: Path, *, bits: int | None = None, width: int | None = None
 
 
 def _refuse(path: Path, what: str, **options: int | str | None) -> None:
-    """A `ValueError` for options that change nothing of what a path holds."""
+    """Raise `ValueError` for options that do not apply to what a path holds."""
     for name, value in options.items():
         if value is not None:
             raise ValueError(f"{path}: is {what}; leave out --{name}")
@@ -110,7 +110,7 @@ def _array_source(path: Path, bits: int | None, width: int | None, described: di
     length = check_shape(path, array.shape)[0]
     rate = described.get("frame_rate")
     if array.dtype.kind == "f":
-        _refuse(path, "an array of values, no codes", bits=bits, width=width)
+        _refuse(path, "an array of values, not of codes", bits=bits, width=width)
         what, unit = described.get("method", "values"), described.get("unit", "as stored")
         title = f"restored by {what}" if "method" in described else what
         view = _light_view("values", title, unit, length, lambda t: np.asarray(array[t], np.float64))
@@ -122,7 +122,7 @@ def _array_source(path: Path, bits: int | None, width: int | None, described: di
         _refuse(path, "packed planes of 1 bit, as --width says", bits=bits)
         return _packed_source(path, array, width)
     if bits is None:
-        raise ValueError(f"{path}: whole numbers are codes or packed planes; say --bits 3, or --width 320 for planes")
+        raise ValueError(f"{path}: whole numbers are codes or packed planes; add --bits 3, or --width 320 for planes")
     if not 1 <= bits <= 16:
         raise ValueError(f"--bits: expected 1 to 16, got {bits}")
 
@@ -135,8 +135,8 @@ def _array_source(path: Path, bits: int | None, width: int | None, described: di
 def _packed_source(path: Path, array: NDArray[Any], width: int) -> Source:
     if array.dtype != np.uint8 or width < 1 or packing.packed_width(width, 1) != array.shape[2]:
         raise ValueError(
-            f"{path}: {array.dtype} {list(array.shape)} holds no packed planes of {width} columns; "
-            f"a row of those is {packing.packed_width(max(width, 1), 1)} bytes of uint8"
+            f"{path}: {array.dtype} {list(array.shape)} does not hold packed planes of {width} columns; "
+            f"a row of those has {packing.packed_width(max(width, 1), 1)} bytes of uint8"
         )
 
     def read(start: int, stop: int) -> NDArray[Any]:
@@ -172,7 +172,7 @@ def _code_views(name: str, bits: int, length: int, read: Callable[[int, int], ND
 
     white = colour.peak(np.stack([average(t) for t in _samples(length)]))
     shown = f"codes of {name}: 0 black, {top} white, no curve"
-    mean = f"plain average of {colour.AVERAGE} frames: white = {white * top:.4g} codes, curve {CURVE}"
+    mean = f"naive mean of {colour.AVERAGE} frames: white = {white * top:.4g} codes, curve {CURVE}"
     return {
         "codes": View("codes", shown, code, None, {"bits": bits}),
         "average": View("average", mean, lambda t: _grey(colour.tone(average(t), white)), None, {"white": white}),
@@ -194,7 +194,7 @@ def _flow_view(clip: Clip) -> View:
 
 def _depth_view(clip: Clip) -> View:
     near, far = colour.depth_range(np.stack([clip.depth(t) for t in _samples(len(clip))]))
-    declared = f"depth: {near:.3g} m (left of the bar) to {far:.3g} m, even in 1/depth, black where nothing is"
+    declared = f"depth: {near:.3g} m (left of the bar) to {far:.3g} m, even in 1/depth, black without a surface"
     return View(
         "depth",
         declared,
@@ -205,16 +205,16 @@ def _depth_view(clip: Clip) -> View:
 
 
 def choose(source: Source, wanted: list[str] | None, *, several: bool = True) -> list[View]:
-    """The views asked for, or the usual ones: all of a clip but `radiance` and `average` (one if not `several`)."""
+    """Return the wanted views; by default all but `radiance` and `average` (the first of them if not `several`)."""
     if wanted is None:
         usual = [view for kind, view in source.views.items() if kind not in ("radiance", "average")]
         return usual if several else usual[:1]
     for kind in wanted:
         if kind not in source.views:
-            raise ValueError(f"{source.name}: has no '{kind}' to show; there are: {', '.join(source.views)}")
+            raise ValueError(f"{source.name}: has no view '{kind}'; it has: {', '.join(source.views)}")
     return [source.views[kind] for kind in wanted]
 
 
 def declaration(view: View) -> dict[str, Any]:
-    """What a view shows and how, for programs."""
+    """Return kind, declaration and scale of a view, for JSON."""
     return {"what": view.kind, "declared": view.declared} | view.scale

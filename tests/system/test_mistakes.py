@@ -153,7 +153,7 @@ MISTAKES = [
     ("qsim report lit -o x.pdf", "x.pdf: a page is a .html file, as in -o x.html"),
     ("qsim preview lit -o x.webm", "x.webm: a preview is a .mp4, .gif, .png file, as in -o x.mp4"),
     ("qsim preview data", "data: is a data set; name one of its clips, as in data/clips/NAME"),
-    ("qsim preview codes.npy", "whole numbers are codes or packed planes; say --bits 3"),
+    ("qsim preview codes.npy", "whole numbers are codes or packed planes; add --bits 3"),
     ("qsim tradeoff", "give a clip or a scene, --table, or --paper-figure"),
     ("qsim tradeoff lit", "lit: 2000 fps; this study needs a clip of at least 10000 fps, as in `qsim render fan"),
     ("qsim tradeoff --paper-figure 3 -o x", "there are: 1, 2"),

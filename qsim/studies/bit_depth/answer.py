@@ -1,7 +1,7 @@
-"""Answers of a bit-depth study: a motion that is asked for, optima at the edge of the tried bits, a sentence.
+"""Finds the speed for a wanted motion, widens a study while its deepest frame is best, and states the best depth.
 
-Words: a **plane** is one clip frame read with one bit; a **frame** of b bits is 2^b - 1 planes; a **code** is the value
-of a pixel in one frame. Motion is the mean over the pixels that move more than 0.1 px per frame of `CODE_BITS` bits.
+A **plane** is one clip frame read with one bit. A **frame** of b bits is 2^b - 1 planes, and a **code** is the value of
+a pixel in one frame. Motion is the mean over the pixels that move more than 0.1 px per frame of `CODE_BITS` bits.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, moving_mean
 from qsim.studies.bit_depth.clip_study import Study, StudyRow, clip_motion, study
 from qsim.studies.bit_depth.readout import MODELS, StudySettings
 
-WIDEST = 7  # bits up to which the range is widened
+WIDEST = 7  # bits: the largest depth to which a study is widened
 LOOKS = 4  # instants at which the motion of a scene is measured
 SPEEDS = (1e-3, 1e3)  # factors on a scene's motion that are tried
-CLOSE = 0.01  # relative difference to the asked motion that is good enough
-NEAR = 0.05  # relative difference that is accepted at most
+CLOSE = 0.01  # relative difference to the wanted motion at which the search ends
+NEAR = 0.05  # largest relative difference that is accepted
 
 
 def scene_motion(name: str, size: tuple[int, int], *, frames: int, frame_rate: float, seed: int, speed: float) -> float:
-    """Motion of a scene in px per frame of 3 bits, from its ground truth at a few instants; 0 where nothing moves.
+    """Return the motion of a scene [px per frame of 3 bits]: the mean over `LOOKS` instants; 0 if nothing moves.
 
-    Nothing is rendered: rays find the first surfaces.
+    The flow comes from rays to the first surfaces; nothing is rendered.
     """
     import scenes
     from qsim.rendering.renderer import Renderer
@@ -40,9 +40,9 @@ def scene_motion(name: str, size: tuple[int, int], *, frames: int, frame_rate: f
 
 
 def speed_for(px: float, motion: Callable[[float], float], name: str) -> tuple[float, float]:
-    """(speed factor, motion reached) of a scene whose motion [px] at a factor is `motion(factor)`.
+    """Return (speed factor, motion reached) for a scene whose motion [px] at a factor is `motion(factor)`.
 
-    `ValueError` for a still scene, and if no factor comes within 5 %.
+    Raise `ValueError` if the scene is still or if no factor comes within 5 %.
     """
     low, high = SPEEDS
     speed, tried = 1.0, {}
@@ -53,7 +53,7 @@ def speed_for(px: float, motion: Callable[[float], float], name: str) -> tuple[f
         if tried[speed] > 0:
             after = float(np.clip(speed * px / tried[speed], low, high))
         elif max(tried.values()) > 0:
-            after = (speed * max(tried)) ** 0.5  # too slow for the threshold of what moves
+            after = (speed * max(tried)) ** 0.5  # below MOVING everywhere: try between this and the fastest
         else:
             after = high if speed < high else speed
         if after in tried:
@@ -71,9 +71,9 @@ def speed_for(px: float, motion: Callable[[float], float], name: str) -> tuple[f
 
 
 def step_for(px: float, clip: Clip) -> tuple[int, float]:
-    """(whole factor, motion reached) of a clip, of which only every so many-th frame is taken to make it faster.
+    """Return (step, motion reached) for a clip: reading every `step`-th frame makes it so many times faster.
 
-    `ValueError` without ground truth, for a still clip, and if the clip moves faster already.
+    Raise `ValueError` if the clip has no ground truth, is still, or moves faster already.
     """
     if not clip.has_truth:
         raise ValueError(f"{clip.path}: has no ground truth, so its motion is unknown; give --speed instead of --px")
@@ -98,11 +98,11 @@ def step_for(px: float, clip: Clip) -> tuple[int, float]:
     return step, at(step)
 
 
-# The edge of what was tried
+# The best depth
 
 
 def at_edge(found: Study, model: str) -> str:
-    """`>=` if the best depth is the deepest tried, `<=` if it is the shallowest above 1 bit, else nothing."""
+    """Return ">=" if the best depth is the deepest tried, "<=" if it is the shallowest above 1 bit, else ""."""
     bits = [row.bits for row in found.rows if row.model == model]
     best = found.best(model).bits
     if best == max(bits):
@@ -111,12 +111,12 @@ def at_edge(found: Study, model: str) -> str:
 
 
 def marked(found: Study, model: str) -> str:
-    """The best depth with its mark, as `4` or `>= 5`."""
+    """Return the best depth with its mark, as "4" or ">= 5"."""
     return f"{at_edge(found, model)} {found.best(model).bits}".strip()
 
 
 def widened(clip: Clip, settings: StudySettings, note: Callable[[str], None] | None = None) -> Study:
-    """The study, with one more bit after the other while the deepest is best, up to 7 bits and the clip's length."""
+    """Return the study, with one more bit at a time while the deepest is best, up to 7 bits and the clip's length."""
     found = study(clip, settings)
     while any(at_edge(found, model) == ">=" for model in MODELS) and settings.bits[-1] < WIDEST:
         settings = replace(settings, bits=(*settings.bits, settings.bits[-1] + 1))
@@ -129,12 +129,12 @@ def widened(clip: Clip, settings: StudySettings, note: Callable[[str], None] | N
 
 
 def code_motion(row: StudyRow) -> float | None:
-    """Motion of a row in px per frame of 3 bits."""
+    """Return the motion of a row [px per frame of 3 bits]."""
     return None if row.motion_px_per_frame is None else row.motion_px_per_frame / (2**row.bits - 1) * CODE_PLANES
 
 
 def answer(found: Study) -> str:
-    """One sentence: the best depth of both readouts at this motion and light, and what its neighbours lose."""
+    """Return one sentence: the best depth of both readouts, and how many dB its neighbours are worse."""
     motion = code_motion(found.rows[0])
     where = "at unknown motion" if motion is None else f"at {motion:.3g} px per {CODE_BITS}-bit frame"
     return f"{where} and {found.ppp:.3g} photons per plane: " + "; ".join(_of_model(found, model) for model in MODELS)

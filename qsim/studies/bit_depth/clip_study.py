@@ -1,17 +1,17 @@
-"""Bit depths of one fast clip: the same photons read as 2^b - 1 binary planes, or once as a number of b bits.
+"""Compares bit depths on one fast clip: the same photons read as 2^b - 1 binary planes, or once with b bits.
 
     clip at the plane rate (>= 10 000 fps) -> per bit depth: motion, blur, noise by its causes, PSNR, data rate
 
 A frame of b bits lasts M = 2^b - 1 clip frames. M is odd, so the frames of **all** depths are centred on the same clip
-frames: every depth delivers at the same instants (equal output rate) and is scored against the same sharp image.
+frames. Every depth has the same output rate and is scored against the same sharp image.
 
-* `planes`: M binary planes, each at its own instant of the motion, drawn with the key of its clip frame. A deeper frame
-  contains the very planes of a shallower one, and they are the planes of `qsim sense --group`.
-* `multibit`: the light of the M clip frames, read once; the depths share each pixel's random number.
+* `planes`: M binary planes, each exposed at another instant and drawn with the key of its clip frame. A deeper frame
+  contains the planes of a shallower one, and they are the planes of `qsim sense --group`.
+* `multibit`: the light of the M clip frames, read once. All depths use the same random number of a pixel.
 
-Beside every simulated error stands its exact expectation: the sum over codes of P(code | light) (estimate - truth)^2,
-with the light that the clip gives. For planes that differ in light the binomial of their mean probability is used, its
-variance times sum p (1 - p) / (M mean p (1 - mean p)): exact to second order in the differences.
+Every simulated error has its exact expectation beside it: the sum over codes of P(code | light) (estimate - truth)^2.
+For planes of different light, the binomial distribution of their mean probability is used. Its variance is multiplied
+by sum p (1 - p) / (M mean p (1 - mean p)), which is exact to second order in the differences.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from qsim.studies.bit_depth.readout import GRID, Readout, StudySettings, readout
 
 @dataclass(frozen=True)
 class StudyRow:
-    """One bit depth of one model. Errors are rms over pixels, in photons per pixel and **clip frame** (plane)."""
+    """One bit depth of one model; errors are rms over pixels, in photons per pixel and clip frame (plane)."""
 
     model: str  # "planes" or "multibit"
     bits: int
     fps: float
-    motion_px_per_frame: float | None  # of what moves (clip_motion), in this frame; None where the clip has no flow
+    motion_px_per_frame: float | None  # clip_motion times the clip frames of this frame; None if the clip has no flow
     blur_error: float  # exposed mean against the sharp instant
-    blur_predicted: float  # the same from the clip's structure function (tradeoff.Structure)
+    blur_predicted: float  # the same from the clip's structure function (laws.Structure)
     shot_error: float  # of an ideal photon counter behind the same efficiency and dark rate
-    quantisation_error: float  # what few levels and saturation add (in squares), without read noise
-    read_error: float  # what read noise adds (in squares); negative where it takes away (it dithers coarse levels)
+    quantisation_error: float  # added by few levels and saturation (in squares), without read noise
+    read_error: float  # added by read noise (in squares); negative where it dithers coarse levels
     snr_db: float  # exposure-referred, at the mean light: photons sqrt(Fisher information), 20 log10
     psnr_db: float  # of the maximum-likelihood frame against the sharp instant
     psnr_predicted_db: float  # its exact expectation
@@ -58,13 +58,13 @@ class StudyRow:
 
 @dataclass(frozen=True)
 class Study:
-    """All rows of one clip at one light level."""
+    """The rows of one clip at one light level."""
 
     clip: str
     rows: tuple[StudyRow, ...]
-    ppp: float  # photons per pixel and clip frame, whole clip
+    ppp: float  # photons per pixel and clip frame, mean of the clip
     lux: float | None
-    peak: float  # photons per clip frame that PSNR refers to: 2.5 x the mean light; nothing is clamped there
+    peak: float  # photons per clip frame that PSNR refers to: 2.5 x the mean light; nothing is clamped to it
     frame_rate: float
     speed: int
     instants: tuple[int, ...]  # clip frames that were scored
@@ -76,23 +76,23 @@ class Study:
         return tuple(sorted({row.bits for row in self.rows}))
 
     def best(self, model: str) -> StudyRow:
-        """The row of highest PSNR."""
+        """Return the row of highest PSNR."""
         return max((row for row in self.rows if row.model == model), key=lambda row: row.psnr_db)
 
 
 @dataclass(frozen=True)
 class Exposed:
-    """One frame of M clip frames around an instant, arrays [H, W]."""
+    """One frame of M clip frames around an instant; arrays are float64 [H, W]."""
 
     planes: int
-    photons: Array  # sum of the light
-    fired: Array  # planes that fired, of the `planes` model
+    photons: Array  # sum of the light, photons
+    fired: Array  # number of planes that fired (model "planes")
     quiet: Array  # sum of the probabilities 1 - p that a plane does not fire
     spread: Array  # sum of p (1 - p), the variance of `fired`
 
 
 def check_clip(clip: Clip, settings: StudySettings) -> None:
-    """`ValueError` if the clip is too slow or too short for the settings."""
+    """Raise `ValueError` if the clip is too slow or too short for the settings."""
     if clip.frame_rate < SLOWEST:
         raise ValueError(
             f"{clip.path}: {clip.frame_rate:g} fps; this study needs a clip of at least {SLOWEST:g} fps, as in "
@@ -106,7 +106,7 @@ def check_clip(clip: Clip, settings: StudySettings) -> None:
 
 
 def instants(frames: int, settings: StudySettings) -> tuple[int, ...]:
-    """Centres of frames of the deepest depth that do not overlap, spread over the clip."""
+    """Return the centres of frames of the deepest depth, spread over the clip without overlap."""
     span = settings.longest
     count = min(settings.instants, frames // span)
     first, last = span // 2, frames - 1 - span // 2
@@ -116,9 +116,10 @@ def instants(frames: int, settings: StudySettings) -> tuple[int, ...]:
 def expose(
     clip: Clip, centre: int, settings: StudySettings, factor: float, plane: Sensor, structure: Array
 ) -> Iterator[Exposed]:
-    """Frames of all depths around one clip frame, shallow to deep; adds squared differences of light to `structure`.
+    """Yield the frames of all depths around one clip frame, shallow to deep; add squared differences to `structure`.
 
-    `structure[k]` gets the mean over pixels of (light at two instants, k planes apart, symmetric about the centre)^2.
+    `factor` multiplies the light of the clip. `structure` [K] is float64: entry k grows by the mean over pixels of the
+    squared difference of the light at two instants, k planes apart and symmetric about the centre.
     """
     key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))
     wanted = [2**b - 1 for b in settings.bits]
@@ -141,7 +142,7 @@ def expose(
 
 
 class _Sums:
-    """Running sums over pixels and instants of one readout."""
+    """The running sums of one readout over pixels and instants."""
 
     def __init__(self) -> None:
         self.pixels = 0
@@ -149,7 +150,7 @@ class _Sums:
         self.quiet = 0.0  # noise without read noise
 
     def add(self, readout: Readout, frame: Exposed, codes: Array, sharp: Array) -> None:
-        """All errors in photons per clip frame."""
+        """Add the errors of one frame, in photons per clip frame; `codes` and `sharp` are [H, W]."""
         m = frame.planes
         light = _equivalent(readout, frame)
         mean, variance = readout.moments(light)
@@ -178,7 +179,7 @@ def _duration(readout: Readout) -> float:
 
 
 def _equivalent(readout: Readout, frame: Exposed) -> Array:
-    """Constant light of the whole frame that gives the same mean code."""
+    """Return the constant light [photons per frame] that gives the same mean code, [H, W]."""
     if readout.model == "multibit":
         return frame.photons
     sensor = readout.sensor
@@ -191,7 +192,10 @@ def _equivalent(readout: Readout, frame: Exposed) -> Array:
 
 
 def study(clip: Clip, settings: StudySettings, *, progress: Callable[[int, int], None] | None = None) -> Study:
-    """Draw and score every bit depth of a clip; `ValueError` if the clip is too slow, too short or has no light."""
+    """Draw and score every bit depth of a clip.
+
+    Raise `ValueError` if the clip is too slow or too short, or if its light is unknown.
+    """
     check_clip(clip, settings)
     level = light_level(clip, ppp=settings.ppp)
     forms = readouts(settings, level.ppp, clip.exposure)
@@ -220,15 +224,15 @@ def study(clip: Clip, settings: StudySettings, *, progress: Callable[[int, int],
 
 
 def _read(clip: Clip, form: Readout, frame: Exposed, centre: int, settings: StudySettings) -> Array:
-    """One multi-bit read of the summed light; its key is that of the instant, stage 1 (planes are stage 0)."""
+    """Return the codes of one multi-bit read of the summed light, [H, W]; stage 1 of the key (planes: stage 0)."""
     key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name), frame=centre, stage=1)
     return form.sensor.sample(frame.photons, form.exposure, key=key)
 
 
 def clip_motion(clip: Clip, t: int, speed: int = 1) -> float | None:
-    """Motion [px per plane] of what moves more than 0.1 px per 3-bit frame, at a whole `speed`; None without truth.
+    """Return the mean motion [px per plane] of the pixels that move more than 0.1 px per 3-bit frame, at frame t.
 
-    0 where nothing moves so far.
+    `speed` is a whole factor on the motion. 0 if no pixel moves so far, None if the clip has no ground truth.
     """
     if not clip.has_truth:
         return None
@@ -264,5 +268,5 @@ def _row(
 
 
 def signed_root(square: float) -> float:
-    """sqrt(|x|) with the sign of x."""
+    """Return sqrt(|x|) with the sign of x."""
     return math.copysign(math.sqrt(abs(square)), square)

@@ -1,4 +1,4 @@
-"""Clips of a bit-depth study: a clip at several speeds, a scene rendered at each, and clips of grouped frames."""
+"""Prepares the clips of a bit-depth study: one clip at several speeds, rendered scenes, clips of grouped frames."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from qsim.studies.bit_depth.readout import StudySettings, plane_sensor
 
 @dataclass(frozen=True, eq=False)
 class MovingClip:
-    """A clip at one speed: rendered so (step 1), or of every `step`-th frame."""
+    """A clip at one speed: rendered at that speed (step 1), or read at every `step`-th frame."""
 
     speed: float
     clip: Clip
@@ -31,7 +31,7 @@ class MovingClip:
 
 @dataclass(frozen=True)
 class ClipShape:
-    """How a scene is rendered for a study."""
+    """The size, rate and error of a clip that is rendered for a study."""
 
     frames: int
     height: int = 96
@@ -42,9 +42,9 @@ class ClipShape:
 
 
 def render(name: str, path: Path, shape: ClipShape, *, speed: float = 1.0, progress: Progress | None = None) -> Clip:
-    """The scene as a clip; one that is already there is kept if it is the same scene, shape, rate and speed.
+    """Render a scene to a clip, or return the clip at `path` if scene, shape, rate and speed are the same.
 
-    `FileExistsError` if it is another one.
+    Raise `FileExistsError` if the clip there is another one.
     """
     import scenes
     from qsim.rendering import fidelity
@@ -66,17 +66,21 @@ def render(name: str, path: Path, shape: ClipShape, *, speed: float = 1.0, progr
 def clips_for(
     source: str, speeds: Sequence[float], shape: ClipShape, folder: Path | None, progress: Progress | None = None
 ) -> Iterator[MovingClip]:
-    """A clip folder (whole speeds from 1), or a scene rendered at each speed into FOLDER/clips."""
+    """Yield a clip at each speed: a clip folder (whole speeds from 1), or a scene rendered into FOLDER/clips."""
     if (Path(source) / "clip.json").is_file():
         clip = Clip.open(source)
         if any(v < 1 or not float(v).is_integer() for v in speeds):
-            raise ValueError(f"{source}: a clip can be made faster by whole factors only; other speeds need a scene")
+            raise ValueError(
+                f"{source}: a clip can be made faster by whole factors only; for other speeds name a scene"
+            )
         yield from (MovingClip(v, clip, int(v)) for v in speeds)
         return
     import scenes
 
     if source not in scenes.FAMILIES and not source.endswith(".py"):
-        raise FileNotFoundError(f"{source}: neither a clip folder nor a scene; there are {', '.join(scenes.FAMILIES)}")
+        raise FileNotFoundError(
+            f"{source}: neither a clip folder nor a scene; the scenes are {', '.join(scenes.FAMILIES)}"
+        )
     if folder is None:
         raise ValueError(f"{source} is a scene: give a folder for its clip with -o")
     for v in speeds:
@@ -85,10 +89,10 @@ def clips_for(
 
 
 def write_streams(clip: Clip, folder: Path, settings: StudySettings) -> list[Path]:
-    """One clip per bit depth, FOLDER/NAME_3bit, with the streams `planes` and `multibit`; returns their paths.
+    """Write one clip per bit depth, FOLDER/NAME_3bit, with the streams `planes` and `multibit`; return their paths.
 
-    Its frames are the means of 2^b - 1 frames of `clip`, its sharp frames the middle ones, so that
-    `quiver evaluate FOLDER/NAME_3bit --stream planes` scores any restorer against the sharp instants.
+    Their frames are means of 2^b - 1 frames of `clip`, and their sharp frames are the middle ones. So
+    `quiver evaluate FOLDER/NAME_3bit --stream planes` scores a restorer against the sharp instants.
     """
     check_clip(clip, settings)
     level = light_level(clip, ppp=settings.ppp)
@@ -113,7 +117,7 @@ def write_streams(clip: Clip, folder: Path, settings: StudySettings) -> list[Pat
 
 
 def group(clip: Clip, path: Path, m: int) -> Clip:
-    """A clip whose frames are means of m frames (m odd) and whose sharp frames are the middle ones."""
+    """Write a clip whose frames are means of m frames (m odd) and whose sharp frames are the middle ones."""
     kept = ("radiance_unit", "camera", "scene", "split", "origin", "seed", "render")
     meta = {key: clip.meta[key] for key in kept if key in clip.meta}
     frames, height, width = clip.shape

@@ -1,4 +1,4 @@
-"""Figures of bit-depth studies, PNG: PSNR over bit depth, and the best depth over speed and light."""
+"""Draws bit-depth studies as PNG: PSNR over bit depth, and the best depth over speed and light."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COLOURS = {"planes": "tab:orange", "multibit": "tab:blue"}
 
 
 def study_figure(found: Study) -> bytes:
-    """PSNR and the parts of the error over bit depth: points simulated, lines expected."""
+    """Return PSNR and the parts of the error over bit depth as PNG; points are simulated, lines expected."""
     drawing = new_figure(10, 3.8)
     left, right = drawing.subplots(1, 2)
     for model in MODELS:
@@ -32,7 +32,7 @@ def study_figure(found: Study) -> bytes:
             bits, np.where(values > 0, values, np.nan), style, label=f"|{field.replace('_', ' ')}|", linestyle="-"
         )
     right.plot(bits, [row.blur_predicted / found.peak for row in rows], "k:", label="blur by the structure function")
-    left.set_ylabel("PSNR of the likeliest frame [dB]")
+    left.set_ylabel("PSNR of the maximum-likelihood frame [dB]")
     right.set_ylabel("rms error / peak (multibit)")
     right.set_yscale("log")
     for axes in (left, right):
@@ -46,7 +46,7 @@ def study_figure(found: Study) -> bytes:
 
 
 def sweep_figure(found: Sweep) -> bytes:
-    """Best bit depth over speed and light: coloured cells and large numbers simulated, small ones by the law."""
+    """Return the best bit depth over speed and light as PNG: large numbers are simulated, small ones the law's."""
     drawing = new_figure(11, 4.2)
     bits = [row.bits for line in found.studies for one in line for row in one.rows]
     for axes, model in zip(drawing.subplots(1, 2), MODELS, strict=True):

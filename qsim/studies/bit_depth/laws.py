@@ -1,4 +1,4 @@
-"""Bit depth against motion: what a sensor that may read M = 2^b - 1 planes as one b-bit frame gains and pays.
+"""States the laws of bit depth against motion for a sensor that reads M = 2^b - 1 planes as one b-bit frame.
 
     planes at `base_fps` -> frames of b bits at base_fps / (2^b - 1), all with the same exposure per second
 
@@ -28,17 +28,17 @@ class Depth:
 
     @property
     def planes(self) -> int:
-        """Binary planes that fit into one frame."""
+        """The number of binary planes in one frame."""
         return 2**self.bits - 1
 
 
 def depths(
     *, height: int, width: int, base_fps: float, read_noise: float, bits: Sequence[int], speed: float
 ) -> list[Depth]:
-    """The table of the QUIVER paper (ECCV 2024, Table 1) for any sensor.
+    """Return the table of the QUIVER paper (ECCV 2024, Table 1) for any sensor.
 
-    `speed` is that of the image in px/s, `read_noise` in e- per read. The paper rounds its frame rates to
-    1428, 323, 78 and 20 before it forms the other columns; here they stay exact (1428.57, 322.58, 78.74, 19.57).
+    `speed` is that of the image [px/s], `read_noise` in e- per read. The paper rounds its frame rates to 1428, 323, 78
+    and 20 before it computes the other columns; they stay exact here (1428.57, 322.58, 78.74, 19.57).
     """
     for name, value in {"height": height, "width": width, "base_fps": base_fps}.items():
         if not value > 0:
@@ -59,26 +59,26 @@ def depths(
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """How light at a pixel changes with time: D(k) = mean of (light(t + k) - light(t))^2, k = 0, 1, ... planes.
+    """The structure function of the light: D(k) = mean of (light(t + k) - light(t))^2, k = 0, 1, ... planes.
 
-    If the statistics of the scene do not change with time, blur follows from it exactly. For M planes of weight 1/M
-    around an instant (M odd)
+    If the statistics of the scene do not change with time, the blur follows exactly. For M planes of weight 1/M around
+    an instant (M odd)
 
         mean (exposed - sharp)^2 = 1/M sum_s D(|s|) - 1/M^2 sum_(k < M) (M - k) D(k),   s = -(M-1)/2 ... (M-1)/2
 
     (expand both squares in the covariance C and set C = C(0) - D/2). A scene moving v times as fast has D(v k).
-    Noise of the rendering enters both sides alike.
+    Noise of the rendering is the same on both sides.
     """
 
     values: Array  # [K], photons^2, values[0] = 0
 
     def at(self, lags: Array) -> Array:
-        """D at any lag: squares of lags are interpolated (D is quadratic for small ones), constant after the last."""
+        """Return D at lags of any shape [planes]: interpolated over squared lags, constant after the last."""
         known = np.arange(len(self.values), dtype=float)
         return np.interp(np.asarray(lags, float) ** 2, known**2, self.values)
 
     def blur(self, planes: int, speed: float = 1.0) -> float:
-        """Mean square error of a frame of `planes` against its sharp middle, at `speed` times the motion."""
+        """Return the mean square error [photons^2] of a frame against its sharp middle, at `speed` times the motion."""
         k, s = np.arange(1, planes), np.arange(planes) - planes // 2
         within = float(np.sum((planes - k) * self.at(speed * k))) / planes**2
         return max(float(np.mean(self.at(speed * np.abs(s)))) - within, 0.0)

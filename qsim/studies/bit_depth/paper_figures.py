@@ -1,4 +1,4 @@
-"""The QUIVER paper's first two figures (ECCV 2024) from our scenes, as pictures and numbers.
+"""Draws the first two figures of the QUIVER paper (ECCV 2024) from our scenes, as pictures and numbers.
 
 Figure 1: the same motion at one light level through CMOS pixels of 5.1 e- at 60, 240 and 2000 fps and through a 3-bit
 QIS at 2000 fps. Figure 2: binary planes at 10 000 fps averaged to 3, 5, 7 and 9 bits, at two light levels.
@@ -29,7 +29,7 @@ BITS_2 = (1, 3, 5, 7, 9)
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One picture: an estimate of the light, in photons per pixel and clip frame, and what it scores."""
+    """One picture: an estimate of the light [photons per pixel and clip frame], with its scores."""
 
     label: str
     image: Array  # [H, W]
@@ -37,15 +37,16 @@ class Panel:
 
 
 def figure_1(clip: Clip, *, lux: float = 1.0, seed: int = 0) -> list[Panel]:
-    """Frames of four cameras around the middle of a clip of 12 000 fps (at least 200 frames, with a camera)."""
+    """Return frames of four cameras around the middle of a clip of 12 000 fps (at least 200 frames, with a camera)."""
     for _, fps in CAMERAS:
         if not math.isclose(clip.frame_rate / fps, round(clip.frame_rate / fps)):
             raise ValueError(
-                f"{clip.path}: {clip.frame_rate:g} fps is no whole multiple of {fps:g} fps; take {RATE_1:g}"
+                f"{clip.path}: {clip.frame_rate:g} fps is not a whole multiple of {fps:g} fps; "
+                f"render the clip at {RATE_1:g} fps"
             )
     longest = round(clip.frame_rate / min(fps for _, fps in CAMERAS))
     if len(clip) < longest:
-        raise ValueError(f"{clip.path}: {len(clip)} frames; one frame at 60 fps takes {longest}")
+        raise ValueError(f"{clip.path}: {len(clip)} frames; one frame at 60 fps needs {longest}; render a longer clip")
     level, middle = light_level(clip, lux=lux), len(clip) // 2
     sharp = clip_photons(clip, middle, level.factor, sharp=True)
     peak = colour.peak(sharp)
@@ -76,7 +77,7 @@ def figure_1(clip: Clip, *, lux: float = 1.0, seed: int = 0) -> list[Panel]:
 
 
 def figure_2(clip: Clip, ppp: float, *, seed: int = 0, bits: Sequence[int] = BITS_2) -> list[Panel]:
-    """Sums of 2^b - 1 binary planes around the middle of a clip, `ppp` detected photons per pixel and plane."""
+    """Return sums of 2^b - 1 binary planes around the middle of a clip; `ppp` counts detections per pixel and plane."""
     settings = StudySettings(bits=tuple(bits), sensor="spad-320x240", ppp=ppp, seed=seed)
     check_clip(clip, settings)
     level, middle = light_level(clip, ppp=ppp), len(clip) // 2
@@ -108,7 +109,7 @@ def _rms(values: Array) -> float:
 
 
 def draw(rows: Sequence[Sequence[Panel]]) -> bytes:
-    """The panels, one clip per line, each line with the tone curve of its sharp instant: PNG."""
+    """Return the panels as PNG, one clip per line; the sharp instant of a line gives its white."""
     columns = max(len(row) for row in rows)
     _, width = rows[0][0].image.shape
     shape = rows[0][0].image.shape[0] / width

@@ -1,4 +1,4 @@
-"""Bit depth over speed and light: the sweep of a study with the law's prediction, as JSON and as text."""
+"""Studies every speed and light level, and predicts the best bit depth from one study by a law."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from qsim.tables import text_table
 
 @dataclass(frozen=True)
 class Sweep:
-    """Studies at every (speed, light): `studies[i][j]` at `speeds[i]`, `ppps[j]`, and the law's best depths."""
+    """The studies at every speed and light level, `studies[i][j]` at `speeds[i]`, `ppps[j]`, with the law's depths."""
 
     speeds: tuple[float, ...]
     ppps: tuple[float, ...]
     studies: tuple[tuple[Study, ...], ...]
     predicted: dict[str, Array]  # model -> bits of the highest PSNR by the law, [len(speeds), len(ppps)]
-    loss: dict[str, Array]  # dB that the simulated best is above the law's choice, the same shape
+    loss: dict[str, Array]  # dB by which the law's depth is worse than the simulated best, the same shape
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the sweep for JSON."""
         cells = []
         for i, speed in enumerate(self.speeds):
             for j, ppp in enumerate(self.ppps):
@@ -57,12 +57,12 @@ class Sweep:
 
     @property
     def answers(self) -> list[str]:
-        """A sentence for each cell."""
+        """One sentence per study."""
         return [answer(found) for row in self.studies for found in row]
 
     @property
     def agreement(self) -> dict[str, float]:
-        """Simulation against its exact expectation, in standard errors, and what the law's choices cost."""
+        """Simulation against its exact expectation [standard errors], and the loss of the law's depths [dB]."""
         sigmas = np.array([row.sigmas for line in self.studies for found in line for row in found.rows])
         best = {m: np.array([[found.best(m).bits for found in line] for line in self.studies]) for m in MODELS}
         return {
@@ -76,7 +76,7 @@ class Sweep:
 
 
 def study_dict(found: Study) -> dict[str, Any]:
-    """A study for JSON: rows, light, structure function."""
+    """Return a study for JSON: rows, light, structure function."""
     result = {key: value for key, value in vars(found).items() if key not in ("rows", "structure")}
     result["rows"] = [asdict(row) for row in found.rows]
     result["structure_function"] = [float(v) for v in found.structure.values]
@@ -97,9 +97,9 @@ def sweep(
     widen: bool = False,
     progress: Progress | None = None,
 ) -> Sweep:
-    """Studies of every clip at every light level; `widen` tries more bits where the deepest is best, as clips allow.
+    """Study every clip at every light level; `widen` tries more bits while the deepest is best.
 
-    The law's choice everywhere comes from the **slowest** clip alone, at its middle light level.
+    The law predicts all cells from the **slowest** clip alone, at its middle light level.
     """
     for one in clips:
         check_clip(one.clip, replace(settings, speed=one.step))
@@ -135,19 +135,19 @@ def sweep(
 
 
 def summary(found: Sweep) -> str:
-    """One line: how well simulation, expectation and law agree."""
+    """Return one line: how well simulation, expectation and law agree."""
     a = found.agreement
     return (
         f"{a['simulated']} simulated PSNRs against their exact expectations: {a['rms_sigmas']:.2f} standard errors "
-        f"rms, largest {a['largest_sigmas']:.1f}; the law names another depth in {a['cells_with_another_depth']} of "
-        f"{a['cells']} cells and gives away at most {a['largest_loss_db']:.1f} dB"
+        f"rms, largest {a['largest_sigmas']:.1f}; the law gives another depth in {a['cells_with_another_depth']} of "
+        f"{a['cells']} cells and loses at most {a['largest_loss_db']:.1f} dB"
     )
 
 
 def law(base: Study, clip: Clip, settings: StudySettings, model: str, speed: float, ppp: float) -> dict[int, float]:
-    """bits -> PSNR from the structure function of one study and the sensor's exact moments, at another speed and light.
+    """Return bits -> PSNR [dB] at another speed and light, from the structure function of one study and exact moments.
 
-    `speed` is relative to that study. Pixels are taken as constant during a frame where noise is concerned.
+    `speed` is relative to that study. The noise is that of light that is constant during a frame.
     """
     light = np.concatenate([clip_photons(clip, t, 1.0, sharp=True).ravel() for t in base.instants])
     light = np.sort(light)[:: max(1, light.size // 4000)]
@@ -172,7 +172,7 @@ def _per_plane(motion: float | None, bits: int) -> float | None:
 
 
 def table(found: Study) -> list[str]:
-    """The study in words and columns."""
+    """Return the lines of a study's table."""
     lux = "" if found.lux is None else f", {found.lux:.3g} lx at 555 nm"
     lines = [
         f"{found.clip}: {found.ppp:.4g} photons per pixel and plane{lux}; {found.frame_rate:g} planes/s, speed x"

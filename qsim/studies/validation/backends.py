@@ -1,11 +1,11 @@
-"""Rendering engines beside each other: the same frames by each that works here, their seconds and their means.
+"""Renders the same frames with every backend that works here, and compares seconds and mean radiance.
 
-    run(families) -> BackendReport: one BackendRow per engine and scene; CUDA beside LLVM beside scalar
+    run(families) -> BackendReport: one BackendRow per backend (CUDA, LLVM, scalar) and scene
 
-A frame is radiance and ground truth. What it takes beside the compiled kernels is our own overhead.
+A frame is radiance and ground truth. The time outside compiled kernels is our overhead.
 
-Every engine renders the same scene with the same budget in a process of its own. Two engines that estimate one radiance
-differ in its mean over all pixels and frames by no more than their Monte-Carlo errors explain.
+Every backend renders the same scene with the same budget in a separate process. The means over all pixels and frames
+may differ by their Monte-Carlo errors only.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ from qsim.rendering.budget import Budget
 from qsim.rendering.engine import kernels_timed
 from qsim.tables import text_table
 
-FRAMES = 4  # timed, after a first one that compiles
+FRAMES = 4  # timed frames, after a first one that compiles
 BUDGET = Budget(samples=32, bounces=4)
-DEVIATIONS = 5.0  # standard errors by which means may differ: once in two million comparisons by chance
+DEVIATIONS = 5.0  # standard errors; chance exceeds them once in two million comparisons
 
 
 @dataclass(frozen=True)
 class BackendRow:
-    """One engine on one scene."""
+    """One backend on one scene."""
 
     engine: str
     scene: str
     seconds: float  # per frame, median
-    outside: float | None  # share of the seconds in which no compiled kernel runs; None: the engine has none
+    outside: float | None  # share of the seconds without a compiled kernel; None: the backend has none
     mean: float  # radiance over all frames and pixels, W m^-2 sr^-1
     mean_error: float  # its standard error
 
     def deviation(self, other: BackendRow) -> float:
-        """Difference of the means in standard errors of the difference."""
+        """Return the difference of the means in standard errors of the difference."""
         return abs(self.mean - other.mean) / max(math.hypot(self.mean_error, other.mean_error), 1e-12 * self.mean)
 
 
 @dataclass(frozen=True)
 class BackendReport:
-    """All rows, scene by scene, and why the other engines are missing."""
+    """All rows, scene by scene, and why the other backends are missing."""
 
     height: int
     width: int
@@ -59,7 +59,7 @@ class BackendReport:
     missing: dict[str, str]
 
     def reference(self, row: BackendRow) -> BackendRow:
-        """The row of the same scene that others are compared with: that of the last of BACKENDS, the plain one."""
+        """Return the row that others of the scene are compared with: that of the last of BACKENDS, scalar."""
         return next(r for r in reversed(self.rows) if r.scene == row.scene)
 
     @property
@@ -68,7 +68,7 @@ class BackendReport:
         return all(row.deviation(self.reference(row)) <= DEVIATIONS for row in self.rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
+        """Return the report for JSON."""
         rows = []
         for row in self.rows:
             plain = self.reference(row)
@@ -79,7 +79,7 @@ class BackendReport:
 def run(
     families: Sequence[str], *, height: int, width: int, seed: int, progress: Callable[[str], None] | None = None
 ) -> BackendReport:
-    """Render a few frames of each family with every engine that works here; at least scalar does."""
+    """Render a few frames of each family with every backend that works here; scalar always does."""
     rows: list[BackendRow] = []
     missing: dict[str, str] = {}
     for backend in engine.BACKENDS:
@@ -88,7 +88,7 @@ def run(
         except ValueError as error:
             missing[backend] = str(error)
             continue
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:  # one variant per process
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:  # a process has one variant
             for family in families:
                 if progress is not None:
                     progress(f"{backend}: {family}")
@@ -98,7 +98,7 @@ def run(
 
 
 def _measure(backend: str, family: str, height: int, width: int, seed: int) -> BackendRow:
-    """In a process of its own: the engine is chosen once per process."""
+    """Time one backend on one scene; runs in a separate process, because a process selects its backend once."""
     os.environ["QSIM_ENGINE"] = backend
     import scenes
     from qsim.rendering.renderer import Renderer
@@ -118,7 +118,7 @@ def _measure(backend: str, family: str, height: int, width: int, seed: int) -> B
 
 
 def table(report: BackendReport) -> str:
-    """The rows as text, and why engines are missing."""
+    """Return the rows as text, and why backends are missing."""
     lines = [f"{report.height} x {report.width} pixels, {report.samples} samples; seconds per frame with ground truth"]
     rows = []
     for row in report.rows:

@@ -1,4 +1,4 @@
-"""Hard cases of the sensor models, and whether they come out right: part of `qsim validate sensor`."""
+"""Checks the sensor models at extreme light, ties, tails and exact fractions of dead time, for `validate sensor`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from qsim.sensor.sensor import Sensor
 
 @dataclass(frozen=True)
 class Case:
-    """A hard case and whether it comes out right."""
+    """A hard case, its result, and whether that is right."""
 
     name: str
     found: str
@@ -21,7 +21,7 @@ class Case:
 
 
 def hard_cases(sensors: dict[str, Sensor], exposure: float) -> list[Case]:
-    """Light from nothing to 1e12, ties, tails, exact fractions of dead time, all-dark and all-saturated histograms."""
+    """Check light from 0 to 1e12 photons, ties, tails, exact fractions of dead time, all-dark and all-full counts."""
     cases = []
     light = np.array([0.0, 1e-12, 1e-6, 1.0, 1e3, 1e6, 1e12])
     for name, sensor in sensors.items():
@@ -38,7 +38,7 @@ def hard_cases(sensors: dict[str, Sensor], exposure: float) -> list[Case]:
         )
     for name, sensor in sensors.items():
         if np.isneginf(sensor.log_pmf(np.array(sensor.white(exposure)), exposure)[-1]):
-            continue  # so long a dead time that the counter never fills
+            continue  # the dead time is so long that the counter never fills
         dark, bright = np.eye(sensor.levels)[[0, -1]] * 1000
         low = sensor.maximum_likelihood(dark[None], exposure)
         high = sensor.maximum_likelihood(bright[None], exposure)
@@ -52,7 +52,7 @@ def hard_cases(sensors: dict[str, Sensor], exposure: float) -> list[Case]:
 
 
 def _tail_case(exposure: float) -> Case:
-    """At 0.01 photons code 7 has the probability 4.8e-18; a difference of F would say 0."""
+    """Check P(code 7) at 0.01 photons, which is 4.8e-18; a difference of cdf values would give 0."""
     tail = float(QIS(0.8, 1.6, 0.2, 3).log_pmf(np.array(0.01), exposure)[7])
     plain = float(np.log(_tail_sum(exposure)))
     return Case("QIS: P(code 7) at 0.01 photons", f"{np.exp(tail):.3g}", abs(tail - plain) < 1e-8)
@@ -66,14 +66,14 @@ def _tail_sum(exposure: float) -> float:
 
 
 def _tie_case() -> Case:
-    """Gain 1/2 without read noise: 1 electron is code 0 (half to even), 3 electrons are code 2."""
+    """Check ties at gain 1/2 without read noise: 1 electron is code 0 (half to even), 3 electrons are code 2."""
     sensor = QIS(1.0, 0.0, 0.0, 3, gain=0.5)
     codes = [int(c) for c in sensor.codes_of(np.arange(6.0))]
     return Case("QIS: ties of rounding, electrons 0 ... 5", str(codes), codes == [0, 0, 1, 2, 2, 2])
 
 
 def _dead_time_cases(exposure: float) -> list[Case]:
-    """With tau = T / n at endless light exactly n counts fit, n + 1 only at the very end (probability 0)."""
+    """Check dead time T / n at endless light: n counts fit; n + 1 have probability 0."""
     cases = []
     for n in (1, 2, 4):
         pmf = np.exp(CountingSPAD(1.0, 0.0, exposure / n, 3).log_pmf(np.array(1e9), exposure))

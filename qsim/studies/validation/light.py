@@ -1,11 +1,11 @@
-"""Rendering: does a budgeted frame err as asked and as stated, and has it the light of a converged one?
+"""Compares error and mean light of budgeted frames with converged frames, and with what the budget states.
 
     run(scenes) -> LightReport: one LightRow per scene and level [dB]
 
-Each scene gets the budget of `choose_budget`; a few of its frames are compared with converged ones, which have many
-samples and the deepest bounces. Errors count at white (white.py), those without a clamp stand beside them; the
-reference's own noise is taken off. The mean light is held against what the budget announces: the bounces left out, and
-nothing else but noise, whose standard error comes from independent halves.
+Each scene gets the budget of `choose_budget`. A few of its frames are compared with converged ones, which have many
+samples and the deepest bounces. Errors are clamped at white (clip/clamped_error.py); those without a clamp stand beside
+them. The variance of the reference is subtracted. The mean light may differ by noise, and by the light of the bounces
+that the budget omits. Independent halves give the standard error of the noise.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from qsim.scene import Scene
 from qsim.tables import text_table
 
 LEVELS = (36.0,)  # dB below white
-ENOUGH = 4.5  # standard errors; a right program exceeds them in one of 100 000 rows
-MISSED = 0.5  # dB below what was asked for that `budget.shortfall` names, too
+ENOUGH = 4.5  # standard errors; a correct program exceeds them in one of 100 000 rows
+MISSED = 0.5  # dB below the wanted level that `shortfall` reports, too
 
 
 @dataclass(frozen=True)
@@ -36,27 +36,27 @@ class LightRow:
     """One scene at one level."""
 
     scene: str
-    asked: float  # dB below white
+    asked: float  # wanted, dB below white
     reached: float  # dB against the reference, clamped at white
-    stated: float  # dB, by the frames themselves
+    stated: float  # dB, from the measured error of the frames
     reached_unclamped: float  # dB below the same white
     stated_unclamped: float
     samples: int
     bounces: int
     denoised: bool
-    light: float  # share by which the mean light is above that of the reference
-    announced: float  # share that the bounces left out would add
+    light: float  # relative difference of the mean light from the reference
+    announced: float  # share of light that the omitted bounces would add
     light_error: float  # standard error of light + announced
 
     @property
     def ok(self) -> bool:
-        """The error is as asked, and the light is off by what is announced."""
+        """Whether the error is as wanted, and the light differs by the announced share."""
         return self.reached > self.asked - MISSED and abs(self.light + self.announced) < ENOUGH * self.light_error
 
 
 @dataclass(frozen=True)
 class LightReport:
-    """All rows and what they were measured on."""
+    """All rows, with the size and the engine that rendered them."""
 
     height: int
     width: int
@@ -65,10 +65,11 @@ class LightReport:
 
     @property
     def ok(self) -> bool:
+        """Whether all rows are."""
         return all(row.ok for row in self.rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
+        """Return the report for JSON."""
         return asdict(self) | {"rows": [asdict(row) | {"ok": row.ok} for row in self.rows], "ok": self.ok}
 
 
@@ -81,7 +82,7 @@ def run(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> LightReport:
-    """Measure every scene at every level; all must have one size. Minutes at 96 x 192."""
+    """Measure every scene at every level; all scenes must have one size. Takes minutes at 96 x 192."""
     if not scenes or not levels or not frames:
         raise ValueError("validate light: needs at least one scene, one level and one frame")
     rows = []
@@ -124,12 +125,12 @@ def _row(scene: Scene, level: float, references: Array, frames: Sequence[int], s
 
 
 def _halves(renderer: Renderer, t: int) -> Array:
-    """Two independent estimates of frame t, as `Renderer.frame` draws them."""
+    """Return two independent estimates of the radiance of frame t, [2, H, W]."""
     return renderer.halves(renderer.instants(t), renderer.budget, renderer.key(t))
 
 
 def _without(found: float, own: float) -> float:
-    """An error without the reference's own, of which at least a tenth is left."""
+    """Return an error without that of the reference, at least a tenth of the latter."""
     return math.sqrt(max(found**2 - own**2, own**2 / 100))
 
 
@@ -138,11 +139,11 @@ def _mean(errors: Sequence[float]) -> float:
 
 
 def table(report: LightReport) -> str:
-    """The rows as text, one line each, and the verdict."""
-    verdict = "every error is as asked, every light as announced"
+    """Return the rows as text, one line each, and the verdict."""
+    verdict = "every error is as wanted, every light as announced"
     wrong = [row.scene for row in report.rows if not row.ok]
     if wrong:
-        verdict = f"NOT as asked or announced: {', '.join(wrong)}"
+        verdict = f"NOT as wanted or announced: {', '.join(wrong)}"
     size = f"{report.height} x {report.width} pixels, engine {report.engine}; dB below white, light in %"
     header = ("scene", "asked", "reached", "stated", "unclamped: reached", "stated", "samples", "bounces",
               "light", "announced", "+-", "")  # fmt: skip

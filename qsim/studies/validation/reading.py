@@ -1,10 +1,10 @@
-"""Speed of reading: random training windows out of a clip, beside decoding the same windows from an mp4.
+"""Measures how fast random training windows are read from a clip, and decoded from an mp4 of the same frames.
 
     run() -> ReadingReport: windows of 11 x 128 x 128 per second out of frames of 512 x 1024, ours and by FFmpeg
 
-Each side opens its files anew for every window, as a loader would that forgets them. Ours is one thread; FFmpeg may use
-all cores, seeks to the key frame before the window and decodes from there. The windows are the same and in the same
-order, and they hold the same pictures but for the loss of the video.
+Both readers reopen their files for every window (no cache). Ours is one thread; FFmpeg may use all cores, seeks to the
+key frame before the window and decodes from there. Both read the same windows in the same order. The pictures are equal
+except for the loss of the video.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from qsim.tables import text_table
 
 FRAMES, HEIGHT, WIDTH = 65, 512, 1024
 WINDOW, CROP = 11, 128
-WANTED, RATIO = 100.0, 5.0  # windows per second; times the mp4
+WANTED, RATIO = 100.0, 5.0  # wanted windows per second, and times the mp4
 
 Place = tuple[int, int, int]  # first frame, y, x
 
 
 @dataclass(frozen=True)
 class ReadingReport:
-    """Windows per second here and now, and per second of processor time, which a busy machine changes less."""
+    """Windows per second, and per second of processor time, which depends less on other programs."""
 
     clip: float
     mp4: float
@@ -44,19 +44,21 @@ class ReadingReport:
 
     @property
     def ratio(self) -> float:
+        """How many times more windows per second ours reads."""
         return self.clip / self.mp4
 
     @property
     def ok(self) -> bool:
+        """Whether both speeds are reached, and both readers read the same pictures."""
         return self.clip >= WANTED and self.ratio >= RATIO and self.difference < 0.05
 
     def to_dict(self) -> dict[str, Any]:
-        """For --json."""
+        """Return the report for JSON."""
         sizes = {"window_shape": [WINDOW, CROP, CROP], "clip_shape": [FRAMES, HEIGHT, WIDTH]}
         return asdict(self) | sizes | {"ratio": self.ratio, "wanted": WANTED, "wanted_ratio": RATIO, "ok": self.ok}
 
     def lines(self) -> list[str]:
-        """The report as text."""
+        """Return the report as lines for a terminal."""
         sides = (
             ("clip folder", self.clip, self.clip_processor, f"{WANTED:g}"),
             ("mp4", self.mp4, self.mp4_processor, ""),
@@ -71,7 +73,7 @@ class ReadingReport:
 
 
 def run(seconds: float = 4.0, seed: int = 0) -> ReadingReport:
-    """Write a clip and its video to a temporary folder and read both for so many seconds each, in turns."""
+    """Write a clip and its video to a temporary folder and read both in turns, for so many seconds each."""
     with tempfile.TemporaryDirectory(prefix="qsim-reading-") as folder:
         clip = textured_clip(Path(folder) / "clip", seed)
         video = exporting.export(
@@ -87,7 +89,7 @@ def run(seconds: float = 4.0, seed: int = 0) -> ReadingReport:
 
 
 def textured_clip(path: Path, seed: int) -> Clip:
-    """A texture that moves by 3 pixels per frame, with some noise: neither trivial nor impossible to compress."""
+    """Write a clip of a texture that moves by 3 px per frame, with some noise: video can compress it, with a loss."""
     rng = np.random.default_rng(seed)
     texture = np.kron(rng.random((HEIGHT // 4, WIDTH // 4)), np.ones((4, 4)))
     meta = {"shape": [FRAMES, HEIGHT, WIDTH], "frame_rate": 2000.0, "exposure": 5e-4, "radiance_unit": RELATIVE}
@@ -98,14 +100,14 @@ def textured_clip(path: Path, seed: int) -> Clip:
 
 
 def from_clip(path: Path, place: Place) -> Array:
-    """A window [11, 128, 128] by our reader."""
+    """Return a window of radiance with our reader, float32 [11, 128, 128]."""
     first, y, x = place
     clip = Clip.open(path)
     return np.stack([clip.radiance(t, (y, x, CROP, CROP)) for t in range(first, first + WINDOW)])
 
 
 def from_mp4(path: Path, place: Place) -> Array:
-    """The same window, uint8, by FFmpeg."""
+    """Return the same window with FFmpeg, uint8 [11, 128, 128]."""
     import av
 
     first, y, x = place
@@ -132,7 +134,7 @@ def _place(rng: np.random.Generator) -> Place:
 
 
 def _rate(draw: Callable[[Place], Array], seconds: float, seed: int) -> tuple[float, float]:
-    """Windows per second, and per processor second, over at least so many seconds; the first one does not count."""
+    """Return windows per second, and per processor second, over at least so many seconds; the first is not timed."""
     rng = np.random.default_rng(seed)
     draw(_place(rng))
     done, started, worked = 0, time.perf_counter(), time.process_time()

@@ -1,13 +1,13 @@
-"""Rendering: time per frame against error, the naive loop beside ours, on scenes that tuned nothing.
+"""Compares time per frame at equal error with a naive loop, on scenes that were not used for tuning.
 
     run() -> RenderReport: one RenderRow per scene and level [dB]; the error is that against a converged reference
 
 The naive loop is `mi.render` per frame with the default integrator and the default `independent` sampler, a box
-filter, and the smallest power of two of samples that reaches the level. Ours is `Renderer.frame` without ground truth
-and with the budget that `choose_budget` gives for the level, error measurement included. Both start from a loaded scene
-and are timed alternately, so that a busy machine is fair to both; processor seconds stand beside wall seconds, because
-other programs do not change them. Rows of short frames take up to 15 rounds: the median of three was seen a fifth off.
-The reference's own variance is subtracted.
+filter, and the smallest power of two of samples that reaches the level. Ours is `Renderer.frame` without ground truth,
+with the budget of `choose_budget` for the level; the measurement of its error is included. Both start from a loaded
+scene and are timed alternately. Processor seconds stand beside wall seconds, because other programs change them less.
+Rows of short frames take up to 15 rounds, since a median of three can be a fifth off. The variance of the reference is
+subtracted.
 """
 
 from __future__ import annotations
@@ -37,27 +37,27 @@ from qsim.tables import text_table
 
 LEVELS = (30.0, 35.0, 40.0, 45.0)  # dB below white
 WANTED_RATIO, AT_LEVEL = 10.0, 40.0  # of the median scene
-MOST_SAMPLES = 2**8  # the naive loop is timed up to here; beyond, time is proportional to samples and says so
-TUNED = ("fan", "tumble", "gears", "flag", "crowd", "drums", "text")  # looked at while the budget was written
-MOST_ROUNDS, ENOUGH = 15, 5.0  # of timing a row; seconds after which the least number of rounds is enough
-FRAME = 3  # the instant that is rendered again and again
+MOST_SAMPLES = 2**8  # of the naive loop that are timed; for more, the time is extrapolated and marked
+TUNED = ("fan", "tumble", "gears", "flag", "crowd", "drums", "text")  # used while the choice of budgets was written
+MOST_ROUNDS, ENOUGH = 15, 5.0  # rounds of timing a row; seconds after which the least number suffices
+FRAME = 3  # the first frame that is rendered
 
 
 @dataclass(frozen=True)
 class RenderRow:
-    """One scene at one level: both methods."""
+    """One scene at one level, rendered by both methods."""
 
     scene: str
-    level: float  # dB below white asked for, as all dB here
+    level: float  # wanted, dB below white, as all dB here
     naive_samples: int
     naive_psnr: float  # dB reached
     naive_seconds: float  # per frame, median
-    extrapolated: bool  # naive_seconds is proportional from fewer samples
+    extrapolated: bool  # naive_seconds is extrapolated from fewer samples
     samples: int
     denoised: bool
     bounces: int
     psnr: float  # dB reached, ours
-    stated_psnr: float  # dB that our measured error states
+    stated_psnr: float  # dB by our measured error
     seconds: float  # per frame, median
     naive_processor: float = math.nan  # processor seconds per frame, all threads, median
     processor: float = math.nan  # the same, ours
@@ -80,27 +80,27 @@ class RenderRow:
 
 @dataclass(frozen=True)
 class RenderReport:
-    """All rows and what they were measured on."""
+    """All rows, with the size and the engine that rendered them."""
 
     height: int
     width: int
     engine: str
     rows: tuple[RenderRow, ...]
-    choosing_seconds: dict[str, float]  # per scene, the pilots of all levels together; once per clip, not in `seconds`
+    choosing_seconds: dict[str, float]  # per scene: the pilots of all levels, once per clip; not in `seconds`
     unit: str = "dB below white, clamped"  # of every PSNR; reports without it are in dB below the 99.9th percentile
 
     @property
     def median_ratio(self) -> float:
-        """Of the scenes at AT_LEVEL."""
+        """The median over the scenes at AT_LEVEL."""
         return median(row.ratio for row in self.rows if row.level == AT_LEVEL)
 
     @property
     def ok(self) -> bool:
-        """At least WANTED_RATIO in the median scene at AT_LEVEL, and nowhere slower."""
+        """Whether the median scene at AT_LEVEL reaches WANTED_RATIO, and no scene is slower."""
         return self.median_ratio >= WANTED_RATIO and all(row.ratio >= 1 for row in self.rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
+        """Return the report for JSON."""
         rows = [row.to_dict() for row in self.rows]
         return asdict(self) | {"rows": rows, "median_ratio": self.median_ratio, "ok": self.ok}
 
@@ -114,7 +114,10 @@ def run(
     most_samples: int = MOST_SAMPLES,
     progress: Callable[[str], None] | None = None,
 ) -> RenderReport:
-    """Measure every scene at every level, at least `rounds` times; all must have one size. Minutes at 128 x 256."""
+    """Measure every scene at every level, at least `rounds` times; all scenes must have one size.
+
+    Takes minutes at 128 x 256.
+    """
     if not scenes or AT_LEVEL not in levels:
         raise ValueError(f"validate render: needs at least one scene, and {AT_LEVEL:g} among its levels")
     rows: list[RenderRow] = []
@@ -140,7 +143,7 @@ def run(
 
 
 class Target:
-    """A converged frame, its white, and errors against it, clamped there."""
+    """A converged frame, its white, and errors against it, clamped at white."""
 
     def __init__(self, halves: Array) -> None:
         self.image = halves.mean(axis=0)
@@ -148,7 +151,7 @@ class Target:
         self.variance = Errors.of_halves(halves, self.white).at_white ** 2
 
     def psnr(self, image: Array) -> float:
-        """dB of an image that is independent of the reference."""
+        """Return the PSNR [dB] of an image [H, W] whose noise is independent of the reference."""
         square = Errors.between(image, self.image, self.white).at_white ** 2 - self.variance
         return psnr(self.white, math.sqrt(max(square, self.variance / 100)))
 
@@ -216,12 +219,12 @@ def _compare(
 
 
 def _clocks() -> Array:
-    """Wall and processor seconds (of all threads of this process), float64 [2]."""
+    """Return wall and processor seconds (of all threads of this process), float64 [2]."""
     return np.array([time.perf_counter(), time.process_time()])
 
 
 def _reaching(scene: Scene, chosen: Budget, level: float, target: Target) -> tuple[Renderer, float]:
-    """Our renderer with the chosen budget, or with more samples until the level is reached in truth."""
+    """Return our renderer and its PSNR [dB], with the chosen budget or with more samples until it reaches the level."""
     while True:
         renderer = Renderer(scene, budget=chosen)
         reached = target.psnr(renderer.frame(FRAME, with_truth=False).radiance)
@@ -231,7 +234,7 @@ def _reaching(scene: Scene, chosen: Budget, level: float, target: Target) -> tup
 
 
 def _naive_samples(naive: NaiveLoop, level: float, target: Target) -> tuple[int, float]:
-    """The smallest power of two that reaches the level, and the PSNR there: MSE of independent samples is c / n."""
+    """Return the smallest power of two of samples that reaches the level, and its PSNR [dB], by MSE = c / samples."""
     trial = 64
     measured = target.psnr(naive.mean(FRAME, trial))
     samples = 2 ** max(0, math.ceil(math.log2(trial) + (level - measured) / (10 * math.log10(2))))
@@ -239,19 +242,19 @@ def _naive_samples(naive: NaiveLoop, level: float, target: Target) -> tuple[int,
 
 
 def table(report: RenderReport) -> str:
-    """The rows as text, one line each, and the verdict."""
+    """Return the rows as text, one line each, and the verdict."""
     size = f"{report.height} x {report.width} pixels, engine {report.engine}"
     lines = [f"{size}; seconds per frame, radiance only; {report.unit}"]
     header = ("scene", "level", "naive: samples", "dB", "s", "ours: samples", "dB", "s", "faster", "in processor time")
     lines += text_table(map(_cells, report.rows), header)
     if any(row.extrapolated for row in report.rows):
-        lines.append("* proportional to the time of fewer samples")
+        lines.append("* extrapolated from the time of fewer samples")
     choosing = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in report.choosing_seconds.items())
     lines.append(f"choosing the budgets, once per clip (all levels): {choosing}")
     verdict = "reached" if report.ok else "NOT reached"
     lines.append(
         f"median at {AT_LEVEL:g} dB: {report.median_ratio:.1f} times faster; "
-        f"wanted {WANTED_RATIO:g}, and nowhere slower: {verdict}"
+        f"wanted: {WANTED_RATIO:g}, and no scene slower: {verdict}"
     )
     return "\n".join(lines)
 
@@ -272,7 +275,7 @@ def _cells(row: RenderRow) -> list[str]:
 
 
 def figure(report: RenderReport, path: Path) -> None:
-    """Seconds per frame against the PSNR reached, one panel per scene (.png, .svg or .pdf)."""
+    """Write seconds per frame against PSNR to `path` (.png, .svg or .pdf), one panel per scene."""
     names = list(dict.fromkeys(row.scene for row in report.rows))
     across, down = min(4, len(names)), math.ceil(len(names) / 4)
     drawn = new_figure(3.2 * across, 3.4 * down)

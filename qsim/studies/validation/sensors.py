@@ -1,7 +1,7 @@
-"""Speed against error: every sensor model and engine, measured here and now, beside what it has to reach.
+"""Measures speed and error of every sensor model and engine and compares them with stated bounds.
 
     run() -> SensorReport: rows (speed, error of the cdf, chi-square, mismatches, z-scores), hard cases
-    SensorReport.ok is false when any number is outside its bounds; speeds are outside only if asked for
+    SensorReport.ok is false if any number is outside its bounds; speeds count only if required
 
 The bounds are those of a correct program: exact forms to rounding, statistics to a false alarm of 1e-6 for the whole
 report, compiled codes to 5 in a million.
@@ -33,12 +33,12 @@ from qsim.tables import text_table
 
 EXPOSURE = 5e-4  # s, 2000 frames per second
 FALSE_ALARM = 1e-6  # of all statistical checks of one report together
-CDF_BOUND = {"reference": 1e-10, "fast": 1e-5}  # float64; float32, whose near misses the reference decides
+CDF_BOUND = {"reference": 1e-10, "fast": 1e-5}  # float64; float32, whose uncertain pixels the reference draws
 MISMATCH_BOUND = 5.0  # pixels in a million
 FRAME = (512, 1024)  # pixels, of the published data set
 ROUNDS = 7  # of timing; the medians count
 
-# Name -> sensor, photons of the timing and of the histogram, how many times NumPy it has to reach (0: no target)
+# Name -> sensor, photons per pixel of timing and histogram, wanted speed in times NumPy's (0: none)
 MODELS: dict[str, tuple[Sensor, float, float]] = {
     "QIS 3 bits, gain 1": (QIS(0.8, 1.6, 0.2, 3), 3.25, 25.0),
     "QIS 3 bits, gain 1.077": (quiver_physical(3.25), 3.25, 25.0),
@@ -51,7 +51,7 @@ MODELS: dict[str, tuple[Sensor, float, float]] = {
     "counting SPAD, tau = T/4": (CountingSPAD(0.5, 25.0, EXPOSURE / 4, 3), 6.0, 0.0),
     "paralyzable, tau = T/4": (CountingSPAD(0.5, 25.0, EXPOSURE / 4, 3, paralyzable=True), 6.0, 0.0),
 }
-PACKED_TARGET = 3.0  # times NumPy's `random < p` and packbits, 1 bit
+PACKED_TARGET = 3.0  # wanted speed of packed planes in times NumPy's `random < p` and packbits
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class SensorRow:
     engine: str
     megapixels_per_second: float
     times_numpy: float | None = None  # ratio of the medians of one run
-    target: float | None = None  # what `times_numpy` has to reach
-    cdf_error: float | None = None  # largest, against sums and integrals written out anew
+    target: float | None = None  # wanted `times_numpy`
+    cdf_error: float | None = None  # largest, against independent sums and integrals
     p_value: float | None = None  # chi-square of the codes against the closed form
     z_mean: float | None = None
     z_variance: float | None = None
@@ -73,6 +73,8 @@ class SensorRow:
 
 @dataclass(frozen=True)
 class SensorReport:
+    """The rows of all models, the hard cases and the settings of a run."""
+
     rows: list[SensorRow]
     cases: list[Case]
     pixels: int
@@ -80,16 +82,18 @@ class SensorReport:
 
     @property
     def ok(self) -> bool:
+        """Whether every number is within its bounds and every hard case is right."""
         return not any(row.wrong for row in self.rows) and all(case.ok for case in self.cases)
 
     def to_dict(self) -> dict[str, Any]:
+        """Return the report for JSON."""
         return asdict(self) | {"ok": self.ok}
 
 
 def run(
     pixels: int = 1 << 22, seed: int = 0, *, require_speed: bool = False, progress: Progress | None = None
 ) -> SensorReport:
-    """Measure everything on clips of about `pixels` pixels, in frames of 512 x 1024 where it is enough; a minute."""
+    """Measure all models on about `pixels` pixels, in frames of 512 x 1024 if they suffice; takes a minute."""
     if pixels < 1 << 16:
         raise ValueError(f"pixels: a chi-square and a timing need at least 65536, got {pixels}")
     frames = pixels // FRAME[0] // FRAME[1]
@@ -117,7 +121,7 @@ def _measure(
     checks: int,
     require_speed: bool,
 ) -> list[SensorRow]:
-    """Rows of one model: NumPy's way where there is one, the reference, the compiled engine where it serves."""
+    """Return the rows of one model: NumPy (for a QIS), the reference, and the compiled engine if it has the model."""
     light = np.full(shape, photons, np.float32)
     key = Key(seed, 1)
     engines = ["reference"]
@@ -153,7 +157,7 @@ def _measure(
 
 
 def _packed(shape: tuple[int, ...], seed: int, require_speed: bool) -> list[SensorRow]:
-    """Packed binary planes against NumPy's `random < p` and packbits."""
+    """Return the rows of packed binary planes: NumPy's `random < p` with packbits, and the compiled engine."""
     if not jit.available():
         return []
     sensor, _, _ = MODELS["clocked SPAD, 1 bit"]
@@ -172,7 +176,7 @@ def _packed(shape: tuple[int, ...], seed: int, require_speed: bool) -> list[Sens
 
 
 def _numpy_way(sensor: QIS, light: Array, seed: int) -> Callable[[], Array]:
-    """How the field draws such codes: Poisson, plus a Gaussian, rounded and clipped."""
+    """Return a function that draws codes in the usual way: Poisson plus Gaussian, rounded and clipped."""
     rng = np.random.default_rng(seed)
 
     def draw() -> Array:
@@ -183,12 +187,12 @@ def _numpy_way(sensor: QIS, light: Array, seed: int) -> Callable[[], Array]:
 
 
 def _race(draws: dict[str, Callable[[], Array]]) -> tuple[dict[str, Array], dict[str, float]]:
-    """Results and median seconds, the competitors taking turns so that all see the same machine."""
+    """Return the results and median seconds of all functions, which run in turns on the same machine."""
     times: dict[str, list[float]] = {name: [] for name in draws}
     codes = {}
     for n in range(ROUNDS + 1):
         for name, draw in draws.items():
-            if n == 0 or name != "reference":  # slow, and nothing is asked of its speed: once is enough
+            if n == 0 or name != "reference":  # the reference is slow and has no wanted speed: one run is enough
                 start = time.perf_counter()
                 codes[name] = draw()
                 times[name].append(time.perf_counter() - start)
@@ -198,7 +202,7 @@ def _race(draws: dict[str, Callable[[], Array]]) -> tuple[dict[str, Array], dict
 
 
 def statistics(codes: Array, sensor: Sensor, photons: float) -> tuple[float, float, float]:
-    """Chi-square p-value, z of the mean, z of the variance, against the closed form at constant light."""
+    """Return chi-square p-value, z of mean and z of variance for codes of any shape at constant light [photons]."""
     from scipy.stats import chi2
 
     pmf = np.exp(sensor.log_pmf(np.array(photons), EXPOSURE))
@@ -221,14 +225,14 @@ def statistics(codes: Array, sensor: Sensor, photons: float) -> tuple[float, flo
 
 
 def _z(difference: float, variance: float) -> float:
-    """Standard deviations; a certain number is right or infinitely wrong."""
+    """Return a difference in standard deviations; infinite for a wrong number without variance."""
     if variance > 0:
         return float(difference / sqrt(variance))
     return 0.0 if difference == 0 else float(np.copysign(np.inf, difference))
 
 
 def _cdf_error(sensor: Sensor, engine: str) -> float | None:
-    """Largest error of F over light from 0 to 4 white, against sums written out anew."""
+    """Return the largest error of the cdf over light from 0 to 4 white, against independent sums; None without them."""
     photons = np.linspace(0, 4 * sensor.white(EXPOSURE), 401).astype(np.float32).astype(float)
     expected = _written_out(sensor, photons)
     if expected is None:
@@ -245,7 +249,7 @@ def _cdf_error(sensor: Sensor, engine: str) -> float | None:
 
 
 def _written_out(sensor: Sensor, photons: Array) -> Array | None:
-    """F_0 ... by another way than the models': plain sums over electrons, binomial and gamma laws; None if none."""
+    """Return F_0 ... by independent formulae, [G] -> [G, levels - 1]: sums over electrons, binomial and gamma laws."""
     from scipy import stats
 
     arrivals = sensor.arrivals(photons, EXPOSURE)[:, None]
@@ -267,10 +271,10 @@ def _written_out(sensor: Sensor, photons: Array) -> Array | None:
 
 
 def judged(row: SensorRow, checks: int, require_speed: bool) -> SensorRow:
-    """The row with the names of its columns that are outside their bounds."""
+    """Return the row with the names of its columns that are outside their bounds, among so many `checks`."""
     each = -expm1(log1p(-FALSE_ALARM) / checks)
     limit = NormalDist().inv_cdf(1 - each / 2)
-    faults = {
+    outside = {
         "cdf error": row.cdf_error is not None and row.cdf_error > CDF_BOUND[row.engine],
         "p": row.p_value is not None and row.p_value < each,
         "z mean": row.z_mean is not None and abs(row.z_mean) > limit,
@@ -278,14 +282,14 @@ def judged(row: SensorRow, checks: int, require_speed: bool) -> SensorRow:
         "mismatch": row.mismatches_per_million is not None and row.mismatches_per_million > MISMATCH_BOUND,
         "speed": require_speed and row.target is not None and (row.times_numpy or 0) < row.target,
     }
-    return replace(row, wrong=tuple(name for name, wrong in faults.items() if wrong))
+    return replace(row, wrong=tuple(name for name, wrong in outside.items() if wrong))
 
 
-# ---- What people see
+# Table and figure
 
 
 def table(report: SensorReport) -> list[str]:
-    """Lines for a terminal."""
+    """Return the report as lines for a terminal."""
     header = ("model", "engine", "Mpixel/s", "x NumPy", "(target)", "cdf error", "chi2 p", "z mean", "z var", "ppm", "")
     lines = []
     for row in report.rows:
@@ -305,7 +309,7 @@ def table(report: SensorReport) -> list[str]:
             )
         )
     cases = [("ok" if case.ok else "WRONG", case.name, case.found) for case in report.cases]
-    verdict = "everything is within its bounds" if report.ok else "OUTSIDE: see the lines marked so"
+    verdict = "everything is within its bounds" if report.ok else "OUTSIDE the bounds: see the marked lines"
     return [
         *text_table(lines, header, left=2),
         "",
@@ -320,7 +324,7 @@ def _number(value: float | None, style: str) -> str:
 
 
 def figure(report: SensorReport, path: Path) -> None:
-    """Speed against error, one mark per row that has both, written to `path` (.png, .svg or .pdf)."""
+    """Write speed against error to `path` (.png, .svg or .pdf), one mark per row that has both."""
     drawn = new_figure(8, 5)
     axes = drawn.add_subplot()
     for engine, marker, colour in (("reference", "o", "#1f5c99"), ("fast", "s", "#c4501b")):

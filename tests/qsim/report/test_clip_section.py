@@ -40,7 +40,7 @@ def test_the_expected_codes_include_the_maps(tmp_path, name):
     blind = stream.sensor.pmf(photons, stream.exposure).reshape(-1, 2**stream.bits)
     assert mixture_p_value(codes, blind) < 1e-6
     section = clip_section.clip_section(clip)
-    assert "exact distribution and its map of defects" in section
+    assert "exact distribution of the sensor and its map of defects" in section
     assert "; defects: " in section
     if name == "measured":
         assert "dark_map rates.npy" in section
@@ -61,7 +61,7 @@ def test_marks_are_left_out_where_nothing_exact_is_known(tmp_path):
     grouped, _ = sense(clip, Sensing("spad-320x240", bits=2, ppp=2.0, name="grouped", group=True))
     assert "sums planes" in str(clip_section.unexpected(clip, grouped))
     unknown = replace(stream, meta=stream.meta | {"ppp_factor": None, "defects": {}})
-    assert "light is not known" in str(clip_section.unexpected(clip, unknown))
+    assert "light is unknown" in str(clip_section.unexpected(clip, unknown))
 
 
 def test_average_is_the_mean_of_the_codes_around(folder):
@@ -83,11 +83,11 @@ def test_clip_section_says_light_motion_model_and_error(tmp_path):
     assert main(["sense", str(clip.path), "--ppp", "3.25", "--bits", "3"]) == 0
     stream = clip.stream(clip.streams[0])
     page = report.build_page(clip.path)
-    assert f"{clip.mean_photons:.4g} photons per pixel and exposure as it is" in page
-    assert f"3.25 photons per pixel (the clip&#39;s light × {stream.photons_factor:.4g}), as much as 1.313 lx" in page
+    assert f"{clip.mean_photons:.4g} photons per pixel and exposure" in page
+    assert f"3.25 photons per pixel (the clip&#39;s light × {stream.photons_factor:.4g}), equal to 1.313 lx" in page
     assert "2.6 e⁻ per pixel; 3 bit, QIS (multibit): quantum_efficiency 0.8 e-/photon" in page
     assert "<td>bounces</td><td>2</td><td>later ones &lt;1 %</td>" in page
-    assert "Error of a frame (noise, blur, bounces left out): 0.01 rms in the unit of the radiance, worst 0.01" in page
+    assert "Error of a frame (noise, blur, omitted bounces): 0.01 rms in the unit of the radiance, worst 0.01" in page
     for words in ("light of the truth", "drawn, and expected from the light", "error of every frame"):
         assert words in page, words
 
@@ -97,7 +97,7 @@ def test_motion_is_that_of_the_pixels_that_move(folder):
     assert clip_section.motion(Clip.open(folder / "square"), range(5)) == (1.0, 1.0)
     page = report.build_page(folder / "square")
     assert (
-        "what moves (more than 0.1 px/frame) moves 1 px/frame on average; 99.9 % of all pixels at most 1 px/frame"
+        "moving pixels (more than 0.1 px/frame) move 1 px/frame on average; 99.9 % of all pixels at most 1 px/frame"
         in page
     )
     assert "rim = 1 px/frame" in page

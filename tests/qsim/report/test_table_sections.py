@@ -16,7 +16,7 @@ def test_an_evaluation_says_what_its_scores_mean(folder):
     page = report.build_page(folder, title="All")
     for words in ("behind the clamp", "9.6 %", "20.00 ± 1.00 †", "within 3 dB of the truth", "&lt;nano&gt; was never"):
         assert words in page, words
-    assert "as they were defined before" not in page
+    assert "of the earlier definition" not in page
 
 
 def test_studies_costs_and_validations_have_their_sections(tmp_path):
@@ -43,6 +43,6 @@ def test_studies_costs_and_validations_have_their_sections(tmp_path):
         assert words in page, words
     assert "sensors, 9 pixels a draw: something is OUTSIDE its bounds" in page
     assert "rendering, frames of 8 × 10, llvm: everything is within its bounds" in page
-    assert "windows of 11 × 128 × 128 in a clip of 65 × 512 × 1024: as quick as wanted (100/s, 5 times)" in page
+    assert "windows of 11 × 128 × 128 in a clip of 65 × 512 × 1024: as fast as wanted (100/s, 5 times)" in page
     assert "250.5" in page
     assert "<td>ties</td><td>right</td><td>wrong</td>" in page

@@ -98,4 +98,4 @@ def test_one_definition_of_motion(tmp_path):
     assert [answer.code_motion(row) for row in rows] == pytest.approx([14] * 4)
     assert 7 * clip_study.clip_motion(clip, 3) == pytest.approx(14)
     line = clip_section.motion_line(clip, range(4))
-    assert "moves 2 px/frame on average (14 px per 3-bit frame of 7 planes)" in line
+    assert "move 2 px/frame on average (14 px per 3-bit frame of 7 planes)" in line

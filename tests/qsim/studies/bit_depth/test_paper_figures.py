@@ -59,7 +59,7 @@ def test_planes_of_an_even_field_are_averaged_without_blur(tmp_path):
 
 def test_rates_that_do_not_divide_are_refused(tmp_path):
     camera = Camera(4.5e-3, 2.8, 1.1e-6, *SIZE)
-    with pytest.raises(ValueError, match="no whole multiple of 60 fps"):
+    with pytest.raises(ValueError, match="not a whole multiple of 60 fps"):
         paper_figures.figure_1(still_clip(tmp_path / "grey", 3, 10_000.0, camera))
-    with pytest.raises(ValueError, match="one frame at 60 fps takes 200"):
+    with pytest.raises(ValueError, match="one frame at 60 fps needs 200"):
         paper_figures.figure_1(still_clip(tmp_path / "short", 3, 12_000.0, camera))

@@ -23,7 +23,7 @@ def test_the_verdict_on_light_needs_error_and_light_as_said():
     for wrong in (replace(ROW, reached=35.4), replace(ROW, light=-0.0106), replace(ROW, light=0.0043)):
         bad = replace(good, rows=(ROW, wrong))
         assert not bad.ok
-        assert "NOT as asked or announced: a/0" in light.table(bad)
+        assert "NOT as wanted or announced: a/0" in light.table(bad)
         assert json.loads(json.dumps(bad.to_dict()))["ok"] is False
     with pytest.raises(ValueError, match="at least one scene"):
         light.run([])
