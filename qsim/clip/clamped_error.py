@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.colour import psnr
 from qsim.optics.radiometry import WHITE_PER_MEAN
 
 STEPS = tuple(2 ** (k / 2) for k in range(-3, 4))  # whites around the foreseen one at which a frame states its error
@@ -80,11 +81,6 @@ def error_at(white: float, errors_at: Sequence[Sequence[float]]) -> float:
     return float(np.interp(math.log(white), np.log(whites), errors))
 
 
-def decibels(white: float, error: float | None) -> float | None:
-    """How far an error lies below white; None where there is no error or no light."""
-    return 20 * math.log10(white / error) if error and white > 0 else None
-
-
 def measured(
     mean: float, high: float, errors: Sequence[float], errors_at: Sequence[Sequence[Sequence[float]]]
 ) -> dict[str, Any]:
@@ -99,9 +95,14 @@ def measured(
         found["error_at_white_per_frame"] = [
             error_at(white, pairs) if len(pairs) else plain for plain, pairs in zip(errors, errors_at, strict=True)
         ]
-        found["psnr_of_truth"] = decibels(white, rms(np.array(found["error_at_white_per_frame"])))
-        found["psnr_unclamped"] = decibels(white, rms(np.array(errors)))
+        found["psnr_of_truth"] = _stored(psnr(white, rms(np.array(found["error_at_white_per_frame"]))))
+        found["psnr_unclamped"] = _stored(psnr(white, rms(np.array(errors))))
     return found
+
+
+def _stored(decibels: float) -> float | None:
+    """JSON has no infinity: no error is null."""
+    return decibels if math.isfinite(decibels) else None
 
 
 @dataclass(frozen=True)

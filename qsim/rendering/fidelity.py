@@ -19,8 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.clamped_error import Errors, Stated, decibels, white_in
+from qsim.clip.clamped_error import Errors, Stated, white_in
 from qsim.clip.motion_statistics import MOVING
+from qsim.colour import psnr
 from qsim.optics.camera import Camera
 from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.rendering.budget import Allowed, Budget, Finding, blur_error, grid_samples
@@ -262,8 +263,8 @@ def fewest_samples(noise: Noise, instants: int, allowed: Allowed, share: float) 
     while allowed.part(noise.at(each, instants)) > share and each * instants < MOST_SAMPLES:
         each = 2 * grid_samples(each // 2 + 1)
     expected = noise.at(each, instants)
-    size = f"expected rms {expected.at_white:.2g} = {decibels(allowed.white, expected.at_white) or math.inf:.1f} dB"
-    size += f", without a clamp {decibels(allowed.white, expected.plain):.1f} dB"
+    size = f"expected rms {expected.at_white:.2g} = {psnr(allowed.white, expected.at_white):.1f} dB"
+    size += f", without a clamp {psnr(allowed.white, expected.plain):.1f} dB"
     if allowed.part(expected) > share:
         size += f", the limit of {MOST_SAMPLES} samples is reached"
     return each * instants, Finding("samples", f"{each * instants} per pixel", size)

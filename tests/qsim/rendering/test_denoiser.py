@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from small_scenes import CAMERA, plate, renderer
 
+from qsim.rendering import denoiser
 from qsim.rendering.budget import Budget
 from qsim.rendering.denoiser import available, mixture
 from qsim.scene import Spin, SunSky
@@ -82,3 +83,26 @@ def test_denoising_without_the_package_is_refused(monkeypatch):
     monkeypatch.setattr(denoiser, "available", lambda: False)
     with pytest.raises(ValueError, match="Open Image Denoise is missing"):
         renderer(plate(None), budget=Budget(2, 1, denoise=True)).frame(0)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_denoised_frame_keeps_the_mean_light(monkeypatch, seed):
+    """Whatever share of the light a denoiser loses or adds, up to a few per cent."""
+    rng = np.random.default_rng([9, seed])
+    shift = rng.uniform(0.97, 1.03)
+    monkeypatch.setattr(denoiser, "denoised", lambda half, *_: shift * np.ones_like(half))
+    halves = 1 + 0.3 * rng.standard_normal((2, 128, 128))
+    mixed = denoiser.cleaned_mean(halves, halves[0], halves[0], 2.5)
+    moved = abs(shift - 1) > denoiser.KEPT * mixed.error
+    if not moved:
+        assert mixed.picture.mean() == pytest.approx(halves.mean(), rel=1e-12)
+    assert abs(mixed.picture.mean() - halves.mean()) <= abs(shift * 1 - halves.mean())
+
+
+def test_a_stray_path_does_not_brighten_a_whole_frame(monkeypatch):
+    """One pixel of a million times the light is 60 times the mean of the frame: it moves it by a part of its error."""
+    monkeypatch.setattr(denoiser, "denoised", lambda half, *_: np.ones_like(half))
+    halves = 1 + 0.01 * np.random.default_rng(1).standard_normal((2, 128, 128))
+    halves[0, 5, 5] = 1e6
+    mixed = denoiser.cleaned_mean(halves, halves[0], halves[0], 2.5)
+    assert np.median(mixed.picture) == pytest.approx(1.0, abs=0.02)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_scenes import CAMERA, plate, renderer, scene, square
 
-from qsim.clip.clamped_error import Errors, Stated, decibels, error_at, white_in
+from qsim.clip.clamped_error import Errors, Stated, error_at, white_in
 from qsim.rendering import fidelity
 from qsim.rendering.budget import Allowed, Budget, blur_error, explain
 from qsim.rendering.fidelity import Noise, choose_budget, shortfall
@@ -30,7 +30,7 @@ def test_the_error_asked_for_is_reached_without_waste(psnr):
     chosen = choose_budget(made, psnr=psnr, denoise=False)
     frames = [Renderer(made, budget=chosen).frame(t, with_truth=False) for t in (1, 9)]
     white = white_in(np.stack([frame.radiance for frame in frames]))
-    reached = decibels(white, math.sqrt(np.mean([error_at(white, frame.errors_at) ** 2 for frame in frames])))
+    reached = psnr(white, math.sqrt(np.mean([error_at(white, frame.errors_at) ** 2 for frame in frames])))
     assert psnr - 1 < reached < psnr + 10  # samples come in even squares: 4, 16, 36
 
 

@@ -13,12 +13,12 @@ from stats import critical_z
 from qsim.cli.program import main
 from qsim.clip.clamped_error import (
     Errors,
-    decibels,
     error_at,
     stated,
     white_in,
 )
 from qsim.clip.clip import Clip
+from qsim.colour import psnr
 from qsim.rendering.budget import Budget
 from qsim.rendering.fidelity import choose_budget, dimming, moving
 from qsim.scene import Body, Diffuse, EnvironmentImage, Glow, PointLight, RoughPlastic
@@ -64,7 +64,7 @@ def test_a_scene_with_highlights_reaches_what_was_asked_and_stated():
     assert plain > 1.1 * reached
     assert said == pytest.approx(reached, rel=0.1)
     assert math.sqrt(np.mean([frame.error**2 for frame in frames])) == pytest.approx(plain, rel=0.25)
-    assert 29.5 < decibels(white, reached) < 36  # samples come in steps
+    assert 29.5 < psnr(white, reached) < 36  # samples come in steps
 
 
 def test_the_light_left_out_is_told_with_its_error():

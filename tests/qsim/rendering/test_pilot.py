@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from small_scenes import CAMERA, plate, scene, square
 
-from qsim.clip.clamped_error import Errors, decibels, error_at, white_in
+from qsim.clip.clamped_error import Errors, error_at, white_in
+from qsim.colour import psnr
 from qsim.rendering import pilot
 from qsim.rendering.budget import Allowed
 from qsim.rendering.denoiser import available
@@ -46,7 +47,7 @@ def test_the_denoiser_is_tried_beside_the_middle_of_a_large_frame():
     chosen = choose_budget(made, psnr=42, denoise=True)
     frame = Renderer(made, budget=chosen).frame(3, with_truth=False)
     white = white_in(frame.radiance)
-    assert decibels(white, error_at(white, frame.errors_at)) > 41
+    assert psnr(white, error_at(white, frame.errors_at)) > 41
 
 
 @pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
