@@ -150,12 +150,12 @@ def measure_sums(
         raise ValueError(f"{name}: has no frames")
     drawn, unknown = frames * planes, np.full(ones.shape, np.nan)
     histogram = np.array([ones.size * drawn - ones.sum(), ones.sum()]).astype(np.int64)
-    whole = FrameStatistics(drawn, float(exposure), photons, histogram, ones, ones, unknown, unknown, unknown)
+    statistics = FrameStatistics(drawn, float(exposure), photons, histogram, ones, ones, unknown, unknown, unknown)
     if frames < 2 or planes < 2:
-        return whole
+        return statistics
     observed = float((squares - ones**2 / frames).sum()) / (frames - 1)
-    expected = float(whole.pixel_variance.sum()) * planes
-    return replace(whole, dispersion=observed / expected if expected > 0 else float("nan"), sums=frames)
+    expected = float(statistics.pixel_variance.sum()) * planes
+    return replace(statistics, dispersion=observed / expected if expected > 0 else float("nan"), sums=frames)
 
 
 def _check_light(exposure: float, photons: float | None, name: str) -> None:

@@ -113,7 +113,7 @@ _FIELDS = {"quantum_efficiency": ("quantum_efficiency",), "pde": ("pde_fill",)}
 def to_toml(found: Calibration, title: str, dark_map: str | None = None) -> str:
     """Return the sensor as a device file, each number with its interval and method as its source.
 
-    The map of dark counts stands in a comment, because it fits only frames that are not larger.
+    The map of dark counts is in a comment, because it fits only frames that are not larger.
     """
     lines = [f"# {title}", "[sensor]"]
     described = sensor_of(found).to_dict()

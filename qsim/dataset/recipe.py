@@ -1,4 +1,4 @@
-"""Recipes: one TOML file -> the jobs of a data set. Strict: every mistake is named with file, line and key.
+"""Reads a recipe, one TOML file, into the jobs of a data set; every error names file, line and key.
 
     [recipe]
     name = "starter"           # letters, digits, '.', '_', '-'
@@ -6,12 +6,12 @@
     height = 128               # pixels
     width = 128
     frame_rate = 2000.0        # frames per second of the scene's time; default 2000
-    shutter = 0.0              # open share of a frame, 0..1; 0: a sharp instant with the light of a whole frame
-    psnr = 40.0                # wanted error of the radiance, dB below white, clamped there (white.py)
+    shutter = 0.0              # open share of a frame, 0..1; 0: a sharp instant with the light of a full frame
+    psnr = 40.0                # wanted error of the radiance, dB below white, clamped there (clip/clamped_error.py)
     seed = 0                   # of the samples and of the noise
 
     [[scenes]]                 # one clip per family, seed and speed
-    family = "fan"             # a family of scenes/; or beside the recipe a .py or .xml file, or a folder ("./things")
+    family = "fan"             # a family of scenes/; or a .py file, .xml file or folder beside the recipe ("./things")
     seeds = [0, 1, 2]          # or: count = 3 (seeds first ... first + count - 1; first = 0)
     speed = [1.0, 2.0]         # factor on all motions, a number or a list; default 1
     split = "train"            # train, val or test
@@ -20,11 +20,11 @@
     [[streams]]                # optional; one stream per bits and light level, in every clip
     sensor = "quiver-physical" # a name of `qsim doctor --devices`, or a .toml file beside the recipe
     bits = 3                   # or a list
-    ppp = [3.25, 26.0]         # photons per pixel and code over the whole clip; or lux = ...; or absolute = true
+    ppp = [3.25, 26.0]         # photons per pixel and code, mean of the clip; or lux = ...; or absolute = true
     # seed = 1, name = "...", group = true (codes sum clip frames as binary planes), diffraction = true
 
-Splits are by scene: a (family, seed) belongs to one split, whatever its speed, and a family of the test split occurs in
-no other split.
+Splits are by scene: a (family, seed) belongs to one split at every speed. A family of the test split is in no other
+split.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ from qsim.files import check_name
 from qsim.structure import Check, Table
 
 SPLITS = checks.SPLITS
-MAX_STEM = 180  # characters of a scene's name: with seed, speed and a temporary ending it must be a file's name
+MAX_STEM = 180  # characters of a scene's name, which gets a seed, a speed and a temporary ending as a file's name
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A data set to be made."""
+    """Description of a data set: its name and jobs."""
 
     name: str
     jobs: tuple[Job, ...]
@@ -55,12 +55,12 @@ class Recipe:
 
     @property
     def splits(self) -> dict[str, list[str]]:
-        """Split -> names of its clips."""
+        """Return the names of the clips of each split."""
         return {split: [job.name for job in self.jobs if job.split == split] for split in SPLITS}
 
 
 def load(path: str | Path) -> Recipe:
-    """`FileNotFoundError`, or `ValueError` as `FILE:LINE: what is wrong, what to do`."""
+    """Read a recipe; `FileNotFoundError`, or `ValueError` as `FILE:LINE: what is wrong, what to do`."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such recipe")
@@ -72,31 +72,34 @@ def load(path: str | Path) -> Recipe:
 
 
 def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
-    """A recipe from the text of a TOML file; `path` names it in errors and is where relative files are looked for."""
+    """Return the recipe in the text of a TOML file; errors name `path`, and relative files are beside it."""
     written = Text(path, text)
-    whole = Section(written, None, 0, written.content())
-    whole.values({"recipe, if any": _kept, "scenes, if any": _kept, "streams, if any": _kept})
-    if not isinstance(whole.table.get("recipe"), dict):
+    document = Section(written, None, 0, written.content())
+    document.values({"recipe, if any": _kept, "scenes, if any": _kept, "streams, if any": _kept})
+    if not isinstance(document.table.get("recipe"), dict):
         raise ValueError(f"{path}: the section [recipe] is missing")
-    head = Section(written, "recipe", 0, whole.table["recipe"])
+    head = Section(written, "recipe", 0, document.table["recipe"])
     given = head.values(_HEAD)
     name, seed = given["name"], given.get("seed", 0)
     defaults = {"frame_rate": 2000.0} | _settings(given)
     streams: list[Sensing] = []
     taken: set[str] = set()
-    for section in whole.sections("streams"):
+    for section in document.sections("streams"):
         streams += _streams(section, seed, taken)
     jobs: list[tuple[Job, Section]] = []
-    for section in whole.sections("scenes"):
+    for section in document.sections("scenes"):
         jobs += [(job, section) for job in _jobs(section, defaults, seed, tuple(streams))]
     if not jobs:
         raise ValueError(f"{path}: no [[scenes]], nothing to render")
     _check_jobs(jobs)
-    return Recipe(name, tuple(job for job, _ in jobs), whole.table)
+    return Recipe(name, tuple(job for job, _ in jobs), document.table)
 
 
 def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
-    """No clip twice, no scene in two splits, no family of the test split in another one, frames for every sum."""
+    """`ValueError` for a clip asked for twice, a split that shares a scene, or too few frames for a sum.
+
+    A scene may be in one split only, and a family of the test split in no other split.
+    """
     seen: set[str] = set()
     split_of: dict[str, str] = {}
     tested = {job.stem for job, _ in jobs if job.split == "test"}
@@ -104,7 +107,7 @@ def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
         if job.name in seen:
             raise ValueError(f"{section.where()}: the clip {job.name} is asked for twice; give one of them other seeds")
         seen.add(job.name)
-        same = job.family.endswith(".xml")  # whatever the seed, which draws other samples of it
+        same = job.family.endswith(".xml")  # the seed of such a scene changes its samples only
         scene = job.stem if same else job.scene
         if split_of.setdefault(scene, job.split) != job.split:
             cure = "an .xml scene is one scene whatever the seed: leave one of them out"
@@ -129,7 +132,7 @@ def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
 
 
 def _jobs(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[Sensing, ...]) -> list[Job]:
-    """One job per seed and speed."""
+    """Return one job per seed and speed of a [[scenes]] section."""
     given = section.values(_SCENES)
     family = _family(section, given["family"])
     seeds = _seeds(section, given)
@@ -172,12 +175,12 @@ def _jobs(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[
 
 
 def _settings(given: dict[str, Any]) -> dict[str, Any]:
-    """The fields of `Settings` that a section gives."""
+    """Return the fields of `Settings` that a section gives."""
     return {key: given[key] for key in _SETTINGS if key in given}
 
 
 def _family(section: Section, family: str) -> str:
-    """A family of the library, or the path of a scene file or folder that is there."""
+    """Return a family of the library, or the absolute path of an existing scene file or folder."""
     file = (section.text.path.parent / family).resolve()
     if "/" in family and file.is_dir():
         return str(file)
@@ -197,6 +200,7 @@ def _family(section: Section, family: str) -> str:
 
 
 def _seeds(section: Section, given: dict[str, Any]) -> list[int]:
+    """Return the seeds of a section, listed or counted."""
     if "seeds" in given:
         for key in ("count", "first"):
             if key in given:
@@ -213,7 +217,7 @@ def _seeds(section: Section, given: dict[str, Any]) -> list[int]:
 
 
 def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
-    """One stream per bits and light level, under names that are not taken; they are added to `taken`."""
+    """Return one stream per bits and light level, and add their names to `taken`; `ValueError` for a taken name."""
     given = section.values(_STREAMS)
     unit, levels = _light(section, given)
     bits, name = given.get("bits", [None]), given.get("name")
@@ -247,7 +251,7 @@ def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
 
 
 def _light(section: Section, given: dict[str, Any]) -> tuple[str, list[float | None]]:
-    """("ppp" | "lux" | "absolute", levels); absolute light has one level, as it is."""
+    """Return ("ppp" | "lux" | "absolute", levels); absolute light has the one level None."""
     units = [key for key in ("ppp", "lux", "absolute") if key in given]
     if len(units) != 1:
         raise ValueError(
@@ -263,7 +267,10 @@ def _light(section: Section, given: dict[str, Any]) -> tuple[str, list[float | N
 
 
 def _sensor(section: Section, sensor: str, bits: list[int | None], group: bool) -> str:
-    """The sensor's name or file, if it exists with all these bits, and its planes can be summed where asked."""
+    """Return the sensor's name or absolute file.
+
+    `ValueError` if it does not exist with all these bits, or if its planes cannot be summed and `group` asks for it.
+    """
     from qsim.sensor import devices
     from qsim.sensor.spad import BinarySPAD
 
@@ -281,12 +288,12 @@ def _sensor(section: Section, sensor: str, bits: list[int | None], group: bool) 
 
 
 def _name(value: Any) -> str:
-    """A text that can name a file."""
+    """Return a text that can name a file."""
     return check_name(checks.text(value))
 
 
 def _kept(value: Any) -> Any:
-    """Whatever there is: sections are checked one by one."""
+    """Return the value: sections are checked one by one."""
     return value
 
 

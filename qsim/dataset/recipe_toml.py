@@ -1,4 +1,4 @@
-"""The text of a recipe: its sections, and the line in which a key stands, so that every mistake is named with both."""
+"""Finds the sections of a recipe's TOML text, and the line of each key for error messages."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ class Text:
 
     @property
     def lines(self) -> list[str]:
+        """Return the lines of the file."""
         return self.text.splitlines()
 
     def content(self) -> dict[str, Any]:
-        """What it says; `ValueError` as `FILE:LINE: ...` if it is no TOML."""
+        """Return the parsed content; `ValueError` as `FILE:LINE: ...` if it is not TOML."""
         return parse_toml(self.path, self.text)
 
     def where(self, section: str | None, i: int, key: str | None = None) -> str:
-        """`FILE:LINE` of a key in the i-th section of that name (of the section's head without a key)."""
+        """Return `FILE:LINE` of a key in the i-th section of that name, or of the section's head without a key."""
         number, inside, seen = 0, section is None, -1
         for n, line in enumerate(self.lines, 1):
             head = re.match(r"\s*\[\[?\s*([\w.-]+)\s*\]\]?", line)
@@ -44,7 +45,7 @@ class Text:
         return f"{self.path}:{number or self._mention(section, key)}"
 
     def _mention(self, section: str | None, key: str | None) -> int:
-        """The first line that says `key =`, or else the section, for tables written in line or with dots."""
+        """Return the first line with `key =`, or else with the section, for tables written in line or with dots."""
         for word in (key, section):
             for n, line in enumerate(self.lines, 1):
                 if word and re.search(rf"(?<![\w-]){re.escape(word)}[\"']?\s*[=.]", line):
@@ -63,19 +64,19 @@ class Section:
 
     @property
     def title(self) -> str:
-        """As it is written."""
+        """Return the section's name as it is written."""
         return {None: "the recipe", "recipe": "[recipe]"}.get(self.name, f"[[{self.name}]]")
 
     def where(self, key: str | None = None) -> str:
-        """`FILE:LINE` of a key, or of the section's head."""
+        """Return `FILE:LINE` of a key, or of the section's head."""
         return self.text.where(self.name, self.i, key)
 
     def values(self, table: Table) -> dict[str, Any]:
-        """The values as their checks return them; `ValueError` with the line of the key that is wrong."""
+        """Return the values as their checks return them; `ValueError` with the line of the wrong key."""
         return structure(self.table, table, self.where, of=self.title)
 
     def sections(self, key: str) -> list[Section]:
-        """The tables [[key]] of the file, in their order."""
+        """Return the tables [[key]] of the file, in their order."""
         tables = self.table.get(key, [])
         if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
             raise ValueError(f"{self.text.where(key, 0)}: '{key}' must be sections, each beginning with [[{key}]]")

@@ -103,7 +103,7 @@ def _streams(path: Path) -> list[tuple[Path, Path, Path | None]]:
         return [each for name in names for each in _of_clip(path / "clips" / name, record_path(path, name), path)]
     if (path / "clip.json").is_file() or not path.with_suffix(".json").is_file():
         if not (path / "clip.json").is_file():
-            Clip.open(path)  # says what is missing
+            Clip.open(path)  # raises the error that names what is missing
         return _of_clip(path)
     return [each for each in _of_clip(path.parent.parent) if each[1] == path.with_suffix(".json")]
 
