@@ -1,4 +1,4 @@
-"""What a frame costs and why: the record `Budget`, the sizes of sampling grids and the instants of an exposure."""
+"""Defines `Budget`, the samples, bounces and instants of a frame, and the grids and blur errors that follow."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from qsim.clip.clamped_error import Errors
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a clip models or leaves out, and how large the rest is."""
+    """One effect that a clip models or leaves out, and the size of the remaining error."""
 
     effect: str
     chosen: str
@@ -22,7 +22,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Budget:
-    """What a frame costs, and why; the same record is stored in clip.json."""
+    """The work for one frame and the reasons for it; clip.json stores the same record."""
 
     samples: int = 32  # per pixel and frame, all instants and both halves together
     bounces: int = 6  # scatterings along a path
@@ -31,7 +31,7 @@ class Budget:
     denoise: bool = False  # Open Image Denoise; its error is measured against raw halves
     left_out: float = 0.0  # W m^-2 sr^-1, rms of later bounces by the pilot; part of the error that a frame states
     left_out_at_white: float = 0.0  # the same of pictures clamped at white
-    white: float = 0.0  # W m^-2 sr^-1, by the pilot; 0: not known, each frame takes its own
+    white: float = 0.0  # W m^-2 sr^-1, by the pilot; 0: unknown, each frame uses its own
     dimmed: float = 0.0  # share of the mean light that later bounces would add, by the pilot
     dimmed_error: float = 0.0  # standard error of that share
     findings: tuple[Finding, ...] = field(default=())
@@ -42,7 +42,7 @@ class Budget:
                 raise ValueError(f"Budget.{name}: at least 1, got {getattr(self, name)!r}")
 
     def grid(self, instants: int) -> int:
-        """Samples per pixel of each half at each of these instants."""
+        """Return the samples per pixel of each half at each of `instants` instants."""
         return grid_samples(math.ceil(self.samples / instants / 2))
 
 
@@ -55,22 +55,21 @@ class Allowed:
     sensor: float = math.inf  # without a clamp
 
     def part(self, errors: Errors) -> float:
-        """How much of what is allowed these errors take, 1 being all."""
+        """Return the fraction of the allowed error that these errors take; 1 is all of it."""
         return max(errors.at_white / self.target, errors.plain / self.sensor)
 
 
 def explain(budget: Budget) -> str:
-    """What was modelled, what was left out, and how large it would have been; one line each."""
+    """Return one line per finding: effects modelled, effects left out, and their sizes."""
     width = max((len(finding.effect) for finding in budget.findings), default=0)
     return "\n".join(f"{f.effect:{width}}  {f.chosen}; {f.size}" for f in budget.findings)
 
 
 def grid_samples(samples: int) -> int:
-    """The next size of an even number of cells, nearly square: 4, 6, 8, 12, 16, 20, 24, 30, 36, 42, 48, 56, 64, ...
+    """Return the next size of an even, nearly square grid: 4, 6, 8, 12, 16, 20, 24, 30, 36, 42, 48, 56, 64, ...
 
-    Multijitter does worse on squares of odd numbers: measured under sun and sky, error * samples^0.7 is 0.012 to 0.015
-    at 4, 16, ... 144, but 0.018 to 0.028 at 9, 25, ... 121. On all others it is alike: at 4, 6, 8, 12, 16, 20 and 24
-    samples it stays within 5 % of its mean (fan, tumble, gears, flag, crowd).
+    Multijitter has larger errors on squares of odd numbers; on all other grids, error * samples^0.7 is nearly constant
+    (docs/log.md).
     """
     size = max(4, samples)
     while not _is_grid(size):
@@ -79,22 +78,23 @@ def grid_samples(samples: int) -> int:
 
 
 def _is_grid(size: int) -> bool:
-    """Whether multijitter, whose grid is isqrt(size) high, holds just that many, evenly and nearly square."""
+    """Return whether the grid of multijitter, isqrt(size) cells high, has exactly `size` cells and is nearly square."""
     high = math.isqrt(size)
     return size % 2 == 0 and size % high == 0 and size // high - high <= 2
 
 
 def instants(middle: float, exposure: float, count: int) -> list[float]:
-    """The middles of `count` equal parts of an exposure [s]."""
+    """Return the middles [s] of `count` equal parts of an exposure [s]."""
     return [middle + float(part) * exposure for part in (np.arange(count) + 0.5) / count - 0.5]
 
 
 def blur_left(means: Array, count: int) -> float:
-    """The rms error of the mean of 3, 6, 9 ... instants, from `means` [3, 2, H, W]: of all, of thirds, of the middle.
+    """Return the rms error of the mean of `count` instants (3, 6, 9 ...), W m^-2 sr^-1.
 
-    Each in two independent halves: the product of their differences is a square that noise changes by nothing on
-    average. The error falls as a power of the instants, 1/2 (thin ghosts apart) to 2 (steps below a pixel), which the
-    middle one and the thirds show; of three instants 2 is taken. Other counts have no thirds: 0, not measured.
+    `means` [3, 2, H, W] are the means of all instants, of every third one, and the middle one alone, each in two
+    independent halves. The product of the halves' differences is a squared error without bias from noise. The error
+    falls as a power of the count, from 1/2 (separate thin ghosts) to 2 (steps below a pixel). The middle instant and
+    the thirds determine that power; for three instants it is 2. Other counts have no thirds: 0, not measured.
     """
     if count % 3:
         return 0.0
@@ -105,11 +105,12 @@ def blur_left(means: Array, count: int) -> float:
     return math.sqrt(thirds) / 3 ** min(max(power, 0.5), 2.0)
 
 
-def blur_error(travel: float, instants: int) -> float:
-    """Largest error of the mean of K instants at a moving edge, as a share of its contrast.
+def blur_error(extent: float, instants: int) -> float:
+    """Return the largest error of the mean of K instants at a moving edge, as a fraction of its contrast.
 
-    An edge that travels m px in the exposure steps by d = m / K. While d < 1 px, a pixel's coverage is piecewise linear
-    in time and the midpoint rule errs by at most d^2 / (8 m) per kink; coarser steps leave separate ghosts of 1 / K.
+    An edge that moves by `extent` = m px in the exposure steps by d = m / K. While d < 1 px, a pixel's coverage is
+    piecewise linear in time, and the midpoint rule errs by at most d^2 / (8 m) per kink. Larger steps leave separate
+    ghosts of 1 / K.
     """
-    step = travel / instants
-    return step**2 / (8 * travel) if 0 < step <= 1 else 1 / instants if step > 1 else 0.0
+    step = extent / instants
+    return step**2 / (8 * extent) if 0 < step <= 1 else 1 / instants if step > 1 else 0.0

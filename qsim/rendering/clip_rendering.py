@@ -29,9 +29,10 @@ def render_clip(
     extra: dict[str, Any] | None = None,
     force: bool = False,
 ) -> Clip:
-    """Render frames 0 .. frames - 1 into a clip folder; an interrupted call with the same question is continued.
+    """Render frames 0 .. frames - 1 into a clip folder; an equal call resumes an interrupted one.
 
-    `progress(done, frames)` is called after each frame; `extra` joins clip.json (the split of a data set, say).
+    `progress(done, frames)` is called after each frame; `extra` is added to clip.json (the split of a
+    data set, for example).
     """
     if frames < 1:
         raise ValueError(f"{path}: a clip needs at least one frame, got {frames}")

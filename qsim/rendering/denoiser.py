@@ -1,24 +1,23 @@
-"""Open Image Denoise on radiance: optional (`pip install qsim[denoise]`), and its error measured without a reference.
+"""Denoises radiance with Open Image Denoise (optional) and measures the error without a reference.
 
     halves [2, H, W] + albedo [H, W] + normal [H, W, 3] -> radiance [H, W], its rms error
 
-A denoiser's bias is the same in two halves, so their difference says nothing about it. Both halves A and B, whose noise
-is independent, are denoised, and D(A) meets the raw half B, D(B) the raw half A. With the raw mean M = (A + B) / 2, the
-denoised mean C = (D(A) + D(B)) / 2, Z = A - B and Y = D(A) - D(B), multiplying out and dropping what is zero on average
-(the error of D(A) times the noise of B, and the reverse) leaves
+It is installed by `pip install qsim[denoise]`. A denoiser has the same bias in two halves, so their difference does not
+contain it. The halves A and B with independent noise are therefore both denoised, and D(A) is compared with the raw
+half B, D(B) with the raw half A. Let M = (A + B) / 2 be the raw mean, C = (D(A) + D(B)) / 2 the denoised mean,
+Z = A - B and Y = D(A) - D(B). Without the terms of zero mean (the error of D(A) times the noise of B, and the reverse),
 
     E (M - truth)^2 = E Z^2 / 4,    E (M - truth)(C - truth) = E Y Z / 4,    E (C - M)^2 = E (C - M)^2,
 
-so that the error of every mixture w C + (1 - w) M is known without the truth, and with it the w that errs least:
+The error of every mixture w C + (1 - w) M then follows without the truth, and with it the best w:
 
     E (w C + (1 - w) M - truth)^2 = E [Z^2 / 4 - w Z (Z - Y) / 2 + w^2 (C - M)^2].
 
-Means are taken around each pixel: where texture or a mirror misleads the denoiser, raw samples speak. Denoising the
-halves instead of their mean takes as many calls (two), errs about as much once mixed (from 0.2 dB more to 0.4 dB less;
-tried once, seven scenes at 8 to 72 samples), and what is stated is the error of the very picture that is returned.
+Means are taken around each pixel: where the denoiser is biased (texture, mirrors), the weight of the raw samples rises.
+The stated error is that of the picture that is returned.
 
-The denoiser shifts the mean light, by -0.25 to +0.65 % of it in nine scenes. Raw halves do not: a frame gets their
-mean, as long as that moves it by less than KEPT of its own error.
+The denoiser shifts the mean light (docs/log.md). Raw halves do not, so a frame gets their mean if that shift is smaller
+than KEPT times its error.
 """
 
 from __future__ import annotations
@@ -31,19 +30,20 @@ from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import clamped_squares
 
-DENOISE_COST = 15.0  # samples per pixel that two denoised halves, albedo and normals cost (about, on two cores)
+DENOISE_COST = 15.0  # cost of two denoised halves, albedo and normals in samples per pixel (about, on two cores)
 AROUND = 33  # px, side of the square around a pixel in which errors are compared
-KEPT = 0.25  # of a frame's error: the most by which its mean is moved to that of the raw halves
+KEPT = 0.25  # of a frame's error: the largest shift of its mean towards that of the raw halves
 
 
 def available() -> bool:
-    """Whether the denoiser is installed."""
+    """Return whether the denoiser is installed."""
     return find_spec("pyoidn") is not None
 
 
 def denoised(noisy: Array, albedo: Array, normal: Array) -> Array:
-    """A grey picture without its pixel noise, float32 [H, W]; albedo (0..1) and normals are taken as free of noise.
+    """Return a grey picture [H, W] without its pixel noise, float32; albedo and normals are treated as free of noise.
 
+    Albedo is [H, W] in 0..1, `normal` is [H, W, 3].
     `ValueError` if the denoiser is not installed.
     """
     if not available():
@@ -58,29 +58,29 @@ def denoised(noisy: Array, albedo: Array, normal: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """Raw and denoised halves mixed, and what is known of the errors."""
+    """Raw and denoised halves, mixed, with estimates of the squared errors."""
 
-    share: Array  # [H, W], of the denoised mean in the picture, 0 to 1
+    share: Array  # [H, W], fraction of the denoised mean in the picture, 0 to 1
     picture: Array  # [H, W], with the mean of the raw halves
-    lower: Array  # [H, W], the darker of the two halves, each mixed alike
+    lower: Array  # [H, W], the darker of the two halves, both mixed by `share`
     squares: Array  # [H, W], whose mean estimates the picture's squared error; single ones may be negative
     raw: Array  # [H, W], the same of the raw mean
 
     @property
     def error(self) -> float:
-        """The rms error of the picture."""
+        """The rms error of the picture, W m^-2 sr^-1."""
         return _root(self.squares, self.raw)
 
     def error_at(self, white: float, sigmas: float = 1.0) -> float:
-        """The rms error of picture and truth clamped at white, with so many standard errors of its own added."""
+        """Return the rms error of picture and truth clamped at white, plus `sigmas` of its standard errors."""
         squares = clamped_squares(self.squares, self.picture, self.lower, white)
         return _root(squares, np.minimum(self.raw, white**2), sigmas)
 
 
 def cleaned_mean(halves: Array, albedo: Array, normal: Array, white: float) -> Mixture:
-    """The mean of two independent halves [2, H, W], denoised where that helps.
+    """Return the mean of two independent halves [2, H, W], denoised where that lowers the error.
 
-    Its mean is that of the raw halves, unless that moves it by more than KEPT of its error at white.
+    Its mean is that of the raw halves, unless the shift exceeds KEPT times its error at white.
     """
     cleaned = np.stack([denoised(half, albedo, normal) for half in halves])
     mixed = mixture(halves, cleaned)
@@ -92,11 +92,11 @@ def cleaned_mean(halves: Array, albedo: Array, normal: Array, white: float) -> M
 
 
 def mixture(halves: Array, cleaned: Array) -> Mixture:
-    """The share w [H, W] of C that errs least around each pixel, and the picture w C + (1 - w) M.
+    """Return the fraction w [H, W] of C with the smallest error around each pixel, and the picture w C + (1 - w) M.
 
-    From halves [2, H, W] = A, B and `cleaned` [2, H, W] = D(A), D(B). The share is chosen from the pixels that also
-    give the error, which makes that too small by about one standard error of its own (0 to 1.8 of them, six scenes at
-    8, 16 and 32 samples): one is added. The error is at least a tenth of the raw one, lest chance promise nothing.
+    `halves` [2, H, W] are A and B, `cleaned` [2, H, W] are D(A) and D(B). The same pixels select w and give the error,
+    which lowers it by about one standard error (docs/log.md): one is added. The error is at least a tenth of the raw
+    one, so that chance cannot make it zero.
     """
     from scipy.ndimage import uniform_filter
 

@@ -1,4 +1,4 @@
-"""Sets the Mitsuba variant that `qsim.backend` chose, and keeps the few calls of Dr.Jit that all of rendering needs."""
+"""Activates the Mitsuba variant chosen by `qsim.backend`; times kernels and makes Dr.Jit values opaque."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from qsim.backend import Engine, choose, limit_threads
 
 
 def select(prefer: str | None = None) -> Engine:
-    """Choose (once per process) and activate an engine; `prefer` or QSIM_ENGINE insists on "cuda", "llvm" or "scalar".
+    """Choose (once per process) and activate an engine; `prefer` or QSIM_ENGINE requires "cuda", "llvm" or "scalar".
 
-    Raises ValueError when the wanted engine does not work here, with the reason and what to install.
+    `ValueError` if the required engine does not work on this machine, with the reason and what to install.
     """
     engine = choose(prefer)
     activate(engine)
@@ -21,7 +21,7 @@ def select(prefer: str | None = None) -> Engine:
 
 
 def activate(engine: Engine) -> None:
-    """Make this engine's variant the current one; cheap when it already is."""
+    """Make this engine's variant the current one; cheap if it is already active."""
     if engine.llvm_path:
         os.environ["DRJIT_LIBLLVM_PATH"] = engine.llvm_path
     import mitsuba as mi
@@ -33,9 +33,9 @@ def activate(engine: Engine) -> None:
 
 @contextmanager
 def kernels_timed() -> Iterator[list[float]]:
-    """How long compiled kernels run inside the block, one number [s] for each; the list is filled at its end.
+    """Yield a list that receives the run time [s] of every kernel launched in the block, at the end of the block.
 
-    Empty for the scalar engine, which launches none.
+    It stays empty for the scalar engine, which launches none.
     """
     import drjit as dr
 
@@ -52,7 +52,7 @@ def kernels_timed() -> Iterator[list[float]]:
 
 @contextmanager
 def errors_only(mi: Any) -> Iterator[None]:
-    """Mitsuba's log inside the block without warnings that say nothing here; the caller says which."""
+    """Suppress warnings of Mitsuba inside the block; the caller states in a comment which ones and why."""
     level = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)
     try:
@@ -62,7 +62,7 @@ def errors_only(mi: Any) -> Iterator[None]:
 
 
 def opaque(value: Any) -> Any:
-    """A Dr.Jit value as data: were it code, every kernel would be compiled anew whenever it changes."""
+    """Return a Dr.Jit value as data; as a literal, each change of it would compile the kernels again."""
     import drjit as dr
 
     dr.make_opaque(value)

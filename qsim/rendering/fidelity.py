@@ -1,13 +1,13 @@
-"""How much work a scene needs: bounces, instants per exposure and samples, from the error that is asked for.
+"""Chooses bounces, instants per exposure and samples of a scene for a requested error.
 
-    choose_budget(scene, ..., psnr=40, ppp=26) -> Budget; its findings say what is modelled, left out, and how large
+    choose_budget(scene, ..., psnr=40, ppp=26) -> Budget; its findings list effects modelled or left out, with sizes
 
-A pilot (pilot.py) looks at every n-th pixel in its true size. Two limits are kept, the stricter one counts:
+A pilot (pilot.py) renders every n-th pixel at full resolution. The stricter of two limits holds:
 
-    target:  white * 10^(-psnr / 20), rms of picture and truth clamped at white (white.py), blurred as it will be
+    target:  white * 10^(-psnr / 20), rms of picture and truth clamped at white (clip/clamped_error.py), after blur
     sensor:  Monte-Carlo variance in electrons^2 at most 1 % of the shot variance: mean * sqrt(0.01 / (QE * PPP)), rms
 
-What is allowed is shared: bounces and blur may each take 30 % of it (rms), the samples get all that those leave.
+Bounces and blur may each take 30 % of the allowed error (rms); the samples use the remainder.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from qsim.clip.clamped_error import Errors, Stated, white_in
 from qsim.clip.motion_statistics import MOVING
 from qsim.colour import psnr
 from qsim.optics.camera import Camera
+from qsim.optics.diffraction import diffraction_line
 from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.rendering.budget import Allowed, Budget, Finding, blur_error, grid_samples
 from qsim.rendering.pilot import COUNTS, Pilot, denoised_samples, rests
@@ -30,29 +31,29 @@ from qsim.scene import Scene
 
 SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
 SENSOR_SHARE = 0.01  # of the shot variance that Monte-Carlo noise may add
-DEPTHS = (2, 4, 6, 9, 12, 16, 24)  # bounces tried, against (each depth is a kernel to compile)
-DEEPEST = 32
+DEPTHS = (2, 4, 6, 9, 12, 16, 24)  # bounces that are tried; each depth is a kernel to compile
+DEEPEST = 32  # bounces of the reference for them
 MOST_SAMPLES = 16384
-PEAK_INSTANTS = 25  # whose mean tells how bright the exposure of a frame is
+PEAK_INSTANTS = 25  # whose mean gives the white of a blurred frame
 MOST_INSTANTS = 3 + 6 * 85
-MOST_TRIED = 15  # instants up to which more are tried against them
+MOST_TRIED = 15  # instants up to which a larger number is rendered for comparison
 
 
 @dataclass(frozen=True)
 class Noise:
-    """The errors of pilots with COUNTS samples, and between and beyond them by powers of the samples."""
+    """Errors of pilots with COUNTS samples [W m^-2 sr^-1], inter- and extrapolated by power laws."""
 
     at_white: tuple[float, ...]
     plain: tuple[float, ...]
 
     @classmethod
     def of(cls, pilots: list[Array], white: float) -> Noise:
-        """From halves [2, times, H, W], one per count."""
+        """Return the noise of pilots given as halves [2, times, H, W], one array per count."""
         errors = [Errors.of_halves(halves, white) for halves in pilots]
         return cls(_falling([e.at_white for e in errors]), _falling([e.plain for e in errors]))
 
     def at(self, samples: float, instants: int = 1) -> Errors:
-        """Of the mean of so many instants with so many samples each."""
+        """Return the errors of the mean of `instants` instants with `samples` samples each."""
         return Errors(*(_error(errors, samples) / math.sqrt(instants) for errors in (self.at_white, self.plain)))
 
 
@@ -68,11 +69,12 @@ def choose_budget(
     denoise: bool | None = None,
     seed: int = 0,
 ) -> Budget:
-    """The smallest budget that keeps the error below `psnr` [dB] and, at `ppp` photons, below the sensor's noise.
+    """Return the smallest budget with an error below `psnr` [dB] and, at `ppp` photons, below the sensor's noise.
 
-    `ppp` is the highest light level that the clip will be sensed at (None: only `psnr` counts). `denoise` None means:
-    where it is installed and, at the same measured error, cheaper. Depends on nothing but its arguments and on what is
-    installed, so that an interrupted clip is continued with the same budget.
+    `ppp` is the highest light level at which the clip will be sensed; with None, only `psnr` counts. `denoise` None
+    denoises if Open Image Denoise is installed and cheaper at the same measured error. The result depends only on the
+    arguments and the installed software: an interrupted clip resumes with the same budget. `ValueError` for a `psnr`
+    outside 10 to 80 dB and for a scene without light.
     """
     if not 10 <= psnr <= 80:
         raise ValueError(f"psnr: 10 to 80 dB can be asked for, got {psnr!r}")
@@ -82,8 +84,8 @@ def choose_budget(
         raise ValueError(
             f"scene {scene.name}: the pilot saw no light in frames {list(pilot.times)}; is a lamp behind a wall?"
         )
-    # Noise lifts the percentile of few samples: the white that counts is that of the pilot with the most. Blur lowers
-    # it where what is bright is small: with an open shutter it is that of the blurred pilot.
+    # Noise raises the percentile of few samples, so white comes from the pilot with the most samples. Blur lowers the
+    # white of small bright things, so with an open shutter it comes from the blurred pilot.
     blurs = shutter > 0 and not rests(scene)
     exposed = np.stack([pilot.blurred(t, PEAK_INSTANTS, DEEPEST).mean(axis=0) for t in pilot.times]) if blurs else full
     rough, _ = allowed_in(exposed, psnr, ppp, quantum_efficiency)
@@ -98,7 +100,7 @@ def choose_budget(
         low, high = (float(np.percentile(bright, share)) for share in (0.1, 99.9))
         contrast = allowed.part(Errors(min(high, allowed.white) - low, high - low))
         instants, blurred, about_blur = fewest_instants(
-            pilot.travel, contrast, lambda k: allowed.part(pilot.changes(k, bounces, allowed.white))
+            pilot.extent, contrast, lambda k: allowed.part(pilot.changes(k, bounces, allowed.white))
         )
     share = math.sqrt(1 - min(allowed.part(left_out), SHARE) ** 2 - min(blurred, SHARE) ** 2)
     noise = Noise.of(halves, allowed.white)
@@ -114,7 +116,7 @@ def choose_budget(
     lens = _left_out(scene.camera, pilot.truths())
     pixels = scene.camera.height * scene.camera.width
     noisy = noise.at(samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
-    about_light, about_motion = _light(dimmed, noisy, fewer is not None), moving(pilot.travel, shutter)
+    about_light, about_motion = _light(dimmed, noisy, fewer is not None), moving(pilot.extent, shutter)
     findings = (limit, about_samples, about_denoiser, about_bounces, about_light, about_motion, about_blur, *lens)
     return Budget(
         samples,
@@ -131,18 +133,18 @@ def choose_budget(
 
 
 def shortfall(reached: Stated | None, asked: float) -> str:
-    """What to say of a clip whose measured PSNR misses the one asked for by more than chance, 0.5 dB; else nothing.
+    """Return a message if the measured PSNR of a clip misses `asked` [dB] by more than chance (0.5 dB), else "".
 
-    Clips of earlier versions state another PSNR, which cannot be held against the one asked for: nothing either.
+    Clips of earlier versions state a PSNR without a clamp, which cannot be compared with `asked`: also "".
     """
     if reached is None or reached.unclamped is None or reached.psnr >= asked - 0.5:
         return ""
-    why = "the pilot foresaw less error or more light; a higher psnr takes more samples"
+    why = "the pilot estimated less error or more light; request a higher psnr for more samples"
     return f"{reached.line}, where {asked:g} were asked for: {why}"
 
 
 def allowed_in(image: Array, psnr: float, ppp: float | None, efficiency: float) -> tuple[Allowed, Finding]:
-    """The two limits for a clip that looks like this picture, or these."""
+    """Return the limits for a clip with the radiance of `image` (any shape, W m^-2 sr^-1), and the finding."""
     mean, white = float(image.mean()), white_in(image)
     target = white * 10 ** (-psnr / 20)
     rule = f"{WHITE_PER_MEAN:g} x the mean" if white == WHITE_PER_MEAN * mean else "the 99.9th percentile"
@@ -158,9 +160,9 @@ def allowed_in(image: Array, psnr: float, ppp: float | None, efficiency: float) 
 
 
 def fewest_bounces(cut_at: Callable[[int], Array], full: Array, allowed: Allowed) -> tuple[int, Array, Finding]:
-    """The smallest depth whose radiance differs from that of DEEPEST by at most SHARE of what is allowed; and that.
+    """Return the smallest depth within SHARE of the allowed error of DEEPEST, its radiance, and the finding.
 
-    `cut_at(depth)` and `full` are the pilot's radiance from the same paths, W m^-2 sr^-1.
+    `cut_at(depth)` and `full` are the pilot's radiance from the same paths, [times, H, W], W m^-2 sr^-1.
     """
     for bounces in DEPTHS:
         cut = cut_at(bounces)
@@ -168,7 +170,7 @@ def fewest_bounces(cut_at: Callable[[int], Array], full: Array, allowed: Allowed
         if allowed.part(left_out) <= SHARE:
             break
     else:
-        # What lies beyond is not known; it is less than what the last step added, which takes its place.
+        # Deeper bounces add less than the last step did; that step is stated in their place.
         size = f"the last {DEEPEST - bounces} added rms {left_out.plain:.2g}, more than allowed; "
         return DEEPEST, cut, Finding("bounces", f"{DEEPEST}", size + "deeper ones were not tried")
     size = f"later bounces up to {DEEPEST} would add rms {left_out.at_white:.2g}, {left_out.plain:.2g} without a clamp"
@@ -176,13 +178,13 @@ def fewest_bounces(cut_at: Callable[[int], Array], full: Array, allowed: Allowed
 
 
 def dimming(full: Array, cut: Array) -> tuple[float, float]:
-    """The share of the mean light that is missing in `cut`, from the same paths as `full`, and its standard error."""
+    """Return the fraction of the mean light missing in `cut` against `full` (same paths), and its standard error."""
     missing = full - cut
     return float(missing.mean() / full.mean()), float(missing.std() / math.sqrt(missing.size) / full.mean())
 
 
 def _light(dimmed: tuple[float, float], noisy: float, denoises: bool) -> Finding:
-    """How far the mean light of a frame will be from that of a converged one; `noisy` is by chance, as a share."""
+    """Return the expected deviation of a frame's mean light; `noisy` is its random part, as a fraction."""
     low, error = (100 * share for share in dimmed)
     size = (
         f"the bounces left out, known to +- {error:.2g} %; beside that the noise of a frame's mean, {100 * noisy:.2g} %"
@@ -191,9 +193,9 @@ def _light(dimmed: tuple[float, float], noisy: float, denoises: bool) -> Finding
     return Finding("mean light", f"{low:.2g} % too low" if low else "all of it", size + kept)
 
 
-def moving(travel: Array, shutter: float) -> Finding:
-    """Which share of the pixels moves, how far on average and at most; `travel` as in `Pilot`."""
-    speed = travel / (shutter or 1.0)
+def moving(extent: Array, shutter: float) -> Finding:
+    """Return the fraction of moving pixels, with mean and largest motion; `extent` as in `Pilot`."""
+    speed = extent / (shutter or 1.0)
     fast = speed[speed > MOVING]
     size = f"more than {MOVING:g} px/frame"
     if fast.size:
@@ -206,15 +208,16 @@ def _percent(share: float) -> str:
     return f"{100 * share:.2g} %"
 
 
-def fewest_instants(travel: Array, contrast: float, changes: Callable[[int], float]) -> tuple[int, float, Finding]:
-    """Instants (3, 9, 15 ...), the part of the error allowed that their blur takes, and the finding.
+def fewest_instants(extent: Array, contrast: float, changes: Callable[[int], float]) -> tuple[int, float, Finding]:
+    """Return the number of instants (3, 9, 15 ...), the part of the allowed error that their blur takes, and a finding.
 
-    First from the travel of what is seen, px [frames, H, W], in the frame where most of it moves farthest; then, since
-    shadows, lamps and reflections move on surfaces at rest, more until `changes(K)`, what the means of K and of more
-    instants differ by, is at most SHARE. `changes` and `contrast`, that of the picture, are parts of the error allowed.
+    The first estimate comes from the motion `extent` [frames, H, W] in px, in the frame with the most motion. Shadows,
+    lamps and reflections also move on surfaces at rest. The number therefore grows until `changes(K)`, the difference
+    between the means of K and of more instants, is at most SHARE. `changes` and `contrast` (of the picture) are
+    fractions of the allowed error.
     """
-    fastest = float(np.percentile(travel, 99.9, axis=(1, 2)).max())
-    runs = float((travel > 0.1).mean(axis=(1, 2)).max())
+    fastest = float(np.percentile(extent, 99.9, axis=(1, 2)).max())
+    runs = float((extent > 0.1).mean(axis=(1, 2)).max())
     edge = SHARE / max(contrast * math.sqrt(runs), 1e-300)
     count = 3
     while blur_error(fastest, count) > edge and count < MOST_INSTANTS:
@@ -226,7 +229,7 @@ def fewest_instants(travel: Array, contrast: float, changes: Callable[[int], flo
             break
         count += 6
     found, power = tried.get(count, 0.0), 1.0
-    if tried and count not in tried:  # beyond the last trial the difference falls as it did before, or as ghosts do
+    if tried and count not in tried:  # extrapolate by the power of the trials
         few, most = min(tried), max(tried)
         if few < most:
             power = min(max(math.log(tried[few] / tried[most]) / math.log(most / few), 0.5), 2.0)
@@ -246,9 +249,9 @@ def fewest_instants(travel: Array, contrast: float, changes: Callable[[int], flo
 
 
 def _falling(errors: list[float]) -> tuple[float, ...]:
-    """The rms errors of pilots with COUNTS samples, as they must be at least.
+    """Return the rms errors of pilots with COUNTS samples, raised to those that follow from larger pilots.
 
-    Paths that are rare and bright are missed by small pilots: fewer samples err at least as 1 / sqrt(n) makes it.
+    Small pilots miss rare bright paths: fewer samples have an error of at least 1 / sqrt(n) times that of more.
     """
     for i in (1, 0):
         errors[i] = max(errors[i], errors[i + 1] * math.sqrt(COUNTS[i + 1] / COUNTS[i]))
@@ -256,7 +259,7 @@ def _falling(errors: list[float]) -> tuple[float, ...]:
 
 
 def fewest_samples(noise: Noise, instants: int, allowed: Allowed, share: float) -> tuple[int, Finding]:
-    """Samples per pixel and frame whose noise takes at most this share of what is allowed."""
+    """Return the samples per pixel and frame whose noise takes at most `share` of the allowed error, and a finding."""
     each = 2 * grid_samples(COUNTS[0] // 2)
     if min(noise.plain) <= 0:
         return each * instants, Finding("samples", f"{each * instants} per pixel", "the pilot found no noise")
@@ -271,7 +274,7 @@ def fewest_samples(noise: Noise, instants: int, allowed: Allowed, share: float) 
 
 
 def _error(errors: tuple[float, ...], samples: float) -> float:
-    """Error at a number of samples: a power law through the two nearest pilots, beyond them 0.5 to 0.75."""
+    """Return the error by a power law through the two nearest pilots; beyond them, with a power of 0.5 to 0.75."""
     if min(errors) <= 0:
         return 0.0
     i = 0 if samples <= COUNTS[1] else 1
@@ -282,9 +285,7 @@ def _error(errors: tuple[float, ...], samples: float) -> float:
 
 
 def _left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, ...]:
-    """Effects that the renderer does not draw, with their size where the pilot knows it."""
-    from qsim.optics.diffraction import diffraction_line
-
+    """Return findings for effects that the renderer leaves out, with their size where it can be computed."""
     depths = np.concatenate([truth["depth"].ravel() for truth in truths])
     depths = depths[np.isfinite(depths) & (depths > camera.focal_length)]
     focus = camera.focus

@@ -1,14 +1,14 @@
-"""Ground truth from known motion: where the point behind each pixel centre was, is and will be.
+"""Computes ground truth from known motion: flow, validity, depth and body of the point behind each pixel centre.
 
     hits at time t + poses -> flow to t' [px], validity, depth [m], body number
 
-A hit belongs to a body; the body's poses (or its deformed triangle) carry it to any other time, the camera's pose of
-that time projects it. Nothing is estimated from images. Points of the surroundings lie infinitely far away and move
-with the camera's turn only. Through glass and in mirrors the surface itself is followed, not what is seen in it.
+Each hit belongs to a body. The body's poses (or its deformed triangle) carry the point to another time, and the
+camera's pose of that time projects it. Nothing is estimated from images. Points of the surroundings are infinitely
+distant and move only with the camera's rotation. For glass and mirrors, the flow is that of the surface.
 
-Points are rays [3, N] in the camera's axes together with how many lengths of its ray each lies away. A rigid motion
-(R, T) makes of the ray r of a point, d lengths away, the ray R r + T / d, along which it again lies d lengths away:
-nearby points and those at infinity (d = inf) obey one rule, and what does not move keeps its ray to the last bit.
+A point is a ray [3, N] in the camera's axes and a distance d in lengths of that ray. A rigid motion (R, T) maps the ray
+r to R r + T / d and keeps d. Nearby points and those at infinity (d = inf) therefore follow one rule, and points at
+rest keep their rays to the last bit.
 """
 
 from __future__ import annotations
@@ -21,16 +21,22 @@ from numpy import ndarray as Array
 from qsim.rendering.ray_casting import Hits
 from qsim.scene import Body, Scene
 
-SPEED_STEPS = 64  # of an exposure, over one of which a speed is measured: up to 32 turns are told from rest
-SPEED_PARTS = (-0.5, -0.27, 0.0, 0.23, 0.5)  # where in the exposure; uneven, so that no oscillation rests at all
-OCCLUSION_TOLERANCE = 1e-4  # relative distance by which a surface may lie before the point that it is itself
+SPEED_STEPS = 64  # of an exposure; a speed is measured over one step, so up to 32 turns are distinguished from rest
+SPEED_PARTS = (
+    -0.5,
+    -0.27,
+    0.0,
+    0.23,
+    0.5,
+)  # fractions of the exposure; uneven, so that no oscillation rests at all of them
+OCCLUSION_TOLERANCE = 1e-4  # relative distance by which a point may lie behind its own surface
 
 
 def flow_between(scene: Scene, rays: Array, hits: Hits, t: float, later: float) -> tuple[Array, Array, Array]:
-    """Flow [2, N] in pixels from time t to `later`, whether it ends inside the frame [N], and the rays then [3, N].
+    """Return flow [2, N] in px from time t to `later` [s], whether it ends inside the frame [N], and the later rays.
 
-    `rays` [3, N] are those of the hits at time t; a ray then is in the camera's axes of then, and its point lies
-    `hits.distance` of it away. Where a point is behind the camera then, flow is 0 and not inside.
+    `rays` [3, N] are those of the hits at time t. The later rays [3, N] are in the later camera's axes, with the
+    points at `hits.distance` lengths. For a point behind the later camera, flow is 0 and not inside.
     """
     camera = scene.camera
     start, end = seen_again(scene, rays, hits, t, later)
@@ -44,9 +50,9 @@ def flow_between(scene: Scene, rays: Array, hits: Hits, t: float, later: float) 
 
 
 def motion_extent(scene: Scene, rays: Array, hits: Hits, t: float, exposure: float, *, sharp: bool) -> Array:
-    """How far what each ray hits moves in an exposure [s] around time t [s]: px, float64 [N].
+    """Return the image-space motion [px] of each hit during an exposure [s] around time t [s], float64 [N].
 
-    From its largest speed, not from where it comes to lie: a wheel that turns once has not rested. `sharp` takes the
+    It follows from the largest speed, not from the end points: a wheel that turns once has moved. `sharp` uses the
     speed at t alone.
     """
     parts = (0.0,) if sharp else SPEED_PARTS
@@ -55,15 +61,15 @@ def motion_extent(scene: Scene, rays: Array, hits: Hits, t: float, exposure: flo
         ends = [t + part * exposure + step / 2, t + part * exposure - step / 2]
         late, early = (flow_between(scene, rays, hits, t, end)[0] for end in ends)
         fastest = np.maximum(fastest, np.hypot(*(late - early)))
-    across = math.hypot(scene.camera.height, scene.camera.width)  # nothing smears farther
+    across = math.hypot(scene.camera.height, scene.camera.width)  # no point moves farther in the frame
     return np.minimum(fastest * SPEED_STEPS, across)
 
 
 def seen_again(scene: Scene, rays: Array, hits: Hits, t: float, later: float) -> tuple[Array, Array]:
-    """The rays [3, N] of the hits at time t and those of the same points at time `later`.
+    """Return the rays [3, N] of the hits at time t, and of the same points at time `later`.
 
-    The first answer differs from `rays` only for deforming bodies, whose points are rebuilt from their triangles so
-    that both times round alike.
+    The first result differs from `rays` only for deforming bodies: their points are rebuilt from their triangles, with
+    the same rounding at both times.
     """
     before, after = scene.camera.pose(t), scene.camera.pose(later)
     inverse = 1 / hits.distance
@@ -86,12 +92,12 @@ def seen_again(scene: Scene, rays: Array, hits: Hits, t: float, later: float) ->
 
 
 def visible(distance: Array, hits: Hits) -> Array:
-    """Whether points at `distance` [N] are the first thing along the rays of `hits`; inf is the surroundings."""
+    """Return whether points at `distance` [N] are the first surfaces along the rays of `hits`; inf the background."""
     return hits.distance >= distance * (1 - OCCLUSION_TOLERANCE)
 
 
 def _moved(rays: Array, inverse: Array, before: Array, motion: Array, after: Array) -> Array:
-    """Rays [3, N] of points at 1 / `inverse` [N], seen from `before`, once `motion` moved them, from `after`."""
+    """Return rays [3, N] from camera pose `after`, for points at 1 / `inverse` [N] of `before` moved by `motion`."""
     if np.array_equal(motion @ before, after):
         return rays.copy()
     whole = np.linalg.inv(after) @ motion @ before
@@ -104,7 +110,7 @@ def _pose(scene: Scene, number: int, t: float) -> Array:
 
 
 def _points(body: Body, hits: Hits, chosen: Array, t: float) -> Array:
-    """World points [n, 3] of the chosen hits at time t [s], rebuilt from their triangles."""
+    """Return world points [n, 3] of the chosen hits at time t [s], rebuilt from their triangles."""
     corners = body.vertices(t)[body.mesh.faces[hits.triangle[chosen]]]
     weights = hits.weights[chosen]
     pose, first = body.pose(t), 1 - weights.sum(axis=1)

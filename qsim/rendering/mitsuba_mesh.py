@@ -1,4 +1,4 @@
-"""Meshes of Mitsuba: the names of their parameters, their construction, and vertex normals that repeat exactly."""
+"""Builds Mitsuba meshes, names their parameters, and computes vertex normals that repeat exactly."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy import ndarray as Array
 from qsim.rendering.engine import errors_only
 from qsim.scene import Mesh
 
-# The only place that names a mesh's parameters: other releases of Mitsuba call them differently.
+# The only names of a mesh's parameters in this project; Mitsuba 3.10 renames them.
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 
 
 def mesh_shape(mi: Any, mesh: Mesh, name: str, vertices: Array, properties: Any) -> Any:
-    """A Mitsuba mesh with these vertices [V, 3]; `properties` holds its bsdf and emitter."""
+    """Return a Mitsuba mesh with these vertices [V, 3] in m; `properties` holds its bsdf and emitter."""
     properties["face_normals"] = not mesh.smooth
     uv = mesh.uv
     shape = mi.Mesh(
@@ -42,7 +42,7 @@ def mesh_shape(mi: Any, mesh: Mesh, name: str, vertices: Array, properties: Any)
 
 
 def vertex_normals(vertices: Array, faces: Array) -> Array:
-    """Unit normals, float32 [V, 3]: face normals weighted by the corner's angle, always summed in the same order."""
+    """Return unit normals, float32 [V, 3]: face normals weighted by corner angle, summed in a fixed order."""
     corners = np.asarray(vertices, np.float64)[faces]  # [F, 3, 3]
     edges = np.roll(corners, -1, axis=1) - corners
     face = np.cross(edges[:, 0], -edges[:, 2])

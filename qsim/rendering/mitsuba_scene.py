@@ -1,12 +1,11 @@
-"""Our records in Mitsuba's words: one scene object, and the few parameters that move.
+"""Converts a `Scene` to a Mitsuba scene once, and updates only the parameters that move.
 
     Scene -> mi.Scene (loaded once) + `place(t)`, which moves bodies, lamps and points to their poses at time t
 
-How a body moves decides how it is held: at rest, its mesh lies in world coordinates; rigid and large, it is an instance
-whose `to_world` changes (the acceleration structure of its mesh stays); small, deforming or glowing, its vertices are
-rewritten. Mitsuba traces the code of every instance into the kernel of every pass: 87 small bodies took 13 s a frame as
-instances, 0.7 s rewritten.
-`mi` is the Mitsuba module, handed in by render.py, which alone imports it.
+The motion of a body decides its form in Mitsuba. A resting mesh lies in world coordinates. A large rigid body is an
+instance whose `to_world` changes; the acceleration structure of its mesh stays. The vertices of small, deforming or
+glowing bodies are rewritten, because Mitsuba traces every instance into the kernel of every pass (docs/log.md).
+`mi` is the Mitsuba module, passed in by the renderer.
 """
 
 from __future__ import annotations
@@ -24,18 +23,18 @@ from qsim.scene import Body, Part, Scene, lights, materials
 from qsim.scene.environment import environment_map, sky_map, sun_direction, sun_radiance
 
 LARGE = 20_000  # triangles from which a rigid body becomes an instance
-# How often smooth surroundings (constant, clear sky) are drawn as a bounce's emitter, against 1 for any other light.
-# Rays that a surface scatters find them anyway; drawing them takes samples from the sun or the lamp. Tried once, at
-# equal samples on fan, tumble and flag: 1.3 to 1.7 times less error than with 1 (test_renderer.py asks 1.25).
+# Sampling weight of smooth surroundings (constant, clear sky) as an emitter, against 1 for any other light. Scattered
+# rays find them anyway, and sampling them takes samples from the sun or the lamp. test_mitsuba_scene.py requires 1.25
+# times less error than with 1; docs/log.md has the measurement.
 SMOOTH_WEIGHT = 1 / 1024
 SUN_DISTANCE = 1000.0  # in units of the scene's reach from the camera: parallax of the sun under 1 mrad
 
 
 class Stage:
-    """A loaded scene that can be moved to any time; the only mutable thing of the renderer."""
+    """A loaded scene that can be moved to any time; the only mutable state of the renderer."""
 
     def __init__(self, mi: Any, scene: Scene, smooth_weight: float = SMOOTH_WEIGHT) -> None:
-        """`smooth_weight` is 1 in Mitsuba unless told otherwise."""
+        """Load the scene; a `smooth_weight` of 1 is Mitsuba's default."""
         self.mi, self.scene = mi, scene
         self.loaded = (
             mi.load_dict(_scene_dict(mi, scene, smooth_weight))
@@ -45,11 +44,11 @@ class Stage:
         self._parameters = mi.traverse(self.loaded)
         self._rest = {part.name: self._rest_of(part) for part in scene.parts if part.motion is not None}
         self._placed: dict[str, bytes] = {}
-        self._normals: dict[str, Array] = {}  # of smooth bodies that moved, set after Mitsuba has made its own
+        self._normals: dict[str, Array] = {}  # of smooth bodies that moved; replace those of Mitsuba
         self._rest_normals: dict[str, Array] = {}
 
     def place(self, t: float) -> None:
-        """Move everything to time t [s]; what did not change since the last call is left alone."""
+        """Move everything to time t [s]; parameters equal to those of the last call are not set again."""
         for i, body in enumerate(self.scene.bodies):
             if body.motion is not None:
                 self._place_body(f"body{i}", body, t)
@@ -60,7 +59,7 @@ class Stage:
         for part in self.scene.parts:
             if part.motion is not None:
                 self._place_part(part.name, part.pose(t), self._rest[part.name])
-        with errors_only(self.mi):  # the scalar engine warns of normals that it cannot make; ours replace them
+        with errors_only(self.mi):  # the scalar engine warns of normals that it cannot compute; ours replace them
             self._parameters.update()
         if self._normals:
             for key, normals in self._normals.items():
@@ -69,7 +68,7 @@ class Stage:
             self._parameters.update()
 
     def shape_numbers(self) -> dict[str, int]:
-        """Shape id -> body number; lamps follow the bodies; the sun's disk is -1 (surroundings)."""
+        """Return shape id -> body number; lamps follow the bodies; the sun's disk is -1 (surroundings)."""
         numbers = {f"body{i}": i for i in range(len(self.scene.bodies))}
         numbers |= {f"light{i}": len(self.scene.bodies) + i for i in range(len(self.scene.lights))}
         numbers |= {part.name: i for i, part in enumerate(self.scene.parts)}
@@ -86,7 +85,7 @@ class Stage:
                 self._normals[f"{name}.{NORMALS}"] = self._normals_of(name, body, pose, world)
 
     def _normals_of(self, name: str, body: Body, pose: Array, world: Array) -> Array:
-        """Unit normals of a smooth body's vertices, float32 [V, 3]; those of a rigid one are made once and turned."""
+        """Return unit normals of a smooth body, float32 [V, 3]; a rigid body's are computed once and rotated."""
         if body.deforms:
             return vertex_normals(world, body.mesh.faces)
         if name not in self._rest_normals:
@@ -102,7 +101,7 @@ class Stage:
             self._set(f"{name}.position", position, lambda: self._opaque(self.mi.Point3f(position.tolist())))
 
     def _rest_of(self, part: Part) -> tuple[Array, ...]:
-        """Where a shape of a file stands: its 4x4 placement, or its vertices [V, 3] and normals [V, 3] or [0, 3]."""
+        """Return a file shape's rest state: its 4x4 placement, or its vertices [V, 3] and normals [V, 3] or [0, 3]."""
         if f"{part.name}.to_world" in self._parameters:
             return (np.array(self._parameters[f"{part.name}.to_world"].matrix, np.float64).reshape(4, 4),)
         arrays = (f"{part.name}.{POSITIONS}", f"{part.name}.{NORMALS}")
@@ -145,7 +144,7 @@ def film_pass(
     integrator: Any,
     sampler: str = "multijitter",
 ) -> Array:
-    """Radiance of a window (y, x, height, width), float64 [H, W], by Mitsuba's own camera, film and box filter."""
+    """Render a window (y, x, height, width) with Mitsuba's own camera and film: radiance, float64 [H, W]."""
     mi, camera = stage.mi, stage.scene.camera
     y, x, height, width = crop
     film: dict[str, Any] = {
@@ -153,8 +152,8 @@ def film_pass(
         "width": camera.width,
         "height": camera.height,
         "rfilter": {"type": "box"},
-        # In Mitsuba's RGB variant a uniform spectrum is reddish (the white of sRGB is not that of equal energy);
-        # its luminance is 1.
+        # In Mitsuba's RGB variant a uniform spectrum is reddish: sRGB white is not equal-energy white. Its luminance
+        # is 1.
         "pixel_format": "luminance",
     }
     film |= {"crop_offset_x": x, "crop_offset_y": y, "crop_width": width, "crop_height": height}
@@ -170,7 +169,7 @@ def film_pass(
 
 
 def lamp_pose(lamp: lights.AreaLamp) -> Array:
-    """Matrix that takes the square -1..1 in x, y (facing +z) to the lamp at its place, float64 [4, 4]."""
+    """Return the matrix from the square -1..1 in x, y (facing +z) to the lamp in the world, float64 [4, 4]."""
     forward = np.subtract(lamp.target, lamp.origin)
     forward = forward / np.linalg.norm(forward)
     helper = (0.0, 1.0, 0.0) if abs(forward[1]) < 0.99 else (1.0, 0.0, 0.0)
@@ -184,7 +183,7 @@ def lamp_pose(lamp: lights.AreaLamp) -> Array:
 
 
 def _is_instance(body: Body) -> bool:
-    """Whether a body is held as an instance of a mesh in its own coordinates."""
+    """Return whether a body is an instance of a mesh in body coordinates."""
     rigid = body.motion is not None and not body.deforms
     return rigid and len(body.mesh.faces) >= LARGE and not isinstance(body.material, materials.Glow)
 
@@ -236,7 +235,7 @@ def _light(mi: Any, scene: Scene, light: lights.Light, name: str, smooth_weight:
 
 
 def _sun(mi: Any, scene: Scene, light: lights.SunSky) -> dict[str, Any]:
-    """A far disk that shines on the scene; its angular radius and irradiance are those of the record."""
+    """Return a distant disk with the angular radius and irradiance of the record."""
     centre = np.asarray(scene.camera.origin)
     points = [_to_world(body.pose(0.0), body.vertices(0.0)) for body in scene.bodies] or [centre[None]]
     reach = max(1.0, *(float(np.max(np.linalg.norm(p - centre, axis=1))) for p in points))
@@ -292,7 +291,7 @@ def _texture(mi: Any, texture: materials.Texture) -> dict[str, Any]:
 
 
 def _bitmap(mi: Any, pixels: Array, repeat: tuple[float, float], kind: str = "bilinear") -> dict[str, Any]:
-    """Mitsuba has row 0 at v = 0, our textures have it at v = 1."""
+    """Return a bitmap texture: row 0 lies at v = 0 in Mitsuba and at v = 1 in our textures."""
     data = mi.TensorXf(np.ascontiguousarray(pixels[::-1], np.float32))
     scale = mi.ScalarTransform4f().scale([repeat[0], repeat[1], 1])
     return {"type": "bitmap", "data": data, "raw": True, "filter_type": kind, "to_uv": scale}
@@ -303,7 +302,7 @@ def _rgb_bitmap(mi: Any, grey: Array) -> Any:
 
 
 def _grey(mi: Any, value: float) -> Any:
-    """A number that is the same for every colour, so that the RGB variant computes what the mono variant does."""
+    """Return a value equal for all colours: the RGB variant then computes the same as the mono variant."""
     if mi.variant().startswith("scalar_rgb"):
         return {"type": "rgb", "value": [value] * 3} if 0 <= value <= 1 else {"type": "spectrum", "value": float(value)}
     return float(value)

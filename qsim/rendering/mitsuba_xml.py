@@ -1,8 +1,8 @@
-"""A scene in Mitsuba's own XML: read by Mitsuba, looked at by our camera, moved by our motions.
+"""Reads scenes in Mitsuba's XML; our camera and motions replace those of the file.
 
     scene.xml + {shape id: motion} -> Scene(file, parts)
 
-Mitsuba keeps shapes, materials and lights; we need the names of the shapes, which of them can move, and a camera.
+Mitsuba keeps shapes, materials and lights. The `Scene` holds the names of the shapes, their motions and the camera.
 `mi` is the Mitsuba module.
 """
 
@@ -22,7 +22,7 @@ from qsim.rendering.engine import errors_only, select
 from qsim.rendering.mitsuba_mesh import POSITIONS
 from qsim.scene import MitsubaFile, Part, Scene
 
-F_NUMBER, PITCH = 2.8, 1.1e-6  # of the camera that is made from the file's, which has no pixels in metres
+F_NUMBER, PITCH = 2.8, 1.1e-6  # of the camera made from the file's sensor, which has no pixels in metres
 MOVABLE = ("to_world", POSITIONS)
 
 
@@ -58,16 +58,16 @@ def read_mitsuba(xml: str | Path, motions: Mapping[str, Pose] | None = None, *, 
 
 
 def load(mi: Any, path: str) -> Any:
-    """Mitsuba's scene object, every shape with an id: those that the file left unnamed are numbered."""
+    """Return Mitsuba's scene object with an id for every shape; unnamed shapes are numbered."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        with errors_only(mi):  # it warns that a colour film becomes grey, and we use no film
+        with errors_only(mi):  # it warns that a colour film becomes grey; no film is used
             loaded = mi.load_file(path, optimize=False)  # optimising would merge shapes and lose their names
     except RuntimeError as error:
         raise ValueError(f"{path}: Mitsuba cannot load it: {' '.join(str(error).split())}") from None
     if not isinstance(loaded, mi.Scene):
-        raise ValueError(f"{path}: its root is no <scene>")
+        raise ValueError(f"{path}: its root element is not <scene>; only scene files can be read")
     for i, shape in enumerate(loaded.shapes()):
         if not shape.id():
             shape.set_id(f"shape {i}")
@@ -75,7 +75,7 @@ def load(mi: Any, path: str) -> Any:
 
 
 def _camera(mi: Any, loaded: Any, path: Path) -> Camera:
-    """The file's first sensor as a pinhole behind an f/2.8 lens."""
+    """Return the file's first sensor as a pinhole behind an f/2.8 lens."""
     ask = "give a camera of your own: read_mitsuba(..., camera=Camera(...))"
     if not loaded.sensors():
         raise ValueError(f"{path}: no sensor; {ask}")

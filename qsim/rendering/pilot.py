@@ -1,9 +1,9 @@
-"""What a pilot of a scene measures, for budget.py to decide on: every n-th pixel, in its true size.
+"""Low-cost measurements of a scene (every n-th pixel at full resolution), from which `fidelity` chooses the budget.
 
-Motion and bodies are looked at in every frame (of more than MOST_LOOKS, in so many), by rays alone. Light is rendered
-in a few frames: the first, the middle and the last; those that show what these do not; with an open shutter, those in
-which things move fastest. Noise is told from what is not by two independent halves. Equal frames draw equal paths,
-whatever the depth.
+Rays alone measure motion and bodies, in every frame or in MOST_LOOKS of them. Light is rendered in a few frames: the
+first, the middle and the last, those with bodies that these do not show, and, with an open shutter, those with the
+fastest motion. Two independent half-renders separate Monte Carlo noise from signal. Equal frames use equal paths at
+every depth.
 """
 
 from __future__ import annotations
@@ -23,32 +23,32 @@ from qsim.rendering.renderer import Renderer
 from qsim.scene import Scene, Still
 
 COUNTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
-PIXELS = 3000
-MOST_MORE = 3  # frames beyond the first, the middle and the last for what these do not show, and for what moves
+PIXELS = 3000  # of the frame that a pilot renders, about
+MOST_MORE = 3  # frames added for hidden bodies, and as many for fast motion
 WINDOW = 96  # px, side of the windows in which the denoiser is tried, one in the middle of each quarter of the frame
-MOST_LOOKS = 256  # frames of a clip in which motion and bodies are looked at
+MOST_LOOKS = 256  # frames of a clip in which motion and bodies are measured
 STAGE = 18  # of the random keys
-LUCK = 3.0  # times less raw noise than the pilot's: chance
-CAREFUL = 2.0  # standard errors added to the error of a trial: a lucky one would hold for the whole clip
-MOST_DENOISED = 256  # samples per instant up to which the error of denoised pictures is foretold
+LUCK = 3.0  # a trial with so many times less raw noise than the pilot missed rare paths by chance
+CAREFUL = 2.0  # standard errors added to the error of a trial, whose result holds for the complete clip
+MOST_DENOISED = 256  # samples per instant up to which the error of denoised pictures is extrapolated
 
 
 @dataclass(frozen=True)
 class Pilot:
-    """A loaded scene seen in some of its pixels, what moves there, and the frames in which light is looked at."""
+    """A loaded scene, thinned to every n-th pixel, with its motion and the frames in which light is rendered."""
 
     renderer: Renderer
-    travel: Array  # [frames looked at, H, W], px in the exposure, in a whole frame time if the shutter is 0
-    middle: int  # frame
-    times: tuple[int, ...]  # frames in which light is looked at
+    extent: Array  # motion [frames, H, W] in px per exposure, or per frame time if the shutter is 0
+    middle: int  # index of the middle frame
+    times: tuple[int, ...]  # frames in which light is rendered
 
     @classmethod
     def of(cls, scene: Scene, frame_rate: float, shutter: float, frames: int, seed: int) -> Pilot:
-        """About PIXELS pixels of a scene."""
+        """Return the pilot of a scene, with about PIXELS pixels."""
         thinned = max(1, math.isqrt(scene.camera.height * scene.camera.width // PIXELS))
         renderer = Renderer(scene, frame_rate=frame_rate, shutter=shutter, seed=seed, budget=Budget(), thinned=thinned)
         looks = np.unique(np.linspace(0, frames - 1, min(frames, MOST_LOOKS)).round().astype(int)).tolist()
-        travel, bodies = (np.stack(each) for each in zip(*map(renderer.motion_extent, looks), strict=True))
+        extent, bodies = (np.stack(each) for each in zip(*map(renderer.motion_extent, looks), strict=True))
         times = {0, frames // 2, frames - 1}
         known = set(np.unique([renderer.motion_extent(t)[1] for t in times]).tolist())
         for _ in range(MOST_MORE):
@@ -59,28 +59,28 @@ class Pilot:
             known |= set(np.unique(bodies[most]).tolist())
             times.add(looks[most])
         if shutter > 0:
-            times.add(looks[int(np.argmax(np.percentile(travel, 99.9, axis=(1, 2))))])
+            times.add(looks[int(np.argmax(np.percentile(extent, 99.9, axis=(1, 2))))])
             times |= _fastest(scene, {t: renderer.time(t) for t in {*looks, *times}}, times)
-        return cls(renderer, travel, frames // 2, tuple(sorted(times)))
+        return cls(renderer, extent, frames // 2, tuple(sorted(times)))
 
     def halves(self, samples: int, bounces: int) -> Array:
-        """Two independent estimates of the sharp radiance, float64 [2, times, H, W], W m^-2 sr^-1."""
+        """Return two independent estimates of the sharp radiance, float64 [2, times, H, W], W m^-2 sr^-1."""
         return np.stack([self._drawn(t, self.renderer.time(t), Budget(samples, bounces)) for t in self.times], axis=1)
 
     def mean(self, samples: int, bounces: int) -> Array:
-        """The mean of the two [times, H, W]."""
+        """Return the mean of the two halves, float64 [times, H, W], W m^-2 sr^-1."""
         return self.halves(samples, bounces).mean(axis=0)
 
     def truths(self) -> list[dict[str, Array]]:
-        """Flow, depth and the rest at each time."""
+        """Return the ground truth of each frame in `times`, as `Renderer.truth`."""
         return [self.renderer.truth(t) for t in self.times]
 
     def changes(self, count: int, bounces: int, white: float) -> Errors:
-        """The differences between the means of K and of 3 K or 5 K instants, the larger ones.
+        """Return the larger of the differences between the mean of K = `count` instants and those of 3 K and 5 K.
 
-        Two, because what returns after a third of a step looks like rest among 3 K. The K are among both, and all
-        instants draw the same paths, so that what rests adds nothing. The square is the product of the differences of
-        two independent halves, which noise changes by nothing on average.
+        Two comparisons are needed: motion with a period of a third of a step looks like rest with 3 K instants. Both
+        contain the K instants, and all instants use the same paths, so that resting parts add nothing. The squared
+        difference is the product over two independent halves, which has no bias from noise.
         """
         squares = np.zeros((2, 2))
         for t in self.times:
@@ -90,12 +90,12 @@ class Pilot:
         return Errors(*np.sqrt(np.maximum(squares.max(axis=1), 0)).tolist())
 
     def blurred(self, t: int, count: int, bounces: int) -> Array:
-        """Two independent estimates of frame t's mean over so many instants, [2, H, W], with the same paths in each."""
+        """Return two estimates (float64 [2, H, W]) of frame t's mean over `count` instants, all with equal paths."""
         budget = Budget(COUNTS[0], bounces)
         return np.mean([self._drawn(t, instant, budget) for instant in self.exposed(t, count)], axis=0)
 
     def exposed(self, t: int, count: int) -> list[float]:
-        """So many instants of the exposure of frame t [s]."""
+        """Return `count` instants [s] of the exposure of frame t."""
         return instants(self.renderer.time(t), self.renderer.shutter / self.renderer.frame_rate, count)
 
     def _drawn(self, t: int, instant: float, budget: Budget) -> Array:
@@ -103,7 +103,7 @@ class Pilot:
 
 
 def rests(scene: Scene) -> bool:
-    """Whether nothing in a scene moves, seen or not."""
+    """Return whether nothing in a scene moves, visible or not."""
     return not _moving(scene)
 
 
@@ -114,9 +114,9 @@ def _moving(scene: Scene) -> list[Pose]:
 
 
 def _fastest(scene: Scene, moments: dict[int, float], known: set[int]) -> set[int]:
-    """Frames, at most MOST_MORE, in which things go that are slow in the known ones: below half of their fastest.
+    """Return at most MOST_MORE frames with fast motion that the known frames miss (below half of its largest speed).
 
-    `moments` are the times [s] of the frames that come into question, the known ones among them.
+    `moments` are the times [s] of all candidate frames, the known ones included.
     """
     frames = sorted(moments)
     speeds = np.array([[sum(map(np.linalg.norm, m.velocity(moments[t]))) for t in frames] for m in _moving(scene)])
@@ -140,11 +140,11 @@ def denoised_samples(
     wanted: bool | None,
     expected: Callable[[int], Errors],
 ) -> tuple[int | None, Finding]:
-    """Samples of a frame with which denoised windows have the error asked for, or None where `raw` ones cost less.
+    """Return the samples of a frame with which denoised windows reach the error, or None if `raw` samples cost less.
 
-    Windows of the clip's middle frame, every pixel of them, with `count` instants. `wanted` None means: where it costs
-    less. `expected(samples)` are the errors of raw ones: a trial far below has missed rare paths and is not believed.
-    The error asked for is this share of what is allowed.
+    Complete windows of the clip's middle frame are rendered with `count` instants. The error to reach is `share` of the
+    allowed one. `wanted` None denoises only if that costs less. `expected(samples)` are the errors of raw samples; they
+    replace a trial that missed rare paths, which shows as noise far below them.
     """
     renderer, t = pilot.renderer, pilot.middle
     camera = renderer.scene.camera
@@ -161,7 +161,7 @@ def denoised_samples(
     surfaces = [window.surfaces(times, key) for window in windows]
     errors: list[float] = []
     for samples in tried:
-        squares = np.zeros(3)  # of the raw halves, and of what is made of them, at white and without a clamp
+        squares = np.zeros(3)  # of the raw halves; of the denoised mixture at white and without a clamp
         for window, (albedo, normal) in zip(windows, surfaces, strict=True):
             halves = window.halves(times, Budget(samples, bounces), key)
             mixed = cleaned_mean(halves, albedo, normal, allowed.white)
@@ -186,7 +186,7 @@ def denoised_samples(
 
 
 def _windows(camera: Camera) -> list[tuple[int, int, int, int]]:
-    """Where the denoiser is tried, (y, x, height, width): all of a small frame, else four places that stand for it."""
+    """Return the windows (y, x, height, width) for the denoiser's trial: a small frame itself, or four of its parts."""
     height, width = camera.height, camera.width
     if height * width <= 4 * WINDOW**2:
         return [(0, 0, height, width)]
@@ -195,9 +195,9 @@ def _windows(camera: Camera) -> list[tuple[int, int, int, int]]:
 
 
 def needed_samples(tried: list[int], errors: list[float], target: float) -> float:
-    """Samples with which a falling error reaches the target: a power of them between the last two trials and beyond.
+    """Return the samples at which a falling error reaches the target, by a power law through the last two trials.
 
-    `errors` are those of the first so many counts; inf where they do not fall.
+    `errors` belong to the first counts of `tried`; the result is inf if they do not fall.
     """
     if errors[0] <= target:
         return tried[0]
@@ -205,4 +205,4 @@ def needed_samples(tried: list[int], errors: list[float], target: float) -> floa
         return math.inf
     before, last = tried[len(errors) - 2 : len(errors)]
     share = math.log(errors[-2] / target) / math.log(errors[-2] / errors[-1])
-    return before * math.exp(min(share * math.log(last / before), 100.0))  # where samples hardly help, no overflow
+    return before * math.exp(min(share * math.log(last / before), 100.0))  # no overflow if the error hardly falls

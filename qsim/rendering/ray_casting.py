@@ -14,30 +14,30 @@ from qsim.rendering.mitsuba_scene import Stage
 
 @dataclass(frozen=True)
 class Hits:
-    """First surfaces along rays, one entry per ray [N]."""
+    """First surfaces along rays, one entry per ray; all arrays [N] unless stated."""
 
     distance: Array  # float64, in lengths of the ray (z of the camera's axes where the ray's z is 1); inf: nothing hit
-    number: Array  # int32, body number; lamps follow the bodies; -1 where nothing is
+    number: Array  # int32, body number; lamps follow the bodies; -1 for a miss
     triangle: Array  # int64, index into the mesh's faces
     weights: Array  # float64 [N, 2], barycentric weights of the triangle's second and third vertex
 
 
 def pixel_rays(camera: Camera, crop: tuple[int, int, int, int], thinned: int = 1) -> Array:
-    """Rays [3, N] through the pixel centres of a window, row by row, in the camera's axes and with unit z."""
+    """Return rays [3, N] through a window's pixel centres, row by row, in the camera's axes with z = 1."""
     y, x, height, width = crop
     rays = camera.directions()[y : y + height : thinned, x : x + width : thinned]
     return np.ascontiguousarray(rays.reshape(-1, 3).T)
 
 
 class RayCaster:
-    """First hits in a loaded scene, at the time at which it stands; one ray after the other on the scalar engine."""
+    """First hits in a loaded scene at its current time; the scalar engine casts one ray after the other."""
 
     def __init__(self, stage: Stage, backend: str) -> None:
         self._mi, self._stage, self._scalar = stage.mi, stage, backend == "scalar"
         self._numbers = self._shape_table()
 
     def cast(self, pose: Array, rays: Array) -> Hits:
-        """First hits along rays [3, N] of a camera with this pose."""
+        """Return the first hits along rays [3, N] in the axes of a camera with this pose [4, 4]."""
         origin, directions = pose[:3, 3], pose[:3, :3] @ rays
         if self._scalar:
             return self._cast_one_by_one(origin, directions)
@@ -52,11 +52,11 @@ class RayCaster:
         shape = dr.reinterpret_array(mi.UInt32, found.shape)
         instance: Any = dr.reinterpret_array(mi.UInt32, found.instance)
         hit = found.is_valid()
-        # Where nothing was hit, Dr.Jit leaves whatever the memory held.
+        # Dr.Jit leaves misses uninitialised.
         index = dr.select(hit, dr.select(instance > 0, instance, shape), 0)
         distance = dr.select(hit, found.t / length, dr.inf)
         triangle, weights = dr.select(hit, found.prim_index, 0), dr.select(hit, found.prim_uv, 0)
-        dr.eval(index, distance, triangle, weights)  # rays are cast once, not once for each answer
+        dr.eval(index, distance, triangle, weights)  # together: separate evaluations would cast the rays again
         number = self._numbers[np.minimum(np.array(index), len(self._numbers) - 1)]
         far = np.where(number >= 0, np.array(distance, np.float64), np.inf)
         return Hits(far, number, np.array(triangle, np.int64), np.array(weights, np.float64).reshape(2, -1).T)
@@ -77,7 +77,7 @@ class RayCaster:
         return Hits(distance, number, triangle, weights)
 
     def _shape_table(self) -> Array:
-        """Body numbers by Dr.Jit's registry index; unknown shapes (the sun) are surroundings, -1."""
+        """Return body numbers by Dr.Jit's registry index; unknown shapes (the sun) are surroundings, -1."""
         if self._scalar:
             return np.zeros(0, np.int32)
         import drjit as dr

@@ -1,12 +1,11 @@
-"""A scene at given times: radiance with its error, and the ground truth of its motion.
+"""Renders frames of a scene: radiance with its error, and the ground truth of its motion.
 
     Scene + frame rate + shutter + budget -> Frame(radiance, sharp, flow, flow_back, valid, depth, body_id, error)
 
-Frame t is exposed around t / frame_rate: K instants, evenly spread over shutter / frame_rate seconds, are averaged
+Frame t is exposed around t / frame_rate: the mean of K instants, spread evenly over shutter / frame_rate seconds
 (Mitsuba's wheels have no motion blur). Every pixel integrates its own area (box filter). Samples come in two
-independent halves A and B; radiance is their mean, its noise the rms of (A - B) / 2; the error that a frame states
-holds its blur and the bounces left out as well. The sampler's seeds are words of qsim.keys, so any frame can be
-rendered alone, in any order. With engine.py, the only importer of Mitsuba.
+independent halves A and B: radiance is their mean, and its noise the rms of (A - B) / 2. The stated error also contains
+blur and omitted bounces. The sampler's seeds are words of qsim.keys: frames can be rendered alone and in any order.
 """
 
 from __future__ import annotations
@@ -34,13 +33,13 @@ from qsim.scene import Scene
 RENDER_STAGE = 16  # of the random keys: sampler seeds
 SHARP_STAGE = 17  # the sharp instant has seeds of its own
 SURFACE_SAMPLES = 16  # per pixel, for the denoiser's albedo and normals
-MAX_LANES = 2**23  # samples in flight, about; a frame that takes more is rendered in parts
+MAX_LANES = 2**23  # samples in flight, about; a frame with more is rendered in parts
 FIREFLY = 10.0  # a pixel counts as a firefly where halves differ by this many rms of the frame's difference
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One exposure and what is known about it."""
+    """One exposure with its error and ground truth."""
 
     radiance: Array  # float32 [H, W], W m^-2 sr^-1, mean over the exposure
     error: float  # rms error of `radiance`, W m^-2 sr^-1: noise and blur as measured, and the budget's `left_out`
@@ -63,9 +62,9 @@ class Frame:
 class Renderer:
     """A scene loaded once; `frame(t)` moves it and renders, in any order of t.
 
-    `shutter` is the share of the frame time that the shutter is open (0 is an instant), `crop` = (y, x, height, width)
-    renders that window of the camera's frame, `thinned` = n only every n-th row and column of it (pixels of their true
-    size, for pilots). `ValueError` for a crop outside the frame or rates that make no sense.
+    `shutter` is the fraction of the frame time during which the shutter is open; 0 is an instant. `crop` = (y, x,
+    height, width) selects a window of the camera's frame, and `thinned` = n every n-th row and column of it (for
+    pilots). `ValueError` for a crop outside the frame and for a frame rate or shutter outside its range.
     """
 
     def __init__(
@@ -100,37 +99,37 @@ class Renderer:
         self._caster = RayCaster(self.stage, self.engine.backend)
 
     def time(self, t: int) -> float:
-        """Mid-exposure of frame t [s]."""
+        """Return the mid-exposure time of frame t [s]."""
         return t / self.frame_rate
 
     def frame(self, t: int, *, with_truth: bool = True) -> Frame:
-        """Render frame t."""
+        """Render frame t: arrays of the window's height and width [H, W]."""
         activate(self.engine)
         radiance, error, errors_at, fireflies = self._exposed(self.instants(t), self.key(t))
         sharp = None
         if self.shutter > 0 and self.budget.sharp:
             sharp = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))[0]
-        # Last, because it leaves the scene at t + 1, where the next frame wants it.
+        # Last: it leaves the scene at t + 1, where the next frame starts.
         found = self.truth(t) if with_truth else {}
         return Frame(radiance, error, errors_at, fireflies, sharp, **found)
 
     def window(self, crop: Crop) -> Renderer:
-        """The same loaded scene seen through another crop, every pixel of it."""
+        """Return a renderer of the same loaded scene for every pixel of another crop."""
         other = copy.copy(self)
         other.crop, other.thinned, other.shape = _checked_crop(self.scene, crop), 1, crop[2:]
         return other
 
     def instants(self, t: int) -> list[float]:
-        """The times [s] whose mean is the exposure of frame t."""
+        """Return the times [s] whose mean is the exposure of frame t."""
         count = self.budget.sub_frames if self.shutter > 0 else 1
         return instants(self.time(t), self.shutter / self.frame_rate, count)
 
     def halves(self, instants: list[float], budget: Budget, key: Key) -> Array:
-        """Two independent estimates A, B of the mean radiance over the instants [s], float64 [2, H, W]."""
+        """Return independent estimates A, B of the mean radiance over the instants [s], float64 [2, H, W]."""
         return self._means(instants, budget, key)[0]
 
     def _means(self, instants: list[float], budget: Budget, key: Key) -> Array:
-        """Those estimates, and the same of every third and of the middle instant alone, float64 [3, 2, H, W]."""
+        """Return `halves` of all instants, of every third one, and of the middle one, float64 [3, 2, H, W]."""
         n, samples = len(instants), budget.grid(len(instants))
         parts = self.parts(2 * samples)
         seeds = words(key, (2, n * len(parts))).reshape(2, n, len(parts))
@@ -155,23 +154,23 @@ class Renderer:
         return sums.reshape(3, 2, *self.shape)
 
     def parts(self, samples: int) -> list[range]:
-        """The window's pixels, row by row, in ranges of about MAX_LANES samples or less, `samples` to a pixel.
+        """Return the window's pixels, row by row, in ranges of at most about MAX_LANES samples, `samples` per pixel.
 
-        Pixels are shared among the passes, not samples: the error of a whole grid falls faster than that of its parts.
+        Passes divide the pixels, not the samples: the error of a complete grid falls faster than that of its parts.
         """
         pixels = math.prod(self.shape)
         count = min(pixels, math.ceil(pixels * samples / MAX_LANES))
         return [range(pixels * i // count, pixels * (i + 1) // count) for i in range(count)]
 
     def key(self, t: int, stage: int = RENDER_STAGE) -> Key:
-        """The random key of frame t: another seed, scene or stage draws other samples."""
+        """Return the random key of frame t; seed, scene and stage select the samples."""
         return replace(self._key, frame=t, stage=stage)
 
     def _exposed(self, instants: list[float], key: Key) -> tuple[Array, float, tuple[tuple[float, float], ...], int]:
-        """Mean radiance over the instants, its rms error, the same clamped at some whites, and the fireflies."""
+        """Return the mean radiance [H, W], its rms error, that error at some whites, and the fireflies."""
         means = self._means(instants, self.budget, key)
         halves, broken = means[0], ~np.isfinite(means[0]).all(axis=0)
-        means[:, :, broken] = 0  # or the denoiser and every mean around would break too
+        means[:, :, broken] = 0  # they would break the denoiser and every mean around them
         difference = (halves[0] - halves[1]) / 2
         error, radiance = rms(difference), halves.mean(axis=0)
         fireflies = int(np.count_nonzero(broken | ((np.abs(difference) > FIREFLY * error) & (error > 0))))
@@ -191,7 +190,7 @@ class Renderer:
         return radiance.astype(np.float32), whole, frame_errors(error_at, white), fireflies
 
     def surfaces(self, instants: list[float], key: Key) -> tuple[Array, Array]:
-        """Albedo [H, W] (1 where nothing or a mirror is) and normals [H, W, 3] of first surfaces, for the denoiser."""
+        """Return albedo [H, W] (1 for mirrors and misses) and normals [H, W, 3] of first surfaces, for the denoiser."""
         if self.engine.backend == "scalar":
             raise ValueError("the scalar engine cannot denoise; leave Budget.denoise off or install LLVM")
         import drjit as dr
@@ -213,20 +212,20 @@ class Renderer:
                 albedo = dr.select(matt, bsdf.eval_diffuse_reflectance(found)[0], 1)
                 normal = dr.select(seen, found.sh_frame.n, 0)
                 values = (albedo, normal.x, normal.y, normal.z)
-                dr.eval(*values)  # together, or each sum would trace the rays again
+                dr.eval(*values)  # together: separate sums would each trace the rays again
                 means = [np.array(dr.block_sum(value, samples)) / samples for value in values]
                 sums[:, part.start : part.stop] += means
         albedo, *normals = sums.reshape(4, *self.shape) / len(instants)
         return albedo, np.stack(normals, axis=-1)
 
     def _pass(self, pose: Array, seed: int, samples: int, bounces: int, part: range) -> Array:
-        """Two independent estimates of the radiance of these pixels, float64 [2, N], `samples` per pixel each.
+        """Return two independent estimates of the radiance of these pixels, float64 [2, N], `samples` per pixel each.
 
-        Both are one launch: what it costs to start one is that of several samples of a small frame.
+        One launch computes both: a launch costs as much as several samples of a small frame.
         """
         import drjit as dr
 
-        integrator = self._integrator(bounces)  # first: loading amid what follows would change the kernel once
+        integrator = self._integrator(bounces)  # first: loading it later would change the kernel once
         sampler, position = self._film_positions(seed, samples, part, 2)
         ray = self._camera_ray(pose, position, sampler)
         radiance, _, _ = integrator.sample(self.stage.loaded, sampler, ray)
@@ -234,7 +233,7 @@ class Renderer:
         return np.array(mean, np.float64).reshape(2, len(part))
 
     def _film_positions(self, seed: int, samples: int, part: range, times: int = 1) -> tuple[Any, Any]:
-        """A seeded sampler and film positions [px], uniform in each pixel, whose samples are neighbours in memory.
+        """Return a seeded sampler and film positions [px], uniform in each pixel; its samples are neighbours in memory.
 
         The pixels of `part` come `times` times over, each time with grids of their own. Size and place of the window
         are data, not code: a pilot and a whole frame share one compiled kernel.
@@ -253,14 +252,14 @@ class Renderer:
         return sampler, corner + sampler.next_2d()
 
     def _integrator(self, bounces: int) -> Any:
-        """A path tracer without Russian roulette, so that the same seed draws the same paths at every depth."""
+        """Return a path tracer without Russian roulette: equal seeds give equal paths at every depth."""
         if bounces not in self._integrators:
             plugin = {"type": "path", "max_depth": bounces + 1, "rr_depth": 1000}
             self._integrators[bounces] = self.mi.load_dict(plugin)
         return self._integrators[bounces]
 
     def _camera_ray(self, pose: Array, position: Any, sampler: Any) -> Any:
-        """Rays through film positions [px]; the pose is data, not code, so that moving it compiles nothing."""
+        """Return rays through film positions [px]; the pose is data, not code, so that motion compiles no kernel."""
         import drjit as dr
 
         mi, camera = self.mi, self.scene.camera
@@ -286,7 +285,7 @@ class Renderer:
         return self._samplers[samples]
 
     def truth(self, t: int) -> dict[str, Array]:
-        """Flow, validity, depth and body of frame t at mid-exposure, as in `Frame`."""
+        """Return flow, validity, depth and body of frame t at mid-exposure, as in `Frame`."""
         camera, now, after, shape = self.scene.camera, self.time(t), self.time(t + 1), self.shape
         rays = pixel_rays(camera, self.crop, self.thinned)
         self.stage.place(now)
@@ -304,9 +303,9 @@ class Renderer:
         }
 
     def motion_extent(self, t: int) -> tuple[Array, Array]:
-        """How far what each pixel sees moves in the exposure [px], and the body that it is, both [H, W].
+        """Return the image-space motion per exposure [px] and the body index of the first hit, both [H, W].
 
-        With the shutter at 0, by its speed at the instant, in a complete frame time.
+        With the shutter at 0, it is the motion per frame time at the speed of that instant.
         """
         now, exposure = self.time(t), (self.shutter or 1.0) / self.frame_rate
         rays = pixel_rays(self.scene.camera, self.crop, self.thinned)

@@ -26,20 +26,20 @@ def test_sample_counts_are_those_of_the_sampler(capfd):
     assert "rounded" not in capfd.readouterr().out
 
 
-@pytest.mark.parametrize(("travel", "instants"), [(0.5, 1), (3.0, 5), (3.0, 9), (4.2, 7), (1.0, 1)])
-def test_the_blur_error_bounds_the_midpoint_rule_at_an_edge(travel, instants):
+@pytest.mark.parametrize(("extent", "instants"), [(0.5, 1), (3.0, 5), (3.0, 9), (4.2, 7), (1.0, 1)])
+def test_the_blur_error_bounds_the_midpoint_rule_at_an_edge(extent, instants):
     """A pixel whose coverage grows while an edge passes it: exact integral against K instants, at any offset."""
-    offsets = np.linspace(-travel, 1 + travel, 801)
+    offsets = np.linspace(-extent, 1 + extent, 801)
     fine = (np.arange(4000) + 0.5) / 4000
     coarse = (np.arange(instants) + 0.5) / instants
 
     def mean(times):
-        return np.clip(offsets[:, None] + travel * (times - 0.5), 0, 1).mean(axis=1)
+        return np.clip(offsets[:, None] + extent * (times - 0.5), 0, 1).mean(axis=1)
 
     worst = np.abs(mean(fine) - mean(coarse)).max()
     # Two kinks of the coverage may fall into the exposure: at most twice the error of one.
-    assert worst <= 2 * blur_error(travel, instants) + 1e-6
-    assert worst >= 0.3 * blur_error(travel, instants)
+    assert worst <= 2 * blur_error(extent, instants) + 1e-6
+    assert worst >= 0.3 * blur_error(extent, instants)
 
 
 @pytest.mark.parametrize(("count", "edges"), [(9, 0.5), (9, 6.0), (33, 0.5), (33, 20.0), (3, 0.3)])

@@ -77,13 +77,13 @@ def test_the_light_left_out_is_told_with_its_error():
 
 
 def test_the_share_that_moves_is_said():
-    travel = np.zeros((2, 10, 10))
-    travel[:, 0, :4], travel[:, 1, 0] = 2.0, 0.09
-    found = moving(travel, 0.0)
+    extent = np.zeros((2, 10, 10))
+    extent[:, 0, :4], extent[:, 1, 0] = 2.0, 0.09
+    found = moving(extent, 0.0)
     assert found.chosen == "4 % of the pixels move"
     assert "those by 2 on average" in found.size
-    assert moving(travel, 0.5).chosen == "5 % of the pixels move"  # 0.09 px in half a frame
-    assert moving(0 * travel, 0.0).chosen == "0 % of the pixels move"
+    assert moving(extent, 0.5).chosen == "5 % of the pixels move"  # 0.09 px in half a frame
+    assert moving(0 * extent, 0.0).chosen == "0 % of the pixels move"
 
 
 def test_a_rendered_clip_states_its_error_below_its_own_white(tmp_path, capsys):

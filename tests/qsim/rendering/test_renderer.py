@@ -132,13 +132,13 @@ def test_an_open_shutter_blurs_by_the_motion_and_keeps_the_energy():
 def test_the_mean_of_more_instants_converges_like_the_stated_blur_error():
     from qsim.rendering.budget import blur_error
 
-    travel = 3.0
-    lamp = Body("lamp", square(0.8), Glow(1.0), Translation((travel * RATE * 4 / CAMERA.focal_pixels, 0, 0)))
+    extent = 3.0
+    lamp = Body("lamp", square(0.8), Glow(1.0), Translation((extent * RATE * 4 / CAMERA.focal_pixels, 0, 0)))
     made = Scene("lamp", 0, CAMERA, (), (lamp,))
     rows = {k: renderer(made, shutter=1.0, budget=Budget(200 * k, 1, k, False)).frame(0) for k in (5, 9, 63)}
     for k in (5, 9):
         worst = np.abs(rows[k].radiance - rows[63].radiance)[8:16].max()
-        assert worst < blur_error(travel, k) + 8 * rows[k].error  # the noise of edge pixels is above the mean
+        assert worst < blur_error(extent, k) + 8 * rows[k].error  # the noise of edge pixels is above the mean
     assert rows[5].radiance.shape == (24, 33)
 
 
