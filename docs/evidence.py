@@ -102,7 +102,7 @@ TESTS = """## What the tests hold
 | stated error of a frame is its error | `test_fidelity.py`, `test_fidelity_white.py`, `test_rendering.py` |
 | mean light is that of a converged frame, as far as is announced | `test_idle_options.py`, `test_denoiser.py` |
 | compiled and reference engine agree over 10 000 random sensors | `tests/qsim/sensor/compiled/test_codes_search.py` |
-| codes have the exact distribution: tails, ties, dead times | `tests/qsim/sensor/test_sensor.py`, `test_qis.py` |
+| codes have the exact distribution: tails, ties, dead times | `tests/qsim/sensor/test_qis.py`, `test_counting.py` |
 | closed forms agree with following every photon | `tests/qsim/sensor/defects/test_event_simulation.py` |
 | no two frames are equal; any order, any workers, same bytes | `tests/qsim/dataset/test_dataset.py`, `test_keys.py` |
 | a killed run, a full disk, a damaged file | `tests/qsim/dataset/test_dataset.py`, `tests/system/test_mistakes.py` |

@@ -1,0 +1,109 @@
+"""Light from codes: maximum likelihood with its bounds, and the response of a sensor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sensor_cases import EXPOSURE, SENSORS, each
+from stats import critical_z
+
+from qsim.sensor.qis import QIS
+from qsim.sensor.sensor import Sensor
+from qsim.sensor.spad import BinarySPAD
+
+
+@pytest.mark.parametrize("sensor", [SENSORS[0], SENSORS[4], SENSORS[6], SENSORS[7]])
+def test_estimates_scatter_as_fisher_information_says(sensor: Sensor):
+    """From 2000 codes each: z-scores have mean 0 (bias of the order 1/sqrt(n)) and variance 1; intervals hold 95 %."""
+    n, repeats, light = 2000, 2000, 4.0
+    histograms = np.random.default_rng(5).multinomial(n, sensor.pmf(light, EXPOSURE), size=repeats)
+    found = sensor.maximum_likelihood(histograms, EXPOSURE)
+    z = (found.photons - light) * np.sqrt(n * sensor.fisher_information(light, EXPOSURE))
+    limit = critical_z(checks=12)
+    assert abs(z.mean()) < limit / np.sqrt(repeats) + 3 / np.sqrt(n)
+    assert abs(z.var() - 1) < limit * np.sqrt(2 / repeats) + 10 / n
+    inside = int(((found.lower < light) & (light < found.upper)).sum())
+    assert abs(inside / repeats - 0.95) < limit * np.sqrt(0.95 * 0.05 / repeats) + 10 / n
+
+
+def test_one_plane_has_its_closed_form():
+    """Binary pixels: photons = -log(share of zeros) / PDE - dark; 0 where dark counts explain more than was seen."""
+    sensor = BinarySPAD(0.4, 100.0)
+    ones = np.array([1, 5, 40, 90, 99])
+    found = sensor.maximum_likelihood(np.stack([100 - ones, ones], axis=-1), EXPOSURE)
+    expected = np.maximum((-np.log1p(-ones / 100) - 100 * EXPOSURE) / 0.4, 0)
+    np.testing.assert_allclose(found.photons, expected, rtol=1e-9, atol=1e-15)
+    assert found.photons[0] == 0
+    assert np.all((found.lower <= found.photons) & (found.photons < found.upper))
+
+
+@pytest.mark.parametrize("n", [1, 11, 10**9])
+def test_all_dark_has_a_one_sided_bound(n):
+    """No count in n planes: 0, and an upper bound where that has a probability of 5 %: 2.996 / (n PDE)."""
+    found = BinarySPAD(0.4, 0.0, 3).maximum_likelihood(np.array([n, 0, 0, 0, 0, 0, 0, 0]), EXPOSURE)
+    assert (found.photons, found.lower) == (0.0, 0.0)
+    assert found.upper == pytest.approx(-np.log(0.05) / (0.4 * n), rel=1e-6)
+
+
+@pytest.mark.parametrize("n", [1, 11, 10**6])
+@each
+def test_all_saturated_is_finite_with_a_one_sided_bound(sensor: Sensor, n):
+    """The highest possible code n times: P^n is 1/2 at the estimate, 5 % at the lower bound, if it can be certain."""
+    histogram = np.zeros(sensor.levels)
+    highest = np.flatnonzero(sensor.log_pmf(5.0, EXPOSURE) > -np.inf)[-1]
+    histogram[highest] = n
+    found = sensor.maximum_likelihood(histogram, EXPOSURE)
+    assert np.isfinite(found.photons)
+    assert 0 < found.lower < found.photons
+    # On the rising branch of a paralyzable pixel a single code can be likeliest before the end
+    assert found.upper == np.inf or getattr(sensor, "paralyzable", False)
+    if sensor.pmf(1e6, EXPOSURE)[highest] == 1:
+        saturated = np.exp(n * sensor.log_pmf(np.stack([found.photons, found.lower]), EXPOSURE)[:, highest])
+        np.testing.assert_allclose(saturated, [0.5, 0.05], rtol=1e-4)
+
+
+def test_the_likelihood_is_highest_at_the_estimate():
+    rng = np.random.default_rng(2)
+    for sensor in SENSORS:
+        histograms = rng.multinomial(30, sensor.pmf(rng.uniform(0.5, 12, 50), EXPOSURE))
+        found = sensor.maximum_likelihood(histograms, EXPOSURE)
+        best, *others = (
+            (histograms * np.maximum(sensor.log_pmf(found.photons * factor, EXPOSURE), -1e9)).sum(axis=1)
+            for factor in (1.0, 0.99, 1.01)
+        )
+        for beside in others:
+            dark_or_bright = (found.photons == 0) | np.isinf(found.upper)
+            assert np.all((beside <= best + 1e-9) | dark_or_bright)
+
+
+def test_histograms_without_answer_are_named():
+    sensor = QIS(0.8, 0.0, 0.0, 3, gain=2.0)
+    with pytest.raises(ValueError, match=r"^histogram has the shape \[..., 8\], one bin per code; got \[2, 4\]$"):
+        sensor.maximum_likelihood(np.ones((2, 4)), EXPOSURE)
+    counts = np.ones((3, 2, 8))
+    counts[1, 0] = 0
+    with pytest.raises(ValueError, match=r"^histogram\[1, 0\] counts codes: finite, not negative, at least one"):
+        sensor.maximum_likelihood(counts, EXPOSURE)
+    counts[1, 0, 0] = 1
+    with pytest.raises(ValueError, match=r"^histogram\[0, 0\] holds code 1, which no light gives with this QIS\("):
+        sensor.maximum_likelihood(counts, EXPOSURE)  # gain 2 without read noise: codes are even
+
+
+# ---- Response
+
+
+@each
+def test_response_is_the_exact_mean_and_variance(sensor: Sensor):
+    table = sensor.response(EXPOSURE)
+    some = slice(None, None, 97)
+    np.testing.assert_allclose(table.mean[some], sensor.mean(table.photons[some], EXPOSURE), rtol=1e-9)
+    np.testing.assert_allclose(table.variance[some], sensor.variance(table.photons[some], EXPOSURE), atol=1e-12)
+
+
+@each
+def test_response_gives_the_light_of_a_mean_code_back(sensor: Sensor):
+    """Interpolated between 4096 levels of light: to 1e-4 of what a hundred codes resolve, and never beyond its cap."""
+    table = sensor.response(EXPOSURE)
+    light = np.linspace(0.2, 1.0, 5) * table.cap(100)
+    np.testing.assert_allclose(table.invert(sensor.mean(light, EXPOSURE), 10**6), light, rtol=1e-4)
+    assert table.invert(sensor.levels, 11) == table.cap(11) < table.photons[-1]
