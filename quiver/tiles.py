@@ -1,10 +1,10 @@
-"""Cutting a large frame into tiles: exactly, where a result depends on near pixels only, or with blended seams.
+"""Cuts a large frame into tiles: exactly, where a result depends on near pixels only, or with blended seams.
 
     cores that cover the frame, each grown by `reach` on its inner sides  ->  tiles that are computed
 
-Where a pixel depends on nothing farther than `reach`, a core is what the whole frame gives. Tiles begin at multiples of
-the network's stride, so that its pooling sees the same cells. Of all cuts whose tiles fit, the one with the smallest
-total area is taken.
+Where a pixel depends on nothing farther than `reach`, a core has the result of the complete frame. Tiles begin at
+multiples of the network's stride, so that pooling uses the same cells. Of all cuts whose tiles fit, the one with the
+smallest total area is taken.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy import ndarray as Array
 
 @dataclass(frozen=True)
 class Tile:
-    """A part of the frame and how much its result counts, [h, w]; the weights of all tiles sum to 1 at every pixel."""
+    """A part of the frame and the weight of its result, [h, w]; the weights of all tiles sum to 1 at every pixel."""
 
     y: int
     x: int
@@ -25,14 +25,14 @@ class Tile:
 
 
 def extents(length: int, core: int, reach: int) -> list[tuple[int, int]]:
-    """First and last + 1 pixel of the spans that `core` pixels each, grown by `reach`, take of `length`."""
+    """Return first and last + 1 pixel of each span: `core` pixels of `length`, grown by `reach` on both sides."""
     return [(max(0, start - reach), min(length, start + core + reach)) for start in range(0, length, core)]
 
 
 def cores(height: int, width: int, pixels: int, reach: int, multiple: int) -> tuple[int, int]:
-    """Height and width of the cores whose tiles have at most `pixels` pixels each and the smallest area together.
+    """Return height and width of the cores whose tiles hold at most `pixels` pixels and have the smallest total area.
 
-    `multiple` divides reach and cores. `ValueError` if not even the smallest tile fits.
+    `multiple` divides reach and cores. `ValueError` if the smallest tile does not fit.
     """
     if height * width <= pixels:
         return height, width
@@ -53,9 +53,9 @@ def cores(height: int, width: int, pixels: int, reach: int, multiple: int) -> tu
 
 
 def spans(length: int, core: int, reach: int, blend: bool) -> list[tuple[int, Array]]:
-    """Starts and weights [n] of spans that cover `length`; the weights sum to 1.
+    """Return starts and weights [n] of spans that cover `length`; the weights sum to 1.
 
-    A weight is 1 in the core and 0 beyond; with `blend` it rises and falls over what neighbours share.
+    A weight is 1 in the core and 0 beyond; with `blend` it rises and falls linearly over the overlap.
     """
     shapes = []
     total = np.zeros(length)
@@ -74,9 +74,9 @@ def spans(length: int, core: int, reach: int, blend: bool) -> list[tuple[int, Ar
 def cut_tiles(
     height: int, width: int, pixels: int, reach: int, multiple: int = 1, *, blend: bool = False
 ) -> list[Tile]:
-    """Tiles of at most `pixels` pixels that start at multiples of `multiple`; the whole frame, if that fits.
+    """Return tiles of at most `pixels` pixels that start at multiples of `multiple`; one tile if the frame fits.
 
-    `ValueError` if less than a tile fits.
+    `ValueError` if the smallest tile does not fit.
     """
     reach = -(-reach // multiple) * multiple
     tall, wide = cores(height, width, pixels, reach, multiple)

@@ -1,4 +1,4 @@
-"""Clips of a data set: opening them, their sharp photons, where these are known, and the peak of a score."""
+"""Opens the clips of a data set and gives their sharp photons, their valid pixels and the peak of a score."""
 
 from __future__ import annotations
 
@@ -16,39 +16,43 @@ __all__ = ["Clip", "has_sharp", "known", "mean_light", "open_clips", "peak_of", 
 
 
 def open_clips(path: Path | str, split: str | None = None) -> list[Clip]:
-    """The finished clips of a data set folder, all or of one split; or the one clip of a clip folder."""
+    """Return the finished clips of a data set folder, all or of one split; or the one clip of a clip folder."""
     path = Path(path)
     return [Clip.open(path)] if (path / "clip.json").exists() else Dataset.open(path).clips(split)
 
 
 def has_sharp(clip: Clip) -> bool:
-    """Whether the clip stores sharp frames beside the exposed ones."""
+    """Return whether the clip stores sharp frames beside the exposed ones."""
     return "sharp/000000.exr" in clip.meta["checksums"]
 
 
 def truth(clip: Clip, factor: float, start: int, stop: int) -> Array:
-    """Sharp expected photons [stop - start, H, W] of a clip under a light factor: what a restorer should return."""
+    """Return the sharp expected photons, float64 [stop - start, H, W], of a clip under a light factor: the target of a
+    restorer.
+    """
     return np.stack([clip_photons(clip, t, factor, sharp=True) for t in range(start, stop)])
 
 
 def known(clip: Clip, start: int, stop: int) -> Array | None:
-    """bool [stop - start, H, W]: where the light of frames is known, not cut off by a saturated camera; None = all."""
+    """Return bool [stop - start, H, W], false where a saturated camera cut off the light; None if all are valid."""
     if not clip.meta.get("saturated_pixels"):
         return None
     return ~np.stack([clip.saturated(t) for t in range(start, stop)])
 
 
 def mean_light(clip: Clip, factor: float) -> float:
-    """Mean expected photons per pixel and exposure of a clip under a light factor."""
+    """Return the mean expected photons per pixel and exposure of a clip under a light factor."""
     return factor * (clip.mean_radiance if clip.camera is None else clip.mean_photons)
 
 
 def peak_of(light: float, peak: float | None = None) -> float:
-    """The peak of a score [photons]: `peak` if given, else 2.5 times the mean light of the stream.
+    """Return the peak of a score [photons]: `peak` if given, else 2.5 times the mean light of the stream.
 
     `ValueError` for a stream without light.
     """
     found = WHITE_PER_MEAN * light if peak is None else peak
     if not 0 < found < float("inf"):
-        raise ValueError(f"the peak of a score is a number of photons above 0, got {found!r}; is there any light?")
+        raise ValueError(
+            f"the peak of a score is a number of photons above 0, got {found!r}; check that the stream holds light"
+        )
     return found

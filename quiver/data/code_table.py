@@ -1,11 +1,11 @@
-"""The exact draw of a sensor's codes, with a table that decides nearly every pixel by one look-up.
+"""Draws the codes of a sensor exactly, with a table that decides nearly every pixel by one look-up.
 
     code = #{k : u >= F_k(photons)},  u uniform: grows with u and with photons
 
-The plane of (sqrt(photons), u) is cut into cells. Where a code is the same in the two extreme corners of a cell it is
-the same everywhere in it; the few pixels in other cells (1 to 2 % at 3 bits) ask the sensor itself. So nothing is
-approximated: the codes are those of the sensor's reference engine, to the last one (tested), several times faster and
-in plain NumPy, for worker processes that must not touch Dr.Jit.
+The plane of (sqrt(photons), u) is cut into cells. Where the code is equal in the two extreme corners of a cell, it is
+equal everywhere in the cell. For the pixels in other cells (1 to 2 % at 3 bits) the sensor itself draws. Nothing is
+approximated: the codes equal those of the sensor's reference engine (tested). The draw is several times faster and
+needs NumPy only, for worker processes that must not use Dr.Jit.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class CodeTable:
     UNDECIDED = np.uint8(255)
 
     def __init__(self, sensor: Distribution, exposure: float) -> None:
-        """ValueError for a sensor whose codes do not grow with light (a paralyzable counter)."""
+        """Fill the table. `ValueError` for a sensor whose codes do not grow with light (a paralyzable counter)."""
         self.sensor, self.exposure = sensor, exposure
         brightest = sensor.white(exposure)
         while sensor.cdf(np.array([brightest]), exposure)[0, -2] > 1e-4 and brightest < 64 * sensor.white(exposure):
@@ -50,9 +50,9 @@ class CodeTable:
         self.steps = (CELLS - 1) / np.sqrt(brightest)
 
     def draw(self, photons: Array, first: Array, second: Array | None = None) -> Array:
-        """Codes uint8 from expected photons and one 32-bit word per pixel, any shape.
+        """Return codes, uint8 [...], of expected photons [...] and one 32-bit word per pixel [...].
 
-        `second` is needed, and asked for by a LookupError, where 32 bits do not decide (one pixel in 10^8).
+        `LookupError` where 32 bits do not decide (one pixel in 10^8) and `second` words [...] are missing.
         """
         row = np.minimum(np.sqrt(photons) * self.steps, CELLS - 1).astype(np.int32)
         codes = self.table[row * CELLS + (first >> np.uint32(U_SHIFT)).astype(np.int32)]
@@ -71,7 +71,7 @@ class CodeTable:
 
 @lru_cache(maxsize=64)
 def _code_table(sensor: Sensor, exposure: float) -> CodeTable | None:
-    """None for a sensor that a table cannot hold."""
+    """Return the table of a sensor; None for a sensor that a table cannot hold."""
     if sensor.bits > TABLE_BITS:
         return None
     try:
@@ -81,12 +81,11 @@ def _code_table(sensor: Sensor, exposure: float) -> CodeTable | None:
 
 
 def draw_codes(sensor: Sensor, photons: Array, exposure: float, key: Key, origin: tuple[int, int] = (0, 0)) -> Array:
-    """Codes [T, H, W] of expected photons [T, H, W], frame t under `key.at(key.frame + t)`; quick, without Dr.Jit.
+    """Return codes [T, H, W] of expected photons [T, H, W], frame t under `key.at(key.frame + t)`, without Dr.Jit.
 
-    `origin` (y, x) places a crop in the full frame.
-
-    The codes of `sensor.sample(..., engine="reference")` where a sensor draws one number per pixel. A clocked SPAD
-    draws one per plane: its codes have the same exact distribution, from other numbers.
+    `origin` (y, x) places a crop in the full frame. The codes equal those of `sensor.sample(..., engine="reference")`
+    where a sensor draws one number per pixel. A clocked SPAD draws one number per plane: its codes here have the same
+    exact distribution, from other numbers.
     """
     table = _code_table(sensor, exposure)
     if table is None or not (photons.min() >= 0 and photons.max() < np.inf):  # the sensor names the bad pixel

@@ -1,4 +1,4 @@
-"""Few-bit streams with all that a restorer must know: from memory, a file, or a clip that is sensed when read.
+"""Gives few-bit streams and their sensor to restorers: from memory, from a file, or drawn from a clip when read.
 
     clip, light -> codes [T, H, W]
 
@@ -44,7 +44,7 @@ WINDOW_STAGE = 1000  # of the random keys of published test windows, + frame; 0 
 
 @dataclass(frozen=True)
 class Codes:
-    """A few-bit stream with all that a restorer must know; frames are read when asked for."""
+    """A few-bit stream with everything that a restorer needs; frames are read on request."""
 
     name: str
     shape: tuple[int, int, int]  # T, H, W
@@ -52,19 +52,19 @@ class Codes:
     exposure: float  # s, of one code
     frame_rate: float  # codes per second
     read: Callable[[int, int], Array]  # codes uint8 [stop - start, H, W] of frames start .. stop - 1
-    source: str  # where they come from, for provenance
-    digest: Callable[[], str] = str  # SHA-256 of what is read, computed when asked for; empty: not known
+    source: str  # of the codes, for provenance
+    digest: Callable[[], str] = str  # SHA-256 of the codes, computed on request; empty: not known
     sensor_name: str = ""  # of a device or a file; empty: the sensor's model
     ppp: float | None = None  # mean photons per pixel and code; None: not known
 
     @property
     def white(self) -> float:
-        """Photons at which x = 1."""
+        """Return the photons at which restored video has the value 1."""
         return self.sensor.white(self.exposure)
 
 
 def array_digest(array: Array) -> str:
-    """SHA-256 of an array's type, shape and values; a memory map is read piece by piece."""
+    """Return the SHA-256 of an array's type, shape and values. A memory map is read in blocks."""
     found = hashlib.sha256(f"{array.dtype.str} {array.shape}".encode())
     step = max(1, DIGEST_BYTES // max(1, array[:1].nbytes))
     for start in range(0, len(array), step):
@@ -73,9 +73,13 @@ def array_digest(array: Array) -> str:
 
 
 def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "codes", source: str = "memory") -> Codes:
-    """Codes [T, H, W] in memory or a memory map; `ValueError` if empty or with codes the sensor cannot produce."""
+    """Return codes [T, H, W] in memory or in a memory map. `ValueError` if empty, or for codes that the sensor cannot
+    produce.
+    """
     if codes.ndim != 3 or codes.size == 0 or not np.issubdtype(codes.dtype, np.integer):
-        raise ValueError(f"{name}: expected integer codes [T, H, W], none of them 0, got {codes.dtype} {codes.shape}")
+        raise ValueError(
+            f"{name}: expected integer codes [T, H, W] without an empty axis, got {codes.dtype} {codes.shape}"
+        )
 
     def read(start: int, stop: int) -> Array:
         part = np.asarray(codes[start:stop])
@@ -91,7 +95,10 @@ def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "code
 
 
 def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float]:
-    """A clip as a sensor sees it, drawn when read, and the light factor: the codes that `qsim sense` would store."""
+    """Return the codes of a clip under a light level, and the light factor: the codes that `qsim sense` would store.
+
+    Codes are drawn when they are read.
+    """
     sensing, draw = light.sensing(seed), light.draw(clip, seed)
 
     def read(start: int, stop: int) -> Array:
@@ -116,7 +123,7 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
 
 
 def stream_codes(stream: Stream) -> Codes:
-    """A stored stream."""
+    """Return the codes of a stored stream."""
     meta = stream.meta
     return Codes(
         stream.name,
@@ -133,14 +140,14 @@ def stream_codes(stream: Stream) -> Codes:
 
 
 def open_stream(path: Path) -> Stream:
-    """The stored stream whose .npy or .json this is; `ValueError` if it is video that `quiver restore` wrote."""
+    """Return the stored stream with this .npy or .json. `ValueError` for video written by `quiver restore`."""
     if "seconds_per_frame" in read_json(path.with_suffix(".json")):
-        raise ValueError(f"{path}: is restored video; name the stream or the clip that it was made from")
+        raise ValueError(f"{path}: is restored video; give the stream or the clip that it was made from")
     return Stream.open(path.with_suffix(".json"))
 
 
 def stored(clip: Clip, name: str) -> tuple[Codes, float]:
-    """A stored stream of a clip, and its light factor; `ValueError` where a code sums several clip frames."""
+    """Return a stored stream of a clip and its light factor. `ValueError` where a code sums several clip frames."""
     stream = clip.stream(name)
     if stream.shape != clip.shape:
         raise ValueError(
@@ -151,9 +158,10 @@ def stored(clip: Clip, name: str) -> tuple[Codes, float]:
 
 
 def windows_sensed(clip: Clip, light: Illumination, seed: int, centres: range) -> Iterator[Codes]:
-    """The published test: each window of 11 frames brought to the light level on its own, with noise of its own.
+    """Draw the windows of the published test: 11 frames each, brought to the light level one by one, with separate
+    noise.
 
-    `ValueError` for a light without a level (the clip's own), which cannot be forced.
+    `ValueError` for the clip's own light (`ppp` None), which has no level to bring a window to.
     """
     if light.ppp is None:
         raise ValueError("the published protocol forces the exposure of every window; give --ppp")

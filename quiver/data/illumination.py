@@ -1,6 +1,6 @@
-"""Light levels and the sensors that see them.
+"""Describes at which light level a sensor sees a clip, and builds that sensor.
 
-light level, sensor's name or file -> sensor, and all that decides the codes of a clip
+light level, sensor's name or file -> sensor, and everything that decides the codes of a clip
 """
 
 from __future__ import annotations
@@ -21,27 +21,29 @@ from qsim.sensor.sensor import Sensor
 
 @dataclass(frozen=True)
 class Illumination:
-    """A light level and the sensor that sees it."""
+    """A light level and the sensor that receives it."""
 
     sensor: str = "quiver-physical"  # a named device of qsim, or a TOML file
     ppp: float | None = 3.25  # mean photons per pixel and exposure over the clip; None = the clip's own light
     bits: int | None = 3  # None = the device's own
 
     def device(self, exposure: float) -> Sensor:
-        """The sensor for clips with this exposure [s]."""
+        """Return the sensor for clips with this exposure [s]."""
         return _device(self, exposure)
 
     def sensing(self, seed: int = 0) -> Sensing:
-        """The same in qsim's words."""
+        """Return the same light level and sensor as settings of `qsim sense`."""
         return Sensing(self.sensor, bits=self.bits, ppp=self.ppp, seed=seed)
 
     def draw(self, clip: Clip, seed: int = 0) -> Draw:
-        """All that decides the codes of a clip, with the defects of a sensor file; `ValueError` if it does not fit."""
+        """Return everything that decides the codes of a clip, with the defects of a sensor file. `ValueError` if it
+        does not fit the clip.
+        """
         return prepare(clip, self.sensing(seed))
 
     @property
     def label(self) -> str:
-        """`3.25 PPP, 3 bit`, as tables show it."""
+        """Return the text of tables: `3.25 PPP, 3 bit`."""
         return ", ".join(
             (
                 "own light" if self.ppp is None else f"{self.ppp:g} PPP",
@@ -51,7 +53,7 @@ class Illumination:
 
 
 def read_sensor(source: str | Mapping[str, Any], bits: int | None = None) -> tuple[Sensor, Defects | None]:
-    """The sensor of a file with its defects, or of the record of one; `ValueError` if it has other bits."""
+    """Return the sensor of a file with its defects, or the sensor of a record. `ValueError` if its bits differ."""
     if isinstance(source, str):
         return devices.load(source, bits=bits), from_toml(source)
     return devices.from_dict(source), None
@@ -63,10 +65,10 @@ def _device(light: Illumination, exposure: float) -> Sensor:
 
 
 def follows_light(sensor: str) -> bool:
-    """Whether the gain of a named sensor is set from the photons per pixel."""
+    """Return whether the gain of a named sensor is set from the photons per pixel."""
     return sensor in devices.DEVICES and devices.DEVICES[sensor].follows_light
 
 
 def ideal_counter(bits: int) -> Sensor:
-    """A sensor that counts every detected photon up to 2^bits - 1, for measured photon counts."""
+    """Return a sensor that counts every photon up to 2^bits - 1, for measured photon counts."""
     return QIS(quantum_efficiency=1.0, dark_current=0.0, read_noise=0.0, bits=bits)

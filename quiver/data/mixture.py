@@ -14,15 +14,15 @@ from quiver.data.noise import Noise, as_text, short_name
 
 @dataclass(frozen=True)
 class Mixture:
-    """What every window draws one of, and what there is to say of the choice."""
+    """The noises of which every window draws one, and a remark on the choice."""
 
     noises: tuple[Noise, ...]
-    remark: str = ""  # where it comes from, if not from the streams
+    remark: str = ""  # its source, if not the streams
     streams: tuple[Noise, ...] = ()  # of the clips
 
     @property
     def lines(self) -> list[str]:
-        """One line for people, and one more where the data set's streams say something else."""
+        """Return one line on the noise, and a second one where the streams of the data set differ."""
         told = [f"noise: {describe(self.noises)}" + (f" ({self.remark})" if self.remark else "")]
         if self.streams and set(self.streams) != set(self.noises):
             told.append(f"this differs from the data set's streams: {describe(self.streams)}")
@@ -35,14 +35,14 @@ def choose(
     ppp: Sequence[float] | None = None,
     bits: Sequence[int] | None = None,
 ) -> Mixture:
-    """The noise of the clips' streams, with the sensors, light levels [photons/pixel] and bits that are asked for.
+    """Return the noise of the clips' streams, changed to the requested sensors, light levels [photons/pixel] and bits.
 
-    Where sensors are asked for, streams of these are taken if there are any. Without streams the default sensor and
-    light stand in for them. `ValueError` for a stream that training windows cannot be drawn as.
+    Where sensors are requested, their streams are taken if there are any. Without streams, the default sensor and light
+    are used. `ValueError` for a stream whose noise training windows cannot have.
     """
     asked = bool(sensors or ppp or bits)
     streams = _streams(clips)
-    if sensors and ppp and bits:  # nothing is left to the streams, whatever they are
+    if sensors and ppp and bits:  # the streams decide nothing
         streams = [stream for stream in streams if (stream.meta.get("planes_per_code") or 1) == 1]
     found = _sorted(streams)
     if not asked:
@@ -68,13 +68,13 @@ def _unique(noises: Iterable[Noise]) -> tuple[Noise, ...]:
 
 
 def _sorted(streams: Iterable[Stream]) -> tuple[Noise, ...]:
-    """What streams were drawn by, each once, in an order that does not depend on their names."""
+    """Return the noise of each stream once, in an order that does not depend on the names of streams."""
     found = _unique(Noise.of_stream(stream) for stream in streams)
     return tuple(sorted(found, key=lambda n: (n.sensor, n.bits or 0, n.lux or 0.0, n.ppp or 0.0, as_text(n.to_dict()))))
 
 
 def _changed(noise: Noise, sensor: str | None, ppp: float | None, bits: int | None) -> Noise:
-    """A noise with the parts that were asked for."""
+    """Return a noise with the requested changes."""
     if sensor is not None and (sensor != noise.sensor or sensor.endswith(".toml")):
         depth = bits if bits is not None or sensor.endswith(".toml") else noise.bits
         fresh = Noise.of(Illumination(sensor, noise.ppp, depth))
@@ -92,7 +92,9 @@ def _changed(noise: Noise, sensor: str | None, ppp: float | None, bits: int | No
 
 
 def describe(noises: Sequence[Noise]) -> str:
-    """`spad-320x240, 1 bit, 1 and 10 PPP, dark-count map; quiver-physical, 3 bits, 3.25 PPP`"""
+    """Return the text for people: `spad-320x240, 1 bit, 1 and 10 PPP, dark-count map; quiver-physical, 3 bits, 3.25
+    PPP`.
+    """
     levels: dict[tuple[str, str, int | None], list[str]] = {}
     for noise in noises:
         effects = ", ".join([*_effects(noise), *(["diffraction"] if noise.diffraction else [])])
@@ -111,7 +113,7 @@ def _level(noise: Noise) -> str:
 
 
 def _joined(levels: Sequence[str]) -> str:
-    """`1 and 10 PPP` of `1 PPP` and `10 PPP`."""
+    """Return `1 and 10 PPP` for `1 PPP` and `10 PPP`."""
     units = {text.rpartition(" ")[2] for text in levels}
     if len(units) == 1:
         unit = units.pop()
@@ -129,7 +131,7 @@ def _and(words: Sequence[str]) -> str:
 
 
 def _effects(noise: Noise) -> list[str]:
-    """The defects, in words."""
+    """Return the names of the defects."""
     if noise.defects is None:
         return []
     table = json.loads(noise.defects)

@@ -1,4 +1,4 @@
-"""The noise of training windows: a sensor with its defects at a light level, as a data set's stream has it."""
+"""Describes the noise of training windows: a sensor with its defects at a light level, as a stored stream has it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from quiver.data.illumination import Illumination, read_sensor
 
 @dataclass(frozen=True)
 class Noise(Illumination):
-    """A light level and all that a stored stream says of what sees it; defects are those named here and no others."""
+    """A light level and a sensor as a stored stream describes them; it has the stated defects and no others."""
 
     lux: float | None = None  # on the faceplate, instead of `ppp`
     diffraction: bool = False
@@ -29,7 +29,7 @@ class Noise(Illumination):
 
     @classmethod
     def of(cls, light: Illumination) -> Noise:
-        """What a sensor's name or file means now; `ValueError` or `FileNotFoundError` where it means nothing."""
+        """Return the noise of a sensor's name or file. `ValueError` or `FileNotFoundError` for an unknown one."""
         if isinstance(light, Noise):
             return light
         if not light.sensor.endswith(".toml"):
@@ -45,7 +45,7 @@ class Noise(Illumination):
 
     @classmethod
     def of_stream(cls, stream: Stream) -> Noise:
-        """What a stored stream was drawn by; `ValueError` for one that training windows cannot be drawn as."""
+        """Return the noise of a stored stream. `ValueError` if training windows cannot have it."""
         meta, where = stream.meta, stream.path.with_suffix(".json")
         planes = meta.get("planes_per_code") or 1
         if planes != 1:
@@ -56,7 +56,7 @@ class Noise(Illumination):
         name = str(meta.get("sensor_name") or stream.sensor.to_dict()["model"])
         named = "sensor_name" in meta and not name.endswith(".toml")
         ppp, lux = meta.get("ppp_target"), meta.get("lux_target")
-        if "ppp_target" not in meta:  # not drawn by us
+        if "ppp_target" not in meta:  # written by another program
             ppp = meta.get("ppp")
         defects = meta.get("defects")
         return cls(
@@ -71,7 +71,10 @@ class Noise(Illumination):
 
     @classmethod
     def from_dict(cls, values: Any) -> Noise:
-        """Inverse of `to_dict`; strict, `ValueError`. Maps of defects may be elsewhere: they are read when drawn."""
+        """Return the inverse of `to_dict`; strict, `ValueError`.
+
+        The files of defect maps may be missing here: they are read when codes are drawn.
+        """
         if not isinstance(values, dict) or set(values) != {field.name for field in fields(cls)}:
             raise ValueError(f"noise has {', '.join(field.name for field in fields(cls))}; got {repr(values)[:100]}")
         for name, kinds in _KINDS.items():
@@ -86,32 +89,32 @@ class Noise(Illumination):
         return found
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
+        """Return plain values, for JSON."""
         texts = {name: getattr(self, name) for name in ("record", "defects")}
         return asdict(self) | {name: None if text is None else json.loads(text) for name, text in texts.items()}
 
     @property
     def label(self) -> str:
-        """`3.25 PPP, 3 bit, spad-320x240`"""
+        """Return the text of tables: `3.25 PPP, 3 bit, spad-320x240`."""
         light = super().label if self.lux is None else f"{self.lux:g} lx, {self.bits} bit"
         return light if self.sensor == Illumination.sensor else f"{light}, {short_name(self.sensor)}"
 
     @property
     def simple(self) -> Illumination:
-        """The same as a plain `Illumination`, where it says no more than that."""
+        """Return a plain `Illumination` if that holds everything, else this noise."""
         light = Illumination(self.sensor, self.ppp, self.bits)
         return light if Noise(self.sensor, self.ppp, self.bits) == self else self
 
     def sensing(self, seed: int = 0) -> Sensing:
-        """The same in qsim's words, without record and defects."""
+        """Return the same as settings of `qsim sense`, without record and defects."""
         return Sensing(self.sensor, bits=self.bits, ppp=self.ppp, lux=self.lux, seed=seed, diffraction=self.diffraction)
 
     def device(self, exposure: float) -> Sensor:
-        """The sensor for clips with this exposure [s]."""
+        """Return the sensor for clips with this exposure [s]."""
         return super().device(exposure) if self.record is None else _sensor(self.record)
 
     def draw(self, clip: Clip, seed: int = 0) -> Draw:
-        """All that decides the codes of a clip; `ValueError` where this noise does not fit it."""
+        """Return everything that decides the codes of a clip. `ValueError` where this noise does not fit it."""
         own = None if self.record is None else _sensor(self.record)
         return assemble(clip, self.sensing(seed), None if self.defects is None else stored_defects(self.defects), own)
 
@@ -128,6 +131,7 @@ _KINDS: dict[str, Any] = {
 
 
 def as_text(values: Mapping[str, Any]) -> str:
+    """Return JSON with sorted keys."""
     return json.dumps(values, sort_keys=True)
 
 
@@ -138,8 +142,10 @@ def _sensor(text: str) -> Sensor:
 
 @lru_cache(maxsize=64)
 def stored_defects(text: str) -> Defects:
+    """Return the defects of a table [defects] in JSON."""
     return read_defects(json.loads(text))
 
 
 def short_name(sensor: str) -> str:
+    """Return the name of a device, or of a file without folder and suffix."""
     return sensor.rpartition("/")[2].removesuffix(".toml")

@@ -1,4 +1,4 @@
-"""Photon counts of a static object, read from a .npy or .npz that may be damaged."""
+"""Reads photon counts of a static object from a .npy or .npz, which may be damaged."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ class Counts:
 
     @property
     def light(self) -> float:
-        """Mean photons per pixel and frame."""
+        """Return the mean photons per pixel and frame."""
         return float(self.frames.mean())
 
 
 def read_counts(path: Path) -> Counts:
-    """Counts [N, H, W], or [T, K, H, W] with K time gates, from .npy or a .npz with one array.
+    """Return counts [N, H, W], or [T, K, H, W] with K time gates, from a .npy or a .npz with one array.
 
-    With gates a frame's share is its gate's mean, else its own. `ValueError` for anything else than whole counts, and
-    for a file that is damaged in any way; `FileNotFoundError` without one.
+    The share of a frame is the mean of its gate, or of the frame itself without gates. `ValueError` for anything but
+    integer counts and for a damaged file; `FileNotFoundError` if there is no file.
     """
     if path.suffix not in (".npy", ".npz"):
         raise ValueError(f"{path}: photon counts are a .npy, or a .npz with one array")
@@ -47,13 +47,13 @@ def read_counts(path: Path) -> Counts:
     frames = array.reshape(-1, *array.shape[-2:])
     light = array.mean(axis=(0, 2, 3)) if array.ndim == 4 else array.mean(axis=(1, 2))
     if not light.min() > 0:
-        raise ValueError(f"{path}: frame or gate {int(np.argmin(light))} holds no photon at all")
+        raise ValueError(f"{path}: frame or gate {int(np.argmin(light))} holds no photon")
     shares = np.tile(light, len(frames) // len(light)) / light.mean()
     return Counts(frames, shares, path.name)
 
 
 def _load(path: Path) -> Array:
-    """The one array of a .npy or .npz."""
+    """Return the one array of a .npy or .npz."""
     with open(path, "rb") as file:
         if path.suffix == ".npy":
             return _array(file, path.stat().st_size)
@@ -67,13 +67,13 @@ def _load(path: Path) -> Array:
 
 
 def _array(file: IO[bytes], size: int) -> Array:
-    """An array in the .npy format, whose header is believed only as far as its `size` [bytes] reaches."""
+    """Return an array in the .npy format; the header may not ask for more than `size` bytes."""
     reader = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     version = np.lib.format.read_magic(file)
     if version not in reader:
         raise ValueError(f"version {version} of the format is unknown")
     shape, _, dtype = reader[version](file)
     if math.prod(shape) * dtype.itemsize > min(size, LARGEST):
-        raise ValueError(f"{dtype} {list(shape)} needs more than the {size:,} bytes that are there")
+        raise ValueError(f"{dtype} {list(shape)} needs more than the {size:,} bytes of the file")
     file.seek(0)
     return np.asarray(np.lib.format.read_array(file, allow_pickle=False))

@@ -1,4 +1,4 @@
-"""Codes from a bare array on disk: codes, or packed binary planes that are summed when they are read."""
+"""Reads codes from a bare array on disk: codes, or packed binary planes that are summed when they are read."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ from qsim.sensor.spad import BinarySPAD
 from quiver.data.codes import Codes, array_codes, array_digest
 from quiver.data.illumination import Illumination
 
-PLANE_PIXELS = 1 << 24  # of packed planes that are unpacked at a time: 16 MB
+PLANE_PIXELS = 1 << 24  # unpacked at a time: 16 MB
 
 
 def cube_codes(
     path: Path, light: Illumination, frame_rate: float, *, planes: int | None = None, width: int | None = None
 ) -> Codes:
-    """Codes from a bare .npy: integers [T, H, W], or with `width` binary planes [T, H, ceil(W/8)], first pixel in the
-    highest bit. Every `planes` = 2^b - 1 of them (default 1) are summed to one b-bit code of a clocked SPAD; what is
-    left at the end is not used. `frame_rate` counts codes per second. `ValueError` where these do not fit together.
+    """Return the codes of a bare .npy: integers [T, H, W], or with `width` binary planes [T, H, ceil(W/8)].
+
+    The first pixel of a packed byte is its highest bit. Every `planes` = 2^b - 1 planes (default 1) are summed to one
+    b-bit code of a clocked SPAD; the remainder at the end is not used. `frame_rate` counts codes per second.
+    `ValueError` where these do not fit together.
     """
     array = load_array(path)
     if width is None:
@@ -34,7 +36,9 @@ def cube_codes(
 
 
 def plane_bits(planes: int) -> int:
-    """Bits of a code that sums so many binary planes; `ValueError` unless that is 2^b - 1 with b = 1 ... 16."""
+    """Return the bits of a code that sums this many binary planes. `ValueError` unless that is 2^b - 1 with b = 1 ...
+    16.
+    """
     bits = planes.bit_length()
     if 1 <= planes == 2**bits - 1 < 2**16:
         return bits
@@ -44,7 +48,7 @@ def plane_bits(planes: int) -> int:
 
 
 def _summed(path: Path, cube: Array, light: Illumination, frame_rate: float, planes: int, width: int) -> Codes:
-    """Packed planes as codes, summed when they are read."""
+    """Return packed planes as codes that are summed when they are read."""
     bits = plane_bits(planes)
     if light.bits not in (None, bits):
         raise ValueError(f"{path}: sums of {planes} planes are {bits}-bit codes, got bits = {light.bits}; leave it out")
@@ -56,8 +60,8 @@ def _summed(path: Path, cube: Array, light: Illumination, frame_rate: float, pla
         )
     if cube.ndim != 3 or cube.dtype != np.uint8 or cube.shape[2] != (width + 7) // 8 or 0 in cube.shape:
         raise ValueError(
-            f"{path}: {cube.dtype} {list(cube.shape)} is no cube of packed planes {width} px wide; "
-            f"that would be uint8 [T, H, {(width + 7) // 8}]"
+            f"{path}: {cube.dtype} {list(cube.shape)} is not a cube of packed planes {width} px wide; "
+            f"expected uint8 [T, H, {(width + 7) // 8}]"
         )
     if len(cube) < planes:
         raise ValueError(f"{path}: {len(cube)} planes are fewer than the {planes} of one code")

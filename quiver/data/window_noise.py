@@ -1,10 +1,10 @@
-"""Codes of one training window with the defects of its sensor, as `qsim sense` draws them.
+"""Draws the codes of one training window with the defects of its sensor, as `qsim sense` draws them.
 
     Noise, clip, place -> window_codes
 
-A window's defects are those of its place in the full frame, so a pixel has the same ones as in `qsim sense`. What
-reaches into a window from outside is drawn with a margin: the neighbours' crosstalk, and the afterpulses of the frames
-before, as far as the clip has them. Counting pixels that remember an earlier exposure are refused.
+The defects of a window are those of its place in the full frame, so a pixel has the same ones as in `qsim sense`.
+Effects that reach into a window are drawn with a margin: crosstalk of neighbours, and afterpulses of earlier frames as
+far as the clip has them. Counting pixels whose codes depend on an earlier exposure are refused.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ NEGLIGIBLE = 1e-6  # chance of an afterpulse chain that is as long as the frames
 
 @dataclass(frozen=True)
 class WindowPlace:
-    """Where sample n comes from and how it is turned: enough to make it again."""
+    """Where sample n lies and how it is turned: enough to draw it again."""
 
     clip: int
     start: int
@@ -48,7 +48,7 @@ def _pixel_array(defects: str, sensor: Sensor, shape: tuple[int, int]) -> PixelA
 
 
 def check_windows(noise: Noise, clip: Clip) -> None:
-    """`ValueError` if windows of this clip cannot be drawn with this noise, each on its own."""
+    """Raise `ValueError` if windows of this clip cannot be drawn one by one with this noise."""
     draw = noise.draw(clip)
     if noise.defects is not None:
         array = _pixel_array(noise.defects, draw.plane, clip.shape[1:])
@@ -62,11 +62,11 @@ def check_windows(noise: Noise, clip: Clip) -> None:
 def window_codes(
     noise: Noise, draw: Draw, clip: Clip, place: WindowPlace, frames: int, side: int, scale: float = 1.0
 ) -> Array:
-    """Codes [T, side, side] of a window with defects, in the order in which its frames are seen, not turned.
+    """Return codes [T, side, side] of a window with defects, in the order in which its frames are exposed, not turned.
 
-    The codes of `qsim sense` under `place.key`, cropped, as far as both draw the same numbers. `draw` is the noise for
-    this clip, `scale` a factor on the light. A crop that drifts keeps the pixels of its first place: the scene moves,
-    the sensor does not.
+    They equal the cropped codes of `qsim sense` under `place.key`, as far as both draw the same numbers. `draw` belongs
+    to this noise and clip, `scale` is a factor on the light. A drifting crop keeps the pixels of its first place: the
+    scene moves, the sensor does not.
     """
     assert noise.defects is not None
     array = _pixel_array(noise.defects, draw.plane, clip.shape[1:])
@@ -80,7 +80,7 @@ def window_codes(
     columns = left + side + min(reach, width - x[1] - side)
 
     def light(i: int) -> Array:
-        moved = min(max(i, 0), last)  # frames outside of the window are seen from its ends
+        moved = min(max(i, 0), last)  # frames outside of the window take the crop at its ends
         crop = (place.y + dy * moved - top, place.x + dx * moved - left, rows, columns)
         return scale * clip_photons(clip, place.start + i, draw.level.factor, crop, diffraction=draw.diffraction)
 

@@ -1,11 +1,11 @@
-"""Training windows from the clips of any data set folder: a plain `torch` data set, usable without our loop.
+"""Draws training windows from the clips of any data set folder: a plain `torch` data set, usable without our loop.
 
-    clip -> photons of a window and its sharp truth -> codes, drawn on the fly -> codes/(2^b - 1), photons/white
+    clip -> photons of a window and its sharp truth -> codes, drawn when read -> codes/(2^b - 1), photons/white
 
-Sample n is a function of (seed, n) alone: which clip, where, how turned, at which light level, and every bit of its
-noise; so 0, 1 or 8 workers give the same bytes and a killed run goes on with the sample it would have drawn. Sample
-n + e * len(windows) is sample n of epoch e: count on to get fresh noise. Dr.Jit, which does not survive a fork, is
-never touched. Sensor, light and defects are those of the clips' streams unless the settings name others (noise.py).
+Sample n is a function of (seed, n) alone: its clip, place, turn, light level and every bit of its noise. So 0, 1 or 8
+workers give the same bytes, and a killed run resumes with the next sample. Sample n + e * len(windows) is sample n of
+epoch e, with new noise. Dr.Jit, which does not survive a fork, is not used. Sensor, light and defects are those of the
+clips' streams unless the settings name others (noise.py).
 
     windows = Windows(open_clips("out/starter", "train"), WindowSettings(crop=64))
     loader = DataLoader(windows, batch_sampler=Batches(8, first=0, last=1000))
@@ -39,16 +39,16 @@ TRAINING, VALIDATION = 1, 2  # stages of the random keys: no two uses share nois
 
 @dataclass(frozen=True)
 class WindowSettings:
-    """What a training sample is."""
+    """The settings of training samples."""
 
     lights: tuple[Illumination, ...] | None = None  # each sample draws one; None: those of the clips' streams
     frames: int = 11
     crop: int = 64  # px, side of the square; validation takes the centre
     flips: bool = True  # the eight flips and quarter turns
     reverse: bool = True  # half of the windows run backwards in time
-    drift: int = 0  # px/frame; in half of the windows the crop itself moves, up to so far along each side
-    force_exposure: bool = False  # published: every window is brought to the light level on its own
-    ceiling: float = 2.0  # targets end here, in units of white: 11 codes tell no light above from saturation
+    drift: int = 0  # px/frame; in half of the windows the crop moves, up to this far along each side
+    force_exposure: bool = False  # published: every window is brought to the light level separately
+    ceiling: float = 2.0  # of targets, in units of white: 11 codes do not distinguish light above it from saturation
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -59,21 +59,23 @@ class WindowSettings:
 
 
 class Windows(Dataset[dict[str, Any]]):
-    """Windows of `frames` frames from the clips of a folder, with fresh noise: a map-style `torch` data set.
+    """Windows of `frames` frames from the clips of a folder, with new noise in every epoch: a map-style `torch` data
+    set.
 
-    item: codes float32 [T, 1, h, w] in [0, 1], target float32 [T, 1, h, w] = sharp photons / white (up to `ceiling`),
-    white [photons], peak [photons] of its scores, ppp, sample (its number), key (text: clip, place, light, random key).
-    Codes and target follow the sensor of their window. `noise` is the mixture that windows draw from, `print(windows)`
-    says it. `ValueError` for a folder without clips, for clips shorter or smaller than a window, and for noise that
-    windows cannot have.
+    An item holds codes float32 [T, 1, h, w] in [0, 1], target float32 [T, 1, h, w] = sharp photons / white (up to
+    `ceiling`), white [photons], peak [photons] of its scores, ppp, sample (its number) and key (text: clip, place,
+    light, random key). Codes and target follow the sensor of their window. `noise` is the mixture that windows draw
+    from; `repr` shows it. `ValueError` for a folder without clips, for clips shorter or smaller than a window, and for
+    noise that windows cannot have.
     """
 
     def __init__(
         self, clips: Sequence[Clip], settings: WindowSettings, *, fixed: bool = False, repeats: int = 1
     ) -> None:
-        """`fixed` is for validation: sample n is the same in every epoch, from the middle of its clip, not turned.
+        """Choose the noise. An epoch holds `repeats` windows of every clip.
 
-        An epoch holds `repeats` windows of every clip (fixed: one per clip and light level).
+        `fixed` is for validation: one window per clip and light level, from the middle of the clip, not turned, equal
+        in every epoch.
         """
         check_clips(clips, settings)
         self.clips, self.settings, self.fixed = tuple(clips), settings, fixed
@@ -90,7 +92,7 @@ class Windows(Dataset[dict[str, Any]]):
         return self.length
 
     def place(self, n: int) -> WindowPlace:
-        """Where sample n lies, without reading it."""
+        """Return where sample n lies, without reading it."""
         if self.fixed:
             return self._middle(n % self.length)
         settings, (epoch, index) = self.settings, divmod(n, self.length)
@@ -116,7 +118,7 @@ class Windows(Dataset[dict[str, Any]]):
         )
 
     def _drift(self, clip: int, rng: np.random.Generator) -> tuple[int, int]:
-        """How the crop moves, as far as the clip has room."""
+        """Return the drift of the crop [px/frame], as far as the clip has room."""
         settings = self.settings
         if not settings.drift or rng.random() < 0.5:
             return 0, 0
@@ -143,7 +145,7 @@ class Windows(Dataset[dict[str, Any]]):
                 codes = draw_codes(draw.sensor, photons * scale, clip.exposure, place.key)
             else:
                 drawn = window_codes(noise, draw, clip, place, self.settings.frames, self.settings.crop, scale)
-                codes = turned(drawn, replace(place, backwards=False))  # drawn in the order in which they are seen
+                codes = turned(drawn, replace(place, backwards=False))  # in the order of exposure already
         except ValueError as error:
             raise ValueError(f"{clip.path}: window from frame {place.start}: {error}") from None
         white = draw.sensor.white(clip.exposure)
@@ -159,7 +161,7 @@ class Windows(Dataset[dict[str, Any]]):
         }
 
     def photons_of(self, place: WindowPlace) -> tuple[Array, Array]:
-        """Expected photons of the exposed and of the sharp window, [T, h, w], turned."""
+        """Return the expected photons of the exposed and of the sharp window, float64 [T, h, w] each, turned."""
         clip, side = self.clips[place.clip], self.settings.crop
         (dy, dx), draw = place.drift, self._draw(place)
 
@@ -184,28 +186,28 @@ class Windows(Dataset[dict[str, Any]]):
         )
 
     def _draw(self, place: WindowPlace) -> Draw:
-        """Sensor and light factor of a place's clip and noise."""
+        """Return sensor and light factor of a place's clip and noise."""
         if (place.clip, place.light) not in self._draws:
             self._draws[place.clip, place.light] = self.noise.noises[place.light].draw(self.clips[place.clip])
         return self._draws[place.clip, place.light]
 
 
 def turned(window: Array, place: WindowPlace) -> Array:
-    """A window [T, h, w] flipped, turned and reversed as its place says."""
+    """Return a window [T, h, w] flipped, turned and reversed as its place states."""
     window = window[:, :, ::-1] if place.turn >= 4 else window
     window = np.rot90(window, place.turn % 4, axes=(1, 2))
     return np.ascontiguousarray(window[::-1] if place.backwards else window)
 
 
 def as_input(codes: Array, sensor: Sensor) -> torch.Tensor:
-    """Codes [T, H, W] as networks see them: float32 [T, 1, H, W], codes / (2^b - 1)."""
+    """Return codes [T, H, W] as the input of networks: float32 [T, 1, H, W], codes / (2^b - 1)."""
     return torch.from_numpy(codes.astype(np.float32) / np.float32(sensor.levels - 1))[:, None]
 
 
 def check_clips(clips: Sequence[Clip], settings: WindowSettings) -> None:
-    """ValueError naming the first clip that holds no window."""
+    """Raise `ValueError` with the first clip that holds no window."""
     if not clips:
-        raise ValueError("no complete clip to draw windows from; is the split right, has `qsim generate` finished?")
+        raise ValueError("no complete clip to draw windows from; check the split, or finish `qsim generate`")
     for clip in clips:
         length, height, width = clip.shape
         if length < settings.frames or min(height, width) < settings.crop:
@@ -216,7 +218,7 @@ def check_clips(clips: Sequence[Clip], settings: WindowSettings) -> None:
 
 
 class Batches(Sampler[list[int]]):
-    """Sample numbers of batch after batch, from batch `first` on; of `world` processes each gets its own share."""
+    """Sample numbers of batch after batch, from batch `first` on; each of `world` processes gets a separate share."""
 
     def __init__(self, batch: int, first: int, last: int, rank: int = 0, world: int = 1) -> None:
         self.batch, self.first, self.last, self.rank, self.world = batch, first, last, rank, world

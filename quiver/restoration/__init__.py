@@ -1,1 +1,1 @@
-"""Any method on clips of any size in bounded memory."""
+"""Restores clips of any size with any method, in bounded memory."""

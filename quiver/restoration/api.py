@@ -1,4 +1,4 @@
-"""Restoring in one line, for notebooks: a stream, a clip, a path or an array of codes in, photons out."""
+"""Restores in one line, for notebooks: a stream, a clip, a path or an array of codes in, photons out."""
 
 from __future__ import annotations
 
@@ -31,14 +31,15 @@ def restore(
     mode: str | None = None,
     strict: bool = False,
 ) -> Array:
-    """Restored video, float32 [T, H, W], in photons per pixel and exposure (expected, before quantum efficiency).
+    """Return restored video, float32 [T, H, W], in photons per pixel and exposure (expected, before quantum
+    efficiency).
 
-    `source` is a `Stream`; a `Clip` (its only stream; with `ppp` it is sensed now by the default sensor); the path of
-    either; or integer codes [T, H, W], for which `sensor` and `exposure` [s] must be given. `method` is a classical
-    method (naive, moment, likelihood, transform-denoise, qbp, qbp-bm3d), shipped weights (default nano), a .safetensors
-    file or a folder of `quiver train`; `device` (auto, cpu, cuda) and `mode` (exact, streaming, windows) are for
-    networks. A network outside of what it was measured for warns, and with `strict` it is a `ValueError`. `ValueError`
-    or `FileNotFoundError` where these do not fit together.
+    `source` is one of these: a `Stream`; a `Clip` (its only stream; with `ppp` the default sensor senses it now); the
+    path of either; integer codes [T, H, W], for which `sensor` and `exposure` [s] must be given. `method` is a
+    classical method (naive, moment, likelihood, transform-denoise, qbp, qbp-bm3d), shipped weights (default nano), a
+    .safetensors file or a folder of `quiver train`. `device` (auto, cpu, cuda) and `mode` (exact, streaming, windows)
+    are for networks. A network outside of what it was measured for warns; with `strict` it is a `ValueError`.
+    `ValueError` or `FileNotFoundError` where the arguments do not fit together.
 
         video = quiver.restore("out/fan", "moment")
     """
@@ -56,18 +57,18 @@ def restore(
 def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: float | None) -> Codes:
     if isinstance(source, np.ndarray):
         if sensor is None or exposure is None:
-            raise ValueError("codes in an array do not say what made them; give sensor= and exposure= in seconds")
+            raise ValueError("an array of codes has no sensor and no exposure; give sensor= and exposure= in seconds")
         if ppp is not None:
-            raise ValueError("ppp= senses a clip now; the codes of an array are there already")
+            raise ValueError("ppp= is for a clip that is sensed now, and an array holds codes already; leave it out")
         return array_codes(source, sensor, exposure)
     if sensor is not None or exposure is not None:
-        raise ValueError("sensor= and exposure= are for arrays; a clip and a stream know theirs")
+        raise ValueError("sensor= and exposure= are for arrays, and a clip or a stream has its own; leave them out")
     if isinstance(source, str | os.PathLike):
         path = Path(source)
         source = Clip.open(path) if path.is_dir() or not path.exists() else open_stream(path)
     if isinstance(source, Stream):
         if ppp is not None:
-            raise ValueError("ppp= senses a clip now; a stream knows its light")
+            raise ValueError("ppp= is for a clip that is sensed now, and a stream has its own light; leave it out")
         return stream_codes(source)
     if ppp is not None:
         return sensed(source, Illumination("quiver-physical", ppp, 3))[0]

@@ -1,10 +1,11 @@
-"""What a network was measured for: cells of sensor, bits and light, each with its PSNR and the best classical one.
+"""Describes what a network was measured for: cells of sensor, bits and light with the PSNR of network and best rival.
 
     weights file --`quiver domain`--> cells in its metadata;   stream, cells --`remark`--> nothing, or one line
 
-A stream belongs to the nearest cell in log light among those of the same kind of sensor, the same bits and about the
-same gain. Light is counted in detected photons: sensors of one kind share their cells whatever their efficiency.
-Read noise, dark counts and defects are not compared. Beyond the measured light, by more than NEAR, nothing is known.
+A stream belongs to the nearest cell in log light, among those of the same kind of sensor, the same bits and about the
+same gain. Light is counted in detected photons: sensors of one kind share their cells at any efficiency. Read noise,
+dark counts and defects are not compared. Streams whose light differs from the measured one by more than NEAR have no
+cell.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from quiver.data.noise import Noise
 
 FORMAT = "quiver-domain-1"
 KEY = "domain"  # of the metadata of a weights file
-NEAR = 1.25  # light and gain that differ by no larger factor count as the measured ones
+NEAR = 1.25  # light and gain within this factor of the measured ones count as equal
 MAX_CELLS = 10_000
 
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Where a stream lies: what decides how much its codes tell."""
+    """Where a stream lies: the quantities that decide how informative its codes are."""
 
     model: str  # of the sensor: QIS, BinarySPAD, CountingSPAD
     bits: int
@@ -37,7 +38,7 @@ class OperatingPoint:
     white: float  # detected photons at the top code
 
     def like(self, other: OperatingPoint) -> bool:
-        """Same kind and bits, and the same gain: either in photons, or in units of the light."""
+        """Return whether kind, bits and gain agree; the gain either in photons, or in units of the light."""
         if (self.model, self.bits) != (other.model, other.bits):
             return False
         relative = (self.white / self.light) / (other.white / other.light)
@@ -48,7 +49,7 @@ class OperatingPoint:
 class Cell:
     """One measurement: matched PSNR [dB], mean over clips."""
 
-    sensor: str  # that it was measured with
+    sensor: str  # used in the measurement
     ppp: float
     place: OperatingPoint
     network: float
@@ -57,27 +58,29 @@ class Cell:
 
     @property
     def wins(self) -> bool:
-        """Whether the network is at least as good as the best classical method."""
+        """Return whether the network is at least as good as the best classical method."""
         return self.network >= self.classical_psnr
 
     @property
     def name(self) -> str:
+        """Return the text of tables: `quiver-physical, 3 bit, 3.25 PPP`."""
         return f"{self.sensor}, {self.place.bits} bit, {self.ppp:g} PPP"
 
     @property
     def scores(self) -> str:
+        """Return both scores as text."""
         return f"{self.classical} {self.classical_psnr:.1f} dB, network {self.network:.1f} dB"
 
 
 @dataclass(frozen=True)
 class Domain:
-    """All cells of one weights file, and how they were measured."""
+    """All cells of one weights file, and the settings of their measurement."""
 
     cells: tuple[Cell, ...]
     measured: Mapping[str, Any]  # clips, frames, methods, seed, version: the same for all cells
 
     def nearest(self, place: OperatingPoint) -> Cell | None:
-        """The cell that speaks for a stream; None where nothing near was measured."""
+        """Return the cell of a stream; None if nothing near was measured."""
         like = [cell for cell in self.cells if cell.place.like(place)]
         if not like:
             return None
@@ -88,21 +91,21 @@ class Domain:
 
     @property
     def best_classical(self) -> str:
-        """The classical method that is best in most cells."""
+        """Return the classical method that is best in most cells."""
         names = [cell.classical for cell in self.cells]
         return max(dict.fromkeys(names), key=names.count)
 
     def to_json(self) -> str:
-        """As the metadata of a weights file hold it."""
+        """Return the text for the metadata of a weights file."""
         return json.dumps(self.to_dict(), sort_keys=True)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
+        """Return plain values, for JSON."""
         return {"format": FORMAT, "measured": dict(self.measured), "cells": [asdict(cell) for cell in self.cells]}
 
     @classmethod
     def from_json(cls, text: str) -> Domain:
-        """Inverse of `to_json`; strict, ValueError."""
+        """Return the inverse of `to_json`; strict, `ValueError`."""
         try:
             found = json.loads(text)
             if not isinstance(found, dict) or found.get("format") != FORMAT or not isinstance(found["measured"], dict):
@@ -127,22 +130,22 @@ def _cell(values: Mapping[str, Any]) -> Cell:
             value = getattr(part, field.name)
             good = isinstance(value, kinds[str(field.type)]) and not isinstance(value, bool)
             if not good or (isinstance(value, int | float) and not math.isfinite(value)):
-                raise ValueError(f"{field.name} = {repr(value)[:60]} cannot be")
+                raise ValueError(f"{field.name} = {repr(value)[:60]} is not valid")
     if not (cell.place.bits >= 1 and min(cell.ppp, cell.place.light, cell.place.white) > 0):
-        raise ValueError(f"a cell of {cell.place.bits} bit at {cell.ppp!r} photons cannot be")
+        raise ValueError(f"a cell of {cell.place.bits} bit at {cell.ppp!r} photons is not valid")
     return cell
 
 
 @dataclass(frozen=True)
 class Scope:
-    """What is known of a network: the cells that were measured, else what it was trained on."""
+    """The cells that were measured for a network, else the streams that it was trained on."""
 
     domain: Domain | None = None
     trained: tuple[Illumination, ...] = ()
 
 
 def read_scope(path: Path, metadata: Mapping[str, str]) -> Scope:
-    """The scope in the metadata of a weights file; ValueError if the domain in it is damaged."""
+    """Return the scope in the metadata of a weights file. `ValueError` if the domain in it is damaged."""
     text = metadata.get(KEY)
     try:
         domain = None if text is None else Domain.from_json(text)
@@ -152,7 +155,7 @@ def read_scope(path: Path, metadata: Mapping[str, str]) -> Scope:
 
 
 def _trained(text: str | None) -> tuple[Illumination, ...]:
-    """Sensors, bits and light of the settings that training leaves in a weights file; empty where they do not say."""
+    """Return sensors, bits and light of the training settings in a weights file; empty if they are missing."""
     try:
         settings = json.loads(text or "{}")
         if settings.get("noise"):
@@ -173,13 +176,13 @@ def _listed(value: Any) -> list[Any]:
 
 
 def place_of(sensor: Sensor, exposure: float, ppp: float) -> OperatingPoint:
-    """Where codes of a sensor lie that sees `ppp` photons per pixel and exposure [s]."""
+    """Return where codes of a sensor lie that receives `ppp` photons per pixel and exposure [s]."""
     efficiency = sensor.efficiency
     return OperatingPoint(type(sensor).__name__, sensor.bits, ppp * efficiency, sensor.white(exposure) * efficiency)
 
 
 def table(domain: Domain) -> list[str]:
-    """The cells as a Markdown table, the winner of each in bold."""
+    """Return the cells as a Markdown table, the winner of each in bold."""
     rows = []
     for cell in domain.cells:
         ours, theirs = f"{cell.network:.2f}", f"{cell.classical_psnr:.2f}"
@@ -189,6 +192,6 @@ def table(domain: Domain) -> list[str]:
 
 
 def merged(old: Iterable[Cell], new: Iterable[Cell]) -> tuple[Cell, ...]:
-    """Cells by sensor, bits and light; a new one takes the place of an old one."""
+    """Return cells by sensor, bits and light; a new one replaces an old one."""
     found = {(cell.sensor, cell.place.bits, cell.ppp): cell for cell in (*old, *new)}
     return tuple(found[key] for key in sorted(found))

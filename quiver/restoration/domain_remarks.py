@@ -1,4 +1,4 @@
-"""Remarks on networks that restore a stream outside of what they were measured for."""
+"""Writes remarks on networks that restore a stream outside of what they were measured for."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ LIGHT_FRAMES = 11  # from which the light of a stream is estimated where it is n
 
 
 def light_of(codes: Codes) -> float:
-    """Photons per pixel and code of a stream: as it says, else by the moment inverse or mean of its first frames."""
+    """Return the photons per pixel and code of a stream: stored, or estimated by the moment inverse or the mean."""
     if codes.ppp is not None and codes.ppp > 0:
         return float(codes.ppp)
     some = codes.read(0, min(LIGHT_FRAMES, codes.shape[0]))
     try:
         found = float(METHODS["moment"].restore(some, codes.sensor, codes.exposure).mean())
-    except ValueError:  # its codes tell no light
+    except ValueError:  # its codes do not determine the light
         found = float(METHODS["naive"].restore(some, codes.sensor, codes.exposure).mean())
     return max(found, 1e-9 * codes.white)
 
 
 def remark(name: str, scope: Scope, codes: Codes) -> str | None:
-    """One line where a network is outside of what it was measured for; None inside."""
+    """Return one line where a network is outside of what it was measured for; None inside."""
     ppp = light_of(codes)
     place = place_of(codes.sensor, codes.exposure, ppp)
     stream = f"{codes.sensor_name or place.model}, {place.bits} bit, {ppp:.3g} PPP"
@@ -36,18 +36,18 @@ def remark(name: str, scope: Scope, codes: Codes) -> str | None:
     cell = scope.domain.nearest(place)
     if cell is None:
         best = scope.domain.best_classical
-        return f"{name} was never measured near {stream}; {best} is mostly the best classical method where it was"
+        return f"{name} was never measured near {stream}; where it was, {best} is mostly the best classical method"
     return None if cell.wins else f"{name} is worse than {cell.classical} on {stream}: {cell.scores} at {cell.name}"
 
 
 def remarks(methods: Iterable[Restorer], codes: Codes) -> list[str]:
-    """The remarks on all networks among the methods."""
+    """Return the remarks on all networks among the methods."""
     found = (None if m.scope is None else remark(m.name, m.scope, codes) for m in methods)
     return [text for text in found if text is not None]
 
 
 def measured_at(method: Restorer, codes: Codes) -> str | None:
-    """For the curious: the measurement that speaks for a network on a stream; None where nothing does."""
+    """Return the measurement that is nearest to a stream, as a line for --verbose; None where there is none."""
     if method.scope is None or method.scope.domain is None:
         return None
     cell = method.scope.domain.nearest(place_of(codes.sensor, codes.exposure, light_of(codes)))
@@ -55,19 +55,19 @@ def measured_at(method: Restorer, codes: Codes) -> str | None:
 
 
 def refuse_outside(methods: Sequence[Restorer], found: Sequence[str]) -> None:
-    """What `strict` asks for: `ValueError` with the first remark, and where no method is a network."""
+    """Raise `ValueError` for `strict`: with the first remark, or where no method is a network."""
     if not any(method.learned for method in methods):
         names = ", ".join(method.name for method in methods)
         raise ValueError(f"strict: acts on networks, and {names} is classical; leave it out")
     if found:
-        raise ValueError(f"{found[0]}; without strict it runs all the same")
+        raise ValueError(f"{found[0]}; leave out strict to run it nevertheless")
 
 
 def _unmeasured(name: str, trained: Sequence[Illumination], codes: Codes, place: OperatingPoint, stream: str) -> str:
-    """Weights without cells: what they were trained on, and whether the stream is like that."""
+    """Return the remark on weights without cells: what they were trained on, and whether the stream is like that."""
     start = f"{name} was never measured against the classical methods"
     if not trained:
-        return f"{start}, and its file does not say what it was trained on; this stream is {stream}"
+        return f"{start}, and its file does not state what it was trained on; this stream is {stream}"
     words = ", ".join(dict.fromkeys(light.sensor for light in trained))
     depths = ", ".join(str(bits) for bits in sorted({light.bits for light in trained if light.bits is not None}))
     levels = ", ".join(f"{ppp:g}" for ppp in sorted({light.ppp for light in trained if light.ppp is not None}))
@@ -77,11 +77,11 @@ def _unmeasured(name: str, trained: Sequence[Illumination], codes: Codes, place:
 
 
 def _same(light: Illumination, codes: Codes, place: OperatingPoint) -> bool:
-    """Whether a stream lies where training was."""
+    """Return whether a stream lies where training was."""
     if light.ppp is None:
         return False
     try:
         seen = place_of(light.device(codes.exposure), codes.exposure, light.ppp)
-    except (ValueError, OSError):  # a sensor's file that is not here
+    except (ValueError, OSError):  # the sensor's file is missing
         return False
     return seen.like(place) and abs(math.log(seen.light / place.light)) <= math.log(NEAR)

@@ -1,4 +1,4 @@
-"""The interface of every restorer: how it runs, and what a table says about it."""
+"""Defines the interface of every restorer: how it runs, and its entries in a table."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ DEFAULT_METHOD = "nano"  # of `quiver restore` and `quiver.restore`
 DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory beside the weights
 MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/model/schedules.py
 
-RestoreInto = Callable[
-    [Codes, Array, int, Progress | None], None
-]  # adds photons of frames `first` ... to zeros [t, H, W]
+# Adds the photons of frames `first` ... to zeros [t, H, W]; called with (codes, zeros, first, progress)
+RestoreInto = Callable[[Codes, Array, int, Progress | None], None]
 
 
 @dataclass(frozen=True)
 class RestoreOptions:
     """How to run, not what to compute: apart from `mode` and `precision` the numbers agree to rounding.
 
-    A memory that holds no whole frame of a QUIVER network is the exception: a warning then says what it changed.
+    There is one exception: a QUIVER network whose complete frame exceeds the memory. A warning then states the
+    difference.
     """
 
     memory: int = DEFAULT_MEMORY  # bytes
-    mode: str = "exact"  # exact = the published windows; streaming = state carried on, faster; windows = recomputed
+    mode: str = "exact"  # exact = the published windows; streaming = state kept, faster; windows = recomputed
     device: str = "auto"  # auto, cpu, cuda
     precision: str = "float32"  # or bfloat16
 
@@ -39,12 +39,12 @@ class RestoreOptions:
         if self.precision not in ("float32", "bfloat16"):
             raise ValueError(f"precision {self.precision!r}; known are float32 and bfloat16")
         if self.memory < 1:
-            raise ValueError(f"memory is a number of bytes above 0, got {self.memory}")
+            raise ValueError(f"memory is in bytes and above 0, got {self.memory}")
 
 
 @dataclass(frozen=True)
 class Restorer:
-    """A method ready to run, and what a table says about it."""
+    """A method that is ready to run, and its entries in a table."""
 
     name: str
     window: int  # frames used for one restored frame
@@ -52,13 +52,13 @@ class Restorer:
     learned: bool
     description: str
     fill: RestoreInto
-    seamless: bool = True  # a range of frames restored alone equals that part of the whole
+    seamless: bool = True  # a range of frames restored alone equals the same frames of the complete stream
     identity: Mapping[str, object] = field(default_factory=dict)  # settings and weights that change the answer
-    cut: Callable[[int, int], str] = lambda height, width: ""  # of a frame, where it changes the answer
-    scope: Scope | None = None  # of a network: what it was measured for or trained on; None: not known
+    cut: Callable[[int, int], str] = lambda height, width: ""  # tiles of a frame, where they change the answer
+    scope: Scope | None = None  # of a network: the streams that it was measured for or trained on; None: not known
 
     def restore(self, codes: Codes, first: int = 0, last: int | None = None, progress: Progress | None = None) -> Array:
-        """Restored photons float32 [last - first, H, W] of frames first ... last - 1, all of them by default."""
+        """Return photons, float32 [last - first, H, W], of frames first ... last - 1; of all frames by default."""
         length, height, width = codes.shape
         out = np.zeros(((length if last is None else last) - first, height, width), np.float32)
         self.fill(codes, out, first, progress)

@@ -1,4 +1,4 @@
-"""Networks as restorers: tile by tile where a frame takes more than the memory bound (pieces.py)."""
+"""Runs networks as restorers, tile by tile where a frame exceeds the memory bound (pieces.py)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CONTEXT = 5  # frames that a network needs before and after the one it restores
 
 
 def network_restorer(path: Path, options: RestoreOptions) -> Restorer:
-    """The network stored in a weights file; a training run is named after its folder."""
+    """Return the network of a weights file; a training run is named after its folder."""
     from quiver.model.weights import load, metadata_of
     from quiver.restoration.domain import read_scope
 
@@ -40,7 +40,7 @@ def network_restorer(path: Path, options: RestoreOptions) -> Restorer:
 
 
 def network_title(model: nn.Module) -> str:
-    """What a network is, for people: `nano (U-Net on aligned frames)`, `QUIVER (quiver-s)`, `U-Net`."""
+    """Return a title for people: `nano (U-Net on aligned frames)`, `QUIVER (quiver-s)`, `U-Net`."""
     from quiver.model.folded import FoldedQUIVER
     from quiver.model.presets import PRESETS
     from quiver.model.quiver import QUIVER
@@ -57,11 +57,11 @@ def network_title(model: nn.Module) -> str:
 def wrap_network(
     model: nn.Module, name: str, description: str, options: RestoreOptions, weights_sha256: str | None = None
 ) -> Restorer:
-    """A network as a method; the checksum is that of its weights file."""
+    """Return a network as a method; the checksum is that of its weights file."""
     from quiver.model.blocks import RADIUS, WINDOW
     from quiver.model.quiver import QUIVER
 
-    mode = options.mode if isinstance(model, QUIVER) else "windows"  # others share no work between frames
+    mode = options.mode if isinstance(model, QUIVER) else "windows"  # other networks share no work between frames
     model.to(pick_device(options.device)).eval()
 
     def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
@@ -76,7 +76,7 @@ def wrap_network(
 
 
 def pick_device(wanted: str) -> str:
-    """`auto` is CUDA where there is one."""
+    """Return `cpu` or `cuda`; `auto` is CUDA where there is one."""
     import torch
 
     if wanted == "auto":
@@ -89,9 +89,9 @@ def pick_device(wanted: str) -> str:
 def fill_network(
     model: nn.Module, codes: Codes, out: Array, first: int, options: RestoreOptions, progress: Progress | None
 ) -> None:
-    """Restore tile by tile, frame by frame; `out` must be zero and collects the weighted tiles.
+    """Restore tile by tile and frame by frame; `out` [t, H, W] must be zero and collects the weighted tiles.
 
-    A warning says by how much tiles differ where a frame is cut in a way that changes the answer (see pieces.py).
+    Where a cut changes the answer (pieces.py), a warning states by how much neighbouring tiles differ.
     """
     import torch
 
@@ -120,9 +120,9 @@ def fill_network(
                     progress(done, len(out) * len(pieces.tiles))
     if not pieces.exact:  # tiles that agree may still differ from the whole frame
         rms, most = apart.measured()
-        more = f"; --memory {-(-pieces.needed // 10**6)}MB restores it whole" if pieces.needed else ""
+        more = f"; --memory {-(-pieces.needed // 10**6)}MB avoids the cut" if pieces.needed else ""
         warnings.warn(
-            f"{codes.name}: {options.memory / 1e6:.0f} MB hold no frame of {height} x {width} px; cut into "
+            f"{codes.name}: {options.memory / 1e6:.0f} MB hold no frame of {height} x {width} px; it is cut into "
             f"{pieces.text}, which differ where they overlap by {100 * rms:.2g} % of white rms, {100 * most:.2g} % at "
             f"most{more}",
             stacklevel=2,
@@ -130,12 +130,15 @@ def fill_network(
 
 
 def padded_frames(codes: Codes, part: tuple[slice, slice], first: int, count: int) -> Iterator[Tensor]:
-    """Frames first-5 ... first+count+4 (reflected at the ends of the stream) as networks see them, [1, 1, h, w]."""
+    """Yield frames first-5 ... first+count+4 as input of networks, [1, 1, h, w], codes / (2^b - 1).
+
+    Frames beyond the ends of the stream are reflections.
+    """
     import torch
 
     length, height, width = codes.shape
     top = codes.sensor.levels - 1
-    step = max(1, BLOCK_PIXELS // (height * width))  # reading, and drawing, is quicker by the block
+    step = max(1, BLOCK_PIXELS // (height * width))  # blocks are read, and drawn, faster than frames
 
     @lru_cache(maxsize=2)
     def block(i: int) -> Array:
@@ -147,7 +150,7 @@ def padded_frames(codes: Codes, part: tuple[slice, slice], first: int, count: in
 
 
 def pad_space(frame: Tensor, multiple: int) -> Tensor:
-    """[1, 1, h, w] continued to the right and down by its last pixels, up to multiples of `multiple`."""
+    """Return a frame [1, 1, h, w] padded to the right and below by its last pixels, to multiples of `multiple`."""
     import torch.nn.functional as functional
 
     height, width = frame.shape[-2:]
@@ -155,7 +158,7 @@ def pad_space(frame: Tensor, multiple: int) -> Tensor:
 
 
 def pictures(model: nn.Module, frames: Iterable[Tensor], mode: str) -> Iterator[Tensor]:
-    """Restored frames [1, 1, h, w], one for each frame that has five before and five after it."""
+    """Yield restored frames [1, 1, h, w]: one for each frame that has five frames before and five after it."""
     from quiver.model import schedules
     from quiver.model.quiver import QUIVER
 

@@ -1,9 +1,9 @@
-"""What of a frame is computed at a time, so that a network stays within a memory bound without another answer.
+"""Decides how much of a frame a network computes at a time, so that the memory bound holds and the answer stays.
 
-A U-Net sees 36 px far: tiles that overlap by twice as much give what the whole frame gives. QUIVER's attention and
-gates average over the frame, and its recurrence carries far: it takes the frame whole, and only the initial estimate of
-a FoldedQUIVER, which needs the most memory, runs tile by tile. A frame too large even for that is cut into tiles that
-are blended. These do see less: `fill_network` measures by how much they disagree, and warns.
+A U-Net has a reach of 36 px: tiles that overlap by twice as much give the result of the complete frame. The attention
+and the gates of QUIVER average over the frame, and its recurrence reaches far: it takes the complete frame. Only the
+initial estimate of a FoldedQUIVER, which needs the most memory, runs tile by tile. A frame too large even for that is
+cut into tiles that are blended. Their result differs: `fill_network` measures by how much, and warns.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from quiver.tiles import Tile, cut_tiles
 if TYPE_CHECKING:
     from torch import nn
 
-BLENDED = 32  # px: half of what neighbouring tiles share where no overlap makes them exact
-STARTING = 60_000_000  # bytes that torch takes for its kernels when it is used first
+BLENDED = 32  # px: half of the overlap of neighbouring tiles where no overlap makes them exact
+STARTING = 60_000_000  # bytes that torch takes for its kernels at first use
 ESTIMATE_BYTES = 1_200  # per pixel of an initial estimate of width 32; 930 measured
-COUNTS = 0.1  # weight from which a tile's answer is compared with its neighbours'
+COUNTS = 0.1  # weight from which the result of a tile is compared with its neighbours
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """How a frame is cut."""
+    """The cut of a frame."""
 
     tiles: list[Tile]
-    estimate_pixels: int | None = None  # that the initial estimate takes at a time; None: the whole tile
-    exact: bool = True  # whether the answer is that of the whole frame
-    needed: int = 0  # bytes, about, with which it would be
+    estimate_pixels: int | None = None  # of the initial estimate at a time; None: the complete tile
+    exact: bool = True  # whether the answer is that of the complete frame
+    needed: int = 0  # bytes, about, for an exact cut; 0 for an exact one
 
     @property
     def text(self) -> str:
-        """The cut that changes the answer; empty if it does not."""
+        """Return the tiles of a cut that changes the answer; empty for one that does not."""
         if self.exact:
             return ""
         tallest, widest = (max(tile.weight.shape[axis] for tile in self.tiles) for axis in (0, 1))
@@ -44,7 +44,7 @@ class Pieces:
 
 
 def cut_pieces(model: nn.Module, height: int, width: int, memory: int, mode: str) -> Pieces:
-    """The cut of a frame for a network and so many bytes; `ValueError` if they hold not even a small tile."""
+    """Return the cut of a frame for a network and `memory` bytes. `ValueError` if they do not hold a small tile."""
     from quiver.model.folded import FoldedQUIVER
     from quiver.model.quiver import QUIVER
     from quiver.model.unet import SmallUNet
@@ -72,7 +72,9 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int, mode: str
 
 
 def bytes_per_pixel(model: nn.Module, mode: str) -> int:
-    """Working memory of a network per pixel of the tile, float32, about 1.5 times of what `quiver bench` measured."""
+    """Return the working memory of a network per pixel of a tile, float32: about 1.5 times of what `quiver bench`
+    measured.
+    """
     from quiver.model.folded import FoldedQUIVER
     from quiver.model.quiver import QUIVER
 
@@ -86,7 +88,7 @@ def bytes_per_pixel(model: nn.Module, mode: str) -> int:
 
 
 def frame_bytes(model: nn.Module, mode: str) -> int:
-    """Working memory per pixel of a FoldedQUIVER beside its initial estimate; nano: 1338, measured 1030."""
+    """Return the working memory per pixel of a FoldedQUIVER beside its initial estimate; nano: 1338, measured 1030."""
     from quiver.model.folded import FoldedQUIVER
 
     assert isinstance(model, FoldedQUIVER)
@@ -96,7 +98,7 @@ def frame_bytes(model: nn.Module, mode: str) -> int:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """The least and the largest that tiles gave for a pixel, [H, W], where two or more of them count."""
+    """The least and the largest value of a pixel, [H, W] each, where two or more tiles count."""
 
     low: Array
     high: Array
@@ -104,11 +106,12 @@ class Disagreement:
 
     @classmethod
     def nothing(cls, height: int, width: int) -> Disagreement:
+        """Return the record of a frame before any tile."""
         shape = (height, width)
         return cls(np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32), np.zeros(shape, np.uint8))
 
     def add(self, tile: Tile, restored: Array) -> None:
-        """Take note of what a tile gave, [h, w], where its weight is at least COUNTS."""
+        """Add the result of a tile, [h, w], where its weight is at least COUNTS."""
         part = (slice(tile.y, tile.y + restored.shape[0]), slice(tile.x, tile.x + restored.shape[1]))
         counts = tile.weight >= COUNTS
         np.minimum(self.low[part], restored, out=self.low[part], where=counts)
@@ -116,6 +119,6 @@ class Disagreement:
         self.times[part] += counts
 
     def measured(self) -> tuple[float, float]:
-        """Root mean square and largest difference; zeros where no pixel was seen twice."""
+        """Return the root mean square and the largest difference; zeros where no pixel lies in two tiles."""
         apart = (self.high - self.low)[self.times > 1]
         return (float(np.sqrt(np.mean(apart**2))), float(apart.max())) if apart.size else (0.0, 0.0)

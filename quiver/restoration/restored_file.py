@@ -1,9 +1,10 @@
-"""Restored video as a file: made on disk block by block, resumable, whole or absent, by one writer at a time.
+"""Writes restored video to a file, block by block: resumable, complete or absent, by one writer at a time.
 
-PATH.npy.part, PATH.npy.part.json  ->  PATH.npy (float32 photons [T, H, W]) and PATH.json
-PATH.npy.lock                          held while a process writes
+    PATH.npy.part, PATH.npy.part.json  ->  PATH.npy (float32 photons [T, H, W]) and PATH.json
+    PATH.npy.lock                          held while a process writes
 
-The space is taken before the work begins: a full disk is an error then, and the memory map cannot meet it later.
+The disk space is reserved before the work begins. So a full disk is an error at the start, not a fault in the memory
+map.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from quiver.data.codes import Codes
 from quiver.restoration.interface import Restorer
 
 FORMAT = "quiver-restored-1"
-BLOCK_FRAMES = 256  # restored between two notes of how far a file has come
-WHAT_CHANGED = {  # key of the description -> what it is called where it is why a restoration starts again
+BLOCK_FRAMES = 256  # restored between two entries of the journal
+WHAT_CHANGED = {  # key of the description -> its name in the message that a restoration starts again
     "codes_sha256": "the codes",
     "method": "the method",
     "description": "the method",
@@ -47,13 +48,15 @@ def restore_to_file(
     note: Callable[[str], None] | None = None,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Restore a stream into PATH.npy (float32 photons [T, H, W]) and PATH.json; both appear when whole, the json last.
+    """Restore a stream into PATH.npy (float32 photons [T, H, W]) and PATH.json; return the content of the json.
 
-    Returns what the json says. Works on disk, BLOCK_FRAMES at a time, in PATH.npy.part: an interrupted restoration of
-    the same codes by the same method that has finished a block is resumed; one of others starts again, and `note` is
-    told why. `threads` is noted in the description. A failure leaves nothing behind. A link is followed. `ValueError`
-    while another process writes PATH, `FileExistsError` if a result is there and `force` is not set, or if what is
-    there is no restored video.
+    Both appear when complete, the json last. Until then the video is PATH.npy.part, written in blocks of BLOCK_FRAMES.
+    An interrupted restoration of the same codes by the same method resumes after its last block. If codes or method
+    differ, it starts again and `note` receives the reason. `threads` is recorded in the description. A failure leaves
+    nothing behind. A link is followed.
+
+    `ValueError` while another process writes PATH. `FileExistsError` if there is a result and `force` is not set, or a
+    file that is not restored video.
     """
     path = path.resolve()
     part, journal = path.with_name(path.name + ".part"), path.with_name(path.name + ".part.json")
@@ -79,7 +82,7 @@ def restore_to_file(
             seconds = _fill_file(codes, method, part, journal, meta, progress, note, threads)
             meta |= {"seconds_per_frame": seconds / codes.shape[0], "threads": threads, "sha256": sha256(part)}
             meta = sealed(meta)
-            write_json(journal, meta)  # takes its space before anything is replaced
+            write_json(journal, meta)  # takes its disk space before anything is replaced
         except BaseException as error:
             if isinstance(error, Exception) or not journal.exists():
                 part.unlink(missing_ok=True)
@@ -96,7 +99,7 @@ def restore_to_file(
 
 @contextlib.contextmanager
 def _only_writer(path: Path) -> Iterator[None]:
-    """Hold PATH.npy.lock, which is deleted at the end; `ValueError` if another process holds it."""
+    """Hold PATH.npy.lock and delete it at the end. `ValueError` if another process holds it."""
     lock = Lock(path.with_name(path.name + ".lock"))
     if not lock.acquire():
         raise ValueError(f"{path}: another process is writing this video; wait for it, or name another with -o")
@@ -107,7 +110,7 @@ def _only_writer(path: Path) -> Iterator[None]:
 
 
 def _finish_naming(path: Path, part: Path, journal: Path) -> None:
-    """Give the description its name if a writer was killed between naming the video and that."""
+    """Rename the description if a writer was killed after it renamed the video."""
     if journal.exists() and path.exists() and not (part.exists() or path.with_suffix(".json").exists()):
         with contextlib.suppress(ValueError):
             if "seconds_per_frame" in read_json(journal):
@@ -115,7 +118,7 @@ def _finish_naming(path: Path, part: Path, journal: Path) -> None:
 
 
 def _check_target(path: Path, force: bool) -> None:
-    """`FileExistsError` if a result is there and may not be replaced."""
+    """Raise `FileExistsError` if there is a result that may not be replaced."""
     if path.is_dir():
         raise FileExistsError(f"{path}: is a folder; name a file with -o")
     for file in (path, path.with_suffix(".json")):
@@ -123,7 +126,9 @@ def _check_target(path: Path, force: bool) -> None:
             raise FileExistsError(f"{file}: exists; name another with -o, or use --force to replace it")
     description = path.with_suffix(".json")
     if description.exists() and read_json(description).get("format") != FORMAT:
-        raise FileExistsError(f"{description}: describes no restored video, which is all that --force replaces")
+        raise FileExistsError(
+            f"{description}: does not describe restored video, and --force replaces nothing else; name another with -o"
+        )
 
 
 def _fill_file(
@@ -136,18 +141,18 @@ def _fill_file(
     note: Callable[[str], None] | None,
     threads: int | None,
 ) -> float:
-    """Restore what is missing of PART, block by block, noting each in JOURNAL; the seconds it took, all in all."""
+    """Restore the missing frames of PART, record each block in JOURNAL, and return the seconds of all blocks."""
     length = codes.shape[0]
     done, seconds, why = _done(part, journal, meta)
     if why and note is not None:
-        note(f"{part}: holds a restoration that was interrupted, but {why}; starting again")
+        note(f"{part}: holds an interrupted restoration, but {why}; starting again")
     if not done:
         journal.unlink(missing_ok=True)
         _reserve(part, codes.shape)
     out = np.lib.format.open_memmap(part, mode="r+")
     for first in range(done, length, BLOCK_FRAMES if method.seamless else length):
         block = out[first : first + BLOCK_FRAMES if method.seamless else length]
-        block[:] = 0  # an interrupted block may have left something
+        block[:] = 0  # an interrupted block may be partly written
         started = time.perf_counter()
         method.fill(codes, block, first, _shifted(progress, first, length, len(block)))
         check_finite(block, method.name, first)
@@ -160,7 +165,7 @@ def _fill_file(
 
 
 def _reserve(part: Path, shape: tuple[int, int, int]) -> None:
-    """A new .npy of float32 [T, H, W] whose space on the disk is taken; `OSError` if there is not enough."""
+    """Create a .npy of float32 [T, H, W] and reserve its disk space. `OSError` if there is not enough."""
     with open(part, "wb") as file:
         header = {"descr": np.lib.format.dtype_to_descr(np.dtype(np.float32)), "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)
@@ -169,21 +174,19 @@ def _reserve(part: Path, shape: tuple[int, int, int]) -> None:
 
 
 def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, str]:
-    """Frames that an interrupted restoration of the same thing has finished, the seconds they took, and, where there
-    is one that cannot be resumed, why.
-    """
+    """Return the finished frames and seconds of an interrupted restoration, and why it cannot be resumed, if so."""
     if not (part.exists() and journal.exists()):
         return 0, 0.0, ""
     try:
         found = read_json(journal)
-        found.pop("threads", None)  # numbers agree to rounding whatever it is
+        found.pop("threads", None)  # numbers agree to rounding for any number
         done, seconds = int(found.pop("done", 0)), float(found.pop("seconds", 0.0))
         for key in ("sha256", "checksum"):
             found.pop(key, None)
-        if "seconds_per_frame" in found:  # whole: killed before it was given its name
+        if "seconds_per_frame" in found:  # complete: killed before the rename
             done, seconds = meta["shape"][0], meta["shape"][0] * float(found.pop("seconds_per_frame"))
     except (ValueError, TypeError) as error:
-        return 0, 0.0, f"its notes are damaged ({error})"
+        return 0, 0.0, f"its journal is damaged ({error})"
     changed = [key for key in meta if found.get(key) != meta[key]]
     if not changed and found.keys() == meta.keys():
         return done, seconds, ""
@@ -192,14 +195,14 @@ def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, 
 
 
 def _shifted(progress: Progress | None, first: int, length: int, block: int) -> Progress | None:
-    """Progress of a block as progress of the whole, in frames."""
+    """Return the progress of a block as progress of the complete stream, in frames."""
     if progress is None:
         return None
     return lambda done, total: progress(first + done * block // total, length)
 
 
 def check_finite(restored: Array, name: str, first: int = 0) -> None:
-    """ValueError naming the first frame with a value that is not finite; `first` is the number of the first one."""
+    """Raise `ValueError` with the first frame that holds a NaN or Inf; frames are numbered from `first`."""
     for t, frame in enumerate(restored, start=first):
         if not np.isfinite(frame).all():
             raise ValueError(f"{name}: restored frame {t} holds NaN or Inf; are the weights damaged?")

@@ -1,10 +1,10 @@
-"""Restoring streams of any length and size, with any method, in bounded memory.
+"""Finds restorers by name, and runs classical methods in blocks of frames that fit the memory.
 
     codes [T, H, W] -> restored photons [T, H, W], float32
 
-Edges are padded inside: time by reflection, so that every frame is restored; space by repetition up to the multiple the
-network needs. Where a frame takes more than the memory bound, less of it is computed at a time (pieces.py). No ground
-truth is needed. `restorer(NAME)` finds a classical method, shipped weights, a weights file or a training folder.
+Restorers pad edges themselves: time by reflection, so that every frame is restored; space by repetition up to the
+multiple that a network needs. Where a frame exceeds the memory bound, less of it is computed at a time (pieces.py). No
+ground truth is needed. `restorer(NAME)` finds a classical method, shipped weights, a weights file or a training folder.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from numpy import ndarray as Array
 
@@ -25,18 +24,16 @@ from quiver.data.codes import Codes
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 
-if TYPE_CHECKING:
-    pass
-
 PRETRAINED = Path(__file__).parents[1] / "pretrained"  # weights that ship with the package
 FRAME_BYTES = 16  # per pixel and frame that a classical method holds: codes and video
-BLOCK_FRAMES = 32  # that a classical method restores between two reports of progress, at most
+BLOCK_FRAMES = 32  # at most, of a classical method between two reports of progress
 
 
 def restorer(name: str, options: RestoreOptions | None = None) -> Restorer:
-    """A method by name, shipped preset, weights file or training folder; ValueError or FileNotFoundError otherwise.
+    """Return a method by name: classical, shipped weights, weights file or training folder.
 
-    A classical method may be followed by its window in frames, as in `moment:5`.
+    A classical method may be followed by its window in frames, as in `moment:5`. `ValueError` or `FileNotFoundError`
+    for another name.
     """
     options = options or RestoreOptions()
     base, _, window = name.partition(":")
@@ -62,19 +59,19 @@ def restorer(name: str, options: RestoreOptions | None = None) -> Restorer:
 
 
 def shipped_names() -> list[str]:
-    """Networks whose weights come with the package."""
+    """Return the networks whose weights come with the package."""
     return sorted(file.stem for file in PRETRAINED.glob("*.safetensors"))
 
 
 def method_names() -> list[str]:
-    """Every method that needs no training: the classical ones and the shipped networks."""
+    """Return every method that needs no training: the classical ones and the shipped networks."""
     return [*METHODS, *shipped_names()]
 
 
 def restorers(names: Sequence[str], options: RestoreOptions | None = None) -> list[Restorer]:
-    """Several methods for one table; `all` stands for every method that needs no training.
+    """Return several methods for one table; `all` stands for every method that needs no training.
 
-    ValueError as for `restorer`, and where two of them would go by one name.
+    `ValueError` as for `restorer`, and where two methods would have one name.
     """
     expanded = [one for name in names for one in (method_names() if name == "all" else (name,))]
     found: dict[str, str] = {}
@@ -91,7 +88,7 @@ def restorers(names: Sequence[str], options: RestoreOptions | None = None) -> li
 
 
 def weights_path(name: str) -> Path:
-    """The weights file meant by the name of a shipped preset, a file or a training folder."""
+    """Return the weights file of a shipped preset, a file or a training folder."""
     path, shipped = Path(name), shipped_names()
     if name in shipped:
         return PRETRAINED / f"{name}.safetensors"
@@ -102,7 +99,7 @@ def weights_path(name: str) -> Path:
     if (path / "best.safetensors").is_file():
         return path / "best.safetensors"
     if (path / "settings.json").is_file():
-        raise FileNotFoundError(f"{path}: a training run without best.safetensors; has it validated yet?")
+        raise FileNotFoundError(f"{path}: a training run without best.safetensors; continue it until it has validated")
     raise ValueError(
         f"no method {name!r}{suggest(name, method_names())}; known are {', '.join(method_names())}, a "
         ".safetensors file, and a folder of `quiver train`"
@@ -118,9 +115,9 @@ def fill_classical(
     free: int,
     progress: Progress | None,
 ) -> None:
-    """Run a classical method over blocks of frames that `free` bytes hold, with the frames around them that it needs.
+    """Run a classical method on blocks of frames that `free` bytes hold, together with the frames around them.
 
-    Frames are taken whole: what memory there is changes no answer.
+    Frames are not cut: the memory changes no answer.
     """
     length, height, width = codes.shape
     last = first + len(out)

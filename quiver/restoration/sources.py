@@ -1,6 +1,6 @@
-"""What a path and the options of a command mean together: codes to restore, and refusals of options that cannot act.
+"""Finds the codes that a path and the options of a command mean, and refuses options that have no effect.
 
-An option is None until it is given. One that would be ignored for this input is a `ValueError` that says why.
+An option is None until it is given. An option that would be ignored for this input is a `ValueError` with the reason.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from quiver.data.photon_cubes import cube_codes
 if TYPE_CHECKING:
     from quiver.restoration.interface import Restorer
 
-BARE = ("width", "planes", "frame_rate")  # facts that only a bare array does not know
+BARE = ("width", "planes", "frame_rate")  # missing in a bare array only
 LIGHT = ("sensor", "ppp", "bits", "seed")
 FRAME_RATE = 2000.0  # codes per second of a bare array
 
 
 def refuse(args: argparse.Namespace, names: Sequence[str], why: str) -> None:
-    """`ValueError` that names the first of these options that was given, and why it cannot act."""
+    """Raise `ValueError` with the first of these options that was given, and the reason why it has no effect."""
     for name in names:
         if getattr(args, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')}: {why}; leave it out")
 
 
 def refuse_idle(asked: Mapping[str, Any], methods: Sequence[Restorer]) -> None:
-    """`ValueError` for an asked mode, precision or device that none of the methods runs with."""
+    """Raise `ValueError` for a mode, precision or device that none of the methods uses."""
     names = ", ".join(method.name for method in methods)
     for option in ("mode", "precision", "device"):
         value = asked.get(option)
@@ -44,20 +44,22 @@ def refuse_idle(asked: Mapping[str, Any], methods: Sequence[Restorer]) -> None:
 
 
 def codes_to_restore(args: argparse.Namespace) -> Codes:
-    """The codes of `quiver restore`: a stored stream, a clip that is sensed now, or a bare array."""
+    """Return the codes of `quiver restore`: a stored stream, a clip that is sensed now, or a bare array."""
     path: Path = args.source
     if path.is_dir():
         return _of_clip(path, args)
     if path.with_name(f"{path.name}.part").is_dir() and not path.exists():
-        open_clips(path)  # which says that it is unfinished
+        open_clips(path)  # raises: the clip is unfinished
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if path.suffix not in (".npy", ".json"):
-        raise ValueError(f"{path}: no stream, clip folder or .npy array; `qsim convert` makes a clip of other files")
+        raise ValueError(
+            f"{path}: not a stream, a clip folder or a .npy array; `qsim convert` makes a clip of other files"
+        )
     refuse(args, ["stream"], f"names a stream of a clip, and {path} is a file")
     if path.with_suffix(".json").is_file():
         stream = open_stream(path)
-        refuse(args, (*LIGHT, *BARE), f"{path} is a stored stream, which knows its own (see its .json)")
+        refuse(args, (*LIGHT, *BARE), f"{path} is a stored stream, which has its own (see its .json)")
         return stream_codes(stream)
     return _of_array(path, args)
 
@@ -66,7 +68,7 @@ def _of_clip(path: Path, args: argparse.Namespace) -> Codes:
     clips = open_clips(path)
     if not (path / "clip.json").exists():
         one = f", as in {clips[0].path}" if clips else "; none is finished yet"
-        raise ValueError(f"{path}: is a data set; name one of its clips{one}")
+        raise ValueError(f"{path}: is a data set; give one of its clips{one}")
     clip: Clip = clips[0]
     refuse(args, BARE, f"describes a bare array, and {path} is a clip")
     if args.ppp is None and args.stream is None and len(clip.streams) != 1:
@@ -75,16 +77,16 @@ def _of_clip(path: Path, args: argparse.Namespace) -> Codes:
     if args.stream is not None or args.ppp is None:
         stream = clip.stream(args.stream or clip.streams[0])
         now = "" if args.stream else ", or sense the clip now with --ppp"
-        refuse(args, LIGHT, f"{stream.path} is a stored stream, which knows its own{now}")
+        refuse(args, LIGHT, f"{stream.path} is a stored stream, which has its own{now}")
         return stream_codes(stream)
     return sensed(clip, Illumination(_sensor(args), args.ppp, _bits(args)), args.seed or 0)[0]
 
 
 def _of_array(path: Path, args: argparse.Namespace) -> Codes:
     sensor = _sensor(args)
-    refuse(args, ["seed"], f"is of noise that is drawn, and {path} holds codes already")
+    refuse(args, ["seed"], f"is for noise that is drawn, and {path} holds codes already")
     if not follows_light(sensor):
-        refuse(args, ["ppp"], f"the codes are there already, and the gain of {sensor} does not follow the light")
+        refuse(args, ["ppp"], f"{path} holds codes already, and the gain of {sensor} does not follow the light")
     light = Illumination(sensor, args.ppp, args.bits if args.width is not None else _bits(args))
     if args.output.resolve() == path.resolve():
         raise ValueError(f"{path}: would be replaced by what is made from it; name another with -o")
@@ -96,12 +98,12 @@ def _sensor(args: argparse.Namespace) -> str:
 
 
 def _bits(args: argparse.Namespace) -> int | None:
-    """Bits per code: as asked, else those that a sensor's file states, else 3."""
+    """Return the bits per code: as given, else those of a sensor's file, else 3."""
     return args.bits or (None if _sensor(args).endswith(".toml") else 3)
 
 
 def assumed(codes: Codes, method: Restorer) -> str:
-    """One line with everything that a restoration took for granted."""
+    """Return one line with everything that a restoration assumes."""
     length, height, width = codes.shape
     sensor = codes.sensor_name or type(codes.sensor).__name__
     light = "" if codes.ppp is None else f", {codes.ppp:.4g} photons/pixel"

@@ -106,7 +106,7 @@ MISTAKES = [
     ("quiver restore lit -o x --ppp 3", "x: restored video is written as .npy; name a file that ends so"),
     ("qsim render lit -o x", "lit: is a clip, made from a scene already"),
     ("qsim render raises.py -o x", "raises.py:2: ZeroDivisionError: division by zero"),
-    ("quiver restore text.txt -o x.npy", "text.txt: no stream, clip folder or .npy array"),
+    ("quiver restore text.txt -o x.npy", "text.txt: not a stream, a clip folder or a .npy array"),
     # Recipes
     ("qsim generate none.toml", "none.toml: no such recipe"),
     ("qsim generate bad.toml -o x", "bad.toml:1: not valid TOML"),
@@ -173,7 +173,7 @@ MISTAKES = [
     ("quiver restore lit -o x.npy --method moment", "lit: choose one of its streams with --stream (none), or sense"),
     (
         "quiver restore data/clips/fan_0000 -o x.npy --stream quiver-physical_3bit_3.25ppp --bits 1",
-        "--bits: data/clips/fan_0000/streams/quiver-physical_3bit_3.25ppp.npy is a stored stream, which knows its own",
+        "--bits: data/clips/fan_0000/streams/quiver-physical_3bit_3.25ppp.npy is a stored stream, which has its own",
     ),
     ("quiver restore codes.npy -o x.npy --width 10 --planes 5", "sums 2^b - 1 binary planes, got 5; use 3 or 7"),
     ("quiver restore codes.npy -o x.npy --seed 1", "--seed: is of noise that is drawn, and codes.npy holds codes"),

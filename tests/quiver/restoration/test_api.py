@@ -52,5 +52,5 @@ def test_the_command_and_the_call_have_one_default_method(inputs, tmp_path):
 def test_the_call_refuses_what_it_would_ignore(inputs, changes, message):
     with pytest.raises(ValueError, match=message):
         quiver.restore(inputs["clip"], "moment", **changes)
-    with pytest.raises(ValueError, match="a stream knows its light"):
+    with pytest.raises(ValueError, match="a stream has its own light"):
         quiver.restore(inputs["stream"], "moment", ppp=3.0)

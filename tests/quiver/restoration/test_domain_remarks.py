@@ -61,7 +61,7 @@ def test_weights_without_cells_say_what_they_were_trained_on(tmp_path):
         "(quiver-physical, 3 bit, 3.25 PPP)"
     )
     assert "it was trained on quiver-physical, 1, 3 bit, 3.25, 9.75 PPP, this stream is spad512s, 1 bit" in str(other)
-    assert "does not say what it was trained on" in str(domain_remarks.remark("old", Scope(), stream()))
+    assert "does not state what it was trained on" in str(domain_remarks.remark("old", Scope(), stream()))
     own = Noise("mine.toml", 2.0, 1, record=json.dumps(devices.load("spad512s", bits=1).to_dict()), lux=None)
     path = weights(tmp_path, settings={"sensor": None, "noise": [own.to_dict(), Noise().to_dict()]})
     scope = domain.read_scope(path, metadata_of(path))

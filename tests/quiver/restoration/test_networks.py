@@ -108,7 +108,7 @@ def test_modes_of_the_network():
     [
         ({"mode": "fast"}, "mode 'fast'; known are exact, streaming, windows"),
         ({"precision": "float16"}, "precision 'float16'"),
-        ({"memory": 0}, "memory is a number of bytes"),
+        ({"memory": 0}, "memory is in bytes and above 0"),
     ],
 )
 def test_bad_options_are_named(changes, message):

@@ -151,7 +151,7 @@ def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path):
     whole = quiet(network_restorer(path, RestoreOptions(memory=10**10)), codes)
     found = float(np.sqrt(np.mean((np.load(tmp_path / "r.npy") - whole) ** 2))) / codes.white
     assert 0 < found < 10 * said
-    needed = int(re.search(r"--memory (\d+)MB restores it whole", text)[1]) * 10**6  # type: ignore[index]
+    needed = int(re.search(r"--memory (\d+)MB avoids the cut", text)[1]) * 10**6  # type: ignore[index]
     assert cut_pieces(network, 104, 120, needed, "exact").exact
 
 

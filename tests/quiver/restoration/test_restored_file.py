@@ -227,7 +227,7 @@ def test_force_replaces_restored_video_only(tmp_path, make_clip, capsys):
     held = {path: path.read_bytes() for path in (stream.path, stream.path.with_suffix(".json"), tmp_path / "a.npy")}
     words = ["--method", "naive", "--force"]
     assert main(["restore", str(stream.path), "-o", str(stream.path), *words]) == 2
-    assert "describes no restored video" in capsys.readouterr().err
+    assert "does not describe restored video" in capsys.readouterr().err
     array = ["restore", str(tmp_path / "a.npy"), "--sensor", "quiver-paper"]
     assert main([*array, "-o", str(tmp_path / "." / "a.npy"), *words]) == 2
     assert "would be replaced by what is made from it" in capsys.readouterr().err
