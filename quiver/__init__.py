@@ -1,6 +1,6 @@
-"""quiver: restores blur-free video from few-bit quanta streams; trains, evaluates and compares.
+"""Restores blur-free video from few-bit quanta streams; trains, evaluates and compares methods.
 
-`quiver.restore(codes, "moment", ...)` is the whole of it in a notebook; nothing heavy is imported before it is called.
+`quiver.restore(codes, "moment", ...)` is enough in a notebook; nothing heavy is imported before it is called.
 """
 
 from __future__ import annotations

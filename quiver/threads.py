@@ -1,9 +1,10 @@
-"""Chooses how many threads torch uses: measured once per process, since two on busy cores can be many times slower.
+"""Chooses how many threads torch uses, by one measurement per process: two threads on busy cores can be many times
+slower.
 
-    --threads N, else what the resumed run had, else the faster of one thread and of all, by a small convolution
+    --threads N, else the number of the resumed run, else the faster of one thread and of all, by a small convolution
 
-OpenMP's threads wait for each other by spinning, unless OMP_WAIT_POLICY says otherwise before torch is loaded. On a
-core that another process needs, each wait then lasts until the scheduler intervenes. So commands set it to PASSIVE.
+OpenMP's threads wait for each other by spinning, unless OMP_WAIT_POLICY is set before torch is loaded. On a core that
+another process needs, each wait then lasts until the scheduler intervenes. So commands set it to PASSIVE.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pathlib import Path
 
 from qsim.files import read_json
 
-SECONDS = 0.15  # that the measurement may take, after one call of each number
+SECONDS = 0.15  # limit of the measurement, after one call of each number
 
 
 @dataclass(frozen=True)
@@ -32,12 +33,12 @@ class Threads:
 
 
 def cores() -> int:
-    """Processor cores that this process may use."""
+    """Return the processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def wait_without_spinning() -> None:
-    """Make OpenMP's threads sleep while they wait; call it before torch is imported. A user's own setting stays.
+    """Make OpenMP's threads sleep while they wait. Call it before torch is imported; a user's setting stays.
 
     NumPy's BLAS gets one thread: its products are small here, and its threads spin too.
     """
@@ -64,28 +65,28 @@ def use(wanted: int | None = None, earlier: int | None = None) -> Threads:
 
 
 def current() -> int | None:
-    """Torch's number of threads now; None where torch was not needed."""
+    """Return torch's number of threads; None where torch was not needed."""
     return sys.modules["torch"].get_num_threads() if "torch" in sys.modules else None
 
 
 def recorded(path: Path) -> int | None:
-    """The number that a description or journal names, if it is there and names one."""
+    """Return the number of threads in a description or journal; None without a valid one."""
     try:
         found = read_json(path).get("threads")
-    except (OSError, ValueError):  # whoever needs the file says what is wrong with it
+    except (OSError, ValueError):  # the reader of the file reports what is wrong with it
         return None
     return found if isinstance(found, int) and not isinstance(found, bool) and found >= 1 else None
 
 
 def check(wanted: int | None) -> None:
-    """`ValueError` unless the machine has so many cores; None is no wish."""
+    """Raise `ValueError` unless the machine has this many cores; None is allowed."""
     if wanted is not None and not 1 <= wanted <= cores():
         raise ValueError(f"--threads {wanted}: this machine has {cores()} cores; give 1 to {cores()}")
 
 
 @cache
 def measured() -> Threads:
-    """The faster of one thread and of all that torch would take, by the time of a small convolution."""
+    """Return the faster of one thread and of all that torch would take, by the time of a small convolution."""
     import torch
 
     most = min(torch.get_num_threads(), cores())
@@ -107,5 +108,5 @@ def measured() -> Threads:
     while not spent or time.perf_counter() < end:
         spent.append([seconds(number) for number in numbers])
     mean = [sum(column) / len(spent) for column in zip(*spent, strict=True)]
-    told = ", ".join(f"{1e3 * time_:.2g} ms with {number}" for number, time_ in zip(numbers, mean, strict=True))
-    return Threads(numbers[mean.index(min(mean))], f"measured: {told}")
+    times = ", ".join(f"{1e3 * time_:.2g} ms with {number}" for number, time_ in zip(numbers, mean, strict=True))
+    return Threads(numbers[mean.index(min(mean))], f"measured: {times}")

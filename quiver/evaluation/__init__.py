@@ -1,1 +1,1 @@
-"""Scores, costs and tables."""
+"""Scores methods, measures their costs, and writes tables of both."""

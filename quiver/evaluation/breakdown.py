@@ -1,7 +1,7 @@
-"""What a mean score hides: the error of every speed of motion, and pictures of the same place by every method.
+"""Breaks a mean score down: the error of every speed of motion, and crops of one place by every method.
 
 restored, truth, |flow| [H, W] -> squared errors and pixels per bin of motion -> PSNR per bin, pooled over clips
-middle frame, where most moves -> crop per method -> one sheet of crops
+middle frame, place of most motion -> crop per method -> one sheet of crops
 """
 
 from __future__ import annotations
@@ -26,19 +26,21 @@ SCENES_SHOWN = 6  # rows of a sheet
 
 
 def bin_names() -> list[str]:
-    """`0-0.5`, ..., `8 and more`, in px/frame."""
+    """Return `0-0.5`, ..., `8 and more`, in px/frame."""
     return [f"{low:g} and more" if math.isinf(high) else f"{low:g}-{high:g}" for low, high in pairwise(EDGES)]
 
 
 def speeds(clip: Clip, frames: range) -> Array | None:
-    """Motion [T, H, W] in px/frame from the clip's own flow, NaN where it is not known; None without flow."""
+    """Return motion [T, H, W] in px/frame from the clip's own flow, NaN where it is not valid; None without flow."""
     if not clip.has_truth:
         return None
     return np.stack([np.hypot(*clip.flow(t)) for t in frames])
 
 
 def by_motion(matched: Array, target: Array, speed: Array) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """Pixels and summed squared error (clamped, in units of the peak) of every bin of EDGES; all arrays [T, H, W]."""
+    """Return pixels and summed squared error (clamped, in units of the peak) of every bin of EDGES; all arrays [T, H,
+    W].
+    """
     squares = (np.clip(matched, 0, 1) - np.clip(target, 0, 1)) ** 2
     known = np.isfinite(speed)
     bins = np.digitize(speed[known], EDGES[1:-1])
@@ -48,7 +50,9 @@ def by_motion(matched: Array, target: Array, speed: Array) -> tuple[tuple[int, .
 
 
 def pooled(counts: Sequence[Sequence[int]], squares: Sequence[Sequence[float]]) -> list[float]:
-    """PSNR [dB] of every bin over several clips; NaN for a bin without pixels, or whose error the clamp hides."""
+    """Return the PSNR [dB] of every bin over several clips; NaN for a bin without pixels or with its error above the
+    peak.
+    """
     if not counts:
         return [math.nan] * (len(EDGES) - 1)
     pixels, total = np.sum(counts, axis=0), np.sum(squares, axis=0)
@@ -59,34 +63,37 @@ def pooled(counts: Sequence[Sequence[int]], squares: Sequence[Sequence[float]]) 
 
 
 def place(clip: Clip, t: int) -> tuple[slice, slice]:
-    """The square of at most CROP px in frame t where most moves, in steps of 8 px; the middle without flow."""
+    """Return the square of at most CROP px in frame t with most motion, in steps of 8 px; the middle without flow."""
     height, width = clip.shape[1:]
     side = min(CROP, height, width)
     found = speeds(clip, range(t, t + 1))
     if found is None:
         y, x = (height - side) // 2, (width - side) // 2
     else:
-        moving = np.minimum(np.nan_to_num(found[0]), EDGES[-2])  # very fast pixels shall not decide alone
+        moving = np.minimum(np.nan_to_num(found[0]), EDGES[-2])  # limits the influence of very fast pixels
         corners = [(y, x) for y in range(0, height - side + 1, 8) for x in range(0, width - side + 1, 8)]
         y, x = max(corners, key=lambda corner: moving[corner[0] : corner[0] + side, corner[1] : corner[1] + side].sum())
     return slice(y, y + side), slice(x, x + side)
 
 
 def crop_file(out: Path, light: str, clip: str, method: str) -> Path:
-    """Where the crop of one clip by one method at one light level is kept."""
+    """Return the file of the crop of one clip by one method at one light level."""
     words = (re.sub(r"[^A-Za-z0-9.]+", "-", word) for word in (light, clip, method))
     return out / "crops" / ("_".join(words) + ".npy")
 
 
 def save_crop(path: Path, picture: Array) -> None:
-    """A float16 picture in units of the peak, what lies above 2 cut off: a sheet shows white there."""
+    """Store a float16 picture [h, w] in units of the peak, limited to 2: a sheet shows white there."""
     path.parent.mkdir(exist_ok=True)
     with replacing(path) as file:
         np.save(file, np.minimum(picture, 2).astype(np.float16))
 
 
 def sheet(out: Path, light: str, clips: Sequence[str], methods: Sequence[str], target: Path) -> bool:
-    """One row per clip, one column per method, as PNG; False if there is nothing to show. White = white, gamma 2.2."""
+    """Draw one row per clip and one column per method as PNG, peak = white, gamma 2.2.
+
+    Return False if there are no crops.
+    """
     rows = [clip for clip in clips if crop_file(out, light, clip, "truth").exists()][:SCENES_SHOWN]
     if not rows:
         return False

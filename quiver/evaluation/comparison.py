@@ -1,10 +1,10 @@
-"""One table for all methods: scores on held-out clips at several light levels, with what the truth itself is worth.
+"""Compares methods: scores on held-out clips at several light levels, with the PSNR of the ground truth itself.
 
     clips x lights -> codes (fixed keys) -> restored -> Score per clip -> mean and 95 % interval over scenes
 
-All methods see the same codes of the same frames. Every result is written down when it is there, so an interrupted
-evaluation goes on; a method that fails keeps its row, with the reason. Tables and figures: table.py. Real photons of a
-static object: static.py.
+All methods receive the same codes of the same frames. Every result is stored at once, so an interrupted evaluation
+resumes. A method that fails keeps its row, with the reason. Tables and figures: summary.py. Real photons of a static
+object: static_object.py.
 """
 
 from __future__ import annotations
@@ -34,29 +34,30 @@ FORMAT = "quiver-evaluation-2"  # 1: peak = the sensor's white, factor of the le
 PLAN_FORMAT = "quiver-plan-2"
 PUBLISHED_EDGE = 5  # frames at each end that the published evaluation leaves out
 
-ComparisonProgress = Callable[[str, int, int], None]  # (what is restored, rows done, rows in all)
+ComparisonProgress = Callable[[str, int, int], None]  # (text for people, rows done, rows in all)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What is evaluated; stored beside the results."""
+    """The settings of an evaluation; stored beside the results."""
 
     source: str  # data set or clip folder
     split: str | None = "test"  # None = all clips
     lights: tuple[Illumination, ...] = (Illumination(),)
     seed: int = 0  # of the test noise: the same for all methods and all runs
-    published: bool = False  # every window exposed, drawn, scaled and scored on its own; ends of clips left out
+    published: bool = False  # every window exposed, drawn, scaled and scored separately; ends of clips left out
     stream: str | None = None  # score this stored stream instead of sensing at `lights`
     peak: float | None = None  # of the scores, photons per pixel; None = 2.5 x mean light (published: sensor's white)
 
     def to_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return plain
 
 
 @dataclass(frozen=True)
 class ComparisonRow:
-    """One clip restored by one method at one light level; either a score or the reason why there is none."""
+    """One clip restored by one method at one light level: a score, or the reason why there is none."""
 
     method: str
     description: str  # of the method, with a digest of its weights
@@ -67,22 +68,23 @@ class ComparisonRow:
     seconds_per_frame: float = math.nan
     peak_bytes: int | None = None  # of memory while restoring, beyond what was in use before
     peak: float = math.nan  # photons per pixel that the scores refer to
-    truth_psnr: float | None = None  # dB; what a perfect restorer would score against this truth, at least
+    truth_psnr: float | None = None  # dB; lower bound of the score of a perfect restorer
     motion_pixels: tuple[int, ...] = ()  # per bin of breakdown.EDGES; empty where the clip has no flow
     motion_squares: tuple[float, ...] = ()  # squared error summed over them, matched, in units of the peak
     failure: str | None = None
 
     @property
     def key(self) -> tuple[str, str, str, str]:
-        """What must agree for an old result to count."""
+        """Return what must agree for an old result to count."""
         return self.method, self.description, self.light, self.clip
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON has no NaN and no infinity: they become null."""
+        """Return plain values for JSON, which has no NaN and no infinity: they become null."""
         return json_safe(asdict(self))
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> ComparisonRow:
+        """Return the inverse of `to_dict`."""
         score = values.pop("score")
         if score is not None:
             numbers: dict[str, Any] = {name: math.nan if v is None else v for name, v in score.items()}
@@ -94,7 +96,7 @@ class ComparisonRow:
 
 
 def json_safe(value: Any) -> Any:
-    """The same with null for numbers that JSON cannot hold."""
+    """Return the same value with null for numbers that JSON cannot hold."""
     if isinstance(value, dict):
         return {name: json_safe(v) for name, v in value.items()}
     if isinstance(value, list | tuple):
@@ -103,22 +105,22 @@ def json_safe(value: Any) -> Any:
 
 
 def scored_frames(length: int, published: bool) -> range:
-    """Frames of a clip that are scored: all, or, as published, those with five frames before and five after."""
+    """Return the scored frames of a clip: all, or, as published, those with five frames before and five after."""
     return range(PUBLISHED_EDGE, max(PUBLISHED_EDGE, length - PUBLISHED_EDGE)) if published else range(length)
 
 
 def scene_of(clip: Clip) -> str:
-    """Family and seed: clips of one scene are no independent evidence."""
+    """Return family and seed: clips of one scene are not independent evidence."""
     scene = clip.meta.get("scene") or {}
     return f"{scene['family']}:{scene.get('seed', 0)}" if "family" in scene else clip.name
 
 
 def truth_psnr(clip: Clip, factor: float, peak: float, frames: range) -> float | None:
-    """PSNR [dB] of the clip's own truth at a peak in photons, from its measured errors; None if there are none.
+    """Return the PSNR [dB] of the clip's own truth at a peak in photons, from its measured errors; None without them.
 
-    At least so much. Errors that were measured clamped at white serve peaks up to 2.5 times the mean light. At another
-    peak, and for clips of earlier versions, an unclamped error counts as if all of it lay below the peak. Errors are
-    measured in radiance; photons are proportional to it.
+    It is a lower bound. Errors that were measured clamped at white apply to peaks up to 2.5 times the mean light. At
+    another peak, and for clips of earlier versions, an unclamped error counts as if all of it lay below the peak.
+    Errors are measured in radiance, to which photons are proportional.
     """
     errors = clip.meta.get("error_per_frame")
     if not errors or clip.mean_radiance <= 0:
@@ -130,7 +132,7 @@ def truth_psnr(clip: Clip, factor: float, peak: float, frames: range) -> float |
 
 
 def peak_in_photons(comparison: Comparison, clip: Clip, codes: Codes, factor: float) -> float:
-    """The peak of a clip's scores: as the comparison says, else 2.5 times the mean light, or as published the white."""
+    """Return the peak of a clip's scores: as set, else 2.5 times the mean light, or as published the white."""
     if comparison.peak is None and comparison.published:
         return codes.white
     return peak_of(mean_light(clip, factor), comparison.peak)
@@ -145,7 +147,10 @@ def restore_clip(
     factor: float,
     out: Path | None = None,
 ) -> ComparisonRow:
-    """Restore and score one clip, and keep a crop of its middle frame under OUT; a failure becomes the row's reason."""
+    """Restore and score one clip, and store a crop of its middle frame under OUT.
+
+    A failure becomes the reason in the row.
+    """
     row = ComparisonRow(method.name, method.description, comparison.stream or light.label, clip.name, scene_of(clip))
     frames = scored_frames(len(clip), comparison.published)
     white = peak_in_photons(comparison, clip, codes, factor)
@@ -161,7 +166,7 @@ def restore_clip(
         seconds = (time.perf_counter() - started) / len(frames)
         peak = peak_memory() - before
         score = metrics.score(restored / np.float32(white), target, per_frame_scale=comparison.published, valid=valid)
-    except Exception as error:  # whatever a method dies of is its result
+    except Exception as error:  # a method's failure is recorded as its result
         return replace(row, failure=f"{type(error).__name__}: {' '.join(str(error).split())}")
     matched = restored * np.float32(score.scale / white)
     speed = breakdown.speeds(clip, frames)
@@ -185,7 +190,9 @@ def restore_clip(
 def keep_crops(
     out: Path, row: ComparisonRow, clip: Clip, codes: Codes, frames: range, stacks: dict[str, Array]
 ) -> None:
-    """The part of the middle frame where most moves, from each [T, H, W] stack and from the codes, under OUT/crops."""
+    """Store the part of the middle frame with most motion, from each [T, H, W] stack and from the codes, under
+    OUT/crops.
+    """
     middle = len(frames) // 2
     part = breakdown.place(clip, frames[middle])
     pictures = {name: stack[middle][part] for name, stack in stacks.items()}
@@ -200,9 +207,9 @@ def evaluate(
     out: Path | None = None,
     progress: ComparisonProgress | None = None,
 ) -> list[ComparisonRow]:
-    """Every method on every clip at every light level; rows are kept in OUT/rows.jsonl and taken from there.
+    """Run every method on every clip at every light level; rows are stored in OUT/rows.jsonl and reused from there.
 
-    ValueError if there is nothing to score, FileExistsError if OUT holds another evaluation.
+    `ValueError` if there is nothing to score, `FileExistsError` if OUT holds another evaluation.
     """
     if comparison.stream is not None and (comparison.published or len(comparison.lights) > 1):
         raise ValueError("a stored stream has one light level and one exposure; leave out --ppp and --published")
@@ -211,7 +218,7 @@ def evaluate(
         raise ValueError(f"{comparison.source}: no finished clip in split {comparison.split!r}")
     for clip in clips:
         if not scored_frames(len(clip), comparison.published):
-            raise ValueError(f"clip {clip.name}: {len(clip)} frames are too few, the published windows have 11")
+            raise ValueError(f"clip {clip.name}: {len(clip)} frames are too few; published windows have 11")
     known = {row.key: row for row in begin(comparison, out, clips)} if out is not None else {}
     rows: list[ComparisonRow] = []
     total = len(comparison.lights) * len(clips) * len(methods)
@@ -238,7 +245,7 @@ def evaluate(
 
 
 def streams(comparison: Comparison) -> Iterator[Codes]:
-    """Every stream of a comparison, nothing drawn yet; as `evaluate` for what cannot be scored."""
+    """Yield every stream of a comparison before anything is drawn; errors as `evaluate`."""
     for light in comparison.lights:
         for clip in open_clips(comparison.source, comparison.split):
             yield (
@@ -247,12 +254,12 @@ def streams(comparison: Comparison) -> Iterator[Codes]:
 
 
 def in_memory(codes: Codes) -> Codes:
-    """The same, drawn once for all methods."""
+    """Return the same codes, drawn once for all methods."""
     return replace(codes, read=array_codes(codes.read(0, codes.shape[0]), codes.sensor, codes.exposure).read)
 
 
 def content_digest(comparison: Comparison, clips: Sequence[Clip]) -> str:
-    """SHA-256 of what is scored: the descriptions of the clips, which hold checksums, and of the stored stream."""
+    """Return the SHA-256 of the scored content: the descriptions of clips and stored stream, with checksums."""
     described = [
         [clip.meta, None if comparison.stream is None else clip.stream(comparison.stream).meta] for clip in clips
     ]
@@ -260,12 +267,12 @@ def content_digest(comparison: Comparison, clips: Sequence[Clip]) -> str:
 
 
 def begin(comparison: Comparison, out: Path, clips: Sequence[Clip]) -> list[ComparisonRow]:
-    """Make the folder of an evaluation, or take the finished rows of an interrupted one of the same content."""
+    """Create the folder of an evaluation, or return the finished rows of an interrupted one of the same content."""
     path = out / "plan.json"
     wanted = {"format": PLAN_FORMAT} | comparison.to_dict() | {"content_sha256": content_digest(comparison, clips)}
     if not path.exists():
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise FileExistsError(f"{out} exists and is no evaluation; choose another -o")
+            raise FileExistsError(f"{out} exists and is not an evaluation; choose another -o")
         out.mkdir(parents=True, exist_ok=True)
         write_json(path, wanted)
     elif (found := read_json(path)) != wanted:
@@ -277,14 +284,14 @@ def begin(comparison: Comparison, out: Path, clips: Sequence[Clip]) -> list[Comp
     if not rows.exists():
         return []
     text = rows.read_text()
-    if not text.endswith("\n"):  # a killed writer tore its last line: close it, so that the next one stands alone
+    if not text.endswith("\n"):  # a killed writer's last line is incomplete: end it
         with open(rows, "a", encoding="utf-8") as file:
             file.write("\n")
     return list(finished(text.splitlines()))
 
 
 def finished(lines: Sequence[str]) -> Iterator[ComparisonRow]:
-    """Rows of a file whose last line may be torn; failures are left out, so that they are tried again."""
+    """Yield the rows of a file whose last line may be incomplete. Failures are left out: they are tried again."""
     for line in lines:
         try:
             row = ComparisonRow.from_dict(json.loads(line))
@@ -295,6 +302,7 @@ def finished(lines: Sequence[str]) -> Iterator[ComparisonRow]:
 
 
 def append(path: Path, row: ComparisonRow) -> None:
+    """Append a row to a file and sync it."""
     with open(path, "a", encoding="utf-8") as file:
         file.write(json.dumps(row.to_dict(), sort_keys=True, allow_nan=False) + "\n")
         file.flush()

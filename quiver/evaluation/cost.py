@@ -1,10 +1,10 @@
-"""What a restored frame costs: seconds, memory and multiply-accumulates, beside the PSNR it buys.
+"""Measures the cost of a restored frame: seconds, memory and multiply-accumulates, beside its PSNR.
 
-    methods x modes x precisions, on one fixed synthetic clip (or a clip of yours) -> table, figure, JSON
+    methods x modes x precisions, on one fixed synthetic clip -> table, figure, JSON
 
-Every case runs in a process of its own, so that its peak memory is its own. Multiply-accumulates are those of
-convolutions and matrix products, as torch counts them; sampling and baselines are not counted. Presets whose weights do
-not ship are run with random weights: their cost is real, their PSNR is left out.
+Every case runs in a separate process, so that its peak memory is measured alone. Multiply-accumulates are those of
+convolutions and matrix products, as torch counts them; sampling and classical methods are not counted. Presets whose
+weights do not ship run with random weights: their cost is real, their PSNR is left out.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ PRESETS = ("nano", "quiver-s", "quiver", "unet")
 
 @dataclass(frozen=True)
 class CostCase:
-    """One method run in one way."""
+    """One method, run in one way."""
 
     method: str
     mode: str = "exact"
@@ -51,7 +51,7 @@ class CostCase:
 
 @dataclass(frozen=True)
 class CostSettings:
-    """The fixed clip and what is timed on it."""
+    """The fixed clip, and the frames of it that are timed."""
 
     height: int = 64
     width: int = 64
@@ -64,7 +64,7 @@ class CostSettings:
 
 @dataclass(frozen=True)
 class CostRow:
-    """What a case cost; NaN where it could not be measured."""
+    """The cost of a case; NaN where it could not be measured."""
 
     method: str
     mode: str
@@ -79,7 +79,7 @@ class CostRow:
 
 
 def fixed_clip(settings: CostSettings) -> tuple[Codes, Array]:
-    """Codes of waves and a disk that move 2 px per frame, and their photons; the same for ever."""
+    """Return codes of waves and a disk that move 2 px per frame, and their photons [T, H, W]; never to be changed."""
     sensor = Illumination(ppp=settings.ppp).device(EXPOSURE)
     y, x = np.mgrid[: settings.height, : settings.width].astype(float)
     frames = []
@@ -95,7 +95,7 @@ def fixed_clip(settings: CostSettings) -> tuple[Codes, Array]:
 
 
 def method_of(case: CostCase, device: str) -> tuple[Restorer, bool]:
-    """The restorer of a case, and whether it has trained weights (or needs none)."""
+    """Return the restorer of a case, and whether it has trained weights (or needs none)."""
     import torch
 
     from quiver.model.presets import build
@@ -146,7 +146,7 @@ def measure(case: CostCase, settings: CostSettings) -> CostRow:
 
 
 def multiply_accumulates(method: Restorer, codes: Codes, first: int) -> float:
-    """Of one more restored frame: the difference between restoring three frames and two."""
+    """Return those of one more restored frame: the difference between restoring three frames and two."""
     from torch.utils.flop_counter import FlopCounterMode
 
     counts = []
@@ -158,7 +158,7 @@ def multiply_accumulates(method: Restorer, codes: Codes, first: int) -> float:
 
 
 def bench(cases: Sequence[CostCase], settings: CostSettings, progress: Progress | None = None) -> list[CostRow]:
-    """Every case in a fresh process; a case that dies keeps its row, with the reason."""
+    """Run every case in a new process; a case that fails keeps its row, with the reason."""
     costs = []
     for i, case in enumerate(cases):
         if progress is not None:
@@ -179,7 +179,7 @@ def _in_own_process(case: CostCase, settings: CostSettings) -> CostRow:
         found: CostRow | str = ours.recv()
     except EOFError:
         process.join()
-        found = f"its process died (exit code {process.exitcode}); too little memory?"
+        found = f"its process crashed (exit code {process.exitcode}); check its memory"
     process.join()
     if isinstance(found, CostRow):
         return found
@@ -190,12 +190,12 @@ def _in_own_process(case: CostCase, settings: CostSettings) -> CostRow:
 def _child(pipe: Any, case: CostCase, settings: CostSettings) -> None:
     try:
         pipe.send(measure(case, settings))
-    except Exception as error:  # whatever it dies of is its result
+    except Exception as error:  # a failure is recorded as its result
         pipe.send(f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
 def cases_of(methods: Sequence[str], modes: Sequence[str], precisions: Sequence[str]) -> list[CostCase]:
-    """All combinations; modes and precisions make no difference to classical methods, modes none to the U-Net."""
+    """Return all combinations; classical methods have one mode and precision, the U-Net has one mode."""
     cases = []
     for method in methods:
         classical = method.partition(":")[0] in METHODS
@@ -207,7 +207,7 @@ def cases_of(methods: Sequence[str], modes: Sequence[str], precisions: Sequence[
 def checked_cases(
     methods: Sequence[str], modes: Sequence[str] | None, precisions: Sequence[str] | None, device: str | None
 ) -> list[CostCase]:
-    """As `cases_of`, with the defaults for None; `ValueError` for unknown names and for options that cannot act."""
+    """Return `cases_of` with the defaults for None. `ValueError` for unknown names and options without effect."""
     networks = [method for method in methods if method.partition(":")[0] not in METHODS]
     for method in methods:
         if method not in networks:
@@ -229,7 +229,7 @@ def checked_cases(
 
 
 def markdown(costs: Sequence[CostRow], settings: CostSettings) -> str:
-    """The result as a table."""
+    """Return the result as a Markdown table."""
     text = [
         f"# Cost of a restored frame: {settings.height} x {settings.width}, {settings.ppp:g} PPP, {settings.device}",
         "",
@@ -248,7 +248,7 @@ def markdown(costs: Sequence[CostRow], settings: CostSettings) -> str:
 
 
 def figure(costs: Sequence[CostRow], path: Path) -> None:
-    """PSNR against seconds per frame, as PNG; untrained networks are left out."""
+    """Draw PSNR against seconds per frame as PNG; untrained networks are left out."""
     drawing = new_figure(6, 4)
     axes = drawing.subplots()
     for c in costs:

@@ -1,4 +1,4 @@
-"""Measuring a domain: one network against the classical methods, cell by cell, on clips that trained and tuned nothing.
+"""Measures a domain: one network against the classical methods, cell by cell, on clips used for nothing else.
 
     weights, clips, sensors x bits x light -> matched PSNR of the network and of the best classical method -> Domain
 
@@ -35,7 +35,7 @@ CLASSICAL = ("naive", "moment:3", "transform-denoise", "qbp", "qbp-bm3d")
 
 @dataclass(frozen=True)
 class DomainSettings:
-    """What is measured."""
+    """The settings of a measurement."""
 
     clips: tuple[Clip, ...]
     lights: tuple[Illumination, ...]
@@ -43,7 +43,7 @@ class DomainSettings:
     seed: int = 0
 
     def to_dict(self) -> dict[str, object]:
-        """What all cells of a domain share; stored with them."""
+        """Return what all cells of a domain share; stored with them."""
         return {
             "clips": [clip.name for clip in self.clips],
             "clips_sha256": clips_digest(self.clips),
@@ -56,12 +56,12 @@ class DomainSettings:
 
 
 def clips_digest(clips: Sequence[Clip]) -> str:
-    """SHA-256 of what the clips say of themselves, which includes the checksums of their files."""
+    """Return the SHA-256 of the descriptions of the clips, which include the checksums of their files."""
     return hashlib.sha256(json.dumps([clip.meta for clip in clips], sort_keys=True).encode()).hexdigest()
 
 
 def clips_of(sources: Sequence[Path], split: str | None) -> tuple[Clip, ...]:
-    """The clips of several data sets (of one split) and clip folders; ValueError if there are none."""
+    """Return the clips of several data sets (of one split) and clip folders. `ValueError` if there are none."""
     clips = tuple(clip for source in sources for clip in open_clips(source, split))
     if not clips:
         raise ValueError(f"no finished clip in split {split!r} of {', '.join(str(source) for source in sources)}")
@@ -76,11 +76,11 @@ def measure(
     *,
     force: bool = False,
 ) -> Domain:
-    """Measure what is missing of the cells of a weights file, and store each in its metadata as soon as it is there.
+    """Measure the missing cells of a weights file, and store each in its metadata at once.
 
-    Several processes may measure one file. With `force` the cells that are asked for are measured again, and cells that
-    were measured otherwise (other clips, methods, seed or version) go. The tensors of the file stay as they are.
-    `ValueError` for classical methods that are none, and for cells measured otherwise without `force`.
+    Several processes may measure one file. With `force`, requested cells are measured again, and cells measured
+    otherwise (other clips, methods, seed or version) are removed. The tensors of the file stay as they are.
+    `ValueError` for methods that are not classical, and for cells measured otherwise without `force`.
     """
     methods = restorers(settings.methods, options)
     network = network_restorer(weights, options)
@@ -98,7 +98,7 @@ def measure(
     for done, light in enumerate(todo):
         if progress is not None:
             progress(done, len(todo))
-        if not force and _known(weights, shared, light):  # by another process, meanwhile
+        if not force and _known(weights, shared, light):  # measured by another process in the meantime
             continue
         cell = measure_cell(network, methods, settings, light)
         with _one_at_a_time(weights):
@@ -110,7 +110,7 @@ def measure(
 
 
 def stored_cells(weights: Path, shared: Mapping[str, object]) -> tuple[Cell, ...]:
-    """The cells in a weights file that were measured in this way."""
+    """Return the cells in a weights file that were measured with these settings."""
     domain = read_scope(weights, metadata_of(weights)).domain
     return domain.cells if domain is not None and dict(domain.measured) == shared else ()
 
@@ -121,7 +121,7 @@ def _known(weights: Path, shared: Mapping[str, object], light: Illumination) -> 
 
 @contextlib.contextmanager
 def _one_at_a_time(weights: Path) -> Iterator[None]:
-    """Keep other processes from rewriting the file between our reading and our writing of it."""
+    """Prevent other processes from rewriting the file between our reading and our writing."""
     lock = Lock(weights.with_name(f"{weights.name}.lock"))
     lock.acquire(wait=True)
     try:
@@ -135,7 +135,7 @@ def _measures(cell: Cell, light: Illumination) -> bool:
 
 
 def measure_cell(network: Restorer, methods: Sequence[Restorer], settings: DomainSettings, light: Illumination) -> Cell:
-    """The network and the best of the methods at one light; ValueError where a clip has no score."""
+    """Return the cell of the network and the best method at one light. `ValueError` where a clip has no score."""
     own, *others = (_mean_score(method, settings, light) for method in (network, *methods))
     if not (math.isfinite(own) and any(map(math.isfinite, others))):
         raise ValueError(f"{light.label}: the network, or every classical method, fails or has no score on these clips")
@@ -147,7 +147,7 @@ def measure_cell(network: Restorer, methods: Sequence[Restorer], settings: Domai
 
 
 def _mean_score(method: Restorer, settings: DomainSettings, light: Illumination) -> float:
-    """Mean over clips; NaN for a classical method that cannot restore such codes, which then does not compete."""
+    """Return the mean over clips; NaN for a classical method that cannot restore such codes and so is left out."""
     try:
         return float(np.mean([score(method, clip, light, settings.seed) for clip in settings.clips]))
     except ValueError:
@@ -157,7 +157,7 @@ def _mean_score(method: Restorer, settings: DomainSettings, light: Illumination)
 
 
 def score(method: Restorer, clip: Clip, light: Illumination, seed: int) -> float:
-    """Matched PSNR [dB] of one clip restored by one method."""
+    """Return the matched PSNR [dB] of one clip restored by one method."""
     drawn, factor = sensed(clip, light, seed)
     peak = peak_of(mean_light(clip, factor))
     restored = method.restore(in_memory(drawn))

@@ -1,13 +1,13 @@
-"""How close a restored clip is to the truth: PSNR, one brightness factor per clip, SSIM, and intervals over scenes.
+"""Scores a restored clip against the truth: PSNR, one brightness factor per clip, SSIM, and intervals over scenes.
 
     restored x, target x  [T, H, W], in units of the peak (photons / peak)  ->  numbers
 
-The peak is 2.5 times the mean light (`data.peak_of`), for every sensor and depth. Output and target are clamped to
-[0, 1] and PSNR = 10 log10(1 / MSE) of whole frames, no border left out. Few-bit input does not tell the absolute
-brightness when the light level is unknown, so every score has two forms: raw, and after the single factor that is best
-behind the clamp. A frame whose error lies wholly above the peak has no score (NaN); only equal arrays are infinite.
-`valid` [T, H, W], where it is given, is false where the target is not known; these pixels count nowhere.
-Nothing here knows files, sensors or torch.
+The peak is 2.5 times the mean light (`data.clips.peak_of`), for every sensor and depth. Output and target are clamped
+to [0, 1] and PSNR = 10 log10(1 / MSE) of complete frames, without a border. Few-bit input does not determine the
+absolute brightness where the light level is unknown. So every score has two forms: raw, and after the single factor
+that is best behind the clamp. A frame whose error lies completely above the peak has no score (NaN); only equal arrays
+are infinite. `valid` bool [T, H, W] is false where the target is not known; these pixels count nowhere. Nothing here
+imports files, sensors or torch.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ import numpy as np
 
 from qsim import colour
 
-SSIM_WINDOW = 7  # px; uniform window and sample covariance are the defaults of the field (spec 5.3)
-FACTORS = (0.01, 100.0)  # between these the best factor is looked for
-ABOVE_PEAK = 0.05  # share of target pixels above the peak from which a score is doubtful
-NEAR_TRUTH = 3.0  # dB; a score so close to the truth's own error says little about the method
-CHUNK = 1 << 20  # clamping points looked at together
+SSIM_WINDOW = 7  # px; uniform window and sample covariance are the defaults of the field
+FACTORS = (0.01, 100.0)  # limits of the search for the best factor
+ABOVE_PEAK = 0.05  # share of target pixels above the peak from which a table warns
+NEAR_TRUTH = 3.0  # dB; within it, the error of the truth is a large part of a score
+CHUNK = 1 << 20  # clamping points evaluated together
 
 
 @dataclass(frozen=True)
 class Score:
-    """One clip (or one window) scored; decibels are means over frames, `frames` says over how many."""
+    """The score of one clip or one window; decibels are means over the frames that have a score."""
 
     psnr: float  # dB, raw
     psnr_matched: float  # dB, after the output was multiplied by `scale`
@@ -41,11 +41,12 @@ class Score:
     above_peak: float = 0.0  # share of target pixels above the peak
 
     def to_dict(self) -> dict[str, float]:
+        """Return plain values."""
         return asdict(self)
 
 
 def _stack(name: str, image: np.ndarray) -> np.ndarray:
-    """float64 [T, H, W]; ValueError naming the first bad index for NaN or Inf, and for empty or misshaped input."""
+    """Return float64 [T, H, W]. `ValueError` with the first index of NaN or Inf, and for empty or misshaped input."""
     stack = np.asarray(image, dtype=np.float64)
     stack = stack[None] if stack.ndim == 2 else stack
     if stack.ndim != 3 or stack.size == 0:
@@ -57,6 +58,7 @@ def _stack(name: str, image: np.ndarray) -> np.ndarray:
 
 
 def _pair(output: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return output and target as float64 [T, H, W]. `ValueError` if their shapes differ."""
     one, two = _stack("output", output), _stack("target", target)
     if one.shape != two.shape:
         raise ValueError(f"output has shape {one.shape}, target {two.shape}; they must be equal")
@@ -64,20 +66,20 @@ def _pair(output: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def decibel(mse: float) -> float:
-    """PSNR [dB] of a mean squared error at peak 1; infinite for 0."""
+    """Return the PSNR [dB] of a mean squared error at peak 1; infinite for 0."""
     return colour.psnr(1.0, sqrt(max(mse, 0.0)))
 
 
 def above_peak(target: np.ndarray, valid: np.ndarray | None = None) -> float:
-    """Share of the (valid) target pixels above the peak, where the clamp hides errors; NaN without any pixel."""
+    """Return the share of (valid) target pixels above the peak, where the clamp hides errors; NaN without any pixel."""
     stack = _stack("target", target)
     over = stack > 1
     keep = _kept(valid, stack)
     return float(over.mean() if keep is None else over[keep].mean() if keep.any() else nan)
 
 
-def doubtful(what: str, share: float) -> str:
-    """The warning of a table in which more than ABOVE_PEAK of the target lies above the peak."""
+def above_peak_warning(what: str, share: float) -> str:
+    """Return the warning of a table in which more than ABOVE_PEAK of the target lies above the peak."""
     return (
         f"Warning: {100 * share:.1f} % of the pixels of {what} lie above the peak, where the clamp hides errors. "
         "A larger --peak counts them."
@@ -95,9 +97,9 @@ def _kept(valid: np.ndarray | None, like: np.ndarray) -> np.ndarray | None:
 
 
 def psnr(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
-    """PSNR [dB] of every frame, [T], both inputs clamped to [0, 1].
+    """Return the PSNR [dB] of every frame, [T], of images [T, H, W] clamped to [0, 1].
 
-    Infinite for equal frames. NaN where the frames differ and the clamp hides all of it, and without a valid pixel.
+    Infinite for equal frames. NaN where frames differ above the peak only, and without a valid pixel.
     """
     one, two = _pair(output, target)
     keep = _kept(valid, two)
@@ -111,10 +113,10 @@ def psnr(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None = None
 
 
 def best_scale(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None = None) -> float:
-    """The factor s in FACTORS with the least clamped error, sum (clip(s O) - clip(G))^2 over all (valid) pixels.
+    """Return the factor s in FACTORS with the least clamped error, sum (clip(s O) - clip(G))^2 over all (valid) pixels.
 
-    Exact: the error is quadratic in s between the points 1/O at which a pixel reaches the peak, and each piece gives
-    its least value. 1 where no factor is better than 1, as for a black output.
+    It is exact: the error is quadratic in s between the points 1/O at which a pixel reaches the peak, and each piece
+    gives its least value. 1 where no factor is better than 1, as for a black output.
     """
     one, two = _pair(output, target)
     keep = _kept(valid, two)
@@ -140,7 +142,7 @@ def best_scale(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None 
 
 
 def _least(values: np.ndarray, goal: np.ndarray) -> float:
-    """The factor of the least error over all pieces; `values` > 0 falling, `goal` in [0, 1]."""
+    """Return the factor of the least error over all pieces; `values` > 0 falling, `goal` in [0, 1]."""
     low, high = FACTORS
     white = 0.0  # error of the pixels that are at the peak already
     square, product, rest = (float(np.sum(x)) for x in (values * values, values * goal, goal * goal))
@@ -172,10 +174,11 @@ def _least(values: np.ndarray, goal: np.ndarray) -> float:
 
 
 def ssim(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
-    """Structural similarity of every frame, [T]: 7 x 7 uniform window, sample covariance, data range 1, clamped inputs.
+    """Return the structural similarity of every frame, [T]: 7 x 7 uniform window, sample covariance, data range 1,
+    clamped.
 
-    The mean runs over windows that lie inside the frame (Wang et al. 2004, as the common libraries compute it) and
-    hold valid pixels alone. NaN where there is none, as where a side is below 7 px.
+    The mean runs over windows that lie inside the frame (Wang et al. 2004, computed by scikit-image) and hold valid
+    pixels only. NaN without such a window, as where a side is below 7 px.
     """
     one, two = (np.clip(image, 0, 1) for image in _pair(output, target))
     keep = _kept(valid, two)
@@ -242,13 +245,13 @@ def score(
 
 
 def mean_score(scores: Sequence[Score]) -> Score:
-    """Every number's mean over the windows that have one."""
+    """Return the mean of every number over the windows that have one."""
     found = {field.name: _mean(np.array([getattr(s, field.name) for s in scores], float)) for field in fields(Score)}
     return Score(**found)  # type: ignore[arg-type]  # frames become a mean, too
 
 
 def _mean(values: np.ndarray) -> float:
-    """Mean of what is a number; NaN without any."""
+    """Return the mean of the values that are not NaN; NaN without any."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if known.size else nan
 
@@ -263,10 +266,10 @@ class Interval:
 
 
 def over_scenes(values: Sequence[float], scenes: Sequence[Hashable], confidence: float = 0.95) -> Interval:
-    """Mean over scenes and the half-width of Student's interval for it.
+    """Return the mean over scenes and the half-width of Student's interval for it.
 
-    Clips of one scene are averaged first: they are no independent evidence. Not-a-number values (SSIM of tiny frames)
-    are left out; infinite ones (a perfect restoration) make the mean infinite and the half-width unknown.
+    Clips of one scene are averaged first: they are not independent evidence. NaN values (SSIM of tiny frames) are left
+    out. Infinite ones (a perfect restoration) make the mean infinite and the half-width unknown.
     """
     if len(values) != len(scenes):
         raise ValueError(f"over_scenes: {len(values)} values but {len(scenes)} scenes")
@@ -284,10 +287,11 @@ def over_scenes(values: Sequence[float], scenes: Sequence[Hashable], confidence:
 
 
 def clamped_variance(mean: np.ndarray, variance: np.ndarray, peak: float = 1.0) -> np.ndarray:
-    """Variance of min(X, peak) for normal X, elementwise: what a noisy reference adds to a clamped squared error.
+    """Return the variance of min(X, peak) for normal X, elementwise: the part of a noisy reference in a clamped squared
+    error.
 
-    With z = (peak - m)/s, E = m Phi(z) - s phi(z) + peak (1 - Phi(z)) and
-    E2 = (m^2 + s^2) Phi(z) - s (m + peak) phi(z) + peak^2 (1 - Phi(z)). Clamping at 0 is left out: counts are positive.
+    With z = (peak - m)/s, E = m Phi(z) - s phi(z) + peak (1 - Phi(z)) and E2 = (m^2 + s^2) Phi(z) - s (m + peak) phi(z)
+    + peak^2 (1 - Phi(z)). The clamp at 0 is left out: counts are positive.
     """
     from scipy.special import ndtr
 
@@ -301,9 +305,9 @@ def clamped_variance(mean: np.ndarray, variance: np.ndarray, peak: float = 1.0) 
 
 
 def truth_psnr(errors: Sequence[float]) -> float:
-    """PSNR [dB] that a perfect restorer scores against frames with these rms errors (in units of the peak).
+    """Return the PSNR [dB] that a perfect restorer scores against frames with these rms errors (in units of the peak).
 
-    The mean over frames, as a score is; infinite where a frame has no error.
+    It is the mean over frames, as a score is; infinite where a frame has no error.
     """
     for rms in errors:
         if not isfinite(rms) or rms < 0:

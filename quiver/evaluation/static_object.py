@@ -1,11 +1,11 @@
-"""Real photons of a static object: restore from some frames, score against the rest, take off the rest's own noise.
+"""Scores methods on real photons of a static object: restores from some frames, compares with the mean of the others.
 
     counts [N, H, W] -> codes of 11 frames (clipped to b bits) -> restored centre frame; the other N - 11 are the truth
 
-Real light flickers a little from frame to frame: every frame is divided by its own share of the light. The reference is
-a mean of Poisson counts, with a known variance r / sum(shares); what that adds to the squared error is subtracted, with
-the clamp at the peak taken into account (`metrics.clamped_variance`). The peak is 2.5 times the mean count, as for
-clips. The frames are split at random, several times.
+Real light flickers from frame to frame: every frame is divided by its share of the light. The reference is a mean of
+Poisson counts with a known variance r / sum(shares). Its contribution to the squared error is subtracted, with the
+clamp at the peak taken into account (`metrics.clamped_variance`). The peak is 2.5 times the mean count, as for clips.
+The frames are split at random, several times.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FORMAT = "quiver-static-2"  # of the JSON that `quiver evaluate --static` prints
 
 @dataclass(frozen=True)
 class StaticScore:
-    """One method, mean over the splits; the spread is the standard deviation over them."""
+    """The score of one method, mean over the splits; the spread is the standard deviation over them."""
 
     method: str
     psnr: float  # dB, raw, the reference's own variance taken off
@@ -43,14 +43,14 @@ class StaticScore:
 
 
 def reference(counts: Counts, chosen: Array) -> tuple[Array, Array]:
-    """Mean photons per frame [H, W] from the chosen frames, and the variance of that estimate."""
+    """Return the mean photons per frame [H, W] of the chosen frames, and the variance of that estimate [H, W]."""
     light = float(counts.shares[chosen].sum())
     estimate = counts.frames[chosen].sum(axis=0, dtype=np.int64) / light
     return estimate, estimate / light
 
 
 def counted(counts: Counts, bits: int, given: Array | slice = slice(None)) -> Codes:
-    """The chosen frames as codes of an ideal counter of so many bits."""
+    """Return the chosen frames as codes of an ideal counter with this many bits."""
     _check_bits(counts, bits)
     sensor = ideal_counter(bits)
     codes = np.minimum(counts.frames[given], sensor.levels - 1).astype(np.uint8)
@@ -63,22 +63,22 @@ def _check_bits(counts: Counts, bits: int) -> None:
 
 
 def mean_square(output: Array, target: Array, noise: Array) -> float:
-    """Mean squared error of clamped images, in units of the peak, without what the target's variance adds to it."""
+    """Return the mean squared error of clamped images [H, W], in units of the peak, without the target's variance."""
     squares = (np.clip(output, 0, 1) - np.clip(target, 0, 1)) ** 2
     return float(squares.mean() - metrics.clamped_variance(target, noise).mean())
 
 
 def _decibel(mse: float) -> float:
-    """NaN where no error is left beside the reference's own noise."""
+    """Return the PSNR [dB]; NaN where no error is left beside the reference's own noise."""
     return metrics.decibel(mse) if mse > 0 else nan
 
 
 def score_split(
     method: Restorer, counts: Counts, given: Array, bits: int, peak: float
 ) -> tuple[float, float, float, float, float]:
-    """Raw PSNR, matched PSNR, matched PSNR as measured, the factor and the share above the peak [photons] of one split.
+    """Return raw PSNR, matched PSNR, matched PSNR as measured, the factor and the share above the peak of one split.
 
-    `given` frames are restored.
+    `given` are the frames to restore from, `peak` is in photons.
     """
     centre = len(given) // 2
     restored = method.restore(counted(counts, bits, given), centre, centre + 1)[0]
@@ -106,9 +106,9 @@ def evaluate_static(
     seed: int = 0,
     peak: float | None = None,
 ) -> list[StaticScore]:
-    """Every method on the same random splits, scored at `peak` photons (default 2.5 times the mean count).
+    """Score every method on the same random splits, at `peak` photons (default 2.5 times the mean count).
 
-    ValueError if no frame is left for the reference, and for codes of more than 8 bits.
+    `ValueError` if no frame is left for the reference, and for codes of more than 8 bits.
     """
     _check_bits(counts, bits)
     if not 1 <= frames < len(counts.frames):
@@ -124,7 +124,7 @@ def evaluate_static(
 def _score(method: Restorer, counts: Counts, chosen: Sequence[Array], bits: int, peak: float) -> StaticScore:
     try:
         found = np.array([score_split(method, counts, given, bits, peak) for given in chosen])
-    except Exception as error:  # whatever a method dies of is its result
+    except Exception as error:  # a method's failure is recorded as its result
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         return StaticScore(method.name, nan, nan, nan, nan, nan, failure=reason)
     raw, matched, measured, scale, above = (float(value) for value in found.mean(axis=0))
@@ -132,7 +132,7 @@ def _score(method: Restorer, counts: Counts, chosen: Sequence[Array], bits: int,
 
 
 def markdown(counts: Counts, scores: Sequence[StaticScore], frames: int, bits: int, peak: float | None = None) -> str:
-    """The result as a table."""
+    """Return the result as a Markdown table."""
     above = max((s.above_peak for s in scores if s.failure is None), default=nan)
     text = [
         f"# Real photons: {counts.name}, restored from {frames} of {len(counts.frames)} frames at {bits} bit",
@@ -142,7 +142,7 @@ def markdown(counts: Counts, scores: Sequence[StaticScore], frames: int, bits: i
         + f", {100 * above:.1f} % of the reference's pixels are above it; the variance of the reference is taken off, "
         "except where it says as measured. Matched: after the factor that is best behind the clamp. ± is the spread "
         "over random splits. n/a: no error is left beside the reference's noise.",
-        *([] if not above > metrics.ABOVE_PEAK else ["", metrics.doubtful("the reference", above)]),
+        *([] if not above > metrics.ABOVE_PEAK else ["", metrics.above_peak_warning("the reference", above)]),
         "",
     ]
     table = []

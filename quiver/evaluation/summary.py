@@ -1,4 +1,4 @@
-"""An evaluation as people read it: means with 95 % intervals over scenes, per scene, as Markdown and as a figure."""
+"""Summarises an evaluation: means with 95 % intervals over scenes, per scene, as Markdown and as a figure."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ COLUMNS = (
     "truth's own PSNR",
 )
 MEMORY = (
-    "Memory: the most that restoring one clip took beyond what the process held before; what an earlier method left "
-    "free is not counted, `quiver bench` measures each in a process of its own."
+    "Memory: the largest increase while one clip was restored. Memory that an earlier method left free is not counted; "
+    "`quiver bench` measures each method in a separate process."
 )
 SCORES = ("psnr", "psnr_matched", "ssim", "ssim_matched")
 
 
 @dataclass(frozen=True)
 class SummaryLine:
-    """One method at one light level, over all clips."""
+    """One line of the table: a method at one light level."""
 
     method: str
     light: str
@@ -55,16 +55,17 @@ class SummaryLine:
     peak_bytes: int | None  # of memory, largest over clips
     above_peak: float  # share of target pixels above the peak, largest over clips
     truth_psnr: float | None  # dB, mean over clips
-    near_truth: tuple[str, ...]  # PSNR scores that come within metrics.NEAR_TRUTH of the truth's own in some clip
+    near_truth: tuple[str, ...]  # PSNR scores within metrics.NEAR_TRUTH of that of the truth, in some clip
     failures: tuple[str, ...]  # clip: reason
 
 
 def mean(values: Sequence[float]) -> float:
+    """Return the mean of values; NaN without any."""
     return sum(values) / len(values) if values else math.nan
 
 
 def summarise(rows: Sequence[ComparisonRow]) -> list[SummaryLine]:
-    """One line per method and light level, in the order of the rows."""
+    """Return one line per method and light level, in the order of the rows."""
     groups: dict[tuple[str, str], list[ComparisonRow]] = {}
     for row in rows:
         groups.setdefault((row.light, row.method), []).append(row)
@@ -98,7 +99,7 @@ def _line(method: str, light: str, rows: Sequence[ComparisonRow]) -> SummaryLine
 
 
 def near_truth(row: ComparisonRow, name: str = "psnr_matched") -> bool:
-    """Whether a clip's PSNR comes so near to what its truth is worth that the truth's own error weighs in it."""
+    """Return whether the PSNR of a clip is so close to that of its truth that the error of the truth matters."""
     if row.score is None or row.truth_psnr is None:
         return False
     return bool(getattr(row.score, name) > row.truth_psnr - metrics.NEAR_TRUTH)
@@ -116,7 +117,7 @@ def _interval(found: Interval, digits: int) -> str:
 def markdown(
     comparison: Comparison, methods: Sequence[Restorer], rows: Sequence[ComparisonRow], remarks: Sequence[str] = ()
 ) -> str:
-    """The whole evaluation as Markdown: means, what weakens them, failures, per scene, what was not built.
+    """Return the complete evaluation as Markdown: means, caveats, failures, scores per scene, methods not built.
 
     `remarks` are lines about networks outside of what they were measured for.
     """
@@ -136,7 +137,7 @@ def markdown(
         + "Matched = after the one factor "
         + ("per window" if comparison.published else "per clip")
         + " that is best behind this clamp; by frames = its mean over all frames of all clips alike; above peak = "
-        "share of the truth's pixels; n/a = the clamp hides the whole error, or no window of SSIM fits.",
+        "share of the truth's pixels; n/a = the clamp hides the complete error, or no window of SSIM fits.",
         "",
     ]
     lines = summarise(rows)
@@ -149,7 +150,7 @@ def markdown(
 
 
 def peak_name(comparison: Comparison) -> str:
-    """What the scores of a comparison refer to."""
+    """Return the name of the peak that the scores of a comparison refer to."""
     if comparison.peak is not None:
         return f"{comparison.peak:g} photons per pixel"
     return "the sensor's white, as published" if comparison.published else "2.5 x the stream's mean light"
@@ -173,12 +174,12 @@ def _cells(line: SummaryLine, method: Restorer) -> list[str]:
 
 
 def _caveats(lines: Sequence[SummaryLine], rows: Sequence[ComparisonRow]) -> list[str]:
-    """What weakens the scores: truth above the peak, and truth that is hardly better than the answer."""
+    """Return what weakens the scores: truth above the peak, and truth hardly better than the answer."""
     over: dict[str, tuple[float, str]] = {}
     for row in rows:
         if row.score is not None and row.score.above_peak > max(metrics.ABOVE_PEAK, over.get(row.light, (0.0, ""))[0]):
             over[row.light] = row.score.above_peak, f"{row.clip} at {row.light}"
-    text = [metrics.doubtful(what, share) + "\n" for share, what in over.values()]
+    text = [metrics.above_peak_warning(what, share) + "\n" for share, what in over.values()]
     if any(line.near_truth for line in lines):
         text.append(
             f"† In one clip or more within {metrics.NEAR_TRUTH:g} dB of the truth's own PSNR: the error of the truth "
@@ -193,7 +194,7 @@ def _seen_by(comparison: Comparison) -> str:
 
 
 def _by_motion(lines: Sequence[SummaryLine]) -> list[str]:
-    """PSNR against motion; nothing where no clip has flow."""
+    """Return the table of PSNR against motion; nothing if no clip has flow."""
     moving = [line for line in lines if not all(math.isnan(psnr) for psnr in line.psnr_by_motion)]
     if not moving:
         return []
@@ -221,7 +222,7 @@ def _per_scene(rows: Sequence[ComparisonRow]) -> list[str]:
 def as_dict(
     comparison: Comparison, methods: Sequence[Restorer], rows: Sequence[ComparisonRow], remarks: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """The whole evaluation for programs."""
+    """Return the complete evaluation for programs."""
     found: dict[str, Any] = json_safe(
         {
             "format": FORMAT,
@@ -242,7 +243,7 @@ def as_dict(
 
 
 def figure(rows: Sequence[ComparisonRow], path: Path) -> None:
-    """Matched PSNR of each method with its interval, one group of bars per light level, as PNG."""
+    """Draw the matched PSNR of each method with its interval, one group of bars per light level, as PNG."""
     lines = [line for line in summarise(rows) if line.scores["psnr"].scenes]
     lights, methods = list(dict.fromkeys(x.light for x in lines)), list(dict.fromkeys(x.method for x in lines))
     drawing = new_figure(4 + 1.2 * max(3, len(lights) * len(methods) / 2), 4)
@@ -268,7 +269,9 @@ def write(
     rows: Sequence[ComparisonRow],
     remarks: Sequence[str] = (),
 ) -> None:
-    """evaluation.json, .md, .png and a sheet of crops per light level, crops_LIGHT.png, in an evaluation's folder."""
+    """Write evaluation.json, .md, .png and one sheet of crops per light level, crops_LIGHT.png, in an evaluation's
+    folder.
+    """
     one_per_scene = list({row.scene: row.clip for row in reversed(rows)}.values())[::-1]
     for light in dict.fromkeys(row.light for row in rows):
         target = out / f"crops_{light.replace(', ', '_').replace(' ', '')}.png"

@@ -53,9 +53,7 @@ def codes_to_restore(args: argparse.Namespace) -> Codes:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if path.suffix not in (".npy", ".json"):
-        raise ValueError(
-            f"{path}: not a stream, a clip folder or a .npy array; `qsim convert` makes a clip of other files"
-        )
+        raise ValueError(f"{path}: not a stream, clip folder or .npy array; `qsim convert` makes a clip of other files")
     refuse(args, ["stream"], f"names a stream of a clip, and {path} is a file")
     if path.with_suffix(".json").is_file():
         stream = open_stream(path)
@@ -68,7 +66,7 @@ def _of_clip(path: Path, args: argparse.Namespace) -> Codes:
     clips = open_clips(path)
     if not (path / "clip.json").exists():
         one = f", as in {clips[0].path}" if clips else "; none is finished yet"
-        raise ValueError(f"{path}: is a data set; give one of its clips{one}")
+        raise ValueError(f"{path}: is a data set; name one of its clips{one}")
     clip: Clip = clips[0]
     refuse(args, BARE, f"describes a bare array, and {path} is a clip")
     if args.ppp is None and args.stream is None and len(clip.streams) != 1:

@@ -106,7 +106,7 @@ MISTAKES = [
     ("quiver restore lit -o x --ppp 3", "x: restored video is written as .npy; name a file that ends so"),
     ("qsim render lit -o x", "lit: is a clip, made from a scene already"),
     ("qsim render raises.py -o x", "raises.py:2: ZeroDivisionError: division by zero"),
-    ("quiver restore text.txt -o x.npy", "text.txt: not a stream, a clip folder or a .npy array"),
+    ("quiver restore text.txt -o x.npy", "text.txt: not a stream, clip folder or .npy array"),
     # Recipes
     ("qsim generate none.toml", "none.toml: no such recipe"),
     ("qsim generate bad.toml -o x", "bad.toml:1: not valid TOML"),
@@ -176,7 +176,7 @@ MISTAKES = [
         "--bits: data/clips/fan_0000/streams/quiver-physical_3bit_3.25ppp.npy is a stored stream, which has its own",
     ),
     ("quiver restore codes.npy -o x.npy --width 10 --planes 5", "sums 2^b - 1 binary planes, got 5; use 3 or 7"),
-    ("quiver restore codes.npy -o x.npy --seed 1", "--seed: is of noise that is drawn, and codes.npy holds codes"),
+    ("quiver restore codes.npy -o x.npy --seed 1", "--seed: is for noise that is drawn, and codes.npy holds codes"),
     ("quiver restore lit -o x.npy --ppp 3 --width 8", "--width: describes a bare array, and lit is a clip; leave it"),
     (
         "quiver restore lit -o x.npy --ppp 3 --method moment --mode streaming",
@@ -187,7 +187,7 @@ MISTAKES = [
     ("quiver evaluate", "give a data set or clip folder and -o, or --static COUNTS"),
     ("quiver evaluate none -o x", "none: no such data set"),
     ("quiver evaluate data -o x --methods naive,,moment", "expected names with commas between them"),
-    ("quiver evaluate data -o lit", "lit exists and is no evaluation; choose another -o"),
+    ("quiver evaluate data -o lit", "lit exists and is not an evaluation; choose another -o"),
     ("quiver evaluate --static light.npy", "light.npy: expected whole counts [N, H, W] or [T, K, H, W], got float32"),
 ]
 

@@ -214,7 +214,7 @@ def test_nothing_is_overwritten_without_force(capsys, tmp_path, tiny_dataset, cl
     assert "--force removes only what this command made" in mistake(
         capsys, *train_words(tiny_dataset, folder), "--force"
     )
-    assert "is no evaluation" in mistake(capsys, "evaluate", tiny_dataset, "-o", folder)
+    assert "is not an evaluation" in mistake(capsys, "evaluate", tiny_dataset, "-o", folder)
     assert "--force removes only" in mistake(capsys, "evaluate", tiny_dataset, "-o", folder, "--force")
     assert (folder / "thesis.txt").read_text() == "mine"
 

@@ -111,7 +111,7 @@ def test_an_interrupted_evaluation_goes_on(tiny_dataset, tmp_path):
     assert len(calls) == 5
     with pytest.raises(FileExistsError, match="holds another evaluation"):
         evaluate(replace(comparison, seed=1), [method("slow", count)], out)
-    with pytest.raises(FileExistsError, match="is no evaluation"):
+    with pytest.raises(FileExistsError, match="is not an evaluation"):
         begin(comparison, tmp_path, open_clips(str(tiny_dataset), "test"))
 
 
