@@ -1,1 +1,22 @@
 """Scores methods, measures their costs, and writes tables of both."""
+
+from typing import TYPE_CHECKING
+
+from qsim.files import lazy_names
+
+if TYPE_CHECKING:
+    from quiver.evaluation.comparison import Comparison, ComparisonRow, evaluate
+    from quiver.evaluation.metrics import Score, score
+
+__all__ = ["Comparison", "ComparisonRow", "Score", "evaluate", "score"]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "Comparison": "comparison",
+        "ComparisonRow": "comparison",
+        "Score": "metrics",
+        "evaluate": "comparison",
+        "score": "metrics",
+    },
+)

@@ -127,7 +127,7 @@ def test_the_factor_is_the_best_behind_the_clamp(chunk, monkeypatch):
 
 
 def test_no_score_is_infinite_unless_the_frames_are_equal():
-    """Any light, any brightness, any noise: where the clamp hides the complete error there is no score, never infinity."""
+    """Any light, any brightness, any noise: where the clamp hides all error there is no score, never infinity."""
     rng = np.random.default_rng(6)
     hidden = 0
     for _ in range(400):

@@ -1,0 +1,71 @@
+"""Classical restorers, one file per method, one signature.
+
+    restore(codes [T, H, W], sensor, exposure, *, window=..., photons_per_unit=1, frames=None)
+        -> restored [T, H, W], float32
+
+With `frames`, a range, these alone are restored, from the frames around them all the same. Any number of frames and any
+size; a clip is continued by reflection at both ends. METHODS is the whole list: import the module of a method for its
+other settings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from numpy import ndarray as Array
+
+from quiver.baselines import likelihood, moment, naive_mean, qbp, transform_denoise
+from quiver.baselines.sliding_window import look_ahead
+
+
+@dataclass(frozen=True)
+class Method:
+    """A restorer and what a table says about it."""
+
+    name: str
+    restore: Callable[..., Array]  # restore(codes, sensor, exposure, *, window=..., photons_per_unit=1) -> [T, H, W]
+    window: int  # frames used for one restored frame, when not told otherwise
+    description: str
+    bytes_per_pixel: int  # working memory, about, beside the codes and the video
+
+    @property
+    def look_ahead(self) -> int:
+        """Future frames used for one restored frame, with the default window."""
+        return look_ahead(self.window)
+
+
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (
+        Method("naive", naive_mean.restore, 11, "mean of the codes, taken as linear in light", 50),
+        Method("moment", moment.restore, 11, "mean of the codes through the exact inverse response", 50),
+        Method("likelihood", likelihood.restore, 11, "most likely light given the codes of one pixel", 300),
+        Method(
+            "transform-denoise", transform_denoise.restore, 3, "variance stabilised, BM3D, exact unbiased inverse", 1800
+        ),
+        Method("qbp", qbp.restore, 11, "align, Wiener merge, exact inverse response", 600),
+        Method(
+            "qbp-bm3d",
+            partial(qbp.restore, excess=qbp.EXCESS),
+            11,
+            "align, Wiener merge, stabilise, BM3D, exact unbiased inverse",
+            1800,
+        ),
+        Method(
+            "transform-denoise-published",
+            partial(transform_denoise.restore, kind="binomial"),
+            3,
+            "Transform Denoise with the arcsine for sums of binary samples",
+            1800,
+        ),
+        Method(
+            "qbp-published",
+            partial(qbp.restore, settings=qbp.AS_PUBLISHED),
+            11,
+            "QBP with the article's noise estimate and whole-pixel shifts",
+            600,
+        ),
+    )
+}
