@@ -1,4 +1,4 @@
-"""How often the 95 % intervals of `qsim calibrate` hold the truth: writes docs/results/coverage.md.
+"""Measures how often the 95 % intervals of `qsim calibrate` hold the truth, and writes docs/results/coverage.md.
 
     python docs/coverage.py [RUNS]      # 1000 calibrations of each synthetic sensor: 25 minutes on one core
 

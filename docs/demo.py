@@ -1,9 +1,9 @@
-"""The demo: from scenes to restored video with the commands that anybody can type, and one page of what came out.
+"""Runs the demo: the commands from scenes to restored video, and one page of the results.
 
     python docs/demo.py out/demo
 
-Every step is one printed command of `qsim` or `quiver`; a finished step is not done again. Ends with the time and the
-memory that it took.
+Every step is one printed command of `qsim` or `quiver`; a finished step is not repeated. The last line states the time
+and the memory of the run.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def main(out: Path) -> int:
     try:
         steps(out)
     except subprocess.CalledProcessError as failed:
-        print(f"demo: stopped at '{shlex.join(failed.cmd[2:])}'; `make demo` goes on from there", file=sys.stderr)
+        print(f"demo: stopped at '{shlex.join(failed.cmd[2:])}'; `make demo` resumes there", file=sys.stderr)
         return failed.returncode
     minutes = (time.perf_counter() - started) / 60
     peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
@@ -101,7 +101,7 @@ def restore(source: Path, target: Path, method: str) -> None:
 
 
 def run(what: str, program: str, *arguments: str | Path, capture: bool = False) -> str:
-    """One command; its progress goes to the terminal."""
+    """Run one command; its progress goes to the terminal."""
     words = [str(word) for word in arguments]
     print(f"\n{what}\n  $ {program} {shlex.join(words)}", flush=True)
     done = subprocess.run(

@@ -1,10 +1,10 @@
-"""Seconds per restored 512 x 1024 frame of every classical method, as a Markdown table.
+"""Measures the seconds per restored 512 x 1024 frame of every classical method and prints a Markdown table.
 
     python docs/speed.py
 
-A stack of one frame takes the work of one restored frame: its window is the same frame eleven times. Methods that look
-at one pixel at a time are timed on 16 frames, whose windows differ. Light is a photograph, 3 bits, 3.25 PPP; every
-method runs twice, the second time counts.
+A stack of one frame costs as much as one restored frame: its window is the same frame eleven times. Methods that treat
+one pixel at a time are timed on 16 frames, whose windows differ. The light is a photograph, 3 bits, 3.25 PPP. Every
+method runs twice, and the second run is timed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A clip of waves that move by whole pixels: its statistics are the same at all times."""
+"""Makes a clip of waves that move by whole pixels, so that its statistics do not change with time."""
 
 import numpy as np
 
@@ -10,9 +10,9 @@ SIZE = (48, 64)
 
 
 def wave_clip(path, frames: int, speed: int, frame_rate: float = 10_000.0, *, still: int = 0) -> Clip:
-    """A periodic texture that moves to the right by whole pixels: its statistics are the same at all times.
+    """Write a clip of a periodic texture that moves to the right by `speed` px per frame.
 
-    `still` rows are said to stand still.
+    The flow of the first `still` rows is 0.
     """
     y, x = np.mgrid[0 : SIZE[0], 0 : SIZE[1]]
     turn = 2 * np.pi / SIZE[1]

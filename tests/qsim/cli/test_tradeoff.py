@@ -1,4 +1,4 @@
-"""`qsim tradeoff`: numbers, figure and streams; one line where something cannot be answered."""
+"""Tests `qsim tradeoff`: numbers, figure and streams, and one line for a mistake."""
 
 import json
 
@@ -56,7 +56,7 @@ def test_mistakes_are_one_line(clip, capsys, words, message):
     assert error.count("\n") == 1
 
 
-def test_no_source_is_said(capsys, tmp_path):
+def test_a_missing_or_unknown_source_is_refused(capsys, tmp_path):
     assert main(["tradeoff"]) == 2
     assert "give a clip or a scene" in capsys.readouterr().err
     assert main(["tradeoff", "fann", "-o", str(tmp_path)]) == 2

@@ -1,4 +1,4 @@
-"""The clip of noise that previews show, and a folder of all that a page shows."""
+"""Shares a clip of noise, and a folder with every kind of result that a page shows."""
 
 import json
 
@@ -16,7 +16,7 @@ SHAPE = (5, 8, 11)
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory) -> Clip:
-    """Noise of odd size with a truth: everything moves 2 px to the right, depth grows downwards, one row has none."""
+    """Return noise of odd size: all pixels move 2 px to the right, depth grows downwards, the last row has none."""
     path = tmp_path_factory.mktemp("preview") / "odd"
     meta = {"shape": list(SHAPE), "frame_rate": 2000.0, "exposure": 5e-4, "radiance_unit": RELATIVE, "camera": None}
     flow = np.zeros((2, *SHAPE[1:]), np.float32)
@@ -33,7 +33,7 @@ def clip(tmp_path_factory) -> Clip:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A clip with a stream, a restored video of it, a training curve and an evaluation."""
+    """Return a folder with a clip, a stream, a restored video, a training curve and an evaluation."""
     top = tmp_path_factory.mktemp("report")
     clip = square_clip(top / "square")
     assert main(["sense", str(clip.path), "--ppp", "3.25", "--bits", "3"]) == 0

@@ -1,4 +1,4 @@
-"""A clip on a page: its light, motion, codes beside their exact distribution, what was modelled, its error."""
+"""Tests the section of a clip: light, motion, codes with their exact distribution, modelled effects, error."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ DEVICES = {
 
 @pytest.mark.parametrize("name", DEVICES)
 def test_the_expected_codes_include_the_maps(tmp_path, name):
-    """The drawn histogram against the marks, by chi-square; the sensor's own distribution without the maps fails it."""
+    """Chi-square accepts the expectation with the maps, and rejects that of the sensor without them."""
     (tmp_path / "device.toml").write_text(DEVICES[name])
     rates = np.random.default_rng(5).lognormal(7, 1, (40, 60))
     np.save(tmp_path / "rates.npy", rates)
@@ -48,7 +48,7 @@ def test_the_expected_codes_include_the_maps(tmp_path, name):
         assert "rates.npy has changed since the stream was drawn" in clip_section.clip_section(clip)
 
 
-def test_marks_are_left_out_where_nothing_exact_is_known(tmp_path):
+def test_no_expectation_is_shown_without_an_exact_one(tmp_path):
     text = '[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 900.0\nbits = 1\n[defects]\n'
     clip = square_clip(tmp_path / "clip", frames=3, size=(12, 14))
     for cause in ("crosstalk", "afterpulse"):
@@ -74,7 +74,7 @@ def test_average_is_the_mean_of_the_codes_around(folder):
     assert shown[2][brightest] == 255
 
 
-def test_clip_section_says_light_motion_model_and_error(tmp_path):
+def test_the_section_states_light_motion_model_and_error(tmp_path):
     """Numbers of the page are those of the clip: photons, factor, lux, motion, findings, error of every frame."""
     clip = write_clip(
         tmp_path / "lit", frames=4, height=20, width=24,
@@ -93,7 +93,7 @@ def test_clip_section_says_light_motion_model_and_error(tmp_path):
 
 
 def test_motion_is_that_of_the_pixels_that_move(folder):
-    """The square moves 1 px, all else stands; half of the pixels unknown changes nothing."""
+    """The square moves 1 px; all other pixels are still."""
     assert clip_section.motion(Clip.open(folder / "square"), range(5)) == (1.0, 1.0)
     page = report.build_page(folder / "square")
     assert (
@@ -104,7 +104,7 @@ def test_motion_is_that_of_the_pixels_that_move(folder):
 
 
 def test_expected_histogram_is_the_mean_of_the_exact_distribution(tmp_path):
-    """Even light: the expected shares are the sensor's pmf, and the drawn ones lie around them."""
+    """Even light: the expected shares are the pmf of the sensor."""
     clip = write_clip(tmp_path / "even", radiance=np.full((4, 40, 50), 1.0))
     assert main(["sense", str(clip.path), "--ppp", "3.25", "--bits", "3", "-o", "mine"]) == 0
     stream = clip.stream("mine")

@@ -1,4 +1,4 @@
-"""The parts of a report page: self-contained, escaped, consistent."""
+"""Tests the parts of a page: self-contained, escaped, consistent."""
 
 import re
 
@@ -21,7 +21,7 @@ def test_page_loads_nothing_from_elsewhere():
     assert "{{" not in text
 
 
-def test_words_are_escaped():
+def test_text_is_escaped():
     text = page("<b>", "&", [section("<i>", table(Table("c", ["<x>"], [["a<b"]])))])
     assert "<b>" not in text.replace("<body>", "")
     assert "a&lt;b" in text
@@ -48,7 +48,7 @@ def test_panels_of_one_player_have_equal_length():
         player([Panel("a", frames(3)), Panel("b", frames(2))])
 
 
-def test_numbers_are_aligned_and_nothing_is_a_dash():
+def test_numbers_are_aligned_and_none_is_a_dash():
     text = table(Table("t", ["name", "dB"], [["mean", 20.12345], ["none", None]], best=frozenset({0})))
     assert '<td class="number">20.12</td>' in text
     assert '<td class="number">–</td>' in text

@@ -1,4 +1,4 @@
-"""Quick looks: pictures hold legend and declaration, films have all frames, terminals get half blocks."""
+"""Tests previews: pictures with legend and declaration, films with all frames, half blocks in terminals."""
 
 import json
 import os
@@ -84,7 +84,7 @@ def test_fit_keeps_the_shape_and_never_enlarges():
 
 
 def _in_a_terminal(*words: object, **environment: str) -> str:
-    """What a command prints where its output is a terminal of 30 columns."""
+    """Return the output of a command in a terminal of 30 columns."""
     master, slave = pty.openpty()
     env = {**os.environ, "COLUMNS": "30", "LINES": "20", **environment}
     command = [sys.executable, "-m", "qsim", *map(str, words)]
@@ -103,7 +103,7 @@ def _in_a_terminal(*words: object, **environment: str) -> str:
     return found.decode()
 
 
-def test_a_terminal_gets_colour_and_every_frame_played(clip):
+def test_a_terminal_shows_colour_and_plays_every_frame(clip):
     shown = _in_a_terminal("preview", clip.path, "--what", "flow", "--play", "--fps", "200", NO_COLOR="")
     assert "\x1b[38;2;255;0;0m" in shown
     assert shown.count("\x1b[5A") == 4, "four rows of characters, five frames: back up four times"

@@ -1,4 +1,4 @@
-"""Reports: a page for every kind of thing, offline, and one clear sentence where there is nothing to show."""
+"""Tests pages: every kind of result, nothing loaded from elsewhere, one line of error if there is no result."""
 
 import json
 import re
@@ -19,7 +19,7 @@ def test_page_shows_everything_and_loads_nothing(folder):
         assert words in page, words
     assert "&lt;moment&gt;" in page
     assert page.count('class="player"') == 2
-    assert "recorded video" in page  # what another camera saw is not called the truth
+    assert "recorded video" in page  # an imported video is not called the truth
     assert "light of the truth" not in page
     addresses = re.findall(r'(?:src|href|data-strip)="([^"]*)"', page)
     assert all(address.startswith("data:") for address in addresses)
@@ -39,7 +39,7 @@ def test_command_writes_and_does_not_overwrite(folder, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("what", ["missing", "empty"])
-def test_nothing_to_show_is_said(tmp_path, capsys, what):
+def test_a_path_without_results_is_refused(tmp_path, capsys, what):
     path = tmp_path / what
     if what == "empty":
         path.mkdir()
@@ -52,9 +52,9 @@ def test_nothing_to_show_is_said(tmp_path, capsys, what):
 
 def test_a_data_set_is_a_table_and_a_clip_of_each_split(tmp_path):
     data = write_dataset(tmp_path / "tiny", {"train": 2, "val": 1, "test": 1})
-    told: list[tuple[int, int]] = []
-    page = report.build_page(data, progress=lambda done, total: told.append((done, total)))
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    steps: list[tuple[int, int]] = []
+    page = report.build_page(data, progress=lambda done, total: steps.append((done, total)))
+    assert steps == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert page.count('class="player"') == 3
     assert re.findall(r"<h2>(.*?)</h2>", page) == ["Data set tiny", "Clip test_0", "Clip train_0", "Clip val_0"]
     assert "4 clips; motion in the middle frame" in page
@@ -95,7 +95,7 @@ window.addEventListener("load", () => setTimeout(() => {
 
 
 def chromium(*words: object, profile: object) -> str:
-    """Standard output of a headless Chromium."""
+    """Return the standard output of a headless Chromium."""
     options = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-sync"
     command = [
         "chromium",
@@ -110,7 +110,7 @@ def chromium(*words: object, profile: object) -> str:
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium to look at the page with")
 @pytest.mark.parametrize("dark", [False, True])
 def test_page_works_in_a_real_browser(folder, tmp_path, dark):
-    """At a phone's width: the scrubber moves frames, keys step, the slider reveals, nothing complains or sticks out."""
+    """At a phone's width: the scrubber moves frames, keys step, the slider reveals, without errors or overflow."""
     import html
 
     page = tmp_path / "page.html"
@@ -136,7 +136,7 @@ def test_page_works_in_a_real_browser(folder, tmp_path, dark):
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium to look at the page with")
 def test_a_screenshot_is_not_blank(folder, tmp_path):
-    """Dark and bright parts of the pictures are both there."""
+    """The screenshot has dark and bright pixels."""
     from PIL import Image
 
     page, picture = tmp_path / "page.html", tmp_path / "page.png"

@@ -1,4 +1,4 @@
-"""Tables of a page: evaluations, studies, costs and validations as their files have them."""
+"""Tests the tables of a page: evaluations, studies, costs and validations from their files."""
 
 import json
 
@@ -6,7 +6,7 @@ from qsim.report import report
 from qsim.studies.validation.reading import ReadingReport
 
 
-def test_an_evaluation_says_what_its_scores_mean(folder):
+def test_an_evaluation_defines_its_scores(folder):
     """Before format 2 the peak was the sensor's white and the factor unclamped; a page never mixes the two."""
     assert "peak = the sensor&#39;s white" in report.build_page(folder, title="All")
     path = folder / "evaluation.json"

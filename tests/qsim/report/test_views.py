@@ -1,4 +1,4 @@
-"""Views are the declared functions of the numbers."""
+"""Tests that views are the declared functions of the numbers."""
 
 import json
 
@@ -29,7 +29,7 @@ def test_average_is_of_the_frames_around(clip):
     assert np.array_equal(view.picture(0)[..., 0], pictures.tone(mean, view.scale["white"]))
 
 
-def test_restored_video_says_what_it_is(tmp_path):
+def test_restored_video_names_its_method(tmp_path):
     np.save(tmp_path / "video.npy", np.full((3, 4, 5), 6.5, np.float32))
     described = {"format": "quiver-restored-1", "method": "moment", "unit": "photons", "frame_rate": 2000.0}
     (tmp_path / "video.json").write_text(json.dumps(described))
@@ -45,6 +45,6 @@ def test_packed_planes_are_unpacked(tmp_path):
     assert np.array_equal(view.picture(2)[..., 0], planes[2] * 255)
 
 
-def test_a_clip_senses_nothing_and_shows_its_light(tmp_path):
+def test_a_clip_without_streams_shows_its_light(tmp_path):
     clip = write_clip(tmp_path / "plain", frames=3)
     assert list(open_source(clip.path).views) == ["sharp"]

@@ -1,4 +1,4 @@
-"""The clip of waves that the studies of bit depth are made of."""
+"""Shares the clip of waves among the tests of bit-depth studies."""
 
 import pytest
 from waves import wave_clip

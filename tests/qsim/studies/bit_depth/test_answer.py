@@ -1,4 +1,4 @@
-"""The motion that is asked for, optima at the edge of the tried depths, and the sentence."""
+"""Tests the search for a wanted motion, optima at the edge of the tried depths, and the sentence."""
 
 import json
 
@@ -15,7 +15,7 @@ from qsim.studies.bit_depth.readout import MODELS, StudySettings
 
 @pytest.mark.parametrize("seed", range(40))
 def test_the_speed_is_found_for_any_scene(seed):
-    """Random fields of flow: the motion reached is within 5 % of what was asked, or the refusal names the nearest."""
+    """Random fields of flow: the motion reached is within 5 % of the wanted one, or the error names the nearest."""
     rng = np.random.default_rng(seed)
     length = rng.exponential(10 ** rng.uniform(-5, 2), 500) * (rng.random(500) < rng.uniform(0.01, 1))
     px = 10 ** rng.uniform(-0.5, 1.5)
@@ -58,13 +58,13 @@ def test_a_clip_is_made_faster_by_whole_factors(clip, tmp_path, capsys):
 
 
 def test_an_optimum_at_the_edge_is_marked(clip):
-    """Dim and slow wants many bits; the sentence says how much the neighbours lose."""
+    """Dim and slow needs many bits; the sentence states the loss of the neighbours."""
     found = study(clip, StudySettings(bits=(1, 2), ppp=0.1, instants=4))
     assert answer.at_edge(found, "multibit") == ">="
     assert answer.marked(found, "multibit") == ">= 2"
-    said = answer.answer(found)
+    sentence = answer.answer(found)
     lost = found.best("multibit").psnr_db - next(row for row in found.rows if row.model == "multibit").psnr_db
-    assert f"multibit >= 2 bits, 1 bit is {lost:.1f} dB worse (the deepest tried: try --bits 1,...,4)" in said
+    assert f"multibit >= 2 bits, 1 bit is {lost:.1f} dB worse (the deepest tried: try --bits 1,...,4)" in sentence
     deep = study(clip, StudySettings(bits=(4, 5), ppp=30.0, instants=2))
     assert answer.at_edge(deep, "multibit") == "<="
 
@@ -81,7 +81,7 @@ def test_the_range_is_widened_until_the_best_is_inside(clip):
 
 @pytest.mark.slow
 def test_the_motion_of_a_scene_is_that_of_its_clip(tmp_path, capsys):
-    """Measured without rendering; the rendered clip then moves so."""
+    """The motion is measured without rendering; the rendered clip has the same."""
     words = ["tradeoff", "fan", "--px", "3", "--ppp", "2", "--bits", "1,2", "--size", "24x32", "--frames", "16"]
     assert main([*words, "-o", str(tmp_path / "out"), "--json", "-q"]) == 0
     found = json.loads(capsys.readouterr().out)

@@ -1,4 +1,4 @@
-"""Bit depths of one clip: simulated errors against their expectations."""
+"""Tests the bit-depth study of one clip: simulated errors against their expectations."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def rows_of(found, model):
 @pytest.mark.parametrize("ppp", [0.1, 0.65, 8.0])
 @pytest.mark.parametrize("plane", [None, "quiver-paper"])
 def test_simulation_agrees_with_its_expectation(clip, ppp, plane):
-    """Twelve rows, none further off than its stated error allows (p = 1e-6 in all)."""
+    """No row differs by more than its stated error allows (false alarm 1e-6 for all rows together)."""
     rows = study(clip, StudySettings(bits=(1, 3, 4), ppp=ppp, plane=plane, instants=4)).rows
     limit = critical_z(1e-6 / len(rows))
     # 3e-3: second order in the differences of light between the planes of a frame
@@ -71,7 +71,7 @@ def test_deeper_frames_hold_the_planes_of_shallower_ones(clip):
 
 
 def test_faster_is_every_other_frame(clip, tmp_path):
-    """Speed 2 of a clip is the clip that moves twice as fast."""
+    """A clip read at speed 2 equals a clip that moves twice as fast."""
     twice = wave_clip(tmp_path / "wave2", 32, 2)
     stepped = study(clip, StudySettings(bits=(1, 3), ppp=0.65, speed=2, instants=1))
     fast = study(twice, StudySettings(bits=(1, 3), ppp=0.65, instants=1))
@@ -80,7 +80,7 @@ def test_faster_is_every_other_frame(clip, tmp_path):
         assert a.motion_px_per_frame == pytest.approx(b.motion_px_per_frame)
 
 
-def test_clips_that_cannot_answer_are_refused(clip, tmp_path, capsys):
+def test_clips_that_are_too_slow_or_short_are_refused(clip, tmp_path, capsys):
     slow = wave_clip(tmp_path / "slow", 3, 1, frame_rate=2000.0)
     with pytest.raises(ValueError, match="at least 10000 fps"):
         study(slow, StudySettings(ppp=1.0))
@@ -91,7 +91,7 @@ def test_clips_that_cannot_answer_are_refused(clip, tmp_path, capsys):
 
 
 def test_one_definition_of_motion(tmp_path):
-    """Half of the field stands still: studies, figures and the clip page all say what the moving half does."""
+    """Half of the field is still: studies and the clip page state the motion of the other half."""
     clip = wave_clip(tmp_path / "half", 32, 2, still=24)
     rows = study(clip, StudySettings(bits=(1, 3), ppp=0.65, instants=2)).rows
     assert [row.motion_px_per_frame for row in rows] == pytest.approx([2, 14, 2, 14])

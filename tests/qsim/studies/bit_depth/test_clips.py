@@ -1,4 +1,4 @@
-"""Clips of a study: a clip at several speeds, grouped frames, and a rendered clip that is kept or refused."""
+"""Tests the clips of a study: one clip at several speeds, grouped frames, and another clip in the way."""
 
 import numpy as np
 import pytest

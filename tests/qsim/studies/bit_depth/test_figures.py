@@ -1,4 +1,4 @@
-"""Figures of studies: one study and a sweep are drawn as PNG."""
+"""Tests that a study and a sweep are drawn as PNG."""
 
 from qsim.studies.bit_depth.clip_study import study
 from qsim.studies.bit_depth.clips import MovingClip

@@ -1,4 +1,4 @@
-"""Bit depth against motion: the paper's table, and the laws behind it."""
+"""Tests the laws of bit depth against motion, with the paper's table."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The paper's two figures as numbers, on tiny clips whose answer is known."""
+"""Tests the numbers of the paper's two figures on tiny clips with known results."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ SIZE = (24, 30)
 
 
 def still_clip(path, frames: int, rate: float, camera: Camera | None = None) -> Clip:
-    """An even grey field that never changes."""
+    """Write a clip of an even grey field that never changes."""
     meta = {"shape": [frames, *SIZE], "frame_rate": rate, "exposure": 1 / rate, "radiance_unit": RELATIVE}
     if camera is not None:
         from qsim.scene import describe

@@ -1,4 +1,4 @@
-"""The sweep over speed and light, and the depths that the law names."""
+"""Tests the sweep over speed and light, and the depths that the law predicts."""
 
 import json
 
@@ -6,7 +6,7 @@ from qsim.cli.program import main
 
 
 def test_sweep_over_speed_and_light(clip, tmp_path, capsys):
-    """The law from the slowest clip picks depths that cost less than 0.3 dB.
+    """The depths of the law from the slowest clip lose less than 0.3 dB.
 
     Not where binary planes saturate: there motion helps them, and the law takes light as constant within a frame.
     """
@@ -26,4 +26,4 @@ def test_sweep_over_speed_and_light(clip, tmp_path, capsys):
     lawful = [cell for cell in cells if cell["model"] == "multibit" or cell["ppp"] < 1]
     assert max(cell["loss_of_prediction_db"] for cell in lawful) < 0.3
     best = {(cell["speed"], cell["ppp"]): cell["best_bits"] for cell in cells if cell["model"] == "multibit"}
-    assert best[4.0, 30.0] < best[1.0, 0.3]  # fast and bright wants short frames
+    assert best[4.0, 30.0] < best[1.0, 0.3]  # fast and bright needs short frames

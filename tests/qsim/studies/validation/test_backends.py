@@ -1,4 +1,4 @@
-"""Engines beside each other: those that work here agree, and a report of ones that do not says so."""
+"""Tests the comparison of backends: those that work here agree, and a difference of means fails."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from qsim import backend as engine
 from qsim.studies.validation.backends import DEVIATIONS, BackendReport, BackendRow, run, table
 
 
-def test_engines_that_work_here_agree():
+def test_backends_that_work_here_agree():
     report = run(["plain"], height=24, width=32, seed=3)
     assert {row.engine for row in report.rows} | set(report.missing) == set(engine.BACKENDS)
     assert "scalar" in {row.engine for row in report.rows}
@@ -22,7 +22,7 @@ def test_engines_that_work_here_agree():
         assert f"{backend}: {why}" in table(report)
 
 
-def test_means_apart_are_said():
+def test_a_difference_of_means_fails():
     plain = BackendRow("scalar", "fan", 2.0, None, 1.0, 0.003)
     other = BackendRow("cuda", "fan", 0.5, 0.08, 1.0 + 0.9 * DEVIATIONS * 0.005, 0.004)
     good = BackendReport(8, 8, 32, (other, plain), {})

@@ -1,4 +1,4 @@
-"""`qsim validate light`: the verdict on error and mean light, and small scenes that have both as stated."""
+"""Tests `qsim validate light`: the verdict on error and mean light, and small scenes that fulfil it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from qsim.studies.validation.light import LightReport, LightRow
 ROW = LightRow("a/0", 36.0, 36.4, 36.3, 30.0, 30.1, 32, 4, True, -0.0040, 0.0043, 0.0002)
 
 
-def test_the_verdict_on_light_needs_error_and_light_as_said():
+def test_the_verdict_needs_the_wanted_error_and_the_announced_light():
     good = LightReport(8, 10, "llvm", (ROW,))
     assert good.ok
     assert "as announced" in light.table(good)
@@ -29,8 +29,8 @@ def test_the_verdict_on_light_needs_error_and_light_as_said():
         light.run([])
 
 
-def test_a_small_scene_has_the_error_and_the_light_that_are_said():
-    """A plate in sun and sky, 24 x 33 pixels, six frames; errors of so few pixels are known to about 5 %."""
+def test_a_small_scene_has_the_stated_error_and_the_announced_light():
+    """A plate in sun and sky, six frames of 24 x 33; the errors of so few pixels are accurate to about 5 %."""
     report = light.run([plate(None, light=SunSky())], levels=(32.0,), reference_samples=512, frames=tuple(range(6)))
     (row,) = report.rows
     assert row.ok
@@ -40,6 +40,6 @@ def test_a_small_scene_has_the_error_and_the_light_that_are_said():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("family", ["glossy", "glass", "room", "shadow"])
-def test_families_that_tuned_nothing_have_the_light_that_is_announced(family):
+def test_families_not_used_for_tuning_have_the_announced_light(family):
     report = light.run([scenes.load(family, seed=4).resized(64, 96)])
     assert report.ok, light.table(report)

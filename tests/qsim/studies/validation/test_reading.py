@@ -1,4 +1,4 @@
-"""Random crops for training: both readers read the same windows, and the verdict follows from their speeds."""
+"""Tests the comparison of readers: both read the same windows, and the verdict follows from their speeds."""
 
 import json
 
@@ -10,7 +10,7 @@ from qsim.studies.validation import reading
 from qsim.studies.validation.reading import ReadingReport
 
 
-def test_what_counts_as_quick():
+def test_the_verdict_follows_from_speed_ratio_and_difference():
     for clip, mp4, difference, ok in [
         (100.0, 20.0, 0.01, True),
         (99.0, 2.0, 0.01, False),
@@ -22,7 +22,7 @@ def test_what_counts_as_quick():
 
 @pytest.mark.slow
 def test_both_sides_read_equal_windows(capsys: pytest.CaptureFixture[str]):
-    """Ours and FFmpeg on the same windows: the pictures agree; the exit code is the verdict on speed, which is free."""
+    """The pictures of both readers agree; the exit code is the verdict, and no speed is required here."""
     pytest.importorskip("av")
     code = main(["validate", "reading", "--json"])
     found = json.loads(capsys.readouterr().out)
@@ -33,8 +33,8 @@ def test_both_sides_read_equal_windows(capsys: pytest.CaptureFixture[str]):
 
 
 @pytest.mark.slow
-def test_the_two_sides_read_the_same_window(monkeypatch: pytest.MonkeyPatch):
-    """A window one frame off is seen: the texture moves by 3 pixels per frame."""
+def test_windows_one_frame_apart_differ(monkeypatch: pytest.MonkeyPatch):
+    """The texture moves by 3 px per frame, so a window one frame off differs."""
     pytest.importorskip("av")
     right = reading.from_mp4
     monkeypatch.setattr(reading, "from_mp4", lambda path, at: right(path, ((at[0] + 1) % 50, *at[1:])))

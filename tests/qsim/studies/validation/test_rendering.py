@@ -1,4 +1,4 @@
-"""The comparison with the naive loop: what it finds is what it claims to find."""
+"""Tests the comparison with the naive loop: its light, the reference's variance, and the verdict."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from qsim.studies.validation.rendering import NaiveLoop, RenderReport, RenderRow
 ROW = RenderRow("a/0", 40.0, 1024, 40.2, 3.0, False, 32, True, 4, 40.6, 40.1, 0.25)
 
 
-def test_the_naive_loop_sees_the_same_scene():
-    """Its camera, film and sampler are Mitsuba's own: both means agree within their errors."""
+def test_the_naive_loop_renders_the_same_scene():
+    """Camera, film and sampler are those of Mitsuba; both means agree within their errors."""
     views = renderer(plate(Spin((0, 0, 1), 200.0), light=SunSky()), budget=Budget(128, 16))
     ours = views.frame(2, with_truth=False)
     theirs = NaiveLoop(views).frame(2, 64)
@@ -37,7 +37,7 @@ def test_calls_of_the_naive_loop_draw_other_samples():
     assert (one != other).mean() > 0.5
 
 
-def test_the_variance_of_the_reference_is_not_held_against_an_image():
+def test_the_variance_of_the_reference_is_subtracted():
     rng = np.random.default_rng(1)
     truth = np.ones((300, 300))
     target = Target(truth + 0.02 * rng.standard_normal((2, 300, 300)))

@@ -1,4 +1,4 @@
-"""`qsim validate sensor`: a right program passes, each kind of fault is named, and the exit code says so."""
+"""Tests `qsim validate sensor`: a correct program passes; each kind of error is named and sets the exit code."""
 
 import json
 from dataclasses import replace
@@ -18,7 +18,7 @@ PIXELS = 1 << 16
 
 @pytest.fixture(scope="module")
 def report():
-    """One report of two models: the others take their time in the slow tier."""
+    """Return a report of two models; the slow tier runs all."""
     with pytest.MonkeyPatch.context() as patch:
         few = {name: sensors.MODELS[name] for name in ("QIS 3 bits, gain 1", "clocked SPAD, 1 bit")}
         patch.setattr(sensors, "MODELS", few)
@@ -26,7 +26,7 @@ def report():
         yield sensors.run(PIXELS)
 
 
-def test_the_report_holds_a_row_for_every_engine_and_is_well(report):
+def test_the_report_holds_a_row_for_every_engine_and_is_within_bounds(report):
     assert report.ok
     assert report.pixels == PIXELS
     engines = {(row.model, row.engine) for row in report.rows}
@@ -67,7 +67,7 @@ GOOD = sensors.SensorRow("m", "fast", 1.0, 30.0, 25.0, 1e-7, 0.5, 0.1, -0.2, 0.0
         ({"times_numpy": 24.0}, "speed"),
     ],
 )
-def test_each_fault_is_named(change, name):
+def test_each_error_is_named(change, name):
     assert sensors.judged(GOOD, 60, require_speed=True).wrong == ()
     assert sensors.judged(replace(GOOD, **change), 60, require_speed=True).wrong == (name,)
     if name == "speed":
@@ -89,14 +89,14 @@ def test_a_sensor_that_is_one_percent_off_does_not_pass():
 
 
 def test_an_impossible_code_does_not_pass():
-    """A binary sensor that cannot fire, and yet does 50 times: pooling must not hide it."""
+    """A binary sensor that cannot fire fires 50 times; pooling must not hide it."""
     sensor = BinarySPAD(0.5, 0.0)
     codes = np.zeros(PIXELS, np.uint8)
     codes[:50] = 1
     assert sensors.statistics(codes, sensor, 0.0)[0] == 0.0
 
 
-def test_the_figure_is_written_whole(report, tmp_path):
+def test_the_figure_is_written(report, tmp_path):
     for kind, start in (("png", b"\x89PNG"), ("svg", b"<?xml")):
         path = tmp_path / "new" / f"speed.{kind}"
         sensors.figure(report, path)
@@ -123,6 +123,6 @@ def test_too_few_pixels_are_refused():
 
 
 @pytest.mark.slow
-def test_the_whole_report_is_well():
+def test_the_complete_report_is_within_bounds():
     report = sensors.run(1 << 18)
     assert report.ok, "\n".join(sensors.table(report))
