@@ -1,4 +1,4 @@
-"""Files: leftovers of interrupted writes, links, and the words of the system's errors."""
+"""Files: leftovers of interrupted writes, links, and the wording of the system's errors."""
 
 import errno
 import os
@@ -18,7 +18,7 @@ from qsim.dataset import recipe
 
 @pytest.mark.parametrize("name", ["fan", "fan_x2", "fan.tmp-1", "fan.removed-7x"])
 def test_only_exact_leftovers_are_swept(tmp_path: Path, name: str):
-    """Of `fan` only fan.tmp-N and fan.removed-N, with a whole number; links go, what they point to stays."""
+    """Of `fan` only fan.tmp-N and fan.removed-N with a number N; links are deleted, their targets stay."""
     target = tmp_path / "elsewhere"
     target.mkdir()
     (target / "precious").touch()

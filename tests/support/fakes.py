@@ -1,6 +1,6 @@
-"""A renderer for tests of everything around the renderer: quick, deterministic, and slow or broken where asked for.
+"""A quick, deterministic renderer for tests, with variants that are slow or broken.
 
-Here and not in a test module, so that worker processes can import it by name.
+It is not in a test module, so that worker processes can import it by name.
 """
 
 import os
@@ -54,7 +54,7 @@ SUPPORT = f"{Path(__file__).parents[2]}{os.pathsep}{Path(__file__).parent}"  # P
 
 
 def make(job: Job, path: Path) -> Clip:
-    """A clip of moving noise, a function of the job alone."""
+    """Make a clip of moving noise, a function of the job alone."""
     settings = job.settings
     camera = Camera(8e-3, 2.8, 1.1e-6, settings.height, settings.width)
     meta = {
@@ -76,13 +76,13 @@ def make(job: Job, path: Path) -> Clip:
 
 
 def make_slowly(job: Job, path: Path) -> Clip:
-    """The same clip, but the process is likely to be killed meanwhile."""
+    """Make the same clip after a pause in which the process can be killed."""
     time.sleep(0.4)
     return make(job, path)
 
 
 def make_once_allowed(job: Job, path: Path) -> Clip:
-    """The same clip, but not before a file `go` is in the data set's folder."""
+    """Make the same clip when a file `go` is in the data set's folder."""
     end = time.monotonic() + 120
     while not (path.parents[1] / "go").exists() and time.monotonic() < end:
         time.sleep(0.02)
@@ -90,21 +90,21 @@ def make_once_allowed(job: Job, path: Path) -> Clip:
 
 
 def fail_on_tumble(job: Job, path: Path) -> Clip:
-    """Fails as a bad scene would."""
+    """Fail as a bad scene does."""
     if job.family == "tumble":
         raise ValueError("scene tumble: no light and no glowing body")
     return make(job, path)
 
 
 def crash_on_tumble(job: Job, path: Path) -> Clip:
-    """Ends as a process without memory does."""
+    """End as a process without memory does."""
     if job.family == "tumble":
         os.kill(os.getpid(), signal.SIGKILL)
     return make(job, path)
 
 
 def hoard_on_tumble(job: Job, path: Path) -> Clip:
-    """Takes more memory than a worker may."""
+    """Take more memory than a worker may."""
     if job.family == "tumble":
         hoard = np.ones(1 << 27)  # 1 GiB
         time.sleep(20)
@@ -113,7 +113,7 @@ def hoard_on_tumble(job: Job, path: Path) -> Clip:
 
 
 def tree(folder: Path) -> dict[str, bytes]:
-    """Every file that a finished data set consists of, by name; logs and locks apart."""
+    """Return every file of a finished data set by name, without logs and locks."""
     kept = ("dataset.json", "clips", "jobs")
     return {
         str(path.relative_to(folder)): path.read_bytes()
@@ -123,7 +123,7 @@ def tree(folder: Path) -> dict[str, bytes]:
 
 
 def make_with_pause(job: Job, path: Path) -> Clip:
-    """The same clip, but after each frame that it adds it waits for a file `go` in the data set's folder."""
+    """Make the same clip, and wait after each frame for a file `go` in the data set's folder."""
     add = ClipWriter.add
 
     def add_and_wait(writer: ClipWriter, *args: Any, **kwargs: Any) -> None:
@@ -149,7 +149,7 @@ def damage(path: Path, kind: str) -> None:
 
 
 def problems_of(folder: Path) -> list[str]:
-    """What `qsim check` says."""
+    """Return the problems that `qsim check` reports."""
     try:
         return Dataset.open(folder).verify()
     except (ValueError, OSError) as error:
@@ -157,7 +157,7 @@ def problems_of(folder: Path) -> list[str]:
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    """Wait for a condition; an assertion fails when it does not come."""
+    """Wait until a condition holds; fail after `seconds`."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited in vain"
@@ -165,7 +165,7 @@ def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
 
 
 def moved(folder: Path, name: str, place: Path) -> Path:
-    """The clip on another disk, with a link in its place."""
+    """Move a clip to another disk and put a link in its place."""
     shutil.move(folder / "clips" / name, place)
     (folder / "clips" / name).symlink_to(place)
     return folder / "clips" / name

@@ -1,4 +1,4 @@
-"""Synthetic dark and flat stacks of sensors whose every parameter is known: the truth that calibration must cover."""
+"""Synthetic dark and flat frames of sensors with known parameters, the truth for calibration."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ PLANE = (12, 14)  # height and width of `draw_planes`
 
 
 def draw_planes(rng: np.random.Generator, planes: int, rate: float, prnu: float = 0.0) -> np.ndarray:
-    """Planes [T, 12, 14] of a SPAD array with a spread of dark counts."""
+    """Draw planes [T, 12, 14] of a SPAD array with a spread of dark counts."""
     arrivals = rate * np.maximum(1 + prnu * rng.standard_normal(PLANE), 0) * rng.lognormal(0, 0.3, PLANE)
     return rng.random((planes, *PLANE)) < -np.expm1(-arrivals)
 
 
 def statistics_of(codes: np.ndarray, bits: int = 3, photons: float | None = 0.0) -> FrameStatistics:
-    """Statistics of frames of 1 ms."""
+    """Return the statistics of frames of 1 ms."""
     return measure([codes], bits=bits, exposure=1e-3, photons=photons)
 
 
 @dataclass(frozen=True)
 class QISCase:
-    """A few-electron sensor with a fine ADC, and how it is measured."""
+    """A few-electron sensor with a fine ADC, and its measurement."""
 
     gain: float = 8.0  # codes/e-
     offset: float = 40.0  # codes
@@ -43,7 +43,7 @@ class QISCase:
     exposures: tuple[float, ...] = (1e-3, 5e-2)  # s, of the darks
 
     def codes(self, light: float, exposure: float, pattern: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Drawn by NumPy from the definition, not by our sensor."""
+        """Draw codes with NumPy from the definition, not with our sensor."""
         expected = np.maximum(light * (1 + self.prnu * pattern), 0) + self.dark_current * exposure
         shape = (self.frames, *pattern.shape)
         electrons = rng.poisson(expected, shape) + self.read_noise * rng.standard_normal(shape)
@@ -133,7 +133,7 @@ CASES: dict[str, QISCase | SPADCase] = {
 
 
 def coverage(case: QISCase | SPADCase, runs: int, seed: int) -> tuple[dict[str, int], list[float]]:
-    """How often the intervals hold the truth, and the p-values of the fits."""
+    """Return how often the intervals contain the truth, and the p-values of the fits."""
     rng = np.random.default_rng(seed)
     hits: dict[str, int] = {}
     p_values = []
@@ -146,8 +146,8 @@ def coverage(case: QISCase | SPADCase, runs: int, seed: int) -> tuple[dict[str, 
 
 
 @dataclass(frozen=True)
-class Array:
-    """An array with a fixed pattern, vignetting and hot pixels, measured in some way; all of it drawn at random."""
+class RandomArray:
+    """An array with a fixed pattern, vignetting and hot pixels, and its measurement, all drawn at random."""
 
     readout: str  # "qis", "planes" or "counts"
     prnu: float  # 0.01 ... 0.3
@@ -159,7 +159,7 @@ class Array:
     light: float  # electrons or avalanches per exposure, in the middle
 
     @classmethod
-    def draw(cls, rng: np.random.Generator) -> Array:
+    def draw(cls, rng: np.random.Generator) -> RandomArray:
         readout = str(rng.choice(["qis", "planes", "counts"]))
         light = {"qis": (0.5, 8.0), "planes": (0.2, 1.2), "counts": (1.0, 14.0)}[readout]
         return cls(

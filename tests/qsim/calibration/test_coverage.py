@@ -1,15 +1,15 @@
-"""Coverage: intervals hold the truth as often as promised."""
+"""Coverage: intervals contain the true value as often as promised."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from stats import assert_share
-from synthetic import CASES, COUNTER, Array, QISCase, SPADCase, coverage
+from synthetic import CASES, COUNTER, QISCase, RandomArray, SPADCase, coverage
 
 
 def test_one_calibration_of_each_kind_comes_near_the_truth():
-    """Not coverage, but sanity: within eight half-widths, which a right program leaves once in 10^50 times."""
+    """Sanity, not coverage: within eight half-widths, which a right program leaves once in 10^50 times."""
     rng = np.random.default_rng(5)
     for case in (QISCase(), SPADCase(), COUNTER):
         found, truth = case.calibrate(rng)
@@ -20,7 +20,7 @@ def test_one_calibration_of_each_kind_comes_near_the_truth():
 
 @pytest.mark.parametrize("name", ["resolved peaks"])
 def test_quick_coverage(name):
-    """30 calibrations: a coverage of 95 % is not told from 93 %, but a broken interval is."""
+    """30 calibrations: they cannot tell a coverage of 95 % from 93 %, but find a broken interval."""
     hits, _ = coverage(CASES[name], 30, seed=1)
     for count in hits.values():
         assert_share(count, 30, 0.95, checks=len(hits))
@@ -44,22 +44,22 @@ def test_intervals_cover_as_promised():
 
 
 def prnu_hits(runs: int, seed: int) -> dict[str, list[bool]]:
-    """Whether the interval holds the PRNU of random arrays, by readout."""
+    """Return whether the interval contains the PRNU of random arrays, by readout."""
     hits: dict[str, list[bool]] = {}
     for i in range(runs):
         rng = np.random.default_rng([seed, i])
-        array = Array.draw(rng)
+        array = RandomArray.draw(rng)
         found = array.calibrate(rng).values["prnu"]
         hits.setdefault(array.readout, []).append(found.low <= array.prnu <= found.high)
     return hits
 
 
 def test_quick_coverage_of_prnu():
-    """40 small arrays of planes, of any PRNU, vignetting and share of hot pixels: 95 % is told from 65 %."""
+    """40 small arrays of planes of any PRNU, vignetting and share of hot pixels: 95 % differs from 65 %."""
     hits = []
     for i in range(40):
         rng = np.random.default_rng([11, i])
-        array = replace(Array.draw(rng), readout="planes", light=0.6, side=14, frames=200)
+        array = replace(RandomArray.draw(rng), readout="planes", light=0.6, side=14, frames=200)
         found = array.calibrate(rng).values["prnu"]
         hits.append(found.low <= array.prnu <= found.high)
     assert_share(sum(hits), len(hits), 0.95)

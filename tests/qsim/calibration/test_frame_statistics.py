@@ -1,4 +1,4 @@
-"""Statistics of frames: block by block, of sums of planes, and what is refused."""
+"""Statistics of frames: block by block, of sums of planes, and refused values."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_float_frames_are_taken_if_whole():
 
 
 def test_a_million_frames_take_no_more_memory():
-    """The same block a thousand times: what is kept does not grow."""
+    """The same block a thousand times: the stored sums do not grow."""
     block = np.random.default_rng(0).integers(0, 2, (1000, 2, 3)).astype(bool)
     stack = measure((block for _ in range(1000)), bits=1, exposure=1e-5, photons=None)
     assert stack.frames == 1_000_000

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from synthetic import Array
+from synthetic import RandomArray
 
 from qsim.calibration.frame_statistics import measure, measure_sums
 from qsim.calibration.spad import calibrate_spad
@@ -10,8 +10,8 @@ from qsim.calibration.spad import calibrate_spad
 
 @pytest.mark.parametrize("readout", ["qis", "planes", "counts"])
 def test_hot_pixels_stay_out_of_prnu(readout):
-    """15 % hot pixels hardly move PRNU, and more than double the spread of all pixels; both and the number are told."""
-    array = Array(readout, 0.04, 0.3, (0.1, 0.0), 0.15, 30, 600 if readout == "planes" else 60, 1.0)
+    """15 % hot pixels hardly change PRNU and more than double the spread of all pixels; both are reported."""
+    array = RandomArray(readout, 0.04, 0.3, (0.1, 0.0), 0.15, 30, 600 if readout == "planes" else 60, 1.0)
     found = array.calibrate(np.random.default_rng(0)).values
     prnu, everything, count = (found[name] for name in ("prnu", "prnu_with_hot_pixels", "prnu_left_out"))
     assert prnu.low <= 0.04 <= prnu.high
@@ -23,15 +23,15 @@ def test_hot_pixels_stay_out_of_prnu(readout):
 
 
 def test_clean_arrays_lose_no_pixel():
-    array = Array("planes", 0.1, 0.5, (0.0, 0.0), 0.0, 24, 300, 0.6)
+    array = RandomArray("planes", 0.1, 0.5, (0.0, 0.0), 0.0, 24, 300, 0.6)
     found = array.calibrate(np.random.default_rng(1)).values
     assert found["prnu_left_out"].value == 0
     assert "prnu_with_hot_pixels" not in found
 
 
 def test_without_darks_the_flat_tells_hot_pixels():
-    """Bright ones only, and a warning says by which rule."""
-    array = Array("counts", 0.03, 0.3, (0.0, 0.0), 0.0, 24, 40, 2.0)
+    """Only bright pixels, and a warning names the rule."""
+    array = RandomArray("counts", 0.03, 0.3, (0.0, 0.0), 0.0, 24, 40, 2.0)
     rng = np.random.default_rng(2)
     clean = array.calibrate(rng, darks=False)
     assert clean.values["prnu_left_out"].value == 0
@@ -46,9 +46,9 @@ def test_without_darks_the_flat_tells_hot_pixels():
 
 @pytest.mark.parametrize("correlation", [-1.0, 0.0, 1.0])
 def test_dark_pattern_that_follows_the_light_does_not_bias_prnu(correlation):
-    """Dark counts that rise (or fall) with a pixel's efficiency: variances do not subtract, the pixels' own levels do.
+    """Dark counts that rise or fall with a pixel's efficiency: each pixel's own level must be subtracted.
 
-    4 % PRNU and 1.2 % dark spread gave sqrt(4^2 +- 2 x 4 x 1.2) = 5.1 % and 2.5 % where only variances were subtracted.
+    Subtracting variances gave sqrt(4^2 +- 2 x 4 x 1.2) = 5.1 % and 2.5 % for 4 % PRNU and 1.2 % dark spread.
     """
     rng = np.random.default_rng(4)
     pattern, other = rng.standard_normal((2, 60, 60))

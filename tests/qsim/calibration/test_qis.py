@@ -1,4 +1,4 @@
-"""Calibration of a QIS: warnings, and data that are refused."""
+"""Calibration of a QIS: warnings and refused data."""
 
 import numpy as np
 import pytest

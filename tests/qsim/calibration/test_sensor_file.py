@@ -1,4 +1,4 @@
-"""Sensor files: what is written loads as a device, frames are read from every kind of file."""
+"""Sensor files: a written file loads as a device; frames are read from several kinds of files."""
 
 import numpy as np
 import pytest

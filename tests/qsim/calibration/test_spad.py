@@ -24,7 +24,7 @@ def test_no_dark_count_gives_a_one_sided_bound():
 
 
 def test_one_hot_pixel_a_hundred_thousand_times_the_median():
-    """It stands in the map and in the share of hot pixels, and leaves the median alone."""
+    """It appears in the map and in the share of hot pixels, and does not change the median."""
     rng = np.random.default_rng(0)
     rate = np.full((20, 20), 1e-2)
     rate[3, 4] = 1e3  # per frame: always on
@@ -92,7 +92,7 @@ def test_sums_are_calibrated_exactly_as_their_planes(seed):
 
 
 def test_another_number_of_planes_is_noticed():
-    """4096 planes at 30 %: taken as 8192 the binomial would be 0.70 / 0.85 of what it is."""
+    """4096 planes at 30 %, taken as 8192: the variance is 0.70 / 0.85 of that of a binomial."""
     sums = np.random.default_rng(1).binomial(4096, 0.3, (30, H, W))
     right, wrong = (measure_sums([sums], planes=n, exposure=1e-5, photons=None) for n in (4096, 8192))
     sigma = np.sqrt(2 / (29 * H * W))

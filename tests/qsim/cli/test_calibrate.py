@@ -104,7 +104,7 @@ def test_each_option_changes_the_answer(folder, capsys):
 
 
 def test_an_efficiency_that_cannot_be_is_not_written_without_a_word(folder, capsys):
-    """Photons too few by 100 gave a sensor of efficiency 1 in silence; swapped files spoke of BinarySPAD.pde."""
+    """Photons too few by 100 gave a sensor of efficiency 1 without a warning; swapped files gave an error about pde."""
     line = "--planes 50 --dark {} 1e-5 --flat {} 1e-5 {} -o e.toml --force"
     for photons, odd in ((0.9, False), (0.006, True)):
         assert main(["calibrate", *line.format("dark.npy", "flat.npy", photons).split()]) == 0

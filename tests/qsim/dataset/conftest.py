@@ -1,4 +1,4 @@
-"""A data set that nothing disturbed, shared by the tests of this folder."""
+"""Shares a data set that was generated without interruption."""
 
 import pytest
 from fakes import HERE, SMALL, make, tree

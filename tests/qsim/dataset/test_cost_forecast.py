@@ -1,4 +1,4 @@
-"""Plans: the arithmetic, and the forecast against a real run."""
+"""Forecasts: the arithmetic, and a forecast against a real run."""
 
 import json
 import os
@@ -35,7 +35,7 @@ ppp = 3.25
 
 
 def test_the_arithmetic_of_a_forecast():
-    """10 clips of 30 frames: 10 * 6 s + 300 * (1.5 + 0.3) s = 600 s, and a tenth of a fresh process per clip or so."""
+    """10 clips of 30 frames: 10 * 6 s + 300 * (1.5 + 0.3) s = 600 s, and an eighth of a process start per clip."""
     seconds = {"setup": Seconds(6.0, 11.0), "per_frame": Seconds(1.5, 2.9), "sensing": Seconds(0.3, 0.4)}
     cost = Cost("fan", (512, 1024), 10, 300, samples=(8, 72), **seconds, frame_bytes=4e6)
     assert cost.hours == pytest.approx(600 / 3600)
@@ -47,7 +47,7 @@ def test_the_arithmetic_of_a_forecast():
     assert whole.gigabytes == pytest.approx(2.4)
     assert f"10 machines like this: {whole.hours / 10:.3g} hours each" in "\n".join(whole.lines(10))
     assert whole.lines(1)[-1].startswith("within a day: 1 machine like this; run this command on a machine with a GPU")
-    days = Forecast((cost,) * 200, "cuda", 0.5)  # 33 hours and a little
+    days = Forecast((cost,) * 200, "cuda", 0.5)  # a little over 33 hours
     times = f"{days.hours / 24:.2g} times as fast"
     assert days.lines(1)[-1] == f"within a day: 2 machines like this, or one that is {times}"
     assert " 8-72 " in whole.lines(1)[1]
@@ -64,7 +64,7 @@ def test_a_few_jobs_are_looked_at_from_first_to_last():
 
 
 def test_a_frame_costs_what_its_samples_cost(monkeypatch: pytest.MonkeyPatch):
-    """Three budgets of 10, 20 and 90 samples: a frame costs twice that of the middle one, which is timed."""
+    """Three budgets of 10, 20 and 90 samples: a frame costs twice as much as one of the middle job, which is timed."""
     wanted = recipe.parse(RECIPE)
     samples = {0: 10, 1: 20, 2: 90}
     monkeypatch.setattr(job_runner, "load_scene", lambda job: job)
@@ -87,7 +87,7 @@ def test_a_frame_costs_what_its_samples_cost(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_clip_costs_the_choice_of_its_budget_as_well(monkeypatch: pytest.MonkeyPatch):
-    """The first choice of a process takes ten times as long: it counts as one of three, not as what each takes."""
+    """The first choice in a process takes ten times as long; the median of the three counts."""
     clock = [0.0]
     monkeypatch.setattr(Seconds, "now", staticmethod(lambda: Seconds(clock[0], 2 * clock[0])))
     monkeypatch.setattr(job_runner, "load_scene", lambda job: job)
@@ -108,7 +108,7 @@ def test_a_clip_costs_the_choice_of_its_budget_as_well(monkeypatch: pytest.Monke
 
 
 class FakeClip:
-    """Of no frame that could be stored."""
+    """A clip of one frame that is not stored."""
 
     path = Path("/nowhere")
 
@@ -125,7 +125,7 @@ def test_plans_without_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 
 def alone(home: Path, *words: str | Path) -> str:
-    """What a command prints in a process of its own whose home, where Dr.Jit keeps compiled kernels, is new."""
+    """Return what a command prints in a process with a new home, in which Dr.Jit keeps compiled kernels."""
     home.mkdir()
     places = {"HOME": str(home), "XDG_CACHE_HOME": os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))}
     command = [sys.executable, "-m", "qsim", *map(str, words)]
@@ -134,9 +134,9 @@ def alone(home: Path, *words: str | Path) -> str:
 
 @pytest.mark.slow
 def test_a_forecast_against_a_real_run(tmp_path: Path):
-    """In processor time on both sides, which other work on the machine changes little; 30 % is what a plan promises.
+    """Both sides in processor time, on which other work on the machine has little effect; the promise is 30 %.
 
-    Each meets the scenes for the first time: a run that finds the kernels of its plan takes less.
+    Each side meets the scenes for the first time: a run that finds the kernels of its forecast takes less.
     """
     (tmp_path / "r.toml").write_text(RECIPE)
     forecast = json.loads(alone(tmp_path / "1", "plan", tmp_path / "r.toml", "--json"))

@@ -1,4 +1,4 @@
-"""A Dask scheduler and workers in processes and folders of their own: one is killed, one lacks what a job asks for."""
+"""Dask scheduler and workers in separate processes: one worker is killed, one lacks a resource."""
 
 import os
 import re
@@ -52,7 +52,7 @@ class LocalCluster:
         return process
 
     def worker(self, *options: str) -> subprocess.Popen[bytes]:
-        """A worker that does its jobs in the process returned, so that `processes` and kills mean this one."""
+        """Start a worker that runs its jobs in the process returned, to which ids and kills refer."""
         return self.start("worker", self.address, "--nthreads", "1", "--no-nanny", "--no-dashboard", *options)
 
     def wait_for_workers(self, count: int) -> None:
@@ -70,13 +70,13 @@ def cluster(tmp_path: Path) -> Iterator[LocalCluster]:
 
 
 def processes(folder: Path) -> dict[str, list[int]]:
-    """Job -> ids of the processes that its log names, in order: one per begin of its rendering, one for its end."""
+    """Return job -> ids of the processes in its log, in order: one per start of its rendering, one for its end."""
     logs = sorted((folder / "logs").glob("*.log"))
     return {log.stem: [int(word) for word in re.findall(r"process (\d+)", log.read_text())] for log in logs}
 
 
 def half_done(folder: Path) -> dict[int, str]:
-    """Process -> the job that it is at, of which a frame is done and more are missing."""
+    """Return process -> its job, for jobs that have a finished frame and miss others."""
     return {
         ids[-1]: job
         for job, ids in processes(folder).items()
@@ -113,7 +113,7 @@ def test_a_killed_workers_job_is_finished_by_the_other_and_gives_the_files_of_a_
 
 @pytest.mark.slow
 def test_folders_of_one_name_on_one_scheduler_do_not_get_each_others_results(tmp_path: Path, cluster: LocalCluster):
-    """The second client comes while the first one still holds all of its jobs, which have the same names."""
+    """The second client starts while the first still holds all of its jobs, which have the same names."""
     cluster.worker()
     run = Cluster(cluster.address, timeout=PATIENCE)
     later = []
@@ -149,7 +149,7 @@ def test_failures_on_the_cluster_are_listed(tmp_path: Path, cluster: LocalCluste
 
 @pytest.mark.slow
 def test_a_worker_without_the_resource_gets_no_job(tmp_path: Path, cluster: LocalCluster):
-    """It is there and idle all the time, while the other has more than it can do at once."""
+    """It is idle all the time, while the other has more jobs than it can run at once."""
     plain, gifted = cluster.worker(), cluster.worker("--resources", "GPU=1")
     cluster.wait_for_workers(2)
     run = Cluster(cluster.address, gpus=1, timeout=PATIENCE)
@@ -159,7 +159,7 @@ def test_a_worker_without_the_resource_gets_no_job(tmp_path: Path, cluster: Loca
 
 
 def page_options() -> list[str]:
-    """What the first worker of docs/cluster.md is started with, after the scheduler's address."""
+    """Return the options of the first worker in docs/cluster.md."""
     found = re.search(r"^dask worker tcp://HOST:8786 (.*)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
     assert found
     return shlex.split(found[1], comments=True)
@@ -167,7 +167,7 @@ def page_options() -> list[str]:
 
 @pytest.mark.slow
 def test_a_worker_started_as_the_page_says_is_replaced_and_its_jobs_are_done(tmp_path: Path, cluster: LocalCluster):
-    """Its first job does not end before its lifetime does, so that the others are for the process that replaces it."""
+    """Its first job ends after its lifetime, so that the process that replaces it runs the others."""
     options = page_options()
     assert "--memory-limit" in options
     assert "--lifetime-restart" in options
@@ -204,7 +204,7 @@ def test_nobody_at_the_address(tmp_path: Path):
 
 @pytest.fixture
 def options_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Options]:
-    """Beside a file r.toml, where `qsim generate` only notes its options here."""
+    """Write r.toml and make `qsim generate` only record its options."""
     (tmp_path / "r.toml").write_text(RECIPE)
     monkeypatch.chdir(tmp_path)
     used: list[Options] = []
@@ -255,7 +255,7 @@ def test_gpus_are_the_clusters(options_used: list[Options], capsys: pytest.Captu
 
 
 def test_a_scheduler_without_tls_is_named(options_used: list[Options], capsys: pytest.CaptureFixture[str]):
-    """Pickled work is taken from whoever reaches its port; the line comes before anything is sent."""
+    """A scheduler accepts pickled work from every client; the warning comes before anything is sent."""
     assert qsim.cli.program.main(["generate", "r.toml", "--cluster", "tcp://127.0.0.1:1"]) == 0
     assert "tcp://127.0.0.1:1: without TLS, so whoever reaches this port can run any program" in capsys.readouterr().err
     assert qsim.cli.program.main(["generate", "r.toml", "--cluster", "tls://127.0.0.1:1"]) == 0

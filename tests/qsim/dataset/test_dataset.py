@@ -1,4 +1,4 @@
-"""Data sets: read as written, damage named, versions told apart, splits kept honest."""
+"""Data sets: reading, damage, versions, and assets shared between splits."""
 
 import json
 from pathlib import Path
@@ -36,7 +36,7 @@ def test_a_finished_data_set(tmp_path: Path):
 
 
 def test_no_flipped_bit_of_records_and_manifest_escapes(tmp_path: Path):
-    """Every byte of one record, every seventh of the manifest: the file is named, whatever JSON makes of the bit."""
+    """Every byte of one record, every seventh of the manifest: the file is named, however JSON reads the bit."""
     folder = tmp_path / "d"
     generate(SMALL, folder, HERE, make=make)
     for path, step in ((folder / "jobs" / "fan_0000.json", 1), (folder / "dataset.json", 7)):

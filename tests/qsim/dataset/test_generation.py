@@ -1,4 +1,4 @@
-"""Generation: the same bytes after kills, in shards, beside another generator, and with wrong answers of workers."""
+"""Generation: the same bytes after kills, in shards, beside another generator, and with false reports of workers."""
 
 import functools
 import os
@@ -47,7 +47,7 @@ def test_shards_in_any_order_give_the_same_bytes(tmp_path: Path, undisturbed: di
 
 
 def test_killed_at_random_moments_sixty_times(tmp_path: Path, undisturbed: dict[str, bytes]):
-    """The moments are spread over a whole run; each killed folder is resumed by the next run, and killed again."""
+    """The moments are spread over a complete run; the next run resumes each killed folder, and is killed again."""
     moments = random.Random(5)
     started = time.monotonic()
     generate(SMALL, tmp_path / "timing", HERE, make=make)
@@ -60,7 +60,7 @@ def test_killed_at_random_moments_sixty_times(tmp_path: Path, undisturbed: dict[
         while not in_child(run, moments.uniform(0, whole / 2)):
             killed += 1
             if (folder / "dataset.json").is_file():
-                for clip in Dataset.open(folder).clips():  # whatever a reader accepts is whole
+                for clip in Dataset.open(folder).clips():  # every accepted clip is complete
                     assert clip.verify() == []
                     assert len(clip.streams) == 2
         assert tree(folder) == undisturbed
@@ -69,7 +69,7 @@ def test_killed_at_random_moments_sixty_times(tmp_path: Path, undisturbed: dict[
 
 
 def test_killed_before_every_step(tmp_path: Path):
-    """One job; whatever was opened, made, removed or renamed last, the same command then makes the same bytes."""
+    """One job; after a kill before any open, mkdir, remove or rename, the same command makes the same bytes."""
     head, _, tumble = RECIPE.split("[[scenes]]")
     one = recipe.parse(f"{head}[[scenes]]{tumble}".replace("[1, 3]", "[3]"))
     generate(one, tmp_path / "undisturbed", HERE, make=make)
@@ -101,7 +101,7 @@ def test_a_failing_job_is_listed_and_retried(tmp_path: Path, undisturbed: dict[s
     "note", ["{}", "[]", "x", "", '{"error": [1, {}]}', '{"error": null}', '{"why": "?"}', "[" * 999]
 )
 def test_a_note_of_failure_that_cannot_be_read_stops_nothing(tmp_path: Path, undisturbed: dict[str, bytes], note: str):
-    """An empty object ended `generate` in a KeyError, other damage in one line for good, with --retry too or not."""
+    """An empty object ended `generate` in a KeyError; other damage blocked it for good, with --retry or without."""
     folder = tmp_path / "d"
     generate(SMALL, folder, HERE, make=make)
     (folder / "jobs" / "fan_0001.json").unlink()
@@ -114,7 +114,7 @@ def test_a_note_of_failure_that_cannot_be_read_stops_nothing(tmp_path: Path, und
 
 
 def test_clips_that_were_made_somewhere_else_are_named(tmp_path: Path):
-    """Workers whose folder of that name is another one say "done" and mean it."""
+    """Workers with another folder of that name report "done" in good faith."""
     generate(SMALL, tmp_path / "there", HERE, make=make)
     summary = generate(
         SMALL, tmp_path / "here", make=make, run=lambda todo, _, make: run_here(todo, tmp_path / "there", make)
@@ -182,7 +182,7 @@ def test_a_folder_of_somebody_else_is_still_refused(tmp_path: Path):
 
 
 def test_progress_counts_the_frames_of_whoever_renders(tmp_path: Path):
-    """Finished clips whole, a clip at work by the lines of its journal, nothing for the others."""
+    """All frames of finished clips, the lines of the journal of an unfinished one, none of the others."""
     jobs_wanted = list(SMALL.jobs)
     total = sum(job.settings.frames for job in jobs_wanted)
     first, second, _ = jobs_wanted
@@ -208,7 +208,7 @@ def test_progress_counts_the_frames_of_whoever_renders(tmp_path: Path):
 
 
 def test_jumps_of_the_clock_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The wall clock and the times of files go back and forth by years between and during two runs: the same bytes."""
+    """The wall clock and the times of files jump by years between and during two runs: the same bytes."""
     wanted = recipe.parse(RECIPE)
     generate(wanted, tmp_path / "undisturbed", HERE, make=make)
     rng, now = random.Random(0), time.time
@@ -227,14 +227,14 @@ def test_jumps_of_the_clock_change_nothing(tmp_path: Path, monkeypatch: pytest.M
     assert Dataset.open(tmp_path / "d").verify() == []
 
 
-# Answers of workers
+# Reports of workers
 
 
 def first(folder: Path, pattern: str) -> Path:
     return min((folder / "clips" / "fan_0000").glob(pattern))
 
 
-LIES = {  # name -> what a worker does to a job's files before it answers "done"; the record is written last
+LIES = {  # name -> what a worker does to a job's files before it reports "done"; the record is written last
     "an empty record": lambda folder, record: record.write_text("{}"),
     "no JSON": lambda folder, record: record.write_text("done"),
     "the record of another job": lambda folder, record: record.write_bytes(

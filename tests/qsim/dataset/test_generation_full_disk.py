@@ -24,7 +24,7 @@ from qsim.dataset.generation import generate
 
 
 class FullDisk:
-    """Opens files on a disk with so many bytes left; a write that does not fit writes what fits, then ENOSPC."""
+    """Open files on a disk with `space` bytes left; a write that does not fit writes what fits, then ENOSPC."""
 
     def __init__(self, space: int) -> None:
         self.space = space
@@ -57,7 +57,7 @@ class _Limited:
 
 
 def test_a_full_disk_everywhere(tmp_path: Path, undisturbed: dict[str, bytes], monkeypatch: pytest.MonkeyPatch):
-    """Space for 0, 1/10, ... of what a run writes: one clear error, nothing accepted, and resuming gives the same."""
+    """Space for 0, 1/10, ... of a run: one clear error, nothing accepted, and resuming gives the same bytes."""
     measure = FullDisk(1 << 30)
     with monkeypatch.context() as patch:
         for module in (files, job_runner):
@@ -80,7 +80,7 @@ def test_a_full_disk_everywhere(tmp_path: Path, undisturbed: dict[str, bytes], m
 
 
 class FullAt:
-    """From the n-th operation that needs space on, every such operation fails: open, write, sync, rename, mkdir."""
+    """Let every operation that needs space fail from the n-th on: open, write, sync, rename, mkdir."""
 
     def __init__(self, left: int, patch: pytest.MonkeyPatch) -> None:
         self.left = left
@@ -123,7 +123,7 @@ class _Guarded:
 def test_a_disk_that_is_full_from_any_operation_on(
     tmp_path: Path, undisturbed: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, stride: int
 ):
-    """Every place in a run where the system may say ENOSPC, one after the other (in the quick tests: one in 23)."""
+    """Every operation of a run that may fail with ENOSPC, one after the other (in the quick tests: one in 23)."""
     plenty = 1 << 30
     with monkeypatch.context() as patch:
         measure = FullAt(plenty, patch)

@@ -1,4 +1,4 @@
-"""The real renderer in a data set: killed, resumed, with one worker or two, from the command line, the same bytes."""
+"""Generation with the real renderer: killed and resumed from the command line, it gives the same bytes."""
 
 import os
 import signal

@@ -16,7 +16,7 @@ def test_a_data_set_of_the_earlier_unit_is_not_mixed_with_the_new_one(tmp_path, 
     (folder / "jobs" / "train_0.json").unlink()
     with pytest.raises(ValueError, match=r"below the 99\.9th percentile; now it is dB below white"):
         write_dataset(folder, {"train": 2})
-    assert len(Dataset.open(folder).clips()) >= 1  # and stays readable
-    (folder / "dataset.json").unlink()  # it was killed before its end: only the records say whose it is
+    assert len(Dataset.open(folder).clips()) >= 1  # it stays readable
+    (folder / "dataset.json").unlink()  # killed before its end: only the records show its recipe
     with pytest.raises(ValueError, match="was begun by an earlier version, whose psnr meant"):
         write_dataset(folder, {"train": 2})

@@ -1,4 +1,4 @@
-"""Jobs beside each other, jobs whose clip is a link, and the words of a failed job."""
+"""Jobs beside each other, jobs whose clip is a link, and the messages of failed jobs."""
 
 import errno
 import itertools
@@ -20,7 +20,7 @@ ALIKE = ALIKE.replace("frames = 3", "frames = 1")
 
 
 def halting(outer: Job, inner: Job, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch):
-    """An `os.fsync` that does the job `inner` while `outer` syncs its record, and once after so many other syncs."""
+    """Return an `os.fsync` that runs the job `inner` while `outer` syncs its record, and once after `count` syncs."""
     sync, left = os.fsync, [count]
 
     def halted(descriptor: int) -> None:
@@ -29,7 +29,7 @@ def halting(outer: Job, inner: Job, folder: Path, count: int, monkeypatch: pytes
         left[0] -= 1
         recording = place.parent.name == "jobs" and place.name.startswith(f"{outer.name}.json.tmp-")
         if recording or left[0] == 0:
-            with monkeypatch.context() as other:  # another process, with another number
+            with monkeypatch.context() as other:  # another process with another id
                 other.setattr(os, "fsync", sync)
                 other.setattr(os, "getpid", lambda: 100_000)
                 assert job_runner.run_job(inner, folder, make).state == "done"
@@ -40,7 +40,7 @@ def halting(outer: Job, inner: Job, folder: Path, count: int, monkeypatch: pytes
 def test_no_job_tidies_up_what_another_one_is_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Names that begin alike (fan_0000, fan_0000_x2; fan_1000, fan_10000): every job starts inside every other's write.
 
-    One is halted while it syncs its record or another of its files, drawn at random, and the other is done meanwhile.
+    One job is halted while it syncs its record or another file, drawn at random, and the other runs meanwhile.
     """
     wanted = recipe.parse(ALIKE)
     alike = ("fan_0000", "fan_0000_x2", "fan_0000_x2.5", "fan_1000", "fan_10000")
@@ -64,7 +64,7 @@ def test_no_job_tidies_up_what_another_one_is_writing(tmp_path: Path, monkeypatc
 
 
 def test_a_link_whose_disk_is_not_there(tmp_path: Path):
-    """The job is listed, not rendered for nothing; when the disk is back, --retry is enough."""
+    """The job is listed, not rendered in vain; when the disk is back, --retry is enough."""
     wanted, folder, place = recipe.parse(RECIPE), tmp_path / "d", tmp_path / "disk2"
     generate(wanted, folder, HERE, make=make)
     moved(folder, "fan_0000", place)
@@ -90,7 +90,7 @@ def test_a_leftover_link_of_an_earlier_version_does_not_stop_the_job(tmp_path: P
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.ENOENT, errno.EXDEV])
 def test_a_systems_error_is_worded_with_its_file_and_nothing_else(tmp_path: Path, number: int, monkeypatch):
-    """Wherever a job's write fails, failed/ says `FILE: reason`: no number, no quotes, no '-> None'."""
+    """Wherever a job's write fails, failed/ holds `FILE: reason`: no number, no quotes, no '-> None'."""
     wanted = recipe.parse(RECIPE)
     for name, step in itertools.product(("fsync", "replace"), (0, 11)):
         folder = tmp_path / f"{name}-{step}"
@@ -103,7 +103,7 @@ def test_a_systems_error_is_worded_with_its_file_and_nothing_else(tmp_path: Path
 
 
 def failing(name: str, step: int, number: int, monkeypatch: pytest.MonkeyPatch):
-    """Runs one job, in which the so-many-th call of os.NAME fails."""
+    """Return an executor of one job in which one call of os.NAME fails."""
     action, left = getattr(os, name), [step]
 
     def fail(*args, **kwargs):

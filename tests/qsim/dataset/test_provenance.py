@@ -14,7 +14,7 @@ def test_assets_of_a_scene():
 
 
 def test_a_photograph_in_another_range_is_the_same_photograph():
-    """One picture stretched two ways has two checksums: splits that share it must still be told."""
+    """One photograph in two ranges has two checksums: splits that share it must still be found."""
     made = []
     for high in (0.45, 0.7):
         material = Diffuse(textures.photograph("gravel", 0.15, high))

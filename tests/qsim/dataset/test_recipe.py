@@ -1,4 +1,4 @@
-"""Recipes: what they mean, and every mistake named with file, line and key."""
+"""Recipes: their jobs, and every error with file, line and key."""
 
 import json
 import random
@@ -78,7 +78,7 @@ def test_a_digest_changes_with_everything_that_decides_the_files():
 
 AGAIN = "[[scenes]]\nfamily = "
 MISTAKES = [
-    # (text in the good recipe, its replacement, line, what the message says)
+    # (text in the good recipe, its replacement, line, the message)
     ("frames = 3", "frame = 3", 3, r"unknown key 'frame' in \[recipe\] \(did you mean 'frames'\?\)"),
     ("width = 10\n", "", 1, r"key 'width' is missing in \[recipe\]"),
     ("first = 5", "first = 2147483647", 16, r"seeds 2147483647 to 2147483648; the largest is 2\^31 - 1"),
@@ -200,7 +200,7 @@ def test_a_scene_file_beside_the_recipe(tmp_path: Path):
 
 
 def test_own_files_decide_by_content_not_by_place(tmp_path: Path):
-    """A scene file, a folder of a scene's things, a sensor file: edited they are another job, moved the same."""
+    """A scene file, a scene's folder, a sensor file: an edit makes another job, a move does not."""
     sensor = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 2\nread_noise = 0.2\nbits = 3\n'
     text = HEAD + '[[scenes]]\nfamily = "./{0}"\n[[streams]]\nsensor = "s.toml"\nbits = 3\nppp = 3.25\n'
 
@@ -240,7 +240,7 @@ def test_the_large_recipe_is_what_it_says():
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted((Path(__file__).parents[3] / "scenes").glob("*.toml")), ids=lambda p: p.stem)
 def test_no_mesh_or_texture_of_a_test_scene_is_in_training(path: Path):
-    """By content, not by name: the SHA-256 of every picture and of all vertices, and photographs in whatever range."""
+    """By content, not by name: SHA-256 of every picture and of all vertices, and photographs in any range."""
     found: dict[str, set[str]] = {split: set() for split in recipe.SPLITS}
     scenes = {job.scene: job for job in recipe.load(path).jobs}
     for job in scenes.values():
@@ -252,7 +252,7 @@ def test_no_mesh_or_texture_of_a_test_scene_is_in_training(path: Path):
 
 
 def calls(action: Callable[[], object]) -> int:
-    """Calls of functions, ours and built in, that an action makes."""
+    """Return the number of function calls, ours and built in, of an action."""
     count = 0
 
     def see(frame: object, event: str, argument: object) -> None:
@@ -286,7 +286,7 @@ def test_the_work_of_reading_a_recipe_is_linear(kind: str):
 
 
 def test_a_list_is_looked_through_once():
-    """Values are compared for repetitions by hash, not each with each: 20 000 seeds took seconds."""
+    """Values are compared by hash, not each with each: 20 000 seeds took seconds."""
 
     class Value:
         compared = 0
@@ -309,20 +309,20 @@ def test_a_list_is_looked_through_once():
 
 
 def accepted_by_the_jobs(stem: str, folder: Path) -> bool:
-    """Whether a job with such a name makes its clip, writes its record, and tidies up."""
+    """Return whether a job with such a name makes its clip, writes its record, and removes leftovers."""
     found = Settings(1, 2, 3, 2000.0)
     job = Job(f"{stem}_0000_x0.001", f"{stem}.py", 0, 1.0, "train", found, 0, ())
     for name in ("jobs", "failed", "clips", "logs", "locks", "work"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     try:
         return job_runner.run_job(job, folder, make).state == "done"
-    except OSError:  # a name that the file system does not take
+    except OSError:  # the file system refuses the name
         return False
 
 
 @pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
 def test_a_scene_file_is_accepted_exactly_when_its_jobs_are(tmp_path: Path, count: int):
-    """Random names of own scenes: the recipe refuses, with its line, just those that a job would fail on."""
+    """Random names of scene files: the recipe refuses, with its line, exactly those with which a job fails."""
     rng = random.Random(1)
     alphabet = "ab0_-. \u00fc\n\"'*[\\\t$"
     names = ["a b", "\u00fc", "__init__", "-x", "", "a" * 180, "a.tmp-1", "x.part", ".hidden", "CON"]

@@ -1,4 +1,4 @@
-"""`qsim check --redraw`: right streams of every kind pass, wrong codes are named though every checksum fits."""
+"""`qsim check --redraw`: correct streams of every kind pass; wrong codes are found even if all checksums fit."""
 
 import json
 from dataclasses import replace
@@ -28,7 +28,7 @@ QUANTA = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 1.6\
 MAPS = "[defects]\ndevice_seed = 4\nprnu = 0.2\ndead = 0.1\n"
 DISTURBED = "[defects]\nafterpulse = 0.1\ncrosstalk = 0.05\n"
 
-# Name -> (sensor file, what else to sense, how it says it was drawn)
+# Name -> (sensor file, other settings, its `drawn_by`)
 KINDS = {
     "QIS": (QUANTA.format(bits=3), {"ppp": 3.25}, "table"),
     "QIS of a long table": (QUANTA.format(bits=8) + "gain = 0.0085\n", {"ppp": 9000.0}, "table"),
@@ -57,7 +57,7 @@ def drawn(clip: Clip, folder: Path, kind: str) -> Stream:
 
 
 def stored_again(clip: Clip, stream: Stream, values: np.ndarray, **changes: object) -> Stream:
-    """The stream with other codes, every checksum as it should be; keys that are None are left out."""
+    """Store a stream with other codes and the right checksums; keys that are None are left out."""
     own = ("sha256", "checksum", "software", "format_version")
     meta = {key: value for key, value in (stream.meta | changes).items() if key not in own and value is not None}
     return write_stream(clip, stream.name, [values], stream.sensor, meta)
@@ -65,7 +65,7 @@ def stored_again(clip: Clip, stream: Stream, values: np.ndarray, **changes: obje
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_right_streams_pass_and_wrong_codes_are_counted(clip, tmp_path, kind):
-    """With flipped codes in frames 1 and 2 all files are still what was written."""
+    """With flipped codes in frames 1 and 2, all files still match their checksums."""
     stream = drawn(clip, tmp_path, kind)
     assert stream.meta["drawn_by"] == KINDS[kind][2]
     (found,) = redraw.redraw(stream.path)
@@ -114,7 +114,7 @@ def test_a_law_of_a_later_version_is_refused(clip, tmp_path):
 
 
 def as_the_shifted_sums_drew(sensor: QIS, photons: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Codes as kernels drew them once: float32, one factor exp(-shift) in every weight, what underflows lost."""
+    """Return codes as earlier kernels drew them: float32, one factor exp(-shift) in every weight, with underflow."""
     f, steps = np.float32, sensor.short_sums()
     n = len(steps.full)
     shift = n + 7 * np.sqrt(n) + 30 - 85
@@ -187,7 +187,7 @@ def test_a_few_codes_in_a_million_are_the_compiled_engines_own():
 
 
 def test_a_data_set_is_drawn_again_clip_by_clip(tmp_path, capsys):
-    """Streams added by `qsim sense`: each named with its clip; right again after --force."""
+    """Streams added by `qsim sense`: each is named with its clip, and passes after --force."""
     path = write_dataset(tmp_path / "set", {"train": 2, "test": 1})
     assert program.main(["sense", str(path), "--bits", "3", "--ppp", "3.25", "-o", "s"]) == 0
     found = redraw.redraw(path)
@@ -221,7 +221,7 @@ def test_a_damaged_clip_is_named_and_the_others_are_drawn_again(tmp_path, capsys
 
 
 def test_what_is_said_of_a_recipes_streams_mends_them(tmp_path, capsys):
-    """Every file vouches for the wrong codes; with the file gone, `generate --repair` draws them again."""
+    """Every checksum fits the wrong codes; when the file is deleted, `generate --repair` draws them again."""
     settings = Settings(frames=14, height=36, width=44, frame_rate=2000.0)
     sensing = Sensing("quiver-physical", bits=3, ppp=3.25, name="s")
     recipe = Recipe("tiny", (Job("one", "family", 0, 1.0, "train", settings, 0, (sensing,)),), {})

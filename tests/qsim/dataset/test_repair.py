@@ -29,7 +29,7 @@ def test_every_damaged_file_is_named_and_only_it_is_made_again(
     generate(SMALL, folder, HERE, make=make)
     for name in undisturbed:
         damage(folder / name, kind)
-        # a clip whose record is gone does not count as made
+        # a clip without record does not count as made
         named = name.replace("jobs/", "clips/").removesuffix(".json") if kind == "missing" and "jobs" in name else name
         assert any(f"{folder / named}: " in problem for problem in problems_of(folder)), name
         kept = {path: path.stat().st_ino for path in folder.glob("clips/*") if path.name not in name}
@@ -40,7 +40,7 @@ def test_every_damaged_file_is_named_and_only_it_is_made_again(
 
 
 def test_a_damaged_record_costs_no_rendering_but_vouches_for_nothing(tmp_path: Path, undisturbed: dict[str, bytes]):
-    """The clip behind it stays if the manifest still knows it, and goes if its clip.json has changed too."""
+    """Its clip stays if its record would match the manifest, and is replaced if its clip.json has changed too."""
     folder = tmp_path / "d"
     generate(SMALL, folder, HERE, make=make)
     damage(folder / "jobs" / "tumble_0004.json", "bit-flipped")
@@ -54,7 +54,7 @@ def test_a_damaged_record_costs_no_rendering_but_vouches_for_nothing(tmp_path: P
 
 
 def test_repair_names_the_streams_that_go_with_a_clip(tmp_path: Path):
-    """What `qsim sense` has added is in no recipe: it cannot come back by itself."""
+    """A stream added by `qsim sense` is in no recipe, so a repair cannot make it again."""
     folder = tmp_path / "d"
     generate(SMALL, folder, HERE, make=make)
     for damaged in ("radiance/000000.exr", "streams/own.npy"):
@@ -89,7 +89,7 @@ def test_repairing_a_stream_does_not_render(tmp_path: Path, undisturbed: dict[st
 
 
 def test_a_clip_that_was_moved_and_linked(tmp_path: Path):
-    """It is read and its streams are mended through the link; what needs a new clip is refused, and nothing changes."""
+    """It is read and its streams are repaired through the link; a repair that needs a new clip is refused."""
     wanted, folder, place = recipe.parse(RECIPE), tmp_path / "d", tmp_path / "disk2"
     generate(wanted, folder, HERE, make=make)
     expected = tree(folder)
@@ -112,6 +112,6 @@ def test_a_clip_that_was_moved_and_linked(tmp_path: Path):
     frame.write_bytes(whole)
     assert Dataset.open(folder).verify() == []
     frame.unlink()
-    link.unlink()  # as the message says: the clip is made here
+    link.unlink()  # the advice of the message: the clip is made here
     assert generate(wanted, folder, Options(workers=0, repair=True), make=make).failed == {}
     assert tree(folder) == expected

@@ -1,4 +1,4 @@
-"""Own scenes: every file that one reads is known, and an edit of it before a resume is refused by name."""
+"""Scene files of the user: every file that a scene reads is found, and an edit before a resume is refused by name."""
 
 import os
 import random
@@ -45,7 +45,7 @@ def scene(seed=0, *, speed=1.0):
 
 
 def write_scene(folder: Path) -> Path:
-    """The scene file with what it reads."""
+    """Write the scene file and the files that it reads."""
     for name in ("reads_package", "meshes", "unrelated"):
         (folder / name).mkdir(parents=True)
     (folder / "wheel.py").write_text(SCENE)
@@ -70,7 +70,7 @@ READ = {
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder for scenes; no helper of another test is left imported."""
+    """A folder for scenes; modules imported by other tests are removed."""
     monkeypatch.syspath_prepend(tmp_path / "scene")
     for name in [name for name in sys.modules if name.startswith("reads_")]:
         del sys.modules[name]
@@ -78,7 +78,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def make(job: Job, path: Path) -> object:
-    """A clip that says what its scene read, as a rendered one does."""
+    """Make a clip that lists the files of its scene, as a rendered one does."""
     _, read = job_runner.load_traced(job)
     return write_clip(path, frames=1, height=2, width=3, seed=job.scene_seed, **provenance.origin(job, read))
 
@@ -102,7 +102,7 @@ def test_families_of_the_library_read_nothing_and_folders_everything(tmp_path: P
 
 
 def edit(file: Path, rng: random.Random) -> None:
-    """A random change that keeps size and times: a clock that was set back hides nothing."""
+    """Change a file at random and keep its size and times: setting the clock back hides nothing."""
     status, content = file.stat(), bytearray(file.read_bytes())
     if content:
         content[rng.randrange(len(content))] ^= 1
@@ -127,7 +127,7 @@ def test_an_edit_of_any_file_read_is_refused_by_name(place: Path, tmp_path: Path
     for unrelated in ("notes.txt", "meshes/notes.txt", "unrelated/other.py", "seed7.bin", "written.log"):
         edit(place / unrelated, rng)
     assert generate(own, folder, HERE, make=make).made == 0
-    (folder / "jobs" / "wheel_0001.json").unlink()  # something is left to be done
+    (folder / "jobs" / "wheel_0001.json").unlink()  # so that a job is unfinished
     original = (place / name).read_bytes()
     edit(place / name, rng)
     again = only(wanted(path), "wheel")
@@ -218,7 +218,7 @@ SMALL_XML = """<scene version="3.0.0">
 
 @pytest.mark.parametrize("name", ["s.xml", "moved.py"])
 def test_choosing_an_engine_is_no_reading_of_the_scene(tmp_path: Path, name: str):
-    """In a fresh process, whose first scene starts Mitsuba: the first time names the same files as the second."""
+    """In a new process the first scene starts Mitsuba: it must name the same files as the second."""
     (tmp_path / "moved.py").write_text(MOVED)
     (tmp_path / "s.xml").write_text(SMALL_XML)
     (tmp_path / "m.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")

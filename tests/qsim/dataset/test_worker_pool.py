@@ -1,4 +1,4 @@
-"""Worker processes: the same bytes for any number, and one that crashes or loses its folder or parent."""
+"""Worker processes: the same bytes for any number; a crash, a removed folder, a killed parent."""
 
 import os
 import shutil
@@ -62,12 +62,12 @@ def test_a_crashing_worker_takes_down_only_its_job(tmp_path: Path, maker: Render
 
 @pytest.mark.parametrize("part", [None, "locks", "jobs"])
 def test_a_folder_that_is_removed_while_workers_write(tmp_path: Path, part: str | None, capfd):
-    """One line, no worker's traceback; what is left is a data set to the next run, which makes the same files."""
+    """One line, no worker's traceback; the rest is a data set for the next run, which makes the same files."""
     wanted, folder = recipe.parse(RECIPE.replace("[0, 1]", "[0, 1, 2, 3, 5, 6]")), tmp_path / "d"
     stop = threading.Event()
 
     def remove() -> None:
-        while not stop.is_set():  # as `rm -r` that is repeated until nothing is left
+        while not stop.is_set():  # like `rm -r`, repeated until nothing is left
             if any((folder / "logs").glob("*")):
                 shutil.rmtree(folder / part if part else folder, ignore_errors=True)
             stop.wait(0.02)
