@@ -1,7 +1,7 @@
-"""Cloth in the wind: the one thing here that changes its shape.
+"""Defines motions that deform the mesh: cloth in the wind as travelling waves in closed form.
 
-A `Flag` is a rigid motion (of its pole) that also moves the vertices of its mesh in body coordinates: travelling waves,
-in closed form, so that place and velocity are exact at any time. Left out: stretching, folds onto itself, gravity.
+A `Flag` is a rigid motion (of its pole) that also moves the vertices of its mesh in body coordinates. Position and
+velocity are exact at any time. Left out: stretching, self-contact, gravity.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from qsim.scene.rotation import Array
 
 @dataclass(frozen=True)
 class Ripple:
-    """A wave that leaves the pole: amplitude * x / width * sin(2 pi (x / wavelength - f t) + slant y + phase)."""
+    """A wave away from the pole: amplitude * x / width * sin(2 pi (x / wavelength - f t) + slant y + phase)."""
 
     amplitude: float  # m, at the free edge
     wavelength: float  # m, along x
@@ -30,14 +30,14 @@ class Ripple:
             raise ValueError(f"Ripple.wavelength: a positive length [m] is needed, got {self.wavelength!r}")
 
     def angle(self, places: Array, t: float) -> Array:
-        """Phase [rad] at the places [V, 3] at time `t` [s]."""
+        """Return the phase [rad] at the points [V, 3] in m at time t [s], float64 [V]."""
         x, y = places[:, 0], places[:, 1]
         return 2 * np.pi * (x / self.wavelength - self.frequency * t) + self.slant * y + self.phase
 
 
 @dataclass(frozen=True, eq=False)
 class Flag(Motion):
-    """A sheet in the plane z = 0, held at x = 0, free at x = width: the ripples displace it in z."""
+    """A sheet in the plane z = 0, fixed at x = 0, free at x = width; ripples displace it in z."""
 
     rest: Array  # m, vertices [V, 3] of the sheet at rest
     ripples: tuple[Ripple, ...]
@@ -61,7 +61,7 @@ class Flag(Motion):
         return self.carrier.velocity(t)
 
     def deform(self, t: float) -> Array:
-        """Vertices [m] in body coordinates, [V, 3]."""
+        """Return vertices [m] in body coordinates at time t [s], float64 [V, 3]."""
         moved = np.array(self.rest, dtype=np.float64)
         for ripple in self.ripples:
             moved[:, 2] += ripple.amplitude * self.rest[:, 0] / self.width * np.sin(ripple.angle(self.rest, t))

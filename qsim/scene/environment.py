@@ -1,9 +1,9 @@
-"""Radiance from all around: the clear sky with its sun, and pictures of environments, as equirectangular maps.
+"""Computes equirectangular radiance maps of the surroundings: a clear sky, its sun, and environment images.
 
     SunSky, EnvironmentImage -> float32 [H, W] radiance [W m^-2 sr^-1], row 0 at the zenith
 
-Column u (0..1 from left to right) looks to azimuth pi - 2 pi u, so that +z is in the middle and +x left of it, as seen
-from inside. Mitsuba's own sun and sky refuse monochrome; the CIE model needs no table and keeps both irradiances.
+Column u (0..1 from left to right) has azimuth pi - 2 pi u: +z is in the middle and +x left of it, seen from inside.
+Mitsuba's own sun and sky do not support monochrome. The CIE model needs no table and keeps both irradiances.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from qsim.colour import luminance
 from qsim.scene.image_files import read_hdr
 from qsim.scene.lights import EnvironmentImage, SunSky
 
-SKY_ROWS = 128  # of the upper and lower half together; the sky is smooth, the sun is a disk of its own
+SKY_ROWS = 128  # of both halves; the sky is smooth, and the sun is a separate disk
 
 # CIE S 011/E:2003, standard general sky, type 12 "CIE standard clear sky, low luminance turbidity".
 _A, _B, _C, _D, _E = -1.0, -0.32, 10.0, -3.0, 0.45
 
 
 def sun_direction(light: SunSky) -> Array:
-    """Unit vector towards the sun, world axes, float64 [3]."""
+    """Return the unit vector towards the sun in world axes, float64 [3]."""
     horizontal = math.cos(light.elevation)
     return np.array(
         [horizontal * math.sin(light.azimuth), math.sin(light.elevation), horizontal * math.cos(light.azimuth)]
@@ -33,15 +33,15 @@ def sun_direction(light: SunSky) -> Array:
 
 
 def sun_radiance(light: SunSky) -> float:
-    """Radiance of the disk [W m^-2 sr^-1]: irradiance / (pi sin^2 radius)."""
+    """Return the radiance of the disk [W m^-2 sr^-1]: irradiance / (pi sin^2 radius)."""
     return light.sun_irradiance / (math.pi * math.sin(light.sun_radius) ** 2)
 
 
 def sky_map(light: SunSky, rows: int = SKY_ROWS) -> Array:
-    """Sky above, ground below, without the sun's disk: float32 [rows, 2 rows] (rows even).
+    """Return radiance of sky (above) and ground (below) without the sun's disk: float32 [rows, 2 rows], rows even.
 
     Relative sky radiance = phi(Z) f(chi), phi(Z) = 1 + a exp(b / cos Z), f(chi) = 1 + c (exp(d chi) - exp(d pi/2))
-    + e cos^2 chi, with zenith distance Z and angle chi from the sun; scaled to the irradiance asked for.
+    + e cos^2 chi, with zenith distance Z and angle chi from the sun, scaled to the requested irradiance.
     """
     zenith = (np.arange(rows) + 0.5)[:, None] / rows * np.pi
     azimuth = np.pi - 2 * np.pi * (np.arange(2 * rows) + 0.5)[None, :] / (2 * rows)
@@ -59,7 +59,7 @@ def sky_map(light: SunSky, rows: int = SKY_ROWS) -> Array:
 
 
 def environment_map(light: EnvironmentImage) -> Array:
-    """The picture in radiance, float32 [H, W]; `ValueError` or FileNotFoundError naming the file."""
+    """Return the picture in W m^-2 sr^-1, float32 [H, W]; `ValueError` or `FileNotFoundError` with the file's name."""
     picture = read_hdr(Path(light.image)) if isinstance(light.image, str) else np.asarray(light.image, np.float32)
     if picture.ndim == 3:
         picture = luminance(picture[..., :3])

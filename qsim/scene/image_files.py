@@ -11,7 +11,7 @@ from qsim.colour import luminance, to_linear
 
 
 def read_grey(path: Path) -> np.ndarray:
-    """An image file as linear luminance, float32 [H, W]."""
+    """Return an image file as linear luminance, float32 [H, W]; `FileNotFoundError` or `ValueError`."""
     from PIL import Image
 
     if not path.is_file():
@@ -25,7 +25,7 @@ def read_grey(path: Path) -> np.ndarray:
 
 
 def read_hdr(path: Path) -> Array:
-    """Linear picture [H, W] or [H, W, 3] of an .exr (OpenEXR) or Radiance .hdr file."""
+    """Return the linear picture [H, W] or [H, W, 3] of an .exr (OpenEXR) or .hdr (Radiance) file."""
     if not path.is_file():
         raise FileNotFoundError(f"environment {path}: no such file")
     if path.suffix.lower() == ".hdr":
@@ -34,7 +34,7 @@ def read_hdr(path: Path) -> Array:
 
     try:
         channels = OpenEXR.File(str(path)).channels()
-    except Exception as error:  # the binding raises several kinds for a bad file
+    except Exception as error:  # the binding raises several types for a bad file
         raise ValueError(f"environment {path}: not a readable OpenEXR file ({error})") from error
     for name in ("RGB", "RGBA", "Y"):
         if name in channels:
@@ -43,7 +43,7 @@ def read_hdr(path: Path) -> Array:
 
 
 def _read_radiance(path: Path) -> Array:
-    """Radiance RGBE (Ward, "Real pixels", Graphics Gems II, 1991), flat or new-style run lengths."""
+    """Decode Radiance RGBE (Ward, "Real pixels", Graphics Gems II, 1991), flat or with new-style run lengths."""
     content = path.read_bytes()
     head, _, rest = content.partition(b"\n\n")
     size, _, body = rest.partition(b"\n")

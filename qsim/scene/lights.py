@@ -12,7 +12,7 @@ from qsim.optics.camera import Pose, Vector
 
 @dataclass(frozen=True, eq=False)
 class Constant:
-    """The same radiance from every direction."""
+    """Surroundings with the same radiance in every direction."""
 
     radiance: float  # W m^-2 sr^-1
 
@@ -40,14 +40,14 @@ class SunSky:
 
 @dataclass(frozen=True, eq=False)
 class AreaLamp:
-    """A rectangle that shines from `origin` towards `target`, on that side only."""
+    """A rectangle at `origin` that emits towards `target`, on that side only."""
 
-    origin: Vector
-    target: Vector
+    origin: Vector  # m
+    target: Vector  # m
     width: float  # m
     height: float  # m
     radiance: float  # W m^-2 sr^-1
-    motion: Pose | None = None  # world motion: pose(t) is applied after the placement
+    motion: Pose | None = None  # in world axes: pose(t) is applied after the placement
 
     def __post_init__(self) -> None:
         check_light(self, "radiance")
@@ -55,9 +55,9 @@ class AreaLamp:
 
 @dataclass(frozen=True, eq=False)
 class PointLight:
-    """An isotropic point: irradiance at distance r is intensity / r^2."""
+    """An isotropic point light: irradiance at distance r is intensity / r^2."""
 
-    position: Vector
+    position: Vector  # m
     intensity: float  # W sr^-1
     motion: Pose | None = None
 
@@ -82,7 +82,7 @@ ENVIRONMENTS = (Constant, SunSky, EnvironmentImage)
 
 
 def strength(light: Light) -> float:
-    """Some measure that is 0 only for a light that is off."""
+    """Return a measure of a light's power that is 0 only if it emits nothing."""
     match light:
         case Constant(radiance) | AreaLamp(radiance=radiance):
             return radiance

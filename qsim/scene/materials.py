@@ -14,15 +14,15 @@ from qsim.scene.lights import check_light
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """A picture on a surface: an array [H, W] of linear values, or an image file (sRGB grey or colour)."""
+    """A picture on a surface: an array [H, W] of linear values, or an image file (sRGB, grey or colour)."""
 
     image: np.ndarray | str  # float [H, W] linear, or a path; a path's colours become linear luminance (Rec. 709)
-    repeat: tuple[float, float] = (1.0, 1.0)  # how often the picture fits into u, v = 0..1
+    repeat: tuple[float, float] = (1.0, 1.0)  # repetitions of the picture in u, v = 0..1
     nearest: bool = False  # nearest texel instead of bilinear
-    source: str | None = None  # the photograph that the picture shows, in whatever range; recorded with a clip
+    source: str | None = None  # name of the photograph that the picture shows; data sets record it
 
     def pixels(self) -> np.ndarray:
-        """Linear values, float32 [H, W]; raises FileNotFoundError or ValueError naming the file."""
+        """Return linear values, float32 [H, W]; `FileNotFoundError` or `ValueError` with the file's name."""
         if not isinstance(self.image, str | Path):
             pixels = np.asarray(self.image, np.float32)
             where = "Texture.image"
@@ -37,7 +37,7 @@ class Texture:
 
 @dataclass(frozen=True, eq=False)
 class Bump:
-    """Relief that only tilts normals: a height map (in metres where 1 means `height`)."""
+    """Relief that only tilts normals: a height map, with values in units of `height`."""
 
     texture: Texture
     height: float = 1.0  # m
@@ -45,7 +45,7 @@ class Bump:
 
 @dataclass(frozen=True, eq=False)
 class NormalMap:
-    """Tangent-space normals as a picture, float [H, W, 3] in 0..1 (0.5, 0.5, 1 is flat)."""
+    """Tangent-space normals as a picture, float [H, W, 3] in 0..1; (0.5, 0.5, 1) is flat."""
 
     image: np.ndarray
     repeat: tuple[float, float] = (1.0, 1.0)
@@ -56,7 +56,7 @@ Relief = Bump | NormalMap | None
 
 @dataclass(frozen=True, eq=False)
 class Diffuse:
-    """Lambertian surface, both sides."""
+    """A two-sided Lambertian surface."""
 
     reflectance: float | Texture = 0.5  # 0..1
     relief: Relief = None
@@ -67,7 +67,7 @@ class Diffuse:
 
 @dataclass(frozen=True, eq=False)
 class RoughPlastic:
-    """Diffuse base under a rough dielectric coat (GGX)."""
+    """A diffuse base under a rough dielectric coat (GGX)."""
 
     reflectance: float | Texture = 0.5  # of the base, 0..1
     roughness: float = 0.1  # GGX alpha
@@ -80,10 +80,10 @@ class RoughPlastic:
 
 @dataclass(frozen=True, eq=False)
 class Conductor:
-    """Metal by its complex index at the camera's wavelength; roughness 0 is a mirror. Default: aluminium at 550 nm.
+    """A metal given by its complex index at the camera's wavelength (aluminium at 550 nm); roughness 0 is a mirror.
 
     Aluminium 0.96 + 6.70i, silver 0.055 + 3.32i, gold 0.42 + 2.35i, copper 1.04 + 2.59i, chromium 3.12 + 3.31i
-    (rounded from the usual handbooks at 550 nm).
+    (rounded handbook values at 550 nm).
     """
 
     eta: float = 0.96
@@ -103,7 +103,7 @@ class Dielectric:
 
 @dataclass(frozen=True, eq=False)
 class Glow:
-    """A surface that emits the same radiance in all directions, on its outer side, and reflects nothing."""
+    """A surface whose outer side emits the same radiance in all directions; it reflects nothing."""
 
     radiance: float  # W m^-2 sr^-1
 

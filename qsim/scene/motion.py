@@ -1,9 +1,9 @@
-"""Motions: where a body is, and how fast it goes, as a function of time.
+"""Defines motions in closed form: pose and velocity of a body as functions of time.
 
     t [s] -> pose (4x4, body to world) and velocity (linear [m/s] of the body's origin, angular [rad/s], world's axes)
 
-Every motion is a frozen record and a closed form in t: any time can be asked for, in any order, and two times give the
-exact motion between them. Nothing here is random. What deforms is in `cloth.py`.
+Every motion is a frozen record: times can be evaluated in any order, and two of them give the exact motion between
+them. Nothing is random. `deformation.py` has motions that change the mesh.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ GRAVITY: Vector = (0.0, -9.80665, 0.0)  # m s^-2, standard acceleration (CGPM 19
 
 
 class Motion(ABC):
-    """A rigid motion: `pose(t)` and `velocity(t)` are all that a renderer needs.
+    """A rigid motion with `pose(t)` and `velocity(t)`.
 
     `ValueError` for parameters that are not finite, vectors without three components, and axes of length zero.
     """
@@ -44,20 +44,20 @@ class Motion(ABC):
 
     @abstractmethod
     def pose(self, t: float) -> Array:
-        """Body-to-world 4x4 at time `t` [s]."""
+        """Return the body-to-world matrix at time t [s], float64 [4, 4]."""
 
     @abstractmethod
     def velocity(self, t: float) -> tuple[Array, Array]:
-        """(velocity of the body's origin [m/s], angular velocity [rad/s]), in the world's axes, at time `t` [s]."""
+        """Return the velocity of the body's origin [m/s] and its angular velocity [rad/s], float64 [3], world axes."""
 
     def __matmul__(self, inner: Motion) -> Composition:
-        """`outer @ inner`: the inner motion happens in the frame which the outer one carries."""
+        """Return `outer @ inner`: the inner motion in the frame that the outer one moves."""
         return Composition(self, inner)
 
 
 @dataclass(frozen=True)
 class Still(Motion):
-    """At rest at `position` [m], turned by the rotation vector `turn` (axis times angle) [rad]."""
+    """At rest at `position` [m], rotated by the rotation vector `turn` (axis times angle) [rad]."""
 
     position: Vector = ORIGIN
     turn: Vector = ORIGIN
@@ -70,13 +70,13 @@ class Still(Motion):
 
     @classmethod
     def turned(cls, rotation: Array, position: ArrayLike = ORIGIN) -> Still:
-        """At rest in the attitude of a 3x3 rotation matrix."""
+        """Return a body at rest with the orientation of a rotation matrix [3, 3]."""
         return cls(vector(position), vector(logarithm(rotation)))
 
 
 @dataclass(frozen=True)
 class Translation(Motion):
-    """Straight and even: position + speed * t."""
+    """Uniform linear motion: position + speed * t."""
 
     speed: Vector  # m/s
     position: Vector = ORIGIN  # m, at t = 0
@@ -90,7 +90,7 @@ class Translation(Motion):
 
 @dataclass(frozen=True)
 class Spin(Motion):
-    """Even rotation about the axis through `center`; a pan is a spin of the camera about its own place."""
+    """Uniform rotation about the axis through `center`; a pan is a spin of the camera about its own position."""
 
     axis: Vector
     rate: float  # rad/s
@@ -106,7 +106,7 @@ class Spin(Motion):
 
 @dataclass(frozen=True)
 class Ballistic(Motion):
-    """Thrown: free fall of the centre while the body spins evenly about an axis through it."""
+    """Free fall of the centre, with uniform rotation about an axis through it."""
 
     position: Vector  # m, at t = 0
     speed: Vector  # m/s, at t = 0
@@ -125,7 +125,7 @@ class Ballistic(Motion):
 
 @dataclass(frozen=True)
 class Pendulum(Motion):
-    """Swings about a horizontal or any axis through `pivot`: angle = amplitude * sin(2 pi frequency t + phase)."""
+    """Swing about an axis through `pivot`: angle = amplitude * sin(2 pi frequency t + phase)."""
 
     pivot: Vector  # m
     axis: Vector
@@ -146,7 +146,7 @@ class Pendulum(Motion):
 
 @dataclass(frozen=True)
 class Oscillation(Motion):
-    """To and fro: position + amplitude * sin(2 pi frequency t + phase)."""
+    """Linear oscillation: position + amplitude * sin(2 pi frequency t + phase)."""
 
     amplitude: Vector  # m
     frequency: float  # Hz
@@ -164,7 +164,7 @@ class Oscillation(Motion):
 
 @dataclass(frozen=True)
 class Wave:
-    """One sinusoid of a shake: amplitude * sin(2 pi frequency t + phase), [rad] if it turns and [m] if it shifts."""
+    """One sinusoid of a shake: amplitude * sin(2 pi frequency t + phase), in rad for turns and m for shifts."""
 
     amplitude: Vector
     frequency: float  # Hz
@@ -176,7 +176,7 @@ class Wave:
 
 @dataclass(frozen=True)
 class Shake(Motion):
-    """A hand-held or vibrating mount: sums of waves turn it about `center` (as a rotation vector) and shift it."""
+    """A hand-held or vibrating mount: sums of waves rotate it about `center` (rotation vector) and shift it."""
 
     turns: tuple[Wave, ...] = ()
     shifts: tuple[Wave, ...] = ()
@@ -196,9 +196,9 @@ class Shake(Motion):
 
 @dataclass(frozen=True)
 class Keyframes(Motion):
-    """Through given places at given times: cubic Hermite positions with finite-difference slopes, even turns between.
+    """Given positions at given times: cubic Hermite paths with finite-difference slopes, uniform rotation between.
 
-    Before the first and after the last key the body rests there. `turns` are rotation vectors [rad], one per key, or
+    Before the first and after the last key the body rests. `turns` are rotation vectors [rad], one per key, or
     empty for none; the angular velocity jumps at keys, the linear velocity does not (except at the ends).
     """
 
@@ -241,27 +241,27 @@ class Keyframes(Motion):
         return rate, self._turn(i)[1] / length if self.turns else np.zeros(3)
 
     def _locate(self, t: float) -> tuple[int, float, float]:
-        """(interval, place 0..1 in it, its length [s]); times outside stay at the ends."""
+        """Return the interval, the fraction 0..1 of it, and its length [s]; times outside are clipped."""
         i = int(np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.times) - 2))
         length = self.times[i + 1] - self.times[i]
         return i, float(np.clip((t - self.times[i]) / length, 0.0, 1.0)), length
 
     def _slopes(self) -> Array:
-        """m/s at every key: the chord of the two neighbours, one-sided at the ends."""
+        """Return the slope [m/s] at every key, [keys, 3]: the chord of its neighbours, one-sided at the ends."""
         return (
             np.gradient(np.asarray(self.positions, dtype=np.float64), axis=0, edge_order=1)
             / (np.gradient(np.asarray(self.times, dtype=np.float64))[:, None])
         )
 
     def _turn(self, i: int) -> tuple[Array, Array]:
-        """Attitude at key i and the rotation vector, in the world's axes, to key i + 1."""
+        """Return the rotation at key i [3, 3], and the rotation vector [3] in world axes from it to key i + 1."""
         start, end = (exponential(np.asarray(self.turns[j])) for j in (i, i + 1))
         return start, logarithm(end @ start.T)
 
 
 @dataclass(frozen=True)
 class Composition(Motion):
-    """`outer` carries the frame in which `inner` happens: pose = outer.pose @ inner.pose."""
+    """`inner` in the frame that `outer` moves: pose = outer.pose @ inner.pose."""
 
     outer: Motion
     inner: Motion
@@ -278,7 +278,7 @@ class Composition(Motion):
 
 
 def check_numbers(record: Any) -> None:
-    """`ValueError` naming the first number or vector of a record that cannot be; axes must have a direction."""
+    """Raise `ValueError` for the first number or vector of a record that is not finite, and for axes of length zero."""
     for field in fields(record):
         value = getattr(record, field.name)
         try:
@@ -296,7 +296,7 @@ def check_numbers(record: Any) -> None:
 
 
 def _swing(pose: Array, angular: Array, center: ArrayLike) -> tuple[Array, Array]:
-    """Velocity of a body's origin that turns about `center`, with its angular velocity."""
+    """Return the velocity [m/s] of a body's origin that rotates about `center`, and its angular velocity [rad/s]."""
     return np.cross(angular, pose[:3, 3] - np.asarray(center)), angular
 
 

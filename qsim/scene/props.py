@@ -1,4 +1,4 @@
-"""Parts: things with a name, built from the outlines and paths of `shapes`: gears, rotors, letters, springs."""
+"""Builds gears, rotors, letters and springs from the outlines and paths of `shapes`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CURVE = 3  # matplotlib's path code of a quadratic curve's points; 1 starts a lo
 
 
 def gear(teeth: int, radius: float, thickness: float, depth: float = 0.18, spokes: int = 0) -> Mesh:
-    """A spur gear in the plane z = 0: `radius` to the tips, teeth `depth` radii high, a bore, windows if spoked."""
+    """Return a spur gear in the plane z = 0: tip `radius`, teeth `depth` radii high, a bore, windows if spoked."""
     if teeth < 3:
         raise ValueError(f"gear: at least 3 teeth, got {teeth!r}")
     root = radius * (1 - depth)
@@ -30,9 +30,9 @@ def gear(teeth: int, radius: float, thickness: float, depth: float = 0.18, spoke
 
 
 def rotor(blades: int, radius: float, pitch: float = 0.5, width: float = 0.9, sweep: float = 0.3) -> Mesh:
-    """A fan's blades about the z axis, without a hub: each widens outward and is pitched against the plane [rad].
+    """Return a fan's blades about the z axis without a hub; they widen outward, with `pitch` [rad] to the plane.
 
-    `width` is about the angle [rad] that a blade covers at its tip, `sweep` [rad] how far the tip runs ahead.
+    `width` is about the angle [rad] of a blade at its tip, `sweep` the lead of the tip [rad].
     """
     flat = sheet(1.0, 1.0, 16, 24)
     along, across = flat.vertices[:, 1] + 0.5, flat.vertices[:, 0]  # 0..1 from root to tip; -0.5..0.5 across
@@ -48,7 +48,7 @@ def rotor(blades: int, radius: float, pitch: float = 0.5, width: float = 0.9, sw
 
 
 def letters(text: str, height: float, depth: float, font: str = "DejaVuSans-Bold") -> Mesh:
-    """Extruded text in the plane z = 0, centred, capitals about `height` [m] high; the fonts are matplotlib's."""
+    """Return extruded text in the plane z = 0, centred, capitals about `height` [m] high, in a matplotlib font."""
     loops_of_glyphs = glyph_outlines(text, font)
     if not loops_of_glyphs:
         raise ValueError(f"letters: nothing to draw in {text!r}")
@@ -60,7 +60,7 @@ def letters(text: str, height: float, depth: float, font: str = "DejaVuSans-Bold
 
 
 def glyph_outlines(text: str, font: str = "DejaVuSans-Bold") -> list[list[Array]]:
-    """Closed outlines [N, 2] of every visible character, in em, laid out from left to right on the line y = 0."""
+    """Return closed outlines [N, 2] of every visible character in em, from left to right on the line y = 0."""
     import matplotlib as mpl
     from matplotlib.ft2font import FT2Font, LoadFlags
 
@@ -83,7 +83,7 @@ def glyph_outlines(text: str, font: str = "DejaVuSans-Bold") -> list[list[Array]
 
 
 def spring(radius: float, length: float, turns: float, thickness: float) -> Mesh:
-    """A helix of wire along y."""
+    """Return a helix of wire along y; lengths in m."""
     a = np.linspace(0, 2 * np.pi * turns, int(24 * turns) + 1)
     height = np.linspace(-length / 2, length / 2, len(a))
     return wire(np.stack([radius * np.cos(a), height, radius * np.sin(a)], 1), thickness, sides=8)
@@ -100,7 +100,7 @@ def _turn_z(angle: float) -> Array:
 
 
 def _flattened(points: Array, codes: NDArray[np.integer], steps: int = 5) -> list[Array]:
-    """Loops of lines from a glyph's lines and quadratic curves."""
+    """Return loops of lines [N, 2] from a glyph's lines and quadratic curves."""
     loops: list[list[Array]] = []
     i = 0
     while i < len(codes):

@@ -1,9 +1,8 @@
-"""Rotations and poses: the small algebra under every motion.
+"""Computes rotations and poses: Rodrigues' formula, and exponential, logarithm and left Jacobian of SO(3).
 
-A rotation is a 3x3 matrix or a rotation vector (axis times angle [rad]); a pose is a 4x4 matrix, body to world, column
-vectors. Right-handed: positive angles turn counter-clockwise for someone whom the axis points at.
-Formulae: Rodrigues; the exponential, logarithm and left Jacobian of SO(3) as in Sola, Deray & Atchuthan,
-"A micro Lie theory for state estimation in robotics" (2018).
+A rotation is a 3x3 matrix or a rotation vector (axis times angle [rad]). A pose is a 4x4 matrix, body to world, for
+column vectors. Angles are right-handed: seen against the axis, positive ones turn counter-clockwise. SO(3) follows
+Sola, Deray & Atchuthan, "A micro Lie theory for state estimation in robotics" (2018).
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ UP: Vector = (0.0, 1.0, 0.0)
 
 
 def vector(value: ArrayLike) -> Vector:
-    """Three finite floats as a tuple (what frozen records hold); `ValueError` says what came instead."""
+    """Return three finite floats as a tuple; `ValueError` for anything else."""
     v = np.asarray(value, dtype=np.float64).reshape(-1)
     if v.shape != (3,) or not np.isfinite(v).all():
         raise ValueError(f"expected three finite numbers (x, y, z), got {value!r}")
@@ -29,7 +28,7 @@ def vector(value: ArrayLike) -> Vector:
 
 
 def unit(axis: ArrayLike) -> Array:
-    """The direction of `axis`, length 1; `ValueError` for a zero axis."""
+    """Return the unit vector along `axis`, float64 [3]; `ValueError` for a zero axis."""
     a = np.asarray(vector(axis))
     length = float(np.linalg.norm(a))
     if length == 0:
@@ -38,19 +37,19 @@ def unit(axis: ArrayLike) -> Array:
 
 
 def cross_matrix(v: ArrayLike) -> Array:
-    """[v]x, so that [v]x p = v x p."""
+    """Return the cross-product matrix [v]x, float64 [3, 3]: [v]x p = v x p."""
     x, y, z = np.asarray(v, dtype=np.float64)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def rotation_matrix(axis: ArrayLike, angle: float) -> Array:
-    """3x3 rotation by `angle` [rad] about `axis` through the origin (Rodrigues)."""
+    """Return the rotation by `angle` [rad] about `axis` through the origin (Rodrigues), float64 [3, 3]."""
     k = cross_matrix(unit(axis))
     return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
 
 
 def pose_matrix(rotation: Array | None = None, position: ArrayLike = ORIGIN) -> Array:
-    """4x4 of a 3x3 rotation (identity when None) followed by a shift [m]."""
+    """Return the pose [4, 4] of a rotation [3, 3] (None: identity) followed by a shift [m]."""
     pose = np.eye(4)
     if rotation is not None:
         pose[:3, :3] = rotation
@@ -59,7 +58,7 @@ def pose_matrix(rotation: Array | None = None, position: ArrayLike = ORIGIN) -> 
 
 
 def rotation_between(start: ArrayLike, end: ArrayLike) -> Array:
-    """3x3, the shortest rotation that turns direction `start` into direction `end`."""
+    """Return the shortest rotation from direction `start` to direction `end`, float64 [3, 3]."""
     a, b = unit(start), unit(end)
     axis, cosine = np.cross(a, b), float(np.clip(a @ b, -1, 1))
     if np.linalg.norm(axis) < 1e-12:
@@ -70,14 +69,14 @@ def rotation_between(start: ArrayLike, end: ArrayLike) -> Array:
 
 
 def exponential(turn: ArrayLike) -> Array:
-    """3x3 rotation of a rotation vector [rad]; accurate down to angle 0."""
+    """Return the rotation [3, 3] of a rotation vector [rad]; accurate down to angle 0."""
     k = cross_matrix(turn)
     angle = float(np.linalg.norm(turn))
     return np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (k @ k)
 
 
 def logarithm(rotation: ArrayLike) -> Array:
-    """Rotation vector [rad] of a 3x3 rotation, its length at most pi."""
+    """Return the rotation vector [rad] of a rotation [3, 3]; its length is at most pi."""
     r = np.asarray(rotation, dtype=np.float64)
     # The unit quaternion (w, v), from its largest component so that half turns stay accurate
     squares = np.array([1 + np.trace(r), *(1 + 2 * np.diag(r) - np.trace(r))])
@@ -95,14 +94,14 @@ def logarithm(rotation: ArrayLike) -> Array:
 
 
 def left_jacobian(turn: ArrayLike) -> Array:
-    """J with angular velocity = J(turn) d(turn)/dt, in the world's axes."""
+    """Return J [3, 3] with angular velocity = J(turn) d(turn)/dt, in world axes."""
     k = cross_matrix(turn)
     angle = float(np.linalg.norm(turn))
-    if angle < 1e-4:  # the series: sin and cos would cancel
+    if angle < 1e-4:  # series: sin and cos would cancel
         return np.eye(3) + k / 2 + (k @ k) / 6
     return np.eye(3) + (1 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * (k @ k)
 
 
 def about(rotation: Array, center: ArrayLike) -> Array:
-    """Pose of a rotation about the point `center` [m] instead of the origin."""
+    """Return the pose [4, 4] of a rotation [3, 3] about the point `center` [m]."""
     return pose_matrix(rotation, np.asarray(center) - rotation @ np.asarray(center))

@@ -1,4 +1,4 @@
-"""What is in front of the sensor: frozen records in SI units, and nothing that draws.
+"""Describes a scene as frozen records in SI units: camera, lights, and bodies of mesh, material and motion.
 
     Scene = Camera + lights + bodies (mesh, material, motion)
 
@@ -30,7 +30,7 @@ class Deformation(Pose, Protocol):
     """A motion that also moves the vertices within the body's coordinates."""
 
     def deform(self, t: float) -> np.ndarray:
-        """Vertices in body coordinates, float64 [V, 3], same faces as the body's mesh."""
+        """Return vertices [m] in body coordinates at time t [s], float64 [V, 3]; the faces are those of the mesh."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """One thing that moves as a whole."""
+    """A mesh with one material and one motion."""
 
     name: str
     mesh: Mesh
@@ -72,11 +72,11 @@ class Body:
     motion: Pose | None = None  # None: stays where its mesh is
 
     def pose(self, t: float) -> np.ndarray:
-        """Body-to-world matrix at time t [s], float64 [4, 4]."""
+        """Return the body-to-world matrix at time t [s], float64 [4, 4]."""
         return np.eye(4) if self.motion is None else np.asarray(self.motion.pose(t), np.float64)
 
     def vertices(self, t: float) -> np.ndarray:
-        """Vertices in body coordinates at time t [s], float64 [V, 3]; only deformations change them."""
+        """Return vertices [m] in body coordinates at time t [s], float64 [V, 3]; only deformations change them."""
         if self.deforms:
             assert isinstance(self.motion, Deformation)
             return np.asarray(self.motion.deform(t), np.float64)
@@ -84,13 +84,13 @@ class Body:
 
     @functools.cached_property
     def deforms(self) -> bool:
-        """Asked at every frame; telling a protocol costs as much as posing the body."""
+        """Whether the motion deforms the mesh; cached, because the check costs as much as a pose."""
         return isinstance(self.motion, Deformation)
 
 
 @dataclass(frozen=True, eq=False)
 class MitsubaFile:
-    """An XML scene that Mitsuba reads itself: shapes, materials and lights, radiance taken as W m^-2 sr^-1."""
+    """An XML scene with shapes, materials and lights, read by Mitsuba; its radiance is in W m^-2 sr^-1."""
 
     path: str
     sha256: str  # of the file; meshes and pictures that it names are not counted
@@ -98,13 +98,13 @@ class MitsubaFile:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A shape of a Mitsuba file; the motion carries it from where the file puts it, in the world's axes."""
+    """A shape of a Mitsuba file; its motion starts at its place in the file, in the world's axes."""
 
     name: str
     motion: Pose | None = None
 
     def pose(self, t: float) -> np.ndarray:
-        """Matrix that takes the shape from its place in the file to its place at time t [s], float64 [4, 4]."""
+        """Return the matrix from the shape's place in the file to its place at time t [s], float64 [4, 4]."""
         return np.eye(4) if self.motion is None else np.asarray(self.motion.pose(t), np.float64)
 
 
@@ -118,7 +118,7 @@ class Scene:
     lights: tuple[Light, ...]
     bodies: tuple[Body, ...]
     speed: float = 1.0  # the factor that the family applied to its motions
-    file: MitsubaFile | None = None  # instead of lights and bodies of our own; see `qsim.read_mitsuba`
+    file: MitsubaFile | None = None  # instead of lights and bodies; see `qsim.read_mitsuba`
     parts: tuple[Part, ...] = ()  # the file's shapes, in its order
 
     def __post_init__(self) -> None:
@@ -157,7 +157,7 @@ class Scene:
         )
 
     def emits(self) -> bool:
-        """Whether anything gives light."""
+        """Return whether anything emits light."""
         if self.file is not None:
             return True  # checked when the file was read
         return any(strength(light) > 0 for light in self.lights) or any(
@@ -165,18 +165,18 @@ class Scene:
         )
 
     def resized(self, height: int, width: int) -> Scene:
-        """The same scene on another number of pixels."""
+        """Return the same scene with another number of pixels."""
         return replace(self, camera=self.camera.resized(height, width))
 
     def to_dict(self) -> dict[str, Any]:
-        """Provenance as JSON-ready values; arrays become their shape, type and SHA-256."""
+        """Return the scene as JSON-ready values; arrays become their shape, type and SHA-256."""
         described = describe(self)
         assert isinstance(described, dict)
         return described
 
 
 def describe(value: Any) -> Any:
-    """A record as JSON-ready values; dataclasses name their kind, arrays give shape, type and SHA-256."""
+    """Return a record as JSON-ready values: dataclasses with their kind, arrays with shape, type and SHA-256."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {field.name: describe(getattr(value, field.name)) for field in dataclasses.fields(value)}
         return {"kind": type(value).__name__} | fields

@@ -1,7 +1,7 @@
-"""Shapes: meshes in metres, as `scene.Mesh`, made from primitives, outlines, paths and noise, or read from files.
+"""Builds meshes in metres from primitives, outlines, paths and noise, or reads them from files.
 
-Every shape is centred on its own origin unless it says otherwise and carries texture coordinates. Solids of flat faces
-are mapped face by face (a texture keeps its size in metres), round ones around and along their axis.
+Unless stated otherwise, every mesh is centred on its origin and has texture coordinates. Solids of flat faces are
+mapped face by face (a texture keeps its size in metres), round ones around and along their axis.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ MESH_SUFFIXES = frozenset({".obj", ".ply", ".stl", ".off", ".glb", ".gltf"})
 
 
 def moved(mesh: Mesh, pose: Array) -> Mesh:
-    """The mesh after a 4x4 matrix (turn, shift, scale), winding kept outward."""
+    """Return the mesh after a 4x4 matrix (rotation, shift, scale), with outward winding."""
     vertices = mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
     faces = mesh.faces if np.linalg.det(pose[:3, :3]) > 0 else mesh.faces[:, ::-1]
     return Mesh(vertices, faces, mesh.uv, mesh.smooth)
 
 
 def merged(meshes: Sequence[Mesh]) -> Mesh:
-    """Several meshes as one; smooth if all are. Those without texture coordinates get zeros."""
+    """Return several meshes as one, smooth if all are; missing texture coordinates become zeros."""
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
     faces = np.concatenate([m.faces + start for m, start in zip(meshes, starts, strict=False)])
     uv = np.concatenate([np.zeros((len(m.vertices), 2)) if m.uv is None else m.uv for m in meshes])
@@ -38,11 +38,11 @@ def merged(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def box_mapped(vertices: ArrayLike, faces: ArrayLike, size: float = 1.0) -> Mesh:
-    """Flat faces of their own: each gets the texture along the axis it looks to most, one picture per `size` metres."""
+    """Return separate flat faces, each mapped along the axis nearest to its normal, one picture per `size` [m]."""
     corners = np.asarray(vertices, np.float64)[np.asarray(faces)]  # [F, 3, 3]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     axis = np.argmax(np.abs(normal), axis=1)
-    pair = np.array([[2, 1], [0, 2], [0, 1]])[axis]  # which coordinates become u, v
+    pair = np.array([[2, 1], [0, 2], [0, 1]])[axis]  # the coordinates that become u, v
     uv = np.take_along_axis(corners, np.repeat(pair[:, None, :], 3, axis=1), axis=2) / size
     flip = np.sign(normal[np.arange(len(axis)), axis]) * np.where(axis == 2, 1, -1)
     uv[..., 0] *= np.where(flip == 0, 1, flip)[:, None]  # readable from outside
@@ -53,7 +53,7 @@ def box_mapped(vertices: ArrayLike, faces: ArrayLike, size: float = 1.0) -> Mesh
 
 
 def sheet(width: float, height: float, columns: int = 1, rows: int = 1) -> Mesh:
-    """A rectangle in the plane z = 0 that looks to +z, u to the right and v up, cut into `columns` x `rows`."""
+    """Return a rectangle in the plane z = 0 facing +z, u to the right, v up, with `columns` x `rows` cells."""
     v, u = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
     vertices = np.stack([(u - 0.5) * width, (v - 0.5) * height, np.zeros_like(u)], -1).reshape(-1, 3)
     return Mesh(
@@ -62,7 +62,7 @@ def sheet(width: float, height: float, columns: int = 1, rows: int = 1) -> Mesh:
 
 
 def box(width: float, height: float, depth: float, texture_size: float = 1.0) -> Mesh:
-    """A cuboid."""
+    """Return a cuboid [m]."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = [f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))]
@@ -70,20 +70,20 @@ def box(width: float, height: float, depth: float, texture_size: float = 1.0) ->
 
 
 def ball(radius: float, segments: int = 48) -> Mesh:
-    """A sphere of `segments` meridians and half as many parallels, smooth."""
+    """Return a smooth sphere of `segments` meridians and half as many parallels."""
     return revolved(
         [(radius * np.sin(a), -radius * np.cos(a)) for a in np.linspace(0, np.pi, segments // 2 + 1)], segments
     )
 
 
 def torus(radius: float, tube: float, segments: int = 64) -> Mesh:
-    """A ring around the y axis: `radius` to the middle of the `tube`, whose own radius is `tube`; smooth."""
+    """Return a smooth ring around the y axis: `radius` to the tube's centre line, `tube` the tube's radius."""
     angles = np.linspace(-np.pi, np.pi, segments // 2 + 1)
     return revolved([(radius + tube * np.cos(a), tube * np.sin(a)) for a in angles], segments)
 
 
 def cylinder(radius: float, height: float, segments: int = 48, taper: float = 1.0) -> Mesh:
-    """A cylinder around y, or a cone for `taper` 0 (the top's radius over the bottom's); flat caps, flat facets."""
+    """Return a faceted cylinder around y; `taper` is the top radius over the bottom radius, 0 a cone."""
     h, top = height / 2, max(radius * taper, 0.0)
     side = revolved([(radius, -h), (top, h)], segments)
     caps = [revolved([(0, -h), (radius, -h)], segments)]
@@ -93,7 +93,7 @@ def cylinder(radius: float, height: float, segments: int = 48, taper: float = 1.
 
 
 def polyhedron(rng: np.random.Generator, radius: float, corners: int = 12, texture_size: float = 1.0) -> Mesh:
-    """A random convex stone: the hull of `corners` points spread over a ball."""
+    """Return a random convex stone: the hull of `corners` points spread over a ball."""
     import trimesh
 
     points = rng.standard_normal((corners, 3))
@@ -106,7 +106,7 @@ def polyhedron(rng: np.random.Generator, radius: float, corners: int = 12, textu
 
 
 def blob(rng: np.random.Generator, radius: float, roughness: float = 0.25, segments: int = 96) -> Mesh:
-    """A ball pushed in and out by smooth noise: sums of plane waves in space, `roughness` in radii."""
+    """Return a ball displaced by smooth noise (sums of plane waves in space); `roughness` is in radii."""
     mesh = ball(1.0, segments)
     push = np.zeros(len(mesh.vertices))
     for scale in (1.5, 2.5, 4.0, 6.5):
@@ -116,9 +116,9 @@ def blob(rng: np.random.Generator, radius: float, roughness: float = 0.25, segme
 
 
 def revolved(profile: Sequence[tuple[float, float]], segments: int = 48) -> Mesh:
-    """A profile of (radius, y) turned around the y axis, smooth: u goes around, v along the profile.
+    """Return a smooth solid: a profile of (radius, y) revolved around y, with u around and v along the profile.
 
-    The profile runs so that the outside is on its right: upwards for a cylinder's side.
+    The outside is on the right of the profile: it runs upwards for a cylinder's side.
     """
     line = np.asarray(profile, np.float64)
     u = np.linspace(0, 1, segments + 1)
@@ -134,7 +134,7 @@ def revolved(profile: Sequence[tuple[float, float]], segments: int = 48) -> Mesh
 
 
 def extruded(outlines: Sequence[ArrayLike], depth: float, texture_size: float = 1.0) -> Mesh:
-    """A plate of closed outlines [N, 2] (x, y), z from -depth/2 to depth/2; outlines inside outlines are holes."""
+    """Return a plate of closed outlines [N, 2] (x, y), z from -depth/2 to depth/2; inner outlines are holes."""
     loops = [_without_repeats(np.asarray(loop, np.float64)) for loop in outlines]
     flat, triangles = filled(loops)
     front = np.column_stack([flat, np.full(len(flat), depth / 2)])
@@ -155,10 +155,10 @@ def extruded(outlines: Sequence[ArrayLike], depth: float, texture_size: float = 
 
 
 def filled(loops: Sequence[Array]) -> tuple[Array, NDArray[np.int64]]:
-    """The inside (even-odd) of closed loops [N, 2] as points [P, 2] and counter-clockwise triangles [T, 3].
+    """Return the inside (even-odd) of closed loops [N, 2] as points [P, 2] and counter-clockwise triangles [T, 3].
 
-    Trapezoids between all neighbouring heights: in a band between two vertices no edge ends, and every second gap
-    between the edges sorted along x is inside. Loops must not cross one another.
+    The inside is cut into trapezoids between neighbouring heights. No edge ends in a band between two vertices, and
+    every second gap between the edges sorted along x is inside. Loops must not cross one another.
     """
     start = np.concatenate(loops)
     end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
@@ -174,15 +174,15 @@ def filled(loops: Sequence[Array]) -> tuple[Array, NDArray[np.int64]]:
         for left, right in zip(x[0::2], x[1::2], strict=True):
             points.append(np.array([[left[0], low], [right[0], low], [right[1], high], [left[1], high]]))
     if not points:
-        raise ValueError("an outline needs an inside: all its points lie on one line")
+        raise ValueError("the outline has no area: all its points lie on one line")
     quads = 4 * np.arange(len(points))[:, None]
     return np.concatenate(points), np.concatenate([quads + np.array(t) for t in ((0, 1, 2), (0, 2, 3))])
 
 
 def wire(path: ArrayLike, radius: float, sides: int = 8, closed: bool = False) -> Mesh:
-    """A tube of `radius` along a path [N, 3]: open ends, or closed from the last point to the first.
+    """Return a tube of `radius` along a path [N, 3]: with open ends, or closed from the last point to the first.
 
-    Frames are carried along without twist (parallel transport); what a closed path turns them by is spread over it.
+    Frames follow the path by parallel transport. The twist that a closed path accumulates is spread over it.
     """
     points = np.asarray(path, np.float64)
     tangent = np.gradient(np.concatenate([points[-1:], points, points[:1]]), axis=0)[1:-1] if closed else None
@@ -210,45 +210,45 @@ def wire(path: ArrayLike, radius: float, sides: int = 8, closed: bool = False) -
 
 
 def mesh_file(path: str | Path, size: float | None = None) -> Mesh:
-    """A mesh from a file, everything in it as one; `size` [m] scales its longest side. Centred on its bounding box."""
+    """Return all meshes of a file as one, centred on its bounding box; `size` [m] scales its longest side."""
     import trimesh
 
     if not Path(path).is_file():
         raise FileNotFoundError(f"mesh {path}: no such file")
     try:
         loaded: Any = trimesh.load(path, force="mesh")
-    except Exception as error:  # trimesh raises many kinds for a broken file
+    except Exception as error:  # trimesh raises many types for a broken file
         raise ValueError(f"mesh {path}: not readable ({error})") from error
     vertices = np.asarray(loaded.vertices, np.float64)
     if len(vertices) == 0 or len(loaded.faces) == 0:
-        raise ValueError(f"mesh {path}: it holds no triangles")
+        raise ValueError(f"mesh {path}: it contains no triangles")
     low, high = vertices.min(0), vertices.max(0)
     scale = 1.0 if size is None else size / float((high - low).max())
     return box_mapped((vertices - (low + high) / 2) * scale, loaded.faces, size or float((high - low).max()))
 
 
 def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
-    """Two triangles per cell of a grid of vertices, counter-clockwise with rows going up and columns to the right."""
+    """Return two counter-clockwise triangles per cell of a vertex grid, rows upwards, columns to the right."""
     i = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (corner.reshape(-1) for corner in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
     return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
 def _without_repeats(loop: Array) -> Array:
-    """A closed loop without points that repeat their predecessor (the last is followed by the first)."""
+    """Return a closed loop without points equal to their predecessor."""
     keep = np.any(np.abs(loop - np.roll(loop, 1, axis=0)) > 1e-12, axis=1)
     return loop[keep]
 
 
 def _outside_is_right(loop: Array, loops: Sequence[Array]) -> bool:
-    """Whether walking along the loop has the inside of the whole figure on the left."""
+    """Return whether the inside of the complete figure is on the left of the loop."""
     area = 0.5 * np.sum(loop[:, 0] * np.roll(loop[:, 1], -1) - loop[:, 1] * np.roll(loop[:, 0], -1))
     depth = sum(_contains(other, loop[0]) for other in loops if other is not loop)
     return bool((area > 0) == (depth % 2 == 0))
 
 
 def _contains(loop: Array, point: Array) -> bool:
-    """Even-odd test of a point against one closed loop."""
+    """Return whether a point lies inside one closed loop (even-odd)."""
     (x, y), p, q = point, loop, np.roll(loop, -1, axis=0)
     straddles = (p[:, 1] > y) != (q[:, 1] > y)
     p, q = p[straddles], q[straddles]

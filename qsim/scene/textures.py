@@ -1,8 +1,7 @@
-"""Textures: pictures [H, W] of linear reflectance, made from a random generator or read from photographs.
+"""Makes pictures [H, W] of linear reflectance from a random generator, patterns, text or photographs.
 
-Procedural ones tile without a seam. Values lie in 0..1; `levels` stretches any of them to a wanted range, because
-surfaces darker than 2 % or brighter than 95 % are rare. The photographs are files inside the scikit-image package: none
-is ever downloaded.
+Procedural pictures tile without a seam. Values lie in 0..1. `levels` stretches them to a range, because surfaces darker
+than 2 % or brighter than 95 % are rare. The photographs are files of the scikit-image package; nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"})
 
 
 def levels(picture: NDArray[np.floating], low: float = 0.1, high: float = 0.8, contrast: float = 1.0) -> Picture:
-    """Stretch so that the 1st and 99th percentiles become `low` and `high`; `contrast` > 1 favours the ends."""
+    """Stretch the 1st and 99th percentiles to `low` and `high`; `contrast` > 1 favours the ends."""
     if not 0 <= low <= high <= 1:
         raise ValueError(f"levels: expected 0 <= low <= high <= 1, got {low!r} and {high!r}")
     dark, bright = np.percentile(picture, [1, 99])
@@ -60,7 +59,7 @@ def photograph(name: str, low: float = 0.03, high: float = 0.85, repeat: tuple[f
 
 
 def pictures_in(folder: str | Path) -> list[Path]:
-    """The image files of a folder, sorted by name; `FileNotFoundError` if it holds none."""
+    """Return the image files of a folder, sorted by name; `FileNotFoundError` if there are none."""
     found = sorted(p for p in Path(folder).glob("*") if p.suffix.lower() in PICTURE_SUFFIXES)
     if not found:
         raise FileNotFoundError(f"{folder}: no image files ({', '.join(sorted(PICTURE_SUFFIXES))}) in this folder")
@@ -70,9 +69,9 @@ def pictures_in(folder: str | Path) -> list[Path]:
 def noise(
     rng: np.random.Generator, size: tuple[int, int] = (512, 512), slope: float = 1.0, cut: float = 0.0
 ) -> Picture:
-    """Fractal noise: Gaussian with a power spectrum f^(-2 slope), rescaled to 0..1; tiles.
+    """Return fractal noise: Gaussian with a power spectrum f^(-2 slope), rescaled to 0..1; it tiles.
 
-    `slope` 1 looks like clouds, 0.5 like sand, 1.5 like marble; frequencies below `cut` [per picture] are left out.
+    `slope` 1 resembles clouds, 0.5 sand, 1.5 marble. Frequencies below `cut` [per picture] are left out.
     """
     fy = np.fft.fftfreq(size[0])[:, None] * size[0]
     fx = np.fft.rfftfreq(size[1])[None, :] * size[1]
@@ -83,13 +82,13 @@ def noise(
 
 
 def checker(columns: int = 8, rows: int = 8, low: float = 0.1, high: float = 0.8, cell: int = 32) -> Picture:
-    """A chess board of `columns` x `rows` fields; even numbers tile."""
+    """Return a chess board of `columns` x `rows` fields; even numbers tile."""
     y, x = np.mgrid[: rows * cell, : columns * cell] // cell
     return np.where((x + y) % 2 == 0, high, low).astype(np.float32)
 
 
 def stripes(count: int = 16, low: float = 0.1, high: float = 0.8, size: int = 512, duty: float = 0.5) -> Picture:
-    """`count` vertical stripes, a share `duty` of each period bright, edges one texel soft."""
+    """Return `count` vertical stripes, a fraction `duty` of each period bright, with edges one texel soft."""
     phase = (np.arange(size) + 0.5) * count / size % 1.0
     edge = 0.5 + (duty / 2 - np.abs(phase - 0.5)) * size / count
     row = low + (high - low) * np.clip(edge, 0, 1)
@@ -97,14 +96,14 @@ def stripes(count: int = 16, low: float = 0.1, high: float = 0.8, size: int = 51
 
 
 def dots(count: int = 12, low: float = 0.1, high: float = 0.8, size: int = 512, radius: float = 0.3) -> Picture:
-    """A square lattice of `count` x `count` bright disks of `radius` periods."""
+    """Return a square lattice of `count` x `count` bright disks of `radius` periods."""
     place = ((np.arange(size) + 0.5) * count / size) % 1.0 - 0.5
     distance = np.hypot(place[:, None], place[None, :])
     return (low + (high - low) * np.clip(0.5 + (radius - distance) * size / count, 0, 1)).astype(np.float32)
 
 
 def rings(rng: np.random.Generator, count: float = 14.0, size: int = 512, wobble: float = 0.6) -> Picture:
-    """Wood: `count` rings around the left edge's middle, bent by noise (`wobble` in periods), 0..1; does not tile."""
+    """Return wood in 0..1: `count` rings around the left edge's middle, bent by `wobble` periods; it does not tile."""
     y, x = (np.mgrid[:size, :size] + 0.5) / size
     bend = wobble * (noise(rng, (size, size), 1.6) - 0.5) * 6
     phase = count * np.hypot(x, (y - 0.5) * 0.35) + bend
@@ -113,7 +112,7 @@ def rings(rng: np.random.Generator, count: float = 14.0, size: int = 512, wobble
 
 
 def bricks(rng: np.random.Generator, rows: int = 12, columns: int = 6, size: int = 768, joint: float = 0.08) -> Picture:
-    """A wall in running bond: bricks of different greys with rough faces, bright joints; tiles for even `rows`."""
+    """Return a wall in running bond: rough bricks of different greys, bright joints; it tiles for even `rows`."""
     y, x = (np.mgrid[:size, :size] + 0.5) / size
     row = np.floor(y * rows).astype(int)
     shifted = (x * columns + 0.5 * (row % 2)) % columns
@@ -121,14 +120,14 @@ def bricks(rng: np.random.Generator, rows: int = 12, columns: int = 6, size: int
     tone = rng.uniform(0.25, 0.6, (rows, columns))[row, column]
     from_joint = np.minimum(
         _to_edge(y * rows % 1.0), _to_edge(shifted % 1.0) * rows / columns * 0.5
-    )  # in brick heights: a brick is about twice as long as it is high
+    )  # in brick heights: a brick is about twice as long as high
     face = np.clip((from_joint - joint / 2) / 0.04, 0, 1)
     rough = noise(rng, (size, size), 0.8)
     return np.clip(face * tone * (0.7 + 0.6 * rough) + (1 - face) * (0.65 + 0.2 * rough), 0.02, 0.95).astype(np.float32)
 
 
 def cells(rng: np.random.Generator, count: int = 120, size: int = 512, joint: float = 0.12) -> Picture:
-    """Paving: Voronoi cells of different greys with dark joints, 0..1; tiles."""
+    """Return paving in 0..1: Voronoi cells of different greys with dark joints; it tiles."""
     from scipy.spatial import cKDTree
 
     seeds = rng.random((count, 2))
@@ -141,7 +140,7 @@ def cells(rng: np.random.Generator, count: int = 120, size: int = 512, joint: fl
 
 
 def speckles(rng: np.random.Generator, count: int = 1500, size: int = 512, largest: float = 0.02) -> Picture:
-    """Terrazzo: dots of random sizes (shares of the picture) and greys over a ground, 0..1; tiles."""
+    """Return terrazzo in 0..1: dots of random greys and sizes (fractions of the picture) on a ground; it tiles."""
     picture = np.full((size, size), 0.75, np.float32) + 0.1 * (noise(rng, (size, size), 0.6) - 0.5)
     places, radii = rng.random((count, 2)) * size, size * largest * rng.beta(1, 4, count) + 0.7
     for (cy, cx), radius, tone in zip(places, radii, rng.uniform(0, 1, count), strict=True):
@@ -156,9 +155,9 @@ def speckles(rng: np.random.Generator, count: int = 1500, size: int = 512, large
 def lines_of_text(
     lines: Sequence[str], width: int = 1024, height: int = 512, ink: float = 0.05, paper: float = 0.8
 ) -> Picture:
-    """A printed page: every line fills the width, so longer lines are smaller; an empty line is 0.4 pages high.
+    """Return a printed page: every line fills the width, and an empty line is 0.4 pages high.
 
-    The font is the bold DejaVu Sans inside matplotlib.
+    The font is matplotlib's bold DejaVu Sans.
     """
     import matplotlib as mpl
     from PIL import Image, ImageDraw, ImageFont
@@ -180,5 +179,5 @@ def lines_of_text(
 
 
 def _to_edge(phase: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Distance of a phase in 0..1 to the nearer end."""
+    """Return the distance of a phase in 0..1 to the nearer end."""
     return np.minimum(phase, 1 - phase)

@@ -150,7 +150,7 @@ def test_filled_follows_the_even_odd_rule_with_holes_and_islands():
     signed = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
     assert (signed >= -1e-15).all()  # counter-clockwise
     assert signed.sum() == pytest.approx(4 - 1 + 0.25)
-    with pytest.raises(ValueError, match="an outline needs an inside"):
+    with pytest.raises(ValueError, match="the outline has no area"):
         filled([np.array([[0.0, 0], [1, 0], [2, 0]])])
 
 
