@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks
-from qsim.cli.console import checked, command, output, refuse_existing
+from qsim.cli.console import command, output, refuse_existing
+from qsim.cli.options import checked
 
 
 def add_calibrate(sub: Any) -> None:

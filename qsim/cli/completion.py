@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Iterator
 from typing import Any
 
-from qsim.cli.console import command, output
+from qsim.cli.console import command, options_of, output
 
 SHELLS = ("bash", "zsh", "fish")
 
@@ -39,26 +38,15 @@ def script(parser: argparse.ArgumentParser, shell: str) -> str:
     return _fish(parser) if shell == "fish" else _bash(parser, shell)
 
 
-def _commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            return dict(action.choices)
-    return {}
-
-
-def _options(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    return (action for action in parser._actions if action.option_strings)
-
-
 def _words(parser: argparse.ArgumentParser) -> list[str]:
     """Long options of a command and the choices of its arguments."""
-    options = [action.option_strings[-1] for action in _options(parser)]
-    arguments = [action for action in parser._actions if not action.option_strings and action.choices]
-    return [*options, *(str(choice) for action in arguments for choice in action.choices or ())]
+    options, positional, _ = options_of(parser)
+    names = [action.option_strings[-1] for action in options]
+    return [*names, *(str(choice) for action in positional for choice in action.choices or ())]
 
 
 def _bash(parser: argparse.ArgumentParser, shell: str) -> str:
-    prog, commands = parser.prog, _commands(parser)
+    prog, commands = parser.prog, options_of(parser).commands
     lines = ["autoload -U +X bashcompinit && bashcompinit"] if shell == "zsh" else []
     lines += [
         f"_{prog}_complete() {{",
@@ -66,7 +54,7 @@ def _bash(parser: argparse.ArgumentParser, shell: str) -> str:
     ]
     lines += ["    local words=", "    COMPREPLY=()", '    case "${COMP_WORDS[1]} $before" in']
     for name, own in commands.items():
-        for action in _options(own):
+        for action in options_of(own).options:
             if action.choices:
                 patterns = "|".join(f'"{name} {option}"' for option in action.option_strings)
                 values = shlex.quote(" ".join(str(choice) for choice in action.choices))
@@ -81,13 +69,13 @@ def _bash(parser: argparse.ArgumentParser, shell: str) -> str:
 
 
 def _fish(parser: argparse.ArgumentParser) -> str:
-    prog, commands = parser.prog, _commands(parser)
+    prog, commands = parser.prog, options_of(parser).commands
     lines = []
     for name, own in commands.items():
         what = shlex.quote(own.description or "")
         lines.append(f"complete -c {prog} -n __fish_use_subcommand -f -a {name} -d {what}")
         seen = shlex.quote(f"__fish_seen_subcommand_from {name}")
-        for action in _options(own):
+        for action in options_of(own).options:
             names = " ".join(f"-l {o[2:]}" if o.startswith("--") else f"-s {o[1:]}" for o in action.option_strings)
             values = "" if action.nargs == 0 else " -r"
             if action.choices:

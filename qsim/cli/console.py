@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from qsim.checks import suggest
 from qsim.files import FULL, Progress, wording
@@ -72,9 +72,10 @@ class Parser(argparse.ArgumentParser):
         return found, extra
 
     def _refuse_unknown(self, words: list[str]) -> None:
-        known = self._option_string_actions
+        options, _, commands = options_of(self)
+        known = [name for action in options for name in action.option_strings]
         for word in words:
-            if word == "--" or (self._subparsers is not None and not word.startswith("-")):
+            if word == "--" or (commands and not word.startswith("-")):
                 return  # values from here on, or the words of a command
             option = word.split("=")[0]
             short = re.match(r"-[A-Za-z]", word)
@@ -94,6 +95,27 @@ class Parser(argparse.ArgumentParser):
             message = f"argument {number[1]}: expected {kind}, got {number[3]}"
         print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
         raise SystemExit(2)
+
+
+class Arguments(NamedTuple):
+    """The arguments of a parser."""
+
+    options: list[argparse.Action]
+    positional: list[argparse.Action]
+    commands: dict[str, argparse.ArgumentParser]
+
+
+def options_of(parser: argparse.ArgumentParser) -> Arguments:
+    """Return the arguments of a parser; argparse has no public way to list them."""
+    actions = parser._actions
+    commands = {
+        name: below
+        for action in actions
+        if isinstance(action, argparse._SubParsersAction)
+        for name, below in action.choices.items()
+    }
+    options = [action for action in actions if action.option_strings]
+    return Arguments(options, [action for action in actions if not action.option_strings], commands)
 
 
 def command(
@@ -224,22 +246,6 @@ def output(args: argparse.Namespace, found: dict[str, Any], text: str | Sequence
         print(json.dumps(found, sort_keys=True))
     else:
         print(text if isinstance(text, str) else "\n".join(text))
-
-
-def checked(check: Callable[[Any], Any]) -> Callable[[str], Any]:
-    """An argparse type from a check of recipe values (checks.py), so that files and options obey the same rules."""
-
-    def parse(text: str) -> Any:
-        value: int | float | str = text
-        for kind in (float, int):  # the last that fits
-            with contextlib.suppress(ValueError):
-                value = kind(text)
-        try:
-            return check(value)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
-
-    return parse
 
 
 def refuse_idle(args: argparse.Namespace, where: str, names: Sequence[str]) -> None:

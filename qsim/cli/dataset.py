@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks, files
-from qsim.cli.console import GOES_ON, bar, checked, command, note, output
+from qsim.cli.console import GOES_ON, bar, command, note, output
+from qsim.cli.options import checked, part_of
 from qsim.dataset.job import Job
 
 # generate
@@ -25,7 +26,7 @@ def add_generate(sub: Any) -> None:
     parser.add_argument("recipe", type=Path, help="a .toml file; its format is described in qsim/dataset/recipe.py")
     parser.add_argument("-o", "--output", type=Path, help="data set folder (default out/NAME of the recipe)")
     parser.add_argument("--workers", type=int, help="processes, each with its own renderer (default 1)")
-    parser.add_argument("--shard", type=_part, metavar="I/N", help="only the I-th of N parts, as in 7/100")
+    parser.add_argument("--shard", type=part_of, metavar="I/N", help="only the I-th of N parts, as in 7/100")
     memory = checked(checks.positive)
     parser.add_argument("--memory", type=memory, help="GiB per process before it gives up (default 4)")
     parser.add_argument("--retry", action="store_true", help="try failed jobs again")
@@ -99,13 +100,6 @@ def _cluster(args: argparse.Namespace) -> Any:
     if not args.cluster.startswith("tls://"):
         note(f"{args.cluster}: without TLS, so whoever reaches this port can run any program as its workers' user")
     return Cluster(args.cluster, gpus=args.gpus)
-
-
-def _part(text: str) -> tuple[int, int]:
-    first, _, last = text.partition("/")
-    if not (first.isdigit() and last.isdigit() and 1 <= int(first) <= int(last)):
-        raise argparse.ArgumentTypeError(f"expected I/N with 1 <= I <= N, as in 7/100, got {text!r}")
-    return int(first), int(last)
 
 
 # plan

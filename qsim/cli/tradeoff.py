@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks, files
-from qsim.cli.console import bar, checked, command, note, output, refuse_idle
+from qsim.cli.console import bar, command, note, output, refuse_idle
+from qsim.cli.options import checked, frame_size, steps, whole_numbers
 
 # tradeoff
 
@@ -26,11 +27,11 @@ def add_tradeoff(sub: Any) -> None:
     parser.add_argument("source", nargs="?", help="a clip of at least 10000 fps, or a scene (rendered into -o)")
     parser.add_argument("--table", action="store_true", help="only print the table of bit depths, from numbers alone")
     parser.add_argument("--paper-figure", type=int, choices=(1, 2), help="draw a figure of the QUIVER paper")
-    parser.add_argument("--size", type=size, help="ROWSxCOLUMNS (default 240x320, rendered scenes 96x128)")
+    parser.add_argument("--size", type=frame_size, help="ROWSxCOLUMNS (default 240x320, rendered scenes 96x128)")
     parser.add_argument("--base-fps", type=float, help="planes per second (default 10000; a clip has its own)")
     parser.add_argument("--read-noise", type=float, help="table: e- rms per read (default 0.2)")
     bits = "with commas (default 1,2,3,4,5, widened up to 7 where the deepest is best; table 1,3,5,7,9)"
-    parser.add_argument("--bits", type=integers, help=bits)
+    parser.add_argument("--bits", type=whole_numbers, help=bits)
     parser.add_argument("--motion", type=float, help="table: image speed, px/s (default 2500)")
     parser.add_argument("--ppp", type=steps, help="photons per pixel and plane: 0.65 or 0.1,1,10 or 0.1:30 (6 steps)")
     moving = parser.add_mutually_exclusive_group()
@@ -234,46 +235,3 @@ def _tradeoff_table(args: argparse.Namespace) -> int:
     ]
     output(args, {"rows": [asdict(r) for r in rows]}, text)
     return 0
-
-
-def size(text: str) -> tuple[int, int]:
-    """`240x320` -> (240, 320): rows, columns."""
-    height, _, width = text.partition("x")
-    if not (height.isdecimal() and width.isdecimal() and int(height) > 0 and int(width) > 0):
-        raise argparse.ArgumentTypeError(f"a size is ROWSxCOLUMNS, as in 240x320; got {text!r}")
-    return int(height), int(width)
-
-
-def integers(text: str) -> list[int]:
-    """`1,3,5` -> [1, 3, 5]."""
-    words = text.split(",")
-    if not all(word.strip().isdecimal() for word in words):
-        raise argparse.ArgumentTypeError(f"whole numbers with commas, as in 1,3,5; got {text!r}")
-    return [int(word) for word in words]
-
-
-def steps(text: str) -> list[float]:
-    """`3.25`, `0.5,3,26`, `0.1:30` (six geometric steps) or `0.5:8:5` (five of them) -> numbers above 0."""
-    import numpy as np
-
-    words = text.split(":")
-    try:
-        if len(words) == 1:
-            found = [float(word) for word in text.split(",")]
-        else:
-            low, high = float(words[0]), float(words[1])
-            count = int(words[2]) if len(words) == 3 else _doublings(low, high)
-            found = [float(f"{v:.4g}") for v in np.geomspace(low, high, count)]
-    except (ValueError, IndexError):
-        found = []
-    if not found or len(words) > 3 or not all(0 < v < float("inf") for v in found):
-        raise argparse.ArgumentTypeError(f"numbers above 0, as in 0.65 or 0.1,1,10 or 0.1:30 or 0.5:8:5; got {text!r}")
-    return found
-
-
-def _doublings(low: float, high: float) -> int:
-    """Steps of 2 if the range is so many times 2 (up to 32), else six steps."""
-    from math import isclose, log2
-
-    octaves = log2(high / low)
-    return round(octaves) + 1 if 0 < octaves < 5.5 and isclose(octaves, round(octaves)) else 6

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks
-from qsim.cli.console import bar, checked, command, note, output, refuse_existing, refuse_idle
+from qsim.cli.console import bar, command, note, output, refuse_existing, refuse_idle
+from qsim.cli.options import checked
 from qsim.figures import check_figure
 
 PIXELS, HEIGHT, WIDTH, PSNR = 1 << 22, 128, 256, 36.0  # defaults

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from qsim.cli.console import bar, output
-from quiver.cli.options import add_running, command, numbers, running_options, size, use_threads, whole_numbers, words
+from qsim.cli.options import memory_size, numbers, whole_numbers, words
+from quiver.cli.options import add_running, command, running_options, use_threads
 
 MEMORY = "2GB"  # as other commands
 MEASURING = ("split", "sensor", "bits", "ppp", "methods", "seed", "memory", "mode", "device", "precision", "threads")
@@ -48,7 +49,7 @@ def _run_domain(args: argparse.Namespace) -> int:
     if args.clips:
         from quiver.evaluation.domain_measurement import measure
 
-        args.memory = args.memory or size(MEMORY)
+        args.memory = args.memory or memory_size(MEMORY)
         threads.check(args.threads)
         options, settings = running_options(args), _settings(args)
         refuse_idle(vars(args), [network_restorer(path, options)])

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qsim.cli.console import bar, output
+from qsim.cli.options import count, frame_size, positive, words
 from qsim.files import write_bytes, write_json
 from quiver.cli.options import (
     add_light,
@@ -18,13 +19,9 @@ from quiver.cli.options import (
     add_threads,
     check_domain,
     command,
-    count,
-    height_width,
-    positive,
     renew,
     running_options,
     use_threads,
-    words,
 )
 
 if TYPE_CHECKING:
@@ -173,7 +170,7 @@ def add_bench(sub: Any) -> None:
     )
     parser.add_argument("--modes", type=words, help="of networks (default exact,streaming)")
     parser.add_argument("--precisions", type=words, help="of networks: float32, bfloat16 or both (default float32)")
-    parser.add_argument("--size", type=height_width, default="64x64", help="HEIGHTxWIDTH in px (default 64x64)")
+    parser.add_argument("--size", type=frame_size, default="64x64", help="ROWSxCOLUMNS in px (default 64x64)")
     parser.add_argument("--ppp", type=positive, default=3.25, help="light of the fixed clip (default 3.25)")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="of networks (default auto)")
     add_threads(parser)

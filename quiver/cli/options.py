@@ -16,73 +16,12 @@ from typing import Any
 
 from qsim.cli import console
 from qsim.cli.console import note
+from qsim.cli.options import count, memory_size, numbers, positive, whole_numbers, words
 from qsim.files import check_ours
 from quiver.restoration.interface import MODES
 
 NETWORKS = ("nano", "quiver-s", "quiver", "unet")  # see model.py
 PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see run.py
-
-
-def numbers(text: str) -> tuple[float, ...]:
-    """`3.25,9.75` -> (3.25, 9.75)"""
-    return tuple(positive(part) for part in text.split(","))
-
-
-def whole_numbers(text: str) -> tuple[int, ...]:
-    """`1,3` -> (1, 3)"""
-    return tuple(count(part) for part in text.split(","))
-
-
-def positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
-    return value
-
-
-def count(text: str) -> int:
-    if not text.strip().isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
-    return int(text)
-
-
-def nonnegative(text: str) -> int:
-    if not text.strip().isdecimal():
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, got {text!r}")
-    return int(text)
-
-
-def size(text: str) -> int:
-    """Bytes of `2GB`, `500MB`, `1.5GiB` or a bare number."""
-    units = {"kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2**10, "mib": 2**20, "gib": 2**30, "b": 1, "": 1}
-    number = text.rstrip("KMGiBkmgb")
-    unit = text[len(number) :].lower()
-    try:
-        value = float(number) * units[unit]
-    except (ValueError, KeyError):
-        value = float("nan")
-    if not 1 <= value < 2**63:
-        raise argparse.ArgumentTypeError(f"expected a size such as 2GB or 500MB, got {text!r}")
-    return int(value)
-
-
-def height_width(text: str) -> tuple[int, int]:
-    """`128x256` -> (128, 256)"""
-    height, cross, width = text.partition("x")
-    if not cross:
-        raise argparse.ArgumentTypeError(f"expected HEIGHTxWIDTH as in 128x256, got {text!r}")
-    return count(height), count(width)
-
-
-def words(text: str) -> tuple[str, ...]:
-    """`naive,moment:3,out/run` -> its parts; none may be empty."""
-    parts = tuple(part.strip() for part in text.split(","))
-    if not all(parts):
-        raise argparse.ArgumentTypeError(f"expected names with commas between them, got {text!r}")
-    return parts
 
 
 def add_light(parser: argparse.ArgumentParser, several: bool) -> None:
@@ -107,7 +46,7 @@ def add_noise(parser: argparse.ArgumentParser) -> None:
 
 
 def add_running(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--memory", type=size, default="2GB", help="working memory, as in 500MB (default 2GB)")
+    parser.add_argument("--memory", type=memory_size, default="2GB", help="working memory, as in 500MB (default 2GB)")
     parser.add_argument("--mode", choices=MODES, help="networks: how frames share work (default exact)")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="networks: where they run (default auto)")
     parser.add_argument("--precision", choices=("float32", "bfloat16"), help="networks: default float32")

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from qsim.cli.console import bar, note, output
+from qsim.cli.options import count, positive
 from quiver.cli.options import (
     add_light,
     add_running,
     add_strict,
     check_domain,
     command,
-    count,
-    positive,
     running_options,
     use_threads,
 )

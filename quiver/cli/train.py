@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim.cli.console import note, output
+from qsim.cli.options import count, nonnegative, positive
 from quiver.cli.options import (
     NETWORKS,
     PROTOCOLS,
@@ -20,10 +21,7 @@ from quiver.cli.options import (
     add_running,
     add_threads,
     command,
-    count,
     handling,
-    nonnegative,
-    positive,
     running_options,
     use_threads,
 )

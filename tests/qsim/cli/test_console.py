@@ -15,6 +15,7 @@ from clips import write_clip
 import qsim.cli.program
 import quiver.cli.program
 from qsim.cli import console
+from qsim.cli.options import checked
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
 
@@ -144,12 +145,12 @@ def test_values_of_options_obey_the_rules_of_recipes():
 
     from qsim import checks
 
-    assert console.checked(checks.whole)("12") == 12
-    assert console.checked(checks.psnr)("40") == 40.0
-    assert console.checked(checks.positive)("20e-6") == 20e-6
+    assert checked(checks.whole)("12") == 12
+    assert checked(checks.psnr)("40") == 40.0
+    assert checked(checks.positive)("20e-6") == 20e-6
     for wrong in ("12.5", "x", "", "nan"):
         with pytest.raises(ArgumentTypeError, match="expected a whole number"):
-            console.checked(checks.whole)(wrong)
+            checked(checks.whole)(wrong)
 
 
 def test_ctrl_c_of_a_command_that_starts_again(tmp_path):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quiver.cli.options import size
+from qsim.cli.options import memory_size
 from quiver.cli.program import main
 from quiver.data.clips import open_clips
 
@@ -238,7 +238,7 @@ def test_a_checkpoint_that_is_none_is_refused(capsys, tmp_path):
 
 @pytest.mark.parametrize(("text", "bytes_"), [("2GB", 2e9), ("500MB", 5e8), ("1.5GiB", 1.5 * 2**30), ("4096", 4096)])
 def test_sizes(text, bytes_):
-    assert size(text) == bytes_
+    assert memory_size(text) == bytes_
 
 
 @pytest.mark.slow

@@ -1,0 +1,129 @@
+"""Argument types: what the values of options mean, for the commands of qsim and quiver.
+
+Every type raises `argparse.ArgumentTypeError`, which becomes one line that names the option.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+from collections.abc import Callable
+from typing import Any
+
+
+def checked(check: Callable[[Any], Any]) -> Callable[[str], Any]:
+    """An argparse type from a check of recipe values (checks.py), so that files and options obey the same rules."""
+
+    def parse(text: str) -> Any:
+        value: int | float | str = text
+        for kind in (float, int):  # the last that fits
+            with contextlib.suppress(ValueError):
+                value = kind(text)
+        try:
+            return check(value)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return parse
+
+
+def numbers(text: str) -> tuple[float, ...]:
+    """`3.25,9.75` -> (3.25, 9.75)"""
+    return tuple(positive(part) for part in text.split(","))
+
+
+def whole_numbers(text: str) -> tuple[int, ...]:
+    """`1,3` -> (1, 3)"""
+    return tuple(count(part) for part in text.split(","))
+
+
+def positive(text: str) -> float:
+    """Return a finite number above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
+    return value
+
+
+def count(text: str) -> int:
+    """Return a whole number of at least 1."""
+    if not text.strip().isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
+    return int(text)
+
+
+def nonnegative(text: str) -> int:
+    """Return a whole number of at least 0."""
+    if not text.strip().isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 0, got {text!r}")
+    return int(text)
+
+
+def frame_size(text: str) -> tuple[int, int]:
+    """Return rows and columns: `128x256` -> (128, 256)."""
+    height, cross, width = text.partition("x")
+    if not cross:
+        raise argparse.ArgumentTypeError(f"expected ROWSxCOLUMNS, as in 240x320, got {text!r}")
+    return count(height), count(width)
+
+
+def memory_size(text: str) -> int:
+    """Bytes of `2GB`, `500MB`, `1.5GiB` or a bare number."""
+    units = {"kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2**10, "mib": 2**20, "gib": 2**30, "b": 1, "": 1}
+    number = text.rstrip("KMGiBkmgb")
+    unit = text[len(number) :].lower()
+    try:
+        value = float(number) * units[unit]
+    except (ValueError, KeyError):
+        value = float("nan")
+    if not 1 <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"expected a size such as 2GB or 500MB, got {text!r}")
+    return int(value)
+
+
+def words(text: str) -> tuple[str, ...]:
+    """`naive,moment:3,out/run` -> its parts; none may be empty."""
+    parts = tuple(part.strip() for part in text.split(","))
+    if not all(parts):
+        raise argparse.ArgumentTypeError(f"expected names with commas between them, got {text!r}")
+    return parts
+
+
+def part_of(text: str) -> tuple[int, int]:
+    """Return `7/100` as (7, 100)."""
+    first, _, last = text.partition("/")
+    if not (first.isdigit() and last.isdigit() and 1 <= int(first) <= int(last)):
+        raise argparse.ArgumentTypeError(f"expected I/N with 1 <= I <= N, as in 7/100, got {text!r}")
+    return int(first), int(last)
+
+
+def steps(text: str) -> list[float]:
+    """`3.25`, `0.5,3,26`, `0.1:30` (six geometric steps) or `0.5:8:5` (five of them) -> numbers above 0."""
+    import numpy as np
+
+    words = text.split(":")
+    try:
+        if len(words) == 1:
+            found = [float(word) for word in text.split(",")]
+        else:
+            low, high = float(words[0]), float(words[1])
+            count = int(words[2]) if len(words) == 3 else _doublings(low, high)
+            found = [float(f"{v:.4g}") for v in np.geomspace(low, high, count)]
+    except (ValueError, IndexError):
+        found = []
+    if not found or len(words) > 3 or not all(0 < v < float("inf") for v in found):
+        raise argparse.ArgumentTypeError(
+            f"expected numbers above 0, as in 0.65 or 0.1,1,10 or 0.1:30 or 0.5:8:5, got {text!r}"
+        )
+    return found
+
+
+def _doublings(low: float, high: float) -> int:
+    """Steps of 2 if the range is so many times 2 (up to 32), else six steps."""
+    from math import isclose, log2
+
+    octaves = log2(high / low)
+    return round(octaves) + 1 if 0 < octaves < 5.5 and isclose(octaves, round(octaves)) else 6

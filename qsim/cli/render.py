@@ -1,0 +1,111 @@
+"""The command `qsim render`: a scene into a clip of stated error."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+from qsim import checks
+from qsim.cli.console import GOES_ON, bar, command, output, refuse_idle
+from qsim.cli.options import checked
+
+
+def add_render(sub: Any) -> None:
+    parser = command(
+        sub, "render", _run_render, "Render a scene into a clip: radiance, sharp frames, flow, depth, body ids.",
+        "qsim render fan -o out/fan --frames 21 --height 128 --width 128\n"
+        "qsim render fan --explain", GOES_ON,
+        threads="of the renderer (Dr.Jit); the picture does not depend on it",
+    )  # fmt: skip
+    parser.add_argument(
+        "scene", help="a family of scenes/, a .py file with scene(seed, speed=...), Mitsuba .xml, a folder of assets"
+    )
+    parser.add_argument("-o", "--output", type=Path, help="clip folder to make (may be left out with --explain)")
+    parser.add_argument(
+        "--explain", action="store_true", help="say what is modelled, what is left out and how large it would have been"
+    )
+    whole = checked(checks.whole)
+    parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the scene and its samples (default 0)")
+    parser.add_argument("--speed", type=checked(checks.positive), default=1.0, help="factor on all motions (default 1)")
+    parser.add_argument("--frames", type=whole, default=21, help="default 21")
+    parser.add_argument("--height", type=whole, default=128, help="pixels (default 128)")
+    parser.add_argument("--width", type=whole, default=128, help="pixels (default 128)")
+    rate, shutter, psnr = (checked(check) for check in (checks.frame_rate, checks.shutter, checks.psnr))
+    parser.add_argument("--frame-rate", type=rate, default=2000.0, help="frames per second (default 2000)")
+    parser.add_argument("--shutter", type=shutter, default=0.0, help="open share of a frame, 0..1 (default 0: sharp)")
+    parser.add_argument(
+        "--psnr",
+        type=psnr,
+        default=40.0,
+        help="wanted error of the radiance, dB below white, clamped there (default 40)",
+    )
+    light = checked(checks.positive)
+    parser.add_argument("--ppp", type=light, help="brightest light level that will be sensed, photons per pixel")
+    parser.add_argument(
+        "--engine", choices=("cuda", "llvm", "scalar"), help="insist on one (default: QSIM_ENGINE, else the fastest)"
+    )
+    parser.add_argument("--force", action="store_true", help="replace an existing clip")
+
+
+def _run_render(args: argparse.Namespace) -> int:
+    from qsim import backend
+    from qsim.clip.clamped_error import stated
+    from qsim.dataset import scene_files
+    from qsim.optics.diffraction import diffraction_line
+    from qsim.rendering import fidelity
+    from qsim.rendering.budget import explain
+    from qsim.rendering.clip_rendering import render_clip
+
+    if args.output is None and not args.explain:
+        raise ValueError("the following arguments are required: -o/--output; only --explain does without")
+    if args.output is None:
+        refuse_idle(args, "render without --output", ["force"])
+    if args.output is not None and args.output.exists() and not args.force:
+        raise FileExistsError(f"{args.output}: exists; name another with -o, or use --force to replace it")
+    if args.engine is not None:
+        os.environ["QSIM_ENGINE"] = args.engine
+        backend.choose()
+    loaded, read = scene_files.load(args.scene, seed=args.seed, speed=args.speed)
+    scene = loaded.resized(args.height, args.width)
+    with bar(args.output.name if args.output else "pilot") as progress:
+        chosen = fidelity.choose_budget(
+            scene,
+            frame_rate=args.frame_rate,
+            shutter=args.shutter,
+            frames=args.frames,
+            psnr=args.psnr,
+            ppp=args.ppp,
+            seed=args.seed,
+        )
+        if args.output is None:
+            output(args, {"render": dataclasses.asdict(chosen)}, explain(chosen))
+            return 0
+        clip = render_clip(
+            scene,
+            args.output,
+            frames=args.frames,
+            frame_rate=args.frame_rate,
+            shutter=args.shutter,
+            seed=args.seed,
+            budget=chosen,
+            progress=progress,
+            extra={"reads": read} if read else None,
+            force=args.force,
+        )
+    found = stated(clip.meta)
+    text = f"{clip.path}: {len(clip)} frames of {args.height} x {args.width}"
+    text += f", mean radiance {clip.mean_radiance:.4g} W/m2/sr"
+    text += f", {clip.mean_photons:.4g} photons per pixel"
+    text += "" if found is None else f"\nerror: {found.line}"
+    text += (missed := fidelity.shortfall(found, args.psnr)) and f"\nerror: {missed}"
+    if "fireflies_per_frame" in clip.meta:
+        fireflies, pixels = sum(clip.meta["fireflies_per_frame"]), math.prod(clip.shape)
+        how = "counted before denoising" if chosen.denoise else "counted and left in"
+        text += f"\nfireflies: {fireflies} of {pixels} pixels, {how}"
+    text += "\n" + (explain(chosen) if args.explain else diffraction_line(scene.camera))
+    output(args, {"clip": str(clip.path)} | {k: v for k, v in clip.meta.items() if k != "checksums"}, text)
+    return 0

@@ -1,0 +1,131 @@
+"""The command `qsim sense`: clips into few-bit streams, or one frame drawn again."""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from qsim import checks
+from qsim.cli.console import bar, command, note, output, refuse_idle
+from qsim.cli.options import checked, numbers
+
+
+def add_sense(sub: Any) -> None:
+    parser = command(
+        sub, "sense", _run_sense, "Turn clips into few-bit streams, or draw one frame again and compare.",
+        "qsim sense out/fan --bits 3 --ppp 3.25\n"
+        "qsim sense out/starter --sensor spad-320x240 --bits 1 --ppp 0.5,3.25,26\n"
+        "qsim sense out/starter --name quiver-physical_3bit_3.25ppp --replay fan_0003:7",
+        "the same command goes on with the streams that are missing",
+        threads="of the compiled engine (Dr.Jit) that draws codes; codes do not depend on it",
+    )  # fmt: skip
+    parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="clips or data sets")
+    parser.add_argument(
+        "--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default: quiver-physical)"
+    )
+    parser.add_argument("--bits", type=checked(checks.bits), help="bits per code (default: the sensor's own)")
+    parser.add_argument("--ppp", type=numbers, help="photons per pixel and code over the whole clip; several: 3.25,26")
+    parser.add_argument("--lux", type=numbers, help="faceplate lux at 555 nm instead of --ppp")
+    parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the noise (default 0)")
+    parser.add_argument("-o", "--name", help="name of the stream (default: made from sensor, bits and light)")
+    parser.add_argument("--group", action="store_true", help="codes sum 2^bits - 1 clip frames as binary planes")
+    parser.add_argument("--diffraction", action="store_true", help="blur by the lens's Airy pattern")
+    parser.add_argument(
+        "--defects",
+        metavar="FILE.toml",
+        help="table [defects]: hot and dead pixels, PRNU, offsets, measured maps, afterpulses, crosstalk, dead time "
+        "that is carried over (default: that of the sensor's own .toml file)",
+    )
+    parser.add_argument(
+        "--slices", type=int, default=1, help="counting SPAD: clip frames in one exposure, whose light may change"
+    )
+    parser.add_argument(
+        "--replay", metavar="CLIP:FRAME", help="draw one frame again and compare it with the stored one"
+    )
+    parser.add_argument("--force", action="store_true", help="replace a stream of the same name")
+
+
+def _run_sense(args: argparse.Namespace) -> int:
+    from qsim.clip.sensing import Sensing, sense
+
+    if args.ppp and args.lux:
+        raise ValueError("give the light level as --ppp or as --lux, not both")
+    levels = [{"ppp": ppp} for ppp in args.ppp or []] + [{"lux": lux} for lux in args.lux or []] or [{}]
+    if args.name and len(levels) > 1:
+        raise ValueError(f"--name {args.name}: one name for {len(levels)} light levels; leave it out")
+    wanted = [
+        Sensing(args.sensor or "quiver-physical", args.bits, seed=args.seed, name=args.name, group=args.group,
+                       diffraction=args.diffraction, defects=args.defects, slices=args.slices, **level)
+        for level in levels
+    ]  # fmt: skip
+    clips = [clip for path in args.paths for clip in _clips(path)]
+    if args.replay:
+        return _replay(args, clips, wanted[0])
+    made = []
+    frames = sum(len(clip) for clip in clips) * len(wanted)
+    before = 0
+    with bar("sensing") as progress:
+        for clip in clips:
+            for sensing in wanted:
+                drawn: list[int] = []
+
+                def count(done: int, _: int, start: int = before, drawn: list[int] = drawn) -> None:
+                    drawn.append(done)
+                    progress(start + done, frames)
+
+                waiting = partial(note, f"{clip.path}: waiting for another process that senses this clip")
+                found, line = sense(clip, sensing, force=args.force, progress=count, on_wait=waiting)
+                before += len(clip)
+                facts = {"clip": str(clip.path), "stream": found.name, "made": bool(drawn), "light": line}
+                made.append(facts | _light(found.meta))
+    if len(levels) > 1:
+        note("streams of a clip with the same --seed share their random numbers: another --seed makes them independent")
+    lines = [f"{m['light']}; {'made' if m['made'] else 'there already'}: stream {m['stream']}" for m in made]
+    output(args, {"streams": made}, lines)
+    return 0
+
+
+def _light(meta: dict[str, Any]) -> dict[str, Any]:
+    keys = ("ppp", "ppp_factor", "mean_photons_before", "equivalent_lux_555nm", "bits", "shape", "code_model")
+    return {key: meta[key] for key in keys}
+
+
+def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
+    from qsim.clip.sensing import replay
+
+    refuse_idle(args, "--replay draws what is stored", ["group", "diffraction", "defects", "force"])
+    if args.slices != 1:
+        raise ValueError("--replay draws what is stored: --slices changes nothing here; leave it out")
+    name, _, number = args.replay.rpartition(":")
+    if not number.isdigit() or (not name and len(clips) != 1):
+        raise ValueError(f"--replay {args.replay}: expected CLIP:FRAME, as in fan_0003:7")
+    chosen = [clip for clip in clips if not name or clip.name == name]
+    if not chosen:
+        raise ValueError(f"--replay {args.replay}: no clip {name} among {', '.join(clip.name for clip in clips)}")
+    clip = chosen[0]
+    known = clip.streams
+    named = args.sensor or args.bits or args.ppp or args.lux or args.seed  # each is part of a stream's name
+    stored = clip.stream(known[0] if len(known) == 1 and not args.name and not named else sensing.stream_name)
+    drawn, kept = replay(clip, stored, int(number))
+    differ = int((drawn != kept).sum())
+    found = {"clip": clip.name, "stream": stored.name, "frame": int(number), "pixels": drawn.size, "differ": differ}
+    verdict = (
+        "equal to the stored frame" if differ == 0 else f"{differ} of {drawn.size} pixels DIFFER from the stored frame"
+    )
+    output(args, found, f"{clip.name}, {stored.name}, frame {number} drawn again: {verdict}")
+    return 0 if differ == 0 else 1
+
+
+def _clips(path: Path) -> list[Any]:
+    """The clips of a data set, or the one clip of a folder."""
+    from qsim.clip.clip import Clip
+    from qsim.dataset.dataset import Dataset
+
+    if (path / "dataset.json").is_file():
+        clips = Dataset.open(path).clips()
+        if not clips:
+            raise ValueError(f"{path}: this data set has no finished clip yet; run `qsim generate`")
+        return list(clips)
+    return [Clip.open(path)]
