@@ -1,4 +1,4 @@
-"""The folder on disk: radiance, ground truth and packed streams, and how a stream is drawn from light."""
+"""The folder on disk: radiance, ground truth and packed streams, and the simulation of streams from radiance."""
 
 from typing import TYPE_CHECKING
 

@@ -1,11 +1,11 @@
-"""White, and errors that count as in scores: picture and truth are clamped at white before they are compared.
+"""Computes white, and errors as in scores: image and truth are clamped at white before they are compared.
 
     white = the lower of 2.5 x the mean radiance (optics.WHITE_PER_MEAN) and the 99.9th percentile
     PSNR  = 20 log10(white / rms error), clamped; beside it the same without the clamp
 
-White belongs to a clip and is known when all of it is rendered. A frame therefore states its clamped error at several
-whites around the one that its pilot foresaw, and the clip reads off its own. Clips of earlier versions state errors
-below the 99.9th percentile, without a clamp; `stated` says which it is.
+The white of a clip is known when all frames are rendered. A frame therefore stores its clamped error at several whites
+around the one that the pilot predicted, and the clip interpolates at its own. Clips of earlier versions store errors
+below the 99.9th percentile, without a clamp; `stated` returns the kind.
 """
 
 from __future__ import annotations
@@ -21,62 +21,62 @@ from numpy import ndarray as Array
 from qsim.colour import psnr
 from qsim.optics.radiometry import WHITE_PER_MEAN
 
-STEPS = tuple(2 ** (k / 2) for k in range(-3, 4))  # whites around the foreseen one at which a frame states its error
+STEPS = tuple(2 ** (k / 2) for k in range(-3, 4))  # whites of a frame's errors, over the predicted white
 
 
 @dataclass(frozen=True)
 class Errors:
-    """The same error in two counts, rms in W m^-2 sr^-1."""
+    """An error with and without the clamp, rms in W m^-2 sr^-1."""
 
-    at_white: float  # of picture and truth clamped at white
+    at_white: float  # of image and truth clamped at white
     plain: float  # without a clamp
 
     @classmethod
     def between(cls, picture: Array, truth: Array, white: float) -> Errors:
-        """Of a picture against its truth, arrays of one shape."""
+        """Return the errors of a picture against its truth, arrays [...] of one shape."""
         return cls(rms(np.minimum(picture, white) - np.minimum(truth, white)), rms(picture - truth))
 
     @classmethod
     def of_halves(cls, halves: Array, white: float) -> Errors:
-        """Of the mean of two independent halves [2, ...] with noise alone."""
+        """Return the errors of the mean of two independent halves [2, ...] that have noise only."""
         picture, squares = halves.mean(axis=0), (halves[0] - halves[1]) ** 2 / 4
         clamped = clamped_squares(squares, picture, halves.min(axis=0), white)
         return cls(math.sqrt(float(clamped.mean())), math.sqrt(float(squares.mean())))
 
 
 def rms(difference: Array) -> float:
-    """Root of the mean square."""
+    """Return the root of the mean square of an array [...]."""
     return float(np.sqrt(np.mean(np.square(difference))))
 
 
 def white_of(mean: float, high: float) -> float:
-    """White of a mean radiance and a 99.9th percentile, in their unit; of the mean alone where nearly all is black."""
+    """Return white from a mean and a 99.9th percentile, in their unit; from the mean alone if the percentile is 0."""
     return min(WHITE_PER_MEAN * mean, high) if high > 0 else WHITE_PER_MEAN * mean
 
 
 def white_in(radiance: Array) -> float:
-    """White of a picture or several, in the unit of the radiance."""
+    """Return the white of images [...], in the unit of the radiance."""
     return white_of(float(radiance.mean()), float(np.percentile(radiance, 99.9)))
 
 
 def clamped_squares(squares: Array, picture: Array, lower: Array, white: float) -> Array:
-    """Squared errors of a picture's pixels that count at white, from those that count without a clamp; all [...].
+    """Return squared errors [...] of pixels clamped at white, from squared errors [...] without a clamp.
 
-    `lower` is the darker of two independent estimates of each pixel. Below white all of an error counts. A pixel that
-    is white may be so by a bright stray path alone: it errs by as much as its darker half lacks. What such pixels have
-    above white the others lack: it is light that belongs to all, so that each of them errs by its share of it.
+    `lower` [...] is the darker of two independent estimates of each pixel. Below white the complete error counts. A
+    pixel may be white because of a single bright path: its error is then the distance of its darker half to white. The
+    light of such pixels above white is missing in all others, and each of them errs by its share of it.
     """
     stray = float(np.mean(np.where(lower < white, np.maximum(picture - white, 0), 0)))
     return np.where(picture < white, squares, (white - np.minimum(lower, white)) ** 2) + stray**2
 
 
 def whites_around(white: float) -> list[float]:
-    """The whites at which a frame states its error, the foreseen one in the middle."""
+    """Return the whites at which a frame stores its error, the predicted one in the middle."""
     return [white * step for step in STEPS]
 
 
 def error_at(white: float, errors_at: Sequence[Sequence[float]]) -> float:
-    """The clamped error at a white, read off pairs (white, error) of rising white; beyond them that of the last."""
+    """Return the clamped error at a white, interpolated in pairs (white, error) of rising white; constant beyond."""
     whites, errors = np.transpose(errors_at)
     return float(np.interp(math.log(white), np.log(whites), errors))
 
@@ -84,10 +84,10 @@ def error_at(white: float, errors_at: Sequence[Sequence[float]]) -> float:
 def measured(
     mean: float, high: float, errors: Sequence[float], errors_at: Sequence[Sequence[Sequence[float]]]
 ) -> dict[str, Any]:
-    """What clip.json says of the errors of a clip's frames.
+    """Return the fields of clip.json about the errors of a clip's frames.
 
-    From its mean radiance, its 99.9th percentile, the plain errors [frames] and pairs (white, error) of each frame;
-    where a frame has no pairs, its plain error takes their place, which is never less.
+    `mean` and `high` are the mean radiance and its 99.9th percentile. `errors` holds the plain error of each frame,
+    `errors_at` its pairs (white, error). Without pairs the plain error is taken, which is never smaller.
     """
     white = white_of(mean, high)
     found: dict[str, Any] = {"error_per_frame": list(errors), "white": white}
@@ -101,17 +101,17 @@ def measured(
 
 
 def _stored(decibels: float) -> float | None:
-    """JSON has no infinity: no error is null."""
+    """Return a PSNR as JSON stores it: null instead of infinity, which no error gives."""
     return decibels if math.isfinite(decibels) else None
 
 
 @dataclass(frozen=True)
 class Stated:
-    """The PSNR of a clip's radiance [dB] and what it is measured by."""
+    """The PSNR of a clip's radiance [dB] and its reference level."""
 
     psnr: float
-    unclamped: float | None  # below the same white; None for clips of earlier versions, which know only one figure
-    below: str
+    unclamped: float | None  # below the same white; None for clips of earlier versions, which store one value
+    below: str  # the reference level
 
     @property
     def line(self) -> str:
@@ -121,7 +121,7 @@ class Stated:
 
 
 def stated(meta: dict[str, Any]) -> Stated | None:
-    """What clip.json states of the error of its radiance; None where nothing was measured."""
+    """Return the PSNR of the radiance that clip.json holds; None if none was measured."""
     psnr, white = meta.get("psnr_of_truth"), meta.get("white")
     if psnr is None:
         return None
@@ -133,5 +133,5 @@ def stated(meta: dict[str, Any]) -> Stated | None:
 
 
 def frame_errors(errors: Callable[[float], float], white: float) -> tuple[tuple[float, float], ...]:
-    """Pairs (white, error) around a foreseen white, from what gives the error at one; empty without light."""
+    """Return pairs (white, error) around a predicted white, from a function of white; empty without light."""
     return tuple((each, errors(each)) for each in whites_around(white)) if white > 0 else ()

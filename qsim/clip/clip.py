@@ -1,13 +1,13 @@
-"""A clip: a folder with the radiance of a moving scene, its ground truth, and the streams sensed from it.
+"""Reads clips: folders with the radiance of a moving scene, its ground truth, and the streams sensed from it.
 
-    clip.json            what it is: shape, rates, units, camera, scene, render choices, errors, checksums; written last
-    radiance/000000.exr  Y, half, uncompressed: what a sensor integrates
-    sharp/000000.exr     the same at mid-exposure, only where it differs
+    clip.json            shape, rates, units, camera, scene, render choices, errors, checksums; written last
+    radiance/000000.exr  Y, half, uncompressed: mean over the exposure
+    sharp/000000.exr     the same at mid-exposure, only if it differs
     truth/000000.exr     u v bu bv valid Z id: flow to the next and the previous frame, validity, depth, body; zipped
-    saturated/000000.exr 1 where the camera of an imported video was saturated, only of frames in which it was; zipped
+    saturated/000000.exr 1 where the camera of an imported video was saturated, only for frames with such pixels; zipped
     streams/NAME.npy     codes, and NAME.json (stream.py)
 
-A clip grows in NAME.part and gets its name when it is whole; an interrupted one goes on where it stopped.
+A clip is written to NAME.part and renamed when complete; an interrupted run resumes there (writer.py).
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from qsim.optics.radiometry import Crop, check_crop
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """A finished clip folder; frames are read when asked for."""
+    """A complete clip folder; frames are read on demand."""
 
     path: Path
     meta: dict[str, Any]  # clip.json
 
     @staticmethod
     def open(path: str | os.PathLike[str]) -> Clip:
-        """`FileNotFoundError` or `ValueError`, naming file and key, if this is not a whole clip of our version."""
+        """Open a clip; `FileNotFoundError` or `ValueError` if it is incomplete, damaged or of another version."""
         path = Path(path)
         manifest = path / "clip.json"
         if not manifest.is_file():
@@ -65,7 +65,7 @@ class Clip:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(frames, height, width)"""
+        """(frames, height, width)."""
         frames, height, width = self.meta["shape"]
         return frames, height, width
 
@@ -92,7 +92,7 @@ class Clip:
 
     @property
     def mean_photons(self) -> float:
-        """Mean expected photons per pixel and exposure of the light as it is; `ValueError` for relative radiance."""
+        """Mean expected photons per pixel and exposure, without a light factor; `ValueError` for relative radiance."""
         value = self.meta.get("mean_photons")
         if value is None:
             raise ValueError(f"{self.path}: its radiance is relative and has no photons; give a target in PPP")
@@ -104,37 +104,37 @@ class Clip:
         return camera_of(self.meta, self.path / "clip.json")
 
     def radiance(self, t: int, crop: Crop | None = None) -> Array:
-        """What the sensor integrates in frame t, float32 [H, W]; crop = (y, x, height, width)."""
+        """Return the mean radiance over the exposure of frame t, float32 [h, w]; crop = (y, x, height, width) [px]."""
         return self._half("radiance", t, crop)
 
     def sharp(self, t: int, crop: Crop | None = None) -> Array:
-        """The scene at mid-exposure, float32 [H, W], which a restorer should return; `radiance` where not stored."""
+        """Return the radiance at mid-exposure, float32 [h, w], the target of restoration; `radiance` if not stored."""
         return self._half("sharp" if f"sharp/{t:06d}.exr" in self.meta["checksums"] else "radiance", t, crop)
 
     def flow(self, t: int) -> Array:
-        """float32 [2, H, W] (u right, v down) in pixels: pixel p of frame t is at p + flow(p) in frame t + 1."""
+        """Return flow, float32 [2, H, W] (u right, v down) [px]: p of frame t is at p + flow(p) in frame t + 1."""
         return np.stack([self._truth(t, "u"), self._truth(t, "v")])
 
     def flow_back(self, t: int) -> Array:
-        """float32 [2, H, W] (u right, v down) in pixels: pixel p of frame t was at p + flow_back(p) in frame t - 1."""
+        """Return backward flow, float32 [2, H, W] [px]: p of frame t was at p + flow_back(p) in frame t - 1."""
         return np.stack([self._truth(t, "bu"), self._truth(t, "bv")])
 
     def valid(self, t: int) -> Array:
-        """bool [H, W]: False where the point of frame t is hidden in, or outside of, frame t + 1."""
+        """Return bool [H, W]: False where the point of frame t is hidden in, or outside of, frame t + 1."""
         return self._truth(t, "valid") != 0
 
     def depth(self, t: int) -> Array:
-        """float32 [H, W], metres along the optical axis; inf where nothing is."""
+        """Return depth, float32 [H, W], metres along the optical axis; inf where no body is hit."""
         return self._truth(t, "Z")
 
     def body_id(self, t: int) -> Array:
-        """int32 [H, W]: number of the body seen, -1 where nothing is."""
+        """Return the index of the visible body, int32 [H, W]; -1 where no body is hit."""
         return self._truth(t, "id").view(np.int32)
 
     def saturated(self, t: int, crop: Crop | None = None) -> Array:
-        """bool [H, W]: True where the light of frame t is a lower bound, because the camera saturated.
+        """Return bool [h, w]: True where the radiance of frame t is a lower bound, because the camera was saturated.
 
-        `meta["saturated_pixels"]` counts them over all frames; `meta["saturation"]` says at which pixel value.
+        `meta["saturated_pixels"]` counts them over all frames; `meta["saturation"]` holds the pixel value.
         """
         self._check_frame(t)
         _, height, width = self.shape
@@ -145,7 +145,7 @@ class Clip:
 
     @property
     def has_truth(self) -> bool:
-        """Whether flow, validity, depth and ids were stored."""
+        """Whether flow, validity, depth and body indices were stored."""
         return "truth/000000.exr" in self.meta["checksums"]
 
     @property
@@ -154,7 +154,7 @@ class Clip:
         return tuple(sorted(path.stem for path in (self.path / "streams").glob("*.json")))
 
     def stream(self, name: str) -> Stream:
-        """`FileNotFoundError` that lists the streams there are."""
+        """Open a stream by its name; `FileNotFoundError` lists the existing ones."""
         path = self.path / "streams" / f"{name}.json"
         if not path.is_file():
             known = ", ".join(self.streams) or "none yet; make one with `qsim sense`"
@@ -162,9 +162,9 @@ class Clip:
         return Stream.open(path)
 
     def verify(self, progress: Progress | None = None) -> list[str]:
-        """Problems of the folder in words, one per file; empty if every file is what was written.
+        """Return one message per file whose checksum or size differs; empty if the clip is intact.
 
-        `progress` hears (files checked, files in all), a stream counting as one.
+        `progress(done, total)` is called after each file; a stream counts as one.
         """
         problems = []
         stored, streams = sorted(self.meta["checksums"].items()), sorted((self.path / "streams").glob("*.json"))
@@ -181,16 +181,17 @@ class Clip:
         return problems
 
     def unsealed(self) -> list[Path]:
-        """Descriptions of the clip and its streams without a checksum of their own: an earlier version made them."""
+        """Return descriptions (clip, streams) that lack a checksum of themselves: an earlier version wrote them."""
         found = [] if "checksum" in self.meta else [self.path / "clip.json"]
         for path in sorted((self.path / "streams").glob("*.json")):
             try:
                 found += [] if "checksum" in files.read_json(path) else [path]
-            except (ValueError, OSError):  # a problem that `verify` names
+            except (ValueError, OSError):  # `verify` reports it
                 continue
         return found
 
     def _half(self, folder: str, t: int, crop: Crop | None) -> Array:
+        """Return an image of frame t in a folder, float32 [h, w]."""
         self._check_frame(t)
         _, height, width = self.shape
         if crop is not None:
@@ -207,6 +208,7 @@ class Clip:
         return self._channel("truth", t, channel)
 
     def _channel(self, folder: str, t: int, channel: str) -> Array:
+        """Return a channel [H, W] of frame t in a folder."""
         self._check_frame(t)
         path = self.path / folder / f"{t:06d}.exr"
         if not path.is_file():
@@ -225,8 +227,9 @@ class Clip:
 
 
 def _why_not(path: Path) -> str:
+    """Return why a path is not a clip, and what to do."""
     if path.with_name(path.name + ".part").is_dir():
-        return f"{path}: unfinished (only {path.name}.part is there); run the command that made it again, it goes on"
+        return f"{path}: unfinished (only {path.name}.part is there); run the same command again, it resumes"
     if not path.exists():
         return f"{path}: no such clip"
     if (path / "dataset.json").is_file():
@@ -236,6 +239,7 @@ def _why_not(path: Path) -> str:
 
 @functools.lru_cache(maxsize=2)
 def _read_truth(path: Path, height: int, width: int, modified: int, size: int) -> dict[str, Array]:
+    """Return the channels [H, W] by name; `modified` and `size` only key the cache, so that a changed file is read."""
     channels = exr.read(path, (height, width))
     for name, array in channels.items():
         if array.dtype != (np.uint32 if name in ("valid", "id", "saturated") else np.float32):

@@ -1,8 +1,8 @@
-"""OpenEXR images: written from memory, read by the row.
+"""Encodes OpenEXR images in memory, and reads crops of them by rows.
 
-Files are ordinary single-part scan-line OpenEXR 2.0 that any program opens. Two things are why they are not written
-and cropped with the OpenEXR library: bytes made in memory go through one atomic, checksummed writer (files.py) and do
-not depend on a library's version; and a crop of an uncompressed image reads only the rows it needs.
+Files are single-part scan-line OpenEXR 2.0, which any program opens. The OpenEXR library is not used to write or crop
+them, for two reasons. Bytes made in memory go through one atomic, checksummed writer (files.py) and do not depend on
+the version of a library. A crop of an uncompressed image reads only its rows.
 
 Layout (openexr.com, "OpenEXR File Layout"): magic, version, attributes, offset table, then per chunk
 (int32 y, int32 size, data); inside a chunk every row holds its channels one after the other, in alphabetical order.
@@ -29,7 +29,7 @@ HALF_MAX = 65504.0
 
 
 def encode(channels: dict[str, Array], *, compress: bool = False) -> bytes:
-    """An EXR file with the given channels [H, W] of float16, float32 or uint32, uncompressed or losslessly zipped."""
+    """Return an EXR file of channels [H, W] of float16, float32 or uint32, uncompressed or losslessly zipped."""
     names = sorted(channels)
     height, width = channels[names[0]].shape
     arrays = [np.ascontiguousarray(channels[name]) for name in names]
@@ -48,15 +48,15 @@ def encode(channels: dict[str, Array], *, compress: bool = False) -> bytes:
 
 
 def to_half(image: Array) -> tuple[Array, int]:
-    """Half-precision copy and the number of pixels that were clipped to the largest half, 65504."""
+    """Return a half-precision copy of an image [H, W], and the number of pixels clipped to the largest half, 65504."""
     clipped = int(np.count_nonzero(image > HALF_MAX))
     return np.minimum(image, HALF_MAX).astype("<f2"), clipped
 
 
 def read_half(path: Path, height: int, width: int, crop: Crop | None = None) -> Array:
-    """float32 [h, w] of an uncompressed one-channel half image; reads only the rows of the crop (y, x, h, w).
+    """Return float32 [h, w] of an uncompressed one-channel half image; only rows of the crop (y, x, h, w) are read.
 
-    `ValueError` if the file has another size or layout (it is truncated, or from another program).
+    `ValueError` if the file has another size or layout: it is truncated, or was written by another program.
     """
     y, x, rows, columns = crop if crop is not None else (0, 0, height, width)
     header = _half_header(height, width)
@@ -75,15 +75,16 @@ def read_half(path: Path, height: int, width: int, crop: Crop | None = None) -> 
         os.close(descriptor)
     table = np.frombuffer(raw, dtype=np.uint8).reshape(rows, stride)
     if int.from_bytes(raw[:4], "little") != y:
-        raise ValueError(f"{path}: row {y} is not where an uncompressed EXR keeps it; the file is damaged")
+        raise ValueError(f"{path}: row {y} is not at its place; the file is damaged, run `qsim check`")
     pixels = table[:, 8 + 2 * x : 8 + 2 * (x + columns)]
     return np.ascontiguousarray(pixels).view("<f2").astype(np.float32)
 
 
 def read(path: Path, size: tuple[int, int] | None = None) -> dict[str, Array]:
-    """The channels [H, W] of a scan-line EXR file, by the OpenEXR library; `size` = (height, width), if it is known.
+    """Return the channels [H, W] of a scan-line EXR file by name; `size` = (height, width), if it is known.
 
-    `ValueError` if it cannot be read, has another size, or promises more than its bytes can hold.
+    The OpenEXR library decodes. `ValueError` if the file is unreadable, has another size, or declares more pixels than
+    its bytes can hold.
     """
     import OpenEXR
 
@@ -142,7 +143,7 @@ def _half_header(height: int, width: int) -> bytes:
 
 
 def _zip(raw: bytes) -> bytes:
-    """EXR's ZIP method: even bytes before odd bytes, then differences to the byte before (offset 128), then deflate."""
+    """Apply the ZIP method of EXR: even bytes before odd bytes, differences of bytes (offset 128), deflate."""
     data = np.frombuffer(raw, np.uint8)
     split = np.concatenate([data[0::2], data[1::2]])
     delta = split.copy()

@@ -1,4 +1,4 @@
-"""clip.json: its version, units and field names, the checks of a new clip and of one that is opened."""
+"""Defines clip.json: version, units, field names, and the checks of new and of stored clips."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from qsim.optics.camera import Camera
 FORMAT_VERSION = 1
 PHYSICAL = "W m^-2 sr^-1"
 RELATIVE = "relative"
-MEASURED = (  # in clip.json, beyond what was asked for
+MEASURED = (  # fields of clip.json that the writer measures
     *("mean_radiance", "mean_photons", "clipped_pixels", "saturated_pixels", "checksums", "software", "checksum"),
     *("error_per_frame", "error_at_white_per_frame", "white", "psnr_of_truth", "psnr_unclamped", "fireflies_per_frame"),
 )
@@ -29,12 +29,12 @@ _DAMAGED = "the file is damaged; make the clip again, or take clip.json from a c
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """Return clip.json; `ValueError` names file and key if it is not that of a complete clip of this version."""
+    """Return the contents of clip.json; `ValueError` names file and key if it is damaged or of another version."""
     meta = files.read_json(path)
     files.check_version(path, meta.get("format_version"), FORMAT_VERSION)
     structure.description(path, meta, structure.CLIP, _DAMAGED)
     if meta["radiance_unit"] not in (PHYSICAL, RELATIVE):
-        raise ValueError(f"{path}: radiance_unit {meta['radiance_unit']!r}; known are '{PHYSICAL}' and '{RELATIVE}'")
+        raise ValueError(f"{path}: radiance_unit is {meta['radiance_unit']!r}; known are '{PHYSICAL}' and '{RELATIVE}'")
     if (meta.get("camera") is None) != (meta["radiance_unit"] == RELATIVE):
         raise ValueError(f"{path}: a clip in {PHYSICAL} needs a camera, and a relative one has none; {_DAMAGED}")
     for t in range(meta["shape"][0]):
@@ -45,7 +45,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
 
 
 def camera_of(meta: dict[str, Any], where: Path) -> Camera | None:
-    """The camera that clip.json describes, without its motion; None for relative radiance."""
+    """Return the camera that clip.json describes, without its motion; None for relative radiance."""
     described = meta.get("camera")
     if described is None:
         return None
@@ -62,7 +62,7 @@ def camera_of(meta: dict[str, Any], where: Path) -> Camera | None:
 
 
 def check_new(path: Path, meta: dict[str, Any]) -> None:
-    """`ValueError` unless `meta` holds what a new clip needs: shape, rates, unit and camera."""
+    """Raise `ValueError` unless `meta` holds a valid shape, frame rate, exposure, unit and camera for a new clip."""
     shape = meta.get("shape")
     if not (isinstance(shape, list) and len(shape) == 3 and all(isinstance(n, int) for n in shape)):
         raise ValueError(f"{path}: shape must be [frames, height, width], got {shape!r}")

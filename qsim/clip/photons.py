@@ -1,4 +1,4 @@
-"""Expected photons of a clip's frames, and the light level of a clip for a sensor."""
+"""Computes the expected photons of a clip's frames, and the light level of a clip for a sensor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from qsim.optics.radiometry import Crop, LightLevel, expected_photons, photons_p
 
 
 def light_level(clip: Clip, *, ppp: float | None = None, lux: float | None = None) -> LightLevel:
-    """The light of a clip: scaled to `ppp` photons per pixel, to `lux` on the faceplate, or as it is (neither given).
+    """Return the light level of a clip: `ppp` photons per pixel, `lux` on the faceplate, or factor 1 without either.
 
     `ValueError` for a black clip, for both targets at once, and for a clip of relative radiance without `ppp`.
     """
@@ -37,7 +37,10 @@ def light_level(clip: Clip, *, ppp: float | None = None, lux: float | None = Non
 def clip_photons(
     clip: Clip, t: int, factor: float = 1.0, crop: Crop | None = None, *, sharp: bool = False, diffraction: bool = False
 ) -> Array:
-    """Expected photons [h, w] of frame t, or of its sharp instant, times a factor; crop = (y, x, height, width)."""
+    """Return expected photons float64 [h, w] of frame t, or of its sharp instant, times a factor.
+
+    `crop` = (y, x, height, width) [px]; `diffraction` blurs by the lens's Airy pattern.
+    """
     if diffraction and crop is not None:
         whole = clip_photons(clip, t, factor, sharp=sharp, diffraction=True)
         y, x, height, width = crop
@@ -57,7 +60,10 @@ def clip_photons(
 
 
 def light_line(clip: Clip, level: LightLevel, electrons_per_photon: float | None = None) -> str:
-    """`fan_03: mean radiance 0.0254 W/m2/sr, 3.25 PPP (factor 0.84), then 1.31 lx at 555 nm, 2.60 e-/pixel`."""
+    """Return a one-line summary of the light level.
+
+    `fan_03: mean radiance 0.0254 W/m2/sr, 3.25 PPP (factor 0.84), then 1.31 lx at 555 nm, 2.60 e-/pixel`
+    """
     unit = " (relative)" if level.lux is None else " W/m2/sr"
     text = f"{clip.name}: mean radiance {clip.mean_radiance:.4g}{unit}, {level.ppp:.4g} PPP (factor {level.factor:.4g})"
     if level.lux is not None:

@@ -32,22 +32,22 @@ from qsim.sensor.spad import BinarySPAD
 
 @dataclass(frozen=True)
 class Sensing:
-    """What to draw: a sensor at a light level, with a seed; independent of the clip."""
+    """The settings of a stream: sensor, light level, seed; independent of the clip."""
 
     sensor: str  # a name of qsim.devices or a .toml file
     bits: int | None = None  # None: the device's own
-    ppp: float | None = None  # photons per pixel and code over the whole clip; neither ppp nor lux: light as it is
+    ppp: float | None = None  # mean photons per pixel and code over the clip; neither ppp nor lux: factor 1
     lux: float | None = None  # faceplate lux at 555 nm
     seed: int = 0
     name: str | None = None  # of the stream; made from the rest if None
     group: bool = False  # a code sums 2^bits - 1 binary planes, each its own clip frame
     diffraction: bool = False  # blur by the lens's Airy pattern
     defects: str | None = None  # .toml with a table [defects]; None: that of the sensor's file, if it has one
-    slices: int = 1  # clip frames in one exposure of a counting SPAD: light that changes inside it
+    slices: int = 1  # clip frames in one exposure of a counting SPAD, for light that changes within it
 
     @property
     def stream_name(self) -> str:
-        """The given name, or for example `quiver-physical_3bit_3.25ppp`."""
+        """The given name, or one made of the settings: `quiver-physical_3bit_3.25ppp`."""
         if self.name is not None:
             return check_name(self.name)
         light = (
@@ -60,14 +60,14 @@ class Sensing:
 
 
 def prepare(clip: Clip, sensing: Sensing) -> Draw:
-    """The sensor, light factor and key for one clip; `ValueError` if they do not fit it."""
+    """Return the draw of a clip with these settings; `ValueError` if they do not fit the clip."""
 
     source = sensing.defects or (sensing.sensor if sensing.sensor.endswith(".toml") else None)
     return assemble(clip, sensing, None if source is None else defect_table.from_toml(source))
 
 
 def assemble(clip: Clip, sensing: Sensing, found: Defects | None, own: Sensor | None = None) -> Draw:
-    """As `prepare`, with these defects, and with this sensor in place of the one that `sensing` names."""
+    """Return the draw of a clip as `prepare`, with given defects and, if given, the sensor `own`."""
     planes = sensing.slices
     if sensing.group:
         if sensing.bits is None:
@@ -83,7 +83,7 @@ def assemble(clip: Clip, sensing: Sensing, found: Defects | None, own: Sensor | 
     sensor = own or devices.load(
         sensing.sensor, ppp=level.ppp * planes, bits=sensing.bits, exposure=clip.exposure * planes
     )
-    if found is not None:  # measured dark counts take the place of the sensor's
+    if found is not None:  # a measured dark map replaces the dark rate of the sensor
         sensor = PixelArray.of(found, sensor, *clip.shape[1:]).sensor
     _check_planes(sensor, sensing, clip)
     key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
@@ -91,7 +91,7 @@ def assemble(clip: Clip, sensing: Sensing, found: Defects | None, own: Sensor | 
 
 
 def _check_planes(sensor: Sensor, sensing: Sensing, clip: Clip) -> None:
-    """`ValueError` for sums of planes and for slices of exposures that this sensor or this clip does not have."""
+    """Raise `ValueError` if sums of planes or slices of exposures do not fit the sensor or the clip."""
     kind = type(sensor).__name__
     if sensing.group and not isinstance(sensor, BinarySPAD):
         raise ValueError(f"{sensing.sensor}: only a clocked SPAD (BinarySPAD) sums planes, this is a {kind}")
@@ -102,7 +102,7 @@ def _check_planes(sensor: Sensor, sensing: Sensing, clip: Clip) -> None:
 
 
 def describe(clip: Clip, sensing: Sensing, draw: Draw) -> dict[str, Any]:
-    """The json of the stream that `draw` makes, without what only the written file knows."""
+    """Return the json of the stream of a draw, without the fields of the written file (checksums, versions)."""
     frames, height, width = clip.shape
     return {
         "shape": [frames // draw.planes, height, width],
@@ -134,10 +134,10 @@ def sense(
     progress: Progress | None = None,
     on_wait: Callable[[], None] | None = None,
 ) -> tuple[Stream, str]:
-    """Draw and store a stream; returns it and its line of light. A stream that is already there as asked is kept.
+    """Draw and store a stream; return it and a one-line summary of its light level.
 
-    Waits, after a call of `on_wait`, while another process senses this clip. `FileExistsError` if the name is taken by
-    another stream and `force` is not set.
+    A stream of this name is kept if its settings are the same; `FileExistsError` for other settings without `force`.
+    While another process senses this clip, wait after a call of `on_wait`.
     """
     draw = prepare(clip, sensing)
     meta = describe(clip, sensing, draw)
@@ -153,7 +153,7 @@ def sense(
         _tidy(clip)
         return kept, line
     with writing(clip.path / "streams", on_wait):
-        kept = None if force else _kept(clip, sensing, draw, meta)  # made by the process that was waited for
+        kept = None if force else _kept(clip, sensing, draw, meta)  # another process may have made it
         if kept is not None:
             return kept, line
         blocks = draw.packed(clip, meta["shape"][0], progress)
@@ -161,7 +161,7 @@ def sense(
 
 
 def _kept(clip: Clip, sensing: Sensing, draw: Draw, meta: dict[str, Any]) -> Stream | None:
-    """The stream that is there as asked, or None; `FileExistsError` if another one has its name."""
+    """Return the stored stream if its settings are these, None if there is none; `FileExistsError` for others."""
     json_path = clip.path / "streams" / f"{sensing.stream_name}.json"
     try:
         old = Stream.open(json_path)
@@ -177,14 +177,14 @@ def _kept(clip: Clip, sensing: Sensing, draw: Draw, meta: dict[str, Any]) -> Str
 
 
 def replay(clip: Clip, stream: Stream, frame: int) -> tuple[Array, Array]:
-    """One frame drawn again from the stream's json alone, and the stored one: both codes [H, W]."""
+    """Return one frame drawn again from the stream's json, and the stored frame: codes [H, W] each."""
     if not 0 <= frame < len(stream):
         raise ValueError(f"{stream.path}: frame {frame} asked for, the stream has frames 0..{len(stream) - 1}")
     return stored(stream).frames(clip, frame, frame + 1)[0], stream.codes(frame, frame + 1)[0]
 
 
 def write_stream(clip: Clip, name: str, codes_iter: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
-    """Store codes ([H, W] frames or [t, H, W] blocks, in order) as a stream of `clip`; the json comes last.
+    """Store codes ([H, W] frames or [t, H, W] blocks, in order) as a stream of `clip`; the json is written last.
 
     `meta` must hold shape (T, H, W), ppp_factor, exposure and frame_rate. `ValueError` if there are not T frames.
     """
@@ -212,8 +212,8 @@ def _write(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor, meta:
 
 
 def _tidy(clip: Clip) -> None:
-    """Delete the lock of a writer that was killed between writing its stream and deleting it."""
+    """Delete the lock of a writer that was killed after its stream was written."""
     lock = locks.Lock(clip.path / "streams" / "lock")
-    with contextlib.suppress(OSError):  # a folder that may only be read
+    with contextlib.suppress(OSError):  # a read-only folder
         if lock.path.exists() and lock.acquire():
             lock.delete()

@@ -1,9 +1,9 @@
-"""A sensor's draw of one clip: light of clip frames in, codes of stream frames out, block by block.
+"""Simulates the stream of a sensor that sees a clip, block by block: radiance frames to codes.
 
-    Draw --packed--> bytes of a stream      --frames--> codes of some frames, for replay
+    Draw --packed--> packed codes of a stream      --frames--> codes of some frames, for replay
 
-A code sees one clip frame, or several: as binary planes that are summed (clocked pixels), or as slices of one exposure
-in which the light changes (counting pixels).
+A code takes one clip frame or several: binary planes that are summed (clocked pixels), or slices of one exposure in
+which the light changes (counting pixels).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _BLOCK_PIXELS = 1 << 22  # photons held in memory at a time while sensing: 32 Mi
 
 @dataclass(frozen=True)
 class Draw:
-    """A `Sensing` applied to one clip: everything that decides its codes."""
+    """A `Sensing` applied to one clip: all parameters of its codes."""
 
     sensor: Sensor
     plane: Sensor  # draws one clip frame; the same as `sensor` unless planes are summed
@@ -46,12 +46,12 @@ class Draw:
     planes: int  # clip frames per code
     diffraction: bool
     defects: Defects | None = None
-    followed: Effects | None = None  # counting pixels: what the closed form misses, where photons have to be followed
+    followed: Effects | None = None  # counting pixels: the error of the closed form, if photons are followed instead
     engine: str = "auto"
 
     @property
     def law(self) -> str:
-        """How its codes come from random numbers, `drawn_by` of a stream; another law draws other codes.
+        """How codes are drawn from random numbers, `drawn_by` of a stream; another law draws other codes.
 
         "table": one number against the cdf. "process": step by step, or the sum of all planes at once. "planes": one by
         one. "closed form" and "events": counting pixels, by their cdf and photon by photon.
@@ -70,13 +70,16 @@ class Draw:
         return "planes" if few or self.sums or disturbed or isinstance(self.sensor, PlaneByPlane) else "process"
 
     def light(self, clip: Clip, start: int, stop: int) -> Array:
-        """Photons [stop - start, H, W] of clip frames."""
+        """Return expected photons [stop - start, H, W] of clip frames, per clip frame."""
         return np.stack(
             [clip_photons(clip, t, self.level.factor, diffraction=self.diffraction) for t in range(start, stop)]
         )
 
     def frames(self, clip: Clip, start: int, stop: int) -> Array:
-        """Codes of stream frames start ... stop - 1, [stop - start, H, W]; a memory is followed from the first one."""
+        """Return codes [stop - start, H, W] of stream frames start ... stop - 1.
+
+        Pixels with a memory are simulated from the first frame of the clip.
+        """
         array = self._array(clip)
         if self.followed is not None:
             return self._follow(clip, stop)[start:]
@@ -85,7 +88,7 @@ class Draw:
         return np.concatenate([block for n, block in enumerate(blocks, first) if n >= start])
 
     def blocks(self, clip: Clip, start: int, stop: int, step: int) -> Iterator[Array]:
-        """Codes of stream frames start ... stop - 1, `step` at a time; all at once where photons are followed."""
+        """Yield codes [t, H, W] of stream frames start ... stop - 1, `step` at a time, or (events) all at once."""
         if self.followed is not None:
             yield self._follow(clip, stop)[start:]
             return
@@ -105,7 +108,7 @@ class Draw:
             yield self._summed(block)
 
     def packed(self, clip: Clip, frames: int, progress: Progress | None = None) -> Iterator[Array]:
-        """All codes of a stream, packed row by row, some frames at a time."""
+        """Yield all codes of a stream, packed row by row, some frames at a time: uint8 [t, H, ceil(W bits / 8)]."""
         step = max(1, _BLOCK_PIXELS // (clip.shape[1] * clip.shape[2] * self.planes))
         if self.followed is not None or self.defects is not None or self.planes > 1:
             blocks: Iterator[Array] = (
@@ -131,31 +134,33 @@ class Draw:
         return self.plane is not self.sensor
 
     def _exposed(self, light: Array) -> Array:
-        """Light of clip frames -> of the exposures that `plane` draws."""
+        """Return the photons [t, H, W] of exposures of `plane` from those of clip frames."""
         return light if self.sums or self.planes == 1 else light.reshape(-1, self.planes, *light.shape[1:]).sum(axis=1)
 
     def _exposure(self, clip: Clip) -> float:
+        """Return the exposure of `plane` [s]."""
         return clip.exposure if self.sums else clip.exposure * self.planes
 
     def _number(self, frame: int) -> int:
-        """Of a stream's frame in the key: planes are numbered one by one."""
+        """Return the frame number in the key of a stream frame: planes are numbered one by one."""
         return frame * self.planes if self.sums else frame
 
     def _summed(self, drawn: Array) -> Array:
+        """Return codes of stream frames from codes of planes, both [t, H, W]."""
         if not self.sums:
             return drawn
         grouped = drawn.reshape(-1, self.planes, *drawn.shape[1:])
         return grouped.sum(axis=1).astype(packing.code_dtype(self.sensor.bits))
 
     def _array(self, clip: Clip) -> PixelArray | None:
-
+        """Return the pixel array of the defects; None if neither defects nor single photons are simulated."""
         counts = self.followed is not None
         if self.defects is None and not counts:
             return None
         return PixelArray.of(self.defects or Defects(), self.plane, *clip.shape[1:])
 
     def _slices(self, clip: Clip) -> IncidentLight:
-        """Light [slices, rows, W] of a stream's frame and some of its rows."""
+        """Return a function that reads the photons [slices, rows, W] of some rows of a stream frame."""
 
         def read(frame: int, row: int, rows: int) -> Array:
             crop = (row, 0, rows, clip.shape[2])
@@ -169,7 +174,7 @@ class Draw:
         return read
 
     def missed(self, clip: Clip) -> Effects | None:
-        """What the closed form of counting pixels misses in this clip; None where nothing can be missed."""
+        """Return the error of the closed form of counting pixels in this clip; None if it is exact."""
         if not isinstance(self.plane, CountingSPAD):
             return None
         memory = event_simulation.memory_of(self.defects)
@@ -182,7 +187,7 @@ class Draw:
         )
 
     def _follow(self, clip: Clip, frames: int) -> Array:
-
+        """Return codes [frames, H, W] of counting pixels, followed photon by photon from the first frame."""
         array = self._array(clip)
         assert array is not None
         shape = (frames, *clip.shape[1:])
@@ -191,15 +196,18 @@ class Draw:
 
 
 def stored(stream: Stream) -> Draw:
-    """What drew a stream, from its json alone, by the law of its time; `ValueError` if it was not drawn here."""
+    """Return the draw of a stored stream, from its json, by the law of its version.
+
+    `ValueError` for an imported stream, or for a law of a later version.
+    """
     meta = stream.meta
     for name in ("seed", "clip_key", "ppp", "mean_photons_before", "ppp_factor"):
         if meta.get(name) is None:
-            raise ValueError(f"{stream.path}: its description holds no {name}: it was not drawn from a clip of ours")
+            raise ValueError(f"{stream.path}: its description holds no {name}: it was not drawn from a clip by qsim")
     planes, law = int(meta.get("planes_per_code") or 1), meta.get("drawn_by")
     if law not in (None, *LAWS):
         raise ValueError(
-            f"{stream.path}: drawn by {law!r}, which this version does not know; there are {', '.join(LAWS)}"
+            f"{stream.path}: drawn by {law!r}; this version has {', '.join(LAWS)}: use the version that drew it"
         )
     sensor = stream.sensor
     if law in (None, "planes") and isinstance(sensor, BinarySPAD):
@@ -214,5 +222,5 @@ def stored(stream: Stream) -> Draw:
 
 
 def plane_of(sensor: Sensor, planes: int) -> Sensor:
-    """What draws the clip frames of a code: one plane of a clocked SPAD, any other sensor as it is."""
+    """Return the sensor of one clip frame: a single plane of a clocked SPAD, else the sensor."""
     return dataclasses.replace(sensor, bits=1) if planes > 1 and isinstance(sensor, BinarySPAD) else sensor

@@ -1,7 +1,7 @@
-"""Few-bit streams on disk: packed codes and the description that they can be drawn from again.
+"""Reads and writes few-bit streams: packed codes and the description from which they can be drawn again.
 
 NAME.npy is uint8 [T, H, ceil(W*bits/8)], each row packed alone, most significant bit first: one bit is a photon cube.
-NAME.json is written last and holds everything needed to draw any frame again: sensor, light factor, key, widths.
+NAME.json is written last. It holds all that a frame is drawn from: sensor, light factor, key, widths.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from qsim.sensor.sensor import Sensor
 
 FORMAT_VERSION = 1
-_DAMAGED = "the file is damaged, sense again with --force"
+_DAMAGED = "the file is damaged: run `qsim sense --force`"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Stream:
 
     @staticmethod
     def open(json_path: Path) -> Stream:
-        """`FileNotFoundError` if there is no such stream, `ValueError` if its description is damaged."""
+        """Open a stream; `FileNotFoundError` if it does not exist, `ValueError` if its description is damaged."""
         if not json_path.is_file():
             raise FileNotFoundError(f"{json_path}: no such stream")
         meta = files.read_json(json_path)
@@ -85,7 +85,7 @@ class Stream:
 
     @property
     def photons_factor(self) -> float:
-        """photons seen by the sensor = this factor times the clip's expected photons."""
+        """Photons at the sensor over the clip's expected photons."""
         return float(self.meta["ppp_factor"])
 
     @cached_property
@@ -96,18 +96,19 @@ class Stream:
 
     @cached_property
     def packed(self) -> Array:
-        """The packed array [T, H, ceil(W*bits/8)] as a memory map; `ValueError` if the file does not fit its json.
+        """The packed array uint8 [T, H, ceil(W*bits/8)] as a memory map.
 
-        Also if both were replaced since the stream was opened. Once mapped, the codes stay those of this json.
+        `ValueError` if the file does not fit its json, or if both were replaced since the stream was opened. Once
+        mapped, the codes stay those of this json.
         """
         while True:
             before = self._written()
             array = self._mapped()
-            if self._written() == before:  # no writer came between json and codes
+            if self._written() == before:  # nothing was replaced between reading json and codes
                 return array
 
     def _written(self) -> tuple[int, ...]:
-        """Which file the json is now; `ValueError` if it describes other codes than when it was opened."""
+        """Return the identity of the json file; `ValueError` if its codes differ from those at opening."""
         described = self.path.with_suffix(".json")
         problem = f"{described}: was replaced since it was opened; open the stream again"
         try:
@@ -120,20 +121,24 @@ class Stream:
         return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
     def _mapped(self) -> Array:
+        """Return the memory map uint8 [T, H, ceil(W*bits/8)]; `ValueError` for another shape or type."""
         frames, height, width = self.shape
         expected = (frames, height, packing.packed_width(width, self.bits))
         if not self.path.is_file():
-            raise FileNotFoundError(f"{self.path}: no such file, though its json is there; sense again with --force")
+            raise FileNotFoundError(f"{self.path}: no such file, but its json exists; run `qsim sense --force`")
         array = files.load_array(self.path)
         if array.shape != expected or array.dtype != np.uint8:
             raise ValueError(
                 f"{self.path}: expected uint8 {list(expected)}, found {array.dtype} {list(array.shape)}; "
-                "sense again with --force"
+                "run `qsim sense --force`"
             )
         return array
 
     def codes(self, start: int = 0, stop: int | None = None, crop: Crop | None = None) -> Array:
-        """Codes [stop - start, h, w] of frames start ... stop - 1: uint8, uint16 above 8 bits; crop = (y, x, h, w)."""
+        """Return codes [stop - start, h, w] of frames start ... stop - 1, uint8 or (above 8 bits) uint16.
+
+        `crop` = (y, x, height, width) [px]; only its bytes are read.
+        """
         frames, height, width = self.shape
         stop = frames if stop is None else stop
         if not 0 <= start < stop <= frames:
@@ -149,7 +154,7 @@ class Stream:
         return packing.unpack(part, self.bits, x + w - first)[..., x - first :]
 
     def verify(self, progress: Progress | None = None) -> list[str]:
-        """Problems of the stream's files in words; empty if they are what was written."""
+        """Return one message per file whose checksum differs; empty if the stream is intact."""
         problems = files.differs(self.path, self.meta.get("sha256"))
         try:
             if problems:
@@ -159,12 +164,12 @@ class Stream:
         return problems
 
     def unsealed(self) -> list[Path]:
-        """The description, if it holds no checksum of its own: an earlier version made it."""
+        """Return the description if it lacks a checksum of itself: an earlier version wrote it."""
         return [] if "checksum" in self.meta else [self.path.with_suffix(".json")]
 
 
 def orientation(meta: dict[str, Any]) -> str:
-    """Of a clip or stream: what its reader said of the file it was imported from; what we rendered is upright."""
+    """Return the orientation of a clip or stream: that of its source file if it was imported, else upright."""
     origin = meta.get("source")
     imported = origin.get("orientation", "upright") if isinstance(origin, dict) else "upright"
     return str(meta.get("orientation", imported))
@@ -172,7 +177,7 @@ def orientation(meta: dict[str, Any]) -> str:
 
 @contextlib.contextmanager
 def writing(folder: Path, on_wait: Callable[[], None] | None = None) -> Iterator[None]:
-    """One process at a time writes streams of a folder; the others wait, after a call of `on_wait`."""
+    """Hold the lock of a folder of streams; while another process holds it, wait after a call of `on_wait`."""
     folder.mkdir(exist_ok=True)
     lock = locks.Lock(folder / "lock")
     lock.acquire(wait=True, on_wait=on_wait)
@@ -223,7 +228,7 @@ def write_packed(path: Path, blocks: Iterable[Array], sensor: Sensor, meta: dict
 
 
 def _header(*shape: int) -> bytes:
-    """The head of a .npy of bytes."""
+    """Return the header of a .npy file of bytes."""
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": shape})
     return file.getvalue()

@@ -1,4 +1,4 @@
-"""Writing clips: frame by frame into NAME.part, which gets its name when it is whole."""
+"""Writes clips frame by frame to NAME.part, which is renamed when it is complete."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from qsim.optics import radiometry
 
 
 class ClipWriter:
-    """Writes a clip frame by frame into PATH.part and gives it its name when all frames are there.
+    """Writes a clip frame by frame to PATH.part and renames it when all frames are stored.
 
-    `meta` is clip.json without what the writer measures (means, errors, checksums); it must hold shape, frame_rate,
-    exposure and radiance_unit, and camera (a dict) unless the unit is relative. A writer with the same meta goes on
-    where an interrupted one stopped: `has(t)` tells. `FileExistsError` if the clip exists and `force` is not set, or
-    if it is no clip; `ValueError` if PATH.part holds what no writer left there, or, without `force`, frames of a clip
-    with other meta.
+    `meta` is clip.json without the measured fields (means, errors, checksums). It must hold shape, frame_rate,
+    exposure and radiance_unit, and camera (a dict) unless the unit is relative. A writer with the same meta resumes
+    where an interrupted one stopped: `has(t)` is true for its finished frames. `FileExistsError` if the clip exists and
+    `force` is not set, or if the folder is not a clip. `ValueError` if PATH.part holds files of another origin, or,
+    without `force`, frames of a clip with other meta.
     """
 
     def __init__(self, path: str | os.PathLike[str], meta: dict[str, Any], *, force: bool = False) -> None:
@@ -44,7 +44,7 @@ class ClipWriter:
             raise FileExistsError(f"{self.path}: exists; name another with -o, or use --force to replace it")
         if self.path.exists() and not (self.path / "clip.json").is_file():
             raise FileExistsError(
-                f"{self.path}: exists and is no clip, which is all that --force replaces; use another -o"
+                f"{self.path}: exists and is not a clip, which is all that --force replaces; name another with -o"
             )
         if self.path.exists():
             files.check_ours(self.path, OURS)
@@ -53,7 +53,7 @@ class ClipWriter:
         self.part = self.path.with_name(self.path.name + ".part")
         self._camera = camera_of(self.meta, self.path)
         self._frames: dict[int, dict[str, Any]] = {}
-        self._whole = False  # all frames and clip.json are there
+        self._complete = False  # all frames and clip.json are stored
         self._lock = locks.Lock(self.part / "lock")
 
     def __enter__(self) -> ClipWriter:
@@ -63,21 +63,21 @@ class ClipWriter:
             raise ValueError(f"{self.part}: another process is writing this clip; wait for it, or name another with -o")
         try:
             begun = self.part / "begun.json"
-            if not begun.is_file():  # before anything goes: a clearing cut short is still a writer's
-                files.write_bytes(begun, self._asked_before())
-            self._whole = self._is_whole()
+            if not begun.is_file():  # before anything is deleted: an interrupted clearing stays recognisable
+                files.write_bytes(begun, self._identity_before())
+            self._complete = self._is_complete()
             if begun.read_bytes() != identity:
-                done = self._left()["shape"][0] if self._whole else len(_read_journal(self.part))
+                done = self._finished_meta()["shape"][0] if self._complete else len(_read_journal(self.part))
                 if done and not self.force:
                     raise ValueError(
-                        f"{self.part}: {done} frames are there, asked for with other settings; ask for the same to go "
-                        "on, name another with -o, or use --force to begin anew"
+                        f"{self.part}: {done} frames are there, asked for with other settings; repeat these settings "
+                        "to resume, name another with -o, or use --force to start again"
                     )
                 self._clear()
-                self._whole = False
+                self._complete = False
                 files.write_bytes(begun, identity)
             files.remove_leftovers_below(self.part)
-            files.remove_leftovers(self.path)  # a replacement cut short
+            files.remove_leftovers(self.path)  # of an interrupted replacement
             self._frames = _read_journal(self.part)
         except BaseException:
             self._lock.release()
@@ -85,8 +85,8 @@ class ClipWriter:
         return self
 
     def has(self, t: int) -> bool:
-        """Whether an earlier, interrupted writer already finished frame t."""
-        return self._whole or t in self._frames
+        """Return whether an earlier, interrupted writer finished frame t."""
+        return self._complete or t in self._frames
 
     def add(
         self,
@@ -99,16 +99,17 @@ class ClipWriter:
         errors_at: Sequence[Sequence[float]] = (),
         saturated: Array | None = None,
     ) -> None:
-        """Store frame t: radiance [H, W], optionally the sharp instant, ground truth and the rms error of the radiance.
+        """Store frame t: radiance [H, W] in the clip's unit, and optionally its other images and errors.
 
-        `fireflies` counts the pixels that the renderer does not trust; clip.json keeps it beside the error. `errors_at`
-        are pairs (white, rms error of radiance and truth clamped there), from which clip.json gets that at its white.
+        `sharp` [H, W] is the radiance at mid-exposure. `truth` may hold flow [2, H, W] and flow_back [2, H, W] in
+        pixels, valid [H, W], depth [H, W] in m, body_id [H, W]. `error` is the rms error of the radiance. `errors_at`
+        are pairs (white, rms error of radiance and truth clamped there), from which clip.json gets the error at its
+        own white. `fireflies` counts the pixels with implausible samples.
 
-        `saturated` [H, W] is True where a camera could not count further: the radiance there is a lower bound. It is
-        stored where any pixel is, together with what the largest half cuts off, and counted in clip.json.
+        `saturated` [H, W] is True where the camera was saturated: the radiance there is a lower bound. It is stored if
+        any pixel is saturated, together with pixels above the largest half, and counted in clip.json.
 
-        `truth` may hold flow [2, H, W], flow_back [2, H, W], valid, depth, body_id [H, W]. `ValueError` for radiance
-        that is negative or not finite, naming frame and pixel.
+        `ValueError` for radiance that is negative or not finite; it names frame and pixel.
         """
         if not 0 <= t < self.meta["shape"][0]:
             raise ValueError(f"{self.path}: frame {t} does not belong to a clip of {self.meta['shape'][0]} frames")
@@ -146,7 +147,7 @@ class ClipWriter:
             photons = radiometry.expected_photons(stored, self._camera, self.meta["exposure"], origin=origin)
             entry["mean_photons"] = float(photons.mean())
         self._frames[t] = entry
-        self._whole = False
+        self._complete = False
         files.append_line(self.part / "journal.jsonl", json.dumps(entry, sort_keys=True).encode())
 
     def __exit__(
@@ -155,39 +156,40 @@ class ClipWriter:
         try:
             if kind is None:
                 self._finish()
-            elif not (self._frames or self._whole):
+            elif not (self._frames or self._complete):
                 self._clear()
                 shutil.rmtree(self.part)
         finally:
             self._lock.release()
 
-    def _left(self) -> dict[str, Any]:
-        """This clip's clip.json in .part: the writer was killed while giving the folder its name. Else empty."""
+    def _finished_meta(self) -> dict[str, Any]:
+        """Return this clip's clip.json in .part, if the writer was killed during the rename; else empty."""
         with contextlib.suppress(OSError, ValueError):
             left = files.read_json(self.part / "clip.json")
             return left if left.get("name") == self.name else {}
         return {}
 
-    def _asked_before(self) -> bytes:
-        """begun.json anew, of a .part without: killed before it began, or while it gave the folder its name."""
-        if left := self._left():
+    def _identity_before(self) -> bytes:
+        """Return begun.json of a .part that lacks it: its writer was killed at the start, or during the rename."""
+        if left := self._finished_meta():
             return files.to_json({key: value for key, value in left.items() if key not in MEASURED})
         if all(item.name.startswith(("lock", "begun.json.tmp-")) for item in self.part.iterdir()):
             return b""
-        raise ValueError(f"{self.part}: holds files of somebody else; move them away, or name another with -o")
+        raise ValueError(f"{self.part}: contains files not written by qsim; move them away, or name another with -o")
 
-    def _is_whole(self) -> bool:
-        """Whether all is there but the clip's name."""
-        checksums = self._left().get("checksums", {})
+    def _is_complete(self) -> bool:
+        """Return whether the clip is complete except for the rename."""
+        checksums = self._finished_meta().get("checksums", {})
         return bool(checksums) and not any(files.differs(self.part / name, d) for name, d in checksums.items())
 
     def _clear(self) -> None:
-        """Delete what a writer left; begun.json, which says that it was one, stays."""
+        """Delete the files of an earlier writer; begun.json, which marks the folder as a writer's, stays."""
         for item in self.part.iterdir():
             if item.name not in ("lock", "begun.json"):
                 shutil.rmtree(item) if item.is_dir() else item.unlink()
 
     def _encode(self, t: int, folder: str, image: Array, contents: dict[str, bytes]) -> tuple[Array, int]:
+        """Add the image [H, W] of frame t as EXR to `contents`; return it in half precision, and its clipped pixels."""
         _, height, width = self.meta["shape"]
         if image.shape != (height, width):
             raise ValueError(f"{self.path}: {folder} of frame {t} is {image.shape}, expected {(height, width)}")
@@ -196,20 +198,21 @@ class ClipWriter:
             y, x = (int(i) for i in np.argwhere(bad)[0])
             raise ValueError(
                 f"{self.path}: {folder} of frame {t} is {float(image[y, x])!r} at (y, x) = ({y}, {x}); "
-                "radiance is finite and not negative"
+                "radiance must be finite and not negative"
             )
         half, clipped = exr.to_half(image)
         contents[f"{folder}/{t:06d}.exr"] = exr.encode({"Y": half})
         return half, clipped
 
     def _finish(self) -> None:
+        """Write clip.json and rename the folder; `ValueError` if a frame is missing."""
         frames = self.meta["shape"][0]
         missing = [t for t in range(frames) if not self.has(t)]
         if missing:
             raise ValueError(
                 f"{self.path}: frame {missing[0]} was never written ({len(missing)} of {frames} are missing)"
             )
-        if not self._whole:
+        if not self._complete:
             self._write_meta(frames)
         for name in ("begun.json", "journal.jsonl", "lock"):
             (self.part / name).unlink(missing_ok=True)
@@ -219,7 +222,7 @@ class ClipWriter:
         files.sync_folder(self.path.parent)
 
     def _write_meta(self, frames: int) -> None:
-        """clip.json: what was asked for and what was measured (MEASURED)."""
+        """Write clip.json: the requested fields and the measured ones (MEASURED)."""
         entries = [self._frames[t] for t in range(frames)]
         meta = dict(self.meta)
         meta["mean_radiance"] = math.fsum(e["mean_radiance"] for e in entries) / frames
@@ -238,7 +241,7 @@ class ClipWriter:
         files.write_description(self.part / "clip.json", meta)
 
     def _high(self) -> float:
-        """The 99.9th percentile of the radiance, over at most 4 million even samples."""
+        """Return the 99.9th percentile of the radiance, over at most 4 million evenly spaced samples."""
         frames, height, width = self.meta["shape"]
         step = max(1, math.isqrt(frames * height * width // 4_000_000))
         samples = [
@@ -248,6 +251,7 @@ class ClipWriter:
 
 
 def _truth_channels(truth: dict[str, Array]) -> dict[str, Array]:
+    """Return the EXR channels [H, W] of the ground truth by name; `ValueError` for an unknown key."""
     unknown = set(truth) - set(TRUTH.values())
     if unknown:
         raise ValueError(
@@ -268,7 +272,7 @@ def _truth_channels(truth: dict[str, Array]) -> dict[str, Array]:
 
 
 def _read_journal(part: Path) -> dict[int, dict[str, Any]]:
-    """Frames that an earlier writer finished; a line or file cut short by its death is dropped."""
+    """Return the frames that an earlier writer finished; incomplete lines and files are dropped."""
     path = part / "journal.jsonl"
     if not path.is_file():
         return {}
@@ -288,5 +292,6 @@ def _read_journal(part: Path) -> dict[int, dict[str, Any]]:
 
 @functools.cache
 def _software() -> dict[str, str]:
+    """Return the versions of qsim and the libraries that decide the radiance."""
     versions = {name: importlib.metadata.version(name) for name in ("numpy", "mitsuba", "drjit")}
     return {"qsim": VERSION} | versions

@@ -1,4 +1,4 @@
-"""The camera: lens, pixel grid, film and place, with projection between world and pixels."""
+"""Describes the camera (lens, pixel grid, pose) and projects between world and pixels."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ Vector = tuple[float, float, float]
 
 @runtime_checkable
 class Pose(Protocol):
-    """A rigid motion: where a body is and how fast, at any time [s]."""
+    """A rigid motion: the position and the velocity of a body at any time [s]."""
 
     def pose(self, t: float) -> np.ndarray:
-        """Body-to-world matrix, float64 [4, 4]."""
+        """Return the body-to-world matrix, float64 [4, 4]."""
 
     def velocity(self, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """World velocity of the body's origin [m/s] and angular velocity [rad/s], float64 [3] each."""
+        """Return the world velocity of the body's origin [m/s] and angular velocity [rad/s], float64 [3] each."""
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Lens, pixel, film and place: all that stands between the scene and the photodiode."""
+    """Lens, pixels, position and orientation of the camera."""
 
     focal_length: float  # m
     f_number: float  # focal length / entrance pupil diameter
     pixel_pitch: float  # m
     height: int  # pixels
     width: int  # pixels
-    transmission: float = 1.0  # lens and filters, 0..1
-    fill_factor: float = 1.0  # photosensitive share of the pixel, 0..1
+    transmission: float = 1.0  # of lens and filters, above 0, at most 1
+    fill_factor: float = 1.0  # photosensitive share of the pixel, above 0, at most 1
     wavelength: float = 550e-9  # m, effective wavelength of the rendered band
-    vignetting: bool = True  # natural vignetting, cos^4; optics applies it
+    vignetting: bool = True  # natural vignetting, cos^4; radiometry.py applies it
     origin: Vector = (0.0, 0.0, 5.0)  # m
     target: Vector = (0.0, 0.0, 0.0)  # m
     up: Vector = (0.0, 1.0, 0.0)
@@ -49,18 +49,21 @@ class Camera:
         if not 100e-9 <= self.wavelength <= 20e-6:
             raise ValueError(f"Camera.wavelength is in metres, got {self.wavelength!r}; 550 nm is 550e-9")
         if not self.f_number >= 0.5:
-            raise ValueError(f"Camera.f_number: no lens in air is below 0.5, got {self.f_number!r}")
+            raise ValueError(f"Camera.f_number must be at least 0.5, the limit of a lens in air, got {self.f_number!r}")
         for name in ("transmission", "fill_factor"):
             if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"Camera.{name} is a share, 0 < share <= 1, got {getattr(self, name)!r}")
+                raise ValueError(f"Camera.{name} must be in (0, 1], got {getattr(self, name)!r}")
         for name in ("height", "width"):
             if getattr(self, name) < 1 or int(getattr(self, name)) != getattr(self, name):
                 raise ValueError(
-                    f"Camera.{name}: expected a positive whole number of pixels, got {getattr(self, name)!r}"
+                    f"Camera.{name} must be a positive whole number of pixels, got {getattr(self, name)!r}"
                 )
         forward = np.subtract(self.target, self.origin)
         if not np.linalg.norm(np.cross(forward, self.up)) > 1e-9 * np.linalg.norm(forward):
-            raise ValueError(f"Camera: origin {self.origin}, target {self.target} and up {self.up} give no orientation")
+            raise ValueError(
+                f"Camera: origin {self.origin}, target {self.target} and up {self.up} give no orientation; choose a "
+                "target other than the origin, and an up that is not along the view"
+            )
 
     @property
     def focal_pixels(self) -> float:
@@ -78,11 +81,11 @@ class Camera:
         return self.focal_length / (2 * self.f_number)
 
     def resized(self, height: int, width: int) -> Camera:
-        """The same vertical field of view, pixel pitch and f-number on another number of pixels."""
+        """Return a camera of this vertical field of view, pixel pitch and f-number with another number of pixels."""
         return replace(self, height=height, width=width, focal_length=self.focal_length * height / self.height)
 
     def pose(self, t: float = 0.0) -> np.ndarray:
-        """Camera-to-world matrix at time t [s], float64 [4, 4]; camera axes x right, y down, z forward."""
+        """Return the camera-to-world matrix at time t [s], float64 [4, 4]; camera axes x right, y down, z forward."""
         forward = _unit(np.subtract(self.target, self.origin))
         right = _unit(np.cross(forward, self.up))
         down = np.cross(forward, right)
@@ -91,18 +94,18 @@ class Camera:
         return placed if self.motion is None else placed @ np.asarray(self.motion.pose(t), np.float64)
 
     def directions(self) -> np.ndarray:
-        """Rays through the pixel centres in camera axes with z = 1, float64 [H, W, 3]."""
+        """Return rays through the pixel centres in camera axes with z = 1, float64 [H, W, 3]."""
         y, x = np.mgrid[: self.height, : self.width] + 0.5
         return np.stack(
             [(x - self.width / 2) / self.focal_pixels, (y - self.height / 2) / self.focal_pixels, np.ones_like(x)], -1
         )
 
     def cosines(self) -> np.ndarray:
-        """Cosine of the off-axis angle at the pixel centres, float64 [H, W]."""
+        """Return the cosine of the off-axis angle at the pixel centres, float64 [H, W]."""
         return 1.0 / np.linalg.norm(self.directions(), axis=-1)
 
     def project(self, points: np.ndarray, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """World points [..., 3] -> pixels [..., 2] (x, y; the first pixel's centre is 0.5) and depth z [m]."""
+        """Project world points [..., 3] [m] to pixels [..., 2] (x, y; first pixel centre 0.5) and depth z [...] [m]."""
         pose = self.pose(t)
         local = (np.asarray(points, np.float64) - pose[:3, 3]) @ pose[:3, :3]
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Diffraction of an ideal lens: Airy disk, MTF, and a picture convolved with the Airy pattern."""
+"""Computes the Airy disk and the MTF of an ideal lens, and blurs images with the Airy pattern."""
 
 from __future__ import annotations
 
@@ -9,28 +9,31 @@ from qsim.optics.camera import Camera
 
 
 def airy_diameter(camera: Camera) -> float:
-    """Diameter of the Airy disk's first dark ring, 2.44 lambda N, in pixels: 3.4 at f/2.8, 550 nm, 1.1 um."""
+    """Return the diameter of the first dark ring, 2.44 lambda N, in pixels: 3.4 at f/2.8, 550 nm, 1.1 um."""
     return 2.439339 * camera.wavelength * camera.f_number / camera.pixel_pitch
 
 
 def mtf(frequency: Array, camera: Camera) -> Array:
-    """Contrast of an ideal round aperture at `frequency` [cycles per pixel] (Goodman, Fourier Optics, section 6.4)."""
+    """Return the contrast [...] of an ideal round aperture at `frequency` [...] [cycles per pixel].
+
+    Source: Goodman, Fourier Optics, section 6.4.
+    """
     nu = np.minimum(np.abs(frequency) * camera.wavelength * camera.f_number / camera.pixel_pitch, 1.0)
     contrast: Array = 2 / np.pi * (np.arccos(nu) - nu * np.sqrt(1 - nu * nu))
     return contrast
 
 
 def diffraction_line(camera: Camera) -> str:
-    """`Airy disk 3.4 px wide, MTF 0.19 at Nyquist (f/2.8, 550 nm, 1.1 um)`: what the lens could at best resolve."""
+    """Return the resolution limit of the lens: `Airy disk 3.4 px wide, MTF 0.19 at Nyquist (f/2.8, 550 nm, 1.1 um)`."""
     nyquist = float(mtf(np.array([0.5]), camera)[0])
     where = f"f/{camera.f_number:g}, {1e9 * camera.wavelength:g} nm, {1e6 * camera.pixel_pitch:g} um"
     return f"Airy disk {airy_diameter(camera):.2g} px wide, MTF {nyquist:.2f} at Nyquist ({where})"
 
 
 def airy_kernel(camera: Camera) -> Array:
-    """Share of a point's light in the pixels around it, [n, n], n odd: the Airy pattern integrated over each pixel.
+    """Return the share of a point's light in the pixels around it, [n, n], n odd: the Airy pattern per pixel.
 
-    Cut off at six Airy diameters (about 2 % of the light lies outside) and normalised to 1.
+    The pattern is cut off at six Airy diameters (about 2 % of the light lies outside) and normalised to 1.
     """
     from scipy import special
 
@@ -47,7 +50,7 @@ def airy_kernel(camera: Camera) -> Array:
 
 
 def diffract(image: Array, camera: Camera) -> Array:
-    """An image [H, W] seen through an ideal lens: convolved with `airy_kernel`, mirrored at its edges, float64."""
+    """Return an image [H, W] convolved with `airy_kernel`, float64 [H, W] in its unit; mirrored at its edges."""
     from scipy import signal
 
     kernel = airy_kernel(camera)

@@ -1,10 +1,10 @@
-"""Radiance to photons: the lens, the pixel, the exposure, the light level.
+"""Converts radiance to expected photons: lens, pixel, exposure, light level.
 
     radiance [W m^-2 sr^-1] -> irradiance [W m^-2] -> photons [expected per pixel and exposure, before the sensor]
 
 Nothing here is random. The lens obeys the sine condition, so irradiance = pi L T cos^4 / (4 N^2). Every factor enters
-once: transmission, fill factor and vignetting here, quantum efficiency in the sensor. A light level is one number for a
-whole clip (`LightLevel`): a target in photons per pixel (PPP), in faceplate lux, or the light as it is. Left out:
+once: transmission, fill factor and vignetting here, quantum efficiency in the sensor. A light level is one factor for a
+clip (`LightLevel`), from a target in photons per pixel (PPP) or in faceplate lux; without a target it is 1. Left out:
 aberrations, stray light, and the working f-number of close objects.
 """
 
@@ -22,13 +22,13 @@ PLANCK = 6.62607015e-34  # J s, exact (SI)
 LIGHT_SPEED = 299792458.0  # m s^-1, exact (SI)
 LUMINOUS_EFFICACY = 683.0  # lm W^-1 at 540 THz, exact (SI); K_m at 555 nm
 LUX_WAVELENGTH = 555e-9  # m, where V(lambda) = 1: every lux of this module is light of this wavelength
-WHITE_PER_MEAN = 2.5  # white of a clip or stream, in units of its mean light: the peak of scores and of asked errors
+WHITE_PER_MEAN = 2.5  # white of a clip or stream over its mean light: the peak of scores and of requested errors
 
 Crop = tuple[int, int, int, int]  # y, x, height, width
 
 
 def check_crop(crop: Crop, height: int, width: int, where: str = "") -> Crop:
-    """The crop (y, x, h, w) if it lies inside the frame, else `ValueError`."""
+    """Return the crop (y, x, h, w) [px] if it lies inside the frame, else raise `ValueError`."""
     y, x, h, w = crop
     if y < 0 or x < 0 or h < 1 or w < 1 or y + h > height or x + w > width:
         place = f"{where}: " if where else ""
@@ -37,18 +37,24 @@ def check_crop(crop: Crop, height: int, width: int, where: str = "") -> Crop:
 
 
 def photon_energy(wavelength: float) -> float:
-    """Energy of one photon [J]; `wavelength` in m."""
+    """Return the energy of one photon [J]; `wavelength` in m."""
     return PLANCK * LIGHT_SPEED / wavelength
 
 
 def to_irradiance(radiance: Array, camera: Camera, cos_theta: float | Array = 1.0) -> Array:
-    """Faceplate irradiance [W m^-2] of a distant scene: pi L T cos^4(theta) / (4 N^2)."""
+    """Return the faceplate irradiance [W m^-2], float64 [...]: pi L T cos^4(theta) / (4 N^2) of a distant scene.
+
+    `radiance` is [...] in W m^-2 sr^-1; `cos_theta` is a number or broadcasts with it.
+    """
     scale = np.pi * camera.transmission / (4 * camera.f_number**2)
     return np.asarray(radiance, np.float64) * (scale * cos_theta**4)
 
 
 def to_photons(irradiance: Array, camera: Camera, exposure: float) -> Array:
-    """Expected photons per pixel during `exposure` [s] of light at the camera's wavelength."""
+    """Return expected photons per pixel in `exposure` [s], float64 [...], of irradiance [...] [W m^-2].
+
+    All light has the camera's wavelength.
+    """
     area = camera.fill_factor * camera.pixel_pitch**2
     return np.asarray(irradiance, np.float64) * (area * exposure / photon_energy(camera.wavelength))
 
@@ -56,7 +62,7 @@ def to_photons(irradiance: Array, camera: Camera, exposure: float) -> Array:
 def expected_photons(
     radiance: Array, camera: Camera, exposure: float, *, origin: tuple[int, int] | None = None
 ) -> Array:
-    """Expected photons per pixel and exposure, float64, before quantum efficiency: the only way from radiance.
+    """Return expected photons per pixel and exposure, float64 [..., H, W], before quantum efficiency.
 
     `radiance` is [..., H, W] in W m^-2 sr^-1, `exposure` in s. `origin` is the (y, x) of its first pixel in the
     camera's frame; without it the image is centred on the optical axis. `ValueError` if the exposure is not positive.
@@ -77,7 +83,7 @@ def expected_photons(
 
 @functools.lru_cache(maxsize=16)
 def off_axis_cosines(height: int, width: int, centre_y: float, centre_x: float, focal_pixels: float) -> Array:
-    """Cosine of the off-axis angle at the pixel centres, [H, W]; centre and focal length in pixels. Read-only."""
+    """Return the cosine of the off-axis angle at the pixel centres, [H, W], read-only; all lengths in pixels."""
     y = (np.arange(height) + 0.5 - centre_y)[:, None] / focal_pixels
     x = (np.arange(width) + 0.5 - centre_x)[None, :] / focal_pixels
     cosines: Array = 1 / np.sqrt(1 + x * x + y * y)
@@ -86,13 +92,13 @@ def off_axis_cosines(height: int, width: int, centre_y: float, centre_x: float, 
 
 
 def photons_per_lux(camera: Camera, exposure: float) -> float:
-    """Photons per pixel and exposure for one lux of 555 nm light on the faceplate: 2.47 for 1.1 um and 0.5 ms."""
+    """Return photons per pixel in `exposure` [s] for one lux of 555 nm on the faceplate: 2.47 for 1.1 um and 0.5 ms."""
     area = camera.fill_factor * camera.pixel_pitch**2
     return area * exposure / (LUMINOUS_EFFICACY * photon_energy(LUX_WAVELENGTH))
 
 
 def ppp_factor(mean_photons: float, target: float, name: str = "clip") -> float:
-    """The one factor that brings a clip's mean to `target` photons per pixel; `ValueError` for a black clip."""
+    """Return the factor that brings a clip's mean to `target` photons per pixel; `ValueError` for a black clip."""
     if not (target > 0 and np.isfinite(target)):
         raise ValueError(f"{name}: photons per pixel must be a number above 0, got {target!r}")
     if not mean_photons > 0:
@@ -104,9 +110,9 @@ def ppp_factor(mean_photons: float, target: float, name: str = "clip") -> float:
 
 @dataclass(frozen=True)
 class LightLevel:
-    """How bright a clip is for a sensor: photons = factor * (photons of the light as it is), everywhere in the clip."""
+    """The light level of a clip: photons at the sensor = factor * photons of the stored radiance, in every pixel."""
 
-    factor: float  # 1 for light as it is
-    ppp: float  # mean photons per pixel and exposure over the whole clip, after the factor
-    mean_before: float  # the same before the factor; mean radiance where the clip's unit is relative
+    factor: float  # 1 without a target
+    ppp: float  # mean photons per pixel and exposure over the clip, after the factor
+    mean_before: float  # the same before the factor; mean radiance if the clip's unit is relative
     lux: float | None  # faceplate lux at 555 nm that give `ppp`; None without a camera

@@ -97,8 +97,8 @@ MISTAKES = [
     ("qsim sense text.txt --ppp 3", "text.txt: not a clip folder (it has no clip.json)"),
     ("qsim sense data --replay fan_0000", "--replay fan_0000: expected CLIP:FRAME, as in fan_0003:7"),
     # What is in the way
-    ("qsim render fan -o text.txt --force", "text.txt: exists and is no clip, which is all that --force replaces"),
-    ("qsim render fan -o data --force", "data: exists and is no clip, which is all that --force replaces"),
+    ("qsim render fan -o text.txt --force", "text.txt: exists and is not a clip, which is all that --force replaces"),
+    ("qsim render fan -o data --force", "data: exists and is not a clip, which is all that --force replaces"),
     (
         "qsim convert light.npy data --force --frame-rate 2000 --exposure 1e-4 --transfer linear",
         "data: exists and is no",

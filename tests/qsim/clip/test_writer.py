@@ -154,9 +154,9 @@ def test_what_is_no_clip_is_never_replaced(tmp_path: Path):
         path.write_text("years of work")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     for name in ("thesis", "b"):
-        with pytest.raises(FileExistsError, match="exists and is no clip"):
+        with pytest.raises(FileExistsError, match="exists and is not a clip"):
             ClipWriter(tmp_path / name, meta(), force=True)
-    with pytest.raises(ValueError, match=r"c\.part: holds files of somebody else"):
+    with pytest.raises(ValueError, match=r"c\.part: contains files not written by qsim"):
         ClipWriter(tmp_path / "c", meta()).__enter__()
     left = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and path.name != "lock"}
     assert left == before

@@ -108,8 +108,8 @@ def test_a_law_of_a_later_version_is_refused(clip, tmp_path):
     stream = drawn(clip, tmp_path, "QIS")
     old = stored_again(clip, stream, stream.codes(), drawn_by="magic")
     (found,) = redraw.redraw(old.path)
-    assert found.why == "drawn by 'magic', which this version does not know; " + (
-        "there are table, process, planes, closed form, events"
+    assert found.why == "drawn by 'magic'; this version has " + (
+        "table, process, planes, closed form, events: use the version that drew it"
     )
 
 
@@ -168,7 +168,7 @@ def test_streams_of_other_origin_and_damaged_ones_are_said_not_passed(clip, tmp_
     write_stream(own, "imported", [np.ones((3, 8, 9), np.uint8)], QIS(0.8, 1.6, 0.2, 3), meta)
     assert program.main(["check", str(own.path), "--redraw"]) == 0
     out = capsys.readouterr().out
-    assert "imported.npy: not drawn again: its description holds no seed: it was not drawn from a clip of ours" in out
+    assert "imported.npy: not drawn again: its description holds no seed: it was not drawn from a clip by qsim" in out
     assert "drawn again: 0 of 1 streams, 0 codes; so nothing is known of them" in out
     stream, _ = sense(own, Sensing("quiver-physical", ppp=3.0, name="cut"))
     stream.path.write_bytes(stream.path.read_bytes()[:-20])

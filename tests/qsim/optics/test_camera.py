@@ -1,4 +1,4 @@
-"""The camera: impossible ones are refused with one clear line; cameras project as drawn."""
+"""Cameras: impossible ones are refused in one line; points project where geometry says."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ CAMERA = Camera(focal_length=8e-3, f_number=2.8, pixel_pitch=1e-5, height=7, wid
         ({"focal_length": -1.0}, "focal_length is in metres"),
         ({"wavelength": 550.0}, "550 nm is 550e-9"),
         ({"f_number": 0.1}, "f_number"),
-        ({"transmission": 1.5}, "Camera.transmission is a share"),
-        ({"height": 0}, "Camera.height: expected a positive whole number"),
+        ({"transmission": 1.5}, r"Camera\.transmission must be in \(0, 1\], got 1\.5"),
+        ({"height": 0}, "Camera.height must be a positive whole number"),
         ({"target": (0.0, 9.0, 5.0)}, "give no orientation"),
     ],
 )
