@@ -1,4 +1,4 @@
-"""Results on disk as pages and previews. Nothing is computed here that is not in the files."""
+"""Results on disk as pages and previews: stored results only, nothing is recomputed."""
 
 from typing import TYPE_CHECKING
 

@@ -119,7 +119,7 @@ def _array_source(path: Path, bits: int | None, width: int | None, described: di
         _refuse(path, "an array of truth values", bits=bits, width=width)
         bits = 1
     elif width is not None:
-        _refuse(path, "packed planes of 1 bit, as --width says", bits=bits)
+        _refuse(path, "packed planes of 1 bit (--width)", bits=bits)
         return _packed_source(path, array, width)
     if bits is None:
         raise ValueError(f"{path}: whole numbers are codes or packed planes; add --bits 3, or --width 320 for planes")

@@ -1,4 +1,4 @@
-"""Which bit depth is best at which motion and light."""
+"""The best bit depth for a motion and a light level."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Finds the speed for a wanted motion, widens a study while its deepest frame is best, and states the best depth.
+"""Finds the speed for a wanted motion, widens a study while its deepest frame is best, states the best depth.
 
 A **plane** is one clip frame read with one bit. A **frame** of b bits is 2^b - 1 planes, and a **code** is the value of
 a pixel in one frame. Motion is the mean over the pixels that move more than 0.1 px per frame of `CODE_BITS` bits.

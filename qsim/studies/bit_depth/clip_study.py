@@ -11,7 +11,7 @@ frames. Every depth has the same output rate and is scored against the same shar
 
 Every simulated error has its exact expectation beside it: the sum over codes of P(code | light) (estimate - truth)^2.
 For planes of different light, the binomial distribution of their mean probability is used. Its variance is multiplied
-by sum p (1 - p) / (M mean p (1 - mean p)), which is exact to second order in the differences.
+by sum p (1 - p) / (M mean p (1 - mean p)). That is exact to second order in the differences.
 """
 
 from __future__ import annotations
@@ -118,8 +118,8 @@ def expose(
 ) -> Iterator[Exposed]:
     """Yield the frames of all depths around one clip frame, shallow to deep; add squared differences to `structure`.
 
-    `factor` multiplies the light of the clip. `structure` [K] is float64: entry k grows by the mean over pixels of the
-    squared difference of the light at two instants, k planes apart and symmetric about the centre.
+    `factor` multiplies the light of the clip. `structure` is float64 [K]: entry k grows by the mean over pixels of
+    (difference of light)^2 at two instants that are k planes apart, symmetric about the centre.
     """
     key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))
     wanted = [2**b - 1 for b in settings.bits]

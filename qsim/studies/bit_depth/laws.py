@@ -38,7 +38,7 @@ def depths(
     """Return the table of the QUIVER paper (ECCV 2024, Table 1) for any sensor.
 
     `speed` is that of the image [px/s], `read_noise` in e- per read. The paper rounds its frame rates to 1428, 323, 78
-    and 20 before it computes the other columns; they stay exact here (1428.57, 322.58, 78.74, 19.57).
+    and 20 before it computes the other columns. Here they are exact (1428.57, 322.58, 78.74, 19.57).
     """
     for name, value in {"height": height, "width": width, "base_fps": base_fps}.items():
         if not value > 0:

@@ -1,7 +1,7 @@
 """Draws the first two figures of the QUIVER paper (ECCV 2024) from our scenes, as pictures and numbers.
 
-Figure 1: the same motion at one light level through CMOS pixels of 5.1 e- at 60, 240 and 2000 fps and through a 3-bit
-QIS at 2000 fps. Figure 2: binary planes at 10 000 fps averaged to 3, 5, 7 and 9 bits, at two light levels.
+Figure 1: one motion and light level, seen by CMOS pixels of 5.1 e- at 60, 240 and 2000 fps and by a 3-bit QIS at
+2000 fps. Figure 2: binary planes at 10 000 fps averaged to 3, 5, 7 and 9 bits, at two light levels.
 """
 
 from __future__ import annotations

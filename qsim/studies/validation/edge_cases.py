@@ -1,4 +1,4 @@
-"""Checks the sensor models at extreme light, ties, tails and exact fractions of dead time, for `validate sensor`."""
+"""Checks the sensor models at extreme light, at ties, in tails and at exact fractions of the dead time."""
 
 from __future__ import annotations
 

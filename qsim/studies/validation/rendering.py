@@ -2,8 +2,8 @@
 
     run() -> RenderReport: one RenderRow per scene and level [dB]; the error is that against a converged reference
 
-The naive loop is `mi.render` per frame with the default integrator and the default `independent` sampler, a box
-filter, and the smallest power of two of samples that reaches the level. Ours is `Renderer.frame` without ground truth,
+The naive loop is `mi.render` per frame with the default integrator, the default `independent` sampler and a box filter.
+It takes the smallest power of two of samples that reaches the level. Ours is `Renderer.frame` without ground truth,
 with the budget of `choose_budget` for the level; the measurement of its error is included. Both start from a loaded
 scene and are timed alternately. Processor seconds stand beside wall seconds, because other programs change them less.
 Rows of short frames take up to 15 rounds, since a median of three can be a fifth off. The variance of the reference is
