@@ -1,6 +1,7 @@
 """Restores blur-free video from few-bit quanta streams; trains, evaluates and compares methods.
 
-`quiver.restore(codes, "moment", ...)` is enough in a notebook; nothing heavy is imported before it is called.
+In Python: `quiver.restore(codes, "moment", ...)`, and the networks `QUIVER` and `from_published`. Torch is
+imported with the first of these names, not with the package.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`python -m quiver`."""
+"""Runs the command line: `python -m quiver`."""
 
 import sys
 

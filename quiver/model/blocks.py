@@ -1,9 +1,13 @@
-"""The building blocks of QUIVER, in the order in which a frame meets them.
+"""Defines the building blocks of QUIVER, in the order in which they process a frame.
 
-Conventions of the whole network: `conv` = stride 1, zero padding (k-1)/2, with bias; GELU is the exact erf form; no
-normalisation layer, no dropout, no activation on any output. C is the channel unit, f2 the number of channels of a
-folded frame (1 unless frames are folded, see model.Config.fold). Flows are in pixels of their own scale,
-channel 0 = x, 1 = y; they live on the grid of frame t+1 and point into frame t.
+Conventions of all blocks:
+
+* `conv` has stride 1, zero padding (k-1)/2 and a bias; GELU is the exact erf form.
+* There is no normalisation layer, no dropout, and no activation on any output.
+* C is the channel unit. f2 is the number of channels of a frame: 1 in QUIVER, fold^2 in FoldedQUIVER.
+* A flow is in pixels of its scale, channel 0 = x (right), 1 = y (down). It is given on the grid of frame t+1 and points
+  into frame t.
+* Values of frames are in units of x = photons/white.
 """
 
 import math
@@ -19,16 +23,16 @@ from quiver.model.deformable import deform_conv2d, warp
 
 RADIUS = 5  # frames before and after the restored one
 WINDOW = 2 * RADIUS + 1
-NEIGHBOURS = 5  # frames seen by the feature extractors around each frame
-OFFSET_LIMIT = 10.0  # pixels, of the alignment's own offsets on top of the flow
+NEIGHBOURS = 5  # consecutive frames that a feature extractor takes
+OFFSET_LIMIT = 10.0  # px, largest offset that the alignment adds to the flow
 GREY_MEAN, GREY_DEVIATION = 0.449, 0.226  # standardisation of the flow network's input; kept as float32 buffers
 
 
 @dataclass(frozen=True)
 class Output:
-    """What a network returns, in units of x = photons/white, not clamped; None = the network has no such part."""
+    """Result of a network, in units of x = photons/white, not clamped; None where the network lacks the part."""
 
-    denoised: Tensor | None  # [B, T, 1, H, W], each frame on its own
+    denoised: Tensor | None  # [B, T, 1, H, W], each frame denoised alone
     scale1: Tensor  # [B, T-10, 1, H, W], restored frames 5 .. T-6
     scale2: Tensor | None  # [B, T-10, 1, H/2, W/2]
     scale4: Tensor | None  # [B, T-10, 1, H/4, W/4]
@@ -36,7 +40,7 @@ class Output:
 
 
 def check_input(x: Tensor, multiple: int) -> None:
-    """ValueError unless x is [B, T >= 11, 1, H, W] with sides that are multiples of `multiple`."""
+    """Raise ValueError unless x is [B, T >= 11, 1, H, W] with sides that are multiples of `multiple`."""
     if x.ndim != 5 or x.shape[2] != 1 or x.shape[1] < WINDOW:
         raise ValueError(f"the network takes [B, T, 1, H, W] with T >= {WINDOW}, got {tuple(x.shape)}; pad time first")
     if x.shape[3] % multiple or x.shape[4] % multiple or not x.shape[3] or not x.shape[4]:
@@ -44,16 +48,17 @@ def check_input(x: Tensor, multiple: int) -> None:
 
 
 def conv(inputs: int, outputs: int, kernel: int, stride: int = 1, bias: bool = True) -> nn.Conv2d:
+    """Return a convolution [N, inputs, H, W] -> [N, outputs, H/stride, W/stride] with zero padding."""
     return nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2, bias=bias)
 
 
 def upsample(inputs: int, outputs: int) -> nn.ConvTranspose2d:
-    """Transposed convolution that exactly doubles both sides."""
+    """Return a transposed convolution [N, inputs, H, W] -> [N, outputs, 2H, 2W]."""
     return nn.ConvTranspose2d(inputs, outputs, 3, stride=2, padding=1, output_padding=1)
 
 
 def resize(frames: Tensor, height: int, width: int) -> Tensor:
-    """Bilinear, without antialiasing, of the last two axes of [..., C, H, W]."""
+    """Resize [..., C, H, W] to [..., C, height, width], bilinear, without antialiasing."""
     if frames.shape[-2:] == (height, width):
         return frames
     flat = frames.reshape(-1, *frames.shape[-3:])
@@ -62,12 +67,12 @@ def resize(frames: Tensor, height: int, width: int) -> Tensor:
 
 
 def join(*tensors: Tensor) -> Tensor:
-    """Concatenate along channels, channels innermost in memory: convolutions are up to twice as fast on a CPU."""
+    """Concatenate [N, C_i, H, W] along channels, channels last in memory: convolutions then are faster on a CPU."""
     return torch.cat(tensors, dim=1).contiguous(memory_format=torch.channels_last)
 
 
 class ResidualDenseBlock(nn.Module):
-    """Three dense layers, each adding `growth` channels; then back to `channels`, plus the input."""
+    """Three dense layers that add `growth` channels each, then a 1 x 1 convolution to `channels`, plus the input."""
 
     def __init__(self, channels: int, growth: int, activation: type[nn.Module] = nn.GELU) -> None:
         super().__init__()
@@ -76,6 +81,7 @@ class ResidualDenseBlock(nn.Module):
         self.activation = activation()
 
     def forward(self, x: Tensor) -> Tensor:
+        """[N, channels, H, W] -> the same shape."""
         y = x
         for layer in self.layers:
             y = join(y, self.activation(layer(y)))
@@ -83,7 +89,7 @@ class ResidualDenseBlock(nn.Module):
 
 
 class PreDenoiser(nn.Module):
-    """Each frame alone: one residual dense block passed several times, all results fused, added to the frame."""
+    """Denoises each frame alone: one residual dense block runs several times, its results are fused and added."""
 
     def __init__(self, image: int, channels: int, growth: int, passes: int) -> None:
         super().__init__()
@@ -95,7 +101,7 @@ class PreDenoiser(nn.Module):
         self.passes = passes
 
     def forward(self, x: Tensor) -> Tensor:
-        """[N, f2, H, W] -> the same."""
+        """[N, f2, H, W] -> the same shape."""
         shallow = self.lift(join(x))
         results = [self.enter(shallow)]
         for _ in range(self.passes):
@@ -104,7 +110,7 @@ class PreDenoiser(nn.Module):
 
 
 class FlowNetwork(nn.Module):
-    """Coarse-to-fine flow of grey frames (Ranjan & Black 2017, "SpyNet")."""
+    """Estimates the flow of grey frames from coarse to fine (Ranjan & Black 2017, "SpyNet")."""
 
     mean: Tensor
     deviation: Tensor
@@ -123,7 +129,7 @@ class FlowNetwork(nn.Module):
         return nn.Sequential(*layers, conv(channels[-1], 2, kernel))
 
     def forward(self, reference: Tensor, support: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Grey frames [N, 1, H, W] -> flows on the grid of `reference` into `support` at scales 1, 2, 4."""
+        """Grey frames [N, 1, H, W] -> flows [N, 2, H/s, W/s] from `reference` into `support`, s = 1, 2, 4."""
         height, width = reference.shape[2:]
         coarsest = 2 ** len(self.levels)  # pixels per pixel of the zero flow at the start
         padded = tuple(2 * coarsest * math.ceil(side / (2 * coarsest)) for side in (height, width))
@@ -146,9 +152,9 @@ class FlowNetwork(nn.Module):
 
 
 def neighbourhoods(frames: Tensor, before: int = NEIGHBOURS // 2, after: int = NEIGHBOURS // 2) -> Tensor:
-    """Every frame with two neighbours on each side as channels; zeros before the first and after the last.
+    """Stack every frame with two neighbours on each side as channels; zeros before the first and after the last.
 
-    [B, T, f2, H, W] -> [B, T + before + after - 4, f2*5, H, W]; channel order (f2, time).
+    [B, T, f2, H, W] -> [B, T + before + after - 4, f2*5, H, W], channels in the order (f2, time).
     """
     padded = F.pad(frames, (0, 0, 0, 0, 0, 0, before, after))
     stacks = padded.unfold(1, NEIGHBOURS, 1).permute(0, 1, 2, 5, 3, 4)
@@ -156,10 +162,10 @@ def neighbourhoods(frames: Tensor, before: int = NEIGHBOURS // 2, after: int = N
 
 
 class Extractor(nn.Module):
-    """Linear space-time features 5 x 5 x 5 of a stream at scales 1, 2, 4.
+    """Linear features of a stream at scales 1, 2, 4: 3-D convolutions of 5 x 5 x 5.
 
-    A 3-D convolution over all frames is, per frame, a 2-D convolution over its five neighbours; the latter form lets a
-    frame be computed alone, and is quicker for few channels.
+    For one frame, such a convolution is a 2-D convolution over five stacked frames. That form computes a frame alone,
+    and it is faster for few channels.
     """
 
     def __init__(self, image: int, channels: int) -> None:
@@ -184,11 +190,11 @@ class Extractor(nn.Module):
 
 
 class Alignment(nn.Module):
-    """Brings the features of frame t-1 to frame t: deformable convolution guided by the flow; one for all scales."""
+    """Aligns the features of frame t-1 to frame t by a deformable convolution along the flow; one for all scales."""
 
     def __init__(self, channels: int, groups: int, kernel: int = 3) -> None:
         super().__init__()
-        self.pairs = groups * kernel**2  # offsets: one for each tap of each group
+        self.pairs = groups * kernel**2  # number of offset vectors: one for each tap of each group
         self.offsets = nn.Sequential(
             conv(2 * channels + 2, channels, 3),
             nn.LeakyReLU(0.1),
@@ -219,7 +225,7 @@ class Alignment(nn.Module):
 
 
 class GatedFusion(nn.Module):
-    """Joins the aligned denoised and noisy streams, pixel by pixel: merge(GELU(gate z) * (value z))."""
+    """Fuses the aligned denoised and noisy streams pixel by pixel: merge(GELU(gate z) * (value z))."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -228,7 +234,7 @@ class GatedFusion(nn.Module):
         self.merge = nn.Linear(2 * channels, channels)
 
     def forward(self, denoised: Tensor, noisy: Tensor) -> Tensor:
-        """Two [N, C, h, w] -> [N, C, h, w]; the linear layers run as 1 x 1 convolutions, without moving the axes."""
+        """Two [N, C, h, w] -> [N, C, h, w]; linear layers run as 1 x 1 convolutions, so that no axis moves."""
         z = join(denoised, noisy)
         return self._linear(self.merge, F.gelu(self._linear(self.gate, z)) * self._linear(self.value, z))
 
@@ -238,9 +244,9 @@ class GatedFusion(nn.Module):
 
 
 class RecurrentCell(nn.Module):
-    """Recurrent multi-scale fusion: features of one frame at three scales and a state at 1/4 scale.
+    """Fuses the features of one frame at three scales with a state at 1/4 scale.
 
-    `encode` is the part without state, `step` the recurrent part at 1/4 scale.
+    `encode` is the part without state, `step` the recurrent part, `state` the next state from the result of `step`.
     """
 
     def __init__(self, image: int, channels: int, blocks: int, growth: int) -> None:
@@ -262,7 +268,7 @@ class RecurrentCell(nn.Module):
         self.state = nn.Sequential(conv(4 * c, 2 * c, 3), ResidualDenseBlock(2 * c, 2 * c), conv(2 * c, 2 * c, 3))
 
     def encode(self, images: Sequence[Tensor], fused: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Images [N, f2, h, w] and fused features [N, C, h, w] at scales 1, 2, 4 -> R1, R2 (4C), entry (6C at 1/4)."""
+        """Images [N, f2, h, w] and fused features [N, C, h, w], three scales each -> R1, R2 [4C], entry [6C at 1/4]."""
         r1 = self.fuse1(join(self.image1(images[0]), fused[0]))
         r2 = self.down1(self.block1(r1))
         middle = join(r2, self.image2(images[1]), fused[1])
@@ -270,7 +276,7 @@ class RecurrentCell(nn.Module):
         return r1, r2, entry
 
     def step(self, entry: Tensor, state: Tensor) -> Tensor:
-        """Entry (6C) and state (2C) at 1/4 scale -> R4 (4C)."""
+        """Entry [N, 6C, h, w] and state [N, 2C, h, w] at 1/4 scale -> R4 [N, 4C, h, w]."""
         y = self.shrink(self.join(join(entry, state)))
         results = []
         for block in self.blocks:
@@ -280,7 +286,7 @@ class RecurrentCell(nn.Module):
 
 
 class TemporalAttention(nn.Module):
-    """Channel self-attention over the stacked R4 of a window, the centre frame last."""
+    """Channel self-attention over the R4 of a window, stacked with the centre frame last."""
 
     def __init__(self, inputs: int, width: int, outputs: int) -> None:
         super().__init__()
@@ -291,7 +297,7 @@ class TemporalAttention(nn.Module):
         self.leave = conv(width, outputs, 1, bias=False)
 
     def forward(self, window: Sequence[Tensor]) -> Tensor:
-        """R4 [N, 4C, h, w] of the frames in time order, an odd number -> [N, 4C, h, w] for the centre frame."""
+        """R4 [N, 4C, h, w] of an odd number of frames in time order -> [N, 4C, h, w] for the centre frame."""
         centre = len(window) // 2
         c = self.enter(join(*window[:centre], *window[centre + 1 :], window[centre]))
         q, k, v = self.qkv(self.spread(c)).flatten(2).chunk(3, dim=1)
@@ -299,12 +305,12 @@ class TemporalAttention(nn.Module):
         return self.leave(self.project(attended) + c)
 
     def logits(self, q: Tensor, k: Tensor) -> Tensor:
-        """Queries and keys [N, D, hw] -> cosines of all pairs [N, D, D], in [-1, 1]."""
+        """Queries and keys [N, D, hw] -> cosine of every pair [N, D, D], in [-1, 1]."""
         return F.normalize(q, dim=2) @ F.normalize(k, dim=2).transpose(1, 2)
 
 
 class Refinement(nn.Module):
-    """One scale of the output: channel attention, then an image branch and a hidden branch for the next scale."""
+    """Makes the picture of one scale: channel attention, an image branch, and a hidden branch for the next scale."""
 
     def __init__(self, image: int, channels: int) -> None:
         super().__init__()
@@ -321,19 +327,19 @@ class Refinement(nn.Module):
         self.next_picture = upsample(image, image)
 
     def forward(self, feature: Tensor, hidden: Tensor, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """feature, hidden [N, 4C, h, w], picture [N, f2, h, w] -> (new picture, the input of `onward`)."""
+        """Feature, hidden [N, 4C, h, w], picture [N, f2, h, w] -> new picture [N, f2, h, w], g [N, 8C, h, w]."""
         g0 = self.enter(join(feature, hidden))
         b = self.body(g0)
         g = self.gate(b.mean(dim=(2, 3), keepdim=True)) * b + g0
         return self.picture(g) + picture, g
 
     def onward(self, g: Tensor, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Hidden feature and picture for the next finer scale, both twice the size."""
+        """g [N, 8C, h, w], picture [N, f2, h, w] -> hidden [N, 4C, 2h, 2w], picture [N, f2, 2h, 2w]."""
         return self.hidden(g), self.next_picture(picture)
 
 
 def _gelu_chain(widths: Sequence[int]) -> list[nn.Module]:
-    """conv3, GELU, conv3, GELU, ..., conv3 through the given widths."""
+    """Return the layers conv3, GELU, conv3, GELU, ..., conv3 of the given widths."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers += [conv(inputs, outputs, 3), nn.GELU()]

@@ -1,8 +1,8 @@
-"""Warping and modulated deformable convolution in plain torch.
+"""Computes warping and modulated deformable convolution in plain torch, without torchvision.
 
 Both sample images bilinearly at moved positions. Positions are normalised with `align_corners=False`,
-u = (2x + 1)/W - 1, which is the same sampling as pixel centres at integers and also holds for sides of length 1.
-Sampling is done in float32 or better, also under autocast: half precision cannot address a pixel beyond 2048.
+u = (2x + 1)/W - 1. Pixel centres are then at integers, also for sides of length 1. Sampling is in float32 or float64,
+also under autocast: half precision cannot address a pixel beyond 2048.
 """
 
 from typing import Literal
@@ -11,15 +11,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-TAP_LOOP_ABOVE = 2**25  # samples (N*C*K*oh*ow) above which inference takes one tap after the other: 128 MiB of float32
+TAP_LOOP_ABOVE = 2**25  # samples (N*C*K*oh*ow) above which inference computes tap after tap: 128 MiB of float32
 
 
 def warp(image: Tensor, flow: Tensor, padding: Literal["zeros", "border"] = "zeros") -> Tensor:
-    """Backward warp: result(p) = image(p + flow(p)).
+    """Warp an image backward: result(p) = image(p + flow(p)).
 
-    image [N, C, H, W]; flow [N, 2, H, W] in pixels, channel 0 = x (right), 1 = y (down). With `zeros` each of the four
-    neighbours outside the image counts as zero, with `border` positions are clamped to the image.
-    Raises ValueError when the sizes differ.
+    image [N, C, H, W]; flow [N, 2, H, W] in pixels, channel 0 = x (right), 1 = y (down); result [N, C, H, W].
+    With `zeros` each of the four neighbours outside the image counts as zero; with `border` positions are clamped.
+    ValueError if the sizes differ.
     """
     if flow.shape != (image.shape[0], 2, *image.shape[2:]):
         raise ValueError(f"warp: flow must be {(image.shape[0], 2, *image.shape[2:])}, got {tuple(flow.shape)}")
@@ -44,16 +44,16 @@ def deform_conv2d(
     dilation: int = 1,
     tap_loop: bool | None = None,
 ) -> Tensor:
-    """Modulated deformable convolution (Zhu et al. 2019, "Deformable ConvNets v2").
+    """Convolve at moved positions with modulated taps (Zhu et al. 2019, "Deformable ConvNets v2").
 
-    image [N, C, H, W]; weight [Co, C/groups, kh, kw], K = kh*kw taps row by row; G offset groups of neighbours among C.
-    offset [N, 2GK, oh, ow]: channel g*2K + 2k is dy of tap k, the next one dx; mask [N, GK, oh, ow]: channel g*K + k.
-    Tap (ky, kx) of output (i, j) reads the image at (i*stride - padding + ky*dilation + dy, likewise x); neighbours
-    outside the image count as zero.
+    image [N, C, H, W]; weight [Co, C/groups, kh, kw] with K = kh*kw taps row by row; result [N, Co, oh, ow].
+    offset [N, 2GK, oh, ow] of G groups of channels: channel g*2K + 2k is dy of tap k in pixels, the next one dx.
+    mask [N, GK, oh, ow]: channel g*K + k is the factor of tap k.
+    Tap (ky, kx) of output (i, j) samples the image at row i*stride - padding + ky*dilation + dy, and likewise in x;
+    neighbours outside the image count as zero.
 
-    `tap_loop` adds one tap after the other, which needs 1/K of the memory, but only where no gradient is kept; None
-    chooses it for large inputs without gradients. Both forms give the same numbers up to rounding.
-    Raises ValueError when a shape does not fit.
+    `tap_loop` computes tap after tap, which needs 1/K of the memory where no gradient is kept. None chooses it for
+    large inputs without gradients. Both forms give the same numbers up to rounding. ValueError if a shape does not fit.
     """
     with torch.autocast(image.device.type, enabled=False):
         dtype = _at_least_float32(image).dtype
@@ -103,7 +103,7 @@ def _output_size(image: Tensor, weight: Tensor, stride: int, padding: int, dilat
 def _positions(
     offset: Tensor, kernel: torch.Size, groups: int, stride: int, padding: int, dilation: int
 ) -> tuple[Tensor, Tensor]:
-    """Sampling rows and columns [N, G, K, oh, ow] of every tap."""
+    """Return the rows and columns [N, G, K, oh, ow], in pixels, at which every tap samples."""
     height, width = offset.shape[2:]
     pairs = offset.view(offset.shape[0], groups, kernel[0] * kernel[1], 2, height, width)
     rows, columns, tap_rows, tap_columns = (
@@ -117,7 +117,7 @@ def _positions(
 
 
 def _tap_samples(image: Tensor, y: Tensor, x: Tensor) -> Tensor:
-    """Values [N, G, C/G, K, oh, ow] of the image [N, C, H, W] at positions [N, G, K, oh, ow]."""
+    """Return the values [N, G, C/G, K, oh, ow] of an image [N, C, H, W] at positions [N, G, K, oh, ow]."""
     count, groups, taps, height, width = y.shape
     folded = image.reshape(count * groups, image.shape[1] // groups, *image.shape[2:])
     rows, columns = (p.reshape(count * groups, taps * height, width) for p in (y, x))
@@ -136,7 +136,7 @@ def _contract(samples: Tensor, weight: Tensor, part: slice) -> Tensor:
 
 
 def sample_at(image: Tensor, x: Tensor, y: Tensor, padding: str) -> Tensor:
-    """image [N, C, H, W] at pixel positions x, y [N, h, w] -> [N, C, h, w]."""
+    """Sample an image [N, C, H, W] at pixel positions x, y [N, h, w] -> [N, C, h, w]."""
     height, width = image.shape[2:]
     grid = torch.stack(((2 * x + 1) / width - 1, (2 * y + 1) / height - 1), dim=-1)
     return F.grid_sample(image, grid, mode="bilinear", padding_mode=padding, align_corners=False)

@@ -1,11 +1,10 @@
-"""FoldedQUIVER: our own small network, made of QUIVER's stages and an initial estimate.
+"""Defines FoldedQUIVER, our small network: QUIVER's stages on folded frames, plus an initial estimate.
 
     codes/(2^b - 1) [B, T, 1, H, W] -> initial estimate of each centre frame
     the same, folded [B, T, f^2, H/f, W/f] -> QUIVER's stages -> what they add to the estimate -> Output
 
-QUIVER needs days of training and seconds for a frame. Here blocks of f x f pixels become channels, every part is small,
-and a small U-Net over the aligned frames makes an initial estimate. The estimate alone is learnt within minutes.
-The defaults are the preset `nano`.
+QUIVER needs days of training. Here blocks of f x f pixels become channels, every part is small, and a small U-Net over
+aligned frames makes an initial estimate, which is trained within minutes. The defaults are the preset `nano`.
 """
 
 from dataclasses import dataclass
@@ -53,26 +52,26 @@ _FLOW_LAYERS = 8  # at most, of one level
 
 @dataclass(frozen=True)
 class FoldedConfig(Config):
-    """A FoldedQUIVER network: QUIVER's configuration, and the sizes that the paper fixes."""
+    """Configuration of a FoldedQUIVER network: QUIVER's own fields, and the sizes that the paper fixes."""
 
     channels: int = 4
-    deformable_groups: int = 1  # groups of channels with offsets of their own
-    deformable_kernel: int = 1  # side of the deformable convolution; nine taps were the largest single cost
-    denoiser_growth: int = 4  # channels added per dense layer of the pre-denoiser
-    denoiser_passes: int = 1  # times its one block is passed
-    flow_channels: tuple[int, ...] = (8, 8)  # widths of each flow level
+    deformable_groups: int = 1  # of channels that share offsets
+    deformable_kernel: int = 1  # side of the deformable convolution
+    denoiser_growth: int = 4  # channels that a dense layer of the pre-denoiser adds
+    denoiser_passes: int = 1  # runs of its one block
+    flow_channels: tuple[int, ...] = (8, 8)  # widths of the layers of each flow level
     flow_kernel: int = 3
     flow_levels: int = 3  # of the pyramid, at least 3
     cell_blocks: int = 1  # residual dense blocks of the recurrent cell
     attention_width: int | None = 32  # channels of the temporal attention; None = 44C
-    attention_temperature: float | None = 8.0  # start of a learnt factor on the logits; None = none
+    attention_temperature: float | None = 8.0  # initial value of a learnt factor on the logits; None = no factor
     fold: int = 2  # side of the blocks of pixels that become channels (1 = none)
     estimate_width: int = 32  # channels of the initial estimate's U-Net; 0 = no initial estimate
-    largest_velocity: float = 7.0  # px/frame, of the search that aligns the estimate's frames; 0 = not aligned
-    lecun: bool = True  # start from normal weights of variance 1/fan-in (LeCun, as the paper says) and zero biases
+    largest_velocity: float = 7.0  # px/frame, of the search that aligns the estimate's frames; 0 = no alignment
+    lecun: bool = True  # initial weights of variance 1/fan-in (LeCun, as in the paper) and biases of zero
 
     def __post_init__(self) -> None:
-        """`ValueError` for a value that no network of ours has."""
+        """Raise `ValueError` for a value out of range."""
         for name, (least, most) in _WHOLE.items():
             value = getattr(self, name)
             if value is not None or name != "attention_width":
@@ -94,24 +93,24 @@ class FoldedConfig(Config):
 
 
 class ScaledAttention(TemporalAttention):
-    """Temporal attention with a learnt factor on its logits, which without it lie in [-1, 1] and stay nearly even."""
+    """Temporal attention with a learnt factor on its logits; in [-1, 1] their softmax is nearly uniform."""
 
     def __init__(self, inputs: int, width: int, outputs: int, temperature: float) -> None:
         super().__init__(inputs, width, outputs)
         self.temperature = nn.Parameter(torch.tensor(float(temperature)))
 
     def logits(self, q: Tensor, k: Tensor) -> Tensor:
-        """Queries and keys [N, D, hw] -> scaled cosines of all pairs [N, D, D]."""
+        """Queries and keys [N, D, hw] -> scaled cosine of every pair [N, D, D]."""
         return super().logits(q, k) * self.temperature
 
 
 class FoldedQUIVER(QUIVER):
-    """QUIVER's stages in any size, on folded frames, added to an initial estimate."""
+    """QUIVER's stages with parts of any size on folded frames; their pictures are added to an initial estimate."""
 
     config: FoldedConfig
 
     def __init__(self, config: FoldedConfig | None = None) -> None:
-        nn.Module.__init__(self)  # not QUIVER's, whose parts have the published sizes
+        nn.Module.__init__(self)  # QUIVER.__init__ makes parts of the published sizes
         config = FoldedConfig() if config is None else config
         self.config = config
         self.multiple = 4 * config.fold
@@ -138,26 +137,26 @@ class FoldedQUIVER(QUIVER):
         velocity = config.largest_velocity if config.flow else 0.0
         self.estimate = InitialEstimate(config.estimate_width, velocity) if config.estimate_width else None
         if config.lecun and not self.alignment.weight.is_meta:  # nothing to draw without memory
-            _start_from_lecun(self)
+            _set_lecun_weights(self)
         if self.estimate is not None:
-            _start_from_estimate(self, self.estimate)
+            _set_initial_picture(self, self.estimate)
 
     def fold(self, frames: Tensor) -> Tensor:
-        """[..., 1, H, W] -> [..., f2, H/f, W/f]."""
+        """Fold frames [..., 1, H, W] -> [..., f2, H/f, W/f]."""
         return F.pixel_unshuffle(frames, self.config.fold) if self.config.fold > 1 else frames
 
     def unfold(self, frames: Tensor) -> Tensor:
-        """[..., f2, H/f, W/f] -> [..., 1, H, W]."""
+        """Unfold frames [..., f2, H/f, W/f] -> [..., 1, H, W]."""
         return F.pixel_shuffle(frames, self.config.fold) if self.config.fold > 1 else frames
 
     def flows(self, reference: Tensor, support: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Folded denoised frames [N, f2, h, w] -> flow [N, 2, h/s, w/s] for s = 1, 2, 4; zero in the ablation."""
+        """Folded denoised frames [N, f2, h, w] -> flow [N, 2, h/s, w/s] in folded pixels, s = 1, 2, 4."""
         return super().flows(reference.mean(1, keepdim=True), support.mean(1, keepdim=True))
 
     def forward(self, x: Tensor, estimate_only: bool = False) -> Output:
         """[B, T, 1, H, W] of codes/(2^b - 1), T >= 11, H and W multiples of `multiple`; ValueError otherwise.
 
-        With `estimate_only` scale 1 is the initial estimate, and all that comes after it is left out.
+        With `estimate_only`, scale 1 is the initial estimate, and the later stages are not computed.
         """
         check_input(x, self.multiple)
         frames, estimates = self.fold(x), None
@@ -182,14 +181,14 @@ class FoldedQUIVER(QUIVER):
         )
 
 
-def _start_from_lecun(network: FoldedQUIVER) -> None:
-    """Normal weights of variance 1/fan-in and zero biases; the alignment still starts from the flow alone.
+def _set_lecun_weights(network: FoldedQUIVER) -> None:
+    """Draw normal weights of variance 1/fan-in and set biases to zero; the alignment still starts from the flow alone.
 
-    PyTorch's own start has a third of that variance: through the products of the gated fusion, little is left of it.
+    PyTorch's defaults have a third of that variance, of which the products of the gated fusion leave little.
     """
-    own_start = set() if network.estimate is None else set(network.estimate.modules())  # PyTorch's: made of ReLU
+    kept = set() if network.estimate is None else set(network.estimate.modules())  # keeps PyTorch's, which suits ReLU
     for module in network.modules():
-        if module not in own_start and isinstance(module, nn.Conv2d | nn.Conv3d | nn.Linear):
+        if module not in kept and isinstance(module, nn.Conv2d | nn.Conv3d | nn.Linear):
             nn.init.normal_(module.weight, std=module.weight[0].numel() ** -0.5)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
@@ -199,11 +198,11 @@ def _start_from_lecun(network: FoldedQUIVER) -> None:
     nn.init.zeros_(last.weight)
 
 
-def _start_from_estimate(network: FoldedQUIVER, estimate: InitialEstimate) -> None:
-    """Let the untrained network return about the mean of the middle frames.
+def _set_initial_picture(network: FoldedQUIVER, estimate: InitialEstimate) -> None:
+    """Make the untrained network return about the mean of the middle frames.
 
-    The last layers of the pre-denoiser and of the estimate are shrunk. Those of the picture branches are zero, as are
-    the pictures handed on to the next scale: at the start the recurrent part adds nothing to the estimate.
+    The last layers of the pre-denoiser and of the estimate become small. The last layers of the picture branches become
+    zero, as do the pictures for the next scale: before training the recurrent part adds nothing to the estimate.
     """
     with torch.no_grad():
         for layer in (estimate.correction.leave, *([] if network.denoiser is None else [network.denoiser.leave])):

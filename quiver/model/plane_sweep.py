@@ -1,22 +1,26 @@
-"""Where things move, found by trying and then by slope: the path along which the frames of a window agree best.
+"""Estimates the motion in a window of noisy frames: a grid search over velocities, then gradient refinement.
+
+The path of a pixel minimises the weighted variance over time around it:
 
     path(k) = p + k v + k^2/2 a,   k = frames from the centre
     cost(v, a, p) = mean over p's surroundings of  sum_k w_k x_k(path(k))^2 - (sum_k w_k x_k(path(k)))^2
 
-the weighted variance over time, x = sqrt(code + OFFSET): without the root, whose photon noise is about the same
-everywhere, the least variance would be where there is least light. At half the size all velocities of a grid are tried,
-as plane sweeps try depths (Collins, "A space-sweep approach to true multi-image matching", CVPR 1996), and smoothed by
-a median. At full size follow, in turns, corrections by Lucas and Kanade's equations ("An iterative image registration
-technique", IJCAI 1981) for a velocity and an acceleration that all frames share:
+Here x = sqrt(code + OFFSET), which gives photon noise about the same variance everywhere. Without the root, the
+variance would be least where the light is least.
 
-    dv = -(sum_k w_k k^2   <g g'>)^-1 <g sum_k w_k k   x_k(path(k))>,   g = gradient of the aligned mean
-    da = -(sum_k w_k q_k^2 <g g'>)^-1 <g sum_k w_k q_k x_k(path(k))>,   q_k = k^2/2 - sum_k w_k k^2/2, <> = mean over
-                                                                        p's surroundings
+1. At half the size, all velocities of a grid are tried, as plane sweeps try depths (Collins, "A space-sweep approach to
+   true multi-image matching", CVPR 1996). A median smooths the result.
+2. At full size, a step of Lucas and Kanade ("An iterative image registration technique", IJCAI 1981) corrects velocity
+   and acceleration with all frames at once, g = gradient of the aligned mean, <> = mean over p's surroundings:
 
-and a look at what the neighbours found, which is taken over where it costs less (as in PatchMatch, Barnes et al., ACM
-TOG 28(3), 2009). Nothing is learnt, nothing is differentiated: photon noise that hides a pixel from its neighbour in
-time is averaged over frames and a neighbourhood before anything is decided. What is covered and uncovered is left to
-the network.
+    dv = -(sum_k w_k k^2   <g g'>)^-1 <g sum_k w_k k   x_k(path(k))>
+    da = -(sum_k w_k q_k^2 <g g'>)^-1 <g sum_k w_k q_k x_k(path(k))>,   q_k = k^2/2 - sum_k w_k k^2/2
+
+3. The path of a neighbour replaces that of a pixel where it costs less (as in PatchMatch, Barnes et al., ACM TOG 28(3),
+   2009). Steps 2 and 3 alternate.
+
+Nothing is learnt and nothing is differentiated. Averaging over frames and surroundings comes before every decision, so
+that photon noise does not decide. Occlusions are left to the network.
 """
 
 from __future__ import annotations
@@ -27,25 +31,26 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-OFFSET = 0.05  # in units of full scale: about 3/8 of a 3-bit code (Anscombe 1948), too much for more bits
+OFFSET = 0.05  # of full scale: about 3/8 of a 3-bit code (Anscombe 1948); more than that for more bits
 SIGMA = 2.0  # frames, of the weights over time
-REACH = 4  # frames from the centre that count: beyond, weights are under 0.03
-STEP = 0.5  # px/frame at half the size, of the grid of velocities
-SIDE = 7  # px at half the size, of the surroundings and of the median
-PREFERENCE = 0.02  # relative cost of 1 px/frame: where nothing tells velocities apart, things rest
-NEIGHBOURS = (8, 4)  # px, how far the neighbours are whose paths are tried, one turn after the other
-SMOOTH, EVEN = 3, 5  # px: of the mean before its gradient is taken, and of dv and da
-AROUND = (9, 15)  # px of <>, for velocity and acceleration
-MOST = (0.5, 0.2)  # px/frame, px/frame^2: of one correction
-DAMPING = (1e-4, 1e-3)  # added to <g g'>: gradients whose square is smaller are as good as none
-FLOOR = 1e-6  # added to every variance, so that this holds for frames without noise too
+REACH = 4  # frames before and after the centre; beyond, weights are below 0.03
+STEP = 0.5  # px/frame at half the size, between the velocities of the grid
+SIDE = 7  # px at half the size, of the surroundings in step 1 and of the median
+PREFERENCE = 0.02  # relative cost of 1 px/frame: of velocities with equal variance the smallest is taken
+NEIGHBOURS = (8, 4)  # px, distance of the neighbours whose paths are tried, in the first and second turn
+SMOOTH, EVEN = 3, 5  # px: smoothing of the mean before its gradient, and of dv and da
+AROUND = (9, 15)  # px: side of <> for velocity and acceleration
+MOST = (0.5, 0.2)  # px/frame, px/frame^2: largest correction of one step
+DAMPING = (1e-4, 1e-3)  # added to <g g'>: gradients with a smaller square have little effect
+FLOOR = 1e-6  # added to every variance, so that PREFERENCE also acts on frames without noise
 
 
 @torch.no_grad()
 def paths(window: Tensor, largest: float) -> tuple[Tensor, Tensor]:
-    """Frames [N, T, H, W], T odd -> velocity and acceleration [N, 2, H, W] (x, y; px/frame, px/frame^2) in the middle.
+    """Return velocity and acceleration [N, 2, H, W] (x, y; px/frame, px/frame^2) of the middle of frames [N, T, H, W].
 
-    `largest` bounds the tried components. Frame k shows at p + k v + k^2/2 a what the middle one, k = 0, shows at p.
+    T is odd. `largest` bounds the components of the grid, in px/frame. A point at p in the middle frame, k = 0, is at
+    p + k v + k^2/2 a in frame k.
     """
     middle = window.shape[1] // 2
     reach = min(REACH, middle)
@@ -61,19 +66,19 @@ def paths(window: Tensor, largest: float) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def disagreement(drawn: Tensor) -> Tensor:
-    """Aligned frames [N, T, H, W] -> the cost that is left [N, 1, H, W], at full size."""
-    return _variance(_stable(drawn.float().clamp(min=0)))
+def disagreement(moved_frames: Tensor) -> Tensor:
+    """Return the remaining variance over time [N, 1, H, W] of aligned frames [N, T, H, W]."""
+    return _variance(_stable(moved_frames.float().clamp(min=0)))
 
 
 def time_weights(length: int, device: torch.device) -> Tensor:
-    """w_k of `length` frames, [T], of sum 1."""
+    """Return the weights w_k [T] of `length` frames; their sum is 1."""
     weights = torch.exp(-0.5 * ((torch.arange(length, device=device) - length // 2) / SIGMA) ** 2)
     return weights / weights.sum()
 
 
 def aligned(window: Tensor, velocity: Tensor, acceleration: Tensor) -> Tensor:
-    """Frames [N, T, h, w] drawn to where the middle one shows the same: bilinear, clamped at the border."""
+    """Align frames [N, T, H, W] to the middle one along paths [N, 2, H, W]: bilinear, clamped at the border."""
     count, length, height, width = window.shape
     with torch.autocast(window.device.type, enabled=False):
         dtype = torch.promote_types(window.dtype, torch.float32)
@@ -90,7 +95,7 @@ def aligned(window: Tensor, velocity: Tensor, acceleration: Tensor) -> Tensor:
 
 
 def best_of_grid(frames: Tensor, weights: Tensor, largest: float) -> Tensor:
-    """The best velocity of the grid; frames are shifted by whole pixels, rows and columns apart."""
+    """Return the velocity [N, 2, h, w] of the grid that costs least; frames [N, T, h, w] are shifted by pixels."""
     count, length, height, width = frames.shape
     reach, n = length // 2, int(largest / STEP)
     shifts = [[round(k * i * STEP) for i in range(-n, n + 1)] for k in range(-reach, reach + 1)]  # [frame][velocity]
@@ -100,7 +105,7 @@ def best_of_grid(frames: Tensor, weights: Tensor, largest: float) -> Tensor:
         torch.stack([padded[:, t, :, edge + s : edge + s + width] for s in shift]) for t, shift in enumerate(shifts)
     ]
     along = (torch.arange(2 * n + 1, device=frames.device, dtype=frames.dtype) - n) * STEP
-    best, lowest = None, None  # velocity [2, N, h, w] and what it costs, of the rows so far
+    best, lowest = None, None  # velocity [2, N, h, w] and its cost, of the rows so far
     for row in range(2 * n + 1):  # vy
         total = frames.new_zeros(2 * n + 1, count, height, width)  # by vx
         squares = torch.zeros_like(total)
@@ -122,32 +127,32 @@ def best_of_grid(frames: Tensor, weights: Tensor, largest: float) -> Tensor:
 
 
 def _corrected(frames: Tensor, path: Tensor) -> Tensor:
-    """Velocity and acceleration [N, 4, H, W] after one step of Lucas and Kanade with all frames at once."""
+    """Return velocity and acceleration [N, 4, H, W] after one step of Lucas and Kanade with all frames at once."""
     weights = time_weights(frames.shape[1], frames.device)
     k = torch.arange(len(weights), device=frames.device, dtype=frames.dtype) - len(weights) // 2
-    drawn = aligned(frames, path[:, :2], path[:, 2:])
-    mean = _mean_around(_over_time(drawn, weights), SMOOTH)
+    moved_frames = aligned(frames, path[:, :2], path[:, 2:])
+    mean = _mean_around(_over_time(moved_frames, weights), SMOOTH)
     padded = F.pad(mean, (1, 1, 1, 1), mode="replicate")
     gx, gy = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2, (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
     steps = []
     for moment, side, most, damping in zip((k, k * k / 2), AROUND, MOST, DAMPING, strict=True):
         moment = moment - (weights * moment).sum()
-        slope = _over_time(drawn, weights * moment)
+        slope = _over_time(moved_frames, weights * moment)
         products = _mean_around(torch.cat([gx * gx, gx * gy, gy * gy, gx * slope, gy * slope], 1), side)
         xx, xy, yy, bx, by = products.split(1, dim=1)
         xx, yy = xx + damping, yy + damping
         solved = torch.cat([xy * by - yy * bx, xy * bx - xx * by], 1) / (xx * yy - xy * xy)
         step = solved / (weights * moment * moment).sum()
-        steps.append(step.nan_to_num().clamp(-most, most))  # NaN: of a single frame, which has no moments
+        steps.append(step.nan_to_num().clamp(-most, most))  # NaN: a single frame has no moments
     return path + _mean_around(torch.cat(steps, 1), EVEN)
 
 
 def _cheapest(frames: Tensor, path: Tensor, distance: int) -> Tensor:
-    """Of each pixel's own path and those of its neighbours left, right, above and below the one that costs least."""
+    """Return for each pixel the path [N, 4, H, W] that costs least: its own or that of one of four neighbours."""
 
     def cost(tried: Tensor) -> Tensor:
         velocity = tried[:, :2]
-        paid = PREFERENCE / 2 * torch.hypot(velocity[:, :1], velocity[:, 1:])  # a hundred times .norm's pace
+        paid = PREFERENCE / 2 * torch.hypot(velocity[:, :1], velocity[:, 1:])  # much faster than .norm
         return (_variance(aligned(frames, velocity, tried[:, 2:])) + FLOOR) * (1 + paid)
 
     best, lowest = path, cost(path)
@@ -161,19 +166,19 @@ def _cheapest(frames: Tensor, path: Tensor, distance: int) -> Tensor:
 
 
 def _variance(frames: Tensor) -> Tensor:
-    """Weighted variance over time of [N, T, H, W], averaged around each pixel: [N, 1, H, W]."""
+    """Return the weighted variance over time of [N, T, H, W], averaged around each pixel: [N, 1, H, W]."""
     weights = time_weights(frames.shape[1], frames.device)
     mean = _over_time(frames, weights)
     return _mean_around(_over_time(frames * frames, weights) - mean * mean, AROUND[0]).clamp(min=0)
 
 
 def _over_time(frames: Tensor, weights: Tensor) -> Tensor:
-    """Weighted sum over time, [N, 1, H, W]."""
+    """Return the weighted sum over time, [N, 1, H, W]."""
     return (frames * weights.view(1, -1, 1, 1)).sum(1, keepdim=True)
 
 
 def _stable(frames: Tensor) -> Tensor:
-    """Codes in units of full scale -> their roots, whose photon noise is about the same everywhere."""
+    """Return roots of codes in units of full scale, whose photon noise is about the same everywhere."""
     return (frames + OFFSET).sqrt()
 
 
@@ -182,12 +187,12 @@ def _resize(field: Tensor, size: torch.Size) -> Tensor:
 
 
 def _mean_around(image: Tensor, side: int) -> Tensor:
-    """Means over side x side pixels, of those that exist."""
+    """Return means [N, C, H, W] over side x side pixels, of those inside the image."""
     return means_at(image, side, 1)
 
 
 def means_at(image: Tensor, side: int, stride: int) -> Tensor:
-    """The same at every `stride`-th pixel."""
+    """Return the means of `_mean_around` at every `stride`-th pixel only."""
     height, width = image.shape[2:]
     before = (side - 1) // 2
     sums = F.pad(image, (before, side - 1 - before, before, side - 1 - before))
@@ -200,7 +205,7 @@ def means_at(image: Tensor, side: int, stride: int) -> Tensor:
 
 
 def _sums(values: Tensor, side: int, dim: int) -> Tensor:
-    """Sums of `side` neighbours: of 1, 2, 4, ... by doubling, and of what `side` is made of; no cancellation."""
+    """Return sums of `side` neighbours along one axis, by doubling and without cancellation."""
     length = values.shape[dim] - side + 1
     total, taken, width = None, 0, 1
     while True:
@@ -215,7 +220,7 @@ def _sums(values: Tensor, side: int, dim: int) -> Tensor:
 
 
 def _median(field: Tensor) -> Tensor:
-    """Each channel's median over SIDE x SIDE pixels."""
+    """Return the median of each channel [N, C, H, W] over SIDE x SIDE pixels."""
     flat = field.flatten(0, 1)[:, None]
     around = F.unfold(F.pad(flat, (SIDE // 2,) * 4, mode="replicate"), SIDE)
     return around.median(dim=1).values.view(field.shape)

@@ -1,4 +1,4 @@
-"""Networks by name: the presets, the ablations of the paper, and the control without motion."""
+"""Makes networks by name: the presets, the ablations of the paper, and the control."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ PRESETS: dict[str, Config] = {
     "nano": FoldedConfig(),  # small in everything; docs/results/starter.md has what it reaches
 }
 
-# Rows of the paper's ablation (its Table 4, without the pretrained flow): pre-denoiser, flow, multi-scale outputs.
+# Rows of the paper's Table 4, without that of the pretrained flow: pre-denoiser, flow, multi-scale outputs.
 ABLATIONS: dict[str, tuple[bool, bool, bool]] = {
     "none": (False, False, False),
     "denoiser+flow": (True, True, False),
@@ -28,15 +28,15 @@ ABLATIONS: dict[str, tuple[bool, bool, bool]] = {
 
 
 def assemble(config: Config) -> QUIVER:
-    """The network of a configuration, with random weights."""
+    """Return the network of a configuration, with random weights."""
     return FoldedQUIVER(config) if isinstance(config, FoldedConfig) else QUIVER(config)
 
 
 def ablated(config: Config, row: str) -> Config:
-    """The network without some of its parts, at similar capacity: the recurrent cell grows by what was taken away.
+    """Return the configuration without the parts that a row lacks, at similar capacity; ValueError for other rows.
 
-    The growth of the cell's blocks is the whole number that brings the count of parameters closest to that of
-    `config`. ValueError for an unknown row.
+    The recurrent cell is widened to keep the parameter count: the growth of its blocks is the integer that brings the
+    count closest to that of `config`.
     """
     if row not in ABLATIONS:
         raise ValueError(f"no ablation is called {row!r}; known: {', '.join(ABLATIONS)}")
@@ -52,13 +52,13 @@ def ablated(config: Config, row: str) -> Config:
 
 
 def parameter_count(config: Config) -> int:
-    """Number of learnt values, counted without allocating them."""
+    """Return the number of parameters, counted without memory for them."""
     with torch.device("meta"):
         return sum(parameter.numel() for parameter in assemble(config).parameters())
 
 
 def build(name: str) -> nn.Module:
-    """A network with random weights by preset name, or the control "unet"; ValueError names them."""
+    """Return a preset or the control "unet" with random weights; ValueError for other names."""
     if name == "unet":
         return UNet()
     if name not in PRESETS:

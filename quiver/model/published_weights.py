@@ -1,7 +1,7 @@
-"""The published QUIVER's checkpoints: their names of our entries, and their conversion to our weights files.
+"""Converts checkpoints of the published QUIVER to our networks and weights files.
 
-The published names are facts needed for compatibility (tests/data/published_state_dict.tsv). Nothing here executes
-pickled code.
+The published names are facts needed for compatibility (tests/data/published_state_dict.tsv). No pickled code is
+executed.
 """
 
 import re
@@ -15,9 +15,9 @@ from quiver.model.config import Config
 from quiver.model.quiver import QUIVER
 from quiver.model.weights import read_safetensors, read_torch, save
 
-WRAPPERS = ("state_dict", "model_state_dict", "model", "params", "net")  # keys under which trainers nest a state dict
+WRAPPERS = ("state_dict", "model_state_dict", "model", "params", "net")  # around a state dict
 
-# Our module -> published prefix, longest first where one begins another.
+# Our module: published prefix; a name that begins another one comes after it.
 PUBLISHED = {
     "denoiser.lift": "predenoise.sfe1",
     "denoiser.enter": "predenoise.sfe2",
@@ -56,7 +56,7 @@ PUBLISHED = {
     "refine4": "recons3",
     "refine": "recons12",
 }
-# Below those prefixes: patterns of our names and what they are called in the published network.
+# Below those prefixes: patterns of our names, and the published names.
 INSIDE = (
     (re.compile(r"^flow\.levels\.(\d)\."), r"spynet.basic_module.\1.basic_module."),
     (re.compile(r"^fusions\.(\d)\."), lambda match: f"alignfuse_{int(match[1]) + 1}."),
@@ -76,7 +76,7 @@ ALIAS = re.compile(r"^predenoise\.rdbs\.[1-4]\.")  # the pre-denoiser's five blo
 
 
 def published_name(name: str) -> str:
-    """The published name of one of our entries (of a network without our own extensions)."""
+    """Return the published name of an entry of QUIVER's state dict."""
     for ours, theirs in PUBLISHED.items():
         if name == ours or name.startswith(ours + "."):
             name = theirs + name[len(ours) :]
@@ -87,10 +87,10 @@ def published_name(name: str) -> str:
 
 
 def from_published(state: Mapping[str, Tensor]) -> QUIVER:
-    """The network with the 335 entries of a published state dict; the width is read from it.
+    """Return the network with the 335 entries of a published state dict, whose shapes determine the width.
 
-    Aliases may be present or not, but must equal the block they repeat. Raises ValueError for anything else: missing,
-    unknown or misshapen entries, values that are not finite, other flow constants than the published ones.
+    Aliases may be missing, but must equal the block that they repeat. ValueError for anything else: entries that are
+    missing, unknown or of another shape, values that are not finite, flow constants that are not the published ones.
     """
     first = state.get("predenoise.sfe1.weight")
     if not isinstance(first, Tensor) or first.ndim != 4 or first.shape[0] % 16 or not first.shape[0]:
@@ -149,9 +149,9 @@ def _check_constant(name: str, value: Tensor) -> None:
 
 
 def convert_weights(source: Path, target: Path) -> QUIVER:
-    """Turn a published checkpoint (.pt, .pth, .ckpt, .safetensors) into our file; returns the network written.
+    """Convert a published checkpoint (.pt, .pth, .ckpt, .safetensors) to our file, and return the network.
 
-    Raises ValueError for anything that is no such checkpoint and FileExistsError where `target` exists.
+    ValueError for any other content, FileExistsError if `target` exists.
     """
     if target.exists():
         raise FileExistsError(f"{target} exists; choose another name or remove it")

@@ -1,9 +1,9 @@
-"""QUIVER (Chennuri et al., ECCV 2024): eleven few-bit frames in, the restored centre frame out.
+"""Defines QUIVER (Chennuri et al., ECCV 2024): eleven few-bit frames in, the restored centre frame out.
 
     codes/(2^b - 1) [B, T, 1, H, W] -> denoised frames, flows, aligned and fused features, recurrent fusion,
     temporal attention, refinement from 1/4 to full scale -> Output
 
-This is the published network to the last digit (tests/quiver/model/test_golden.py). FoldedQUIVER is our smaller one.
+Every stage agrees with the published network (tests/quiver/model/test_golden.py). FoldedQUIVER is our smaller one.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,23 +29,23 @@ from quiver.model.blocks import (
 )
 from quiver.model.config import GROUPS, Config
 
-CHUNK_PIXELS = 2**16  # without gradients, frames are taken together up to this many pixels
+CHUNK_PIXELS = 2**16  # without gradients, frames are computed together up to this many pixels
 
 Pair = tuple[Tensor, Tensor]  # of the previous and the current frame
 Encoded = tuple[Tensor, Tensor, Tensor]  # R1, R2 and the recurrent cell's entry
 
 
 class QUIVER(nn.Module):
-    """The network; stages are methods, so that a caller may compute each frame's share once (schedules.py)."""
+    """The published network. Its stages are methods, so that schedules.py can compute the share of a frame once."""
 
     config: Config
     denoiser: PreDenoiser | None
     flow: FlowNetwork | None
     multiple: int = 4  # height and width must be multiples of this; callers pad
-    stride: int = 16  # px: frames shifted by multiples of this are computed alike
+    stride: int = 16  # px: a shift of the frame by a multiple of this moves the coarsest flow by complete pixels
 
     def __init__(self, config: Config | int | None = None, *, channels: int | None = None) -> None:
-        """The network of a configuration, or the published one of so many channels; 64 by default."""
+        """Make the network of a configuration, or the published one with so many channels; 64 by default."""
         super().__init__()
         if channels is not None and config is not None:
             raise ValueError("QUIVER takes a configuration or a number of channels, got both")
@@ -67,12 +67,12 @@ class QUIVER(nn.Module):
         self.refine = Refinement(1, c)
 
     def forward(self, x: Tensor) -> Output:
-        """[B, T, 1, H, W] of codes/(2^b - 1), T >= 11, H and W multiples of `multiple`; ValueError otherwise."""
+        """[B, T, 1, H, W] of codes/(2^b - 1), T >= 11, H and W multiples of 4; ValueError otherwise."""
         check_input(x, self.multiple)
         return self.restored(x)
 
     def restored(self, frames: Tensor) -> Output:
-        """The same without the check, [B, T, N, H, W] in and out; here N = 1."""
+        """Run all stages on frames [B, T, 1, H, W], unchecked; in FoldedQUIVER on folded frames [B, T, f2, h, w]."""
         denoised = _per_frame(self.denoise, frames)[0]
         flows = _per_frame(self.flows, denoised[:, 1:], denoised[:, :-1])
         r1, r2, entries = self._encode(frames, denoised, flows)
@@ -91,25 +91,25 @@ class QUIVER(nn.Module):
     # Stages
 
     def denoise(self, frames: Tensor) -> Tensor:
-        """Frames [N, 1, h, w] -> the same, each denoised on its own."""
+        """Frames [N, 1, h, w] -> the same shape, each frame denoised alone."""
         return frames if self.denoiser is None else self.denoiser(frames)
 
     def flows(self, reference: Tensor, support: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Denoised frames [N, 1, h, w] -> flow [N, 2, h/s, w/s] for s = 1, 2, 4; zero in the ablation."""
+        """Denoised frames [N, 1, h, w] -> flow [N, 2, h/s, w/s] in pixels, s = 1, 2, 4; zero in the ablation."""
         if self.flow is None:
             count, _, height, width = reference.shape
             return tuple(reference.new_zeros(count, 2, height // s, width // s) for s in (1, 2, 4))  # type: ignore[return-value]
         return self.flow(reference, support)
 
     def fuse(self, noisy: Sequence[Pair], denoised: Sequence[Pair], flows: Sequence[Tensor]) -> list[Tensor]:
-        """(previous, current) features of both streams and flows, per scale -> fused features [N, C, h/s, w/s]."""
+        """Per scale: (previous, current) features of both streams and a flow -> fused features [N, C, h/s, w/s]."""
         return [
             fusion(self.alignment(*of_denoised, flow), self.alignment(*of_noisy, flow))
             for fusion, of_denoised, of_noisy, flow in zip(self.fusions, denoised, noisy, flows, strict=True)
         ]
 
     def encode_first(self, images: Sequence[Tensor]) -> Encoded:
-        """The first frame of a window, [N, 1, h/s, w/s] per scale: its aligned features are zero by definition."""
+        """Encode the first frame of a window, [N, 1, h/s, w/s] per scale; its aligned features are zero."""
         c = self.config.channels
         zero = [image.new_zeros(image.shape[0], c, *image.shape[2:]) for image in images]
         return self.cell.encode(images, [fusion(z, z) for fusion, z in zip(self.fusions, zero, strict=True)])
@@ -117,16 +117,16 @@ class QUIVER(nn.Module):
     def encode_next(
         self, images: Sequence[Tensor], noisy: Sequence[Pair], denoised: Sequence[Pair], flows: Sequence[Tensor]
     ) -> Encoded:
-        """A later frame: images, (previous, current) features of both streams and flows, each at three scales."""
+        """Encode a later frame: images, (previous, current) features of both streams and flows, at three scales."""
         return self.cell.encode(images, self.fuse(noisy, denoised, flows))
 
     def restore(self, window: Sequence[Tensor], r1: Tensor, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """R4 of eleven frames, R1 and R2 of their centre -> pictures at scales 1, 2, 4."""
+        """R4 of eleven frames, R1 and R2 of their centre -> pictures [N, 1, h/s, w/s] at scales 1, 2, 4."""
         attended = self.attention(window)
         nothing = attended.new_zeros(attended.shape[0], self.refine4.image, *attended.shape[2:])
         picture4, g = self.refine4(attended, torch.zeros_like(attended), nothing)
         picture2, g = self.refine(r2, *self._onward(self.refine4, g, picture4))
-        picture1, _ = self.refine(r1, *self._onward(self.refine, g, picture2))  # its hidden branch leads nowhere
+        picture1, _ = self.refine(r1, *self._onward(self.refine, g, picture2))  # its hidden branch is not used
         return picture1, picture2, picture4
 
     def _onward(self, refinement: Refinement, g: Tensor, picture: Tensor) -> tuple[Tensor, Tensor]:
@@ -134,13 +134,13 @@ class QUIVER(nn.Module):
         return hidden, up if self.config.multi_scale else torch.zeros_like(up)
 
     def first_state(self, entry: Tensor) -> Tensor:
-        """The zero state [N, 2C, h/4, w/4] before the first frame."""
+        """Return the zero state [N, 2C, h/4, w/4] that precedes the first frame."""
         return entry.new_zeros(entry.shape[0], 2 * self.config.channels, *entry.shape[2:])
 
     def _encode(
         self, frames: Tensor, denoised: Tensor, flows: Sequence[Tensor]
     ) -> tuple[dict[int, Tensor], dict[int, Tensor], list[Tensor]]:
-        """R1 and R2 of the centre frames (by index) and the recurrent cell's entries of all frames."""
+        """Return R1 and R2 of the centre frames by index, and the recurrent cell's entries of all frames."""
         length, (height, width) = frames.shape[1], frames.shape[3:]
         images = (frames, *(resize(frames, height // k, width // k) for k in (2, 4)))
         noisy = _per_frame(self.noisy_features, neighbourhoods(frames))
@@ -163,7 +163,7 @@ class QUIVER(nn.Module):
         return r1, r2, entries
 
     def recur(self, entries: Sequence[Tensor]) -> list[Tensor]:
-        """R4 of every frame in time order; the state after the last frame is not computed."""
+        """Entries [N, 6C, h, w] in time order -> R4 [N, 4C, h, w] of every frame; the last state is not computed."""
         state, results = self.first_state(entries[0]), []
         for t, entry in enumerate(entries):
             results.append(self.cell.step(entry, state))
@@ -177,7 +177,7 @@ def _flat(stack: Tensor) -> Tensor:
 
 
 def _per_frame(stage: Callable[..., Tensor | tuple[Tensor, ...]], *stacks: Tensor) -> list[Tensor]:
-    """Apply a stage of [N, ...] tensors to [B, T, ...] stacks; without gradients a few frames at a time."""
+    """Apply a stage on [N, ...] tensors to [B, T, ...] stacks; without gradients a few frames at a time."""
     collected: list[list[Tensor]] = []
     for part in _parts(stacks[0].shape[1], stacks[0]):
         results = stage(*(_flat(stack[:, part]) for stack in stacks))
@@ -187,7 +187,7 @@ def _per_frame(stage: Callable[..., Tensor | tuple[Tensor, ...]], *stacks: Tenso
 
 
 def _parts(length: int, frames: Tensor) -> list[slice]:
-    """Slices of time: everything with gradients, else as many frames as CHUNK_PIXELS allow, at least one."""
+    """Return slices of time: one with gradients; otherwise of as many frames as CHUNK_PIXELS allow, at least one."""
     pixels = frames.shape[0] * frames.shape[-2] * frames.shape[-1]
     step = length if torch.is_grad_enabled() else max(1, CHUNK_PIXELS // pixels)
     return [slice(start, start + step) for start in range(0, length, step)]

@@ -1,14 +1,14 @@
-"""Restoring a video without doing the same work for every window.
+"""Restores a video frame by frame, by three schedules that share more or less work between windows.
 
-Three schedules, all in memory that does not grow with the clip:
+All of them need memory that does not grow with the clip.
 
-`windows` every window from scratch, as published; for any network.
-`exact`   the numbers of windows recomputed from scratch. Pre-denoised frames and flows are computed once. So are the
-          fused features and R1, R2 of the frames at window positions 3 to 8, where the 5-frame extractors do not
-          reach beyond the window. Positions 0, 1, 2, 9, 10 see zeros there, so each window computes its own; and the
-          recurrent state starts at zero in each window.
-`stream`  one pass over the clip: the state is carried on and each frame is encoded once. Not the same numbers: the
-          zeros beyond the window and the zero state then occur at the ends of the clip only.
+`windows` Every window is computed from its eleven frames alone, as published; for any network.
+`exact`   The same numbers. Pre-denoised frames and flows are computed once. So are the fused features and R1, R2 of the
+          frames at window positions 3 to 8, where the 5-frame extractors do not reach beyond the window. At positions
+          0, 1, 2, 9, 10 they reach zeros beyond it, so each window computes these itself. The recurrent state starts
+          at zero in each window.
+`stream`  One pass over the clip: the state is kept, and each frame is encoded once. The numbers differ, because zeros
+          beyond the window and the zero state then occur only at the ends of the clip.
 """
 
 from collections import deque
@@ -23,12 +23,12 @@ from quiver.model.blocks import NEIGHBOURS, RADIUS, WINDOW, resize
 from quiver.model.folded import FoldedQUIVER
 from quiver.model.quiver import QUIVER, Encoded
 
-REACH = NEIGHBOURS // 2  # frames the extractors see before and after
+REACH = NEIGHBOURS // 2  # frames before and after that an extractor takes
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What a frame contributes wherever it stands in a window."""
+    """Results of one frame that do not depend on its position in a window, each [B, 1 or 2, h, w]."""
 
     images: tuple[Tensor, ...]  # at scales 1, 2, 4
     denoised: Tensor
@@ -37,26 +37,26 @@ class Frame:
 
 @dataclass(frozen=True)
 class Features:
-    """Extractor outputs of a frame at scales 1, 2, 4; they depend on the frames around it."""
+    """Features [B, C, h/s, w/s] of a frame at scales s = 1, 2, 4; they depend on the frames around it."""
 
     noisy: tuple[Tensor, ...]
     denoised: tuple[Tensor, ...]
 
 
 def exact(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
-    """Frames [B, 1, H, W] one by one -> restored frames 5 .. T-6 [B, 1, H, W], equal to windows from scratch."""
+    """Yield restored frames 5 .. T-6 of frames [B, 1, H, W], equal to those of `windows`."""
     return _restored(network, _exact, frames)
 
 
 def stream(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
-    """Frames [B, 1, H, W] one by one -> restored frames 5 .. T-6 [B, 1, H, W]; each seven frames late."""
+    """Yield restored frames 5 .. T-6 of frames [B, 1, H, W], each after seven more frames, in one pass."""
     return _restored(network, _stream, frames)
 
 
 def _restored(
     network: QUIVER, schedule: Callable[[QUIVER, Iterable[Tensor]], Iterator[Tensor]], frames: Iterable[Tensor]
 ) -> Iterator[Tensor]:
-    """The pictures of a schedule; where the network folds frames, the schedule sees folded ones."""
+    """Yield the pictures of a schedule; for a FoldedQUIVER the schedule runs on folded frames."""
     if not isinstance(network, FoldedQUIVER):
         yield from schedule(network, frames)
         return
@@ -114,7 +114,7 @@ def _exact(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
 
 
 def windows(network: nn.Module, frames: Iterable[Tensor]) -> Iterator[Tensor]:
-    """Frames [B, 1, H, W] one by one -> restored frames 5 .. T-6 [B, 1, H, W]; nothing is shared between windows."""
+    """Yield restored frames 5 .. T-6 of frames [B, 1, H, W]; windows share no work."""
     window: deque[Tensor] = deque(maxlen=WINDOW)
     for frame in frames:
         window.append(frame)
@@ -123,7 +123,7 @@ def windows(network: nn.Module, frames: Iterable[Tensor]) -> Iterator[Tensor]:
 
 
 def _prepare(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Frame]:
-    """Resize, pre-denoise, and find the flow into the frame before."""
+    """Yield each frame resized and pre-denoised, with the flow into the frame before."""
     before: Tensor | None = None
     for image in frames:
         denoised = network.denoise(image)
@@ -134,13 +134,13 @@ def _prepare(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Frame]:
 
 
 def _then_nothing(frames: Iterator[Frame]) -> Iterator[Frame | None]:
-    """The frames, then as many empty places as the extractors look ahead."""
+    """Yield the frames, then as many empty places as an extractor reaches ahead."""
     yield from frames
     yield from [None] * REACH
 
 
 def _extract(network: QUIVER, places: Iterable[Frame | None]) -> Features:
-    """Features of the middle of five places; None is beyond the window and counts as zeros."""
+    """Return the features of the middle of five places; None is beyond the window and counts as zeros."""
     five = list(places)
     like = next(frame for frame in five if frame is not None).denoised
     nothing = torch.zeros_like(like)
@@ -150,7 +150,7 @@ def _extract(network: QUIVER, places: Iterable[Frame | None]) -> Features:
 
 
 def _encode(network: QUIVER, frame: Frame, before: Features | None, now: Features) -> Encoded:
-    """R1, R2 and the cell's entry of a frame; `before` is None for the first of its window."""
+    """Return R1, R2 and the cell's entry of a frame; `before` is None for the first frame of its window."""
     if before is None:
         return network.encode_first(frame.images)
     assert frame.flows is not None
@@ -160,7 +160,7 @@ def _encode(network: QUIVER, frame: Frame, before: Features | None, now: Feature
 
 
 def _edges(network: QUIVER, window: Sequence[Frame], inside: Sequence[Features]) -> tuple[list[Tensor], list[Tensor]]:
-    """Entries of window positions 0, 1, 2 and 9, 10, where the extractors see zeros or their neighbours do."""
+    """Return the entries of window positions 0, 1, 2 and of 9, 10, which depend on zeros beyond the window."""
     outside: list[Frame | None] = [None] * REACH
     padded = [*outside, *window, *outside]
     at = {p: _extract(network, padded[p : p + NEIGHBOURS]) for p in (0, 1, WINDOW - 2, WINDOW - 1)}

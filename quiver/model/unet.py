@@ -1,6 +1,6 @@
-"""A plain U-Net over the stacked frames of a window: the control that every learned method is measured against.
+"""Defines a U-Net over the stacked frames of a window: the control for every learned method.
 
-Eleven codes enter as channels, the centre frame leaves; nothing knows about motion, time or noise.
+The eleven frames are channels of one image. The network has no part for motion, time or noise.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from quiver.model.config import whole_number
 
 @dataclass(frozen=True)
 class UNetConfig:
-    """Three scales with widths w, 2w, 4w; w = 32 gives 0.91 million parameters."""
+    """Configuration of a U-Net: three scales with widths w, 2w, 4w; w = 32 gives 0.91 million parameters."""
 
     width: int = 32
 
@@ -26,19 +26,19 @@ class UNetConfig:
         whole_number("UNetConfig.width", self.width, 1, 1024)
 
     def to_dict(self) -> dict[str, object]:
-        """Plain values, for JSON."""
+        """Return plain values for JSON."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict[str, object]) -> "UNetConfig":
-        """Inverse of `to_dict`; ValueError for anything but a width."""
+        """Return the configuration of such values; ValueError for anything but a width."""
         return make(cls, values, "UNet")
 
 
 class SmallUNet(nn.Module):
     """Convolutions at full, half and quarter scale, each joined to the next finer one (Ronneberger et al. 2015)."""
 
-    REACH = 36  # px: how far away a pixel of the input can be that an output depends on
+    REACH = 36  # px: an output pixel depends on no input farther away
     MULTIPLE = 4  # of height and width
 
     def __init__(self, inputs: int, width: int) -> None:
@@ -63,10 +63,10 @@ class SmallUNet(nn.Module):
 
 
 class UNet(nn.Module):
-    """The same call as QUIVER; its output has scale 1 only."""
+    """The control; it is called like QUIVER, and its output has scale 1 only."""
 
     multiple = SmallUNet.MULTIPLE
-    reach = SmallUNet.REACH  # px: what is farther away does not change a pixel
+    reach = SmallUNet.REACH  # px: a pixel depends on no input farther away
 
     def __init__(self, config: UNetConfig | None = None) -> None:
         super().__init__()
@@ -74,12 +74,12 @@ class UNet(nn.Module):
         self.body = SmallUNet(WINDOW, self.config.width)
 
     def forward(self, x: Tensor) -> Output:
-        """[B, T, 1, H, W] with T >= 11 -> Output for the frames 5 .. T-6; ValueError as for QUIVER."""
+        """[B, T, 1, H, W] with T >= 11 -> Output of the frames 5 .. T-6; ValueError as in QUIVER."""
         check_input(x, self.multiple)
         windows = [self.body(x[:, t : t + WINDOW, 0]) for t in range(x.shape[1] - WINDOW + 1)]
         return Output(None, torch.stack(windows, dim=1), None, None)
 
 
 def _relu_chain(widths: Sequence[int]) -> list[nn.Module]:
-    """conv3, ReLU, ..., conv3, ReLU through the given widths."""
+    """Return the layers conv3, ReLU, ..., conv3, ReLU of the given widths."""
     return [layer for inputs, outputs in pairwise(widths) for layer in (conv(inputs, outputs, 3), nn.ReLU())]

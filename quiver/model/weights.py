@@ -1,7 +1,6 @@
-"""Weights in and out: our safetensors files, also those of earlier versions.
+"""Writes and reads weights as safetensors files, also those of earlier versions.
 
-Nothing here executes pickled code: our files are safetensors, and other checkpoints are read by torch with
-`weights_only=True`.
+No pickled code is executed: our files are safetensors, and torch reads other checkpoints with `weights_only=True`.
 """
 
 import json
@@ -26,12 +25,13 @@ from quiver.model.unet import UNet, UNetConfig
 
 FORMAT = "quiver-1"  # value of the metadata key "format" in our files
 MAX_CONFIG = 10_000  # characters of a configuration
-MAX_REASON = 300  # characters of torch's that are shown
-DAMAGE = (  # what torch raises for files that hold something else
+MAX_REASON = 300  # characters of an error of torch that are shown
+DAMAGE = (  # errors that torch raises for damaged files and other content
     *(RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError, OverflowError, MemoryError),
     *(RecursionError, pickle.UnpicklingError, zipfile.BadZipFile, NotImplementedError, AssertionError),
 )
-# Earlier versions had one configuration for QUIVER and FoldedQUIVER: fields beside Config's, with their defaults.
+# Earlier versions had one configuration for QUIVER and FoldedQUIVER: its fields beside those of Config, and their
+# defaults, which are the published sizes.
 EARLIER: dict[str, object] = {
     "deformable_groups": 16,
     "deformable_kernel": 3,
@@ -48,20 +48,21 @@ EARLIER: dict[str, object] = {
     "sweep": 0.0,
     "lecun": False,
 }
-RENAMED = {"baseline": "estimate_width", "sweep": "largest_velocity"}  # of them, in FoldedConfig
-RENAMED_PARTS = {"baseline": "estimate", "hourglass": "body"}  # parts of FoldedQUIVER and UNet in earlier versions
+RENAMED = {"baseline": "estimate_width", "sweep": "largest_velocity"}  # earlier field: field of FoldedConfig
+RENAMED_PARTS = {"baseline": "estimate", "hourglass": "body"}  # earlier part of a network: part today
 
 
 def current_names(state: Mapping[str, Any]) -> dict[str, Any]:
-    """A state dict under the names of today, from this version or an earlier one."""
+    """Return the state dict of this version or an earlier one under the names of this version."""
     parts = (name.partition(".") for name in state)
     return {RENAMED_PARTS.get(a, a) + dot + b: value for (a, dot, b), value in zip(parts, state.values(), strict=True)}
 
 
 def read_torch(path: Path, device: torch.device | str = "cpu") -> Any:
-    """Tensors and plain values of a file of torch, nothing executed; ValueError with a short reason for any other file.
+    """Return the tensors and plain values of a torch file; ValueError with a short reason for any other file.
 
-    A zip whose parts are said to be larger than the file is refused unread: torch does not compress.
+    Nothing in the file is executed. A zip whose parts claim more bytes than the file has is refused before it is
+    read, because torch does not compress.
     """
     try:
         if zipfile.is_zipfile(path):
@@ -70,20 +71,20 @@ def read_torch(path: Path, device: torch.device | str = "cpu") -> Any:
             if told > path.stat().st_size:
                 raise ValueError(f"parts of {told} bytes in a file of {path.stat().st_size}")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # about pickle dialects that end as the error below
+            warnings.simplefilter("ignore", UserWarning)  # about pickle dialects, which end in the error below
             return torch.load(path, map_location=device, weights_only=True)
     except DAMAGE as error:
         raise ValueError(short_reason(error)) from None
 
 
 def short_reason(error: BaseException) -> str:
-    """The first line of torch's explanation, at most MAX_REASON characters."""
+    """Return the first line of an error of torch, at most MAX_REASON characters."""
     lines = str(error).strip().splitlines()
     return lines[0][:MAX_REASON] if lines else type(error).__name__
 
 
 def save(network: nn.Module, config: Config | UNetConfig, path: Path, notes: Mapping[str, str] | None = None) -> None:
-    """Write weights and configuration as safetensors, whole or not at all; `notes` become metadata."""
+    """Write weights and configuration as safetensors, atomically; `notes` become metadata."""
     if path.suffix != ".safetensors":
         raise ValueError(f"weights are written as .safetensors, got {path.name}")
     metadata = {
@@ -97,10 +98,10 @@ def save(network: nn.Module, config: Config | UNetConfig, path: Path, notes: Map
 
 
 def load(path: Path) -> QUIVER | UNet:
-    """The network stored by `save`, on the CPU, in evaluation mode; ValueError for any other file.
+    """Return the network stored by `save`, on the CPU, in evaluation mode; ValueError for any other file.
 
-    Layers are made without memory, from a configuration whose numbers are bounded (config.py): what a file can ask for
-    is about its own size.
+    Layers are made without memory, from a configuration whose numbers are bounded. A file therefore costs about as much
+    memory as its size.
     """
     tensors, metadata = read_safetensors(path)
     if metadata.get("format") != FORMAT:
@@ -123,12 +124,12 @@ def load(path: Path) -> QUIVER | UNet:
 
 
 def metadata_of(path: Path) -> dict[str, str]:
-    """The notes of a safetensors file; FileNotFoundError or ValueError for any other file."""
+    """Return the notes of a safetensors file; FileNotFoundError or ValueError for any other file."""
     return read_safetensors(path)[1]
 
 
 def annotate(path: Path, notes: Mapping[str, str]) -> None:
-    """Add notes to a weights file of ours; its tensors stay the same, bit for bit."""
+    """Add notes to a weights file of ours; its tensors do not change."""
     tensors, metadata = read_safetensors(path)
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path}: not weights of this program (no format {FORMAT!r}); see `quiver convert-weights`")
@@ -146,7 +147,7 @@ def _build(kind: str, values: dict[str, object]) -> QUIVER | UNet:
 
 
 def _config_of(values: dict[str, object]) -> Config:
-    """The configuration of a QUIVER of this version or an earlier one, which may be a FoldedQUIVER today."""
+    """Return the configuration of a QUIVER file; of an earlier version it may describe a FoldedQUIVER."""
     if not isinstance(values, dict):
         raise ValueError("the configuration is not a table of values")
     published = {name: value for name, value in values.items() if name not in EARLIER}
@@ -157,6 +158,7 @@ def _config_of(values: dict[str, object]) -> Config:
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Return tensors and metadata; FileNotFoundError or ValueError for any other file."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such weights file")
     try:

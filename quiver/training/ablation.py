@@ -1,9 +1,8 @@
-"""The paper's ablation: the network without some of its parts, at similar capacity, as one command and one table.
+"""Repeats the paper's ablation: trains six networks of similar capacity without some parts, and compares them.
 
-for each of six combinations of pre-denoiser, flow and multi-scale outputs: train, then score on held-out clips
+    for each of six combinations of pre-denoiser, flow and multi-scale outputs: train, then score on held-out clips
 
-`nano` is taken without its initial estimate, which makes a picture from aligned frames before any of these parts acts
-and would hide what they do.
+`nano` is trained without its initial estimate, whose picture from aligned frames would hide the effect of these parts.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ HEADER = ("pre-denoiser", "flow", "multi-scale", "parameters", "PSNR matched", "
 
 
 def networks(preset: str) -> dict[str, Config]:
-    """The six by name; ValueError if the preset has no ablation."""
+    """Return the six configurations by name; ValueError if the preset has no ablation."""
     if preset not in PRESETS:
         raise ValueError(f"no ablation of {preset!r}; there is one of {', '.join(PRESETS)}")
     whole = PRESETS[preset]
@@ -40,9 +39,9 @@ def networks(preset: str) -> dict[str, Config]:
 
 
 def one_noise(settings: Settings) -> tuple[Settings, list[str]]:
-    """The settings with the noise that all six share, that of the first one where it has begun; and lines that say it.
+    """Return the settings with the noise of all six networks, and lines about it.
 
-    ValueError as for `run.settled`.
+    If the first network has been begun, its noise is kept. ValueError as in `settled`.
     """
     found, lines = settled(replace(settings, out=str(Path(settings.out) / next(iter(ABLATIONS)))))
     return replace(settings, noise=found.noise), lines
@@ -56,9 +55,9 @@ def run_ablation(
     should_stop: Callable[[], bool] = lambda: False,
     progress: bool = True,
 ) -> tuple[list[Restorer], list[ComparisonRow]] | None:
-    """Train every combination in OUT/NAME (finished ones are kept) and score them in OUT/table.
+    """Train every combination in OUT/NAME (finished ones are kept), score them in OUT/table, and return the scores.
 
-    None if `should_stop` ended it; the same call goes on. ValueError if the preset has no ablation.
+    None if `should_stop` ended it; the same call resumes it. ValueError if the preset has no ablation.
     """
     out = Path(settings.out)
     out.mkdir(parents=True, exist_ok=True)
@@ -82,7 +81,7 @@ def _run_ablation(
 
 
 def markdown(preset: str, rows: Sequence[ComparisonRow]) -> str:
-    """The paper's table: what is built in, parameters, PSNR after the best factor and SSIM."""
+    """Return the paper's table: parts, parameters, PSNR after the best factor, and SSIM."""
     lines = []
     for name, config in networks(preset).items():
         scores = [row.score for row in rows if row.method == name and row.score is not None]

@@ -1,10 +1,10 @@
-"""One training loop for every learned method: the model is an argument.
+"""Trains a network: one loop for all of them, resumable at every step.
 
-    windows (fresh noise) -> model -> loss -> Adam or Muon; now and then: validation, checkpoint, TensorBoard
+    windows (new noise) -> model -> loss -> Adam or Muon; at intervals: validation, checkpoint, TensorBoard
 
-Sample numbers count on from step to step and from process to process, so a run that was killed and started again draws
-what it would have drawn, and ends with the weights of an uninterrupted one. NaN or Inf stop it with the step and the
-samples at fault. Under `torchrun` every process draws its own share.
+Samples are numbered across steps and processes. A run that was killed and resumed therefore draws the same samples, and
+ends with the same weights, as one without interruption. NaN or Inf stop the run; the message names the step and the
+samples. Under `torchrun` every process draws its share of a batch.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from quiver.training.schedule import State, learning_rate, note_plateau, share_u
 from quiver.training.settings import Settings, settled
 
 CHECKPOINT_SECONDS = 120.0
-FOREVER = 10**9  # steps of a run that is limited by time
-VALIDATION_SIDE = 128  # px, at most
+FOREVER = 10**9  # steps of a run that only time limits
+VALIDATION_SIDE = 128  # px, of the validation windows at most
 
 
 class Diverged(RuntimeError):
-    """The loss or a gradient became NaN or Inf; the message names the step, the samples and the saved state."""
+    """The loss or a gradient is NaN or Inf; the message names the step, the samples and the saved state."""
 
 
 @dataclass(frozen=True)
 class Process:
-    """This process among those of torchrun, and its device."""
+    """Rank and device of this process among those of torchrun."""
 
     rank: int
     world: int
@@ -55,23 +55,23 @@ class Process:
 
     @property
     def leads(self) -> bool:
-        """Whether this process writes files and shows progress."""
+        """Return whether this process writes files and shows progress."""
         return self.rank == 0
 
     def wait(self) -> None:
-        """Until all processes are here."""
+        """Wait for all processes."""
         if self.world > 1:
             torch.distributed.barrier()
 
     def from_leader(self, number: int) -> int:
-        """The leader's number, in every process."""
+        """Return the leader's number in every process."""
         value = torch.tensor(number, device=self.device)
         if self.world > 1:
             torch.distributed.broadcast(value, 0)
         return int(value)
 
     def any(self, condition: bool) -> bool:
-        """Whether the condition holds in any process: all go on, or none does."""
+        """Return in every process whether the condition holds in any of them."""
         flag = torch.tensor(float(condition), device=self.device)
         if self.world > 1:
             torch.distributed.all_reduce(flag, torch.distributed.ReduceOp.MAX)
@@ -80,7 +80,7 @@ class Process:
 
 @contextlib.contextmanager
 def joined(device: str) -> Iterator[Process]:
-    """Join the other processes if torchrun started us, and leave them at the end."""
+    """Join the process group if torchrun started this process, and leave it at the end."""
     rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     place = torch.device(device, int(os.environ.get("LOCAL_RANK", 0))) if device == "cuda" else torch.device(device)
     if world > 1:
@@ -93,7 +93,7 @@ def joined(device: str) -> Iterator[Process]:
 
 
 def make_windows(settings: Settings, multiple: int) -> tuple[Windows, Subset[dict[str, Any]]]:
-    """Training and fixed validation windows; without validation clips the training clips serve, with a warning."""
+    """Return training and fixed validation windows; without validation clips the training clips, with a warning."""
     if settings.crop % multiple:
         raise ValueError(f"--crop {settings.crop}: this network needs a multiple of {multiple}")
     window = WindowSettings(
@@ -120,7 +120,7 @@ def make_windows(settings: Settings, multiple: int) -> tuple[Windows, Subset[dic
 
 
 def batches(windows: Windows, settings: Settings, state: State, process: Process) -> Iterator[dict[str, Any]]:
-    """Batch after batch from the present step on, drawn in this process or in workers: the same bytes."""
+    """Return the batches from the current step on; workers draw the same bytes as this process."""
     last = state.step if state.finished else settings.steps or FOREVER
     numbers = Batches(settings.batch, state.step, last, process.rank, process.world)
     loader = DataLoader(
@@ -128,7 +128,7 @@ def batches(windows: Windows, settings: Settings, state: State, process: Process
         batch_sampler=numbers,
         num_workers=settings.workers,
         multiprocessing_context="spawn" if settings.workers else None,
-        generator=torch.Generator(),  # its own: the loader must not move the model's random state
+        generator=torch.Generator(),  # separate: the loader must not change the global random state
         pin_memory=process.device.type == "cuda",
     )
     return iter(loader)
@@ -136,7 +136,7 @@ def batches(windows: Windows, settings: Settings, state: State, process: Process
 
 @torch.no_grad()
 def validate(model: nn.Module, windows: Subset[dict[str, Any]], device: torch.device) -> tuple[metrics.Score, Tensor]:
-    """Mean score of the restored centre frames; and codes, output, target of the first window side by side."""
+    """Return the mean score, and codes, output and target of the first window side by side [h, 3w]."""
     model.eval()
     scores: list[metrics.Score] = []
     picture = torch.zeros(1, 1)
@@ -145,7 +145,7 @@ def validate(model: nn.Module, windows: Subset[dict[str, Any]], device: torch.de
         output = model(sample["codes"][None].to(device)).scale1[0, :, 0].float().cpu()
         target = sample["target"][RADIUS : RADIUS + len(output), 0]
         if not bool(torch.isfinite(output).all()):
-            output = torch.zeros_like(output)  # scored as black; the next training step says why
+            output = torch.zeros_like(output)  # scored as black; the next training step reports the cause
         unit = float(sample["white"]) / float(sample["peak"])  # scores have one peak for every sensor
         scores.append(metrics.score(output.numpy() * unit, target.numpy() * unit))
         if i == 0:
@@ -155,7 +155,7 @@ def validate(model: nn.Module, windows: Subset[dict[str, Any]], device: torch.de
 
 
 class Board:
-    """TensorBoard scalars and pictures, and the progress bar: what a person watches."""
+    """Progress bar, and TensorBoard's scalars and pictures."""
 
     def __init__(self, folder: Path, settings: Settings, state: State, show: bool) -> None:
         from torch.utils.tensorboard import SummaryWriter
@@ -184,7 +184,7 @@ class Board:
 
 
 class Trainer:
-    """A model in training: steps, validations when they are due, and checkpoints."""
+    """Training of one model: steps, validations when they are due, and checkpoints."""
 
     def __init__(self, model: nn.Module, run: Run, fixed: Subset[dict[str, Any]], process: Process) -> None:
         settings = run.settings
@@ -199,10 +199,10 @@ class Trainer:
         self.board: Board | None = None
         self.started, self.saved = time.monotonic() - self.state.elapsed, time.monotonic()
         self.loss, self.rate = math.nan, math.nan  # of the last step
-        self.validation = 0.0  # s, that the last one took
+        self.validation = 0.0  # s, duration of the last one
 
     def step(self, batch: dict[str, Any]) -> None:
-        """Change the weights by one batch; `Diverged` if its loss or gradient is not finite."""
+        """Update the weights by one batch; `Diverged` if its loss or gradient is not finite."""
         settings, state, device = self.run.settings, self.state, self.process.device
         self.rate = learning_rate(settings, state)
         alone = self.has_estimate and share_used(settings, state) < settings.head_start
@@ -232,7 +232,7 @@ class Trainer:
         )
 
     def validate_if_due(self) -> None:
-        """Find out whether the run ends here; validate then, and whenever a validation is due."""
+        """Determine whether the run ends with this step; validate then, and whenever a validation is due."""
         settings, state = self.run.settings, self.state
         out_of_time = self.process.any(time_is_up(settings, state, self.validation))
         state.finished = state.step == settings.steps or out_of_time
@@ -247,7 +247,7 @@ class Trainer:
         self.validation = time.monotonic() - began
 
     def _record(self, score: metrics.Score) -> None:
-        """Put a validation into the state and its files; keep the weights if they are the best so far."""
+        """Add a validation to the state and its files; keep the weights if they are the best so far."""
         state = self.state
         entry = {"step": state.step, "elapsed": state.elapsed, "loss": self.loss, "learning_rate": self.rate}
         state.history.append(entry | score.to_dict())
@@ -258,7 +258,7 @@ class Trainer:
         self.run.save_history(state)
 
     def save(self, *, now: bool) -> None:
-        """Write the checkpoint now, or if the last one is old."""
+        """Write the checkpoint if the last one is old, or `now`."""
         if self.process.leads and (now or time.monotonic() - self.saved > CHECKPOINT_SECONDS):
             self.run.save(self.run.checkpoint, self.model, self.optimiser, self.state)
             self.saved = time.monotonic()
@@ -274,13 +274,13 @@ def train(
     force: bool = False,
     note: Callable[[str], None] = lambda line: None,
 ) -> State:
-    """Train `model` in place until the end that the settings name, or until `should_stop`; return the state reached.
+    """Train `model` in place to the end that the settings define, or until `should_stop`; return its state.
 
-    Resumes the run in `settings.out` if there is one; `force` begins it again. `note` gets a line or two on the noise
-    that windows are drawn with. Raises ValueError and OSError for settings and folders that do not fit, `Diverged` for
-    NaN or Inf. From then on torch has the run's number of threads, and denormal numbers count as zero in this process.
+    A run in `settings.out` is resumed; `force` starts it again from the beginning. `note` receives lines about the
+    noise of the windows. ValueError and OSError for settings and folders that do not fit, `Diverged` for NaN or Inf.
+    The call sets torch's number of threads, and makes denormal numbers zero in this process.
     """
-    torch.set_flush_denormal(True)  # gradients through the tails of GELU are such numbers: a step can be twice as slow
+    torch.set_flush_denormal(True)  # gradients in the tails of GELU are denormal and slow down a step
     with joined(device) as process, contextlib.ExitStack() as stack:
         asked = settings.threads
         settings, lines = settled(settings, force=force)

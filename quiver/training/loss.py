@@ -1,10 +1,11 @@
-"""What training minimises: pixel and gradient differences at three scales, and of the pre-denoised frames.
+"""Computes the training loss: pixel and gradient differences at three scales, and of the pre-denoised frames.
 
     l(a, b) = mean|a - b| + w (mean|Dx a - Dx b| + mean|Dy a - Dy b|)
     total   = 0.85 l(O1, G) + 0.10 l(O2, G/2) + 0.05 l(O4, G/4) + 0.20 l(d, all clean frames)
 
-The published program and the paper's text differ in w, in the gradient and in how targets are made smaller; both are
-presets (spec 5.2). Any model whose output is a plain tensor gets l(O, G) alone. Always float32, also under autocast.
+The published program and the paper's text differ in w, in the gradient and in the resizing of targets; both are
+presets. A model whose output is a plain tensor gets l(O, G) alone. The loss is computed in float32, also under
+autocast.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from torch import Tensor
 
 
 class MultiScale(Protocol):
-    """Output of the network: every frame pre-denoised, the restored ones at scale 1, 1/2, 1/4 (None = not built)."""
+    """Output of a network: all frames pre-denoised, the restored ones at scale 1, 1/2, 1/4 (None: not computed)."""
 
     @property
     def denoised(self) -> Tensor | None: ...
@@ -53,13 +54,13 @@ class Loss:
 PUBLISHED = Loss(gradient_weight=0.5, gradient="sobel", resize="bilinear")
 # "horizontal and vertical gradients": read as first differences; "bicubic" as the kernel alone
 PAPER = Loss(gradient_weight=1.0, gradient="difference", resize="bicubic")
-L1 = Loss(0.0, gradient="difference", resize="bilinear", scales=(1.0, 0.0, 0.0), denoised=0.0)  # of plain controls
-SCALES_L1 = Loss(0.0, gradient="difference", resize="bilinear")  # nearest to what PSNR asks for, in a short run
+L1 = Loss(0.0, gradient="difference", resize="bilinear", scales=(1.0, 0.0, 0.0), denoised=0.0)  # of controls
+SCALES_L1 = Loss(0.0, gradient="difference", resize="bilinear")  # no gradients: the best PSNR in a short run
 PRESETS = {"published": PUBLISHED, "paper": PAPER, "l1": L1, "scales-l1": SCALES_L1}
 
 
 def gradients(image: Tensor, operator: str) -> tuple[Tensor, Tensor]:
-    """Horizontal and vertical gradient of [N, 1, H, W]; the border without a full neighbourhood is cut off."""
+    """Return the horizontal and vertical gradient of [N, 1, H, W], without border pixels that lack neighbours."""
     if operator == "difference":
         return image[..., :, 1:] - image[..., :, :-1], image[..., 1:, :] - image[..., :-1, :]
     kernel = torch.tensor(
@@ -70,32 +71,32 @@ def gradients(image: Tensor, operator: str) -> tuple[Tensor, Tensor]:
 
 
 def pair_loss(output: Tensor, target: Tensor, loss: Loss) -> Tensor:
-    """l(a, b) of [..., 1, H, W]; a gradient that has no pixel left (1 px frames) counts 0."""
+    """Return l(a, b) of [..., 1, H, W], a scalar; a gradient without pixels (frames of 1 px) counts as 0."""
     a, b = output.float().flatten(0, -4), target.float().flatten(0, -4)
     total = (a - b).abs().mean()
     if loss.gradient_weight == 0 or (loss.gradient == "sobel" and min(a.shape[-2:]) < 3):
         return total
-    for da in gradients(a - b, loss.gradient):  # both operators are linear: one pass over the difference is enough
+    for da in gradients(a - b, loss.gradient):  # both operators are linear
         if da.numel():
             total = total + loss.gradient_weight * da.abs().mean()
     return total
 
 
 def shrink(target: Tensor, size: Sequence[int], mode: str) -> Tensor:
-    """Target [B, T, 1, H, W] at a smaller size; bilinear by 4 is the mean of the central 2 x 2 of each block."""
+    """Resize a target [B, T, 1, H, W]; bilinear by 1/4 is the mean of the central 2 x 2 of each 4 x 4 block."""
     flat = functional.interpolate(target.float().flatten(0, 1), size=list(size), mode=mode, align_corners=False)
     return flat.view(*target.shape[:2], *flat.shape[1:])
 
 
 def centred(target: Tensor, frames: int, first: int) -> Tensor:
-    """The `frames` target frames that an output from frame `first` on answers for; ValueError if they do not exist."""
+    """Return target frames first ... first + frames - 1 of [B, T, 1, H, W]; ValueError if they do not exist."""
     if first < 0 or first + frames > target.shape[1]:
         raise ValueError(f"output holds frames {first}..{first + frames - 1}, the target only 0..{target.shape[1] - 1}")
     return target[:, first : first + frames]
 
 
 def training_loss(output: Tensor | MultiScale, target: Tensor, loss: Loss, *, first: int) -> Tensor:
-    """The loss of one batch, a float32 scalar; target [B, T, 1, H, W], `first` = index of the first restored frame."""
+    """Return the loss of a batch, a float32 scalar; target [B, T, 1, H, W], `first` is the first restored frame."""
     with torch.autocast(target.device.type, enabled=False):
         if isinstance(output, Tensor):
             return pair_loss(output, centred(target, output.shape[1], first), loss)

@@ -1,9 +1,9 @@
-"""What changes the weights: Adam alone, or Muon for the kernels inside the network and Adam for everything else.
+"""Updates the weights: by Adam alone, or by Muon for the inner kernels and Adam for all other weights.
 
-Muon (Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural networks"; torch.optim.Muon) takes the
-momentum's polar factor instead of its elements' signs: every direction of a kernel, seen as a matrix [out, in * h * w],
-learns at the same pace. Its steps are scaled to the size of Adam's (Liu et al. 2025, "Muon is scalable for LLM
-training"), so that both go by one learning rate. In short runs it is worth several times as many steps of Adam.
+Muon (Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural networks"; torch.optim.Muon) replaces the
+momentum of a kernel, as a matrix [out, in * h * w], by its polar factor. All directions of the matrix then change at
+the same rate. Its steps are scaled to the size of Adam's (Liu et al. 2025, "Muon is scalable for LLM training"), so
+that both use one learning rate.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from torch import nn
 
 Kind = Literal["adam", "muon"]
 OPTIMISERS: tuple[Kind, ...] = ("adam", "muon")
-_STORED = ({"step", "exp_avg", "exp_avg_sq"}, {"momentum_buffer"})  # of one weight, by Adam and by Muon
-EDGES = ("leave",)  # names of last layers: Muon is for what lies between
+_STORED = ({"step", "exp_avg", "exp_avg_sq"}, {"momentum_buffer"})  # keys of one weight in Adam and in Muon
+EDGES = ("leave",)  # names of last layers, which Adam updates
 
 
 class Optimiser:
-    """One step for all weights of a network; make it when the weights are where they will stay.
+    """Adam, or Muon and Adam, for the weights of a network, which must already be on their device.
 
-    `ValueError` if Muon is asked for and a kernel is not contiguous.
+    `ValueError` if the kind is Muon and a kernel is not contiguous.
     """
 
     def __init__(self, model: nn.Module, kind: Kind, rate: float, betas: tuple[float, float]) -> None:
@@ -40,7 +40,7 @@ class Optimiser:
             self.parts.append(muon)
 
     def step(self, rate: float) -> None:
-        """Change the weights by their gradients; a weight without gradient stays."""
+        """Update the weights by their gradients; a weight without gradient does not change."""
         for kernel, matrix in zip(self.kernels, self.matrices, strict=True):
             matrix.grad = None if kernel.grad is None else kernel.grad.flatten(1)
         for part in self.parts:
@@ -49,11 +49,11 @@ class Optimiser:
             part.step()
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the next step depends on, beside weights and rate."""
+        """Return all that the next step depends on, apart from weights and rate."""
         return {"parts": [part.state_dict() for part in self.parts]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of `state_dict`; ValueError if it is another optimiser's or no such state. Rates are kept."""
+        """Restore the state of `state_dict`; ValueError for any other content. Rates do not change."""
         parts = state.get("parts") if isinstance(state, dict) else None
         if not isinstance(parts, list) or len(parts) != len(self.parts):
             raise ValueError("the state of another optimiser")
@@ -62,7 +62,7 @@ class Optimiser:
 
 
 def _checked(part: torch.optim.Optimizer, content: Any) -> dict[str, Any]:
-    """A stored state with the settings of `part`; ValueError unless every tensor fits its weight."""
+    """Return a stored state with the settings of `part`; ValueError unless every tensor fits its weight."""
     ours = part.state_dict()
     weights = [weight for group in part.param_groups for weight in group["params"]]
     stored = content.get("state") if isinstance(content, dict) else None
@@ -70,7 +70,7 @@ def _checked(part: torch.optim.Optimizer, content: Any) -> dict[str, Any]:
         raise ValueError("the state of another optimiser")
     for number, values in stored.items():
         if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < len(weights):
-            raise ValueError(f"an optimiser state for weight {str(number)[:60]}, which is not there")
+            raise ValueError(f"an optimiser state for weight {str(number)[:60]}, which does not exist")
         if not isinstance(values, dict) or set(values) not in _STORED:
             raise ValueError("the state of another optimiser")
         for name, value in values.items():

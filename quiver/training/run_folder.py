@@ -1,10 +1,10 @@
-"""A training run as a folder: its settings, its state, its files.
+"""Stores a training run in a folder: its settings, state, weights and curve.
 
     settings.json  checkpoint.pt  best.safetensors  last.safetensors  history.json  curve.png
     failed.pt (only after NaN)  events.out.tfevents...  lock
 
-Every file is whole or absent, and one process at a time trains in a folder. A folder accepts the settings it was made
-with and no others, so that the same command resumes, and two experiments are never mixed.
+Every file is complete or absent, and one process at a time trains in a folder. A folder accepts only the settings that
+it was made with, so that the same command resumes the run, and two runs are never mixed.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from quiver.training.optimiser import Optimiser
 from quiver.training.schedule import State
 from quiver.training.settings import Settings, portable, short
 
-OURS = (  # what a run writes
+OURS = (  # files that a run writes
     r"(settings|history)\.json|(checkpoint|failed(-\d+)?)\.pt|(best|last)\.safetensors|curve\.png|lock|"
     r"events\.out\.tfevents\..*"
 )
-LOCK = "lock"  # of a folder of results: held by the process that works in it
+LOCK = "lock"  # held by the process that works in the folder
 
 
 def _load_weights(model: nn.Module, stored: Any) -> None:
-    """Put stored weights into the model; ValueError unless they are all there, in their shapes, and finite."""
+    """Load stored weights into the model; ValueError unless names and shapes are the model's and values finite."""
     own = model.state_dict()
     if not isinstance(stored, dict) or not all(isinstance(name, str) for name in stored):
         raise ValueError("weights of another network")
@@ -65,7 +65,7 @@ def alone_in(folder: Path, doing: str) -> Iterator[None]:
 
 
 def empty(folder: Path) -> None:
-    """Remove all but the lock, which the caller holds; settings.json last, so that it stays ours until then."""
+    """Remove all but the lock, which the caller holds; settings.json last, so that the folder stays recognisable."""
     for path in sorted(folder.iterdir(), key=lambda path: path.name == "settings.json"):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -74,7 +74,7 @@ def empty(folder: Path) -> None:
 
 
 class Run:
-    """The folder of a run."""
+    """Folder of a run."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings, self.folder = settings, Path(settings.out)
@@ -82,9 +82,9 @@ class Run:
 
     @contextlib.contextmanager
     def open(self, *, force: bool = False) -> Iterator[None]:
-        """Make the folder, or check that it holds a run with these settings, and keep others out while it is open.
+        """Make the folder, or check that it holds a run with these settings, and lock it while it is open.
 
-        `force` begins again where a run is. `FileExistsError` if the folder holds something else or a run with other
+        `force` removes a run that is there. `FileExistsError` if the folder holds other files or a run with other
         settings, `ValueError` while another process trains in it.
         """
         self._check_ours(force)
@@ -110,7 +110,7 @@ class Run:
         if not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir()):
             if force:
                 raise FileExistsError(f"{folder} holds no settings.json; --force removes only what this command made")
-            raise FileExistsError(f"{folder} exists and is no training run; choose another -o")
+            raise FileExistsError(f"{folder} exists and is not a training run; choose another -o")
 
     def _check_settings(self) -> None:
         wanted, found = self.settings.to_dict(), read_json(self.folder / "settings.json")
@@ -124,7 +124,7 @@ class Run:
                 )
 
     def save(self, path: Path, model: nn.Module, optimiser: Optimiser, state: State, **extra: Any) -> None:
-        """The whole state of the run in one file."""
+        """Write the complete state of the run to one file."""
         content = {
             "model": model.state_dict(),
             "optimiser": optimiser.state_dict(),
@@ -133,12 +133,12 @@ class Run:
             "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
             **extra,
         }
-        buffer = io.BytesIO()  # a disk that is full halfway is then the system's error, not torch's
+        buffer = io.BytesIO()  # a full disk then raises the system's error, not torch's
         torch.save(content, buffer)
         write_bytes(path, buffer.getbuffer())
 
     def load(self, model: nn.Module, optimiser: Optimiser, device: torch.device) -> State:
-        """The newest state, put into model and optimiser; a fresh one if there is none, ValueError if it is damaged."""
+        """Load the newest state into model and optimiser; a new state if there is none, ValueError if it is damaged."""
         if not self.checkpoint.exists():
             return State()
         try:
@@ -158,18 +158,18 @@ class Run:
             ) from None
 
     def save_weights(self, name: str, model: nn.Module, state: State) -> None:
-        """NAME.safetensors with the settings in its notes; of folders only the name, because weights travel."""
+        """Write NAME.safetensors with the settings in its notes, without folders, because weights files are copied."""
         settings = portable(self.settings)
         notes = {"step": str(state.step), "settings": json.dumps(settings, sort_keys=True)}
         weights.save(model, model.config, self.folder / f"{name}.safetensors", notes)  # type: ignore[arg-type]
 
     def save_history(self, state: State) -> None:
-        """The curve so far, one entry per validation."""
+        """Write history.json, one entry per validation."""
         write_json(self.folder / "history.json", {"settings": self.settings.to_dict(), "history": state.history})
 
 
 def draw_curve(folder: Path, history: Sequence[Mapping[str, float]]) -> Path | None:
-    """curve.png of a run: validation PSNR and loss over minutes; None before any validation."""
+    """Draw curve.png of a run, validation PSNR and loss over minutes; None without any validation."""
     if not history:
         return None
     minutes = [entry["elapsed"] / 60 for entry in history]

@@ -1,4 +1,4 @@
-"""What changes during a run, and what follows from it: learning rate, validations, the end."""
+"""Holds the state of a run, and derives from it the learning rate, due validations and the end."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 
 from quiver.training.settings import Settings
 
-WARMUP_SHARE = 0.05  # of a run; no warm-up is longer
+WARMUP_SHARE = 0.05  # of a run, longest warm-up
 PLATEAU_GAIN = 1e-4  # relative gain of PSNR that counts
 
 
 @dataclass
 class State:
-    """What changes during a run, apart from weights and optimiser."""
+    """State of a run, apart from weights and optimiser."""
 
     step: int = 0
     elapsed: float = 0.0  # s
@@ -22,13 +22,13 @@ class State:
     plateau_best: float = -math.inf
     plateau_bad: int = 0
     halvings: int = 0
-    tenths: int = 0  # of a timed run, validated so far
+    tenths: int = 0  # of the time of a run without `steps` that are over and validated
     finished: bool = False
     history: list[dict[str, float]] = field(default_factory=list)  # one entry per validation
 
     @classmethod
     def from_dict(cls, values: Any) -> State:
-        """What `asdict` gave; strict, ValueError."""
+        """Return the state of values from `asdict`; ValueError for anything else."""
         kinds = {field.name: field.type for field in fields(cls)}
         if not isinstance(values, dict) or set(values) != set(kinds):
             raise ValueError(f"a state has {', '.join(kinds)}")
@@ -48,7 +48,7 @@ class State:
 
 
 def _is_entry(entry: Any) -> bool:
-    """Whether this is one validation's numbers, as `train` writes them."""
+    """Return whether these are the numbers of one validation."""
     return (
         isinstance(entry, dict)
         and {"step", "elapsed", "loss", "psnr", "psnr_matched"} <= entry.keys()
@@ -57,16 +57,16 @@ def _is_entry(entry: Any) -> bool:
 
 
 def share_used(settings: Settings, state: State) -> float:
-    """How much of the run is over, 0 to 1, by steps or by time, whichever is further."""
+    """Return the share of the run that is over, 0 to 1: by steps or by time, the larger one."""
     steps = state.step / settings.steps if settings.steps else 0.0
     minutes = state.elapsed / (60 * settings.minutes) if settings.minutes else 0.0
     return min(1.0, max(steps, minutes))
 
 
 def learning_rate(settings: Settings, state: State) -> float:
-    """The rate of the next step: linear rise, then a cosine over the share of steps or time used up, or halvings.
+    """Return the rate of the next step: a linear rise, then a cosine over the share of the run, or halvings.
 
-    The rise ends after `warmup` steps, or after a twentieth of a run so short that this comes first.
+    The rise ends after `warmup` steps or a twentieth of the run, whichever comes first.
     """
     share = share_used(settings, state)
     rise = max((state.step + 1) / max(1, settings.warmup), share / WARMUP_SHARE)
@@ -77,7 +77,7 @@ def learning_rate(settings: Settings, state: State) -> float:
 
 
 def validation_due(settings: Settings, state: State) -> bool:
-    """Every `validate_every` steps; in a run that only time limits, after every tenth of it."""
+    """Return whether a validation is due: every `validate_every` steps, or after every tenth of a timed run."""
     if settings.steps is not None:
         return state.step % settings.validate_every == 0
     before, state.tenths = state.tenths, int(10 * share_used(settings, state))
@@ -85,12 +85,12 @@ def validation_due(settings: Settings, state: State) -> bool:
 
 
 def time_is_up(settings: Settings, state: State, validation: float) -> bool:
-    """Whether the last validation, as long as the one before, would no longer fit into the time limit."""
+    """Return whether another validation of that many seconds would exceed the time limit."""
     return settings.minutes is not None and state.elapsed + validation >= 60 * settings.minutes
 
 
 def note_plateau(patience: int, state: State, psnr: float) -> None:
-    """After more than `patience` validations in a row without a relative gain of 1e-4 the rate is halved."""
+    """Count a validation, and halve the rate after more than `patience` in a row without a relative gain of 1e-4."""
     if state.plateau_best == -math.inf or psnr > state.plateau_best * (1 + PLATEAU_GAIN):
         state.plateau_best, state.plateau_bad = psnr, 0
         return

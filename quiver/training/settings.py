@@ -1,4 +1,4 @@
-"""The settings of a training run: their defaults by protocol, and the noise that they come to."""
+"""Holds the settings of a training run, their defaults by protocol, and the noise that follows from them."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ PRECISIONS = ("auto", "float32", "bfloat16")
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything that decides a run; stored beside its results."""
+    """All that a run depends on; stored beside its results."""
 
     data: str  # data set folder
     out: str  # folder of the run
     network: str = "nano"  # name of the model, for the record
-    steps: int | None = None  # optimiser steps; with `minutes`, whichever ends first
+    steps: int | None = None  # of the optimiser; with `minutes` too, the limit that is reached first ends the run
     minutes: float | None = None  # wall-clock limit, validation included
-    sensor: str | tuple[str, ...] | None = None  # as asked for; None: those of the data set's streams
-    ppp: tuple[float, ...] | None = None  # light levels as asked for; None: those of the streams
-    bits: tuple[int, ...] | None = None  # bit depths as asked for; None: those of the streams
-    noise: tuple[Noise, ...] | None = None  # what these come to, filled in by `settled`; every window draws one
+    sensor: str | tuple[str, ...] | None = None  # as given; None: those of the data set's streams
+    ppp: tuple[float, ...] | None = None  # light levels as given; None: those of the streams
+    bits: tuple[int, ...] | None = None  # bit depths as given; None: those of the streams
+    noise: tuple[Noise, ...] | None = None  # follows from these three, set by `settled`; every window draws one
     crop: int = 64  # px
-    frames: int = 11  # of a training window; each one beyond eleven is one more restored frame for little more work
+    frames: int = 11  # of a training window; each frame beyond eleven adds one restored frame at low cost
     batch: int = 8  # of each process
     optimiser: Kind = "adam"  # or muon: see optimiser.py
     learning_rate: float = 1e-3
@@ -47,13 +47,13 @@ class Settings:
     loss: str = "published"  # published, paper, l1 or scales-l1: see loss.py
     flips: bool = True  # the eight flips and quarter turns
     reverse: bool = True  # time reversal
-    drift: int = 0  # px/frame; half of the crops move through their clip, up to so fast
-    head_start: float = 0.0  # share of the run in which a baseline, if the network has one, is trained alone
-    force_exposure: bool = False  # published: every window at the light level on its own
-    validate_every: int = 300  # steps; a run without `steps` validates after every tenth of its time
+    drift: int = 0  # px/frame, largest speed at which half of the crops move through their clip
+    head_start: float = 0.0  # share of the run that trains the initial estimate alone, if the network has one
+    force_exposure: bool = False  # scale every window to the light level by its own mean, as published
+    validate_every: int = 300  # steps; without `steps` a run validates after every tenth of its time
     validation_split: str = "val"
     validation_windows: int = 16  # at most
-    workers: int = 0  # processes that draw samples, beside the training one
+    workers: int = 0  # processes that draw samples; 0: the training process does
     precision: str = "auto"  # float32, bfloat16; auto = bfloat16 on CUDA
     seed: int = 0
     threads: int | None = None  # of torch; None: measured
@@ -76,12 +76,12 @@ class Settings:
 
     @property
     def sensors(self) -> tuple[str, ...] | None:
-        """Names or files of the sensors that are asked for."""
+        """Return the names or files of the given sensors."""
         return (self.sensor,) if isinstance(self.sensor, str) else self.sensor
 
     @property
     def lights(self) -> tuple[Illumination, ...]:
-        """Every combination of sensor, bit depth and light level, with the defaults for what is not asked for."""
+        """Return every combination of sensor, bit depth and light level, with defaults for those not given."""
         if self.noise is not None:
             return self.noise
         return tuple(
@@ -92,12 +92,12 @@ class Settings:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON gives it back: lists for tuples."""
+        """Return plain values, as they are read from JSON: lists for tuples."""
         plain = {name: list(v) if isinstance(v, tuple) else v for name, v in vars(self).items()}
         return plain | {"noise": None if self.noise is None else [noise.to_dict() for noise in self.noise]}
 
 
-# Ours, and what the authors' program and the paper's text say (spec 5.2): bundles of defaults; options override.
+# Bundles of defaults, which options override: ours, those of the authors' program, and those of the paper's text.
 _PUBLISHED = {"schedule": "plateau", "warmup": 0, "crop": 128, "reverse": False, "ppp": (3.25,), "bits": (3,)}
 PROTOCOLS: dict[str, dict[str, Any]] = {
     "quick": {"optimiser": "muon", "learning_rate": 6e-3, "loss": "scales-l1", "drift": 3, "head_start": 0.85},
@@ -112,10 +112,10 @@ _ASKED = ("sensor", "ppp", "bits")
 
 
 def settled(settings: Settings, *, force: bool = False) -> tuple[Settings, list[str]]:
-    """The settings with the noise of a run, and what there is to say of it; `ValueError` where it cannot be drawn.
+    """Return the settings with the noise of the run, and lines about it; `ValueError` if it cannot be drawn.
 
-    A folder that holds a run keeps its noise and its number of threads, and what is not asked for is what was asked for
-    then.
+    A folder that holds a run keeps its noise and its number of threads. Sensor, light levels and bit depths that are
+    not given are those of that run.
     """
     if settings.noise is not None:
         return settings, Mixture(settings.noise).lines
@@ -134,7 +134,7 @@ def settled(settings: Settings, *, force: bool = False) -> tuple[Settings, list[
     files = tuple(name for name in settings.sensors or () if name.endswith(".toml"))
     if files and "noise" in found and set(mixture.noises) != set(noise):
         raise FileExistsError(
-            f"{settings.out} holds a run with noise: {describe(noise)}; {', '.join(files)} says something else now; "
+            f"{settings.out} holds a run with noise: {describe(noise)}; {', '.join(files)} now describes other noise; "
             "choose another -o, or start again with --force"
         )
     return told, Mixture(noise, "as this run began", mixture.streams).lines
@@ -145,7 +145,7 @@ def _as_tuple(value: Any) -> Any:
 
 
 def _recorded(found: Mapping[str, Any]) -> tuple[Noise, ...]:
-    """The noise of a run from its settings; runs of earlier versions had sensor, bits and ppp, and drew no defects."""
+    """Return the noise of a stored run; those of earlier versions stored sensor, bits and ppp, and had no defects."""
     if found.get("noise") is not None:
         if not isinstance(found["noise"], list) or not found["noise"]:
             raise ValueError(f"noise is {short(found['noise'])}")
@@ -155,7 +155,7 @@ def _recorded(found: Mapping[str, Any]) -> tuple[Noise, ...]:
 
 
 def portable(settings: Settings) -> dict[str, Any]:
-    """Settings for a weights file: of folders and files only the names; sensor, ppp and bits are those of the noise."""
+    """Return settings for a weights file: names without folders; sensor, ppp and bits are those of the noise."""
     found = settings.to_dict()
     found |= {name: Path(found[name]).name for name in ("data", "out")}
     for noise in found["noise"] or ():
@@ -172,6 +172,6 @@ def portable(settings: Settings) -> dict[str, Any]:
 
 
 def short(value: Any) -> str:
-    """A value for a message, at most 200 characters of it."""
+    """Return a value as text for a message, at most 200 characters of it."""
     text = repr(value)
     return text if len(text) <= 200 else f"{text[:200]} ..."

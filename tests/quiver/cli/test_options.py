@@ -175,7 +175,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("convert-weights", "--json"): [Acts(CONVERT, "--json", is_json, before=their_weights)],
     ("completion", "--json"): [Acts("completion bash", "--json", is_json)],
     # train
-    ("train", "--output"): [Acts(TRAIN, "-o other", names), Refused(TRAIN, "-o clip", "is no training run")],
+    ("train", "--output"): [Acts(TRAIN, "-o other", names), Refused(TRAIN, "-o clip", "is not a training run")],
     ("train", "--preset"): of_training("--preset", "nano"),
     ("train", "--protocol"): of_training("--protocol", "spad-sum"),
     ("train", "--steps"): of_training("--steps", "3"),

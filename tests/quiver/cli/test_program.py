@@ -210,7 +210,7 @@ def test_nothing_is_overwritten_without_force(capsys, tmp_path, tiny_dataset, cl
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "thesis.txt").write_text("mine")
-    assert "is no training run" in mistake(capsys, *train_words(tiny_dataset, folder))
+    assert "is not a training run" in mistake(capsys, *train_words(tiny_dataset, folder))
     assert "--force removes only what this command made" in mistake(
         capsys, *train_words(tiny_dataset, folder), "--force"
     )

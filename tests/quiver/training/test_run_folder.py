@@ -52,7 +52,7 @@ def test_other_settings_are_refused(tiny_dataset, tmp_path):
     (tmp_path / "other").mkdir()
     (tmp_path / "other/file").write_text("mine")
     for force in (False, True):
-        with pytest.raises(FileExistsError, match=r"is no training run|removes only what this command made"):
+        with pytest.raises(FileExistsError, match=r"is not a training run|removes only what this command made"):
             opened(settings(tiny_dataset, tmp_path / "other"), force=force)
     assert (tmp_path / "other/file").read_text() == "mine"
 
