@@ -159,6 +159,7 @@ def measure_sums(
 
 
 def _check_light(exposure: float, photons: float | None, name: str) -> None:
+    """`ValueError` for an impossible exposure or number of photons."""
     if not (np.isfinite(exposure) and exposure > 0):
         raise ValueError(f"{name}: the exposure is in seconds and above 0, got {exposure!r}")
     if photons is not None and not (np.isfinite(photons) and photons >= 0):

@@ -1,8 +1,8 @@
 """Fits the photon-counting histograms of a QIS by maximum likelihood, and tests the fit by chi-square.
 
-Model of a flat field at one light level: pixel p expects lambda (1 + s x_p) electrons and D t dark electrons. x_p is
-normal with variance 1, and s is the PRNU. All frames of a pixel share x_p, so codes of one pixel are not independent.
-The covariance of the fit is therefore the sandwich I^-1 J I^-1, whose J holds that term (White, Econometrica 50, 1982).
+Model of a flat field at one light level: pixel p expects lambda (1 + s x_p) electrons and D t dark electrons, where
+x_p is normal with variance 1 and s is the PRNU. All frames of a pixel share x_p, so its codes are not independent. The
+covariance of the fit is therefore the sandwich I^-1 J I^-1, whose J holds that term (White, Econometrica 50, 1982).
 Left out of the fit: a spread of the dark current, of the offset and of the read noise between pixels; lag between
 frames.
 """
@@ -84,6 +84,7 @@ def _lower_bounds(size: int) -> Array:
 
 
 def sensor_at(parameters: Array, bits: int) -> QIS:
+    """Return the QIS with these parameters [m], without light and dark current."""
     return QIS(1.0, 0.0, exp(parameters[2]), bits, gain=exp(parameters[0]), offset=float(parameters[1]))
 
 
@@ -129,6 +130,7 @@ def _model(
 
 
 def _log_likelihood(stacks: Sequence[FrameStatistics], shares: Sequence[Array] | Array) -> float:
+    """Return the log-likelihood of the histograms of all stacks, given P(code)."""
     return sum(
         float(np.sum(np.where(s.histogram > 0, s.histogram * np.log(np.maximum(p, 1e-300)), 0.0)))
         for s, p in zip(stacks, shares, strict=True)

@@ -29,9 +29,9 @@ def photon_transfer(darks: Sequence[FrameStatistics], flats: Sequence[FrameStati
     """Fit a weighted straight line to variance over mean; its slope is the gain.
 
     Its height at the darkest stack is read noise plus ADC noise; the ADC adds 1/12 codes^2 (Janesick, Photon Transfer,
-    SPIE 2007). Mean and variance of one stack are correlated through the third moment: the residual v - g m of a stack
-    has the variance (mu4 - v^2 + g^2 v - 2 g mu3) / n. Means are measured from that of the darkest stack. Its noise
-    therefore enters all others, while its own residual is that of v alone. The fit is a generalised least squares with
+    SPIE 2007). Mean and variance of one stack are correlated through the third moment. The residual v - g m of a stack
+    therefore has the variance (mu4 - v^2 + g^2 v - 2 g mu3) / n. Means are measured from that of the darkest stack. Its
+    noise enters all others, while its own residual is that of v alone. The fit is a generalised least squares with
     these covariances.
     """
     base = min(darks, key=lambda stack: stack.exposure)

@@ -45,8 +45,8 @@ def read_stack(
 ) -> FrameStatistics:
     """Return the statistics of the frames in a file: `.npy` of integer values, TIFF, or any recording of `convert`.
 
-    `exposure` in seconds, `photons` per pixel and exposure. With `width` an `.npy` is a photon cube of packed planes;
-    with `planes` every value sums this number of binary planes; `variable` names an array of a `.mat`. `ValueError` or
+    `exposure` in seconds, `photons` per pixel and exposure. With `width` an `.npy` is a photon cube of packed planes.
+    With `planes` every value sums this number of binary planes. `variable` names an array of a `.mat`. `ValueError` or
     `FileNotFoundError` naming the file.
     """
     if planes is None:
@@ -57,6 +57,7 @@ def read_stack(
 
 
 def _blocks(path: Path, bits: int, width: int | None, variable: str | None) -> Iterator[Array]:
+    """Return the frames of a file in blocks [t, H, W]."""
     if variable is not None and path.suffix != ".mat" and not path.is_dir():
         raise ValueError(f"{path}: --variable names an array of a .mat file; leave it out")
     if path.suffix == ".npy" and width is None:

@@ -1,10 +1,10 @@
 """Forecasts the cost of a recipe: measures a few frames of each kind of job and multiplies.
 
-A kind is a family with its render settings. For one job of each kind the scene is loaded, the budget chosen, and a few
-frames are rendered, sensed and stored in a temporary folder. Scenes of one family differ by up to ten times in samples
-per pixel. The budgets of a few more jobs are therefore chosen too, and the time of a frame is scaled by its samples.
-Two clocks are read. Wall time tells how long to wait on a machine as busy as now; processor time is what the work
-needs, and can be compared with a real run, whose logs hold both.
+A kind is a family with its render settings. For one job of each kind the budget is chosen, and a few frames are
+rendered, sensed and stored in a temporary folder. Scenes of one family differ by up to ten times in samples per pixel.
+The budgets of a few more jobs are therefore chosen too, and the time of a frame is scaled by its samples.
+Two clocks are read. Wall time is the time to wait on a machine as busy as now. Processor time can be compared with a
+real run, whose logs hold both.
 """
 
 from __future__ import annotations

@@ -75,6 +75,7 @@ def task_key(folder: Path, job: Job) -> str:
 
 
 def _result(future: Any, job: Job, folder: Path) -> Result:
+    """Return the result of a finished future; an error of the worker is written to failed/."""
     try:
         found = future.result()
     except Exception as error:  # any error of the worker counts as a failure of this job

@@ -149,6 +149,7 @@ def _seen_in(path: Path) -> list[str]:
 
 
 def _read_record(path: Path) -> dict[str, Any]:
+    """Read a record; `ValueError` if it is damaged."""
     record = files.read_json(path)
     cure = "`qsim generate RECIPE -o FOLDER --repair` makes it again"
     structure.description(path, record, structure.RECORD, cure)

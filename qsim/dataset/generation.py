@@ -1,7 +1,7 @@
 """Generates a data set: runs the unfinished jobs of a recipe; an interrupted run resumes.
 
-After a kill, in shards, on a cluster, or with nothing left to do, the finished folder (dataset.py) has the same bytes,
-apart from logs/, on machines of one kind.
+On machines of one kind the finished folder (dataset.py) always has the same bytes, apart from logs/: after a kill, in
+shards, on a cluster.
 """
 
 from __future__ import annotations
@@ -208,6 +208,7 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
 
 
 def _of_earlier_version(folder: Path) -> str:
+    """Return the error for a folder whose psnr has another unit."""
     return (
         f"{folder}: was begun by an earlier version, whose psnr meant dB below the 99.9th percentile; now it "
         "is dB below white, and one data set holds one kind: finish it with that version, or use another folder"
@@ -236,8 +237,8 @@ def _check_reads(recipe: Recipe, folder: Path) -> None:
                 seen.add(key)
                 if problem:
                     raise ValueError(
-                        f"{folder}: {problem} since its clip {job.name} was made, whose scene reads it; put back what "
-                        "was there, or use another folder"
+                        f"{folder}: {problem} since its clip {job.name} was made, and the scene reads it; restore it, "
+                        "or use another folder"
                     )
 
 
@@ -294,6 +295,7 @@ def _failures(folder: Path, jobs: Sequence[Job]) -> dict[str, str]:
 
 
 def _runner(options: Options) -> Executor:
+    """Return the executor for the processes of this machine."""
     if options.workers == 0:
         return run_here
 

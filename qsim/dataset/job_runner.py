@@ -212,6 +212,7 @@ def _clip(job: Job, folder: Path, make: RenderJob) -> Clip:
 
 
 def _log(folder: Path, name: str, text: str) -> None:
+    """Append a line with the time to the job's log."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     with open(folder / "logs" / f"{name}.log", "a", encoding="utf-8") as log:
         log.write(f"{now} {text}\n")

@@ -124,7 +124,7 @@ def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
             if sensing.group and job.settings.frames < 2 ** (sensing.bits or 1) - 1:
                 raise ValueError(
                     f"{section.where()}: {job.settings.frames} frames are too few for {sensing.stream_name}, whose "
-                    f"codes sum {2 ** (sensing.bits or 1) - 1} of them"
+                    f"codes sum {2 ** (sensing.bits or 1) - 1} of them; render more frames, or use fewer bits"
                 )
 
 
@@ -224,7 +224,10 @@ def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
     group, diffraction = given.get("group", False), given.get("diffraction", False)
     sensor = _sensor(section, given["sensor"], bits, group)
     if name is not None and len(bits) * len(levels) > 1:
-        raise ValueError(f"{section.where('name')}: one name for {len(bits) * len(levels)} streams")
+        raise ValueError(
+            f"{section.where('name')}: one name for {len(bits) * len(levels)} streams; give one bits and one light "
+            "level, or leave the name out"
+        )
     found = [
         Sensing(
             sensor,

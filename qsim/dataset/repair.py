@@ -43,6 +43,7 @@ class _Damage:
 
 
 def _damage(folder: Path, job: Job, entry: dict[str, Any]) -> _Damage:
+    """Check the files of a finished job; `entry` is its entry in the manifest."""
     expected = entry | {"digest": job.digest, "split": job.split}
     problems = verify_job(folder, job.name, expected)
     record, clip = record_path(folder, job.name), folder / "clips" / job.name

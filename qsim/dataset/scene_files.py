@@ -3,8 +3,8 @@
     load(family, seed, speed) -> the scene, and {file: SHA-256}
 
 * Mitsuba XML: each file that an attribute names, in this file and in those that it includes.
-* Python: modules that it imports, files that it opens while the scene is made, and files that the scene names. Where
-  it lists a folder and opens files in it, the names of all files with these endings count too (`meshes/*.obj`).
+* Python: modules that it imports, files that it opens while the scene is made, and files that the scene names. If it
+  lists a folder and opens files in it, the names of all files with these endings count too (`meshes/*.obj`).
 * A folder of assets: every file in it.
 
 Names are relative to the scene's file; files outside its folder have absolute names. Installed packages, this program,
