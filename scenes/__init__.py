@@ -1,4 +1,4 @@
-"""The scene library: one file per family, each with `scene(seed=0, *, speed=1.0) -> Scene`.
+"""Loads scenes: one file per family, each with `scene(seed=0, *, speed=1.0) -> Scene`.
 
 `speed` multiplies every motion; 1 moves about 1 to 7 pixels per frame at 512 x 1024 and 2000 frames per second.
 """
@@ -76,7 +76,7 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
         return found
     if str(name).endswith(".xml"):
         if speed != 1:
-            raise ValueError(f"{name}: stands still, so that speed {speed:g} changes nothing; leave it out")
+            raise ValueError(f"{name}: an XML scene has no motion, so speed {speed:g} changes nothing; leave it out")
         from qsim.rendering.mitsuba_xml import read_mitsuba
 
         return read_mitsuba(name)
@@ -91,13 +91,13 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
 
 
 def _moves_alike(one: Scene, other: Scene) -> bool:
-    """Whether camera, bodies, lamps and parts of two scenes are at the same places at some moments."""
+    """Return whether camera, bodies, lamps and parts of two scenes have equal poses at some times."""
     moments = (0.0, 5e-4, 3.3e-3, 0.0107)  # s
     return all(all(map(np.array_equal, _places(one, t), _places(other, t))) for t in moments)
 
 
 def _places(scene: Scene, t: float) -> list[np.ndarray]:
-    """Poses of all things at time t [s], and the vertices of what deforms."""
+    """Return the poses [4, 4] of everything at time t [s], and the vertices [V, 3] of deforming bodies."""
     things = (*scene.lights, *scene.bodies, *scene.parts)
     motions = [motion for thing in things if (motion := getattr(thing, "motion", None)) is not None]
     shapes = [body.vertices(t) for body in scene.bodies if body.deforms]
@@ -106,13 +106,13 @@ def _places(scene: Scene, t: float) -> list[np.ndarray]:
 
 @contextlib.contextmanager
 def _naming_mistakes(path: Path) -> Iterator[None]:
-    """What a scene file raises, as a ValueError that names its line."""
+    """Convert an exception of a scene file to a `ValueError` with its line."""
     try:
         yield
     except Exception as error:
         frames = traceback.extract_tb(error.__traceback__)
         lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == path.resolve()]
-        if not lines:  # ours, about the file as a whole
+        if not lines:  # ours, about the complete file
             raise
         raise ValueError(f"{path}:{lines[-1]}: {type(error).__name__}: {error}") from error
 

@@ -1,10 +1,10 @@
-"""Your own things: a folder of meshes, pictures and environments becomes scenes, one per seed.
+"""Makes scenes of a user's folder of meshes, pictures and environments, one per seed.
 
     folder/**  *.obj *.ply *.stl *.off *.glb *.gltf   meshes, each thrown into the air, scaled to 3 to 6 cm
                *.png *.jpg *.tif *.bmp ...            textures of the meshes, the floor and the wall
                *.hdr *.exr                            surroundings, equirectangular, zenith on top; 1 is 1 W m^-2 sr^-1
 
-Whatever kind is missing is made here: solids, procedural textures, sun and sky.
+Missing kinds are replaced by solids, procedural textures, or sun and sky.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ ENVIRONMENT_SUFFIXES = frozenset({".hdr", ".exr"})
 
 
 def scene(seed: int = 0, *, speed: float = 1.0, folder: str | Path) -> Scene:
-    """Four to seven bodies of the folder's meshes and textures in free flight, as in `tumble`.
+    """Return four to seven bodies of the folder's meshes and textures in free flight, as in `tumble`.
 
-    `FileNotFoundError` if the folder holds nothing of use; a file that cannot be read is named by a `ValueError`.
+    `FileNotFoundError` if the folder has none of these files; `ValueError` names a file that cannot be read.
     """
     meshes, pictures, environments = assets(folder)
     rng = np.random.default_rng([seed, 17])
@@ -41,7 +41,7 @@ def scene(seed: int = 0, *, speed: float = 1.0, folder: str | Path) -> Scene:
 
 
 def assets(folder: str | Path) -> tuple[list[Path], list[Path], list[Path]]:
-    """Meshes, pictures and environments in a folder and below, sorted by path."""
+    """Return the meshes, pictures and environments in a folder and below, each sorted by path."""
     found = sorted(path for path in Path(folder).rglob("*") if path.is_file())
     kinds = (MESH_SUFFIXES, PICTURE_SUFFIXES, ENVIRONMENT_SUFFIXES)
     meshes, pictures, environments = ([p for p in found if p.suffix.lower() in kind] for kind in kinds)
@@ -56,7 +56,7 @@ def _mesh(rng: np.random.Generator, meshes: list[Path]) -> Mesh:
 
 
 def _material(rng: np.random.Generator, pictures: list[Path]) -> Material:
-    """Matt or slightly glossy; a picture is taken as it is, white at 0.9 of the light at most."""
+    """Return a matt or slightly glossy material; a picture keeps its values, with white at a reflectance of 0.9."""
     if not pictures:
         return common.paint(rng, common.surface(rng))
     texture = Texture(0.9 * Texture(str(pick(rng, pictures))).pixels())

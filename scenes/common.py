@@ -1,4 +1,4 @@
-"""What the families share: a camera, walls and floors, textures and lights, all chosen by the given generator."""
+"""Provides what all families share: camera, walls, floors, textures and lights, chosen by a random generator."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from qsim.scene.rotation import UP, exponential, pose_matrix, unit, vector
 from qsim.scene.shapes import moved, sheet
 
 HEIGHT, WIDTH = 512, 1024  # pixels; other sizes by Scene.resized, which keeps the height of the view
-FRAME_RATE = 2000.0  # Hz, for which speed = 1 is meant
+FRAME_RATE = 2000.0  # Hz, the rate at which speed = 1 is defined
 PITCH = 1.1e-6  # m
 PHOTOGRAPHS = ("cat", "coffee", "astronaut", "rocket", "coins", "moon", "camera")
-CLIP = 0.016  # s, 33 frames: things that are thrown pass their middle at half of it
+CLIP = 0.016  # s, 33 frames; thrown things pass their middle at half of it
 
 T = TypeVar("T")
 
 
 def camera(origin: ArrayLike, target: ArrayLike, view: float = 0.5, motion: Motion | None = None) -> Camera:
-    """A small f/2.8 camera with a vertical field of `view` [rad]."""
+    """Return a small f/2.8 camera with a vertical field of `view` [rad]."""
     focal_length = HEIGHT * PITCH / 2 / np.tan(view / 2)
     return Camera(
         focal_length=float(focal_length),
@@ -49,32 +49,32 @@ def camera(origin: ArrayLike, target: ArrayLike, view: float = 0.5, motion: Moti
 
 
 def between(rng: np.random.Generator, low: float, high: float) -> float:
-    """A number from low to high, all equally likely."""
+    """Return a uniform random number from `low` to `high`."""
     return float(rng.uniform(low, high))
 
 
 def any_angle(rng: np.random.Generator) -> float:
-    """An angle from 0 to a whole turn [rad]."""
+    """Return a uniform random angle from 0 to 2 pi [rad]."""
     return between(rng, 0.0, 2 * np.pi)
 
 
 def sign(rng: np.random.Generator) -> float:
-    """-1 or 1."""
+    """Return -1 or 1, equally likely."""
     return float(rng.choice((-1.0, 1.0)))
 
 
 def pick(rng: np.random.Generator, options: Sequence[T]) -> T:
-    """One of the options, all equally likely."""
+    """Return one of the options, all equally likely."""
     return options[int(rng.integers(len(options)))]
 
 
 def direction(rng: np.random.Generator) -> tuple[float, float, float]:
-    """A random unit vector, all directions equally likely."""
+    """Return a random unit vector, all directions equally likely."""
     return vector(unit(rng.standard_normal(3)))
 
 
 def surface(rng: np.random.Generator, low: float = 0.05, high: float = 0.85) -> Texture:
-    """A texture for a thing: one of many kinds, its range stretched to `low` .. `high`."""
+    """Return a random texture for a body, its range stretched to `low` .. `high`."""
     kind = int(rng.integers(8))
     if kind == 0:
         return Texture(textures.checker(2 * int(rng.integers(2, 6)), 2 * int(rng.integers(2, 6)), low, high))
@@ -96,7 +96,7 @@ def surface(rng: np.random.Generator, low: float = 0.05, high: float = 0.85) -> 
 
 
 def backdrop(rng: np.random.Generator, low: float = 0.08, high: float = 0.75) -> Texture:
-    """A texture for a wall about one view high: it repeats where it tiles."""
+    """Return a random texture for a wall about one view high; it repeats if it tiles."""
     kind = int(rng.integers(7))
     if kind == 0:
         return Texture(textures.levels(textures.bricks(rng), low, high), repeat=(2.0, 1.0))
@@ -110,12 +110,12 @@ def backdrop(rng: np.random.Generator, low: float = 0.08, high: float = 0.75) ->
 
 
 def wall(material: Material, width: float = 6.0, height: float = 3.0, z: float = 0.0, y: float = 0.0) -> Body:
-    """An upright rectangle that looks to +z."""
+    """Return an upright rectangle [m] facing +z."""
     return Body("wall", moved(sheet(width, height), pose_matrix(None, (0.0, y, z))), material)
 
 
 def floor(material: Material, size: float = 6.0, y: float = 0.0, z: float = 0.0) -> Body:
-    """A horizontal square that looks up."""
+    """Return a horizontal square [m] facing up."""
     return Body("floor", moved(sheet(size, size), pose_matrix(exponential((-np.pi / 2, 0, 0)), (0.0, y, z))), material)
 
 
@@ -125,7 +125,7 @@ def paint(rng: np.random.Generator, texture: Texture) -> Material:
 
 
 def sun(rng: np.random.Generator, low: float = 0.5, high: float = 1.1, strength: float = 6.0) -> SunSky:
-    """Sun and sky from in front, left or right of the camera (which looks to -z)."""
+    """Return sun and sky in front, left or right of the camera (which faces -z)."""
     return SunSky(
         elevation=between(rng, low, high),
         azimuth=between(rng, -1.0, 1.0),
@@ -135,7 +135,7 @@ def sun(rng: np.random.Generator, low: float = 0.5, high: float = 1.1, strength:
 
 
 def lamp(rng: np.random.Generator, target: ArrayLike, distance: float = 2.5, power: float = 12.0) -> AreaLamp:
-    """A soft lamp above and beside the camera that shines on `target`."""
+    """Return a soft lamp above and beside the camera, directed at `target`."""
     side = pick(rng, (-1.0, 1.0)) * rng.uniform(0.4, 0.9)
     away = unit((side, rng.uniform(0.5, 0.9), rng.uniform(0.7, 1.0)))
     size = between(rng, 0.5, 1.0)
@@ -149,7 +149,7 @@ def lamp(rng: np.random.Generator, target: ArrayLike, distance: float = 2.5, pow
 
 
 def studio(rng: np.random.Generator, strength: float = 0.6, boxes: int = 5) -> EnvironmentImage:
-    """A photographer's studio: soft boxes around, grey walls, a dark floor; its mean radiance is `strength`."""
+    """Return a studio: soft boxes, grey walls, a dark floor; mean radiance `strength` [W m^-2 sr^-1]."""
     height, width = 64, 128
     up = (0.5 - (np.arange(height)[:, None] + 0.5) / height) * np.pi  # elevation [rad]
     azimuth = ((np.arange(width)[None, :] + 0.5) / width - 0.5) * 2 * np.pi
@@ -165,5 +165,5 @@ def studio(rng: np.random.Generator, strength: float = 0.6, boxes: int = 5) -> E
 
 
 def upright(yaw: float) -> tuple[float, float, float]:
-    """The rotation vector of a turn by `yaw` [rad] about the vertical."""
+    """Return the rotation vector of a rotation by `yaw` [rad] about the vertical."""
     return vector(yaw * np.asarray(UP))

@@ -1,4 +1,6 @@
-"""A picture of every family and its measured motion: `python -m scenes.contact_sheet -o docs/pictures/scenes.jpg`.
+"""Renders a picture of every family and measures its motion.
+
+    python -m scenes.contact_sheet -o docs/pictures/scenes.jpg
 
 Each row is one family, one seed after the other. The motion is that of the true flow between two frames in the middle
 of a clip at 2000 frames per second and speed 1, over the pixels that move, scaled to 512 x 1024.
@@ -18,12 +20,12 @@ import scenes
 from qsim.colour import tone
 from scenes.common import FRAME_RATE, HEIGHT
 
-FRAME = 8  # of the clip
+FRAME = 8  # index of the rendered frame
 MOVES = 0.05  # px/frame at 512 x 1024; slower pixels count as still
 
 
 def picture(family: str, seed: int, height: int, samples: int) -> tuple[NDArray[np.uint8], float, float, float]:
-    """(tone-mapped frame, mean and largest motion of moving pixels [px/frame], their share); motion at 512 x 1024."""
+    """Return a tone-mapped frame, and mean, largest motion and fraction of moving pixels [px/frame at 512 x 1024]."""
     from qsim.rendering import Budget, Renderer
 
     renderer = Renderer(
@@ -38,7 +40,7 @@ def picture(family: str, seed: int, height: int, samples: int) -> tuple[NDArray[
 
 
 def sheet(rows: dict[str, list[NDArray[np.uint8]]], columns: int) -> Image.Image:
-    """Families in `columns` columns, each with its name over the pictures of its seeds."""
+    """Return the page: families in `columns` columns, each with its name over the pictures of its seeds."""
     height, width = next(iter(rows.values()))[0].shape
     line, gap = 14, 3
     cell = (height + line + gap, len(next(iter(rows.values()))) * (width + gap))

@@ -1,4 +1,4 @@
-"""A crowd: dozens of small bodies hop across a square in streams that cross; everything hides something."""
+"""Makes a crowd: dozens of small bodies hop across a square in crossing streams, with many occlusions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scenes.common import any_angle, between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Sixty to ninety bodies of 3 to 5 cm in three streams of 1.5 to 4 m/s at speed 1."""
+    """Return sixty to ninety bodies of 3 to 5 cm in three streams of 1.5 to 4 m/s at speed 1."""
     rng = np.random.default_rng([seed, 16])
     bodies = [
         common.floor(Diffuse(common.backdrop(rng)), 2.4, y=0.0, z=-0.3),
@@ -37,7 +37,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def shape(rng: np.random.Generator, size: float) -> Mesh:
-    """Small and of few triangles."""
+    """Return a small mesh of few triangles."""
     kind = int(rng.integers(5))
     if kind == 0:
         width, height, depth = size * rng.uniform(1.0, 2.6, 3)

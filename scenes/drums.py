@@ -1,4 +1,4 @@
-"""Periodic texture: striped and chequered drums turn before a lattice; every period looks like the last one."""
+"""Makes periodic textures: striped and chequered drums turn before a lattice, alike after every period."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scenes.common import between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Four or five drums, 6 to 11 turns per second at speed 1; the lattice behind slides to and fro."""
+    """Return four or five drums, 6 to 11 turns per second at speed 1; the lattice behind oscillates."""
     rng = np.random.default_rng([seed, 8])
     slide = speed * between(rng, 10, 14)
     back = common.wall(Diffuse(Texture(pattern(rng), (6.0, 3.0))), 1.8, 0.9)
@@ -43,7 +43,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def pattern(rng: np.random.Generator) -> Picture:
-    """Stripes, checks or dots, never anything random within."""
+    """Return stripes, checks or dots without random detail."""
     low, high = between(rng, 0.03, 0.2), between(rng, 0.55, 0.85)
     kind = int(rng.integers(4))
     if kind == 0:

@@ -1,4 +1,4 @@
-"""Rotation: a spinning fan in front of a textured wall, in a wire guard or without."""
+"""Makes rotation: a spinning fan in front of a textured wall, with or without a wire guard."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scenes.common import any_angle, between, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """About 5 to 9 turns per second at speed 1."""
+    """Return a fan with about 5 to 9 turns per second at speed 1."""
     rng = np.random.default_rng([seed, 1])
     radius = between(rng, 0.36, 0.43)
     place = Still((between(rng, -0.06, 0.06), between(rng, -0.03, 0.03), 0.45), common.upright(rng.uniform(-0.5, 0.5)))
@@ -44,7 +44,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def guard(radius: float, rings: int) -> Mesh:
-    """Rings and spokes of wire in front of the blades."""
+    """Return rings and spokes of wire in front of the blades."""
     a = np.linspace(0, 2 * np.pi, 73)[:-1]
     wires = []
     for r in np.linspace(0.3, 1.0, rings):

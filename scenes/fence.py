@@ -1,4 +1,4 @@
-"""Occlusion: things pass behind a fence whose slats themselves move, and behind one another."""
+"""Makes occlusions: bodies pass behind a moving fence and behind one another."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scenes.common import any_angle, between, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """A sliding fence before three layers of bodies that cross in both directions at 1 to 4 m/s at speed 1."""
+    """Return a sliding fence before three layers of bodies, in both directions at 1 to 4 m/s at speed 1."""
     rng = np.random.default_rng([seed, 5])
     bodies = [common.wall(Diffuse(common.backdrop(rng, 0.06, 0.45)), 1.8, 0.9, z=-0.45)]
     for i in range(int(rng.integers(5, 8))):
@@ -37,7 +37,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def fence(rng: np.random.Generator) -> Mesh:
-    """Slats side by side with gaps, leaning by a random angle, with two rails."""
+    """Return slats with gaps, tilted by a random angle, with two rails."""
     pitch, share = between(rng, 0.05, 0.1), between(rng, 0.25, 0.42)
     lean = float(rng.choice([0.0, 0.0, 0.3, -0.5]))
     slats = [

@@ -1,4 +1,4 @@
-"""Deforming cloth: one or two printed flags flutter in a gale, seen from the side, before a textured wall."""
+"""Makes deforming cloth: one or two printed flags in a gale, seen from the side, before a textured wall."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from scenes.common import any_angle, between, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Waves of 5 to 40 cm run along the cloth at 2 to 6 m/s at speed 1; the poles tremble."""
+    """Return flags with waves of 5 to 40 cm at 2 to 6 m/s at speed 1, on vibrating poles."""
     rng = np.random.default_rng([seed, 15])
     bodies = [common.wall(Diffuse(common.backdrop(rng, 0.08, 0.45)), 2.4, 1.2, z=-0.5)]
     count = int(rng.integers(1, 3))
     for i in range(count):
         width = between(rng, 0.42, 0.5) if count == 1 else between(rng, 0.3, 0.36)
         height = between(rng, 0.22, 0.26) if count == 1 else between(rng, 0.16, 0.22)
-        # Waves move the cloth across its plane: seen at an angle, they move in the picture
+        # Waves move the cloth across its plane, which shows in the picture at an angle
         yaw = between(rng, 0.7, 0.95) * sign(rng)
         middle = 0.0 if count == 1 else (i - 0.5) * 0.32
         x = middle - 0.5 * width * np.cos(yaw)
@@ -36,7 +36,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def ripples(rng: np.random.Generator, width: float, speed: float) -> tuple[Ripple, ...]:
-    """A long wave and two shorter, lower and faster ones."""
+    """Return a long wave and two shorter, lower and faster ones."""
     return tuple(
         Ripple(
             amplitude=width * share * between(rng, 0.8, 1.2),

@@ -1,4 +1,4 @@
-"""Rotation, coupled: a train of gears of metal and painted plastic turns over a machined plate."""
+"""Makes coupled rotation: a train of metal and painted gears over a machined plate."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MODULE = 0.0042  # m of pitch radius per tooth
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Six to nine gears; neighbours turn against one another at rates inverse to their teeth."""
+    """Return six to nine gears; neighbours turn in opposite directions at rates inverse to their teeth."""
     rng = np.random.default_rng([seed, 3])
     drive = speed * between(rng, 900, 1500) * sign(rng)  # tooth-radians per second
     plate = textures.levels(textures.speckles(rng, 3000, 768, 0.012) + 0.5 * textures.noise(rng, (768, 768)), 0.1, 0.5)
@@ -34,7 +34,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def train(rng: np.random.Generator, count: int) -> list[tuple[int, float, float, float]]:
-    """(teeth, x, y, phase) of gears that mesh one after the other along a crooked line through the view."""
+    """Return (teeth, x, y, phase) of gears that mesh in sequence along a crooked line through the view."""
     teeth = [int(n) for n in rng.integers(9, 21, count)]
     places, phases = [np.zeros(2)], [0.0]
     heading = between(rng, -0.6, 0.6)
@@ -51,7 +51,7 @@ def train(rng: np.random.Generator, count: int) -> list[tuple[int, float, float,
 
 
 def finish(rng: np.random.Generator) -> Material:
-    """Steel, brass or painted."""
+    """Return steel, brass or paint."""
     kind = int(rng.integers(4))
     if kind == 0:
         return Conductor(roughness=between(rng, 0.2, 0.4))

@@ -1,4 +1,4 @@
-"""Glass: clear and frosted bodies fly past a textured wall; what is seen through them moves unlike their surfaces."""
+"""Makes refraction: clear and frosted bodies before a textured wall, which moves unlike their surfaces."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scenes.common import any_angle, between, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Four to six of glass and two of paint, 4 to 10 cm, at 1.5 to 4 m/s and 1 to 5 turns a second at speed 1."""
+    """Return four to six glass and two painted bodies of 4 to 10 cm, 1.5 to 4 m/s, 1 to 5 turns a second at speed 1."""
     rng = np.random.default_rng([seed, 10])
     bodies = [common.wall(Diffuse(common.backdrop(rng, 0.05, 0.85)), 1.6, 0.8, z=-0.25)]
     clear = int(rng.integers(4, 7))
@@ -35,7 +35,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def shape(rng: np.random.Generator, size: float) -> Mesh:
-    """Lenses, prisms, rings and drops."""
+    """Return a lens, prism, ring or drop."""
     kind = int(rng.integers(6))
     if kind == 0:
         return ball(size, 64)

@@ -1,4 +1,4 @@
-"""Glossy: polished metal and lacquered plastic slide and turn on a shiny table; highlights move unlike the surfaces."""
+"""Makes reflections: metal and lacquered bodies on a shiny table, with highlights unlike their motion."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TABLE = -0.09  # m, height of its top
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Six to nine things of 6 to 10 cm slide at 1.5 to 4 m/s and turn 2 to 8 times a second at speed 1."""
+    """Return six to nine bodies of 6 to 10 cm that slide at 1.5 to 4 m/s with 2 to 8 turns a second at speed 1."""
     rng = np.random.default_rng([seed, 9])
     top = RoughPlastic(common.backdrop(rng, 0.05, 0.5), between(rng, 0.08, 0.2))
     bodies = [
@@ -37,7 +37,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def shape(rng: np.random.Generator, size: float) -> Mesh:
-    """A solid that stands on the table and is no figure of revolution about the vertical, or shows it by texture."""
+    """Return a solid on the table whose rotation about the vertical is visible by shape or texture."""
     kind = int(rng.integers(6))
     if kind == 0:
         return box(2 * size, between(rng, 1, 3) * size, 1.4 * size, 2 * size)
@@ -53,7 +53,7 @@ def shape(rng: np.random.Generator, size: float) -> Mesh:
 
 
 def finish(rng: np.random.Generator) -> Material:
-    """Aluminium, chromium, gold or copper, more or less polished; or lacquer over a pattern."""
+    """Return aluminium, chromium, gold or copper of random polish, or lacquer over a pattern."""
     if rng.random() < 0.5:
         eta, k = pick(rng, ((0.96, 6.70), (3.12, 3.31), (0.42, 2.35), (1.04, 2.59)))
         return Conductor(eta, k, between(rng, 0.04, 0.2))

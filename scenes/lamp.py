@@ -1,4 +1,4 @@
-"""Low light: a still life in a dark room under one small lamp that swings; its shadows and glints move too."""
+"""Makes low light: a still life in a dark room under one swinging lamp, with moving shadows and glints."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TABLE = -0.09  # m
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Things on a table, half of them turning, and two that fly through at 2 to 4 m/s at speed 1."""
+    """Return bodies on a table, half of them turning, and two that pass at 2 to 4 m/s at speed 1."""
     rng = np.random.default_rng([seed, 12])
     bodies = [
         common.floor(Diffuse(common.backdrop(rng, 0.1, 0.7)), 1.8, y=TABLE, z=-0.3),
@@ -52,7 +52,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def swinging(rng: np.random.Generator, speed: float) -> AreaLamp:
-    """A lamp above the table on a pendulum; about a fiftieth of the light of the other families."""
+    """Return a lamp on a pendulum above the table, with about a fiftieth of the light of other families."""
     place = (between(rng, -0.15, 0.15), between(rng, 0.3, 0.4), between(rng, 0.0, 0.2))
     pivot = (place[0], place[1] + 0.5, place[2])
     axis = vector((rng.normal(0, 0.3), 0.0, 1.0))
@@ -62,7 +62,7 @@ def swinging(rng: np.random.Generator, speed: float) -> AreaLamp:
 
 
 def finish(rng: np.random.Generator) -> Material:
-    """Paint mostly, some metal."""
+    """Return paint mostly, sometimes metal."""
     if rng.random() < 0.2:
         return Conductor(roughness=between(rng, 0.2, 0.35))
     return RoughPlastic(common.surface(rng, 0.08, 0.85), between(rng, 0.2, 0.4))

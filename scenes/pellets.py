@@ -1,4 +1,4 @@
-"""Fast and small: pellets and crumbs shoot across the view, only a few pixels large."""
+"""Makes fast, small motion: pellets of a few pixels shoot across the view."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scenes.common import any_angle, between, pick
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Forty to seventy pellets of 4 to 12 mm in two or three jets, 2 to 5 m/s at speed 1."""
+    """Return forty to seventy pellets of 4 to 12 mm in two or three jets, 2 to 5 m/s at speed 1."""
     rng = np.random.default_rng([seed, 4])
     bodies = [common.wall(Diffuse(common.backdrop(rng, 0.15, 0.45)), 1.2, 0.6, z=-0.12)]
     jets = [(any_angle(rng), between(rng, 2.0, 4.2)) for _ in range(int(rng.integers(2, 4)))]
@@ -37,7 +37,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def coat(rng: np.random.Generator) -> Material:
-    """Steel, white or dark."""
+    """Return steel, white or dark."""
     if rng.random() < 0.3:
         return Conductor(roughness=0.2)
     return RoughPlastic(float(pick(rng, (0.03, 0.05, 0.8, 0.9))), 0.2)

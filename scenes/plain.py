@@ -1,4 +1,4 @@
-"""Low texture: bodies of one grey each before walls of one grey; only edges and shading tell of the motion."""
+"""Makes low texture: uniform grey bodies before uniform walls, with motion visible by edges and shading only."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scenes.common import any_angle, between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Five to eight bodies of 6 to 14 cm at 1 to 4 m/s and 1 to 6 turns a second at speed 1."""
+    """Return five to eight bodies of 6 to 14 cm at 1 to 4 m/s and 1 to 6 turns a second at speed 1."""
     rng = np.random.default_rng([seed, 11])
     bodies = [
         common.floor(Diffuse(between(rng, 0.2, 0.7)), 2.4, y=-0.16, z=-0.3),
@@ -34,7 +34,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def shape(rng: np.random.Generator, size: float) -> Mesh:
-    """A body whose outline or facets change as it turns; now and then a ball, of which not even that does."""
+    """Return a body whose outline or facets change with rotation, or sometimes a ball, which shows none."""
     kind = int(rng.integers(7))
     if kind <= 1:
         return box(*(size * rng.uniform(0.8, 2.4, 3)))

@@ -1,4 +1,4 @@
-"""Egomotion: nothing moves but the camera, which pans, shakes or walks through a furnished room."""
+"""Makes egomotion: the camera alone pans, shakes or flies through a furnished room."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WIDTH, HEIGHT, DEPTH = 4.0, 2.6, 5.0  # m
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Seeds take turns: a pan of 4 to 9 rad/s, a shake of two degrees at 18 to 32 Hz, a flight at 9 to 18 m/s."""
+    """Return, by seed, a pan of 4 to 9 rad/s, a shake of two degrees at 18 to 32 Hz, a flight at 9 to 18 m/s."""
     rng = np.random.default_rng([seed, 13])
     bodies = [*walls(rng), *furniture(rng)]
     origin = np.array([between(rng, -0.3, 0.3), between(rng, 1.2, 1.6), 2.2])
@@ -25,13 +25,13 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def pan(rng: np.random.Generator, speed: float) -> Motion:
-    """A turn about an axis near the vertical, through the lens; it passes its middle at half of a clip."""
+    """Return a rotation about a near-vertical axis through the lens, at its middle at half of a clip."""
     rate = speed * between(rng, 4.0, 9.0) * sign(rng)
     return Spin((float(rng.normal(0, 0.3)), 1.0, 0.0), rate, -rate * common.CLIP / 2)
 
 
 def shake(rng: np.random.Generator, speed: float) -> Motion:
-    """A hand that trembles: three waves about all axes and one that shifts."""
+    """Return the shake of a hand: three waves about all axes and one that shifts."""
     turns = tuple(
         Wave(vector(rng.normal(0, (0.04, 0.04, 0.02))), speed * between(rng, 18, 32), any_angle(rng)) for _ in range(3)
     )
@@ -39,13 +39,13 @@ def shake(rng: np.random.Generator, speed: float) -> Motion:
 
 
 def flight(rng: np.random.Generator, speed: float) -> Motion:
-    """Forward and sideways, as a drone."""
+    """Return a drone's motion: forward and sideways."""
     velocity = speed * np.array([between(rng, 8, 14) * sign(rng), between(rng, -1, 1), between(rng, 4, 12)])
     return Translation(vector(velocity), vector(-velocity * common.CLIP / 2))
 
 
 def walls(rng: np.random.Generator) -> list[Body]:
-    """Floor, back and sides, without a ceiling: the light comes from above and behind."""
+    """Return floor, back and side walls without a ceiling; the light comes from above and behind."""
     quarter = np.pi / 2
     sides = {
         "floor": (WIDTH, DEPTH, exponential((-quarter, 0, 0)), (0.0, 0.0, 0.0)),
@@ -60,7 +60,7 @@ def walls(rng: np.random.Generator) -> list[Body]:
 
 
 def furniture(rng: np.random.Generator) -> list[Body]:
-    """Crates, pillars and balls on the floor, and pictures on the wall."""
+    """Return crates, pillars and balls on the floor, and pictures on the wall."""
     bodies = []
     for i in range(int(rng.integers(7, 12))):
         size = between(rng, 0.25, 0.55)

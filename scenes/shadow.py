@@ -1,4 +1,4 @@
-"""Moving shadows: blades, slats and leaves out of view cross the sun; the wall is at rest, its brightness is not."""
+"""Makes moving shadows on a wall at rest: blades, slats and leaves outside the view cross the sun."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scenes.common import any_angle, between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Two or three things before the sun at 1 to 5 m/s, and one small flyer in view so that something truly moves."""
+    """Return two or three bodies before the sun at 1 to 5 m/s, and one small flyer in view."""
     rng = np.random.default_rng([seed, 14])
     sun = SunSky(between(rng, 0.75, 1.0), between(rng, -0.8, 0.8), 6 * between(rng, 0.8, 1.3), between(rng, 0.6, 1.5))
     towards = np.array(
@@ -24,7 +24,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         ]
     )
     bodies = [common.wall(Diffuse(common.backdrop(rng, 0.1, 0.75)), 1.6, 0.8)]
-    for i in range(3):  # what stands on the wall, at rest
+    for i in range(3):  # bodies at rest before the wall
         place = pose_matrix(None, (between(rng, -0.28, 0.28), between(rng, -0.12, 0.12), 0.02))
         thing = moved(blob(rng, between(rng, 0.015, 0.03), 0.2), place)
         bodies.append(Body(f"stone {i}", thing, common.paint(rng, common.surface(rng))))
@@ -44,7 +44,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def caster(rng: np.random.Generator, speed: float) -> tuple[Mesh, Motion]:
-    """(mesh, motion) in the plane z = 0 before the sun: a rotor, sliding slats or a branch with leaves."""
+    """Return mesh and motion in the plane z = 0 before the sun: a rotor, sliding slats or a branch with leaves."""
     kind = int(rng.integers(3))
     if kind == 0:
         blades = rotor(int(rng.integers(3, 7)), between(rng, 0.09, 0.14), 0.2, between(rng, 0.4, 0.7))

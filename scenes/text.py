@@ -1,4 +1,4 @@
-"""Text on a moving plate: a printed sign slides, swings and turns; letters of relief stand on it."""
+"""Makes text on a moving plate: a printed sign with raised letters slides, swings and turns."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ WORDS = (
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """One plate across the middle, 1 to 3 m/s at speed 1."""
+    """Return one plate across the middle, 1 to 3 m/s at speed 1."""
     rng = np.random.default_rng([seed, 7])
     place = Still(
         (0.0, between(rng, -0.015, 0.015), 0.0),
@@ -64,7 +64,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def carrier(rng: np.random.Generator, speed: float) -> Motion:
-    """How the plate moves: slides, swings or shakes."""
+    """Return the motion of the plate: a slide, a swing or a shake."""
     kind = int(rng.integers(3))
     if kind == 0:
         angle, rate = any_angle(rng), between(rng, 1.2, 2.5) * speed
@@ -77,6 +77,6 @@ def carrier(rng: np.random.Generator, speed: float) -> Motion:
 
 
 def random_lines(rng: np.random.Generator) -> list[str]:
-    """Three lines as on an eye chart: a heading's space is left free, letters get smaller downwards."""
+    """Return the lines of an eye chart: a free heading, then letters of decreasing size."""
     alphabet = list("ABCDEFGHJKLMNPQRSTUVWXYZ23456789")
     return ["", *("".join(rng.choice(alphabet, n)) for n in (11, 16, 24))]

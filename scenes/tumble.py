@@ -1,4 +1,4 @@
-"""Free flight: shapes thrown into the air tumble under sun and sky over a textured ground."""
+"""Makes free flight: tumbling bodies under sun and sky over a textured ground."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scenes.common import any_angle, between, pick
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """Six to nine toys of 4 to 7 cm, thrown at 1 to 4 m/s, 3 to 8 turns per second at speed 1."""
+    """Return six to nine toys of 4 to 7 cm, thrown at 1 to 4 m/s, 3 to 8 turns per second at speed 1."""
     rng = np.random.default_rng([seed, 2])
     count = int(rng.integers(6, 10))
     bodies = [
@@ -28,7 +28,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def spread(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Places [count, 3] in the view that keep apart from one another in x, y; three in the square in the middle."""
+    """Return positions [count, 3] in the view, apart from one another in x, y; three in the central square."""
     places: list[np.ndarray] = []
     while len(places) < count:
         place = rng.uniform((-0.24, -0.1, -0.08), (0.24, 0.11, 0.1))
@@ -40,7 +40,7 @@ def spread(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def shape(rng: np.random.Generator) -> Mesh:
-    """One solid, about 5 cm across."""
+    """Return one solid, about 5 cm across."""
     kind, size = int(rng.integers(7)), between(rng, 0.022, 0.036)
     if kind == 0:
         width, height, depth = size * rng.uniform(0.9, 1.9, 3)
@@ -59,7 +59,7 @@ def shape(rng: np.random.Generator) -> Mesh:
 
 
 def thrown(rng: np.random.Generator, place: np.ndarray, speed: float) -> Ballistic:
-    """A throw that passes `place` in the middle of a clip, at 1 to 4 m/s, 3 to 8 turns per second at speed 1."""
+    """Return a throw that passes `place` in the middle of a clip, at 1 to 4 m/s, 3 to 8 turns per second at speed 1."""
     velocity = rng.standard_normal(3) * (1.8, 1.4, 0.3) * speed
     return Ballistic(
         vector(place - velocity * common.CLIP / 2),

@@ -1,4 +1,4 @@
-"""Thin structures: spoked wheels, springs and wire globes, one to three pixels thick."""
+"""Makes thin structures: spoked wheels, springs and wire globes, one to three pixels thick."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scenes.common import any_angle, between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
-    """A wheel in the middle, globes and springs beside it, spinning 3 to 8 times a second at speed 1."""
+    """Return a central wheel with globes and springs beside it, at 3 to 8 turns a second at speed 1."""
     rng = np.random.default_rng([seed, 6])
     bodies = [common.wall(Diffuse(common.backdrop(rng, 0.15, 0.7)), 1.5, 0.75, z=-0.2)]
     places = [(0.0, 0.0), (-0.21, 0.03), (0.21, -0.02), (-0.33, -0.06), (0.33, 0.06)]
@@ -34,7 +34,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
 
 
 def wheel(rng: np.random.Generator, radius: float) -> Mesh:
-    """A rim, and crossed spokes to a hub, around z."""
+    """Return a rim with crossed spokes to a hub, around z."""
     rim = moved(torus(radius, 0.04 * radius), pose_matrix(exponential((np.pi / 2, 0, 0))))
     hub = moved(torus(0.1 * radius, 0.04 * radius, 24), pose_matrix(exponential((np.pi / 2, 0, 0))))
     spokes, cross = 2 * int(rng.integers(6, 13)), between(rng, 0, 0.8)
@@ -53,7 +53,7 @@ def wheel(rng: np.random.Generator, radius: float) -> Mesh:
 
 
 def globe(rng: np.random.Generator, radius: float) -> Mesh:
-    """Meridians and parallels of wire, axis y."""
+    """Return meridians and parallels of wire, axis y."""
     a = np.linspace(0, 2 * np.pi, 61)[:-1]
     thickness = between(rng, 0.0005, 0.0013)
     circle = np.stack([np.cos(a), np.sin(a), 0 * a], 1) * radius
@@ -71,7 +71,7 @@ def globe(rng: np.random.Generator, radius: float) -> Mesh:
 
 
 def cage(rng: np.random.Generator, radius: float) -> Mesh:
-    """A tangle: one closed wire along a random torus-knot-like path."""
+    """Return a tangle: one closed wire along a random torus-knot-like path."""
     p, q = pick(rng, ((2, 3), (3, 4), (3, 5), (2, 5), (4, 5)))
     a = np.linspace(0, 2 * np.pi, 301)[:-1]
     r = 0.68 + 0.3 * np.cos(q * a)
@@ -80,12 +80,12 @@ def cage(rng: np.random.Generator, radius: float) -> Mesh:
 
 
 def coil(rng: np.random.Generator, size: float) -> Mesh:
-    """A spring."""
+    """Return a spring."""
     return spring(0.35 * size, 2.2 * size, float(rng.integers(6, 12)), between(rng, 0.0008, 0.002))
 
 
 def metal(rng: np.random.Generator) -> Material:
-    """Bright metal, or painted dark or white."""
+    """Return bright metal, or dark or white paint."""
     kind = int(rng.integers(3))
     if kind == 0:
         return Conductor(roughness=0.3)
