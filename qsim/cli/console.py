@@ -53,7 +53,7 @@ _ALSO_CALLED = {
 EXTRAS = {"av": "video", "zarr": "formats", "h5py": "formats", "distributed": "cluster", "pyoidn": "denoise"}
 EXTRAS |= dict.fromkeys(("torch", "safetensors", "tensorboard"), "train")
 
-_quiet: ContextVar[bool] = ContextVar("quiet", default=False)  # of the command that runs now
+quiet: ContextVar[bool] = ContextVar("quiet", default=False)  # of the command that runs now
 
 
 class Parser(argparse.ArgumentParser):
@@ -182,7 +182,7 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
         args = parser.parse_args(argv)
     except SystemExit as stop:
         return int(stop.code or 0)
-    token = _quiet.set(args.quiet)
+    token = quiet.set(args.quiet)
     started = time.perf_counter()
     try:
         with _warnings_as_lines(parser.prog):
@@ -200,7 +200,7 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
         print(f"\n{parser.prog}: interrupted; {args.after_interrupt}", file=sys.stderr)
         return 130
     finally:
-        _quiet.reset(token)
+        quiet.reset(token)
         if args.verbose:
             spent, memory = time.perf_counter() - started, peak_memory() / 2**30
             print(f"{parser.prog}: {spent:.1f} s, at most {memory:.2f} GiB of memory", file=sys.stderr)
@@ -220,7 +220,7 @@ def _warnings_as_lines(prog: str) -> Iterator[None]:
 
 def note(text: str) -> None:
     """A line for people on stderr, unless the command runs with --quiet."""
-    if not _quiet.get():
+    if not quiet.get():
         print(text, file=sys.stderr)
 
 
@@ -278,7 +278,7 @@ def bar(label: str, unit: str = "frame") -> Iterator[Progress]:
     from tqdm import tqdm
 
     interval = 0.2 if sys.stderr.isatty() else 10.0
-    silent = _quiet.get()
+    silent = quiet.get()
     with tqdm(
         desc=label, unit=unit, delay=2, mininterval=interval, dynamic_ncols=True, file=sys.stderr, disable=silent
     ) as shown:

@@ -12,9 +12,11 @@ from qsim.colour import (
     depth_range,
     flow_colours,
     flow_legend,
+    from_linear,
     luminance,
     peak,
     psnr,
+    to_linear,
     tone,
 )
 
@@ -109,3 +111,14 @@ def test_psnr_has_one_convention_for_nothing():
     assert psnr(1.0, 0.0) == math.inf
     assert psnr(0.0, 0.1) == -math.inf
     assert math.isnan(psnr(1.0, math.nan))
+
+
+@pytest.mark.parametrize("transfer", ["linear", "srgb", "gamma 2.2"])
+@pytest.mark.parametrize("top", [255, 65535])
+def test_transfer_curves_are_inverted_exactly(transfer: str, top: int):
+    coded = np.arange(top + 1)
+    linear = to_linear(coded, transfer, top)
+    assert (np.diff(linear) >= 0).all()
+    assert (linear[0], linear[-1]) == (0, pytest.approx(1))
+    back = from_linear(linear, transfer, top).astype(int)
+    assert np.abs(back - coded).max() <= (0 if top == 255 else 1)

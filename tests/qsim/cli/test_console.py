@@ -130,13 +130,13 @@ def test_verbose_says_time_and_memory_and_shows_the_traceback(tmp_path, capsys):
 
 
 def test_a_quiet_bar_shows_nothing(capsys):
-    token = console._quiet.set(True)
+    token = console.quiet.set(True)
     try:
         with console.bar("rendering") as progress:
             progress(1, 2)
         console.note("working")
     finally:
-        console._quiet.reset(token)
+        console.quiet.reset(token)
     assert capsys.readouterr().err == ""
 
 

@@ -1,7 +1,10 @@
 """Arrays of .mat files: the only one is taken, others by name, and only counts."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from recordings import everything, random_planes
 
 from qsim.formats import importing
 from qsim.formats.mat_files import mat_array
@@ -42,3 +45,23 @@ def test_values_that_are_no_counts_are_refused(tmp_path):
         savemat(tmp_path / f"{name}.mat", {"x": np.full((3, 4), value)})
         with pytest.raises(ValueError, match="expected whole numbers from 0 up"):
             mat_array(tmp_path / f"{name}.mat")
+
+
+@pytest.mark.parametrize("level", ["5", "7.3"])
+def test_mat_parts_of_unequal_length(tmp_path: Path, level: str):
+    expected = random_planes(8, 5, 7)
+    for k, part in ((1, expected[:5]), (2, expected[5:])):
+        path = tmp_path / f"part_{k}.mat"
+        if level == "5":
+            from scipy.io import savemat
+
+            savemat(path, {"OUTPUT": part.transpose(1, 2, 0)}, do_compression=k == 2)
+        else:
+            h5py = pytest.importorskip("h5py")
+            with h5py.File(path, "w", userblock_size=512) as file:
+                file["OUTPUT"] = part.transpose(0, 2, 1)  # MATLAB's columns first, as HDF5 sees it: [T, W, H]
+    (tmp_path / "info.json").write_text('{"no_parts": 2}')
+    np.testing.assert_array_equal(everything(tmp_path), expected)
+    (tmp_path / "part_2.mat").unlink()
+    with pytest.raises(FileNotFoundError, match=r"part_2\.mat: missing, though info\.json speaks of 2 parts"):
+        importing.read(tmp_path)

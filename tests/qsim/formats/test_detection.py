@@ -1,0 +1,98 @@
+"""Layouts: recognised by name, signature and size, or asked about; never guessed."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import raw_planes
+from recordings import clip_of
+
+from qsim.cli.program import main
+from qsim.clip.clip import Clip
+from qsim.colour import to_linear
+from qsim.formats import detection, exporting, images, importing
+from qsim.formats.exporting import Export
+
+
+def test_three_raw_layouts_of_one_size_are_not_guessed(tmp_path: Path):
+    """Evidence is shown (here the right reading is the smoothest), the decision is the user's."""
+    bright = 0.3 + 0.25 * np.sin(2 * np.pi * np.arange(512) / 32)
+    waves = (np.random.default_rng(0).random((256, 512, 512), np.float32) < bright).astype(np.uint8)
+    path = tmp_path / "capture.bin"
+    path.write_bytes(raw_planes.spad512s(waves))
+    assert path.stat().st_size == 8_388_608
+    with pytest.raises(ValueError, match=r"8388608 bytes fit .*; choose one with --layout") as caught:
+        importing.read(path)
+    evidence = dict(re.findall(r"([\w-]+) \(roughness ([\d.]+)\)", str(caught.value)))
+    assert sorted(evidence) == ["spad512s", "swissspad2-full", "swissspad2-half"]
+    assert min(evidence, key=lambda name: float(evidence[name])) == "spad512s"
+    path.write_bytes(raw_planes.spad512s(waves) + b"\0\0\0\0")
+    assert detection.detect(path) == "spad512s"
+    path.rename(tmp_path / "acq_000.bin")
+    assert detection.detect(tmp_path / "acq_000.bin") == "spad512s"
+
+
+@pytest.mark.parametrize("top", [1, 3, 7, 15, 127])
+def test_counts_that_look_like_a_cube_are_asked_about(tmp_path: Path, top: int):
+    array = np.zeros((3, 5, 7), np.uint8)
+    array[1, 2, 3] = top
+    np.save(tmp_path / "a.npy", array)
+    with pytest.raises(ValueError, match=rf"uint8 up to {top}: codes of .* choose with --layout codes"):
+        importing.read(tmp_path / "a.npy")
+
+
+def test_detection_by_name_signature_and_type(tmp_path: Path):
+    np.save(tmp_path / "cube.npy", np.full((2, 3, 4), 200, np.uint8))
+    np.save(tmp_path / "light.npy", np.full((2, 3, 4), 0.5, np.float32))
+    np.save(tmp_path / "counts.npy", np.full((2, 3, 4), 5, np.uint16))
+    np.save(tmp_path / "planes.npy", np.ones((2, 3, 4), bool))
+    kinds = {"cube": "cube", "light": "light", "counts": "light", "planes": "codes"}
+    assert {name: detection.detect(tmp_path / f"{name}.npy") for name in kinds} == kinds
+    (tmp_path / "x.xyz").touch()
+    with pytest.raises(ValueError, match="unknown kind of file; say which with --layout: cube, "):
+        importing.read(tmp_path / "x.xyz")
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        importing.read(tmp_path / "none.npy")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "visionsim").mkdir()
+    (tmp_path / "visionsim" / "transforms.db").touch()
+    with pytest.raises(ValueError, match=r"let visionsim write a transforms\.json"):
+        importing.read(tmp_path / "visionsim")
+    with pytest.raises(ValueError, match="a folder of no known kind"):
+        importing.read(tmp_path / "empty")
+
+
+def test_a_folder_of_videos_becomes_clips(tmp_path: Path):
+    pytest.importorskip("av")
+    frames = np.random.default_rng(0).random((2, 16, 24))
+    clip = clip_of(tmp_path / "c", frames)
+    for name in ("test_00000.mp4", "occ/a.mp4"):
+        exporting.export(clip, tmp_path / "in" / name, Export("mp4", white=1.0))
+    options = ["--frame-rate", "2000", "--transfer", "gamma 2.2", "--split", "test"]
+    assert main(["convert", str(tmp_path / "in"), str(tmp_path / "out"), *options]) == 0
+    found = Clip.open(tmp_path / "out" / "occ_a")
+    assert found.meta["split"] == "test"
+    assert found.camera is None
+    np.testing.assert_allclose(found.radiance(1), clip.radiance(1), atol=0.012)  # half a step of 8 bits at the top
+    assert Clip.open(tmp_path / "out" / "test_00000").frame_rate == 2000.0
+
+
+def test_a_tree_of_picture_folders_becomes_clips(tmp_path: Path):
+    """As X4K1000FPS's test set has it: test/Type1/TEST01/0000.png ..."""
+    pictures = np.random.default_rng(0).integers(0, 255, (3, 9, 7)).astype(np.uint8)
+    for n, name in enumerate(["Type1/TEST01_000_f0433", "Type1/TEST02", "Type2/v1.0"]):
+        (tmp_path / "in" / name).mkdir(parents=True)
+        images.write_png(tmp_path / "in" / name, iter(pictures[: n + 1]))
+    (tmp_path / "in" / "scene").mkdir()  # planes with their pictures beside them are another kind
+    np.save(tmp_path / "in" / "scene" / "0.npy", np.zeros((2, 3, 4), np.uint8))
+    images.write_png(tmp_path / "in" / "scene", iter(pictures))
+    options = ["--frame-rate", "1000", "--transfer", "srgb", "--split", "test"]
+    assert main(["convert", str(tmp_path / "in"), str(tmp_path / "out"), *options]) == 0
+    found = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert found == ["Type1_TEST01_000_f0433", "Type1_TEST02", "Type2_v1.0"]
+    clip = Clip.open(tmp_path / "out" / "Type2_v1.0")
+    assert clip.shape == (3, 9, 7)
+    np.testing.assert_allclose(clip.radiance(2), to_linear(pictures[2], "srgb", 255), rtol=2**-10)
+    assert main(["convert", str(tmp_path / "in" / "Type2" / "v1.0"), str(tmp_path / "one"), *options]) == 0
+    assert Clip.open(tmp_path / "one").shape == (3, 9, 7)

@@ -1,0 +1,149 @@
+"""Exports: codes and light come back from every format at any size."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clips import write_clip
+from fakes import RECIPE, make
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from recordings import CAPTURE, SIZES, clip_of, everything
+
+from qsim.cli.program import main
+from qsim.dataset import generation, recipe
+from qsim.dataset.dataset import Dataset
+from qsim.formats import exporting, importing
+from qsim.formats.exporting import Export
+from qsim.formats.recording import Hints
+
+
+@pytest.mark.parametrize("bits", range(1, 9))
+@pytest.mark.parametrize("width", [1, 7, 10, 33, 70])
+def test_codes_through_our_stream_and_every_export(tmp_path: Path, bits: int, width: int):
+    codes = np.random.default_rng(bits).integers(0, 2**bits, (3, 5, width)).astype(np.uint8)
+    codes[0, 0, 0], codes[0, 1, 0], codes[0, 2, 0] = 0, 1, 2**bits - 1
+    np.save(tmp_path / "codes.npy", codes)
+    recording = importing.read(tmp_path / "codes.npy", Hints("codes", bits=bits))
+    stream = importing.to_stream(recording, tmp_path / "s", CAPTURE)
+    np.testing.assert_array_equal(stream.codes(), codes)
+    np.testing.assert_array_equal(
+        stream.codes(1, 3, (1, width // 2, 3, width - width // 2)), codes[1:, 1:4, width // 2 :]
+    )
+    exports = [Export("png"), Export("zarr")] + ([Export("cube")] if bits == 1 else [])
+    for wanted in exports:
+        path = exporting.export(stream, tmp_path / wanted.kind, wanted)
+        layout = {"png": "png", "zarr": "zarr", "cube": "cube"}[wanted.kind]
+        np.testing.assert_array_equal(everything(path, layout=layout, **said(layout, bits, width)), codes)
+        side = path / "meta.json" if path.is_dir() else path.with_name(path.name + ".json")
+        meta = json.loads(side.read_text())
+        assert (meta["bits"], meta["width"], meta["code_model"], meta["format_version"]) == (
+            bits,
+            width,
+            "binary_sum",
+            1,
+        )
+
+
+def said(kind: str, bits: int, width: int) -> dict[str, int]:
+    """What has to be said to read an export of codes again: a hint that says nothing is refused."""
+    return {"width": width} if kind == "cube" else {} if kind == "png" and bits == 1 else {"bits": bits}
+
+
+@settings(max_examples=30, deadline=None)
+@given(shape=SIZES, bits=st.integers(1, 16), seed=st.integers(0, 99))
+def test_codes_of_any_size_and_depth_come_back(
+    tmp_path_factory: pytest.TempPathFactory, shape: tuple[int, int, int], bits: int, seed: int
+):
+    """Stream -> PNG, zarr (and cube, MATLAB's parts) -> the same codes, whatever the size."""
+    folder = tmp_path_factory.mktemp("any")
+    values = np.random.default_rng(seed).integers(0, 2**bits, shape).astype(np.uint8 if bits <= 8 else np.uint16)
+    np.save(folder / "codes.npy", values)
+    stream = importing.to_stream(importing.read(folder / "codes.npy", Hints("codes", bits=bits)), folder / "s", CAPTURE)
+    np.testing.assert_array_equal(stream.codes(), values)
+    assert (stream.meta["bit_order"], stream.meta["orientation"], stream.meta["width"]) == ("msb", "upright", shape[2])
+    for kind in ("png", "zarr", "cube") if bits == 1 else ("png", "zarr"):
+        path = exporting.export(stream, folder / kind, Export(kind))
+        np.testing.assert_array_equal(everything(path, layout=kind, **said(kind, bits, shape[2])), values)
+    if bits <= 8:
+        from scipy.io import savemat
+
+        cut = seed % shape[0]  # parts of unequal length, or one part alone
+        for k, part in enumerate([values[:cut], values[cut:]] if cut else [values], 1):
+            (folder / "mat").mkdir(exist_ok=True)
+            savemat(folder / "mat" / f"part_{k}.mat", {"OUTPUT": part.transpose(1, 2, 0)})
+        np.testing.assert_array_equal(everything(folder / "mat", bits=bits), values)
+    shutil.rmtree(folder)
+
+
+@settings(max_examples=15, deadline=None)
+@given(shape=SIZES, seed=st.integers(0, 99))
+def test_light_of_any_size_comes_back(tmp_path_factory: pytest.TempPathFactory, shape: tuple[int, int, int], seed: int):
+    """Clip -> EXR and zarr exactly, lossless mp4 and PNG to half a step of 8 bits."""
+    from qsim.clip import exr
+
+    pytest.importorskip("av")
+    zarr = pytest.importorskip("zarr")
+    folder = tmp_path_factory.mktemp("light")
+    light = np.random.default_rng(seed).random(shape).astype(np.float16).astype(np.float32)
+    clip = clip_of(folder / "c", light)
+    path = exporting.export(clip, folder / "exr", Export("exr"))
+    np.testing.assert_array_equal(np.stack([exr.read(path / f"{t:06d}.exr")["Y"] for t in range(shape[0])]), light)
+    path = exporting.export(clip, folder / "z", Export("zarr"))
+    np.testing.assert_array_equal(zarr.open_group(str(path), mode="r")["frames"][...], light)
+    for kind in ("mp4", "png"):
+        path = exporting.export(clip, folder / f"c.{kind}", Export(kind, transfer="linear", white=1.0))
+        np.testing.assert_allclose(everything(path, transfer="linear"), light, atol=0.5 / 255 + 1e-6)
+    shutil.rmtree(folder)
+
+
+def test_a_data_set_becomes_videos(tmp_path: Path):
+    """`convert DATASET --to mp4`: a file per clip in the folder of its split, grey values rounded to half a code."""
+    av = pytest.importorskip("av")
+    generation.generate(recipe.parse(RECIPE), tmp_path / "small", generation.Options(workers=0), make=make)
+    command = ["convert", str(tmp_path / "small"), str(tmp_path / "out"), "--to", "mp4"]
+    assert main(command) == 0
+    clips = Dataset.open(tmp_path / "small").clips()
+    names = {f"{clip.meta['split']}/{clip.name}.mp4": clip for clip in clips}
+    assert sorted(names) == ["test/tumble_0004.mp4", "train/fan_0000.mp4", "train/fan_0001.mp4"]
+    made = [str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.*")]
+    assert sorted(made) == sorted([*names, *(f"{name}.json" for name in names)])
+    for name, clip in names.items():
+        meta = json.loads((tmp_path / "out" / f"{name}.json").read_text())
+        assert (meta["shape"], meta["frame_rate"], meta["split"]) == ([*clip.shape], 2000.0, clip.meta["split"])
+        assert (meta["orientation"], meta["transfer"], meta["lossless"]) == ("upright", "gamma 2.2", True)
+        radiance = np.stack([clip.radiance(t) for t in range(len(clip))]).astype(float)
+        assert meta["white"] == pytest.approx(np.percentile(radiance[:, ::2, ::2], 99.9), rel=1e-6)
+        exact = 255 * np.clip(radiance / meta["white"], 0, 1) ** (1 / 2.2)
+        with av.open(str(tmp_path / "out" / name)) as container:
+            grey = np.stack([frame.to_ndarray(format="gray") for frame in container.decode(video=0)])
+        assert grey.shape == clip.shape
+        assert np.abs(grey - exact).max() <= 0.5 + 1e-6
+    assert main(command) == 2, "what is there is not replaced without --force"
+    assert main([*command, "--force"]) == 0
+
+
+def test_light_out_as_exr_png_and_zarr(tmp_path: Path):
+    from qsim.clip import exr
+
+    frames = np.random.default_rng(0).random((3, 9, 7)).astype(np.float16).astype(np.float32)
+    clip = clip_of(tmp_path / "c", frames)
+    folder = exporting.export(clip, tmp_path / "exr", Export("exr"))
+    np.testing.assert_array_equal(exr.read(folder / "000002.exr")["Y"], frames[2])
+    folder = exporting.export(clip, tmp_path / "png", Export("png", transfer="srgb", white=1.0))
+    np.testing.assert_allclose(everything(folder, transfer="srgb"), frames, atol=0.005)
+    zarr = pytest.importorskip("zarr")
+    folder = exporting.export(clip, tmp_path / "c.zarr", Export("zarr"))
+    np.testing.assert_array_equal(zarr.open_group(str(folder), mode="r")["frames"][...], frames)
+
+
+def test_what_was_written_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    clip = write_clip(tmp_path / "clip", frames=2, height=6, width=8)
+    for kind, words in [
+        ("mp4", "mp4, 2 frames of 6 x 8 pixels at 2000 per second, played at 30, light by gamma 2.2, white"),
+        ("exr", "exr, 2 frames of 6 x 8 pixels at 2000 per second, linear light in W m^-2 sr^-1"),
+    ]:
+        assert main(["convert", str(clip.path), str(tmp_path / kind), "--to", kind]) == 0
+        assert f"{tmp_path / kind}: {words}" in capsys.readouterr().out

@@ -1,0 +1,67 @@
+"""Pictures as light and as codes: PNG and TIFF."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import everything, random_planes
+
+from qsim.colour import code_levels, to_linear
+from qsim.formats import images, importing
+
+
+def test_png_and_tiff_pictures_of_light(tmp_path: Path):
+    tifffile = pytest.importorskip("tifffile")
+    rng = np.random.default_rng(0)
+    for dtype in (np.uint8, np.uint16):
+        pictures = rng.integers(0, np.iinfo(dtype).max, (3, 9, 7)).astype(dtype)
+        folder = tmp_path / f"png{np.dtype(dtype).name}"
+        folder.mkdir()
+        images.write_png(folder, iter(pictures))
+        expected = to_linear(pictures, "srgb", np.iinfo(dtype).max)
+        np.testing.assert_array_equal(everything(folder, transfer="srgb"), expected)
+        for photometric, stored in [("minisblack", pictures), ("miniswhite", np.iinfo(dtype).max - pictures)]:
+            path = tmp_path / f"{photometric}.tif"
+            tifffile.imwrite(path, stored, photometric=photometric)
+            np.testing.assert_array_equal(everything(path, transfer="srgb"), expected)
+        with pytest.raises(ValueError, match="does not say how light was coded"):
+            importing.read(folder)
+
+
+def test_colour_becomes_luminance(tmp_path: Path):
+    from PIL import Image
+
+    colour = np.random.default_rng(0).integers(0, 255, (9, 7, 3)).astype(np.uint8)
+    Image.fromarray(colour).save(tmp_path / "a.png")
+    expected = to_linear(colour, "gamma 2.2", 255) @ np.array([0.2126, 0.7152, 0.0722])
+    np.testing.assert_allclose(everything(tmp_path / "a.png", transfer="gamma 2.2")[0], expected, rtol=1e-5)
+
+
+def test_codes_in_pictures(tmp_path: Path):
+    """One-bit PNG, codes as they are, stretched codes; a stretched file is refused unless it is said."""
+    bits1 = random_planes(2, 5, 7).astype(bool)
+    codes = np.random.default_rng(1).integers(0, 8, (2, 5, 7)).astype(np.uint8)
+    codes[0, 0, :2] = 0, 7
+    for name, pictures in [("one", bits1), ("three", codes), ("wide", code_levels(codes, 3))]:
+        (tmp_path / name).mkdir()
+        images.write_png(tmp_path / name, iter(pictures))
+    np.testing.assert_array_equal(everything(tmp_path / "one"), bits1)
+    np.testing.assert_array_equal(everything(tmp_path / "three", bits=3), codes)
+    np.testing.assert_array_equal(everything(tmp_path / "wide", bits=3, stretched=True), codes)
+    with pytest.raises(ValueError, match=r"value \d+ at \(t, y, x\) = .* is no 3-bit code .* --stretched"):
+        everything(tmp_path / "wide", bits=3)
+    lossy = code_levels(codes, 3)
+    lossy[1, 2, 3] ^= 2
+    (tmp_path / "lossy").mkdir()
+    images.write_png(tmp_path / "lossy", iter(lossy))
+    with pytest.raises(ValueError, match=r"\(t, y, x\) = \(1, 2, 3\).*coded with loss"):
+        everything(tmp_path / "lossy", bits=3, stretched=True)
+
+
+def test_one_bit_tiff_of_both_polarities(tmp_path: Path):
+    tifffile = pytest.importorskip("tifffile")
+    bits = random_planes(1, 5, 11)[0].astype(bool)
+    for photometric, stored in [("minisblack", bits), ("miniswhite", ~bits)]:
+        path = tmp_path / f"{photometric}.tif"
+        tifffile.imwrite(path, stored, photometric=photometric)
+        np.testing.assert_array_equal(everything(path)[0], bits)

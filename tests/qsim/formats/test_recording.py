@@ -1,0 +1,129 @@
+"""Recordings: order of files, flips, and what a reader states about bits and orientation."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import raw_planes
+from recordings import CAPTURE, everything, random_planes
+
+from qsim.clip.sensing import Sensing, sense
+from qsim.formats import array_files, detection, exporting, images, importing, video
+from qsim.formats.exporting import Export
+from qsim.formats.recording import Hints, Recording, numbered
+
+
+def test_numbered_files_are_read_in_the_order_of_their_numbers(tmp_path: Path):
+    expected = random_planes(22, 256, 512)
+    for n in range(11):
+        folder = tmp_path / "0" / str(n // 4)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"filename{n}.bin").write_bytes(raw_planes.half(expected[2 * n : 2 * n + 2]))
+    recording = importing.read(tmp_path, Hints("swissspad2-half"))
+    assert recording.shape == (22, 256, 512)
+    np.testing.assert_array_equal(recording.read(0, 22), expected)
+    np.testing.assert_array_equal(recording.read(5, 13), expected[5:13])
+    assert [p.name for p in numbered([Path("a10.png"), Path("a9.png"), Path("a1.png")])] == [
+        "a1.png",
+        "a9.png",
+        "a10.png",
+    ]
+
+
+def test_flips(tmp_path: Path):
+    expected = random_planes(2, 512, 512)
+    (tmp_path / "acq_0.bin").write_bytes(raw_planes.spad512s(expected))
+    np.testing.assert_array_equal(everything(tmp_path / "acq_0.bin", flip="lr"), expected[..., ::-1])
+    np.testing.assert_array_equal(everything(tmp_path / "acq_0.bin", flip="ud"), expected[:, ::-1])
+
+
+def sample(folder: Path, layout: str) -> tuple[Path, Hints]:
+    """A small recording of each layout, and what has to be said to read it."""
+    planes_ = random_planes(2, 16, 16)
+    path = folder / "a.npy"
+    if layout == "cube":
+        np.save(path, np.packbits(planes_, axis=2))
+    elif layout in ("codes", "light"):
+        np.save(path, planes_.astype(bool if layout == "codes" else np.float32))
+    elif layout == "video":
+        pytest.importorskip("av")
+        path = folder / "a.mp4"
+        video.write_video(path, iter(255 * planes_), 30, lossless=True)
+    elif layout == "png":
+        path = folder
+        images.write_png(folder, iter(planes_.astype(bool)))
+    elif layout == "tiff":
+        path = folder / "a.tif"
+        pytest.importorskip("tifffile").imwrite(path, planes_[0].astype(bool))
+    elif layout == "visionsim":
+        path = folder
+        np.save(folder / "frames.npy", np.packbits(planes_[..., None], axis=2))
+        (folder / "transforms.json").write_text('{"w": 16, "h": 16, "c": 1, "bitpack": true, "bitpack_dim": 2}')
+    elif layout == "zarr":
+        pytest.importorskip("zarr")
+        path = folder / "a.zarr"
+        array_files.write_zarr(path, iter([planes_]), (2, 16, 16), {})
+    elif layout == "mat":
+        from scipy.io import savemat
+
+        path = folder / "a.mat"
+        savemat(path, {"OUTPUT": planes_.transpose(1, 2, 0)})
+    else:
+        path = folder / "a.bin"
+        path.write_bytes(bytes(64 if layout == "spike" else 32768))
+    needed: dict[str, Any] = {"spike": {"height": 16, "width": 16}, "cube": {"width": 16}, "visionsim": {}}
+    light = layout in ("light", "video")  # the pictures hold one bit
+    return path, Hints(layout, **({"transfer": "linear"} if light else needed.get(layout, {})))
+
+
+def promised() -> dict[str, tuple[str, str]]:
+    """(bit order, orientation) of every layout, in the words of the readers, from the table in docs/files.md."""
+    text = (Path(__file__).parents[3] / "docs" / "files.md").read_text(encoding="utf-8")
+    found = {}
+    for names, _, bits, rows in re.findall(r"^\| (`.*?) \| (.*?) \| ?(.*?) \| (.*?) \|$", text, re.MULTILINE):
+        order = "msb" if "highest" in bits else "lsb" if "lowest" in bits else "none"
+        for name in re.findall(r"`([\w-]+)`", names):
+            found[name] = order, rows.removesuffix(", rows padded").removesuffix(": `--flip lr`")
+    return found
+
+
+@pytest.mark.parametrize("layout", detection.LAYOUTS)
+def test_every_reader_says_bit_order_and_orientation(tmp_path: Path, layout: str):
+    """As promised in docs/files.md, in what is read and in what is made of it."""
+    (tmp_path / "in").mkdir()
+    recording = importing.read(*sample(tmp_path / "in", layout))
+    make = importing.to_clip if recording.is_light else importing.to_stream
+    made = make(recording, tmp_path / "made", CAPTURE)
+    order, rows = promised()[layout]
+    assert recording.meta["bit_order"].startswith(order)
+    assert recording.meta["orientation"].startswith(rows)
+    said = {key: recording.meta[key] for key in ("bit_order", "orientation")}
+    assert made.meta["source"] == made.meta["source"] | said
+    assert made.meta.get("orientation", said["orientation"]) == said["orientation"]
+    exported = exporting.export(made, tmp_path / "out", Export("png"))
+    assert json.loads((exported / "meta.json").read_text())["orientation"] == said["orientation"]
+
+
+def test_a_disputed_side_stays_disputed_and_a_flip_is_remembered(tmp_path: Path):
+    (tmp_path / "a.bin").write_bytes(bytes(32768))
+    disputed = "as stored, left and right are disputed"
+    for flip, said in [("none", disputed), ("lr", f"{disputed}; then --flip lr")]:
+        stream = importing.to_stream(
+            importing.read(tmp_path / "a.bin", Hints("spad512s", flip=flip)), tmp_path / flip, CAPTURE
+        )
+        assert (stream.meta["orientation"], stream.meta["source"]["flip_lr"]) == (said, "unknown")
+        cube = exporting.export(stream, tmp_path / f"{flip}_cube.npy", Export("cube"))
+        assert json.loads(cube.with_name(cube.name + ".json").read_text())["orientation"] == said
+    np.save(tmp_path / "light.npy", np.ones((2, 3, 4), np.float32))
+    clip = importing.to_clip(importing.read(tmp_path / "light.npy", Hints(flip="ud")), tmp_path / "clip", CAPTURE)
+    assert clip.meta["source"]["orientation"] == "upright; then --flip ud"
+    sensed, _ = sense(clip, Sensing("quiver-physical", ppp=3.25))
+    assert sensed.meta["orientation"] == "upright; then --flip ud"
+
+
+def test_footage_whose_reader_says_nothing_is_not_called_upright(tmp_path: Path):
+    recording = Recording((1, 2, 8), lambda start, stop: random_planes(stop - start, 2, 8), "somewhere", 1)
+    assert importing.to_stream(recording, tmp_path / "s", CAPTURE).meta["orientation"] == "unknown"
