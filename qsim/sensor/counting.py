@@ -1,7 +1,7 @@
-"""Free-running counters with dead time (CountingSPAD): avalanches of an exposure, one by one.
+"""Models free-running counters with dead time (CountingSPAD): the avalanches of an exposure, one by one.
 
-Avalanches that the pixel could see are a Poisson process; arrivals = PDE photons + dark_count_rate exposure of them are
-expected in an exposure.
+Avalanches that the pixel could detect are a Poisson process. An exposure expects PDE photons + dark_count_rate exposure
+of them, called arrivals.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class CountingSPAD(SPAD):
 
     Non-paralyzable: after a count the pixel is dead for `dead_time`, and k counts fit if the k-th arrival of the live
     time comes soon enough: P(N >= k) = P(Gamma(k) <= arrivals (1 - (k - 1) dead_time / exposure)).
-    Paralyzable: every arrival, counted or not, starts a new dead time; see `deadtime.py`.
+    Paralyzable: every arrival, counted or not, starts a new dead time; see paralyzable.py.
     """
 
     dead_time: float  # s
@@ -53,8 +53,10 @@ class CountingSPAD(SPAD):
             raise ValueError(f"CountingSPAD.paralyzable is true or false, got {self.paralyzable!r}")
 
     def brightest(self, exposure: float) -> float:
-        """Paralyzable: E[N] = 1 - exp(-n a) + n (1 - a) exp(-n a) of n arrivals, a = dead time / exposure < 1, peaks at
-        n a (1 - a) = 1.
+        """Return the photons at which the mean count of a paralyzable pixel peaks; infinity for the other kind.
+
+        E[N] = 1 - exp(-n a) + n (1 - a) exp(-n a) of n arrivals, a = dead time / exposure < 1, peaks at n a (1 - a) =
+        1.
         """
         a = self.dead_time / exposure
         if not (self.paralyzable and 0 < a < 1):
@@ -62,16 +64,19 @@ class CountingSPAD(SPAD):
         return (1 / (a * (1 - a)) - self.dark_count_rate * exposure) / self.pde
 
     def dead_time_law(self, exposure: float) -> Paralyzable | None:
-        """That of a paralyzable pixel; None for the other one, without dead time the two are one."""
+        """Return the law of a paralyzable pixel; None for the other kind. Without dead time both kinds are one."""
         return Paralyzable(exposure / self.dead_time, self.levels) if self.paralyzable and self.dead_time else None
 
     def _live(self, arrivals: Array, exposure: float) -> Array:
-        """Arrivals expected in the live time that is left after k counts: [p, levels]."""
+        """Return the arrivals expected in the live time that remains after k counts: [p] -> [p, levels]."""
         share = 1 - np.arange(self.levels) * (self.dead_time / exposure)
         return arrivals[:, None] * np.maximum(share, 0)
 
     def steps(self, exposure: float) -> tuple[Callable[[Array, Array], Array], Callable[[Array, Array], Array]]:
-        """F_k and dF_k/darrivals of a non-paralyzable pixel for pairs: codes int [p], Poisson means [p] -> [p]."""
+        """Return F_k and dF_k/darrivals of a non-paralyzable pixel as functions of pairs.
+
+        A pair is a code and a Poisson mean: int [p], [p] -> [p].
+        """
         from scipy.special import gammaincc
 
         share = np.maximum(1 - np.arange(self.levels) * (self.dead_time / exposure), 0)
@@ -81,7 +86,7 @@ class CountingSPAD(SPAD):
         )
 
     def cdf_of(self, arrivals: Array, exposure: float) -> Array:
-        """F_k = P(N < k + 1) = Q(k + 1, live_k): the regularised incomplete gamma function."""
+        """Return F_k = P(N < k + 1) = Q(k + 1, live_k): the regularised incomplete gamma function."""
         from scipy.special import gammaincc
 
         if (paralyzable := self.dead_time_law(exposure)) is not None:
@@ -91,7 +96,10 @@ class CountingSPAD(SPAD):
         return cdf
 
     def log_pmf_of(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
-        """P(N = k) = Pois(k; live_(k-1)) + integral of Pois(k; x) from live_k to live_(k-1): two positive terms."""
+        """Return log P(N = k): [p] -> [p, levels].
+
+        P(N = k) = Pois(k; live_(k-1)) + integral of Pois(k; x) from live_k to live_(k-1): two positive terms.
+        """
         from scipy.special import gammainc, gammaincc
 
         if (paralyzable := self.dead_time_law(exposure)) is not None:
@@ -111,7 +119,7 @@ class CountingSPAD(SPAD):
         return result
 
     def kernel_plan(self, exposure: float) -> Plan | None:
-        """F_k = sum of k + 1 Poisson terms of the live time of few bits; curves for more, and if paralyzable."""
+        """Return a plan of sums of k + 1 Poisson terms for few bits; of curves for more bits, and if paralyzable."""
         if self.bits > MOST_BITS:
             return None
         dark, count, law = self.dark_rate * exposure, self.levels - 1, self.dead_time_law(exposure)
@@ -139,7 +147,7 @@ class CountingSPAD(SPAD):
         return self._draw_by_bisection(photons, exposure, key, origin)
 
     def decide(self, u: Array, photons: Array, exposure: float) -> tuple[Array, Array]:
-        """As every sensor; the steps around the code alone, but for few bits or few paralyzable dead times."""
+        """As every sensor; from the steps around the code alone, but for few bits or few paralyzable dead times."""
         from scipy.special import ndtri
 
         law = self.dead_time_law(exposure)
@@ -168,12 +176,12 @@ class CountingSPAD(SPAD):
         return paralyzable_steps.decide(ratio, top, below, above, self.arrivals(photons, exposure).ravel())
 
     def _guess(self, arrivals: Array, exposure: float, z: Array) -> Array:
-        """About the code at z standard deviations: of a renewal count, gaps a dead time and a wait."""
+        """Return about the code at z standard deviations of a renewal count, whose gaps are a dead time and a wait."""
         dead = 1 + arrivals * (self.dead_time / exposure)
         return np.rint((arrivals + dead - 1) / dead + z * np.sqrt(arrivals / dead) / dead)
 
     def _draw_by_bisection(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
-        """The smallest code k with u < F_k without looking at all 2^bits of them; u has 64 bits.
+        """Return the smallest code k with u < F_k for each pixel [H, W], from few of the 2^bits steps; u has 64 bits.
 
         Error: that of the regularised gamma function, below 1e-11 in any probability (tested to 65 534 counts).
         """
@@ -194,7 +202,7 @@ class CountingSPAD(SPAD):
         return search(passed, self.levels - 1, guess).reshape(photons.shape).astype(self.dtype)
 
     def slope_of(self, arrivals: Array, exposure: float) -> Array:
-        """dF_k/dlive_k = -Pois(k; live_k)."""
+        """Return dF_k/darrivals = -share_k Pois(k; live_k), share_k being the live share after k counts."""
         if (paralyzable := self.dead_time_law(exposure)) is not None:
             return paralyzable.slope(arrivals)
         k = np.arange(self.levels)
@@ -205,7 +213,7 @@ class CountingSPAD(SPAD):
 
 
 def _paralyzable_curves(law: Paralyzable, count: int) -> Curves | None:
-    """Curves of the steps F_0 ... F_(count - 1)."""
+    """Return curves of the steps F_0 ... F_(count - 1) of a paralyzable pixel; None if no grid is fine enough."""
     if law.by_steps:
         return below(
             lambda mean: paralyzable_steps.steps(law.ratio, count, mean[0])[0],
@@ -223,7 +231,10 @@ def _paralyzable_curves(law: Paralyzable, count: int) -> Curves | None:
 
 
 def _log_tail(at_once: Array, before: Array, live: Array, k: Array) -> Array:
-    """log P(N = k) below 1e-290, to a few per cent of P: the integral from its larger end and its slope there."""
+    """Return log P(N = k) below 1e-290, to a few per cent of P.
+
+    The integral is approximated from its larger end and its slope there.
+    """
     bright = live > k
     end = np.where(bright, live, before)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,7 +1,7 @@
-"""Named sensors, every number with its source, and sensors from a user's TOML file.
+"""Names sensors, every number with its source, and reads sensors from a user's TOML file.
 
-A number that its maker or authors did not publish is left out: a detection efficiency of 1 with the note "detected
-photons" means that light has to be given as photons that this sensor detects. A fill factor belongs to the camera
+A number that its maker or authors did not publish is left out. A detection efficiency of 1 with the note "detected
+photons" means that light is to be given as photons that this sensor detects. A fill factor belongs to the camera
 (`optics.Camera.fill_factor`), never to the sensor, so that it enters once.
 
     load("quiver-physical", ppp=3.25)     load("spad-320x240", bits=3)     load("my_sensor.toml")
@@ -44,24 +44,30 @@ _QUIVER_DARK = 1.6  # e-/pixel/s in the text of the same paper, e-/pixel/FRAME i
 
 
 def quiver_paper(bits: int = 3) -> QIS:
-    """The QUIVER paper's text: gain 1, dark current per second; two thirds of a flat field saturate at 9.75 PPP."""
+    """Return the sensor of the QUIVER paper's text: gain 1, dark current per second.
+
+    Two thirds of a flat field saturate at 9.75 PPP.
+    """
     return QIS(_QUIVER_QE, _QUIVER_DARK, _QUIVER_READ_NOISE, bits)
 
 
 def quiver_published(ppp: float, bits: int = 3, exposure: float = 5e-4) -> QIS:
-    """The QUIVER authors' program: 1.6 e- dark per frame of `exposure` [s], gain 0.5 (2^b - 1) / PPP."""
+    """Return the sensor of the QUIVER authors' program.
+
+    It has 1.6 e- dark per frame of `exposure` [s] and the gain 0.5 (2^b - 1) / PPP.
+    """
     if not exposure > 0:
         raise ValueError(f"quiver-published: the exposure is in seconds and above 0, got {exposure!r}")
     return QIS(_QUIVER_QE, _QUIVER_DARK / exposure, _QUIVER_READ_NOISE, bits, gain=_gain("quiver-published", ppp, bits))
 
 
 def quiver_physical(ppp: float, bits: int = 3) -> QIS:
-    """Our default: dark current per second as in the paper's text, the program's gain rule 0.5 (2^b - 1) / PPP."""
+    """Return our default: dark current per second as in the paper's text, gain 0.5 (2^b - 1) / PPP as in the program."""
     return QIS(_QUIVER_QE, _QUIVER_DARK, _QUIVER_READ_NOISE, bits, gain=_gain("quiver-physical", ppp, bits))
 
 
 def _gain(name: str, ppp: float, bits: int) -> float:
-    """Codes per electron of the rule 0.5 (2^b - 1) / PPP: the mean light level falls on half of the code range."""
+    """Return the gain 0.5 (2^b - 1) / PPP [codes/e-]: the mean light level falls on half of the code range."""
     if not 0 < ppp < float("inf"):
         raise ValueError(f"{name}: the gain follows the light level; give the photons per pixel above 0, got {ppp!r}")
     return 0.5 * (2**bits - 1) / ppp
@@ -208,10 +214,10 @@ DEVICES: Mapping[str, Device] = MappingProxyType(
 
 
 def load(name: str | Path, *, ppp: float | None = None, bits: int | None = None, exposure: float = 5e-4) -> Sensor:
-    """The sensor of a name in `DEVICES` or of a TOML file.
+    """Return the sensor of a name in `DEVICES` or of a TOML file.
 
-    `ppp` [photons/pixel] sets the gain where it follows the light, `bits` replaces the device's own depth (a TOML file
-    states its own), `exposure` [s] matters for dark electrons given per frame. `ValueError` names what is wrong.
+    `ppp` [photons/pixel] sets the gain where it follows the light. `bits` replaces the device's own depth (a TOML file
+    states its own). `exposure` [s] matters for dark electrons given per frame. `ValueError` names what is wrong.
     """
     if str(name) in DEVICES:
         device = DEVICES[str(name)]
@@ -228,7 +234,7 @@ def load(name: str | Path, *, ppp: float | None = None, bits: int | None = None,
 
 
 def from_toml(path: str | Path) -> Sensor:
-    """The sensor of a TOML file with a table [sensor] and, optionally, [sources] and [defects]; strict."""
+    """Return the sensor of a TOML file with a table [sensor] and, optionally, [sources] and [defects]; strict."""
     path = Path(path)
     tables = files.read_toml(path, "sensor file")
     for key in tables:
@@ -245,7 +251,7 @@ def from_toml(path: str | Path) -> Sensor:
 
 
 def from_dict(settings: Mapping[str, object], where: str = "sensor") -> Sensor:
-    """The sensor that `Sensor.to_dict` described: {"model": "QIS", field: value, ...}; strict, `ValueError`."""
+    """Return the sensor that `Sensor.to_dict` described: {"model": "QIS", field: value, ...}; strict, `ValueError`."""
     name = settings.get("model")
     if not isinstance(name, str) or name not in MODELS:
         raise ValueError(f"{where}: model is one of {', '.join(MODELS)}, got {name!r}{suggest(str(name), MODELS)}")
@@ -254,7 +260,7 @@ def from_dict(settings: Mapping[str, object], where: str = "sensor") -> Sensor:
 
 
 def listing() -> list[dict[str, object]]:
-    """All named sensors for people and programs: name, what, model, settings at 3.25 PPP, sources."""
+    """Return all named sensors as records: name, what, model, settings at 3.25 PPP, sources."""
     rows: list[dict[str, object]] = []
     for device in DEVICES.values():
         settings = device.make(3.25, device.bits, 5e-4).to_dict()

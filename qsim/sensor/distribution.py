@@ -1,4 +1,4 @@
-"""The exact law of a memoryless pixel: one cdf, and all that follows from it without drawing.
+"""States the exact law of a memoryless pixel: one cdf, and all that follows from it without drawing.
 
 A pixel that expects `photons` during `exposure` is completely described by
 
@@ -8,9 +8,9 @@ A model (qis.py, spad.py, counting.py) states F, log P(code = k) and dF/dphotons
 arrivals = efficiency photons + dark_rate exposure. Mean, variance, likelihood, Fisher information and the codes of
 uniform numbers are written here, once.
 
-**Codes.** Every pixel has one uniform number u (keys.py) and code = #{k : u >= F_k}. More light moves F down: codes
-grow with light at a fixed u, and sensors that differ only in their number of bits give the same code as far as both
-can write it. Where 32 bits of u cannot decide, 32 more are drawn; tails are resolved to 2^-64 on both sides.
+**Codes.** Every pixel has one uniform number u (keys.py) and code = #{k : u >= F_k}. More light moves F down, so codes
+grow with light at a fixed u. Sensors that differ only in their number of bits give the same code as far as both can
+write it. Where 32 bits of u cannot decide, 32 more are drawn; tails are resolved to 2^-64 on both sides.
 """
 
 from __future__ import annotations
@@ -36,41 +36,47 @@ class Distribution(ABC):
     @property
     @abstractmethod
     def efficiency(self) -> float:
-        """Poisson events (electrons, avalanches) per photon."""
+        """Return the Poisson events (electrons, avalanches) per photon."""
 
     @property
     @abstractmethod
     def dark_rate(self) -> float:
-        """Poisson events without light [1/s]."""
+        """Return the Poisson events without light [1/s]."""
 
     @abstractmethod
     def white(self, exposure: float) -> float:
-        """Photons at which restored video has the value 1."""
+        """Return the photons per exposure [s] at which restored video has the value 1."""
 
     @abstractmethod
     def cdf_of(self, arrivals: Array, exposure: float) -> Array:
-        """F: Poisson means [p] -> [p, levels]."""
+        """Return F: Poisson means [p] -> float64 [p, levels]."""
 
     @abstractmethod
     def log_pmf_of(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
-        """log P(code = k): Poisson means [p] -> [p, levels]; entries not `wanted` may come out as -inf below 1e-290."""
+        """Return log P(code = k): Poisson means [p] -> float64 [p, levels].
+
+        Entries outside `wanted` (bool [p, levels]) may be -inf where the probability is below 1e-290.
+        """
 
     @abstractmethod
     def slope_of(self, arrivals: Array, exposure: float) -> Array:
-        """dF/darrivals: Poisson means [p] -> [p, levels]."""
+        """Return dF/darrivals: Poisson means [p] -> float64 [p, levels]."""
 
     @property
     def levels(self) -> int:
-        """Number of codes, 2^bits."""
+        """Return the number of codes, 2^bits."""
         return 1 << self.bits
 
     @property
     def dtype(self) -> type[np.unsignedinteger[Any]]:
-        """Of codes: uint8 up to 8 bits, uint16 above."""
+        """Return the type of codes: uint8 up to 8 bits, uint16 above."""
         return np.uint8 if self.bits <= 8 else np.uint16
 
     def arrivals(self, photons: Array, exposure: float) -> Array:
-        """Expected Poisson events per pixel and exposure; ValueError for photons that are no light level."""
+        """Return the expected Poisson events per exposure [s]: photons [...] -> float64 [...].
+
+        `ValueError` names the first value of `photons` that is negative or not finite.
+        """
         check_exposure(exposure)
         values = np.asarray(photons, np.float64)
         wrong = ~(np.isfinite(values) & (values >= 0))
@@ -83,25 +89,26 @@ class Distribution(ABC):
         return self.efficiency * values + self.dark_rate * exposure
 
     def cdf(self, photons: Array, exposure: float) -> Array:
-        """P(code <= k): photons [...] -> float64 [..., levels]."""
+        """Return P(code <= k): photons [...] -> float64 [..., levels]."""
         return self._over_levels(self.cdf_of, photons, exposure)
 
     def log_pmf(self, photons: Array, exposure: float, wanted: Array | None = None) -> Array:
-        """log P(code = k): photons [...] -> float64 [..., levels]; exact in the tails, where differences of F are 0.
+        """Return log P(code = k): photons [...] -> float64 [..., levels]; exact in tails, where differences of F are 0.
 
-        Below 1e-290 sums in logarithms take their time; entries that `wanted` (bool, same shape) excuses may be -inf.
+        Sums of probabilities below 1e-290 are made in logarithms, which is slow. `wanted` (bool, same shape) limits
+        them: other entries may be -inf.
         """
         arrivals = self.arrivals(photons, exposure)
         some = None if wanted is None else np.asarray(wanted).reshape(-1, self.levels)
         return self.log_pmf_of(arrivals.ravel(), exposure, some).reshape(*arrivals.shape, self.levels)
 
     def pmf(self, photons: Array, exposure: float) -> Array:
-        """P(code = k): photons [...] -> float64 [..., levels]; what is below 1e-290 may be 0."""
+        """Return P(code = k): photons [...] -> float64 [..., levels]; values below 1e-290 may be 0."""
         nothing = np.zeros((*np.shape(photons), self.levels), bool)
         return np.exp(self.log_pmf(photons, exposure, nothing))
 
     def dcdf(self, photons: Array, exposure: float) -> Array:
-        """dF_k/dphotons: photons [...] -> float64 [..., levels]."""
+        """Return dF_k/dphotons: photons [...] -> float64 [..., levels]."""
         return self.efficiency * self._over_levels(self.slope_of, photons, exposure)
 
     def _over_levels(self, function: Any, photons: Array, exposure: float) -> Array:
@@ -109,16 +116,16 @@ class Distribution(ABC):
         return np.asarray(function(arrivals.ravel(), exposure)).reshape(*arrivals.shape, self.levels)
 
     def mean(self, photons: Array, exposure: float) -> Array:
-        """Expected code, [...]."""
+        """Return the expected code: photons [...] -> float64 [...]."""
         return self.pmf(photons, exposure) @ np.arange(self.levels, dtype=float)
 
     def variance(self, photons: Array, exposure: float) -> Array:
-        """Variance of the code, [...]."""
+        """Return the variance of the code: photons [...] -> float64 [...]."""
         pmf, codes = self.pmf(photons, exposure), np.arange(self.levels, dtype=float)
         return np.sum(pmf * (codes - (pmf @ codes)[..., None]) ** 2, axis=-1)
 
     def log_likelihood(self, codes: Array, photons: Array, exposure: float) -> Array:
-        """log P(code | photons) of each code, in the broadcast shape of the two."""
+        """Return log P(code | photons) of each code, in the broadcast shape of the two."""
         codes = np.asarray(codes)
         if codes.size and not (codes.dtype.kind in "ui" and codes.min() >= 0 and codes.max() < self.levels):
             raise ValueError(f"codes are integers 0 ... {self.levels - 1} of this {self.bits}-bit sensor")
@@ -129,20 +136,23 @@ class Distribution(ABC):
         return np.take_along_axis(table, chosen, axis=-1)[..., 0]
 
     def fisher_information(self, photons: Array, exposure: float) -> Array:
-        """Of one code about photons [1/photons^2]; infinite at 0 photons where light makes a code possible."""
+        """Return the information of one code about photons [1/photons^2]: photons [...] -> float64 [...].
+
+        It is infinite at 0 photons where light makes a code possible.
+        """
         slope = np.diff(self.dcdf(photons, exposure), axis=-1, prepend=0.0)
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
             terms = np.exp(2 * np.log(np.abs(slope)) - self.log_pmf(photons, exposure, slope != 0))
         return np.where(slope == 0, 0.0, terms).sum(axis=-1)
 
     def brightest(self, exposure: float) -> float:
-        """Photons up to which the mean code grows with light."""
+        """Return the photons up to which the mean code grows with light."""
         return inf
 
     def draw(self, photons: Array, exposure: float, first: Array, second: Callable[[Array], Array]) -> Array:
-        """Codes [...] of one 32-bit word per pixel: expected photons, in a shape that broadcasts, words uint32 [...].
+        """Return codes [...] of one word per pixel: words uint32 [...], and expected photons that broadcast to them.
 
-        `second` gives further words [n] of the pixels of a mask, bool [...], that the first words do not decide.
+        `second` returns further words [n] of the n pixels of a mask, bool [...], that the first words do not decide.
         """
         codes, undecided = self.decide(uniform(first), photons, exposure)
         if undecided.any():
@@ -151,12 +161,15 @@ class Distribution(ABC):
         return codes
 
     def decide(self, u: Array, photons: Array, exposure: float) -> tuple[Array, Array]:
-        """Codes of uniform numbers of 32 bits, and where those do not decide: [...], bool [...] from [...] each."""
+        """Return codes int [...] and where 32 bits do not decide, bool [...], of uniform numbers [...] and photons.
+
+        The photons broadcast to the shape of the numbers.
+        """
         cdf, u = self.cdf(photons, exposure)[..., :-1], u[..., None]
         return np.count_nonzero(u >= cdf, axis=-1), (np.abs(u - cdf) <= 2.0**-32).any(axis=-1)
 
     def codes_at(self, first: Array, second: Array, photons: Array, exposure: float) -> Array:
-        """Codes of single pixels [p] from two words each: a 64-bit number, compared from the nearer end."""
+        """Return codes [p] of two words uint32 [p] each: a 64-bit number, compared from the nearer end."""
         below, above = (u[:, None] for u in uniform_pair(first, second))
         pmf = self.pmf(photons, exposure)
         cdf, survival = np.cumsum(pmf, axis=1)[:, :-1], np.cumsum(pmf[:, :0:-1], axis=1)[:, ::-1]
@@ -169,7 +182,7 @@ def check_exposure(exposure: float) -> None:
 
 
 def require_number(record: Any, name: str, low: float, high: float = np.inf, *, open_low: bool = False) -> None:
-    """ValueError unless the field is a finite number in low ... high (or above low)."""
+    """Raise ValueError unless the field is a finite number in low ... high (or above low)."""
     value = getattr(record, name)
     number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
     if not (number and isfinite(value) and (value > low if open_low else value >= low) and value <= high):
@@ -180,7 +193,7 @@ def require_number(record: Any, name: str, low: float, high: float = np.inf, *, 
 
 
 def require_bits(record: Any) -> None:
-    """ValueError unless the field `bits` is an integer 1 ... 16."""
+    """Raise ValueError unless the field `bits` is an integer 1 ... 16."""
     try:
         bits = index(record.bits)
     except TypeError:

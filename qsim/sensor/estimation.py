@@ -1,7 +1,7 @@
-"""From codes back to light: response curves, variance stabilisation and maximum likelihood, for any sensor.
+"""Estimates light from codes: the response of a sensor and its inverse, and maximum likelihood, for any sensor.
 
-Everything here reads a sensor only through `log_pmf` and `dcdf`. A grid of light levels from 0 to where the sensor has
-nothing more to say brackets every answer; exact evaluations refine it.
+A sensor is read only through its exact law (distribution.py). A grid of light levels from 0 to saturation brackets
+every answer; exact evaluations refine it.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class Response:
     sensor: str  # in words
 
     def cap(self, samples: int) -> float:
-        """The largest estimate [photons] from the mean of `samples` codes: half a count below saturation.
+        """Return the largest estimate [photons] from the mean of `samples` codes: half a count below saturation.
 
-        `ValueError` where that is no light at all.
+        `ValueError` if the mean of so many codes does not resolve the response at all.
         """
         if self.mean[-1] - 0.5 / samples <= self.mean[0]:
             raise ValueError(
@@ -53,7 +53,7 @@ class Response:
         return float(np.interp(self.mean[-1] - 0.5 / samples, self.mean, self.photons))
 
     def invert(self, mean_code: Array, samples: int) -> Array:
-        """Photons whose mean code is this; 0 below the mean of a dark pixel, cap(samples) at saturation. Any shape.
+        """Return photons [...] whose mean code is this: 0 below the mean of a dark pixel, cap(samples) at saturation.
 
         `ValueError` as for `cap`.
         """
@@ -66,8 +66,8 @@ class Estimate:
     """Light from codes; arrays [...] in photons.
 
     Two ends are special. A histogram that is likeliest in the dark has photons = lower = 0 and a one-sided `upper`.
-    One that gets ever likelier with light (all codes saturated) has `upper` infinite, a one-sided `lower`, and as
-    `photons` the light at which it has half of its final likelihood: for n saturated codes, P(saturated)^n = 1/2.
+    A histogram that gets ever likelier with light (all codes saturated) has `upper` infinite and a one-sided `lower`.
+    Its `photons` is the light of half the final likelihood: for n saturated codes, P(saturated)^n = 1/2.
     """
 
     photons: Array
@@ -104,7 +104,7 @@ def _grid(sensor: Distribution, exposure: float) -> _Grid:
 
 
 def _end_of_rise(sensor: Distribution, exposure: float) -> float:
-    """Photons at which the mean code stops rising: at the top code, or before (full well, dead time).
+    """Return the photons at which the mean code stops rising: at the top code, or before (full well, dead time).
 
     `ValueError` for a sensor whose mean code does not rise from darkness.
     """
@@ -131,12 +131,12 @@ def _end_of_rise(sensor: Distribution, exposure: float) -> float:
 
 
 def pieces(photons: Array, values: int) -> list[Array]:
-    """Photons in pieces whose distributions, of this many values each, fit into memory together."""
+    """Split photons [p] into pieces whose distributions, of this many values each, fit into memory together."""
     return np.array_split(photons, -(-len(photons) * values // _TOGETHER))
 
 
 def response(sensor: Distribution, exposure: float, points: int = POINTS) -> Response:
-    """Tabulate a sensor's response from darkness to the end of its rise.
+    """Tabulate a sensor's response from darkness to the end of its rise, at `points` levels of light.
 
     Where the response falls again (a paralyzable counter) the table holds its rising branch only. `ValueError` for a
     sensor whose mean code does not rise.
@@ -150,7 +150,7 @@ def response(sensor: Distribution, exposure: float, points: int = POINTS) -> Res
 
 
 def maximum_likelihood(sensor: Distribution, histogram: Array, exposure: float, confidence: float = 0.95) -> Estimate:
-    """See `Sensor.maximum_likelihood`."""
+    """Return the Estimate of `Sensor.maximum_likelihood`."""
     counts = _checked(sensor, histogram)
     if not 0 < confidence < 1:
         raise ValueError(f"confidence is a probability above 0 and below 1, got {confidence!r}")
@@ -186,18 +186,21 @@ def _refuse_impossible(sensor: Distribution, exposure: float, counts: Array) -> 
 
 @dataclass(frozen=True)
 class _Likelihood:
-    """Histograms [h, levels] as functions of light: for some rows at one light level each, [p], [p] -> [p]."""
+    """Histograms [h, levels] as functions of light.
+
+    The methods take light levels [p] and the rows int [p] that they belong to, and return [p].
+    """
 
     sensor: Distribution
     exposure: float
     counts: Array
 
     def value(self, photons: Array, rows: Array) -> Array:
-        """Log-likelihood."""
+        """Return the log-likelihood."""
         return (self.counts[rows] * self._log_pmf(photons, rows)).sum(axis=1)
 
     def score(self, photons: Array, rows: Array) -> Array:
-        """Its derivative by photons."""
+        """Return the derivative of the log-likelihood by photons."""
         slope = np.diff(self.sensor.dcdf(photons, self.exposure), axis=-1, prepend=0.0)
         with np.errstate(over="ignore", invalid="ignore"):
             ratio = slope * np.exp(-self._log_pmf(photons, rows))
@@ -209,7 +212,7 @@ class _Likelihood:
 
 
 def _estimate(likelihood: _Likelihood, grid: _Grid, confidence: float) -> Array:
-    """photons, lower, upper of every histogram: [3, h]."""
+    """Return photons, lower and upper of every histogram: [3, h]."""
     table = likelihood.counts @ grid.log_pmf.T
     best, end, everything = table.argmax(axis=1), len(grid.photons) - 1, np.arange(len(table))
     if grid.saturates:
@@ -233,7 +236,10 @@ def _estimate(likelihood: _Likelihood, grid: _Grid, confidence: float) -> Array:
 
 
 def _crossing(likelihood: _Likelihood, grid: _Grid, table: Array, start: Array, target: Array, direction: int) -> Array:
-    """Where the log-likelihood first falls to `target` on the way down (-1) or up (+1) from `start`; else 0 or inf."""
+    """Return the light at which the log-likelihood first falls to `target` below (-1) or above (+1) `start`: [h].
+
+    It is 0 or infinity where the likelihood does not fall so far.
+    """
     photons, size = grid.photons, len(grid.photons)
     low_enough = table < target[:, None]
     if direction < 0:
@@ -252,7 +258,7 @@ def _crossing(likelihood: _Likelihood, grid: _Grid, table: Array, start: Array, 
 
 
 def _root(function: Callable[[Array, Array], Array], low: Array, high: Array, rows: Array) -> Array:
-    """Where a function that falls from low to high is 0, each row in its own bracket; else the end nearest to a 0."""
+    """Return the zero of a function that falls from low to high, each row in its own bracket; else the nearer end."""
     from scipy.optimize.elementwise import find_root
 
     def bounded(x: Array, which: Array) -> Array:  # the library gives up at infinity, and passes 64-bit floats

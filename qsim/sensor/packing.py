@@ -1,9 +1,9 @@
-"""Packing of codes: b bits per pixel, each row alone, most significant bit first.
+"""Packs codes: b bits per pixel, each row alone, most significant bit first.
 
     codes [..., W] (uint8, or uint16 above 8 bits)  <->  packed [..., ceil(W * b / 8)] (uint8)
 
-A row starts on a byte and is padded with zero bits, so rows can be read alone; the width is not recoverable from the
-packed array and travels beside it. With one bit this is the photon cube of the field: `numpy.packbits` along W.
+A row starts on a byte and is padded with zero bits, so rows can be read alone. The width cannot be recovered from the
+packed array and is stored beside it. With one bit this is the photon cube of the field: `numpy.packbits` along W.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ MAX_BITS = 16
 
 
 def code_dtype(bits: int) -> np.dtype:
-    """uint8 up to 8 bits, uint16 up to 16."""
+    """Return uint8 up to 8 bits, uint16 up to 16."""
     _check_bits(bits)
     return np.dtype(np.uint8 if bits <= 8 else np.uint16)
 
 
 def packed_width(width: int, bits: int) -> int:
-    """Bytes of one packed row of `width` codes."""
+    """Return the bytes of one packed row of `width` codes."""
     return -(-width * bits // 8)
 
 
 def check(codes: Array, bits: int) -> None:
-    """Codes are unsigned integers within 0 ... 2^bits - 1, or a `ValueError` names the first that is not."""
+    """Raise `ValueError` with the first code that is not an unsigned integer within 0 ... 2^bits - 1."""
     _check_bits(bits)
     top = 2**bits - 1
     expected = f'codes: expected {code_dtype(bits)} "{_axes(codes.ndim)}" with values 0..{top} for a {bits}-bit sensor'
@@ -48,7 +48,7 @@ def index_text(index: tuple[int, ...]) -> str:
 
 
 def pack(codes: Array, bits: int) -> Array:
-    """Packed bytes [..., ceil(W * bits / 8)] of codes [..., W]; `ValueError` if a code does not fit into `bits`."""
+    """Return packed bytes [..., ceil(W * bits / 8)] of codes [..., W]; `ValueError` if a code does not fit."""
     check(codes, bits)
     if bits == 1:
         return np.packbits(codes, axis=-1)
@@ -111,7 +111,7 @@ def unpack(packed: Array, bits: int, width: int) -> Array:
 
 
 def _grouped(codes: Array) -> Array:
-    """Codes [..., W] as [..., ceil(W/8), 8], padded with zeros."""
+    """Return codes [..., W] as [..., ceil(W/8), 8], padded with zeros."""
     width = codes.shape[-1]
     groups = -(-width // 8)
     padded = np.zeros((*codes.shape[:-1], groups * 8), codes.dtype)
@@ -125,5 +125,5 @@ def _check_bits(bits: int) -> None:
 
 
 def _axes(ndim: int) -> str:
-    """Names of the axes: "t h w" for three."""
+    """Return the names of the axes: "t h w" for three."""
     return {1: "w", 2: "h w", 3: "t h w"}.get(ndim, "... t h w")

@@ -1,9 +1,9 @@
-"""The paralyzable counter: how many of n arrivals are counted.
+"""Computes the law of the paralyzable counter: the number of counts from n arrivals.
 
-An arrival is counted if none came in the dead time before it, so the code is 1 + the number of gaps between successive
-arrivals that reach the dead time (the pixel is live at the start). Let n arrivals fall on an exposure that is R dead
-times long. Choose which k - 1 of the n - 1 gaps are long and take one dead time out of each: what remains are
-n uniform points on a line l = R - k + 1 dead times long whose m = n - k chosen gaps are all shorter than one,
+An arrival is counted if none came in the dead time before it. The pixel is live at the start, so the code is 1 + the
+number of gaps between successive arrivals that reach the dead time. Let n arrivals fall on an exposure that is R dead
+times long. Choose which k - 1 of the n - 1 gaps are long and take one dead time out of each. There remain n uniform
+points on a line l = R - k + 1 dead times long, whose m = n - k chosen gaps are all shorter than one:
 
     P(k counted | n) = C(n-1, k-1) (l / R)^n H(m, k; l),
 
@@ -16,8 +16,8 @@ on [0, 1): integration by parts of E[(l - S) (l - S)+^(k-1)] gives
 which starts at the density of S (k = -1), itself a B-spline with the positive recursion of de Boor and Cox:
 (m - 1) A(m, -1; l) = l A(m-1, -1; l) + (m - l) A(m-1, -1; l-1).
 
-Light so bright that the table would be too long paralyses the pixel, if the dead time is not far below the exposure:
-the few counts after the first then follow from the series of binomial moments, which no longer cancels.
+Light so bright that the table would be too long paralyses the pixel, if the dead time is not far below the exposure.
+The few counts after the first then follow from the series of binomial moments, which no longer cancels.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ _SPARSE = 3.0  # expected counts after the first up to which the alternating ser
 
 
 class Paralyzable:
-    """cdf, log_pmf and slope of the clipped count for Poisson means [p]; `ratio` = exposure / dead time."""
+    """Cdf, log_pmf and slope of the clipped count for Poisson means [p]; `ratio` = exposure / dead time."""
 
     def __init__(self, ratio: float, levels: int) -> None:
         self.ratio, self.levels = ratio, levels
         self.possible = min(levels, most_counts(ratio) + 1)  # levels that can occur
 
     def cdf(self, mean: Array) -> Array:
-        """P(code <= k): [p] -> [p, levels]."""
+        """Return P(code <= k): [p] -> [p, levels]."""
         result = np.ones((len(mean), self.levels))
         for rows, table in self._tables(mean, brief=True):
             result[rows, : self.possible] = (
@@ -55,7 +55,7 @@ class Paralyzable:
         return result
 
     def log_pmf(self, mean: Array, wanted: Array | None = None) -> Array:
-        """log P(code = k): [p] -> [p, levels]; `wanted` as in Mixture."""
+        """Return log P(code = k): [p] -> [p, levels]; `wanted` as in Mixture."""
         result = np.full((len(mean), self.levels), -np.inf)
         for rows, table in self._tables(mean):
             some = None if wanted is None else wanted[rows, : self.possible]
@@ -65,7 +65,7 @@ class Paralyzable:
         return result
 
     def slope(self, mean: Array) -> Array:
-        """dcdf/dmean: [p] -> [p, levels]."""
+        """Return dcdf/dmean: [p] -> [p, levels]."""
         result = np.zeros((len(mean), self.levels))
         for rows, table in self._tables(mean):
             result[rows, : self.possible] = (
@@ -75,13 +75,16 @@ class Paralyzable:
 
     @property
     def by_steps(self) -> bool:
-        """Whether so many dead times fit into the exposure that steps come one by one (contours.py), at any light."""
+        """Return whether steps can be computed one by one (paralyzable_steps.py), at any light.
+
+        The exposure must hold enough dead times.
+        """
         return self.ratio >= LEAST
 
     def _tables(self, mean: Array, brief: bool = False) -> Iterator[tuple[Array, Mixture | None]]:
-        """Light levels in groups, each with a table just long enough (the Poisson tail left out is below 1e-30).
+        """Yield light levels in groups, each with a table just long enough (the Poisson tail left out is below 1e-30).
 
-        `brief`: the series where it is as good as the table in the cdf, though not in far tails.
+        `brief`: None instead of a table where the series gives the cdf as well, though not its far tails.
         """
         length = np.exp2(np.ceil(np.log2(mean + 12 * np.sqrt(mean) + 60)))
         if brief and self.ratio < LEAST:  # few moments, which are quicker than a long table
@@ -96,13 +99,13 @@ class Paralyzable:
 
 
 def most_counts(ratio: float) -> int:
-    """The most counts that fit into an exposure of `ratio` dead times, the pixel being live at its start."""
+    """Return the most counts that fit into an exposure of `ratio` dead times, the pixel being live at its start."""
     return floor(ratio) + 1
 
 
 @lru_cache(maxsize=16)
 def arrival_table(ratio: float, levels: int, last: int) -> Mixture:
-    """P(code | n arrivals) for n < `last`; `ratio` = exposure / dead time; codes clip at levels - 1."""
+    """Return P(code | n arrivals) for n < `last`; `ratio` = exposure / dead time; codes clip at levels - 1."""
     most = most_counts(ratio)
     counted = min(most, levels - 1 + _BEYOND_TOP, last - 1)
     log_pmf = _log_counts(ratio, counted, last)
@@ -126,7 +129,7 @@ def arrival_table(ratio: float, levels: int, last: int) -> Mixture:
 
 
 def _log_counts(ratio: float, counted: int, last: int) -> Array:
-    """log P(k counted | n), n = 0 ... last - 1 and k = 0 ... `counted`: [last, counted + 1]."""
+    """Return log P(k counted | n), n = 0 ... last - 1 and k = 0 ... `counted`: [last, counted + 1]."""
     from scipy.special import gammaln
 
     log_shares = _log_shares(ratio, counted, last)
@@ -140,7 +143,7 @@ def _log_counts(ratio: float, counted: int, last: int) -> Array:
 
 
 def _log_shares(ratio: float, counted: int, last: int) -> Array:
-    """log H(n - k, k; ratio - k + 1) at [n, k]; zeros where n < k or k = 0."""
+    """Return log H(n - k, k; ratio - k + 1) at [n, k]; zeros where n < k or k = 0."""
     lengths = ratio - np.arange(min(floor(ratio), counted + last) + 1)  # l of each column
     shorter = np.append(lengths[1:], -1.0)
     fits = shorter >= 0
@@ -168,15 +171,15 @@ def _log_shares(ratio: float, counted: int, last: int) -> Array:
 
 
 def _next(values: Array) -> Array:
-    """The values at l - 1, one column on."""
+    """Return the values at l - 1, one column on."""
     return np.concatenate([values[..., 1:], np.zeros_like(values[..., :1])], axis=-1)
 
 
 class _Paralysed:
-    """Light in which hardly a gap is long: the distribution from the binomial moments B_j = E[C(N, j)].
+    """The law in light so bright that long gaps are rare, from the binomial moments B_j = E[C(N, j)].
 
-    With a = 1 / ratio and rate = mean exp(-mean a), a count at x has the density mean exp(-mean min(x, a)) if it is the
-    first and `rate` if it comes a or more after the one before, so
+    With a = 1 / ratio and rate = mean exp(-mean a), the first count has the density mean exp(-mean min(x, a)) at x. A
+    later count has the density `rate`, if it comes a or more after the one before. So
 
         B_j = rate^(j-1) [J(j-1, c) + rate (c - a)+^j / j!],   c = 1 - (j - 1) a,
         J(r, c) = integral from 0 to min(a, c) of mean exp(-mean x) (c - x)^r / r! dx;
@@ -200,7 +203,7 @@ class _Paralysed:
         self.changes = change + self.moments * (self.j - 1) * (1 / mean - a)[:, None]  # of B_j / rate^(j-1) by the mean
 
     def log_pmf(self) -> Array:
-        """[p, levels]; the last code is this count or more."""
+        """Return log P(code = k): [p, levels]; the last code is this count or more."""
         from scipy.special import binom
 
         result = np.full((len(self.mean), self.levels), -np.inf)
@@ -214,19 +217,19 @@ class _Paralysed:
         return result
 
     def cdf(self) -> Array:
-        """[p, levels]"""
+        """Return P(code <= k): [p, levels]."""
         cdf = 1 - self._beyond(self.moments)
         cdf[:, 0] = np.exp(-self.mean)
         return cdf
 
     def slope(self) -> Array:
-        """dcdf/dmean, [p, levels]"""
+        """Return dcdf/dmean: [p, levels]."""
         slope = -self._beyond(self.changes)
         slope[:, 0] = -np.exp(-self.mean)
         return slope
 
     def _beyond(self, moments: Array) -> Array:
-        """The series of P(N > k), or of its derivative, for every code below the last: [p, levels]."""
+        """Return the series of P(N > k), or of its derivative, for every code below the last: [p, levels]."""
         from scipy.special import binom
 
         terms, result = moments * self.rate[:, None] ** (self.j - 1), np.zeros((len(self.mean), self.levels))
@@ -236,7 +239,10 @@ class _Paralysed:
 
 
 def _moments(mean: Array, a: float, last: int) -> tuple[Array, Array]:
-    """B_j / rate^(j-1) and the part of its derivative in which rate^(j-1) is kept: [p, last] each, j = 1 ... last."""
+    """Return B_j / rate^(j-1) and the part of its derivative in which rate^(j-1) is kept.
+
+    Both are [p, last], j = 1 ... last.
+    """
     moments, slopes = np.empty((len(mean), last)), np.empty((len(mean), last))
     factor = np.exp(-mean * a)
     for j in range(1, last + 1):

@@ -1,4 +1,4 @@
-"""The steps F_k of a paralyzable counter one by one, at any light: a contour integral of its generating function.
+"""Computes the steps F_k of a paralyzable counter one by one, at any light, by a contour integral.
 
 An arrival at t is counted if none came in the dead time tau before it, whatever was counted until t - tau. So the
 generating function g(t) = E[z^N(t)] obeys g'(t) = r (z - 1) g(t - tau), r = lambda exp(-lambda tau) per exposure. Its
@@ -6,7 +6,7 @@ Laplace transform has one pole s for each branch of Lambert's W, tau s = W(r tau
 
     g(T) = sum over the branches of lambda z exp(s T) / ((lambda + s) (1 + tau s)).
 
-In exposures of many dead times the principal branch is the whole sum. Then, on a circle inside or outside of |z| = 1,
+In exposures of many dead times the principal branch is the full sum. Then, on a circle inside or outside of |z| = 1,
 
     F_k = (1 / 2 pi) integral of g(z) z^-k / (1 - z) d theta,    outside: F_k - 1.
 
@@ -35,7 +35,7 @@ _BLOCK = 1 << 10  # pixels of one block of work
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """Half of the circle of each of p pixels: arrays [nodes, p], and [p] of what is far from the mean.
+    """Half of the circle of each of p pixels: arrays [nodes, p] and [p].
 
     g(z) / (1 - z) d theta / pi = factor exp(power).
     """
@@ -49,7 +49,7 @@ class Circle:
     turn: Array  # what the code one turn of the nodes on adds, which is certain
 
     def sums(self, codes: Array, some: Array) -> Array:
-        """Inside F_k, outside F_k - 1, of `codes` [n] of the pixels `some` [n]."""
+        """Return F_k inside of |z| = 1, F_k - 1 outside, of `codes` [n] of the pixels `some` int [n]: [n]."""
         inside, away = self.inside[some], (codes - self.first[some]) / self.deviation[some]
         result = np.where(inside, away > 0, -1.0 * (away < 0))  # far away
         close = np.where(inside, (away > -_FAR) & (away < _OTHER), (away > -_OTHER) & (away < _FAR))
@@ -60,9 +60,10 @@ class Circle:
 
 
 def generating(log_z: Array, mean: Array, ratio: float) -> tuple[Array, Array, Array]:
-    """E[z^N] = exp(power) / factor after `ratio` >= LEAST dead times, and dlog E[z^N]/dmean: log z and means broadcast.
+    """Return power, factor and slope of the generating function after `ratio` >= LEAST dead times.
 
-    In multiples of the mean, the pole is s = mean (share - 1).
+    E[z^N] = exp(power) / factor; the slope is dlog E[z^N]/dmean. Log z and means broadcast. In multiples of the mean,
+    the pole is s = mean (share - 1).
     """
     from scipy.special import lambertw
 
@@ -76,14 +77,14 @@ def generating(log_z: Array, mean: Array, ratio: float) -> tuple[Array, Array, A
 
 
 def moments(mean: Array, ratio: float) -> tuple[Array, Array, Array]:
-    """About the mean, the variance and the third cumulant of the count: [p] each."""
+    """Return approximate mean, variance and third cumulant of the count: Poisson means [p] -> [p] each."""
     fill = mean / ratio * np.exp(-mean / ratio)  # counts per dead time
     first = -np.expm1(-mean / ratio) + fill * (ratio - 1)
     return first, first * (1 - 2 * fill), first * (1 - 6 * fill + 9 * fill * fill)
 
 
 def circle(mean: Array, inside: Array, ratio: float) -> Circle:
-    """Nodes of pixels of Poisson means [p], `inside` or outside of |z| = 1: bool [p]."""
+    """Return the nodes of pixels of Poisson means [p], `inside` or outside of |z| = 1: bool [p]."""
     first, variance, _ = moments(mean, ratio)
     deviation = np.sqrt(np.maximum(variance, _LEAST_VARIANCE))
     end = 2 * np.arcsin(np.sqrt(np.minimum(_FALL / 2 / np.maximum(variance, 1.0), 1.0)))
@@ -97,7 +98,10 @@ def circle(mean: Array, inside: Array, ratio: float) -> Circle:
 
 
 def decide(ratio: float, top: int, below: Array, above: Array, mean: Array) -> tuple[Array, Array]:
-    """The smallest codes k with u < F_k (`top` at most), and how near u comes to a step: [p] from (u, 1 - u), means."""
+    """Return the smallest codes k with u < F_k (`top` at most) and the distance of u to the nearest step.
+
+    Both are [p], of (u, 1 - u) and Poisson means [p].
+    """
     from scipy.special import ndtri
 
     first, variance, third = moments(mean, ratio)
@@ -126,9 +130,10 @@ def _block(ratio: float, top: int, below: Array, above: Array, mean: Array, gues
 
 
 def steps(ratio: float, count: int, mean: Array) -> tuple[Array, Array]:
-    """F_0 ... F_(count - 1) and dF/dmean of Poisson means [n], for grids of curves: [count, n] each.
+    """Return F_0 ... F_(count - 1) and dF/dmean of Poisson means [n], for grids of curves: [count, n] each.
 
-    One circle for all codes, so close to |z| = 1 that no code is amplified by more than exp(7): an error below 1e-11.
+    One circle serves all codes, so close to |z| = 1 that no code is amplified by more than exp(7): an error below
+    1e-11.
     """
     half = max(64, 2 * (count + 1))
     log_z = -14 / half + 1j * np.pi / half * (np.arange(half)[:, None] + 0.5)

@@ -1,9 +1,9 @@
-"""Poisson mixtures: sensors whose code depends on light only through a Poisson number n of electrons or arrivals.
+"""Sums Poisson mixtures: sensors whose code depends on light only through a number n of electrons or arrivals.
 
     P(code = k | lambda) = sum_n Pois(n; lambda) P(code = k | n)
 
-The second factor does not know the light, so it is one table per sensor, made once. Every term is positive: sums lose
-no digits, and the logarithm of a probability is as good at 1e-280 as at 1/2. The derivative is another such sum,
+The second factor does not depend on the light, so it is one table per sensor, made once. Every term is positive: sums
+lose no digits, and the logarithm of a probability is as good at 1e-280 as at 1/2. The derivative is another such sum,
 d/dlambda sum_n Pois(n) C(n) = sum_n Pois(n) [C(n+1) - C(n)], if the differences are made without cancellation.
 """
 
@@ -21,7 +21,7 @@ _CHUNK = 1 << 21  # numbers in one block of work (16 MiB)
 
 
 def poisson_log_pmf(mean: Array, n: Array) -> Array:
-    """log Pois(n; mean), broadcast; exact at mean 0, with an error of about 1e-16 |n - mean| beside rounding.
+    """Return log Pois(n; mean), broadcast; exact at mean 0, else with an error of about 1e-16 |n - mean| and rounding.
 
     Loader's form ("Fast and accurate computation of binomial probabilities", 2000): -(n log(n / mean) - n + mean)
     - log(2 pi n) / 2 - (Stirling's error of log n!). Around the mean, where n log(mean) and log n! are huge and cancel,
@@ -39,7 +39,7 @@ def poisson_log_pmf(mean: Array, n: Array) -> Array:
 
 
 def _stirling_error(n: Array) -> Array:
-    """log n! - (n + 1/2) log n + n - log(2 pi) / 2 for n >= 1."""
+    """Return log n! - (n + 1/2) log n + n - log(2 pi) / 2 for n >= 1."""
     from scipy.special import gammaln
 
     n = np.maximum(n, 1.0)
@@ -49,10 +49,10 @@ def _stirling_error(n: Array) -> Array:
 
 
 def poisson_quantile(mean: Array, below: Array, above: Array) -> Array:
-    """The smallest n with P(N <= n) > u, as float64, from (u, 1 - u): exact inversion, as good as the cdf in float64.
+    """Return the smallest n with P(N <= n) > u as float64, from (u, 1 - u): inversion as exact as the cdf in float64.
 
-    A normal approximation gives the first guess; galloping steps and bisection on the regularised gamma function, from
-    whichever side of the distribution is the smaller, give the answer.
+    A normal approximation gives the first guess. Galloping steps and bisection on the regularised gamma function give
+    the answer, from the smaller side of the distribution.
     """
     from scipy.special import ndtri, pdtr, pdtrc
 
@@ -81,7 +81,7 @@ def poisson_quantile(mean: Array, below: Array, above: Array) -> Array:
 class Mixture:
     """P(code | n) for n = first ... first + m - 1 and some codes: arrays [m, levels] and [levels].
 
-    Below `first` no code of the block occurs except beneath it (cdf 1, pmf 0); from `first` + m on the tail rows hold.
+    Below `first` every code is beneath those of the block (cdf 1, pmf 0). From `first` + m on the tail rows hold.
     """
 
     first: int
@@ -96,7 +96,7 @@ class Mixture:
         return np.exp(self.log_pmf), np.exp(self.tail_log_pmf)
 
     def evaluate_cdf(self, mean: Array) -> Array:
-        """P(code <= k): [p] Poisson means -> [p, levels]."""
+        """Return P(code <= k): Poisson means [p] -> [p, levels]."""
         certain = (self.tail_cdf == 1) & (self.cdf == 1).all(axis=0)  # the top code
         result = self._mix(mean, self.cdf, np.where(certain, 0.0, self.tail_cdf))
         if self.first:
@@ -105,13 +105,14 @@ class Mixture:
         return np.minimum(result, 1.0)
 
     def evaluate_slope(self, mean: Array) -> Array:
-        """d cdf / d mean: [p] -> [p, levels]."""
+        """Return dcdf/dmean: Poisson means [p] -> [p, levels]."""
         return self._mix(mean, self.slope, None)
 
     def evaluate_log_pmf(self, mean: Array, wanted: Array | None = None) -> Array:
-        """log P(code = k): [p] -> [p, levels]; -inf only where no n of the table gives the code.
+        """Return log P(code = k): Poisson means [p] -> [p, levels]; -inf only where no n of the table gives the code.
 
-        Probabilities below 1e-290 are summed in logarithms, which is slow: `wanted`, bool [p, levels], can excuse some.
+        Probabilities below 1e-290 are summed in logarithms, which is slow. `wanted`, bool [p, levels], limits these
+        sums.
         """
         pmf = self._mix(mean, *self._pmf)
         deep = pmf < _UNDERFLOW
@@ -128,7 +129,7 @@ class Mixture:
         return result
 
     def _log_sum(self, mean: Array, rows: Array, codes: Array) -> Array:
-        """The same sum in logarithms for pairs (rows, codes) of means [r] and codes: -> [pairs]."""
+        """Return the same sum in logarithms for pairs (rows, codes) of means [r] and codes: [pairs]."""
         from scipy.special import gammaincc
 
         n = np.arange(self.first, self.first + len(self.log_pmf))
@@ -158,7 +159,7 @@ class Mixture:
         return result
 
     def _weights(self, mean: Array) -> Array:
-        """Pois(n; mean) of the table's n: [p] -> [m, p]."""
+        """Return Pois(n; mean) of the table's n: [p] -> [m, p]."""
         n = np.arange(self.first, self._last)
         bright = mean > _DIM
         if self.first or not len(n) or (bright.any() and self._last > _DIM):
@@ -180,13 +181,13 @@ class Mixture:
         return self.first + len(self.log_pmf)
 
     def _below(self, mean: Array) -> Array:
-        """P(n < first), first > 0."""
+        """Return P(n < first), first > 0."""
         from scipy.special import gammaincc
 
         return gammaincc(self.first, mean)
 
     def _above(self, mean: Array) -> Array:
-        """P(n >= first + m)."""
+        """Return P(n >= first + m)."""
         from scipy.special import gammainc
 
         return gammainc(self._last, mean) if self._last else np.ones_like(mean)

@@ -1,8 +1,8 @@
-"""The quanta image sensor's pixel: Poisson electrons, Gaussian read noise, an ADC of few bits.
+"""Models the quanta image sensor's pixel: Poisson electrons, Gaussian read noise, an ADC of few bits.
 
     code = clip(round(gain (min(N, full_well) + read_noise z) + offset), 0, 2^b - 1),   N ~ Poisson(QE photons + dark t)
 
-Rounding is half to even: with read noise 0 ties happen, and gain n + offset is then what float64 makes of it.
+Rounding is half to even: with read noise 0 ties happen, and gain n + offset is then its float64 value.
 With t_k = (k + 1/2 - offset) / gain, the table of the mixture is P(code <= k | n) = Phi((t_k - min(n, full_well)) /
 read_noise).
 """
@@ -72,7 +72,7 @@ class QIS(Sensor):
         return replace(self, dark_current=rate)
 
     def white(self, exposure: float) -> float:
-        """Photons at which x = 1: top code / (gain QE); neither offset, dark current nor full well enters."""
+        """Return the photons at which x = 1: top code / (gain QE); offset, dark current and full well do not enter."""
         return (self.levels - 1) / (self.gain * self.quantum_efficiency)
 
     def cdf_of(self, arrivals: Array, exposure: float) -> Array:
@@ -88,18 +88,21 @@ class QIS(Sensor):
         return np.concatenate([t.evaluate_slope(arrivals) for _, t in self._tables()], axis=1)
 
     def _tables(self) -> Iterator[tuple[slice, Mixture]]:
-        """Some codes at a time, so few that a table stays below 20 MB: all in one for 8 bits and a gain above 1/16."""
+        """Yield some codes and their table, so few that a table stays below 20 MB.
+
+        All codes share one table for 8 bits and a gain above 1/16.
+        """
         step = min(_BLOCK, max(1, int(_SPAN * self.gain)))
         for start in range(0, self.levels, step):
             stop = min(start + step, self.levels)
             yield slice(start, stop), electron_table(self, start, stop)
 
     def codes_of(self, electrons: Array) -> Array:
-        """The ADC: float electrons, read noise included -> codes; the only place where gain and rounding happen."""
+        """Convert float electrons [...], read noise included, to codes [...]: the only place of gain and rounding."""
         return np.clip(np.rint(self.gain * electrons + self.offset), 0, self.levels - 1).astype(self.dtype)
 
     def decide(self, u: Array, photons: Array, exposure: float) -> tuple[Array, Array]:
-        """As every sensor; where the table is long, the steps around the code alone, to the same 1e-13."""
+        """As every sensor; where the table is long, from the steps around the code alone, to the same 1e-13."""
         from scipy.special import ndtri
 
         steps = thresholds(self) if table_length(self) * (self.levels + 32) > _LONG else None
@@ -116,7 +119,7 @@ class QIS(Sensor):
         return codes.reshape(u.shape), near.reshape(u.shape) <= 2.0**-32
 
     def kernel_plan(self, exposure: float) -> Plan | None:
-        """Short sums over electrons, or curves where those are too long."""
+        """Return a plan of short sums over electrons, or of curves where those are too long."""
         if self.bits > MOST_BITS:
             return None
         dark, count = self.dark_rate * exposure, self.levels - 1
@@ -130,7 +133,7 @@ class QIS(Sensor):
         )
 
     def short_sums(self) -> Electrons | None:
-        """The steps of at most 8 bits as sums over electrons; None if they are too long."""
+        """Return the steps of at most 8 bits as sums over electrons; None if they are too long."""
         if table_length(self) > _LONGEST_TABLE:
             return None
         table = electron_table(self, 0, self.levels)
@@ -151,9 +154,9 @@ class QIS(Sensor):
         noise: Array | float = 1.0,
         offset: Array | float = 0.0,
     ) -> Array:
-        """Codes [H, W] of photons [H, W]: electrons, read noise and ADC, each inverted at a 64-bit number.
+        """Return codes [H, W] of photons [H, W]: electrons, read noise and ADC, each inverted at a 64-bit number.
 
-        `noise` is relative to `read_noise` and `offset` [codes] is added to that of the sensor: a number, or [H, W].
+        `noise` is relative to `read_noise`, and `offset` [codes] is added to that of the sensor: a number, or [H, W].
         Error: that of the inverted functions, below 1e-13 in any probability (tested for means to 65 000).
         """
         from scipy.special import ndtri
@@ -169,7 +172,7 @@ class QIS(Sensor):
     def read_out_pmf(
         self, photons: Array, exposure: float, noise: Array | float = 1.0, offset: Array | float = 0.0
     ) -> Array:
-        """P(code) of `read_out`: photons [..., H, W] -> [..., H, W, levels], noise and offset as there.
+        """Return P(code) of `read_out`: photons [..., H, W] -> [..., H, W, levels], with the same noise and offset.
 
         Sum over electrons n of Pois(n) P(code | n).
         """
@@ -195,14 +198,17 @@ class QIS(Sensor):
 
 
 def table_length(sensor: QIS) -> float:
-    """Electrons in the table of all codes, as `electron_table` has it."""
+    """Return the number of electrons in the table of all codes, as `electron_table` makes it."""
     high = (sensor.levels - 1.5 - sensor.offset) / sensor.gain + _REACH * sensor.read_noise + 1
     return max(min(high, inf if sensor.full_well is None else sensor.full_well), 0.0)
 
 
 @lru_cache(maxsize=32)
 def thresholds(sensor: QIS) -> Thresholds | None:
-    """The steps of a sensor of at most 8 bits one by one; None where read noise blurs more than memory should hold."""
+    """Return the steps of a sensor of at most 8 bits, for evaluation one by one.
+
+    None where read noise blurs more electrons than fit into memory.
+    """
     from scipy.special import ndtr
 
     top, noise = sensor.levels - 1, sensor.read_noise
@@ -227,7 +233,7 @@ def thresholds(sensor: QIS) -> Thresholds | None:
 
 @lru_cache(maxsize=32)
 def electron_table(sensor: QIS, start: int, stop: int) -> Mixture:
-    """P(code | n electrons) for the codes start ... stop - 1."""
+    """Return P(code | n electrons) for the codes start ... stop - 1."""
     from scipy.special import ndtr
 
     top = sensor.levels - 1
@@ -245,7 +251,7 @@ def electron_table(sensor: QIS, start: int, stop: int) -> Mixture:
 
 
 def _normal_thresholds(sensor: QIS, electrons: Array, codes: Array) -> Array:
-    """z such that P(code <= k | electrons) = Phi(z): [n, k]; -inf for k = -1, +inf for the top code."""
+    """Return z of P(code <= k | electrons) = Phi(z): [n, k]; -inf for k = -1, +inf for the top code."""
     if sensor.read_noise == 0:
         return np.where(sensor.codes_of(electrons)[:, None] <= codes, inf, -inf)
     z = ((codes + 0.5 - sensor.offset) / sensor.gain - electrons[:, None]) / sensor.read_noise
@@ -254,7 +260,7 @@ def _normal_thresholds(sensor: QIS, electrons: Array, codes: Array) -> Array:
 
 
 def log_normal_difference(low: Array, high: Array) -> Array:
-    """log(Phi(high) - Phi(low)) for low <= high, without cancellation on either side of 0."""
+    """Return log(Phi(high) - Phi(low)) for low <= high, without cancellation on either side of 0."""
     from scipy.special import erf, log_ndtr
 
     flip = low > 0  # Phi(b) - Phi(a) = Phi(-a) - Phi(-b): work on the side where both are small

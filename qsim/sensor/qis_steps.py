@@ -1,7 +1,7 @@
-"""The steps F_k of a QIS one by one: P(code <= k) for pairs of a code and a light level, without the whole table.
+"""Computes the steps F_k of a QIS one by one: P(code <= k) for pairs of a code and a light level, without a table.
 
-Given n electrons, P(code <= k | n) is 1 for few of them, 0 or a constant (full well) for many, and in between only
-where read noise blurs the threshold:
+Given n electrons, P(code <= k | n) is 1 for few of them, and 0 or a constant (full well) for many. It lies in between
+only where read noise blurs the threshold:
 
     F_k = P(N < first_k) + sum over the blurred n of Pois(n) weight_k(n) + tail_k P(N >= last_k)
 
@@ -31,7 +31,7 @@ class Thresholds:
     tail: Array  # [K]
 
     def cdf(self, codes: Array, mean: Array) -> Array:
-        """F of pairs: codes int [p], Poisson means [p] -> [p]."""
+        """Return F of pairs: codes int [p], Poisson means [p] -> [p]."""
         from scipy.special import gammainc, gammaincc
 
         def block(k: Array, some: Array) -> Array:
@@ -44,7 +44,7 @@ class Thresholds:
         return _in_blocks(block, codes, mean)
 
     def slope(self, codes: Array, mean: Array) -> Array:
-        """dF/dmean of pairs: [p], [p] -> [p]."""
+        """Return dF/dmean of pairs: codes int [p], Poisson means [p] -> [p]."""
         ends = np.column_stack([np.ones(len(self.first)), self.weights, self.tail])
         falls = np.diff(ends, axis=1)  # of P(code <= k | n) from n = first - 1 on
 
@@ -56,7 +56,10 @@ class Thresholds:
         return _in_blocks(block, codes, mean)
 
     def _sum(self, table: Array, k: Array, mean: Array) -> Array:
-        """sum over n of Pois(n; mean) table[k, n - first]; electrons whose weight is below 1e-19 are left out."""
+        """Return the sum over n of Pois(n; mean) table[k, n - first]: [p].
+
+        Electrons whose weight is below 1e-19 are left out.
+        """
         width = table.shape[1]
         reach = 9 * np.sqrt(mean) + 25
         start = np.clip(np.floor(mean - reach) - self.first[k], 0, width).astype(np.intp)
@@ -77,7 +80,10 @@ class Thresholds:
 
 
 def decide(cdf: Callable[[Array, Array], Array], top: int, u: Array, mean: Array, guess: Array) -> tuple[Array, Array]:
-    """The smallest codes k with u < F_k (`top` at most), and how near u comes to a step: [p], [p] from [p] each."""
+    """Return the smallest codes k with u < F_k (`top` at most) and the distance of u to the nearest step.
+
+    Both are [p], of uniform numbers, Poisson means and guesses [p].
+    """
     near = np.full(len(u), np.inf)
 
     def passed(k: Array, left: Array) -> Array:
@@ -89,9 +95,10 @@ def decide(cdf: Callable[[Array, Array], Array], top: int, u: Array, mean: Array
 
 
 def search(passed: Callable[[Array, Array], Array], top: int, guess: Array) -> Array:
-    """The smallest codes whose step is not passed, `top` at most: [p]. `passed`: codes of some pixels, which -> bool.
+    """Return the smallest codes [p] whose step is not passed, `top` at most.
 
-    From the guess on in growing strides, then by bisection; only pixels that are undecided are looked at again.
+    `passed`: codes [n] of the pixels int [n] -> bool [n]. The search goes from the guess on in growing strides, then by
+    bisection; only undecided pixels are evaluated again.
     """
     low, high = np.full(len(guess), -1), np.full(len(guess), top)
     probe = np.clip(guess, 0, max(top - 1, 0)).astype(np.intp)

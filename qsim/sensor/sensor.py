@@ -1,9 +1,9 @@
-"""A sensor: an exact law (distribution.py), the keyed draw of codes from it, and estimates of light.
+"""Draws codes from a sensor's exact law by keys, with the reference or the compiled engine, and estimates light.
 
     expected photons [T, H, W] + key --> codes [T, H, W]
 
 The reference engine draws in NumPy and float64. The compiled engine (compiled/) draws the codes of every sensor that
-states a plan for it, and asks the reference for the few pixels that float32 cannot decide.
+states a plan for it. The reference draws the few pixels that float32 cannot decide.
 """
 
 from __future__ import annotations
@@ -44,27 +44,27 @@ class Sensor(Distribution):
     """A pixel without memory. Subclasses are frozen dataclasses of their parameters."""
 
     def __str__(self) -> str:
-        """Parameters with their units; `repr` is the code that makes this sensor."""
+        """Return the parameters with their units; `repr` is the code that makes this sensor."""
         given = {name: value for name, value in vars(self).items() if value is not None}
         shown = {name: f"{value:.6g}" if isinstance(value, float) else str(value) for name, value in given.items()}
         values = [f"{name} {text} {_UNITS.get(name, '')}".rstrip() for name, text in shown.items()]
         return f"{type(self).__name__} ({self.code_model}): " + ", ".join(values)
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        """What a notebook shows."""
+        """Print `str(self)` in a notebook."""
         printer.text(str(self))
 
     def maximum_likelihood(self, histogram: Array, exposure: float, confidence: float = 0.95) -> Estimate:
-        """Light from codes of the same light: counts of each code [..., levels] -> Estimate of arrays [...] in photons.
+        """Return an Estimate of light [photons]: counts of each code [..., levels] -> arrays [...].
 
-        `lower` and `upper` bound the likelihood-ratio interval of this confidence; at all-dark and all-saturated
-        histograms the estimate is finite and the bound one-sided (see Estimate). ValueError for an empty histogram.
+        `lower` and `upper` bound the likelihood-ratio interval of this confidence. At all-dark and all-saturated
+        histograms the estimate is finite and the bound one-sided (see Estimate). `ValueError` for an empty histogram.
         Where the mean code falls again with light (paralyzable pixels) the answer is the darker of the two.
         """
         return estimation.maximum_likelihood(self, histogram, exposure, confidence)
 
     def response(self, exposure: float, points: int = estimation.POINTS) -> Response:
-        """Mean and variance of the code over light, and the inverse: a table of `points` levels of light."""
+        """Return mean and variance of the code at `points` levels of light, and the inverse."""
         return estimation.response(self, exposure, points)
 
     def with_dark_rate(self, rate: float) -> Sensor:
@@ -72,7 +72,7 @@ class Sensor(Distribution):
         raise ValueError(f"{type(self).__name__}: has no dark rate that a map could change")
 
     def kernel_plan(self, exposure: float) -> Plan | None:
-        """How a compiled kernel draws the codes of this sensor; None where only the reference draws them.
+        """Return how a compiled kernel draws the codes of this sensor; None where only the reference draws them.
 
         A model overrides this to bring its fast form. `plan_of` calls it once per sensor and exposure [s].
         """
@@ -81,10 +81,11 @@ class Sensor(Distribution):
     def sample(
         self, photons: Array, exposure: float, *, key: Key, origin: tuple[int, int] = (0, 0), engine: str = "auto"
     ) -> Array:
-        """Codes of [H, W], or of [T, H, W] = frames key.frame + t; `origin` (y, x) places a crop in the full frame.
+        """Return codes of expected photons [H, W], or [T, H, W] = frames key.frame + t; `exposure` in seconds.
 
-        `engine`: "reference" is NumPy in float64; "fast" is compiled (compiled/launch.py) and differs from it in at
-        most 5 pixels per million; "auto" takes the fast one where it can run.
+        `origin` (y, x) places a crop in the full frame. `engine`: "reference" is NumPy in float64; "fast" is compiled
+        (compiled/launch.py) and differs from it in at most 5 pixels per million; "auto" takes the fast one where it can
+        run.
         """
         photons = _checked(photons, engine)
         check_exposure(exposure)
@@ -105,7 +106,7 @@ class Sensor(Distribution):
     def sample_packed(
         self, photons: Array, exposure: float, *, key: Key, origin: tuple[int, int] = (0, 0), engine: str = "auto"
     ) -> Array:
-        """The codes of `sample`, packed row by row: uint8 [..., H, ceil(W bits / 8)] as `packing.pack` makes them.
+        """Return the codes of `sample` packed by rows: uint8 [..., H, ceil(W bits / 8)], as `packing.pack` makes them.
 
         The compiled engine joins the bits itself, without a byte per code in between. Crops that do not start at a
         multiple of 4 columns are packed afterwards.
@@ -124,9 +125,9 @@ class Sensor(Distribution):
         return packed if photons.ndim == 3 else packed[0]
 
     def draw_at(self, photons: Array, exposure: float, *, key: Key, at: Array) -> Array:
-        """The reference's codes [p] of single pixels: expected photons [p], `at` int [3, p] = (frame, row, column).
+        """Return the reference's codes [p] of single pixels: photons [p], `at` int [3, p] = (frame, row, column).
 
-        Rows and columns are those of the full frame. For sensors of at most 8 bits, whose pixels take one number each.
+        Rows and columns are those of the full frame. The sensor has at most 8 bits, so that a pixel takes one number.
         """
 
         def second(undecided: Array) -> Array:
@@ -135,7 +136,7 @@ class Sensor(Distribution):
         return self.draw(photons, exposure, words_at(key, at), second)
 
     def _usable_plan(self, photons: Array, exposure: float) -> Plan | None:
-        """The plan of a compiled draw of these photons; None where the reference has to draw."""
+        """Return the plan of a compiled draw of these photons; None where the reference has to draw."""
         if not fast_engine_works() or photons.size < max(SMALLEST, 1):
             return None
         from qsim.sensor.compiled import jit
@@ -143,7 +144,7 @@ class Sensor(Distribution):
         return plan_of(self, exposure) if jit.available() else None
 
     def _exact(self, stack: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Callable[[Array], Array]:
-        """The reference's codes [p] of pixels int [3, p] = (t, y, x) of photons [T, H, W], as a function of these."""
+        """Return a function: pixels int [3, p] = (t, y, x) of photons [T, H, W] -> the reference's codes [p]."""
 
         def exact(pixels: Array) -> Array:
             light = np.asarray(stack[tuple(pixels)], np.float64)
@@ -155,7 +156,7 @@ class Sensor(Distribution):
         return exact
 
     def _draw_frame(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
-        """The reference draw of one frame [H, W], some rows at a time."""
+        """Return the reference's codes of one frame [H, W], drawn in blocks of rows."""
         return self._draw_rows(photons, exposure, key, origin, _CHUNK // self.levels)
 
     def _draw_rows(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int], pixels: int) -> Array:
@@ -167,7 +168,7 @@ class Sensor(Distribution):
         return codes
 
     def draw_block(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int], planes: int = 0) -> Array:
-        """The reference's codes [H, W] of photons [H, W]; of `planes` frames from key.frame on, [planes, H, W]."""
+        """Return the reference's codes [H, W] of photons [H, W]; with `planes`, of so many frames: [planes, H, W]."""
         shape = (planes, *photons.shape) if planes else photons.shape
 
         def second(undecided: Array) -> Array:
@@ -176,12 +177,12 @@ class Sensor(Distribution):
         return self.draw(photons, exposure, words(key, shape, origin), second)
 
     def to_dict(self) -> dict[str, Any]:
-        """The record as written into files: {"model": name of the class, field: value, ...}."""
+        """Return the record as files store it: {"model": name of the class, field: value, ...}."""
         return {"model": type(self).__name__, **asdict(self)}  # type: ignore[call-overload]
 
 
 def _checked(photons: Array, engine: str) -> Array:
-    """Photons as an array of frames; `ValueError` for another shape or an unknown engine."""
+    """Return photons as an array of frames; `ValueError` for another shape or an unknown engine."""
     photons = np.asarray(photons)
     if photons.ndim not in (2, 3):
         raise ValueError(f"photons have the shape [H, W] or [T, H, W], got {list(photons.shape)}")
@@ -192,13 +193,13 @@ def _checked(photons: Array, engine: str) -> Array:
 
 @lru_cache(maxsize=32)
 def plan_of(sensor: Sensor, exposure: float) -> Plan | None:
-    """`sensor.kernel_plan(exposure)`, made once: a kernel is traced for each plan object."""
+    """Return `sensor.kernel_plan(exposure)`, made once: a kernel is traced for each plan object."""
     return sensor.kernel_plan(exposure)
 
 
 @cache
 def fast_engine_works() -> bool:
-    """Whether the compiled engine can run on this machine; warns once if it cannot."""
+    """Return whether the compiled engine can run on this machine; warn once if it cannot."""
     try:
         from qsim.sensor.compiled import jit
 

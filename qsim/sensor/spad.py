@@ -1,7 +1,7 @@
-"""Clocked single-photon avalanche diodes (BinarySPAD), and what they share with counting ones (counting.py).
+"""Models clocked single-photon avalanche diodes (BinarySPAD), and the base that counting ones (counting.py) share.
 
-Avalanches that the pixel could see are a Poisson process; arrivals = PDE photons + dark_count_rate exposure of them are
-expected in an exposure.
+Avalanches that the pixel could detect are a Poisson process. An exposure expects PDE photons + dark_count_rate exposure
+of them, called arrivals.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _BATCH = 1 << 17  # words of a batch of planes
 
 @dataclass(frozen=True)
 class SPAD(Sensor):
-    """What both pixels are: avalanches per photon, and in the dark."""
+    """The parameters of both kinds of pixel: avalanches per photon, and avalanches in the dark."""
 
     pde: float  # avalanches per photon, 0 ... 1
     dark_count_rate: float  # 1/s
@@ -46,19 +46,22 @@ class SPAD(Sensor):
         return replace(self, dark_count_rate=rate)
 
     def white(self, exposure: float) -> float:
-        """(2^bits - 1) / PDE: light that would fill the code if every plane could count, or nothing were dead."""
+        """Return (2^bits - 1) / PDE.
+
+        This light would fill the code if every plane could count, and no pixel were ever dead.
+        """
         return (self.levels - 1) / self.pde
 
 
 @dataclass(frozen=True)
 class BinarySPAD(SPAD):
-    """A clocked pixel: one plane says whether anything arrived; a code is the sum of M = 2^bits - 1 planes.
+    """A clocked pixel: one plane is 1 if anything arrived; a code is the sum of M = 2^bits - 1 planes.
 
     **Planes are drawn one by one**, up to 8 bits. Frame f of a b-bit stream is the sum of planes f M ... f M + M - 1,
-    and plane p is what a 1-bit sensor draws for frame p of the same key. So two bit depths of one plane rate use the
-    same photons: seven frames of the 1-bit stream add up to one frame of the 3-bit stream, at constant light and, with
-    `sample_planes` at any number of bits, when every plane sees its own instant of the motion. Above 8 bits `sample`
-    draws the binomial sum from one number per pixel: 65 535 planes would take 2.5 ms.
+    and plane p is the code that a 1-bit sensor draws for frame p of the same key. So two bit depths of one plane rate
+    use the same photons: seven frames of the 1-bit stream add up to one frame of the 3-bit stream. This holds at
+    constant light. With `sample_planes` it holds at any number of bits, each plane having its own instant of the
+    motion. Above 8 bits `sample` draws the binomial sum from one number per pixel: 65 535 planes would take 2.5 ms.
     """
 
     bits: int = 1  # 1 ... 16
@@ -67,7 +70,7 @@ class BinarySPAD(SPAD):
 
     @property
     def planes(self) -> int:
-        """Binary planes in one code, M = 2^bits - 1."""
+        """Return the number of binary planes in one code, M = 2^bits - 1."""
         return self.levels - 1
 
     def cdf_of(self, arrivals: Array, exposure: float) -> Array:
@@ -76,14 +79,14 @@ class BinarySPAD(SPAD):
         return cdf
 
     def log_pmf_of(self, arrivals: Array, exposure: float, wanted: Array | None = None) -> Array:
-        """Binomial(M, p) with p = 1 - exp(-arrivals / M)."""
+        """Return log of Binomial(M, p) with p = 1 - exp(-arrivals / M): [p] -> [p, levels]."""
         from scipy.special import xlogy
 
         k, per_plane = np.arange(self.levels), arrivals[:, None] / self.planes
         return _log_binomials(self.planes) + xlogy(k, -np.expm1(-per_plane)) - (self.planes - k) * per_plane
 
     def slope_of(self, arrivals: Array, exposure: float) -> Array:
-        """dF_k/dp = -M C(M-1, k) p^k (1-p)^(M-1-k), dp/darrivals = (1-p) / M."""
+        """Return dF_k/dp dp/darrivals: -M C(M-1, k) p^k (1-p)^(M-1-k) times (1-p) / M."""
         from scipy.special import xlogy
 
         k, per_plane = np.arange(self.planes), arrivals[:, None] / self.planes
@@ -91,7 +94,7 @@ class BinarySPAD(SPAD):
         return np.pad(-np.exp(log_slope), ((0, 0), (0, 1)))
 
     def kernel_plan(self, exposure: float) -> Plan | None:
-        """F_0 = exp(-arrivals / M) of each of M planes."""
+        """Return the plan of F_0 = exp(-arrivals / M) in each of M planes."""
         if self.bits > MOST_BITS:
             return None
         m = self.planes
@@ -106,7 +109,7 @@ class BinarySPAD(SPAD):
         origin: tuple[int, int] = (0, 0),
         engine: str = "auto",
     ) -> Array:
-        """Codes [T, H, W] from a clip at the plane rate: photons and exposure of each plane, [T M, H, W]."""
+        """Return codes [T, H, W] of a clip at the plane rate: photons [T M, H, W] and exposure [s] of each plane."""
         if photons.ndim != 3 or len(photons) % self.planes:
             raise ValueError(
                 f"planes of a {self.bits}-bit code come in groups of {self.planes}: [T {self.planes}, H, W], "
@@ -126,7 +129,7 @@ class BinarySPAD(SPAD):
         return self._draw_sum(photons, exposure, key, origin)
 
     def _draw_sum(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
-        """The smallest code k with u < P(Binomial(M, p) <= k); u has 64 bits.
+        """Return the smallest code k with u < P(Binomial(M, p) <= k) for each pixel [H, W]; u has 64 bits.
 
         Error: that of the regularised beta function, below 1e-11 in any probability (tested at 9 and 16 bits).
         """
@@ -147,7 +150,7 @@ class BinarySPAD(SPAD):
         return search(passed, m, np.rint(guess)).reshape(photons.shape).astype(self.dtype)
 
     def _draw_planes(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
-        """Many planes of a few rows at a time: all planes of a code share their light.
+        """Return codes [H, W] as sums of planes, drawn in blocks of planes and rows that share their light.
 
         Error: the rounding of one exponential, 1e-16 in the probability of each plane, at any number of bits.
         """
@@ -164,7 +167,7 @@ class BinarySPAD(SPAD):
         return codes
 
     def draw_at(self, photons: Array, exposure: float, *, key: Key, at: Array) -> Array:
-        """As every sensor; the sum of the planes, plane p of frame f being frame f M + p of a 1-bit sensor."""
+        """As every sensor: the sum of the planes, where plane p of frame f is frame f M + p of a 1-bit sensor."""
         if self.bits == 1:
             return super().draw_at(photons, exposure, key=key, at=at)
         single, m = replace(self, bits=1), self.planes
@@ -175,14 +178,14 @@ class BinarySPAD(SPAD):
 
 @dataclass(frozen=True)
 class PlaneByPlane(BinarySPAD):
-    """A clocked pixel as streams without `drawn_by` have it: planes one by one at any number of bits."""
+    """A clocked pixel of streams without `drawn_by`: planes one by one at any number of bits."""
 
     def _draw_frame(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int]) -> Array:
         return self._draw_planes(photons, exposure, key, origin)
 
 
 def _log_binomials(n: int) -> Array:
-    """log C(n, k), k = 0 ... n."""
+    """Return log C(n, k), k = 0 ... n."""
     from scipy.special import gammaln
 
     k = np.arange(n + 1)

@@ -1,1 +1,1 @@
-"""The compiled draw: short sums of a sensor, one kernel, and its launches."""
+"""The compiled draw: plans of a sensor's cdf steps, one kernel, and its launches."""

@@ -1,8 +1,8 @@
-"""The steps F_k of any memoryless sensor as curves over light, for sums too long to be added up in a kernel.
+"""Approximates the steps F_k of any memoryless sensor by curves over light, where sums are too long for a kernel.
 
-A step falls from F_k(0) to F_k(infinity) within about 13 of the variable 2 sqrt(lambda), in which every Poisson law is
-as wide as any other. Each step has a grid of its own over that fall: cells of equal width in sqrt(lambda), in each a
-cubic that has value and slope of F_k at both ends. Its error is largest halfway between the nodes and measured there.
+A step falls from F_k(0) to F_k(infinity) within about 13 of the variable 2 sqrt(lambda), in which all Poisson laws have
+the same width. Each step has its own grid over that fall: cells of equal width in sqrt(lambda). In each cell a cubic
+has value and slope of F_k at both ends. Its error is largest halfway between the nodes and is measured there.
 """
 
 from __future__ import annotations
@@ -35,13 +35,19 @@ class Curves:
 
 
 def by_pairs(step: Callable[[Array, Array], Array], count: int) -> Steps:
-    """F_0 ... F_(count - 1) of rows of means, from a function of pairs: codes int [p], Poisson means [p] -> [p]."""
+    """Return F_0 ... F_(count - 1) of rows of Poisson means, from a function of pairs.
+
+    The function takes codes int [p] and Poisson means [p] and returns [p].
+    """
     codes = np.arange(count)[:, None]
     return lambda mean: step(np.broadcast_to(codes, mean.shape).ravel(), mean.ravel()).reshape(mean.shape)
 
 
 def falling(cdf: Steps, slope: Steps, count: int) -> Curves | None:
-    """Curves of `count` steps that only fall with light, from F_k and dF_k/dlambda; None if no grid is fine enough."""
+    """Return curves of `count` steps that only fall with light, from F_k and dF_k/dlambda.
+
+    None if no grid is fine enough.
+    """
     dark, bright = cdf(np.zeros((count, 1))), cdf(np.full((count, 1), _HIGH**2))
     start = _last(lambda x: dark - cdf(x * x) < _NEGLIGIBLE, count)
     start[start <= _LOW] = 0.0
@@ -50,7 +56,7 @@ def falling(cdf: Steps, slope: Steps, count: int) -> Curves | None:
 
 
 def below(cdf: Steps, slope: Steps, count: int, brightest: float, settled: bool = False) -> Curves | None:
-    """Curves of any steps for at most `brightest` arrivals, all on one grid; None if no grid is fine enough.
+    """Return curves of any steps for at most `brightest` arrivals, all on one grid; None if no grid is fine enough.
 
     `settled`: more light changes nothing, and the curves hold for all light.
     """
@@ -75,7 +81,7 @@ def _fitted(cdf: Steps, slope: Steps, start: Array, stop: Array, brightest: floa
 
 
 def _last(holds: Callable[[Array], Array], count: int) -> Array:
-    """The largest x at which a condition still holds that holds for small x alone: [count, 1], to 1e-4 of x."""
+    """Return the largest x at which a condition holds that holds for small x alone: [count, 1], to 1e-4 of x."""
     low, high = np.full((count, 1), np.log2(_LOW)), np.full((count, 1), np.log2(_HIGH))
     for _ in range(18):
         middle = (low + high) / 2
@@ -85,6 +91,6 @@ def _last(holds: Callable[[Array], Array], count: int) -> Array:
 
 
 def _hermite(value: Array, slope: Array) -> Array:
-    """Coefficients of the cubics between neighbours: values and slopes per cell [K, n + 1] -> [K, n, 4]."""
+    """Return the cubics' coefficients between neighbours: values and slopes per cell [K, n + 1] -> [K, n, 4]."""
     v0, v1, d0, d1 = value[:, :-1], value[:, 1:], slope[:, :-1], slope[:, 1:]
     return np.stack([v0, d0, 3 * (v1 - v0) - 2 * d0 - d1, 2 * (v0 - v1) + d0 + d1], axis=-1)

@@ -1,4 +1,4 @@
-"""Which Dr.Jit runs here, and small pieces that every kernel of codes is made of."""
+"""Finds the Dr.Jit that works on this machine, and defines the small pieces that every kernel of codes shares."""
 
 from __future__ import annotations
 
@@ -22,13 +22,16 @@ _INFINITY = 0x7F800000  # float32; larger bit patterns are NaN or negative
 
 
 def available() -> bool:
-    """Whether Dr.Jit can run here: CUDA or a usable LLVM, and not in a child forked from a process that used it."""
+    """Return whether Dr.Jit can run: CUDA or a usable LLVM works, and this is not a forked child.
+
+    A child forked from a process that used Dr.Jit lacks its threads.
+    """
     return not _in_broken_child and backend() is not None
 
 
 @cache
 def backend() -> Any:
-    """`drjit.cuda` or `drjit.llvm`; None where neither works here."""
+    """Return `drjit.cuda` or `drjit.llvm`; None where neither works on this machine."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Sensor.sample says that the reference draws
         chosen = engine.choose()
@@ -46,7 +49,7 @@ _in_broken_child: list[int] = []  # the process id, in a child of a process that
 
 
 def _after_fork() -> None:
-    """Dr.Jit's threads do not survive a fork: such a child draws with the reference."""
+    """Note that Dr.Jit's threads do not survive a fork: such a child draws with the reference."""
     if "drjit" in sys.modules:
         _in_broken_child[:] = [os.getpid()]
 
@@ -56,7 +59,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def whole_packets(numbers: Array) -> Array:
-    """The same numbers [n] in memory that a kernel may read to the end of its last packet.
+    """Return the same numbers [n] in memory that a kernel may read to the end of its last packet.
 
     Dr.Jit takes over the memory of NumPy's arrays. A packet that reached beyond them, and beyond the last page, ended
     the process.
@@ -69,7 +72,7 @@ def whole_packets(numbers: Array) -> Array:
 
 
 def no_light(photons: list[Any]) -> Any:
-    """Whether one is negative, infinite or NaN, by its bits: the reference says what is wrong."""
+    """Return whether one is negative, infinite or NaN, by its bits; the reference names the wrong value."""
     import drjit as dr
 
     jit = backend()
@@ -87,14 +90,17 @@ def uniform32(word: Any) -> Any:
 
 
 def smaller(a: Any, b: Any) -> Any:
-    """The smaller one, in one instruction: `drjit.minimum` minds NaN and signed zeros, which do not come here."""
+    """Return the smaller of two numbers in one instruction.
+
+    `drjit.minimum` also handles NaN and signed zeros, which do not occur here.
+    """
     import drjit as dr
 
     return dr.select(a < b, a, b)
 
 
 def philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
-    """Four words of one block; the compiled twin of keys.philox4x32 at redraw 0."""
+    """Return the four words of one block; the compiled equivalent of keys.philox4x32 at redraw 0."""
     import drjit as dr
 
     u32 = type(x)
@@ -107,9 +113,9 @@ def philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
 
 
 def exp_below_zero(x: Any) -> Any:
-    """exp(x) of float32 -87 <= x <= 0 within 1.2e-7 of its value: `drjit.exp` also minds everything that is not there.
+    """Return exp(x) of float32 -87 <= x <= 0 within 1.2e-7 of its value; `drjit.exp` also handles all other x.
 
-    2^n exp(r) with |r| <= log(2)/2; adding 1.5 2^23 rounds n to its last bits, where the exponent takes it from. The
+    2^n exp(r) with |r| <= log(2)/2. Adding 1.5 2^23 rounds n to its last bits, from where it enters the exponent. The
     polynomial is that of Cephes (Moshier, expf).
     """
     import drjit as dr

@@ -1,4 +1,4 @@
-"""The compiled kernel, in Dr.Jit: one thread draws the codes of two neighbouring pixels of one frame.
+"""Draws codes in a Dr.Jit kernel: one thread draws two neighbouring pixels of one frame.
 
     photons of 2 pixels + their index -> 2 words of Philox -> their steps F_k (plan.py) -> 2 codes, and "uncertain"
 
@@ -25,7 +25,7 @@ CONSTANT_PLANS = 32  # sensors of a process that get kernels of their own
 
 
 def cdf_steps(plan: Plan, photons: Array) -> Array:
-    """The steps F_0 ... as the kernel has them, for validation: photons [p] -> float64 [p, steps] of one plane."""
+    """Return the kernel's steps F_0 ... of one plane, for validation: photons [p] -> float64 [p, steps]."""
     import drjit as dr
 
     jit = backend()
@@ -43,7 +43,7 @@ def cdf_steps(plan: Plan, photons: Array) -> Array:
 
 
 def fixed_scalars(key: Key, origin: tuple[int, int]) -> list[Any]:
-    """What every launch of a clip shares: first block, the generator's key."""
+    """Return the arguments that every launch of a clip shares: first block, the generator's key."""
     import drjit as dr
 
     numbers = (origin[1] >> 2, key.philox_key >> 32, key.philox_key)
@@ -52,9 +52,9 @@ def fixed_scalars(key: Key, origin: tuple[int, int]) -> list[Any]:
 
 @lru_cache(maxsize=2)  # of one clip: full parts, and the last one
 def _pixel_indices(shape: tuple[int, int, int]) -> list[Any]:
-    """Index of each thread of [frames, rows, threads]: t, y and x in the bits of one number, and shifts and masks.
+    """Return the index of each thread of [frames, rows, threads], and shifts and masks to take it apart.
 
-    Reading it is cheaper than the two divisions that would find it.
+    An index holds t, y and x in the bits of one number. Reading it is cheaper than two divisions.
     """
     import drjit as dr
 
@@ -78,7 +78,7 @@ def start(
     """Start a kernel: pairs of float32 photons as uint64 [n] -> two codes per thread, and 1 where one is uncertain.
 
     `shape` = frames, rows, threads; `first` = frame and row. Without `bits` a thread writes a byte per code, the first
-    one lowest; with `bits` the codes follow each other bit by bit, the first one highest.
+    one lowest. With `bits` the codes follow each other bit by bit, the first one highest.
     """
     import drjit as dr
 
@@ -93,7 +93,7 @@ def start(
 
 @lru_cache(maxsize=64)
 def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
-    """The kernel of a plan, traced once and replayed after that (`drjit.freeze`)."""
+    """Return the kernel of a plan, traced once and replayed after that (`drjit.freeze`)."""
     real = backend().Float
     return _traced(
         lambda photons, words, given: _count(plan, photons, words, given or [real(n) for n in _numbers(plan)]),
@@ -104,7 +104,7 @@ def _kernel(plan: Plan, bits: int | None) -> Callable[..., tuple[Any, Any]]:
 
 @cache
 def _curve_kernel(steps: int, bits: int | None) -> Callable[..., tuple[Any, Any]]:
-    """The one kernel of all sensors with so many steps whose sums are too long."""
+    """Return the one kernel of all sensors with so many steps whose sums are too long."""
     return _traced(lambda photons, words, given: lookup.count(steps, photons, words, given), 1, bits)
 
 
@@ -113,7 +113,7 @@ def _traced(
     planes: int,
     bits: int | None,
 ) -> Callable[..., tuple[Any, Any]]:
-    """A kernel that draws with `count`: photons, words and arguments of a thread -> its codes, and "uncertain"."""
+    """Return a kernel that draws with `count`: photons, words and arguments of a thread -> its codes, and "uncertain"."""
     import drjit as dr
 
     jit = backend()
@@ -127,7 +127,7 @@ def _traced(
         photons = [dr.reinterpret_array(jit.Float, jit.UInt32(half)) for half in (pair, pair >> 32)]
 
         def words(plane: Any) -> list[Any]:
-            """Two neighbouring threads share a block of four words."""
+            """Return two words: two neighbouring threads share a block of four."""
             w = philox(x // 2 + block, y + row, first_plane + plane, high, low)
             right = (x & 1) == 1
             return [dr.select(right, w[2], w[0]), dr.select(right, w[3], w[1])]
@@ -146,7 +146,7 @@ def _traced(
 def _count(
     plan: Plan, photons: list[Any], words: Callable[[Any], list[Any]], scalars: list[Any]
 ) -> tuple[list[Any], Any]:
-    """Codes of the pixels of a thread, and whether one of them is uncertain."""
+    """Return the codes of the pixels of a thread, and whether one of them is uncertain."""
     import drjit as dr
 
     jit, real = backend(), backend().Float
@@ -179,9 +179,9 @@ def _count(
 
 
 def _search(steps: list[Any], u: Any) -> tuple[Any, Any]:
-    """How many of 2^b - 1 ascending steps are at or under u, by bisection, and the distance to the nearest step.
+    """Return how many of 2^b - 1 ascending steps are at or under u, by bisection, and the distance to the nearest step.
 
-    The step before u and the one behind it are both on the way, so nothing else need be looked at.
+    The steps just before and behind u are both on the way, so no other step needs to be compared.
     """
     import drjit as dr
 
@@ -198,7 +198,7 @@ def _search(steps: list[Any], u: Any) -> tuple[Any, Any]:
 
 
 def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list[Any], Any]:
-    """The steps F_k of one pixel, in a unit of its own."""
+    """Return the steps F_k of one pixel, and the unit in which they are."""
     import drjit as dr
 
     real = type(mean)
@@ -232,7 +232,7 @@ def _steps(steps: Electrons | Live, mean: Any, scalars: list[Any]) -> tuple[list
 
 
 def _numbers(plan: Plan) -> list[float]:
-    """The numbers of a plan, in the order in which `_count` and `_steps` take them."""
+    """Return the numbers of a plan, in the order in which `_count` and `_steps` take them."""
     values, steps = [plan.efficiency, plan.dark, plan.margin], _sums(plan)
     if isinstance(steps, Live):
         return [*values, *steps.shares]
@@ -244,8 +244,10 @@ def _numbers(plan: Plan) -> list[float]:
 
 @lru_cache(maxsize=32)
 def arguments(plan: Plan) -> list[Any]:
-    """Nothing for the first sensors of a process, whose numbers are constants of kernels of their own; for the rest the
-    numbers, as arguments of a shared (about 20 % slower) kernel: a training that varies its sensors compiles once.
+    """Return nothing for the first plans of a process: their numbers are constants of their own kernels.
+
+    For later plans the numbers are arguments of a shared kernel, about 20 % slower. So a training that varies its
+    sensors compiles once.
     """
     import drjit as dr
 

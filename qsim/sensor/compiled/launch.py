@@ -1,16 +1,15 @@
-"""The compiled engine: the codes of the NumPy reference, many times faster.
+"""Draws clips by the compiled engine: the codes of the NumPy reference, many times faster.
 
     photons of one frame -> one thread per pair of pixels -> two codes, one byte each or packed
 
 Every pixel compares the same Philox word with the same cdf as `Sensor.sample(engine="reference")`, but in float32, by
-short sums (plan.py) or along curves over light (curves.py). A pixel whose word comes so near to a step F_k that
-float32 could not decide (about 40 in a million) is flagged by the kernel and drawn by the reference in float64, so the
-codes are the reference's on every kind of machine; tails, where a second word is drawn, come out right for the same
-reason.
+short sums (plan.py) or along curves over light (curves.py). The kernel flags a pixel whose word is too near to a step
+F_k for float32 to decide (about 40 in a million). The reference draws such pixels in float64, so the codes are the
+reference's on every kind of machine. Tails, where a second word is drawn, are right for the same reason.
 
-Peak memory: the output, one frame, and the buffers of launches. Those have at most four million pixels, where the cost
-of starting one has faded, and hold, per pixel, 4 bytes of converted light, 2 of indices for each of two shapes, and 2.5
-that each of two launches writes: at most 55 MB.
+Peak memory: the output, one frame, and the buffers of launches. A launch has at most four million pixels, where the
+cost of starting it no longer matters. Per pixel the buffers hold 4 bytes of converted light, 2 of indices for each of
+two shapes, and 2.5 that each of two launches writes: at most 55 MB.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ Exact = Callable[[Array], Array]  # pixels int [3, p] = (t, y, x) of photons [T,
 
 
 def sample(plan: Plan, photons: Array, key: Key, origin: tuple[int, int], exact: Exact) -> Array:
-    """Codes uint8 [T, H, W] of expected photons [T, H, W], frame t under `key.at(key.frame + t)`.
+    """Return codes uint8 [T, H, W] of expected photons [T, H, W], frame t under `key.at(key.frame + t)`.
 
     `origin` (y, x) places a crop in the full frame; `exact` draws the pixels that the kernel leaves uncertain.
     """
@@ -55,7 +54,7 @@ def sample(plan: Plan, photons: Array, key: Key, origin: tuple[int, int], exact:
 
 
 def sample_packed(plan: Plan, photons: Array, bits: int, key: Key, origin: tuple[int, int], exact: Exact) -> Array:
-    """Packed codes uint8 [T, H, ceil(W bits / 8)] (packing.py), without writing a byte per code.
+    """Return packed codes uint8 [T, H, ceil(W bits / 8)] (packing.py), without writing a byte per code.
 
     Equal to `packing.pack(sample(...), bits)`; the column of `origin` is a multiple of 4.
     """
@@ -76,7 +75,7 @@ def sample_packed(plan: Plan, photons: Array, bits: int, key: Key, origin: tuple
 
 
 def _octets(pairs: Array, bits: int) -> Array:
-    """Rows of bytes of rows of pairs of codes: [..., 4 n] numbers of 2 `bits` each -> bytes [..., n bits]."""
+    """Return rows of bytes [..., n bits] of rows of pairs of codes, [..., 4 n] numbers of 2 `bits` each."""
     if bits == 1:
         # Four bytes of two bits: the product brings them side by side into the highest byte, and no other bits there
         return (pairs.view(np.uint32) * np.uint32(0x40100401)) >> np.uint32(24)
@@ -87,7 +86,7 @@ def _octets(pairs: Array, bits: int) -> Array:
 
 
 def _join(numbers: Array, bits: int) -> Array:
-    """Neighbours side by side: [..., 2 n] numbers of `bits` bits -> [..., n] twice as wide, the first one highest."""
+    """Return neighbours side by side: [..., 2 n] numbers of `bits` bits -> [..., n] twice as wide, first one highest."""
     width, wide = 8 * numbers.itemsize, np.dtype(f"u{2 * numbers.itemsize}") if numbers.itemsize < 8 else None
     if wide is None:
         return numbers[..., ::2] << np.uint64(bits) | numbers[..., 1::2]
@@ -111,10 +110,10 @@ def _write_octets(at: Array, width: int, bits: int, exact: Exact, packed: Array)
 def _parts(
     plan: Plan, photons: Array, key: Key, origin: tuple[int, int], blocks: int, bits: int | None = None
 ) -> Iterator[tuple[slice, slice, Array, Array]]:
-    """Parts of a clip: frames, rows, pairs of codes [frames, rows, threads], uncertain threads [3, n] = (t, y, thread).
+    """Yield parts of a clip: frames, rows, pairs of codes [frames, rows, threads], and uncertain threads.
 
-    Rows are padded to whole groups of `blocks` Philox blocks of the full frame. Small frames share a launch, large ones
-    take several.
+    Uncertain threads are int [3, n] = (t, y, thread). Rows are padded to complete groups of `blocks` Philox blocks of
+    the full frame. Small frames share a launch, large ones take several.
     """
     frames, height, width = photons.shape
     left = origin[1] & 3

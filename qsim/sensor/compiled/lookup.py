@@ -1,4 +1,4 @@
-"""Steps that a kernel looks up: the curves of curves.py in Dr.Jit, one kernel for all sensors with as many steps."""
+"""Looks up steps in Dr.Jit along the curves of curves.py, by one kernel for all sensors with as many steps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from qsim.sensor.compiled.jit import backend, no_light, smaller, uniform32
 
 
 def count(steps: int, photons: list[Any], words: Callable[[Any], list[Any]], given: list[Any]) -> tuple[list[Any], Any]:
-    """As `_count`, with steps that are looked up; `given` are those of `arguments`."""
+    """Return codes and whether one is uncertain, with steps that are looked up; `given` is from `arguments`."""
     import drjit as dr
 
     jit = backend()
@@ -30,7 +30,7 @@ def count(steps: int, photons: list[Any], words: Callable[[Any], list[Any]], giv
 
 
 def curve(curves: list[Any], k: Any, x: Any) -> Any:
-    """Step k (an index per pixel) at x = sqrt(arrivals)."""
+    """Return step k (an index per pixel) at x = sqrt(arrivals)."""
     import drjit as dr
 
     jit = backend()
@@ -44,7 +44,10 @@ def curve(curves: list[Any], k: Any, x: Any) -> Any:
 
 
 def arguments(efficiency: float, dark: float, margin: float, steps: Curves) -> list[Any]:
-    """Efficiency, dark, margin, brightest; beginnings, cells per x, number of cells and cubics of all steps."""
+    """Return a plan's numbers as kernel arguments.
+
+    Efficiency, dark, margin, brightest; beginnings, cells per x, number of cells and cubics of all steps.
+    """
     import drjit as dr
 
     jit = backend()

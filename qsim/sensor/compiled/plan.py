@@ -1,4 +1,4 @@
-"""How a compiled kernel has the steps F_0 ... F_(top-1) of a sensor: as short sums, or as curves that it looks up.
+"""Plans how a compiled kernel evaluates the cdf steps F_0 ... F_(top-1) of a sensor: short sums, or curves.
 
 A pixel's code is the number of steps F_k that its uniform number u has passed. With lambda expected arrivals:
 
@@ -7,12 +7,13 @@ A pixel's code is the number of steps F_k that its uniform number u has passed. 
     CountingSPAD   F_k = sum_(n <= k) Pois(n; lambda s_k)   s_k: share of the exposure that is live after k counts
     BinarySPAD     F_0 = exp(-lambda) in each of M planes   a code is the number of planes that fired
 
-Where the sums are long, or there are none (paralyzable pixels), steps are curves over light: curves.py.
+Where the sums are long, or there are none (paralyzable pixels), steps are curves over light: curves.py. Each model
+states its plan by `Sensor.kernel_plan`.
 
 The Poisson weights are carried as (lambda / scale)^n with coefficients scale^n / n!, so that one multiplication and
-one addition per term suffice. Short sums are compared as u exp(lambda) >= sum; longer ones have half of the exponential
+one addition per term suffice. Short sums are compared as u exp(lambda) >= sum. Longer ones have half of the exponential
 on either side, u exp(lambda / 2) >= exp(-lambda / 2) sum. A weight that underflows is then below 1e-10 of the unit, at
-any light: with one exponential of a fixed shift in all weights, dark pixels of long sums lost terms that count.
+any light. With one exponential of a fixed shift in all weights, dark pixels of long sums lost terms that count.
 """
 
 from __future__ import annotations
@@ -46,7 +47,10 @@ class Electrons:
 
     @classmethod
     def of(cls, cdf: Array, tail: Array) -> Electrons | None:
-        """The sums of P(code <= k | n electrons) [n, K] and of its value [K] for more; None if they are too long."""
+        """Return the sums of P(code <= k | n electrons), cdf [n, K] and its value `tail` [K] for more electrons.
+
+        None if the sums are too long.
+        """
         floor = np.where(tail > _NEGLIGIBLE, tail, 0.0)
         weights = cdf - floor
         terms = np.flatnonzero((weights > _NEGLIGIBLE).any(axis=1))[-1:] + 1
@@ -89,7 +93,7 @@ class Plan:
 
     @classmethod
     def summed(cls, efficiency: float, dark: float, steps: Electrons | Live, planes: int = 1) -> Plan:
-        """Steps that are added up; `efficiency` and `dark` of one plane.
+        """Return a plan whose steps are added up; `efficiency` and `dark` are those of one plane.
 
         The margin is several times the largest float32 error of a step: rounding of u, exp and lambda, and of each
         term.
@@ -99,5 +103,5 @@ class Plan:
 
     @classmethod
     def looked_up(cls, efficiency: float, dark: float, steps: Curves | None) -> Plan | None:
-        """Steps that are looked up; None without curves."""
+        """Return a plan whose steps are looked up; None without curves."""
         return None if steps is None else cls(efficiency, dark, 1, steps, steps.margin)
