@@ -24,11 +24,11 @@ from qsim.sensor.poisson import poisson_log_pmf
 from qsim.sensor.qis_steps import decide, search
 from qsim.sensor.spad import SPAD
 
-_ROWS = 1 << 14  # pixels of a block that is drawn step by step
+_ROWS = 1 << 14  # pixels of a block whose steps are computed one by one
 _SUMMED_BITS = 4  # of counters whose steps a kernel adds up
 _PARALYSED = 45.0  # arrivals per dead time, at least one of which then comes in each: the code is 1 to 1e-16
 _BRIGHT = 1000.0  # arrivals up to which those of many dead times have curves
-_UNDERFLOW = 1e-290  # below, sums in floating point may have lost terms
+_UNDERFLOW = 1e-290  # below it, float64 sums may have lost terms
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,10 @@ def quiver_published(ppp: float, bits: int = 3, exposure: float = 5e-4) -> QIS:
 
 
 def quiver_physical(ppp: float, bits: int = 3) -> QIS:
-    """Return our default: dark current per second as in the paper's text, gain 0.5 (2^b - 1) / PPP as in the program."""
+    """Return our default: dark current per second as in the paper's text, and the program's gain.
+
+    The gain is 0.5 (2^b - 1) / PPP.
+    """
     return QIS(_QUIVER_QE, _QUIVER_DARK, _QUIVER_READ_NOISE, bits, gain=_gain("quiver-physical", ppp, bits))
 
 

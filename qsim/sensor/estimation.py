@@ -18,8 +18,8 @@ from numpy import ndarray as Array
 from qsim.sensor.distribution import Distribution
 
 _DECADES, _PER_DECADE = 8, 128  # of the grid: linear interpolation between its points is good to 4e-5
-_FLAT = 1e-14  # change of the cdf per doubling of light at which a sensor is taken as saturated
-_DOUBLINGS = 44  # of light in which a sensor must saturate, or its mean code must end to rise
+_FLAT = 1e-14  # change of the cdf per doubling of light, below which a sensor counts as saturated
+_DOUBLINGS = 44  # of light: within these a sensor saturates, or its mean code stops rising
 _NEVER = -1e290  # stands for log 0 where it may be multiplied by 0
 POINTS = 4096  # of a response; linear interpolation then errs by less than 1e-6 of the full scale
 _ENDED = 1e-7  # a response this close to its top (relative to the full scale) has ended
@@ -37,7 +37,7 @@ class Response:
     mean: Array  # [G], codes, strictly rising
     variance: Array  # [G], codes^2
     top: int  # the largest code of the sensor
-    sensor: str  # in words
+    sensor: str  # its parameters, for messages
 
     def cap(self, samples: int) -> float:
         """Return the largest estimate [photons] from the mean of `samples` codes: half a count below saturation.
@@ -261,7 +261,7 @@ def _root(function: Callable[[Array, Array], Array], low: Array, high: Array, ro
     """Return the zero of a function that falls from low to high, each row in its own bracket; else the nearer end."""
     from scipy.optimize.elementwise import find_root
 
-    def bounded(x: Array, which: Array) -> Array:  # the library gives up at infinity, and passes 64-bit floats
+    def bounded(x: Array, which: Array) -> Array:  # find_root stops at infinity and passes rows as floats
         found = function(x.ravel(), rows[which.ravel().astype(np.intp)]).reshape(x.shape)
         return np.nan_to_num(found, nan=-_HUGE, posinf=_HUGE, neginf=-_HUGE)
 

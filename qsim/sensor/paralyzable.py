@@ -34,7 +34,7 @@ from qsim.sensor.poisson import Mixture
 
 _BEYOND_TOP = 64  # codes above the top one that are summed term by term
 _LONGEST = 1 << 14  # arrivals in the longest table
-_MOST = 120  # counts that the alternating series looks at; 120 of 3 expected have a probability of 1e-142
+_MOST = 120  # counts in the alternating series; 120 counts where 3 are expected have a probability of 1e-142
 _SPARSE = 3.0  # expected counts after the first up to which the alternating series keeps 13 digits
 
 
@@ -87,7 +87,7 @@ class Paralyzable:
         `brief`: None instead of a table where the series gives the cdf as well, though not its far tails.
         """
         length = np.exp2(np.ceil(np.log2(mean + 12 * np.sqrt(mean) + 60)))
-        if brief and self.ratio < LEAST:  # few moments, which are quicker than a long table
+        if brief and self.ratio < LEAST:  # few moments are quicker than a long table
             expected = mean * np.exp(-mean / self.ratio) * (1 - 1 / self.ratio)
             length[(mean > self.ratio) & (expected <= _SPARSE)] = np.inf
         for last in np.unique(length):
@@ -120,7 +120,7 @@ def arrival_table(ratio: float, levels: int, last: int) -> Mixture:
     cdf = np.minimum(np.cumsum(codes, axis=1), 1.0)
     cdf[:, -1] = 1.0
     survival = np.pad(np.cumsum(codes[:, :0:-1], axis=1)[:, ::-1], ((0, 0), (0, 1)))
-    # A difference of whichever side of the distribution is small
+    # A difference on the smaller side of the distribution
     slope = np.where(cdf[:-1] < 0.5, np.diff(cdf, axis=0), -np.diff(survival, axis=0))
     with np.errstate(divide="ignore"):
         log_codes = np.log(codes)

@@ -23,13 +23,13 @@ from numpy import ndarray as Array
 
 from qsim.sensor.qis_steps import search
 
-LEAST = 48.0  # dead times in an exposure from which the principal branch is the whole sum, to 1e-12
+LEAST = 48.0  # dead times in an exposure from which the principal branch is the full sum, to 1e-12
 _RADIUS = 2.0  # distance of the circle from |z| = 1, in standard deviations of theta
 _STEP = 0.45  # of theta, in those; the error is exp(-2 pi _RADIUS / _STEP)
 _LEAST_VARIANCE = 16.0  # of a circle: the tail of a Poisson law of few counts is longer than a normal one
 _FALL = 34.0  # of the logarithm of the integrand, where it ends
 _FAR = 10.0  # standard deviations from the mean, beyond which F_k is 0 or 1 to 1e-18
-_OTHER = 3.0  # of those, beyond which F_k is surely on the other side of 1/2 than u, and an outer circle no longer good
+_OTHER = 3.0  # likewise; beyond, F_k and u are on two sides of 1/2, and an outer circle is inexact
 _BLOCK = 1 << 10  # pixels of one block of work
 
 
@@ -44,9 +44,9 @@ class Circle:
     power: Array
     factor: Array
     inside: Array  # bool [p]
-    first: Array  # about the mean of the count
-    deviation: Array  # standard deviation, 4 at least
-    turn: Array  # what the code one turn of the nodes on adds, which is certain
+    first: Array  # mean of the count, approximately
+    deviation: Array  # standard deviation of the count, at least 4
+    turn: Array  # the contribution of the code one turn of the nodes further, which is certain
 
     def sums(self, codes: Array, some: Array) -> Array:
         """Return F_k inside of |z| = 1, F_k - 1 outside, of `codes` [n] of the pixels `some` int [n]: [n]."""

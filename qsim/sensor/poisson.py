@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy import ndarray as Array
 
-_UNDERFLOW = 1e-290  # below, products of two representable factors may have lost terms: sum logarithms instead
+_UNDERFLOW = 1e-290  # below it, products of two representable factors may lose terms; logarithms are summed instead
 _DIM = 600.0  # Poisson mean up to which the recursion from exp(-mean) does not underflow; n steps lose n 1e-16
 _CHUNK = 1 << 21  # numbers in one block of work (16 MiB)
 
@@ -135,7 +135,7 @@ class Mixture:
         n = np.arange(self.first, self.first + len(self.log_pmf))
         above = self._above(mean)
         with np.errstate(divide="ignore"):
-            # gammainc near 1 is better as 1 - gammaincc; near 0 it is itself exact
+            # gammainc near 1 is better as 1 - gammaincc; near 0 it is exact
             log_above = np.where(above > 0.5, np.log1p(-gammaincc(max(self._last, 1), mean)), np.log(above))
         weights = np.column_stack([poisson_log_pmf(mean[:, None], n), log_above])
         table = np.vstack([self.log_pmf, self.tail_log_pmf]).T

@@ -28,9 +28,9 @@ from qsim.sensor.sensor import Sensor
 
 _REACH = 39.0  # sigmas: Phi(-39) = 1e-333 is 0 in float64
 _BLOCK, _SPAN = 256, 4096  # most levels, and electrons between them, that share one table
-_LONG = 1 << 13  # electrons of a table x (codes + 32); above, few steps are looked at, each by itself
-_LONGEST_TABLE = 2048  # electrons in a table that is looked through for short sums
-_BLUR = 8.3  # sigmas: 1 - Phi(8.3) = 5e-17 is nothing beside 1
+_LONG = 1 << 13  # electrons of a table x (codes + 32); above it, few steps are computed one by one
+_LONGEST_TABLE = 2048  # electrons in a table that short sums are made of
+_BLUR = 8.3  # sigmas: 1 - Phi(8.3) = 5e-17 is negligible beside 1
 _FARTHEST = 1e15  # electrons; no light reaches further
 _WIDEST = 1 << 22  # numbers in all thresholds of a sensor
 _PROCESS_BITS = 8  # above, codes are drawn step by step instead of through their cdf
@@ -223,7 +223,7 @@ def thresholds(sensor: QIS) -> Thresholds | None:
         tail = ndtr((at - well) / noise)
         return Thresholds(first.astype(np.int64), ndtr((at[:, None] - electrons) / noise), tail)
     around = np.floor(at)[:, None] + np.arange(-1, 3)
-    kept = sensor.codes_of(around) <= codes[:, None]  # ties as the ADC has them
+    kept = sensor.codes_of(around) <= codes[:, None]  # ties as the ADC rounds them
     first = np.clip(
         np.minimum(around[:, 0] + np.count_nonzero(kept, axis=1), ceil(well) if well < inf else inf), 0, _FARTHEST
     )
@@ -242,7 +242,7 @@ def electron_table(sensor: QIS, start: int, stop: int) -> Mixture:
     well = inf if sensor.full_well is None else sensor.full_well
     first = max(floor(min(low - reach, well)), 0) if start else 0
     last = max(ceil(min(high + reach, well)), first)
-    saturated = well if last >= well else inf  # what n >= last collects
+    saturated = well if last >= well else inf  # electrons of all n >= last
     electrons = np.append(np.arange(first, last, dtype=float), saturated)
     z = _normal_thresholds(sensor, electrons, np.arange(start - 1, stop))
     cdf, log_pmf = ndtr(z[:, 1:]), log_normal_difference(z[:, :-1], z[:, 1:])

@@ -25,7 +25,7 @@ from qsim.sensor.estimation import Estimate, Response
 from qsim.sensor.packing import pack
 
 _CHUNK = 1 << 18  # probabilities in one block of a draw (2 MiB)
-SMALLEST = 1 << 14  # pixels of a compiled draw; below, compiling costs more than it brings
+SMALLEST = 1 << 14  # pixels of a compiled draw; for fewer, compiling costs more than it saves
 ENGINES = ("auto", "reference", "fast")
 _UNITS = {
     "quantum_efficiency": "e-/photon",

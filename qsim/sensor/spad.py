@@ -18,7 +18,7 @@ from qsim.sensor.distribution import require_bits, require_number
 from qsim.sensor.qis_steps import search
 from qsim.sensor.sensor import Sensor
 
-_PLANES_BITS = 8  # of a sum of planes; above, the sum is drawn at once
+_PLANES_BITS = 8  # of a sum drawn plane by plane; above it, the sum is drawn from one number
 _BATCH = 1 << 17  # words of a batch of planes
 
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy import ndarray as Array
 
-_NEGLIGIBLE = 1e-10  # of a fall, left out at either end
-_LOW, _HIGH = 2.0**-17, 2.0**30  # sqrt(lambda) among which a fall is looked for: 6e-11 to 1e18 arrivals
+_NEGLIGIBLE = 1e-10  # share of a fall that is left out at either end
+_LOW, _HIGH = 2.0**-17, 2.0**30  # sqrt(lambda) between which a fall is searched: 6e-11 to 1e18 arrivals
 _CELLS, _MOST_CELLS = 128, 2048
 _ERROR = 5e-7  # of a curve, at most
 _ROUNDING = 6e-7  # of coefficients, cubic and uniform number in float32, several times
@@ -30,8 +30,8 @@ class Curves:
     start: Array  # [K]
     rate: Array  # [K] cells per x
     cubics: Array  # float32 [K, cells, 4]: coefficients in the share of the cell, constant first
-    margin: float  # nearer than this to a step, the curves do not decide
-    brightest: float  # x up to which they hold
+    margin: float  # distance to a step below which the curves do not decide
+    brightest: float  # x up to which the curves hold
 
 
 def by_pairs(step: Callable[[Array, Array], Array], count: int) -> Steps:

@@ -33,7 +33,7 @@ def available() -> bool:
 def backend() -> Any:
     """Return `drjit.cuda` or `drjit.llvm`; None where neither works on this machine."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Sensor.sample says that the reference draws
+        warnings.simplefilter("ignore")  # Sensor.sample warns that the reference draws
         chosen = engine.choose()
     if chosen.backend == "scalar":
         return None

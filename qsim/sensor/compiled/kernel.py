@@ -20,8 +20,8 @@ from qsim.sensor.compiled.curves import Curves
 from qsim.sensor.compiled.jit import backend, exp_below_zero, no_light, philox, smaller, uniform32, whole_packets
 from qsim.sensor.compiled.plan import Electrons, Live, Plan
 
-_CERTAIN = 80.0  # arrivals that are sure to bring 15: P(N < 15) = 1e-19
-CONSTANT_PLANS = 32  # sensors of a process that get kernels of their own
+_CERTAIN = 80.0  # arrivals at which 15 are certain: P(N < 15) = 1e-19
+CONSTANT_PLANS = 32  # plans of a process whose numbers are constants of their kernels
 
 
 def cdf_steps(plan: Plan, photons: Array) -> Array:
@@ -113,7 +113,10 @@ def _traced(
     planes: int,
     bits: int | None,
 ) -> Callable[..., tuple[Any, Any]]:
-    """Return a kernel that draws with `count`: photons, words and arguments of a thread -> its codes, and "uncertain"."""
+    """Return a kernel that draws with `count`.
+
+    `count`: photons, words and arguments of a thread -> its codes, and "uncertain".
+    """
     import drjit as dr
 
     jit = backend()

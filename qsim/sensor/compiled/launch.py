@@ -77,7 +77,7 @@ def sample_packed(plan: Plan, photons: Array, bits: int, key: Key, origin: tuple
 def _octets(pairs: Array, bits: int) -> Array:
     """Return rows of bytes [..., n bits] of rows of pairs of codes, [..., 4 n] numbers of 2 `bits` each."""
     if bits == 1:
-        # Four bytes of two bits: the product brings them side by side into the highest byte, and no other bits there
+        # Four bytes of two bits: the product puts them side by side into the highest byte
         return (pairs.view(np.uint32) * np.uint32(0x40100401)) >> np.uint32(24)
     eights = _join(_join(pairs, 2 * bits), 4 * bits)
     size = eights.dtype.itemsize
@@ -86,7 +86,7 @@ def _octets(pairs: Array, bits: int) -> Array:
 
 
 def _join(numbers: Array, bits: int) -> Array:
-    """Return neighbours side by side: [..., 2 n] numbers of `bits` bits -> [..., n] twice as wide, first one highest."""
+    """Return neighbours side by side: [..., 2 n] numbers of `bits` bits -> [..., n] of twice as many, first highest."""
     width, wide = 8 * numbers.itemsize, np.dtype(f"u{2 * numbers.itemsize}") if numbers.itemsize < 8 else None
     if wide is None:
         return numbers[..., ::2] << np.uint64(bits) | numbers[..., 1::2]
@@ -135,7 +135,7 @@ def _parts(
         first = (key.frame + part[0].start, origin[0] + part[1].start)
         return start(plan, pairs, shape, first, fixed, bits)
 
-    # While the host finishes some frames the kernel of the next ones runs, unless both need the buffer
+    # The kernel of the next frames runs while the host finishes these, unless both need the buffer
     running: tuple[tuple[slice, slice], list[Any]] | None = None
     times = [slice(t, min(t + together, frames)) for t in range(0, frames, together)]
     parts = [(t, slice(y, min(y + rows, height))) for t in times for y in range(0, height, rows)]

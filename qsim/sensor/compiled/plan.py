@@ -27,10 +27,10 @@ from numpy import ndarray as Array
 from qsim.sensor.compiled.curves import Curves
 
 MOST_BITS = 8  # of a code that a kernel draws: a byte
-_MAX_WORK = 260  # terms of all sums of one kernel together; looking up curves is quicker than more
-_TERMS = 75  # electrons up to which float32 has the range, halved: exp(165 / 2)
+_MAX_WORK = 260  # terms of all sums of one kernel; beyond it, curves are quicker
+_TERMS = 75  # electrons up to which the range of float32 suffices, halved: exp(165 / 2)
 _EXPONENT = 85.0  # exp of more overflows
-_NEGLIGIBLE = 1e-12  # a coefficient that small moves no step by more than float64's rounding of the reference
+_NEGLIGIBLE = 1e-12  # a smaller coefficient moves a step by less than the reference's rounding
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Electrons:
     """Sums over electrons: q_0 ... q_(n-1), and for each step how many come in full and which are weighted."""
 
     highest: float  # arrivals beyond which every step without a floor is 0; more light changes nothing
-    halved: bool  # half of exp(highest) is what the float has room for
+    halved: bool  # exp(highest) overflows, so both sides carry half of the exponent
     scale: float
     full: Array  # [n] coefficient of a whole term, scale^n / n!
     prefix: tuple[int, ...]  # per step: terms 0 ... prefix - 1 in full
@@ -89,7 +89,7 @@ class Plan:
     dark: float  # arrivals without light, of one plane
     planes: int  # summed into one code; 1 unless BinarySPAD
     steps: Electrons | Live | Curves  # of one plane
-    margin: float  # nearer than this to a step, float arithmetic does not decide
+    margin: float  # distance to a step below which float32 does not decide
 
     @classmethod
     def summed(cls, efficiency: float, dark: float, steps: Electrons | Live, planes: int = 1) -> Plan:
