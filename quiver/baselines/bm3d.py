@@ -4,14 +4,15 @@
     denoised
 
 Source: Dabov, Foi, Katkovnik, Egiazarian, "Image denoising by sparse 3-D transform-domain collaborative filtering",
-IEEE TIP 16(8), 2007; written from the description, with the parameters of its normal profile. Our reading: in the
-first step blocks are similar if their distance exceeds that of two noisy copies of one block, 2 sigma^2, by at most
-3000. That replaces the article's second set of parameters for strong noise, and needs no filter before matching. The
-mean of a stack is never shrunk, so that nothing depends on where grey level 0 lies.
+IEEE TIP 16(8), 2007; written from the description, with the parameters of its normal profile. Our reading: in the first
+step blocks are similar if their distance exceeds that of two noisy copies of one block, 2 sigma^2, by at most 3000.
+That replaces the article's second set of parameters for strong noise, and needs no filter before matching. The mean of
+a stack is never shrunk, so the position of grey level 0 does not matter.
 
-How it is fast without a loop over pixels: the transformed block at every position is one row of a table [positions,
-64]. Distances are matrix products of rows (a DCT keeps distances), stacks are gathered rows, and filtered rows are
-added up at their positions, so that each position is transformed back once. Memory: about 1.2 kB per pixel.
+No loop runs over pixels: the transformed block at every position is one row of a table [positions, 64]. Distances are
+matrix products of rows (a DCT keeps distances), stacks are gathered rows, and filtered rows are added at their
+positions, so that each position is transformed back once. Memory: about 1.2 kB per pixel. The package `bm3d` is not
+used: its licence forbids commercial use.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ AREA = BLOCK * BLOCK
 RADIUS = 19  # pixels: a search window of 39 x 39
 STEP = 3  # pixels between reference blocks
 TILE = 8  # reference blocks per side of a tile that shares one matrix product
-REACH = STEP * (TILE - 1) + 2 * RADIUS + 1  # positions per side which the blocks of a tile look at
+REACH = STEP * (TILE - 1) + 2 * RADIUS + 1  # positions per side in the search windows of a tile
 KAISER = 2.0  # shape parameter of the window that weighs the pixels of a block
 FAR = 1e30  # squared distance of a position outside the image
 
@@ -45,10 +46,10 @@ class Profile:
 
 
 def denoise(image: Array, sigma: float, *, peak: float = 1.0, profile: Profile = Profile()) -> Array:
-    """An image [H, W] of any size with white noise of deviation `sigma` -> denoised float32 [H, W], same unit.
+    """Return an image [H, W] without its white noise of deviation `sigma`: float32 [H, W], same unit.
 
-    `peak` is the image value that stands for 255 grey levels, the unit in which the profile's limits are given.
-    Raises ValueError for anything that is not an image or not a noise.
+    `peak` is the image value that stands for 255 grey levels, the unit of the profile's limits. `ValueError` for input
+    that is not an image, and for an impossible deviation.
     """
     if image.ndim != 2 or image.size == 0 or not np.all(np.isfinite(image)):
         raise ValueError(f"image: expected finite numbers [H, W], got {image.dtype} {image.shape}")
@@ -57,7 +58,7 @@ def denoise(image: Array, sigma: float, *, peak: float = 1.0, profile: Profile =
     if sigma == 0:
         return image.astype(np.float32)
     grey = 255.0 / peak
-    level = float(image.mean(dtype=np.float64))  # taken off for the sake of float32
+    level = float(image.mean(dtype=np.float64))  # subtracted: float32 loses less
     noisy = torch.from_numpy(pad((image - level) * grey).astype(np.float32))
     with torch.no_grad():
         coefficients = block_table(noisy)
@@ -68,13 +69,13 @@ def denoise(image: Array, sigma: float, *, peak: float = 1.0, profile: Profile =
 
 
 def pad(image: Array) -> Array:
-    """Reflect bottom and right until reference blocks, STEP apart, end exactly at the border."""
+    """Return the image reflected at bottom and right until reference blocks, STEP apart, end exactly at the border."""
     extra = [max(BLOCK - side, 0) or -(side - BLOCK) % STEP for side in image.shape]
     return np.pad(image, [(0, extra[0]), (0, extra[1])], mode="symmetric")
 
 
 def dct_matrix() -> Tensor:
-    """The orthonormal 2-D DCT-II of a block as a matrix [64 coefficients, 64 pixels]."""
+    """Return the orthonormal 2-D DCT-II of a block as a matrix [64 coefficients, 64 pixels]."""
     n = np.arange(BLOCK)
     one = np.cos(np.pi * (2 * n[None, :] + 1) * n[:, None] / (2 * BLOCK)) * np.sqrt(2 / BLOCK)
     one[0] /= np.sqrt(2)
@@ -82,7 +83,7 @@ def dct_matrix() -> Tensor:
 
 
 def wavelet_matrix() -> Tensor:
-    """The periodic biorthogonal 1.5 wavelet transform of a block, rows of unit length: [64 coefficients, 64 pixels]."""
+    """Return the periodic biorthogonal 1.5 wavelet transform of a block, rows of unit length: [64, 64 pixels]."""
     low = np.array([3, -3, -22, 22, 128, 128, 22, -22, -3, 3]) / (128 * np.sqrt(2))
     one, size = np.eye(BLOCK), BLOCK
     while size > 1:
@@ -97,7 +98,7 @@ def wavelet_matrix() -> Tensor:
 
 
 def haar_matrix(size: int) -> Tensor:
-    """The orthonormal Haar transform over `size` (a power of two) blocks, [size, size]."""
+    """Return the orthonormal Haar transform over `size` (a power of two) blocks, [size, size]."""
     matrix = np.ones((1, 1))
     while len(matrix) < size:
         fine = np.kron(np.eye(len(matrix)), [1, -1])
@@ -106,13 +107,15 @@ def haar_matrix(size: int) -> Tensor:
 
 
 def table_size(shape: torch.Size) -> tuple[int, int, int, int]:
-    """Tiles down and across, and height and width of the table of positions: the image's, bordered for the search."""
+    """Return tiles down and across, and height and width of the table of positions: the image's, with a border for the
+    search.
+    """
     down, across = (-(-((side - BLOCK) // STEP + 1) // TILE) for side in shape)
     return down, across, STEP * TILE * (down - 1) + REACH, STEP * TILE * (across - 1) + REACH
 
 
 def block_table(image: Tensor) -> Tensor:
-    """DCT of the block at every position: rows [table height * table width, 64]; zeros outside the image."""
+    """Return the DCT of the block at every position: rows [table height * table width, 64]; zeros outside the image."""
     _, _, height, width = table_size(image.shape)
     table = torch.zeros(height, width, AREA)
     blocks = image.unfold(0, BLOCK, 1).unfold(1, BLOCK, 1)  # [positions down, across, 8, 8], a view
@@ -123,7 +126,7 @@ def block_table(image: Tensor) -> Tensor:
 
 
 def inside_image(shape: torch.Size) -> Tensor:
-    """Which positions of the table [height, width] hold a block of the image."""
+    """Return which positions of the table [height, width] hold a block of the image."""
     _, _, height, width = table_size(shape)
     inside = torch.zeros(height, width, dtype=torch.bool)
     inside[RADIUS : RADIUS + shape[0] - BLOCK + 1, RADIUS : RADIUS + shape[1] - BLOCK + 1] = True
@@ -134,12 +137,12 @@ def inside_image(shape: torch.Size) -> Tensor:
 class Matches:
     """The stacks of one row of tiles."""
 
-    position: Tensor  # [references, stack], rows of the table, nearest first: the reference itself leads
+    position: Tensor  # [references, stack], rows of the table, nearest first, the reference at 0
     size: Tensor  # [references], blocks of the stack that count: a power of two
 
 
 def match_blocks(table: Tensor, norm: Tensor, tile_row: int, shape: torch.Size, stack: int, limit: float) -> Matches:
-    """The most similar blocks within the search window of every reference block in one row of tiles."""
+    """Return the most similar blocks within the search window of every reference block in one row of tiles."""
     _, across, _, width = table_size(shape)
     top, jump = tile_row * TILE * STEP, TILE * STEP
     view = table.as_strided((across, REACH, REACH, AREA), (jump * AREA, width * AREA, AREA, 1), top * width * AREA)
@@ -169,13 +172,13 @@ def match_blocks(table: Tensor, norm: Tensor, tile_row: int, shape: torch.Size, 
 
 
 def norms(table: Tensor, shape: torch.Size) -> Tensor:
-    """Squared length of every row [table height, width]; FAR outside the image."""
+    """Return the squared length of every row [table height, width]; FAR outside the image."""
     inside = inside_image(shape)
     return table.square().sum(1).view(inside.shape).masked_fill_(~inside, FAR)
 
 
 def similar_blocks(table: Tensor, shape: torch.Size, stack: int, limit: float) -> list[Tensor]:
-    """All stacks as positions [n, size], sorted into one tensor per size and row of tiles."""
+    """Return all stacks as positions [n, size], one tensor per size and row of tiles."""
     norm, found = norms(table, shape), []
     for tile_row in range(table_size(shape)[0]):
         matches = match_blocks(table, norm, tile_row, shape, stack, limit)
@@ -185,7 +188,7 @@ def similar_blocks(table: Tensor, shape: torch.Size, stack: int, limit: float) -
 
 
 def threshold_step(table: Tensor, shape: torch.Size, sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
-    """Hard thresholding: sums of weighted filtered rows [positions, 64] and of their weights [positions]."""
+    """Return sums of weighted rows [positions, 64] after hard thresholding, and of their weights [positions]."""
     total, weights = torch.zeros_like(table), torch.zeros(len(table))
     to_wavelet = wavelet_matrix() @ dct_matrix().T
     wavelets = table @ to_wavelet.T
@@ -201,7 +204,7 @@ def threshold_step(table: Tensor, shape: torch.Size, sigma: float, profile: Prof
 
 
 def wiener_step(table: Tensor, basic: Tensor, sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
-    """Empirical Wiener filter, the spectrum taken from the basic estimate; returns what `threshold_step` returns."""
+    """Return the same sums after an empirical Wiener filter, whose spectrum comes from the basic estimate."""
     total, weights = torch.zeros_like(table), torch.zeros(len(table))
     pilot_table = block_table(basic)
     for position in similar_blocks(pilot_table, basic.shape, profile.second_stack, profile.second_limit):
@@ -222,7 +225,7 @@ def add_blocks(total: Tensor, weights: Tensor, position: Tensor, stack: Tensor, 
 
 
 def aggregate(total: Tensor, weights: Tensor, shape: torch.Size) -> Tensor:
-    """Weighted mean of all overlapping filtered blocks: an image of this shape."""
+    """Return the weighted mean of all overlapping filtered blocks: an image of this shape."""
     height, width = table_size(shape)[2:]
     kaiser = torch.from_numpy(np.kaiser(BLOCK, KAISER).astype(np.float32))
     kaiser = torch.outer(kaiser, kaiser).flatten()

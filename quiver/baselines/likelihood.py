@@ -1,13 +1,13 @@
-"""Maximum likelihood per pixel: the light that makes the codes of a window most likely.
+"""Restores by maximum likelihood per pixel: the light that makes the codes of a window most likely.
 
     photons = argmax over theta of sum over codes k of (times k occurred) * log P(k | theta),   at most the cap
 
 Source: textbook; the likelihood is the sensor's exact one (`sensor.maximum_likelihood`). The order of the codes does
-not matter, so a window has few different outcomes (31 824 for 11 frames of 3 bits): each is solved once. All-
-saturated pixels have no finite maximum; estimates end where those of the moment inverse end.
+not matter, so a window has few different outcomes (31 824 for 11 frames of 3 bits): each is solved once. Pixels with
+saturated codes only have no finite maximum; estimates end where those of the moment inverse end.
 
-Few bits are where this differs from the moment inverse: at 6.5 photons (3 bits, gain 1.077) its variance is 1.10 times
-the Cramer-Rao bound, that of the moment inverse 1.15 times.
+The difference to the moment inverse is largest at few bits. At 6.5 photons (3 bits, gain 1.077) its variance is 1.10
+times the Cramer-Rao bound, that of the moment inverse 1.15 times.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ def restore(
     photons_per_unit: float = 1.0,
     frames: range | None = None,
 ) -> Array:
-    """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
+    """Restore codes [T, H, W] from `window` frames around each: float32 [T, H, W], in units of this many photons.
 
-    Quick up to about 4 bits; with more, nearly every pixel has an outcome of its own. Raises ValueError for codes the
+    It is quick up to about 4 bits; above, nearly every pixel has a different outcome. `ValueError` for codes that the
     sensor cannot produce and for an empty window.
     """
     check_codes(codes, sensor)
@@ -55,7 +55,7 @@ def restore(
 
 
 def outcome_names(levels: int, window: int) -> Array:
-    """A uint64 per code; their sum over a window names the outcome, whatever the order of the codes.
+    """Return a uint64 per code; their sum over a window names the outcome, for any order of the codes.
 
     Powers of window + 1 where they fit 64 bits (up to 3 bits for 255 frames, 4 for 15): names are unique. Else random
     numbers: two of half a million outcomes share a name with a probability of 1e-8.
@@ -66,7 +66,7 @@ def outcome_names(levels: int, window: int) -> Array:
 
 
 def solve(outcomes: Array, sensor: Sensor, exposure: float, cap: float) -> Array:
-    """Windows of codes [window, N] -> most likely photons [N], float32, at most `cap`."""
+    """Return the most likely photons [N], float32, of windows of codes [window, N]; at most `cap`."""
     photons = np.empty(outcomes.shape[1], np.float32)
     step = max(1, CHUNK // sensor.levels)
     for start in range(0, len(photons), step):

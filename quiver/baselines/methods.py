@@ -1,10 +1,10 @@
-"""Classical restorers, one file per method, one signature.
+"""Lists the classical restorers: one module per method, one signature.
 
     restore(codes [T, H, W], sensor, exposure, *, window=..., photons_per_unit=1, frames=None)
         -> restored [T, H, W], float32
 
-With `frames`, a range, these alone are restored, from the frames around them all the same. Any number of frames and any
-size; a clip is continued by reflection at both ends. METHODS is the whole list: import the module of a method for its
+With a range `frames`, only these are restored, also from the frames around them. Any number of frames and any size is
+allowed; a clip is continued by reflection at both ends. METHODS is the complete list; the module of a method has its
 other settings.
 """
 
@@ -22,17 +22,17 @@ from quiver.baselines.sliding_window import look_ahead
 
 @dataclass(frozen=True)
 class Method:
-    """A restorer and what a table says about it."""
+    """A restorer and its entries in a table."""
 
     name: str
     restore: Callable[..., Array]  # restore(codes, sensor, exposure, *, window=..., photons_per_unit=1) -> [T, H, W]
-    window: int  # frames used for one restored frame, when not told otherwise
+    window: int  # frames used for one restored frame, by default
     description: str
     bytes_per_pixel: int  # working memory, about, beside the codes and the video
 
     @property
     def look_ahead(self) -> int:
-        """Future frames used for one restored frame, with the default window."""
+        """Return the future frames used for one restored frame, with the default window."""
         return look_ahead(self.window)
 
 

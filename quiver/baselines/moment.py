@@ -1,9 +1,9 @@
-"""Moment inverse: the mean code of a window, sent back through the sensor's exact mean response.
+"""Restores by the moment inverse: the mean code of a window, through the inverse of the sensor's exact mean response.
 
     photons = mu^-1(min(mean(codes), top - 1/(2 window)))
 
-Source: method of moments, textbook. Knows clipping, rounding, dark counts and dead time, because mu comes from the
-sensor's exact distribution; knows nothing about space or motion.
+Source: method of moments, textbook. Clipping, rounding, dark counts and dead time are taken into account, because mu
+comes from the sensor's exact distribution. Space and motion are not.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ def restore(
     photons_per_unit: float = 1.0,
     frames: range | None = None,
 ) -> Array:
-    """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
+    """Restore codes [T, H, W] from `window` frames around each: float32 [T, H, W], in units of this many photons.
 
-    Raises ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
+    `ValueError` for codes that the sensor cannot produce, an empty window and an impossible unit.
     """
     table = sensor.response(exposure)
 

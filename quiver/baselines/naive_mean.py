@@ -1,10 +1,10 @@
-"""Naive mean: the floor under every table. Averages the codes of a window and believes they are linear in light.
+"""Restores by the naive mean: averages the codes of a window and takes them as linear in light.
 
     photons = max(0, mean(codes) - dark) * white / top
 
-Source: textbook. `white / top` is the light of one code step as the settings promise it (1/(gain * efficiency)),
-`dark` the codes which dark counts and offset add in the same linear picture. Clipping and dead time are ignored: at
-3.25 photons per pixel (3 bits, gain 1.077) the estimate is 4 % low, at four times that light 39 %.
+Source: textbook; the lower bound of every table. `white / top` is the nominal light of one code step (1/(gain *
+efficiency)), `dark` the codes that dark counts and offset add in the same linear picture. Clipping and dead time are
+ignored: at 3.25 photons per pixel (3 bits, gain 1.077) the estimate is 4 % low, at four times that light 39 %.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from quiver.baselines.sliding_window import restore_by_mean
 
 
 def dark_codes(sensor: Sensor, exposure: float) -> float:
-    """What a linear sensor would read in the dark [codes]."""
+    """Return the codes that a linear sensor would have in the dark."""
     slope = (sensor.levels - 1) / sensor.white(exposure)  # codes per photon
     offset = sensor.offset if isinstance(sensor, QIS) else 0.0
     return slope * sensor.dark_rate * exposure / sensor.efficiency + offset
@@ -33,9 +33,9 @@ def restore(
     photons_per_unit: float = 1.0,
     frames: range | None = None,
 ) -> Array:
-    """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
+    """Restore codes [T, H, W] from `window` frames around each: float32 [T, H, W], in units of this many photons.
 
-    Raises ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
+    `ValueError` for codes that the sensor cannot produce, an empty window and an impossible unit.
     """
     dark, step = dark_codes(sensor, exposure), sensor.white(exposure) / (sensor.levels - 1)
 

@@ -1,15 +1,15 @@
-"""Patch alignment of two images, coarse to fine: how far each patch of the reference has moved in the other image.
+"""Aligns patches of two images, coarse to fine: the shift of each patch of the reference in the other image.
 
     pyramid (1/1, 1/2, 1/8) -> exhaustive search at 1/8 -> Lucas-Kanade -> three candidates per patch at 1/2, search,
     Lucas-Kanade -> three candidates at 1/1, search -> (v, u) of 16x16 patches at a stride of 8
 
 Source: Ma, Gupta, Ulku, Bruschini, Charbon, Gupta, "Quanta Burst Photography", ACM TOG 39(4), 2020, with the parameters
-its authors use; alignment after Hasinoff et al. 2016 and Lucas and Kanade 1981; written from the description. Our
+of its authors; alignment after Hasinoff et al. 2016 and Lucas and Kanade 1981; written from the description. Our
 reading: a candidate that would leave the image is moved to the nearest place inside.
 
-Everything runs on all patches at once. Patches lie in the last dimension, [patch height, patch width, N], so that
-shifted views of a search window are as fast as whole arrays. Shifts are (v, u) = (down, right), in pixels, and lead
-from the reference to the other image: reference(p) is like other(p + shift).
+All patches are computed at once. Patches lie in the last dimension, [patch height, patch width, N], so that shifted
+views of a search window are as fast as complete arrays. Shifts are (v, u) = (down, right), in pixels, from the
+reference to the other image: reference(p) is like other(p + shift).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-MULTIPLE = 64  # sides of an image that the pyramid and all patch sizes divide
+MULTIPLE = 64  # of the sides of an image, which pyramid and patch sizes divide
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,13 @@ ITERATIONS = 3  # of Lucas-Kanade
 
 
 def pad_image(image: Tensor) -> Tensor:
-    """Replicate bottom and right until both sides are multiples of 64."""
+    """Return the image with bottom and right replicated until both sides are multiples of 64."""
     height, width = image.shape
     return pad(image[None, None], (0, -width % MULTIPLE, 0, -height % MULTIPLE), mode="replicate")[0, 0]
 
 
 def pyramid(image: Tensor, levels: tuple[Level, ...] = LEVELS) -> list[Tensor]:
-    """Box means of an image [H, W] with sides that are multiples of 64, finest first."""
+    """Return box means of an image [H, W] with sides that are multiples of 64, finest first."""
     images = [image]
     for level in levels[1:]:
         images.append(avg_pool2d(images[-1][None], level.ratio)[0])
@@ -54,14 +54,14 @@ def pyramid(image: Tensor, levels: tuple[Level, ...] = LEVELS) -> list[Tensor]:
 
 
 def grid(shape: torch.Size, level: Level) -> tuple[Tensor, int, int]:
-    """Upper left corners [2, N] (y, x) of the patches in raster order, and their number down and across."""
+    """Return the upper left corners [2, N] (y, x) of the patches in raster order, and their number down and across."""
     down, across = ((side - level.patch) // level.stride + 1 for side in shape)
     y, x = torch.meshgrid(torch.arange(down), torch.arange(across), indexing="ij")
     return torch.stack([y.flatten(), x.flatten()]) * level.stride, down, across
 
 
 def gather(image: Tensor, corner: Tensor, size: int) -> Tensor:
-    """Squares of `size` pixels with these upper left corners [2, N] -> [size, size, N]; outside, the border repeats."""
+    """Return squares [size, size, N] with these upper left corners [2, N]; outside, the border repeats."""
     height, width = image.shape
     step = torch.arange(size)
     y = (corner[0] + step[:, None]).clamp_(0, height - 1) * width
@@ -70,9 +70,9 @@ def gather(image: Tensor, corner: Tensor, size: int) -> Tensor:
 
 
 def search(patches: Tensor, other: Tensor, corner: Tensor, centre: Tensor, radius: int) -> tuple[Tensor, Tensor]:
-    """Best integer shift [2, N] within `radius` of each `centre`, and its sum of absolute differences [N].
+    """Return the best integer shift [2, N] within `radius` of each `centre`, and its sum of absolute differences [N].
 
-    Only shifts that keep the patch inside the image; among equals the first in raster order.
+    Only shifts that keep the patch inside the image count; among equals the first in raster order.
     """
     size, limit = patches.shape[0], torch.tensor(other.shape)[:, None]
     low, high = -corner, limit - patches.shape[0] - corner
@@ -89,7 +89,7 @@ def search(patches: Tensor, other: Tensor, corner: Tensor, centre: Tensor, radiu
 
 
 def derivatives(image: Tensor) -> tuple[Tensor, Tensor]:
-    """(d/dy, d/dx) by (f(x-2) - 8 f(x-1) + 8 f(x+1) - f(x+2)) / 12, borders mirrored."""
+    """Return (d/dy, d/dx) by (f(x-2) - 8 f(x-1) + 8 f(x+1) - f(x+2)) / 12, borders mirrored."""
     kernel = (1 / 12, -8 / 12, 0.0, 8 / 12, -1 / 12)
     found = []
     for axis in (0, 1):
@@ -100,13 +100,13 @@ def derivatives(image: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def cubic_weights(fraction: Tensor) -> Tensor:
-    """Weights [4, N] of the pixels -1, 0, 1, 2 for a position between 0 and 1 (Catmull-Rom)."""
+    """Return weights [4, N] of the pixels -1, 0, 1, 2 for a position between 0 and 1 (Catmull-Rom)."""
     t = fraction
     return torch.stack([((2 - t) * t - 1) * t, (3 * t - 5) * t**2 + 2, ((4 - 3 * t) * t + 1) * t, (t - 1) * t**2]) / 2
 
 
 def sample_cubic(image: Tensor, position: Tensor, size: int) -> Tensor:
-    """Bicubic patches [size, size, N] with upper left corners at real positions [2, N]."""
+    """Return bicubic patches [size, size, N] with upper left corners at real positions [2, N]."""
     whole = position.floor()
     square = gather(image, whole.long() - 1, size + 3)
     y, x = cubic_weights(position[0] - whole[0]), cubic_weights(position[1] - whole[1])
@@ -116,7 +116,7 @@ def sample_cubic(image: Tensor, position: Tensor, size: int) -> Tensor:
 
 
 def sample_linear(image: Tensor, position: Tensor, size: int) -> Tensor:
-    """Bilinear patches [size, size, N] with upper left corners at real positions [2, N]."""
+    """Return bilinear patches [size, size, N] with upper left corners at real positions [2, N]."""
     whole = position.floor()
     square = gather(image, whole.long(), size + 1)
     y, x = position - whole
@@ -125,17 +125,17 @@ def sample_linear(image: Tensor, position: Tensor, size: int) -> Tensor:
 
 
 def inside(shape: torch.Size, position: Tensor, size: int) -> Tensor:
-    """Which pixels of patches at real positions [2, N] lie in the image: bool [size, size, N]."""
+    """Return which pixels of patches at real positions [2, N] lie in the image: bool [size, size, N]."""
     at = position[:, None] + torch.arange(size)[:, None]
     y, x = ((at[k] >= 0) & (at[k] <= shape[k] - 1) for k in (0, 1))
     return y[:, None] & x[None]
 
 
 def lucas_kanade(reference: Tensor, other: Tensor, corner: Tensor, shift: Tensor, size: int) -> Tensor:
-    """Refine shifts [2, N] to fractions of a pixel: template Lucas-Kanade, translation only.
+    """Return shifts [2, N] refined to fractions of a pixel: template Lucas-Kanade, translation only.
 
     The gradient is the mean of both images'. Steps are at most one pixel long; a patch without structure in two
-    directions stays where it is.
+    directions is not moved.
     """
     template, flats = gather(reference, corner, size), derivatives(other)
     slopes = [gather(image, corner, size) for image in derivatives(reference)]
@@ -156,7 +156,7 @@ def lucas_kanade(reference: Tensor, other: Tensor, corner: Tensor, shift: Tensor
 
 
 def candidates(parent: Tensor, down: int, across: int, fine: Level, coarse: Level) -> list[Tensor]:
-    """Integer shifts [2, N] for the patches of the finer level from their parent and two of its neighbours."""
+    """Return integer shifts [2, N] for the patches of the finer level from their parent and two of its neighbours."""
     scaled = (parent * coarse.ratio).round().long()
 
     def parents(count: int, limit: int) -> tuple[Tensor, Tensor]:
@@ -171,7 +171,7 @@ def candidates(parent: Tensor, down: int, across: int, fine: Level, coarse: Leve
 
 
 def align(reference: list[Tensor], other: list[Tensor], *, refine_finest: bool = False) -> Tensor:
-    """Shifts [2, N] of the finest level's patches between two pyramids; integers (as floats) unless refined."""
+    """Return shifts [2, N] of the finest level's patches between two pyramids; integers (as floats) unless refined."""
     shifts = torch.zeros(2, 1, 1)
     for depth in range(len(LEVELS) - 1, -1, -1):
         level, image = LEVELS[depth], reference[depth]

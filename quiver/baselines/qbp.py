@@ -4,18 +4,18 @@
     with BM3D: mean code -> f -> BM3D with sigma = excess / sqrt(window) -> D^-1 -> photons
 
 Source: Ma, Gupta, Ulku, Bruschini, Charbon, Gupta, "Quanta Burst Photography", ACM TOG 39(4), 2020; written from the
-description. Our reading for few-bit streams: every frame is a block of its own and the response is inverted by its
-exact table; 1-bit streams take blocks of several frames (`Settings.block`), as the article does. AS_PUBLISHED keeps the
-article's choices, above all its noise estimate (the variance of the reference patch, which contains the picture).
-CALIBRATED, the default, takes the sensor's exact variance, refines shifts at full resolution and averages three frames
-before matching; its c0 was chosen on clips made for that: a photograph in motion, a filmed ball and two rendered scenes
-at 3.25 and 26 photons per pixel.
+description. Our reading for few-bit streams: every frame is one block, and the response is inverted by its exact table.
+1-bit streams take blocks of several frames (`Settings.block`), as the article does. AS_PUBLISHED keeps the article's
+choices, above all its noise estimate (the variance of the reference patch, which contains the picture). CALIBRATED, the
+default, takes the sensor's exact variance, refines shifts at full resolution and averages three frames before matching.
+Its c0 was chosen on clips made for that: a photograph in motion, a filmed ball and two rendered scenes at 3.25 and 26
+photons per pixel.
 
-The window slides over the clip, so that its frames are aligned again for each restored frame.
+The window slides over the clip, so its frames are aligned again for each restored frame.
 
-The denoising step takes the stabiliser and the unbiased inverse of vst.py in place of the binomial Anscombe transform.
-Where the Wiener merge distrusts a frame, fewer than `window` codes are averaged: `excess` is the deviation of the noise
-over that of a full average.
+The denoising step uses the stabiliser and the unbiased inverse of vst.py in place of the binomial Anscombe transform.
+Where the Wiener merge gives a frame a low weight, fewer than `window` codes are averaged: `excess` is the deviation of
+the noise over that of a full average.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from quiver.baselines.vst import stabiliser
 
 @dataclass(frozen=True)
 class Settings:
-    """What can be chosen beside the window."""
+    """The settings beside the window."""
 
     block: int = 1  # frames averaged before alignment; the window is a whole number of blocks
     prefilter: int = 3  # neighbouring blocks averaged for matching only; 1 or 3
-    wiener: float = 16.0  # c0: larger trusts the other frames more
+    wiener: float = 16.0  # c0: a larger one gives the other frames more weight
     wiener_variance: Literal["sensor", "patch"] = "sensor"  # noise of a reference pixel: exact, or its patch's variance
     refine_finest: bool = True  # sub-pixel shifts at full resolution too
 
@@ -68,10 +68,10 @@ def restore(
     excess: float | None = None,
     frames: range | None = None,
 ) -> Array:
-    """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
+    """Restore codes [T, H, W] from `window` frames around each: float32 [T, H, W], in units of this many photons.
 
-    With `excess`, merged frames are denoised by BM3D. Raises ValueError for codes the sensor cannot produce, an
-    impossible unit, and a window that blocks do not divide.
+    With `excess`, merged frames are denoised by BM3D. `ValueError` for codes that the sensor cannot produce, an
+    impossible unit, and a window that is not a multiple of the block.
     """
     check_codes(codes, sensor)
     check_window(window)
@@ -90,7 +90,7 @@ def restore(
 
 
 def merge(codes: Array, frame: int, table: Response, window: int, settings: Settings = CALIBRATED) -> Array:
-    """The mean code [H, W], float32, of the window around one frame after alignment and Wiener merging."""
+    """Return the mean code [H, W], float32, of the window around one frame after alignment and Wiener merging."""
     check_window(window)
     if window % settings.block:
         raise ValueError(f"window is {window} frames, which blocks of {settings.block} do not divide")
@@ -104,10 +104,10 @@ def merge(codes: Array, frame: int, table: Response, window: int, settings: Sett
 
 
 def frame_shifts(frames: Tensor, settings: Settings = CALIBRATED) -> Tensor:
-    """Shifts [D, F, 2, N] of the patches of the middle block in every frame of D blocks [D, F, H, W].
+    """Return shifts [D, F, 2, N] of the patches of the middle block in every frame of D blocks [D, F, H, W].
 
-    Means of `prefilter` blocks are matched where they share no frame with the middle's: shared noise would say that
-    nothing moves. Other frames follow linearly in time between matched ones, and at constant speed beyond the last.
+    Means of `prefilter` blocks are matched where they share no frame with the middle block: shared noise would pull
+    shifts to zero. Other frames follow linearly in time between matched ones, and at constant speed beyond the last.
     """
     blocks, middle = frames.mean(1), len(frames) // 2
     width = settings.prefilter if len(frames) >= 3 * settings.prefilter else 1
@@ -127,7 +127,9 @@ def frame_shifts(frames: Tensor, settings: Settings = CALIBRATED) -> Tensor:
 
 
 def _interpolate(place: Tensor, known: Tensor, values: Tensor) -> Tensor:
-    """Shifts [K, ...] at rising times [K], one of them 0 -> at other times: linear between, in proportion beyond."""
+    """Return shifts at other times from shifts [K, ...] at rising times [K], one of them 0: linear, in proportion
+    beyond.
+    """
     if len(known) == 1:
         return values.expand(len(place), *values.shape[1:])
     within = place.clamp(float(known[0]), float(known[-1]))
@@ -138,7 +140,7 @@ def _interpolate(place: Tensor, known: Tensor, values: Tensor) -> Tensor:
 
 
 def _warp_block(frames: Tensor, shifts: Tensor, corner: Tensor, smooth: bool) -> Tensor:
-    """Mean of the frames [F, H, W] of a block, each moved patch by patch [F, 2, N] -> [patch, patch, N].
+    """Return the mean of the frames [F, H, W] of a block, moved patch by patch [F, 2, N]: [patch, patch, N].
 
     Pixels from outside the image are left out; where no frame has any, the border repeats.
     """
@@ -157,7 +159,7 @@ def _warp_block(frames: Tensor, shifts: Tensor, corner: Tensor, smooth: bool) ->
 
 
 def _merge_patches(frames: Tensor, shifts: Tensor, table: Response, settings: Settings) -> Tensor:
-    """Steps from aligned patches to the merged image: spectra, Wiener weights, overlap-add."""
+    """Return the merged image from aligned patches: spectra, Wiener weights, overlap-add."""
     corner = patch_alignment.grid(frames.shape[2:], patch_alignment.LEVELS[0])[0]
     size, count = patch_alignment.LEVELS[0].patch, len(frames)
     smooth = settings.refine_finest
@@ -177,7 +179,7 @@ def _merge_patches(frames: Tensor, shifts: Tensor, table: Response, settings: Se
 
 
 def _noise(reference: Tensor, table: Response, settings: Settings) -> Tensor:
-    """Variance of a pixel of each reference patch [N], in units of the top code squared."""
+    """Return the variance of a pixel of each reference patch [N], in units of the top code squared."""
     if settings.wiener_variance == "patch":
         return reference.flatten(0, 1).var(0).clamp(min=float(np.finfo(np.float32).eps))
     mean_code = table.top * reference.mean((0, 1)).numpy()
@@ -186,7 +188,7 @@ def _noise(reference: Tensor, table: Response, settings: Settings) -> Tensor:
 
 
 def overlap_add(patches: Tensor, corner: Tensor, shape: torch.Size) -> Tensor:
-    """Image of this shape as the mean of overlapping patches [size, size, N], weighted by a raised cosine."""
+    """Return an image of this shape: the mean of overlapping patches [size, size, N], weighted by a raised cosine."""
     size, width = patches.shape[0], shape[1]
     one = 0.5 - 0.5 * torch.cos(2 * torch.pi * (torch.arange(size) + 0.5) / size)
     weight = torch.outer(one, one)[..., None]

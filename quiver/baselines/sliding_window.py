@@ -1,10 +1,10 @@
-"""Frames of a stream: checking them, reaching over the ends of a clip, sums over a sliding window.
+"""Checks the frames of a stream, continues a clip beyond its ends, and sums codes over a sliding window.
 
     codes [T, H, W] -> for every frame t the sum of the codes of `window` frames around it
 
-A window of w frames covers t - w//2 ... t + (w-1)//2: centred for odd w, one frame more of the past for even w.
-Frames before the first and after the last are reflections that do not repeat the end frame (-1 is frame 1), over and
-over for short clips.
+A window of w frames covers t - w//2 ... t + (w-1)//2: centred for odd w, one frame more of the past for even w. Frames
+before the first and after the last are reflections that do not repeat the end frame (-1 is frame 1), several times for
+short clips.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from qsim.sensor.sensor import Sensor
 
 
 def check_codes(codes: Array, sensor: Sensor) -> None:
-    """Raise ValueError unless `codes` is a non-empty integer stack [T, H, W] which this sensor can produce."""
+    """Raise `ValueError` unless `codes` is a non-empty integer stack [T, H, W] that this sensor can produce."""
     if codes.ndim != 3 or codes.size == 0 or not np.issubdtype(codes.dtype, np.integer):
         raise ValueError(f"codes: expected integers [T, H, W] with at least one frame, got {codes.dtype} {codes.shape}")
     if codes.max() >= sensor.levels or codes.min() < 0:
@@ -31,18 +31,18 @@ def check_codes(codes: Array, sensor: Sensor) -> None:
 
 
 def check_window(window: int) -> None:
-    """Raise ValueError unless a window holds at least one frame."""
+    """Raise `ValueError` unless a window holds at least one frame."""
     if window < 1:
         raise ValueError(f"window is a number of frames, got {window}; use 1 or more")
 
 
 def look_ahead(window: int) -> int:
-    """Future frames which a window of this many frames needs."""
+    """Return the number of future frames in a window of this many frames."""
     return (window - 1) // 2
 
 
 def reflect(index: Array, length: int) -> Array:
-    """Frame numbers inside 0 ... length-1 for any integers: -1 -> 1, length -> length-2; always 0 for one frame."""
+    """Return frame numbers inside 0 ... length-1 for any integers: -1 -> 1, length -> length-2; 0 for one frame."""
     if length == 1:
         return np.zeros_like(index)
     folded = np.abs(index) % (2 * length - 2)
@@ -50,14 +50,14 @@ def reflect(index: Array, length: int) -> Array:
 
 
 def window_frames(frame: int, window: int, length: int) -> Array:
-    """The `window` frame numbers around `frame`, reflected at both ends of a clip of `length` frames."""
+    """Return the `window` frame numbers around `frame`, reflected at both ends of a clip of `length` frames."""
     return reflect(np.arange(frame - window // 2, frame + look_ahead(window) + 1), length)
 
 
 def window_sums(codes: Array, window: int, top: int) -> Iterator[Array]:
-    """Sum of the codes over the window around each frame: T unsigned arrays [H, W], 0 ... window * top.
+    """Yield the sum of the codes over the window around each frame: T unsigned arrays [H, W], 0 ... window * top.
 
-    A running sum: one frame enters, one leaves. Every yielded array is the caller's own.
+    It is a running sum: one frame enters, one leaves. The caller may change each array.
     """
     dtype = np.uint16 if window * top < 2**16 else np.uint32
     length = len(codes)
@@ -78,10 +78,10 @@ def restore_by_mean(
     photons_per_unit: float,
     frames: range | None = None,
 ) -> Array:
-    """Restored frames [T, H, W], all or those in `frames`, where a frame depends on its window's mean code only.
+    """Return restored frames [T, H, W], all or those in `frames`, of a method that uses a window's mean code only.
 
-    A sum of codes has few values, so the whole method is one table, `photons_of` every possible mean code, and a
-    running sum. ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
+    A sum of codes has few values. So the method is one table, `photons_of` every possible mean code, and a running sum.
+    `ValueError` for codes that the sensor cannot produce, an empty window and an impossible unit.
     """
     check_codes(codes, sensor)
     check_window(window)
@@ -90,13 +90,13 @@ def restore_by_mean(
     frames = range(len(codes)) if frames is None else frames
     restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
     for frame, total in enumerate(window_sums(codes, window, top)):
-        if frame in frames:  # clip never happens, but is the unbuffered mode
+        if frame in frames:  # no index is clipped; this mode needs no buffer
             np.take(table, total, out=restored[frame - frames.start], mode="clip")
     return in_units(restored, photons_per_unit)
 
 
 def in_units(photons: Array, photons_per_unit: float) -> Array:
-    """Restored photons, float32, in a unit of so many photons. Raise ValueError unless that is finite and above 0."""
+    """Return photons, float32, in a unit of this many photons. `ValueError` unless the unit is finite and above 0."""
     if not 0 < photons_per_unit < np.inf:
         raise ValueError(f"photons_per_unit must be a finite number above 0, got {photons_per_unit!r}")
     return photons if photons_per_unit == 1 else photons / np.float32(photons_per_unit)

@@ -1,11 +1,11 @@
-"""Transform Denoise: sum the codes of a window, stabilise the variance, denoise as a Gaussian image, invert.
+"""Restores by Transform Denoise: sums the codes of a window, stabilises the variance, denoises, inverts.
 
     mean code -> f -> BM3D with sigma = 1/sqrt(window) -> D^-1 -> photons
 
 Source: Chan, Elgendy, Wang, "Images from Bits: Non-Iterative Image Reconstruction for Quanta Image Sensors", Sensors
-16(11):1961, 2016; written from the description. Our reading for few-bit pixels: stabiliser and inverse are tables
-from the sensor's exact distribution (vst.py); the article's binary form is `kind="binomial"`. A window longer than
-one frame blurs what moves: short windows suit motion, long ones static scenes.
+16(11):1961, 2016; written from the description. Our reading for few-bit pixels: stabiliser and inverse are tables from
+the sensor's exact distribution (vst.py). The article's binary form is `kind="binomial"`. A window longer than one frame
+blurs motion: short windows suit motion, long ones static scenes.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ def restore(
     kind: Kind = "table",
     frames: range | None = None,
 ) -> Array:
-    """Codes [T, H, W] -> restored [T, H, W], float32, from `window` frames around each, in units of so many photons.
+    """Restore codes [T, H, W] from `window` frames around each: float32 [T, H, W], in units of this many photons.
 
-    Raises ValueError for codes the sensor cannot produce, an empty window and an impossible unit.
+    `ValueError` for codes that the sensor cannot produce, an empty window and an impossible unit.
     """
     check_codes(codes, sensor)
     check_window(window)

@@ -1,14 +1,14 @@
-"""Variance stabilisation of a mean code, computed from the sensor's exact distribution, and its exact unbiased inverse.
+"""Stabilises the variance of a mean code by the sensor's exact distribution, with the exact unbiased inverse.
 
     f(m) = integral from mu(0) to m of dmu / sqrt(V(mu)),    deviation of f(mean of n codes) close to 1/sqrt(n)
     D(photons) = E[f(mean of n codes)],    inverse: photons = D^-1(denoised)
 
-A denoiser returns an estimate of the expectation of f, not of f at the expectation: the algebraic inverse f^-1 would
-be biased, D^-1 is not (Makitalo and Foi, IEEE TIP 2011, for Poisson; here for any sensor, by the exact distribution
-of a sum of n codes). Saturation squeezes V towards 0, so f grows steeply there and stops at the top.
+A denoiser estimates the expectation of f, not f at the expectation. So the algebraic inverse f^-1 would be biased; D^-1
+is not (Makitalo and Foi, IEEE TIP 2011, for Poisson; here for any sensor, by the exact distribution of a sum of n
+codes). Saturation reduces V towards 0, so f grows steeply there and ends at the top.
 
 Other stabilisers, for comparison: `binomial` (Chan, Elgendy, Wang, Sensors 16(11), 2016: Anscombe's arcsine for a sum
-of binary samples; wrong for a counting pixel) and `poisson` (Anscombe's square root of the electron count; blind to
+of binary samples; wrong for a counting pixel) and `poisson` (Anscombe's square root of the electron count; ignores
 clipping).
 """
 
@@ -26,7 +26,7 @@ from qsim.sensor.sensor import Sensor
 Kind = Literal["table", "binomial", "poisson"]
 
 FLOOR = 1e-3  # of the variance in the integral [codes^2]: keeps f finite where every code is the top one
-POINTS = 1500  # of the table of D; each is a full distribution of a sum
+POINTS = 1500  # of the table of D; each needs the distribution of a sum
 
 
 @dataclass(frozen=True)
@@ -41,25 +41,25 @@ class Stabiliser:
 
     @property
     def deviation(self) -> float:
-        """Of the stabilised mean code, as far as stabilisation works."""
+        """Return the nominal deviation of the stabilised mean code."""
         return self.samples**-0.5
 
     @property
     def peak(self) -> float:
-        """Range of stabilised values from darkness to saturation."""
+        """Return the range of stabilised values from darkness to saturation."""
         return float(self.expected[-1] - self.expected[0])
 
     def forward(self, mean_code: Array) -> Array:
-        """Mean codes of any shape -> stabilised values, float32."""
+        """Return stabilised values, float32 [...], of mean codes [...]."""
         return np.interp(mean_code, self.mean_code, self.stabilised).astype(np.float32)
 
     def inverse(self, stabilised: Array) -> Array:
-        """Denoised stabilised values of any shape -> photons, float32; limited to 0 and the cap of `samples` codes."""
+        """Return photons, float32 [...], of denoised stabilised values [...]; from 0 to the cap of `samples` codes."""
         return np.interp(stabilised, self.expected, self.photons).astype(np.float32)
 
 
 def sum_pmf(pmf: Array, samples: int) -> Array:
-    """Distribution of a sum of independent codes: [G, levels] -> [G, samples * (levels - 1) + 1], by convolution."""
+    """Return the distribution of a sum of independent codes: [G, levels] -> [G, samples * (levels - 1) + 1]."""
     size = samples * (pmf.shape[1] - 1) + 1
     if size <= 512:  # direct: exact tails
         total = np.ones((len(pmf), 1))
@@ -74,7 +74,7 @@ def sum_pmf(pmf: Array, samples: int) -> Array:
 
 
 def stabiliser(sensor: Sensor, exposure: float, samples: int, kind: Kind = "table") -> Stabiliser:
-    """Tables for the mean of `samples` codes of this sensor; ValueError for an unknown kind."""
+    """Return the tables for the mean of `samples` codes of this sensor. `ValueError` for an unknown kind."""
     table = sensor.response(exposure)
     top = sensor.levels - 1
     mean_code = np.linspace(0, top, max(4096, samples * top + 1))

@@ -1,4 +1,4 @@
-"""The command `quiver`."""
+"""Reads the command line of `quiver` and runs its commands."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""The command `quiver domain`: what weights were measured for, and the measuring; a pair of options and action."""
+"""The command `quiver domain`: shows what weights were measured for, or measures it."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ from qsim.cli.console import bar, output
 from qsim.cli.options import memory_size, numbers, whole_numbers, words
 from quiver.cli.options import add_running, command, running_options, use_threads
 
-MEMORY = "2GB"  # as other commands
+MEMORY = "2GB"  # as in other commands
 MEASURING = ("split", "sensor", "bits", "ppp", "methods", "seed", "memory", "mode", "device", "precision", "threads")
 
 
 def add_domain(sub: Any) -> None:
     parser = command(
         sub, "domain", _run_domain,
-        "Measure where weights are better than the classical methods, and store it in their file; without clips, show.",
+        "Measure where weights are better than the classical methods and store it in their file, or show it.",
         "quiver domain nano\n"
         "quiver domain out/mine out/data --bits 1,3 --ppp 1,3.25,10\n"
-        "quiver domain out/mine out/data --sensor spad-320x240 --bits 1 --ppp 0.3,1,3", goes_on=True,
+        "quiver domain out/mine out/data --sensor spad-320x240 --bits 1 --ppp 0.3,1,3", resumes=True,
     )  # fmt: skip
     parser.add_argument("weights", help="shipped weights, a .safetensors file, or a folder of `quiver train`")
-    parser.add_argument("clips", nargs="*", type=Path, help="data sets and clip folders that trained and tuned nothing")
+    parser.add_argument(
+        "clips", nargs="*", type=Path, help="data sets and clip folders that were not used for training or tuning"
+    )
     parser.add_argument("--split", choices=("train", "val", "test", "all"), help="of data sets (default test)")
     parser.add_argument("--sensor", type=words, help="names or .toml files, with commas (default quiver-physical)")
     parser.add_argument("--bits", type=whole_numbers, help="with commas (default 3)")
@@ -33,8 +35,8 @@ def add_domain(sub: Any) -> None:
     )
     parser.add_argument("--seed", type=int, help="of the noise (default 0)")
     add_running(parser)
-    parser.set_defaults(memory=None)  # so that one that was given shows
-    parser.add_argument("--force", action="store_true", help="measure cells again that are there")
+    parser.set_defaults(memory=None)  # None: not given
+    parser.add_argument("--force", action="store_true", help="measure existing cells again")
 
 
 def _run_domain(args: argparse.Namespace) -> int:
@@ -57,12 +59,12 @@ def _run_domain(args: argparse.Namespace) -> int:
         with bar("cells", "cell") as progress:
             found: Domain | None = measure(path, settings, options, progress, force=args.force)
     else:
-        refuse(args, MEASURING, "is of measuring, and no clips are named")
+        refuse(args, MEASURING, "is for measuring, and no clips are given")
         if args.force:
-            raise ValueError("--force: is of measuring, and no clips are named; leave it out")
+            raise ValueError("--force: is for measuring, and no clips are given; leave it out")
         found = read_scope(path, metadata_of(path)).domain
     if found is None:
-        raise ValueError(f"{path}: was never measured; name clips that trained and tuned nothing")
+        raise ValueError(f"{path}: was never measured; give clips that were not used for training or tuning")
     wins = sum(cell.wins for cell in found.cells)
     text = [
         *table(found),
@@ -85,7 +87,7 @@ def _settings(args: argparse.Namespace) -> Any:
     )
     if args.split is not None and all((clips / "clip.json").exists() for clips in args.clips):
         raise ValueError(
-            f"--split {args.split}: chooses clips of data sets, and only clip folders are named; leave it out"
+            f"--split {args.split}: chooses clips of data sets, and only clip folders are given; leave it out"
         )
     clips = clips_of(args.clips, None if args.split == "all" else args.split or "test")
     return DomainSettings(clips, lights, args.methods or CLASSICAL, args.seed or 0)

@@ -1,4 +1,4 @@
-"""The commands `quiver evaluate` and `quiver bench`: scores and costs of methods; options, and what they do."""
+"""The commands `quiver evaluate` and `quiver bench`, scores and costs of methods: their options and actions."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def add_evaluate(sub: Any) -> None:
         sub, "evaluate", _run_evaluate, "Compare methods on held-out clips, or on real photons of a static object.",
         "quiver evaluate out/starter -o out/table --methods naive,moment,out/mine,out/unet --ppp 3.25,9.75,26\n"
         "quiver evaluate out/starter/clips/fan_0003 -o out/fan_table --methods moment,nano --split all\n"
-        "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,nano", goes_on=True,
+        "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,nano", resumes=True,
     )  # fmt: skip
     parser.add_argument("source", nargs="?", help="data set or clip folder")
     parser.add_argument("-o", "--output", type=Path, help="folder for evaluation.md, .json, .png (needed for clips)")
@@ -43,10 +43,10 @@ def add_evaluate(sub: Any) -> None:
         "--methods", type=words, default="naive,moment", help="with commas; window as in moment:3; all = all"
     )
     parser.add_argument("--split", choices=("train", "val", "test", "all"), help="of a data set (default test)")
-    parser.add_argument("--stream", help="score this stored stream of every clip instead of sensing now")
+    parser.add_argument("--stream", help="score this stored stream of every clip instead of sensing it now")
     add_light(parser, several=True)
     parser.add_argument("--seed", type=int, help="of the test noise or of the random splits (default 0)")
-    parser.add_argument("--published", action="store_true", help="every window exposed, scaled and scored on its own")
+    parser.add_argument("--published", action="store_true", help="expose, scale and score every window separately")
     parser.add_argument(
         "--peak", type=positive, help="photons per pixel that the scores refer to (default 2.5 x the mean light)"
     )
@@ -94,7 +94,7 @@ def _run_evaluate(args: argparse.Namespace) -> int:
 
 
 def _comparison(args: argparse.Namespace) -> Comparison:
-    """What `quiver evaluate` scores on the clips of a data set, or on one clip."""
+    """Return what `quiver evaluate` scores on the clips of a data set, or on one clip."""
     from quiver.data.illumination import Illumination
     from quiver.evaluation.comparison import Comparison
     from quiver.restoration.sources import LIGHT, refuse
@@ -105,11 +105,13 @@ def _comparison(args: argparse.Namespace) -> Comparison:
             f"--split {args.split}: chooses clips of a data set, and {args.source} is one clip; leave it out"
         )
     if args.stream is not None:
-        refuse(args, LIGHT, f"stream {args.stream} is stored and knows its own")
+        refuse(args, LIGHT, f"stream {args.stream} is stored and has its own")
         if args.published:
-            raise ValueError(f"--published: exposes every window now, and stream {args.stream} is stored; leave it out")
+            raise ValueError(
+                f"--published: is for windows that are exposed now, and stream {args.stream} is stored; leave it out"
+            )
     sensor = args.sensor or ("quiver-published" if args.published else "quiver-physical")
-    own = sensor.endswith(".toml")  # such a file states its bits
+    own = sensor.endswith(".toml")  # the file states the bits
     lights = tuple(
         Illumination(sensor, ppp, bits)
         for bits in args.bits or ((None,) if own else (3,))
@@ -142,10 +144,10 @@ def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
 
 
 def _refuse_for_counts(args: argparse.Namespace) -> None:
-    """`ValueError` for options of `quiver evaluate` that cannot act on measured counts."""
+    """Raise `ValueError` for options of `quiver evaluate` without effect on measured counts."""
     from quiver.restoration.sources import refuse
 
-    why = "is of clips, and --static scores measured counts"
+    why = "is for clips, and --static scores measured counts"
     if args.source is not None:
         raise ValueError(f"{args.source}: {why}; leave one of them out")
     refuse(args, ("output", "split", "stream", "sensor", "ppp"), why)

@@ -1,7 +1,4 @@
-"""What the commands share: options and what their values mean, folders that start anew, signals.
-
-Every function from text to value raises `argparse.ArgumentTypeError`, which becomes one line that names the option.
-"""
+"""Shares options between the commands, and handles folders to replace and signals."""
 
 from __future__ import annotations
 
@@ -20,11 +17,12 @@ from qsim.cli.options import count, memory_size, numbers, positive, whole_number
 from qsim.files import check_ours
 from quiver.restoration.interface import MODES
 
-NETWORKS = ("nano", "quiver-s", "quiver", "unet")  # see model.py
-PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see run.py
+NETWORKS = ("nano", "quiver-s", "quiver", "unet")  # see quiver/model/presets.py
+PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see quiver/training/settings.py
 
 
 def add_light(parser: argparse.ArgumentParser, several: bool) -> None:
+    """Add --sensor, --ppp and --bits; `several` allows lists of light levels and bits."""
     kind, many = (numbers, "; several: 3.25,9.75,26") if several else (positive, "")
     whole = whole_numbers if several else count
     parser.add_argument("--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default quiver-physical)")
@@ -33,7 +31,7 @@ def add_light(parser: argparse.ArgumentParser, several: bool) -> None:
 
 
 def add_noise(parser: argparse.ArgumentParser) -> None:
-    """Of training: what is not given is taken from the data set's streams."""
+    """Add --sensor, --ppp and --bits of training; values that are not given come from the streams of the data set."""
     parser.add_argument(
         "--sensor",
         type=words,
@@ -46,6 +44,7 @@ def add_noise(parser: argparse.ArgumentParser) -> None:
 
 
 def add_running(parser: argparse.ArgumentParser) -> None:
+    """Add the options of how methods run."""
     parser.add_argument("--memory", type=memory_size, default="2GB", help="working memory, as in 500MB (default 2GB)")
     parser.add_argument("--mode", choices=MODES, help="networks: how frames share work (default exact)")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="networks: where they run (default auto)")
@@ -54,13 +53,14 @@ def add_running(parser: argparse.ArgumentParser) -> None:
 
 
 def add_threads(parser: argparse.ArgumentParser) -> None:
+    """Add --threads."""
     parser.add_argument(
-        "--threads", type=count, help="of torch on the CPU (default: measured at start; work that is resumed keeps its)"
+        "--threads", type=count, help="of torch on the CPU (default: measured at start; resumed work keeps its number)"
     )
 
 
 def use_threads(args: argparse.Namespace, earlier: int | None = None) -> int:
-    """Set the number of torch's threads, and say which with --verbose."""
+    """Set the number of torch's threads, and print it with --verbose."""
     from quiver import threads
 
     chosen = threads.use(args.threads, earlier)
@@ -70,13 +70,14 @@ def use_threads(args: argparse.Namespace, earlier: int | None = None) -> int:
 
 
 def add_strict(parser: argparse.ArgumentParser) -> None:
+    """Add --strict."""
     parser.add_argument(
         "--strict", action="store_true", help="networks: refuse a stream outside of what they were measured for"
     )
 
 
 def check_domain(args: argparse.Namespace, methods: Sequence[Any], streams: Iterable[Any]) -> list[str]:
-    """A line on stderr for each network outside of what it was measured for; `ValueError` with --strict."""
+    """Print a line for each network outside of what it was measured for; `ValueError` with --strict."""
     from quiver.restoration.domain_remarks import measured_at, refuse_outside, remarks
 
     found: list[str] = []
@@ -93,14 +94,14 @@ def check_domain(args: argparse.Namespace, methods: Sequence[Any], streams: Iter
 
 
 def running_options(args: argparse.Namespace) -> Any:
-    """What `add_running` asked for, as `RestoreOptions`."""
+    """Return the options of `add_running` as `RestoreOptions`."""
     from quiver.restoration.interface import RestoreOptions
 
     return RestoreOptions(args.memory, args.mode or "exact", args.device or "auto", args.precision or "float32")
 
 
 def renew(folder: Path, mark: str, ours: str) -> None:
-    """Remove a folder that holds the file `mark`, and files whose names match the pattern `ours` only."""
+    """Remove a folder that holds the file `mark`, and only files whose names match the pattern `ours`."""
 
     if (folder / mark).is_file():
         check_ours(folder, ours)
@@ -110,15 +111,15 @@ def renew(folder: Path, mark: str, ours: str) -> None:
 
 
 def command(
-    sub: Any, name: str, action: Any, what: str, example: str, *, goes_on: bool = False
+    sub: Any, name: str, action: Any, what: str, example: str, *, resumes: bool = False
 ) -> argparse.ArgumentParser:
-    """A command's parser, as `qsim.console.command` makes it."""
-    return console.command(sub, name, action, what, example, console.GOES_ON if goes_on else console.STARTS_AGAIN)
+    """Return a command's parser from `qsim.cli.console.command`."""
+    return console.command(sub, name, action, what, example, console.GOES_ON if resumes else console.STARTS_AGAIN)
 
 
 @contextlib.contextmanager
 def handling(handler: Callable[[int, Any], Any], *numbers: signal.Signals) -> Iterator[None]:
-    """Signals go to `handler` inside the block (only the main thread may say so; elsewhere nothing changes)."""
+    """Send signals to `handler` inside the block; in other threads than the main one nothing changes."""
     main_thread = threading.current_thread() is threading.main_thread()
     before = {number: signal.signal(number, handler) for number in numbers if main_thread}
     try:

@@ -1,4 +1,4 @@
-"""The command `quiver`: its parser and its commands."""
+"""Builds the parser of the command `quiver`, and runs a command line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from quiver.cli.train import add_ablate, add_train
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command line; returns the exit code."""
+    """Run a command line and return the exit code."""
     from quiver.threads import wait_without_spinning
 
     wait_without_spinning()
@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for add in (add_train, add_restore, add_evaluate, add_domain, add_ablate, add_bench, _add_convert_weights):
         add(sub)
     add_completion(sub, parser)
-    with handling(signal.default_int_handler, signal.SIGTERM):  # termination cleans up like Ctrl-C
+    with handling(signal.default_int_handler, signal.SIGTERM):  # termination cleans up as Ctrl-C does
         return run(parser, argv)
 
 

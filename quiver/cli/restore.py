@@ -1,4 +1,4 @@
-"""The command `quiver restore`: options, and what they do."""
+"""The command `quiver restore`: its options and its action."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def add_restore(sub: Any) -> None:
         "quiver restore out/fan/streams/quiver-physical_3bit_3.25ppp.npy -o out/fan.npy --method out/mine\n"
         "quiver restore out/fan --ppp 3.25 -o out/fan.npy --method moment\n"
         "quiver restore cube.npy --width 320 --planes 7 --sensor spad-320x240 --frame-rate 1428 -o out/cube.npy",
-        goes_on=True,
+        resumes=True,
     )  # fmt: skip
     parser.add_argument("source", type=Path, help="stream (.npy with its .json), clip folder, or bare .npy array")
     parser.add_argument("-o", "--output", type=Path, required=True, help=".npy to write; a .json appears beside it")
@@ -71,7 +71,7 @@ def _run_restore(args: argparse.Namespace) -> int:
     with bar(method.name) as progress:
 
         def shown(done: int, total: int) -> None:
-            while lines and time.monotonic() > started + 2:  # as the bar: a mistake is one line without it
+            while lines and time.monotonic() > started + 2:  # as the bar: an early error stays one line
                 note(lines.pop())
             progress(done, total)
 

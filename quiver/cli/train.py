@@ -1,4 +1,4 @@
-"""Commands that train: `train` one network, `ablate` six; pairs of options and action."""
+"""The commands `quiver train` (one network) and `quiver ablate` (six): their options and actions."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from quiver.cli.options import (
 
 def add_train(sub: Any) -> None:
     parser = command(
-        sub, "train", _run_train, "Train a network on the clips of a data set; the same command again goes on.",
+        sub, "train", _run_train, "Train a network on the clips of a data set; the same command resumes it.",
         "quiver train out/starter -o out/mine --minutes 20\n"
         "quiver train out/starter -o out/unet --preset unet --protocol control --minutes 20\n"
         "torchrun --nproc-per-node 4 -m quiver train out/starter -o out/s --preset quiver-s --protocol published",
-        goes_on=True,
+        resumes=True,
     )  # fmt: skip
     parser.add_argument("data", help="data set folder")
     parser.add_argument("-o", "--output", required=True, help="folder of the run")
     parser.add_argument("--preset", default="nano", choices=NETWORKS, help="network (default nano)")
     parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
     parser.add_argument("--steps", type=count, help="optimiser steps")
-    parser.add_argument("--minutes", type=positive, help="wall-clock limit; the learning rate is planned for it")
+    parser.add_argument("--minutes", type=positive, help="wall-clock limit; the learning rate follows it")
     add_noise(parser)
     parser.add_argument("--crop", type=count, help="px, side of the training windows")
     parser.add_argument("--frames", type=count, help="of a training window (default 11, one restored frame; 16: six)")
@@ -58,7 +58,7 @@ def add_train(sub: Any) -> None:
     parser.add_argument("--precision", choices=("auto", "float32", "bfloat16"), help="default auto: bfloat16 on CUDA")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
     parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
-    parser.add_argument("--force", action="store_true", help="start anew where a run is")
+    parser.add_argument("--force", action="store_true", help="replace an existing run")
 
 
 def _run_train(args: argparse.Namespace) -> int:
@@ -73,7 +73,7 @@ def _run_train(args: argparse.Namespace) -> int:
     from quiver.training.settings import PROTOCOLS
 
     if args.validate_every is not None and args.steps is None and "steps" not in PROTOCOLS[args.protocol]:
-        raise ValueError("--validate-every: counts steps of a run with --steps; one that --minutes ends is validated "
+        raise ValueError("--validate-every: counts steps of a run with --steps; a run that --minutes ends is validated "
                          "after every tenth of its time; leave it out")  # fmt: skip
     settings = _settings(args)
     if args.validation_split is not None and not open_clips(settings.data, args.validation_split):
@@ -103,13 +103,13 @@ def _run_train(args: argparse.Namespace) -> int:
         draw_curve(folder, state.history)
         output(args, *_summary(folder, state))
     if interrupted:
-        print("quiver: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        print("quiver: interrupted; the same command resumes where it stopped", file=sys.stderr)
         return 130
     return 0
 
 
 def _settings(args: argparse.Namespace) -> Any:
-    """The protocol's settings, overridden by the options that were given."""
+    """Return the protocol's settings, replaced by the options that are given."""
     from quiver.training.settings import PROTOCOLS, Settings
 
     given = {field.name: getattr(args, field.name, None) for field in fields(Settings)}
@@ -119,7 +119,7 @@ def _settings(args: argparse.Namespace) -> Any:
 
 @contextlib.contextmanager
 def _signals() -> Iterator[list[int]]:
-    """Collects Ctrl-C and termination instead of dying of them: the loop ends after its step and saves its state."""
+    """Collect Ctrl-C and termination instead of ending: the loop ends after its step and saves its state."""
     found: list[int] = []
     with handling(lambda number, _: found.append(number), signal.SIGINT, signal.SIGTERM):
         yield found
@@ -140,8 +140,8 @@ def _summary(folder: Path, state: Any) -> tuple[dict[str, Any], str]:
 
 def add_ablate(sub: Any) -> None:
     parser = command(
-        sub, "ablate", _run_ablate, "Train the network without some of its parts, six ways, and compare them.",
-        "quiver ablate out/starter -o out/ablation --minutes 20", goes_on=True,
+        sub, "ablate", _run_ablate, "Train the network in six versions, without some of its parts, and compare them.",
+        "quiver ablate out/starter -o out/ablation --minutes 20", resumes=True,
     )  # fmt: skip
     parser.add_argument("data", help="data set folder")
     parser.add_argument("-o", "--output", required=True, help="folder of the six runs and their table")
@@ -164,7 +164,7 @@ def _run_ablate(args: argparse.Namespace) -> int:
     from quiver.model.presets import ABLATIONS
     from quiver.training.ablation import markdown, one_noise, run_ablation
 
-    args.precision, precision = None, args.precision  # of restoring; training keeps its own default
+    args.precision, precision = None, args.precision  # for restoring; training has another default
     settings = _settings(args)
     args.precision = precision
     first = Path(args.output) / next(iter(ABLATIONS)) / "settings.json"
@@ -177,7 +177,7 @@ def _run_ablate(args: argparse.Namespace) -> int:
         options, show = running_options(args), not (args.json or args.quiet)
         found = run_ablation(settings, comparison, options, should_stop=lambda: bool(interrupted), progress=show)
     if found is None:
-        print("quiver: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        print("quiver: interrupted; the same command resumes where it stopped", file=sys.stderr)
         return 130
     methods, rows = found
     summary.write(Path(args.output) / "table", comparison, methods, rows)

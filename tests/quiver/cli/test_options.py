@@ -145,7 +145,7 @@ def of_training(option: str, value: str, *more: Row, resumed: str = "") -> list[
 
 
 def of_measuring(option: str, value: str, *rows: Row) -> list[Row]:
-    return [*rows, Refused(SHOW, f"{option} {value}".strip(), "no clips are named")]
+    return [*rows, Refused(SHOW, f"{option} {value}".strip(), "no clips are given")]
 
 
 def of_clips(option: str, value: str, *rows: Row) -> list[Row]:

@@ -96,7 +96,7 @@ def test_the_command_shows_and_measures(capsys, tiny_dataset, tmp_path):
     ):
         code, _, err = run(capsys, "domain", path, *option)
         assert (code, err.count("\n")) == (2, 1)
-        assert f"{option[0]}: is of measuring, and no clips are named" in err
+        assert f"{option[0]}: is for measuring, and no clips are given" in err
     clip = open_clips(tiny_dataset, "test")[0].path
     code, text, _ = run(capsys, "domain", path, clip, "--methods", "naive", "--bits", "1,3", "--ppp", 2)
     assert code == 0
