@@ -142,7 +142,7 @@ def stream_codes(stream: Stream) -> Codes:
 def open_stream(path: Path) -> Stream:
     """Return the stored stream with this .npy or .json. `ValueError` for video written by `quiver restore`."""
     if "seconds_per_frame" in read_json(path.with_suffix(".json")):
-        raise ValueError(f"{path}: is restored video; give the stream or the clip that it was made from")
+        raise ValueError(f"{path}: is restored video; name the stream or the clip that it was made from")
     return Stream.open(path.with_suffix(".json"))
 
 

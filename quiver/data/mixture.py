@@ -23,10 +23,10 @@ class Mixture:
     @property
     def lines(self) -> list[str]:
         """Return one line on the noise, and a second one where the streams of the data set differ."""
-        told = [f"noise: {describe(self.noises)}" + (f" ({self.remark})" if self.remark else "")]
+        lines = [f"noise: {describe(self.noises)}" + (f" ({self.remark})" if self.remark else "")]
         if self.streams and set(self.streams) != set(self.noises):
-            told.append(f"this differs from the data set's streams: {describe(self.streams)}")
-        return told
+            lines.append(f"this differs from the data set's streams: {describe(self.streams)}")
+        return lines
 
 
 def choose(

@@ -206,12 +206,12 @@ def _ssim_frame(output: np.ndarray, target: np.ndarray, keep: np.ndarray | None)
 def score(
     output: np.ndarray, target: np.ndarray, *, per_frame_scale: bool = False, valid: np.ndarray | None = None
 ) -> Score:
-    """All numbers of one clip, [T, H, W] in units of the peak; frames without a score are left out of every mean.
+    """Return the score of one clip, [T, H, W] in units of the peak; frames without a score are left out of every mean.
 
-    One factor for the whole clip, because a clip has one light level; `per_frame_scale` gives every frame its own, for
-    the published protocol that forces the exposure of every window. The factor is that of the least clamped error of
-    the clip. It is 1 where the mean over frames would fall or a frame would lose its score, so that matched scores are
-    never below raw ones.
+    One factor serves the complete clip, because a clip has one light level. `per_frame_scale` gives every frame its
+    factor, for the published protocol, which exposes every window separately. The factor is that of the least clamped
+    error. It is 1 where the mean over frames would fall or a frame would lose its score, so matched scores are never
+    below raw ones.
     """
     one, two = _pair(output, target)
     keep = _kept(valid, two)

@@ -118,7 +118,7 @@ def fill_network(
                 done += 1
                 if progress is not None:
                     progress(done, len(out) * len(pieces.tiles))
-    if not pieces.exact:  # tiles that agree may still differ from the whole frame
+    if not pieces.exact:  # tiles that agree may still differ from the uncut frame
         rms, most = apart.measured()
         more = f"; --memory {-(-pieces.needed // 10**6)}MB avoids the cut" if pieces.needed else ""
         warnings.warn(

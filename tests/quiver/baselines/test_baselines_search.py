@@ -82,7 +82,7 @@ def test_every_method_restores_or_refuses_many_random_streams():
 @pytest.mark.parametrize("name", ["moment", "likelihood", "transform-denoise", "qbp", "qbp-bm3d"])
 @pytest.mark.parametrize(("bits", "photons"), [(1, 26.0), (1, 60.0), (1, 300.0), (2, 300.0)])
 def test_a_flat_field_keeps_its_light_where_codes_are_rare(name, bits, photons):
-    """The default gain rule puts the first step at half of the range: one bit at 26 photons sees 26 electrons as 1."""
+    """The default gain rule puts the first step at half of the range: one bit at 26 photons reads 26 electrons as 1."""
     sensor = devices.quiver_physical(photons, bits)
     light = 1.25 * photons  # the mean of electrons is then on the step of one bit
     codes = sensor.sample(np.full((11, 24, 24), light), EXPOSURE, key=Key(3, bits), engine="reference")

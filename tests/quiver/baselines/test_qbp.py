@@ -1,4 +1,4 @@
-"""Quanta Burst Photography: alignment against known motion, merging against averages, and the whole chain."""
+"""Quanta Burst Photography: alignment against known motion, merging against averages, and the complete chain."""
 
 from pathlib import Path
 

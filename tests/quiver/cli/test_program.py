@@ -1,4 +1,4 @@
-"""The command line as a person meets it: the whole chain, examples in the help, one clear line for every mistake."""
+"""The command line: the complete chain, examples in the help, one clear line for every mistake."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def train_words(data: Path, out: Path) -> list[object]:
 
 
 def test_the_whole_chain(capsys, tiny_dataset, clip, tmp_path):
-    """Train, go on, restore with the run, evaluate it beside a classical method."""
+    """Train, resume, restore with the run, evaluate it beside a classical method."""
     run_folder, video = tmp_path / "run", tmp_path / "video.npy"
     code, out, _ = run(capsys, *train_words(tiny_dataset, run_folder), "--json")
     found = json.loads(out)

@@ -115,7 +115,7 @@ HOSTILE = (
 
 @pytest.mark.parametrize("name", ["noise", "sensor", "ppp", "bits", "steps", "seed", "data"])
 def test_any_value_in_the_settings_of_a_run(data, tmp_path, name):
-    """Refused in one line, or a run as before; whole settings, and every key of a noise."""
+    """Refused in one line, or a run as before; all settings, and every key of a noise."""
     run = small(data, tmp_path / "r")
     train(network(), run, progress=False)
     path = tmp_path / "r/settings.json"

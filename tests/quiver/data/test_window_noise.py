@@ -42,7 +42,7 @@ def random_defects(rng: random.Random, qis: bool, spad: bool) -> Defects:
 
 
 def whole_frames(noise: Noise, clip: Clip, key: Key, light: Array) -> Array:
-    """Codes of whole frames from the first one on, by the reference engine: what `qsim sense` stores."""
+    """Codes of complete frames from the first one on, by the reference engine, as `qsim sense` stores them."""
     draw = noise.draw(clip)
     array = PixelArray.of(draw.defects, draw.plane, *clip.shape[1:])
     return next(array.blocks([light], clip.exposure, key, engine="reference"))

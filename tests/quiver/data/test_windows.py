@@ -60,7 +60,7 @@ def test_codes_have_the_mean_of_their_photons(make_clip: ClipMaker):
 @pytest.mark.parametrize("turn", range(8))
 @pytest.mark.parametrize("backwards", [False, True])
 def test_turns_move_codes_and_target_together(make_clip: ClipMaker, turn: int, backwards: bool):
-    """At a million photons noise is invisible: codes are the clipped target, whatever the turn."""
+    """At a million photons noise is invisible: codes are the clipped target at every turn."""
     data = windows(make_clip, lights=(Illumination("quiver-paper", ppp=3.25),))
     place = replace(data.place(0), turn=turn, backwards=backwards)
     exposed, sharp = data.photons_of(place)
@@ -100,7 +100,7 @@ def test_epochs_and_samples_have_their_own_noise(make_clip: ClipMaker):
     assert same(data[4], data[4])
     assert not torch.equal(data[4]["codes"], data[4 + 6]["codes"])
     clips = [data.place(n).clip for n in range(12)]
-    assert sorted(clips[:6]) == sorted(clips[6:]) == [0, 0, 1, 1, 2, 2]  # an epoch sees every clip equally often
+    assert sorted(clips[:6]) == sorted(clips[6:]) == [0, 0, 1, 1, 2, 2]  # an epoch holds every clip equally often
     assert not same(data[4], windows_with_seed(data, 1)[4])
 
 

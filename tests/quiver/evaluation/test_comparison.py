@@ -167,7 +167,7 @@ def bright_clip(make_clip: ClipMaker, share: float, **options: object):
 
 
 def test_every_sensor_is_scored_at_one_peak(make_clip: ClipMaker):
-    """2.5 times the light, whatever the sensor: no score is infinite, and the same pixels lie above the peak."""
+    """2.5 times the light, for any sensor: no score is infinite, and the same pixels lie above the peak."""
     clip = bright_clip(make_clip, 0.1)
     rng = np.random.default_rng(10)
     sensors = [("spad-320x240", 1), ("quiver-physical", 3), ("quiver-paper", 5), ("megax-b", 4), ("qis-ma2017", 1)]

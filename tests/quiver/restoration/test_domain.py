@@ -1,4 +1,4 @@
-"""Weights know their domain: cells are measured, stored, found again, and said in one line where they speak against."""
+"""Cells of a domain: the nearest one is found, and they survive the metadata of a weights file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import network_restorer
 from quiver.restoration.restorers import PRETRAINED
 
-# ---- Which cell speaks for a stream
+# ---- The cell of a stream
 
 
 def test_the_nearest_cell_is_the_nearest_in_log_light():

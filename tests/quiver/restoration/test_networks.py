@@ -35,7 +35,7 @@ def random_codes(frames: int, height: int, width: int, seed: int = 0) -> Codes:
 
 
 class CentreFrame(nn.Module):
-    """Returns the centre of its window untouched: whatever padding and tiling do, the codes must come back."""
+    """Returns the centre of its window untouched: with any padding and tiling, the codes must come back."""
 
     multiple = 8
 
@@ -76,7 +76,7 @@ def test_every_frame_of_any_size_comes_back(shape):
 
 @pytest.mark.parametrize("frames", [1, 2, 4, 14])
 def test_time_is_continued_by_reflection(frames):
-    """Frame 0 sees frames 5 4 3 2 1 0 1 2 3 4 5 (folded again where the clip is shorter)."""
+    """The window of frame 0 is frames 5 4 3 2 1 0 1 2 3 4 5 (folded again where the clip is shorter)."""
     codes = random_codes(frames, 4, 4)
     period = max(1, 2 * frames - 2)
     for t in (0, frames - 1):
@@ -145,7 +145,7 @@ print(peak_memory() - before)
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["exact", "windows"])
 def test_the_memory_bound_holds(mode):
-    """80 MB for a frame that takes more in one piece; peak of resident pages, in a process of its own."""
+    """80 MB for a frame that takes more in one piece; peak of resident pages, in a separate process."""
     tiled, whole = (
         int(
             subprocess.run(

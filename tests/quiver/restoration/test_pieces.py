@@ -1,4 +1,4 @@
-"""What memory there is changes no answer: blocks of frames, exact tiles; where it must, the difference is said."""
+"""The memory changes no answer: blocks of frames, exact tiles; where it must, a warning states the difference."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def same_with_less_memory(name: str, mode: str, seed: int) -> None:
 @pytest.mark.parametrize("name", shipped_names())
 @pytest.mark.parametrize("mode", MODES)
 def test_memory_does_not_change_what_a_shipped_network_answers(name, mode, monkeypatch):
-    monkeypatch.setattr(pieces, "STARTING", 0)  # tiny frames: what torch takes at first would hold them whole
+    monkeypatch.setattr(pieces, "STARTING", 0)  # tiny frames: they would fit into the memory that torch takes at first
     same_with_less_memory(name, mode, MODES.index(mode))
 
 
@@ -118,7 +118,7 @@ def test_memory_does_not_change_what_a_shipped_network_answers_searched(name, mo
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["nano", "quiver-s", "quiver", "unet"])
 def test_no_preset_changes_its_answer_unsaid(preset):
-    """Tiny frames, small bounds: equal to 1e-5 of white, or a warning that says by how much tiles differ."""
+    """Tiny frames, small bounds: equal to 1e-5 of white, or a warning that states by how much tiles differ."""
     torch.manual_seed(1)
     model, rng = build(preset).eval(), np.random.default_rng(0)
     for seed in range(2):
@@ -134,7 +134,7 @@ def test_no_preset_changes_its_answer_unsaid(preset):
 
 
 def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path):
-    """QUIVER averages over the frame: tiles differ. The warning says by how much, and the file how it was cut."""
+    """QUIVER averages over the frame: tiles differ. The warning states by how much, and the file how it was cut."""
     path, codes = weights_path("nano"), moving(1, 104, 120)
     network = load(path).eval()
     memory = bytes_per_pixel(network, "exact") * 9_000

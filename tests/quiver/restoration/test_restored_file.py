@@ -57,7 +57,7 @@ def interrupted(codes: Codes, method: Restorer, path: Path) -> None:
 
 
 def resumed(codes: Codes, method: Restorer, path: Path) -> tuple[list[int], list[str]]:
-    """The first frames of the blocks that a second call restored, and what it said."""
+    """The first frames of the blocks that a second call restored, and its notes."""
     starts: list[int] = []
     said: list[str] = []
 
@@ -90,7 +90,7 @@ def weights(folder: Path, seed: int) -> Path:
 
 @pytest.mark.parametrize("what", ["stream", "array", "sensed clip", "weights", "window", "precision", "sensor"])
 def test_a_restoration_of_something_else_starts_again(tmp_path, make_clip, blocks_of_four, what):
-    """Whatever changes the answer: all blocks are restored again, as the new one's, and one line says why."""
+    """Each change of the answer: all blocks are restored again, and one line gives the reason."""
     before, after = random_codes(), random_codes()
     old, new, why = restorer("moment"), restorer("moment"), "the codes changed"
     match what:
@@ -190,7 +190,7 @@ def test_a_second_writer_is_refused_however_it_spells_the_name(tmp_path, monkeyp
 
 
 def test_many_writers_of_one_video(tmp_path):
-    """Eight processes, two methods, one name: one writes, the others are refused, and the json says whose it is."""
+    """Eight processes, two methods, one name: one writes, the others are refused, and the json names its method."""
     codes = random_codes(frames=60, height=40, width=50)
     (tmp_path / "link").symlink_to(tmp_path)
 
@@ -261,7 +261,7 @@ def restore_words(source: Path, target: Path, method: str) -> list[str]:
 
 
 def test_a_disk_that_fills_up(small_disk, tmp_path, capsys):
-    """A disk of every number of pages up to one that holds all: one line and nothing left, or the whole video."""
+    """A disk of every number of pages up to one that holds all: one line and nothing left, or the complete video."""
     source = array_file(tmp_path)
     words, whole = restore_words(source, small_disk / "r.npy", "moment"), []
     for kilobytes in range(4, 64, 4):

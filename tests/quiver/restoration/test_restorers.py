@@ -1,4 +1,4 @@
-"""Any length, any size, tiles, ranges of frames, files that are whole or absent."""
+"""Methods are found by name; restored files are complete or absent, and interrupted ones resume."""
 
 from __future__ import annotations
 
@@ -143,4 +143,4 @@ def test_an_interrupted_restoration_goes_on(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         restore_to_file(codes, slow, path)
     restore_to_file(random_codes(14, 5, 6), replace(slow, description="another"), path)
-    assert starts[3:] == [0, 4, 8, 12]  # another method does not go on with the frames of this one
+    assert starts[3:] == [0, 4, 8, 12]  # another method does not reuse these frames
