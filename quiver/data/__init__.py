@@ -1,4 +1,4 @@
-"""Codes and training windows out of qsim's files; the door to qsim's physics and data."""
+"""Reads codes and training windows from qsim's files; the only door to qsim's physics and data."""
 
 from typing import TYPE_CHECKING
 

@@ -91,3 +91,9 @@ def square_clip(path, frames: int = 5, size: tuple[int, int] = (24, 33)) -> Clip
             flow[0, 6:12, 4 + t : 10 + t] = 1.0
             writer.add(t, radiance, truth={"flow": flow, "flow_back": -flow, "valid": np.ones(size, bool)}, error=0.01)
     return Clip.open(path)
+
+
+def packed(planes: np.ndarray, path: Path) -> Path:
+    """Binary planes [T, H, W], packed along the rows, as a .npy."""
+    np.save(path, np.packbits(planes, axis=2))
+    return path

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from clips import packed
 from numpy import ndarray as Array
 
 from quiver.cli.program import main
@@ -15,11 +14,6 @@ from quiver.data.photon_cubes import cube_codes, plane_bits
 VALID = [2**b - 1 for b in range(1, 17)]
 
 SPAD = Illumination("spad-320x240", None, None)
-
-
-def packed(planes: np.ndarray, path: Path) -> Path:
-    np.save(path, np.packbits(planes, axis=2))
-    return path
 
 
 @pytest.mark.parametrize("planes", VALID)

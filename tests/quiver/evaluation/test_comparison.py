@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from clips import ClipMaker
+from methods import broken, method
 from numpy import ndarray as Array
 
 from qsim import files
@@ -34,15 +35,6 @@ from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer
 
 
-def method(name: str, restore: object, learned: bool = False) -> Restorer:
-    """A restorer from a function of (codes) -> photons [T, H, W]."""
-
-    def fill(codes: Codes, out: Array, first: int, progress: object) -> None:
-        out += restore(codes)[first : first + len(out)]
-
-    return Restorer(name, 1, 0, learned, f"test {name}", fill)
-
-
 def oracle(source: Path, factor: float = 1.0) -> Restorer:
     """Knows the truth of every clip at 3.25 PPP; `factor` is its error of brightness."""
     known = {clip.name: clip for clip in open_clips(source)}
@@ -52,10 +44,6 @@ def oracle(source: Path, factor: float = 1.0) -> Restorer:
         return factor * truth(clip, sensed(clip, Illumination())[1], 0, len(clip))
 
     return method(f"oracle {factor:g}", restore)
-
-
-def broken(codes: Codes) -> Array:
-    raise RuntimeError("no road\nleads there")
 
 
 def test_a_known_truth_scores_what_it_should(tiny_dataset):

@@ -8,29 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from methods import broken, method
 from numpy import ndarray as Array
 
-from quiver.data.codes import Codes, array_codes
+from quiver.data.codes import array_codes
 from quiver.data.illumination import ideal_counter
 from quiver.data.photon_counts import Counts, read_counts
 from quiver.evaluation.static_object import evaluate_static, markdown, mean_square, reference
-from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer
 
 HAZELNUT = Path(__file__).parents[2] / "data" / "hazelnut_gates6.npz"
-
-
-def method(name: str, restore: object, learned: bool = False) -> Restorer:
-    """A restorer from a function of (codes) -> photons [T, H, W]."""
-
-    def fill(codes: Codes, out: Array, first: int, progress: object) -> None:
-        out += restore(codes)[first : first + len(out)]
-
-    return Restorer(name, 1, 0, learned, f"test {name}", fill)
-
-
-def broken(codes: Codes) -> Array:
-    raise RuntimeError("no road\nleads there")
 
 
 def static_counts(light: float, shares: Array, seed: int = 0) -> tuple[Counts, Array]:

@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from clips import ClipMaker
-from numpy import ndarray as Array
+from methods import method
 
 from quiver.data.clips import truth
-from quiver.data.codes import Codes, sensed
+from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import summary
 from quiver.evaluation.comparison import (
@@ -22,15 +22,6 @@ from quiver.evaluation.comparison import (
 )
 from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer
-
-
-def method(name: str, restore: object, learned: bool = False) -> Restorer:
-    """A restorer from a function of (codes) -> photons [T, H, W]."""
-
-    def fill(codes: Codes, out: Array, first: int, progress: object) -> None:
-        out += restore(codes)[first : first + len(out)]
-
-    return Restorer(name, 1, 0, learned, f"test {name}", fill)
 
 
 def test_the_table_holds_what_was_promised(tiny_dataset, tmp_path):

@@ -12,10 +12,10 @@ import pytest
 import torch
 from domains import tensors_digest
 from numpy import ndarray as Array
+from random_codes import random_codes
 from torch import Tensor, nn
 
-from qsim.sensor.qis import QIS
-from quiver.data.codes import Codes, array_codes
+from quiver.data.codes import Codes
 from quiver.model.blocks import Output
 from quiver.model.presets import build
 from quiver.model.unet import UNet, UNetConfig
@@ -23,15 +23,6 @@ from quiver.model.weights import load, save
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import fill_network, network_title
 from quiver.restoration.restorers import PRETRAINED, restorer
-
-EXPOSURE = 5e-4
-
-SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
-
-
-def random_codes(frames: int, height: int, width: int, seed: int = 0) -> Codes:
-    drawn = np.random.default_rng(seed).integers(0, 8, (frames, height, width), dtype=np.uint8)
-    return array_codes(drawn, SENSOR, EXPOSURE)
 
 
 class CentreFrame(nn.Module):

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from clips import ClipMaker
 from numpy import ndarray as Array
+from random_codes import EXPOSURE, SENSOR, random_codes
 
-from qsim.sensor.qis import QIS
 from quiver.baselines import METHODS
 from quiver.data.clips import truth
-from quiver.data.codes import Codes, array_codes, sensed
+from quiver.data.codes import Codes, sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import metrics
 from quiver.model.presets import build
@@ -25,14 +25,7 @@ from quiver.restoration.networks import network_restorer
 from quiver.restoration.restored_file import restore_to_file
 from quiver.restoration.restorers import method_names, restorer, restorers, weights_path
 
-EXPOSURE = 5e-4
 DEFAULTS = RestoreOptions()
-SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
-
-
-def random_codes(frames: int, height: int, width: int, seed: int = 0) -> Codes:
-    drawn = np.random.default_rng(seed).integers(0, 8, (frames, height, width), dtype=np.uint8)
-    return array_codes(drawn, SENSOR, EXPOSURE)
 
 
 @pytest.mark.parametrize("name", METHODS)
