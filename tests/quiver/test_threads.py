@@ -1,4 +1,4 @@
-"""The number of threads: chosen by measurement or by option, noted, kept; and it changes no result."""
+"""The number of threads: chosen by measurement or by option, recorded, kept; and it changes no result."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_a_run_keeps_its_number_unless_told_otherwise(tiny_dataset, tmp_path):
 
 @two_cores
 def test_restored_video_notes_its_number(make_clip: ClipMaker, tmp_path, capsys):
-    """A restoration that is resumed takes that of its journal."""
+    """A resumed restoration takes the number in its journal."""
     words = ["restore", make_clip().path, "-o", tmp_path / "v.npy", "--method", "moment", "--ppp", 3.25, "--force"]
 
     def noted(*more: object) -> int:
@@ -180,7 +180,7 @@ def test_every_command_that_computes_has_the_option(capsys):
 
 @two_cores
 def test_the_compiled_engine_has_as_many_and_the_next_command_all(tmp_path, monkeypatch, capsys):
-    """Inside the command Dr.Jit and processes that it starts have the number; after it, what there was before."""
+    """Inside the command Dr.Jit and its child processes have the number; after it, the number from before."""
     drjit = pytest.importorskip("drjit")
     before, seen, plain = drjit.thread_count(), [], sensing.sense
 

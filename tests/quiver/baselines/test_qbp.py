@@ -173,7 +173,7 @@ def test_a_scene_at_rest_is_nearly_averaged():
 
 
 def test_the_other_frames_are_not_trusted_where_they_differ():
-    """A neighbour that is noise-free and wrong everywhere: the merge stays at the reference."""
+    """A neighbour without noise that is wrong everywhere: the merge stays at the reference."""
     sensor = quiver_physical(3.25)
     codes = np.full((3, 64, 64), 6, np.uint8)
     codes[1] = 1

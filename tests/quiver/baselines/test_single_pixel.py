@@ -1,4 +1,4 @@
-"""Restorers that look at one pixel at a time: naive mean, moment inverse, maximum likelihood, and their tables.
+"""Restorers of single pixels: naive mean, moment inverse, and what they share with maximum likelihood.
 
 Numbers "worked by hand" are computed from the sensor's definition in double precision: 3 bits, gain 3.5 / 3.25.
 """

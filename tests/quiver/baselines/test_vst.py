@@ -40,7 +40,7 @@ def test_deviation_after_stabilising_worked_by_hand(kind, samples, expected):
 
 
 def test_only_the_table_stabilises_within_three_percent():
-    """Eleven frames, from 1 to 5 photons: where few codes are 0 or saturated. The other forms miss it there."""
+    """Eleven frames, from 1 to 5 photons, where few codes are 0 or saturated: the other forms exceed 3 %."""
     inner = slice(1, 5)
     assert np.abs(deviations("table", 11)[inner] - 1).max() < 0.03
     assert np.abs(deviations("binomial", 11)[inner] - 1).max() > 0.3
@@ -50,7 +50,7 @@ def test_only_the_table_stabilises_within_three_percent():
 @pytest.mark.parametrize("samples", [1, 3, 11])
 @pytest.mark.parametrize("sensor", [SENSOR, BinarySPAD(0.4, 25.0, 3), quiver_physical(3.25, bits=1)], ids=str)
 def test_the_inverse_is_unbiased(sensor, samples):
-    """What a perfect denoiser returns, E[f], comes back as the light; f's own inverse would not."""
+    """E[f], the result of a perfect denoiser, gives the light; the inverse of f would not."""
     transform = stabiliser(sensor, EXPOSURE, samples)
     photons = np.linspace(0.02, 0.9, 7) * transform.photons[-1]
     pmf = sum_pmf(np.exp(sensor.log_pmf(photons, EXPOSURE)), samples)

@@ -1,8 +1,4 @@
-"""Every option of `quiver` acts or is refused: a table that a new option fails until it has its row.
-
-Networks and frames are tiny. Where an option decides how the work is done and not what comes out (threads, memory,
-worker processes), the row compares what the program did: `seen`.
-"""
+"""Every option of `quiver` has an effect or is refused: a new option fails until it has a row in this table."""
 
 from __future__ import annotations
 
@@ -39,7 +35,7 @@ from quiver.training import loop
 
 
 def tensors(run: Run) -> dict[str, Any]:
-    """Weights of the files that a command writes; their notes are no result."""
+    """Return the weights in the files that a command writes, without their metadata."""
     files = sorted(run.folder.rglob("*.safetensors"))
     return {
         path.relative_to(run.folder).as_posix(): {name: value.tobytes() for name, value in load_file(path).items()}
@@ -90,7 +86,7 @@ def see(what: str, value: Any) -> None:
 
 
 def seen(what: str) -> Callable[[Run], list[Any]]:
-    """What the program did in a folder: `threads` of torch, frames per read, worker processes, cells measured."""
+    """Return what the program did in a folder: torch's threads, frames per read, worker processes, cells measured."""
     return lambda run: SEEN[run.folder.resolve()].get(what, [])
 
 

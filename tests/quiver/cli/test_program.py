@@ -25,7 +25,7 @@ def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, s
 
 
 def mistake(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    """The one line that a mistake gets, with exit code 2."""
+    """Return the one line of a mistake, which has exit code 2."""
     code, out, err = run(capsys, *words)
     assert code == 2
     assert out == ""
@@ -243,7 +243,7 @@ def test_sizes(text, bytes_):
 
 @pytest.mark.slow
 def test_the_ablation(capsys, tiny_dataset, tmp_path):
-    """Six networks of nearly one size, one table; done again at once, because everything is there."""
+    """Six networks of nearly one size, one table; the second call returns at once, because everything exists."""
     words = [
         "ablate",
         tiny_dataset,

@@ -1,4 +1,4 @@
-"""Options of training and measuring commands: each acts, or is refused in one line that leaves everything as it was."""
+"""Options of training and measuring commands: each has an effect, or is refused in one line and changes nothing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FAST = ("--steps", "2", "--crop", "16", "--batch", "1", "--preset", "unet", "--p
 
 
 def told(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    """The one line of a refusal."""
+    """Return the one line of a refusal."""
     code = main([str(word) for word in words])
     out, err = capsys.readouterr()
     assert (code, out, err.count("\n")) == (2, "", 1), err

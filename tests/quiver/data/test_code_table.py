@@ -1,4 +1,4 @@
-"""Codes drawn through the table are those of the reference draw; sensors that fit no table draw themselves."""
+"""Codes drawn through the table equal those of the reference draw; sensors that fit no table draw without it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SENSORS = (
 
 @pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: f"{type(s).__name__}-{s.bits}")
 def test_table_draws_are_the_reference_draws(sensor: Sensor):
-    """Every code, from darkness to far beyond saturation, equals the sensor's own slow draw."""
+    """Every code, from darkness to far beyond saturation, equals the sensor's slow draw."""
     photons = np.random.default_rng(0).choice([0, 1e-6, 0.3, 1, 3.25, 7, 20, 300, 1e6], (3, 40, 50))
     photons = photons * np.random.default_rng(1).uniform(0.5, 1.5, photons.shape)
     key = Key(seed=3, clip=5, frame=2)
@@ -43,7 +43,7 @@ def test_sums_of_planes_have_the_exact_distribution():
 
 
 def test_the_table_decides_most_pixels_itself():
-    """Otherwise it would be exact for a dull reason: 3 bits leave 1 to 2 % of the cells open."""
+    """The table is used: 3 bits leave 1 to 2 % of the cells undecided."""
     table = CodeTable(SENSORS[0], EXPOSURE)
     assert 0.003 < np.mean(table.table == CodeTable.UNDECIDED) < 0.03
     assert set(np.unique(table.table)) == {0, 1, 2, 3, 4, 5, 6, 7, 255}

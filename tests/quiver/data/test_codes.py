@@ -26,7 +26,7 @@ SENSORS = (
 
 
 def test_sensed_codes_and_truth(make_clip: ClipMaker):
-    """Drawn frame by frame or at once, the codes are the same; truth has the asked light level."""
+    """Drawn frame by frame or at once, the codes are the same; the truth has the requested light level."""
     clip = make_clip()
     codes, factor = sensed(clip, Illumination(), seed=2)
     whole = codes.read(0, 14)

@@ -1,4 +1,4 @@
-"""The noise of training windows: that of the data set's streams, with the defects of the pixels where they lie."""
+"""The noise of a training run: recorded, resumed, and read again from its weights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damaged or wrong files of photon counts are one line."""
+"""Damaged or wrong files of photon counts give an error of one line."""
 
 from __future__ import annotations
 

@@ -130,7 +130,7 @@ def test_a_drifting_window_keeps_its_pixels(make_clip: ClipMaker, tmp_path):
 
 
 def test_afterpulses_of_a_reversed_window_follow_its_own_time(make_clip: ClipMaker, tmp_path):
-    """Light that ends at once: afterpulses come after it in the order in which the window is seen, never before."""
+    """Light that ends at once: afterpulses follow it in the order of exposure of the window, and never precede it."""
     radiance = np.zeros((24, 20, 26))
     radiance[:12] = 1.0
     clip = make_clip(radiance=radiance, relative=True)
@@ -145,7 +145,7 @@ def test_afterpulses_of_a_reversed_window_follow_its_own_time(make_clip: ClipMak
 
 
 def test_no_defects_change_no_bit(make_clip: ClipMaker, tmp_path):
-    """A sensor file draws what its sensor draws, and a plain window what it always drew."""
+    """A sensor file without defects draws what its sensor draws, and a plain window is unchanged."""
     clip = make_clip()
     file = sensor_file(tmp_path, QIS + "prnu = 0.0\n", 3)
     data = Windows([clip], WindowSettings(crop=16, lights=(Illumination(file, 3.25, 3),)))

@@ -1,4 +1,4 @@
-"""Training windows: exact codes, keyed noise, the same bytes for any number of workers, targets where they belong."""
+"""Training windows: exact codes, keyed noise, the same bytes for any number of workers, targets at the right place."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def same(a: dict, b: dict) -> bool:
 
 
 def test_a_sample_is_what_the_docs_say(make_clip: ClipMaker):
-    """Undo nothing, flip nothing: the target is the sharp photons of that place over white, codes come from its key."""
+    """Nothing turned: the target is the sharp photons of that place over white, and codes come from its key."""
     clip = make_clip(sharp=True)
     data = Windows([clip], WindowSettings(crop=16, flips=False, reverse=False, seed=7))
     sample, place = data[1], data.place(1)
@@ -167,7 +167,7 @@ def test_the_pattern_moves():
 
 
 def test_bad_radiance_names_its_clip(make_clip: ClipMaker, monkeypatch):
-    """A damaged file may hold NaN: both ways to codes say which clip, and which frames."""
+    """A damaged file may hold NaN: both ways to codes name the clip and the frames."""
     clip = make_clip()
     monkeypatch.setattr(type(clip), "radiance", lambda self, t, crop=None: np.full((36, 44), np.nan, np.float32))
     with pytest.raises(ValueError, match=r"sliding_0: frames 2\.\.3: photons"):

@@ -1,4 +1,4 @@
-"""Errors by motion and crops: sums that must agree, bins that must hold, the place where most moves."""
+"""Errors by motion and crops: sums agree, bins hold their pixels, crops lie where most moves."""
 
 from __future__ import annotations
 

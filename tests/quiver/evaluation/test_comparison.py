@@ -1,4 +1,4 @@
-"""One table: equal codes for all, resumed rows, failures with reasons, the truth's own worth, real static photons."""
+"""One table: equal codes for all methods, resumed rows, failures with reasons, the PSNR of the truth."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from quiver.restoration.restorers import restorer
 
 
 def oracle(source: Path, factor: float = 1.0) -> Restorer:
-    """Knows the truth of every clip at 3.25 PPP; `factor` is its error of brightness."""
+    """A restorer with the truth of every clip at 3.25 PPP; `factor` is its error of brightness."""
     known = {clip.name: clip for clip in open_clips(source)}
 
     def restore(codes: Codes) -> Array:
@@ -148,7 +148,7 @@ def test_truth_psnr_is_the_radiance_error_in_units_of_white(make_clip: ClipMaker
 
 
 def bright_clip(make_clip: ClipMaker, share: float, **options: object):
-    """A clip in which so many pixels are about nine times as bright as the others."""
+    """A clip in which this many pixels are about nine times as bright as the others."""
     rng = np.random.default_rng(9)
     radiance = rng.uniform(0.8, 1.2, (12, 24, 30)) * np.where(rng.random((24, 30)) < share, 9.0, 1.0)
     return make_clip(f"bright_{share:g}", radiance=radiance, **options)
@@ -194,7 +194,7 @@ def test_the_published_protocol_keeps_its_white(make_clip: ClipMaker):
 
 
 def test_saturated_pixels_count_nowhere(tmp_path):
-    """Half of a recording is saturated: a method that errs there alone is as good as one that errs nowhere."""
+    """Half of a recording is saturated: a method with errors there alone scores as one without errors."""
     mask = np.zeros((24, 30), bool)
     mask[:, 15:] = True
     meta = {"shape": [12, 24, 30], "frame_rate": 2000.0, "exposure": 5e-4, "radiance_unit": RELATIVE, "camera": None}
@@ -222,7 +222,7 @@ def test_published_windows_are_counted_as_published():
 
 
 def test_published_protocol_forces_every_window(tiny_dataset):
-    """Every restored frame comes from a window of eleven with a mean of 3.25 PPP; each has its own factor."""
+    """Every restored frame comes from a window of eleven with a mean of 3.25 PPP and a separate factor."""
     levels: list[float] = []
 
     def look(codes: Codes) -> Array:

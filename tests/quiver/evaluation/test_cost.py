@@ -1,4 +1,4 @@
-"""The bench: a clip that never changes, and the cases worth running. Costs: test_cli_quiver.py, slow tier."""
+"""The bench: a clip that never changes, and cases that differ. Costs: tests/quiver/cli/test_program.py, slow tier."""
 
 from __future__ import annotations
 

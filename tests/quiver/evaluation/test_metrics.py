@@ -155,7 +155,7 @@ def test_a_larger_error_scores_less():
 
 
 def test_invalid_pixels_count_nowhere():
-    """Whatever stands in them, the score is that of the other pixels; a frame without any has none."""
+    """For any values in them, the score is that of the other pixels; a frame without valid pixels has none."""
     rng = np.random.default_rng(8)
     target = rng.uniform(0.05, 1.2, (3, 20, 24))
     output = 1.2 * target + rng.normal(0, 0.05, target.shape)

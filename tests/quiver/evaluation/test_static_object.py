@@ -27,7 +27,7 @@ def static_counts(light: float, shares: Array, seed: int = 0) -> tuple[Counts, A
 
 
 def test_the_reference_takes_off_its_own_noise():
-    """An oracle's error against 19 noisy frames is all reference noise: what is left is zero within its own spread."""
+    """The error of an oracle against 19 noisy frames is noise of the reference: the rest is zero within its spread."""
     shares = np.tile([1.2, 0.9, 0.9], 10)
     left, measured = [], []
     for seed in range(40):

@@ -47,7 +47,7 @@ def test_the_table_holds_what_was_promised(tiny_dataset, tmp_path):
 
 
 def test_a_one_bit_sensor_in_much_light_is_not_perfect(make_clip: ClipMaker):
-    """At 10 PPP every pixel of a 1-bit code lies above its own white: there all guesses were perfect, `moment` inf."""
+    """At 10 PPP every pixel lies above the white of a 1-bit code: with that as peak, every guess would be perfect."""
     comparison = Comparison(
         str(make_clip().path), None, (Illumination("spad-320x240", 1.0, 1), Illumination("spad-320x240", 10.0, 1))
     )
@@ -77,7 +77,7 @@ def test_an_extreme_peak_has_a_table_and_no_foreign_warning(peak, tiny_dataset, 
 
 
 def test_scores_near_the_truth_are_marked(make_clip: ClipMaker):
-    """A truth with an error of 3 % of its mean is worth 38.4 dB; an answer of 36 dB is marked, one of 20 dB is not."""
+    """A truth with an error of 3 % of its mean has 38.4 dB; an answer of 36 dB is marked, one of 20 dB is not."""
     clip = make_clip("rough", error=0.03 * make_clip().mean_radiance)
     rng = np.random.default_rng(11)
 

@@ -105,7 +105,7 @@ def test_notes_leave_the_tensors_alone(tmp_path):
 
 
 def test_the_shipped_weights_know_their_domain():
-    """Measured cells, not typed ones: the page shows what the file holds, and light it fails at is named."""
+    """The cells are measured: the page shows the content of the file, and light at which the network fails is named."""
     path = PRETRAINED / "nano.safetensors"
     scope = domain.read_scope(path, metadata_of(path))
     page = (Path(__file__).parents[3] / "docs/results/domain.md").read_text(encoding="utf-8")

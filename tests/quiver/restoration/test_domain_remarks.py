@@ -39,7 +39,7 @@ def test_inside_nothing_is_said_and_outside_the_better_method():
 
 
 def test_light_that_is_not_told_is_estimated():
-    """From 12 x 256 codes at 3.25 PPP: the mean is known to a percent or so, the nearest cell surely."""
+    """From 12 x 256 codes at 3.25 PPP the mean is known to about 1 %, which decides the nearest cell."""
     told, untold = stream(), stream(told=False)
     assert untold.ppp is None
     assert domain_remarks.light_of(told) == 3.25
@@ -146,7 +146,7 @@ def test_the_call_in_python_warns_and_refuses_with_strict(tmp_path, make_clip: C
 
 
 def test_a_sensor_whose_codes_tell_no_light_still_has_a_remark():
-    """A full well of a hundredth of an electron: the moment inverse refuses, the warning must not."""
+    """A full well of a hundredth of an electron: the moment inverse refuses it, the remark does not."""
     sensor = QIS(0.8, 1.6, 0.2, 3, gain=0.5, full_well=0.01)
     codes = array_codes(np.zeros((3, 8, 8), np.uint8), sensor, 5e-4)
     with pytest.raises(ValueError, match="does not"):

@@ -26,7 +26,7 @@ from quiver.restoration.restorers import PRETRAINED, restorer
 
 
 class CentreFrame(nn.Module):
-    """Returns the centre of its window untouched: with any padding and tiling, the codes must come back."""
+    """Returns the centre of its window unchanged: with any padding and tiling, the codes must come back."""
 
     multiple = 8
 
@@ -42,7 +42,7 @@ class CentreFrame(nn.Module):
 
 
 class WindowMean(CentreFrame):
-    """The mean of its window: shows which frames a window held."""
+    """Returns the mean of its window: shows which frames a window held."""
 
     def forward(self, x: Tensor) -> Output:
         mean = x.mean(dim=1, keepdim=True)
@@ -156,7 +156,7 @@ NANO_TENSORS = "6a63ccb037b3b58e691acd1cc99acfc15ca5803003a647be778a7d7d36d2ab31
 
 
 def test_the_shipped_weights_are_those_that_were_trained():
-    """Notes were added later; the tensors are the same, bit for bit, and the file stays small."""
+    """The metadata were added later: the tensors are the same, bit for bit, and the file stays small."""
     path = PRETRAINED / "nano.safetensors"
     assert tensors_digest(path) == NANO_TENSORS
     assert path.stat().st_size < 5_000_000

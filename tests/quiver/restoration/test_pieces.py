@@ -28,7 +28,7 @@ SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
 
 
 def moving(frames: int, height: int, width: int, seed: int = 0) -> Codes:
-    """Codes of smooth structure that moves 1.5 px per frame: paths and patches have something to follow."""
+    """Codes of smooth structure that moves 1.5 px per frame, so that alignment has work to do."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:height, : width + 2 * frames].astype(float)
     waves = sum(np.sin(a * x + b * y + c) for a, b, c in rng.uniform((-0.5, -0.5, 0), (0.5, 0.5, 6), (6, 3)))
@@ -38,7 +38,7 @@ def moving(frames: int, height: int, width: int, seed: int = 0) -> Codes:
 
 
 def quiet(method: Restorer, codes: Codes) -> Array:
-    """Restored without a warning."""
+    """Restored video, without a warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         return method.restore(codes)
@@ -48,7 +48,7 @@ def quiet(method: Restorer, codes: Codes) -> Array:
 
 
 def test_the_reach_of_the_small_unet_is_what_it_says():
-    """A pixel that changes: nothing farther than REACH answers, at any phase of the pooling, and something that far."""
+    """A pixel changes: nothing farther than REACH changes, at any phase of the pooling, and something at REACH does."""
     unet, side, seen = SmallUNet(3, 4).double().eval(), 120, []
     frame = torch.rand(1, 3, side, side, dtype=torch.double)
     for parameter in unet.parameters():

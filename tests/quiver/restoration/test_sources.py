@@ -1,4 +1,4 @@
-"""What `quiver restore` and `quiver evaluate` take for input: sums of planes, and options that act or are refused."""
+"""The inputs of `quiver restore` and `quiver evaluate`: options have an effect or are refused."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ REFUSED = {  # by kind of input, with a classical method
 
 @pytest.mark.parametrize("kind", REFUSED)
 def test_an_option_that_cannot_act_is_refused(kind, inputs, tmp_path, capsys):
-    """Each option of `quiver restore` that this input would ignore: one line that names it, and nothing is made."""
+    """Each option of `quiver restore` without effect on this input: one line names it, and nothing is written."""
     name, *own = kind.split()
     words = ["restore", str(inputs[name]), *own, "--method", "naive", "-o", str(tmp_path / "r.npy"), "-q"]
     assert main(words) == 0
@@ -53,7 +53,7 @@ def test_an_option_that_cannot_act_is_refused(kind, inputs, tmp_path, capsys):
 
 
 def test_the_other_options_change_the_answer(inputs, tmp_path):
-    """What is taken for a clip that is sensed now, for an array and for planes makes another video."""
+    """Each option for a clip that is sensed now, for an array and for planes makes another video."""
 
     def video(kind: str, *words: object) -> np.ndarray:
         path = tmp_path / "r.npy"
