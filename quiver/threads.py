@@ -1,5 +1,6 @@
-"""Chooses how many threads torch uses, by one measurement per process: two threads on busy cores can be many times
-slower.
+"""Chooses how many threads torch uses, by one measurement per process.
+
+Two threads on busy cores can be many times slower than one.
 
     --threads N, else the number of the resumed run, else the faster of one thread and of all, by a small convolution
 

@@ -1,4 +1,4 @@
-"""BM3D: removes white Gaussian noise of known deviation from one image, by filtering stacks of similar blocks together.
+"""Removes white Gaussian noise from one image by BM3D, which filters stacks of similar blocks together.
 
     image -> (match, Haar x wavelet, hard threshold, aggregate) = basic -> (match on basic, Haar x DCT, Wiener) ->
     denoised
@@ -10,7 +10,7 @@ That replaces the article's second set of parameters for strong noise, and needs
 a stack is never shrunk, so the position of grey level 0 does not matter.
 
 No loop runs over pixels: the transformed block at every position is one row of a table [positions, 64]. Distances are
-matrix products of rows (a DCT keeps distances), stacks are gathered rows, and filtered rows are added at their
+matrix products of rows (a DCT keeps distances); stacks are gathered rows, and filtered rows are added at their
 positions, so that each position is transformed back once. Memory: about 1.2 kB per pixel. The package `bm3d` is not
 used: its licence forbids commercial use.
 """

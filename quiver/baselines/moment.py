@@ -1,4 +1,4 @@
-"""Restores by the moment inverse: the mean code of a window, through the inverse of the sensor's exact mean response.
+"""Restores by the moment inverse: the mean code of a window through the sensor's exact inverse response.
 
     photons = mu^-1(min(mean(codes), top - 1/(2 window)))
 

@@ -3,7 +3,7 @@
     photons = max(0, mean(codes) - dark) * white / top
 
 Source: textbook; the lower bound of every table. `white / top` is the nominal light of one code step (1/(gain *
-efficiency)), `dark` the codes that dark counts and offset add in the same linear picture. Clipping and dead time are
+efficiency)); `dark` are the codes of dark counts and offset in the same linear picture. Clipping and dead time are
 ignored: at 3.25 photons per pixel (3 bits, gain 1.077) the estimate is 4 % low, at four times that light 39 %.
 """
 

@@ -1,4 +1,4 @@
-"""Quanta Burst Photography, with and without BM3D: aligns the frames of a window, merges them, inverts the response.
+"""Restores by Quanta Burst Photography, with or without BM3D: aligns frames, merges them, inverts the response.
 
     codes -> matching images -> shifts per 16x16 patch -> Wiener merge of patch spectra -> mean code -> mu^-1 -> photons
     with BM3D: mean code -> f -> BM3D with sigma = excess / sqrt(window) -> D^-1 -> photons

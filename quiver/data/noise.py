@@ -1,4 +1,4 @@
-"""Describes the noise of training windows: a sensor with its defects at a light level, as a stored stream has it."""
+"""Describes the noise of training windows: a sensor with its defects at a light level, as a stream stores it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draws training windows from the clips of any data set folder: a plain `torch` data set, usable without our loop.
+"""Draws training windows from the clips of a data set: a plain `torch` data set, usable without our loop.
 
     clip -> photons of a window and its sharp truth -> codes, drawn when read -> codes/(2^b - 1), photons/white
 
@@ -59,14 +59,21 @@ class WindowSettings:
 
 
 class Windows(Dataset[dict[str, Any]]):
-    """Windows of `frames` frames from the clips of a folder, with new noise in every epoch: a map-style `torch` data
-    set.
+    """Windows of `frames` frames from the clips of a folder, with new noise in every epoch: a `torch` data set.
 
-    An item holds codes float32 [T, 1, h, w] in [0, 1], target float32 [T, 1, h, w] = sharp photons / white (up to
-    `ceiling`), white [photons], peak [photons] of its scores, ppp, sample (its number) and key (text: clip, place,
-    light, random key). Codes and target follow the sensor of their window. `noise` is the mixture that windows draw
-    from; `repr` shows it. `ValueError` for a folder without clips, for clips shorter or smaller than a window, and for
-    noise that windows cannot have.
+    An item holds:
+
+        codes    float32 [T, 1, h, w] in [0, 1]
+        target   float32 [T, 1, h, w], sharp photons / white, up to `ceiling`
+        white    photons
+        peak     photons, of its scores
+        ppp      mean photons per pixel and exposure
+        sample   its number
+        key      text: clip, place, light, random key
+
+    Codes and target follow the sensor of their window. `noise` is the mixture that windows draw from; `repr` shows it.
+    `ValueError` for a folder without clips, for clips shorter or smaller than a window, and for noise that windows
+    cannot have.
     """
 
     def __init__(

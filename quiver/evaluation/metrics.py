@@ -1,4 +1,4 @@
-"""Scores a restored clip against the truth: PSNR, one brightness factor per clip, SSIM, and intervals over scenes.
+"""Scores a restored clip against the truth: PSNR, a brightness factor per clip, SSIM, intervals over scenes.
 
     restored x, target x  [T, H, W], in units of the peak (photons / peak)  ->  numbers
 

@@ -1,4 +1,4 @@
-"""Scores methods on real photons of a static object: restores from some frames, compares with the mean of the others.
+"""Scores methods on real photons of a static object: restores from some frames, the mean of others is the truth.
 
     counts [N, H, W] -> codes of 11 frames (clipped to b bits) -> restored centre frame; the other N - 11 are the truth
 

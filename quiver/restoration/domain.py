@@ -1,9 +1,9 @@
-"""Describes what a network was measured for: cells of sensor, bits and light with the PSNR of network and best rival.
+"""Describes what a network was measured for: cells of sensor, bits and light, its PSNR and the best rival's.
 
     weights file --`quiver domain`--> cells in its metadata;   stream, cells --`remark`--> nothing, or one line
 
-A stream belongs to the nearest cell in log light, among those of the same kind of sensor, the same bits and about the
-same gain. Light is counted in detected photons: sensors of one kind share their cells at any efficiency. Read noise,
+Cells of the same kind of sensor, the same bits and about the same gain are like a stream; the nearest one in log light
+is its cell. Light is counted in detected photons: sensors of one kind share their cells at any efficiency. Read noise,
 dark counts and defects are not compared. Streams whose light differs from the measured one by more than NEAR have no
 cell.
 """
