@@ -126,9 +126,9 @@ class Renderer:
 
     def halves(self, instants: list[float], budget: Budget, key: Key) -> Array:
         """Return independent estimates A, B of the mean radiance over the instants [s], float64 [2, H, W]."""
-        return self._means(instants, budget, key)[0]
+        return self.means(instants, budget, key)[0]
 
-    def _means(self, instants: list[float], budget: Budget, key: Key) -> Array:
+    def means(self, instants: list[float], budget: Budget, key: Key) -> Array:
         """Return `halves` of all instants, of every third one, and of the middle one, float64 [3, 2, H, W]."""
         n, samples = len(instants), budget.grid(len(instants))
         parts = self.parts(2 * samples)
@@ -168,7 +168,7 @@ class Renderer:
 
     def _exposed(self, instants: list[float], key: Key) -> tuple[Array, float, tuple[tuple[float, float], ...], int]:
         """Return the mean radiance [H, W], its rms error, that error at some whites, and the fireflies."""
-        means = self._means(instants, self.budget, key)
+        means = self.means(instants, self.budget, key)
         halves, broken = means[0], ~np.isfinite(means[0]).all(axis=0)
         means[:, :, broken] = 0  # they would break the denoiser and every mean around them
         difference = (halves[0] - halves[1]) / 2

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from qsim.optics.camera import Camera, Pose
 from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
-from qsim.scene import Body, Constant, Diffuse, Light, Mesh, Scene, Texture
+from qsim.scene import Body, Conductor, Constant, Diffuse, Light, Mesh, RoughPlastic, Scene, Still, SunSky, Texture
 
 CAMERA = Camera(focal_length=2e-3, f_number=2.8, pixel_pitch=5e-5, height=24, width=33, origin=(0, 0, 4))
 SKY = Constant(0.7)
@@ -32,6 +34,12 @@ def plate(motion: Pose | None, light: Light = SKY, camera: Camera = CAMERA) -> S
     texture = Texture(0.2 + 0.6 * np.random.default_rng(5).random((6, 6)))
     wall = Body("wall", square(12, -1), Diffuse(0.3))
     return scene(wall, Body("plate", square(1.6), Diffuse(texture), motion), light=light, camera=camera)
+
+
+def mirrored_sun() -> Scene:
+    """A mirror on the ground reflects the sun onto a wall, which paths find by chance only."""
+    mirror = Body("mirror", square(4), Conductor(roughness=0.02), Still((0, -1, 1), (-math.pi / 2, 0, 0)))
+    return scene(Body("wall", square(9, -1), RoughPlastic(0.5)), mirror, light=SunSky())
 
 
 def renderer(made: Scene, budget: Budget = CHEAP, **options) -> Renderer:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
-from small_scenes import CHEAP, plate, renderer, scene, square
+from small_scenes import CHEAP, mirrored_sun, plate, renderer
 
 from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
-from qsim.scene import Body, Conductor, RoughPlastic, Spin, Still, SunSky
+from qsim.scene import Spin
 
 
-def test_a_clip_goes_on_after_an_interruption_with_the_same_bytes(tmp_path):
+def test_an_interrupted_clip_resumes_with_the_same_bytes(tmp_path):
     made = plate(Spin((0, 0, 1), 200.0))
 
     class Stop(Exception):
@@ -35,10 +33,8 @@ def test_a_clip_goes_on_after_an_interruption_with_the_same_bytes(tmp_path):
 
 
 def test_a_clip_counts_its_fireflies(tmp_path):
-    """Frame by frame in clip.json, beside the measured errors and the choice."""
-    mirror = Body("mirror", square(4), Conductor(roughness=0.02), Still((0, -1, 1), (-math.pi / 2, 0, 0)))
-    rough = Body("wall", square(9, -1), RoughPlastic(0.5))
-    made = scene(rough, mirror, light=SunSky())
+    """clip.json has the number for every frame, with the measured errors and the budget."""
+    made = mirrored_sun()
     clip = render_clip(made, tmp_path / "mirror", frames=2, budget=Budget(8, 4))
     counted = [renderer(made, budget=Budget(8, 4)).frame(t, with_truth=False).fireflies for t in range(2)]
     assert clip.meta["fireflies_per_frame"] == counted

@@ -1,4 +1,4 @@
-"""The denoiser: its mixture with raw samples, and the error that is stated for it."""
+"""The denoiser: its mixture with raw samples, and the stated error."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from qsim.scene import Spin, SunSky
 
 @pytest.mark.parametrize("bias", [0.0, 0.3, 2.0])
 def test_the_best_mixture_is_known_without_the_truth(bias):
-    """A filter that adds a bias to the truth, raw noise of 0.5: A - B knows nothing of the bias, D(A) - B does.
+    """A filter adds a bias to the truth, with raw noise of 0.5: D(A) - B contains the bias, A - B does not.
 
-    The shares are as 1 / variance, that of the mean of two halves 0.125: w = 0.125 / (0.125 + bias^2), and
-    error^2 = w bias^2. Over 40 000 pixels the estimate has a sigma of 0.001 or less (0.125 sqrt(2) / 200; with the bias
-    of 2, w is 0.03 and bias Z w as large), of which one is added.
+    Weights are 1 / variance, which is 0.125 for the mean of two halves: w = 0.125 / (0.125 + bias^2), and
+    error^2 = w bias^2. Over 40 000 pixels the estimate has a sigma of at most 0.001 (0.125 sqrt(2) / 200; for a bias of
+    2, w is 0.03 and bias Z w as large). One sigma is added.
     """
     rng = np.random.default_rng(3)
     truth = rng.random((200, 200))
@@ -32,11 +32,11 @@ def test_the_best_mixture_is_known_without_the_truth(bias):
     assert error**2 == pytest.approx(max(best * bias**2, 0.00125), abs=0.006)
 
 
-def test_halves_whose_noise_the_filter_keeps_are_known_for_it():
-    """A filter that keeps the share k of the noise, without bias: E (C - truth)^2 is k^2 of the raw one.
+def test_noise_that_the_filter_keeps_is_part_of_the_error():
+    """A filter keeps the fraction k of the noise, without bias: E (C - truth)^2 is k^2 of the raw one.
 
-    The best w is the whole (only C), its error k sqrt(V / 2); a naive half difference of D(A) and D(B) says the same
-    here, which the test above denies it. 160 000 pixels: sigma of the square below 0.4 %.
+    The best w is 1 (only C), with the error k sqrt(V / 2). Here half the difference of D(A) and D(B) gives the same; in
+    the test above it does not. 160 000 pixels: sigma of the square below 0.4 %.
     """
     rng = np.random.default_rng(5)
     noise = rng.standard_normal((2, 400, 400))
@@ -47,10 +47,10 @@ def test_halves_whose_noise_the_filter_keeps_are_known_for_it():
 
 
 def test_each_part_of_a_picture_is_mixed_by_its_own_errors():
-    """A filter that is right on the left and far off on the right: denoised there, raw here, away from the border.
+    """A filter is right on the left and biased on the right: denoised left, raw right, away from the border.
 
-    The left share is a ratio of two sums of 33 x 33 squares: 6 % of noise, 9 % at a border, which mirrors half of them,
-    and nothing above 1. The right one is 0.005, known far better.
+    The left fraction is a ratio of two sums of 33 x 33 squares: 6 % of noise, 9 % at a border, which mirrors half of
+    them, and at most 1. The right one is 0.005, with far less noise.
     """
     rng = np.random.default_rng(6)
     truth = np.ones((120, 300))
@@ -61,13 +61,13 @@ def test_each_part_of_a_picture_is_mixed_by_its_own_errors():
     assert share[:, 180:].max() < 0.05
 
 
-def test_a_filter_that_does_nothing_is_not_trusted():
+def test_a_filter_without_effect_lowers_no_error():
     halves = np.random.default_rng(4).standard_normal((2, 100, 100))
     assert mixture(halves, halves).error == pytest.approx(math.sqrt(0.5), rel=0.05)
 
 
 @pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
-def test_denoising_helps_where_it_says_so():
+def test_the_stated_error_of_a_denoised_frame_is_its_error():
     """A matt plate under sun and sky: the stated error of a denoised frame covers its distance from the truth."""
     made = plate(Spin((0, 0, 1), 200.0), light=SunSky(), camera=CAMERA.resized(96, 132))
     raw, clean = (renderer(made, budget=Budget(8, 2, denoise=on)).frame(0, with_truth=False) for on in (False, True))
@@ -87,7 +87,7 @@ def test_denoising_without_the_package_is_refused(monkeypatch):
 
 @pytest.mark.parametrize("seed", range(10))
 def test_a_denoised_frame_keeps_the_mean_light(monkeypatch, seed):
-    """Whatever share of the light a denoiser loses or adds, up to a few per cent."""
+    """Also if the denoiser changes the mean light by up to three per cent."""
     rng = np.random.default_rng([9, seed])
     shift = rng.uniform(0.97, 1.03)
     monkeypatch.setattr(denoiser, "denoised", lambda half, *_: shift * np.ones_like(half))
@@ -99,8 +99,8 @@ def test_a_denoised_frame_keeps_the_mean_light(monkeypatch, seed):
     assert abs(mixed.picture.mean() - halves.mean()) <= abs(shift * 1 - halves.mean())
 
 
-def test_a_stray_path_does_not_brighten_a_whole_frame(monkeypatch):
-    """One pixel of a million times the light is 60 times the mean of the frame: it moves it by a part of its error."""
+def test_a_stray_path_does_not_brighten_the_frame(monkeypatch):
+    """One pixel of a million times the light has 60 times the frame's mean; it shifts it by a part of its error."""
     monkeypatch.setattr(denoiser, "denoised", lambda half, *_: np.ones_like(half))
     halves = 1 + 0.01 * np.random.default_rng(1).standard_normal((2, 128, 128))
     halves[0, 5, 5] = 1e6

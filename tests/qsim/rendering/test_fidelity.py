@@ -1,4 +1,4 @@
-"""The budget: its choices hold the error asked for, its formulae are checked by brute force."""
+"""The choice of a budget: the requested error holds, without waste, for motion, shadows and late bodies."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from small_scenes import CAMERA, plate, renderer, scene, square
 
+from qsim import colour
 from qsim.clip.clamped_error import Errors, Stated, error_at, white_in
 from qsim.rendering import fidelity
 from qsim.rendering.budget import Allowed, Budget, blur_error, explain
@@ -25,16 +26,16 @@ def test_no_motion_needs_one_instant():
 
 
 @pytest.mark.parametrize("psnr", [32.0, 42.0])
-def test_the_error_asked_for_is_reached_without_waste(psnr):
+def test_the_requested_error_is_reached_without_waste(psnr):
     made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
     chosen = choose_budget(made, psnr=psnr, denoise=False)
     frames = [Renderer(made, budget=chosen).frame(t, with_truth=False) for t in (1, 9)]
     white = white_in(np.stack([frame.radiance for frame in frames]))
-    reached = psnr(white, math.sqrt(np.mean([error_at(white, frame.errors_at) ** 2 for frame in frames])))
+    reached = colour.psnr(white, math.sqrt(np.mean([error_at(white, frame.errors_at) ** 2 for frame in frames])))
     assert psnr - 1 < reached < psnr + 10  # samples come in even squares: 4, 16, 36
 
 
-def test_more_light_on_the_sensor_asks_for_more_samples():
+def test_more_light_on_the_sensor_needs_more_samples():
     made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
     plain, bright = (choose_budget(made, psnr=25, ppp=ppp, denoise=False) for ppp in (None, 300.0))
     assert bright.samples > plain.samples
@@ -42,7 +43,7 @@ def test_more_light_on_the_sensor_asks_for_more_samples():
 
 
 def test_bounces_follow_the_scene():
-    """One matt plate in the open needs one bounce or few; the inside of a bright corner needs more."""
+    """One matt plate in the open needs few bounces; the inside of a bright corner needs more."""
     open_air = choose_budget(scene(Body("plate", square(1.5), Diffuse(0.5))), psnr=30, denoise=False)
     lamp = Body("lamp", square(0.4, -0.9), Glow(20.0))
     walls = [Body(f"wall{i}", square(2.2, -1.1), Diffuse(0.95), turned) for i, turned in enumerate(BOX)]
@@ -66,10 +67,10 @@ def test_an_open_shutter_gets_an_odd_number_of_instants():
 
 
 def test_a_shadow_that_moves_on_a_wall_at_rest_is_blurred_too():
-    """Nothing that is seen moves; a slat beside the lamp throws a shadow that runs across the wall.
+    """Nothing visible moves; a slat beside the lamp casts a shadow that moves across the wall.
 
-    With the instants chosen, the mean over the exposure is that of many more to the error asked for; that of the three
-    which motion takes at least is not.
+    With the chosen instants, the mean over the exposure equals that of many more, to the requested error. With three
+    instants, the least number for motion, it does not.
     """
     slat = Body("slat", square(0.15), Diffuse(0.5), Translation((100.0, 0.0, 0.0), (-0.5, 0.0, 2.0)))
     made = scene(Body("wall", square(6, -1), Diffuse(0.7)), slat, light=PointLight((0.0, 0.0, 3.0), 40.0))
@@ -88,7 +89,7 @@ def test_a_shadow_that_moves_on_a_wall_at_rest_is_blurred_too():
 
 
 def held(made: Scene, psnr: float, t: int) -> tuple[Budget, float, float, float]:
-    """What is chosen for an open shutter; rms error at white allowed, of frame t against 315 instants, and stated."""
+    """Return the choice for an open shutter, and rms errors at white: allowed, real (315 instants) and stated."""
     chosen = choose_budget(made, shutter=1.0, psnr=psnr, denoise=False)
     frame = renderer(made, shutter=1.0, budget=chosen).frame(t, with_truth=False)
     many = Budget(8 * 315, chosen.bounces, 315, sharp=False)
@@ -98,19 +99,19 @@ def held(made: Scene, psnr: float, t: int) -> tuple[Budget, float, float, float]
     return chosen, white * 10 ** (-psnr / 20), real, error_at(white, frame.errors_at)
 
 
-def test_a_wheel_that_turns_once_in_the_exposure_has_not_rested():
-    """Its flow is 0, and what it looks like after a third or a fifth of a turn is the same for 15 blades only."""
+def test_a_wheel_that_turns_once_in_the_exposure_counts_as_moving():
+    """Its flow is 0, and thirds and fifths of a turn look alike for 15 blades only."""
     rate = 2 * math.pi * 2000
     wheel = Body("wheel", square(1.2), Diffuse(0.8), Spin((0, 0, 1), rate))
     chosen, allowed, real, stated = held(scene(Body("wall", square(12, -1), Diffuse(0.1)), wheel), 30, 10)
     assert chosen.sub_frames >= 15
     assert real < allowed
-    assert 0.3 < stated / real < 4  # its instants are told by thirds, of a shape with four of everything
+    assert 0.3 < stated / real < 4  # thirds of its instants, for a shape of fourfold symmetry
     assert "0 % of the pixels move" not in explain(chosen)
 
 
 def test_a_body_that_no_pilot_frame_shows_is_found():
-    """It crosses the view in frames 4 to 7; light is looked at in frames 0, 10 and 20 of 21."""
+    """It crosses the view in frames 4 to 7; light is rendered in frames 0, 10 and 20 of 21."""
     path = Translation((1650.0, 0.0, 0.0), (-1650.0 * 5.5 / 2000, 0.0, 0.0))
     made = scene(Body("wall", square(12, -1), Diffuse(0.2)), Body("ghost", square(0.5), Diffuse(0.9), path))
     chosen, allowed, real, stated = held(made, 30, 5)
@@ -119,7 +120,7 @@ def test_a_body_that_no_pilot_frame_shows_is_found():
     assert 0.5 < stated / real < 4
 
 
-def test_instants_are_foretold_beyond_the_trials_and_their_limit_is_said():
+def test_instants_are_extrapolated_beyond_the_trials_up_to_a_stated_limit():
     rest = np.zeros((1, 8, 8))
     count, left, finding = fidelity.fewest_instants(rest, 1.0, lambda k: 27 / k)
     assert 90 <= count <= 96
@@ -131,7 +132,7 @@ def test_instants_are_foretold_beyond_the_trials_and_their_limit_is_said():
     assert f"the limit of {count} instants is reached" in finding.size
 
 
-def test_a_lucky_small_pilot_is_not_believed():
+def test_a_pilot_that_misses_rare_paths_by_chance_is_corrected():
     """A caustic that 8 samples missed: errors of 0.001, 0.09 and 0.03 with 8, 32 and 128 samples."""
     halves = [np.array([np.full((1, 4, 4), error), np.full((1, 4, 4), -error)]) + 1 for error in (0.001, 0.09, 0.03)]
     allowed = Allowed(white=100.0, target=0.0025)
@@ -148,14 +149,14 @@ def test_later_bounces_are_part_of_the_stated_error():
     assert errors[1] == pytest.approx(math.hypot(errors[0], 0.3))
 
 
-def test_a_clip_that_misses_what_was_asked_is_told():
+def test_a_clip_that_misses_the_requested_psnr_is_reported():
     low = Stated(38.9, 30.0, "white")
     assert shortfall(replace(low, psnr=39.6), 40) == shortfall(None, 40) == ""
     assert "38.9 dB below white, clamped there; 30.0 dB unclamped, where 40 were asked for" in shortfall(low, 40)
-    assert shortfall(replace(low, unclamped=None), 40) == ""  # an earlier version's, of another unit
+    assert shortfall(replace(low, unclamped=None), 40) == ""  # of an earlier version, in another unit
 
 
-def test_bounces_that_no_pilot_tried_are_not_called_nothing():
+def test_bounces_that_no_pilot_tried_are_not_stated_as_zero():
     full = np.full((1, 4, 4), 2.0)
     bounces, cut, finding = fidelity.fewest_bounces(lambda depth: full - 0.1, full, Allowed(5.0, 0.03))
     assert bounces == fidelity.DEEPEST
@@ -163,19 +164,19 @@ def test_bounces_that_no_pilot_tried_are_not_called_nothing():
     assert "deeper ones were not tried" in finding.size
 
 
-def test_the_choice_is_a_function_of_the_question():
+def test_equal_arguments_give_equal_budgets():
     made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
     assert choose_budget(made, psnr=25) == choose_budget(made, psnr=25)
 
 
-def test_a_lamp_behind_a_wall_is_said():
+def test_a_lamp_behind_a_wall_is_reported():
     made = scene(Body("wall", square(50, -1), Diffuse(0.5)), light=PointLight((0, 0, -2), 1.0))
     with pytest.raises(ValueError, match="the pilot saw no light"):
         choose_budget(made)
 
 
 @pytest.mark.parametrize("psnr", [0.0, 200.0])
-def test_an_error_nobody_can_ask_for_is_refused(psnr):
+def test_a_psnr_out_of_range_is_refused(psnr):
     with pytest.raises(ValueError, match="10 to 80 dB"):
         choose_budget(plate(None), psnr=psnr)
 

@@ -35,7 +35,7 @@ def test_a_spark_in_the_dark_gets_a_budget():
 
 
 def sun_in_a_ball():
-    """A lacquered ball under a sky with a small sun, whose mirror picture is far above white."""
+    """A lacquered ball under a sky with a small sun, whose reflection is far above white."""
     sky = np.full((32, 64), 0.05)
     sky[6:8, 40:42] = 400.0
     wall = Body("wall", square(12, -1), Diffuse(0.3))
@@ -43,10 +43,10 @@ def sun_in_a_ball():
     return scene(wall, shiny, light=EnvironmentImage(sky), camera=CAMERA.resized(48, 66))
 
 
-def test_a_scene_with_highlights_reaches_what_was_asked_and_stated():
-    """Below white, where scores count it: the 99.9th percentile of this scene lies 4 dB above.
+def test_a_scene_with_highlights_reaches_the_requested_and_the_stated_error():
+    """Errors count below white, as in scores; the 99.9th percentile of this scene is 4 dB higher.
 
-    Against a converged frame, whose own error is taken off. Six frames of 3168 pixels know their error to about 3 %.
+    The reference is a converged frame, whose error is subtracted. Six frames of 3168 pixels give the error to 3 %.
     """
     made = sun_in_a_ball()
     chosen = choose_budget(made, psnr=30, frames=1, denoise=False)
@@ -60,14 +60,14 @@ def test_a_scene_with_highlights_reaches_what_was_asked_and_stated():
     own = Errors.of_halves(halves, white)
     reached = math.sqrt(np.mean([error.at_white**2 for error in real]) - own.at_white**2)
     plain = math.sqrt(np.mean([error.plain**2 for error in real]) - own.plain**2)
-    said = math.sqrt(np.mean([error_at(white, frame.errors_at) ** 2 for frame in frames]))
+    stated_error = math.sqrt(np.mean([error_at(white, frame.errors_at) ** 2 for frame in frames]))
     assert plain > 1.1 * reached
-    assert said == pytest.approx(reached, rel=0.1)
+    assert stated_error == pytest.approx(reached, rel=0.1)
     assert math.sqrt(np.mean([frame.error**2 for frame in frames])) == pytest.approx(plain, rel=0.25)
     assert 29.5 < psnr(white, reached) < 36  # samples come in steps
 
 
-def test_the_light_left_out_is_told_with_its_error():
+def test_the_light_left_out_is_stated_with_its_error():
     rng = np.random.default_rng(2)
     full = 1 + rng.random((3, 40, 50))
     missing = 0.02 * rng.random(full.shape)
@@ -76,7 +76,7 @@ def test_the_light_left_out_is_told_with_its_error():
     assert abs(low - 0.01 / full.mean()) < critical_z() * error
 
 
-def test_the_share_that_moves_is_said():
+def test_the_fraction_that_moves_is_stated():
     extent = np.zeros((2, 10, 10))
     extent[:, 0, :4], extent[:, 1, 0] = 2.0, 0.09
     found = moving(extent, 0.0)
@@ -87,7 +87,7 @@ def test_the_share_that_moves_is_said():
 
 
 def test_a_rendered_clip_states_its_error_below_its_own_white(tmp_path, capsys):
-    """And `--explain` says what that means."""
+    """`--explain` prints the limit, the motion and the light left out."""
     command = ["render", "fan", "-o", str(tmp_path / "fan"), "--frames", "2", "--height", "24", "--width", "32"]
     assert main([*command, "--psnr", "20", "--explain"]) == 0
     clip, text = Clip.open(tmp_path / "fan"), capsys.readouterr().out

@@ -65,7 +65,7 @@ def test_going_forward_and_back_returns_where_valid():
 
 
 def test_what_a_plate_uncovers_and_covers_is_not_valid():
-    """The plate moves right by 1.5 px per frame: the wall just right of it is hidden next, nothing else changes."""
+    """The plate moves right by 1.5 px per frame and hides the wall just right of it; nothing else changes."""
     step = 1.5
     speed = step * RATE * 4 / CAMERA.focal_pixels
     frame = renderer(plate(Translation((speed, 0, 0)))).frame(0)
@@ -86,7 +86,7 @@ def test_what_leaves_the_frame_is_not_valid():
 
 
 def test_colours_move_with_the_flow():
-    """Even light on a matt plate: warping frame 1 by the flow gives frame 0 within noise and interpolation."""
+    """Uniform light on a matt plate: frame 1 warped by the flow equals frame 0 within noise and interpolation."""
     camera = CAMERA.resized(60, 80)
     smooth = Texture(0.5 + 0.3 * np.sin(np.linspace(0, 2 * np.pi, 64, endpoint=False))[None, :] * np.ones((64, 1)))
     made = scene(Body("plate", square(8), Diffuse(smooth), Translation((160.0, 60.0, 0))), camera=camera)
@@ -107,21 +107,21 @@ def test_a_static_scene_is_static():
         assert (first.truth[name] == 0).all()
     assert first.valid.all()
     assert (first.depth == second.depth).all()
-    assert (first.radiance != second.radiance).any()  # but every frame has noise of its own
+    assert (first.radiance != second.radiance).any()  # every frame has its own noise
 
 
 def test_a_panning_camera_moves_the_surroundings_too():
     angle = 0.05
     camera = Camera(2e-3, 2.8, 5e-5, 24, 33, origin=(0, 0, 4), motion=Spin((0, 1, 0), angle * RATE))
     frame = renderer(scene(light=EnvironmentImage(np.ones((8, 16))), camera=camera)).frame(0)
-    # The camera turns to its right (about its own y, which points down): the picture moves to the left.
+    # The camera turns right (about its y axis, which points down), so the picture moves left.
     expected = -camera.focal_pixels * math.tan(angle)
     assert frame.flow[0, 12, 16] == pytest.approx(expected, abs=0.02)
     assert (frame.body_id == -1).all()
 
 
 class Stretch(Still):
-    """A sheet whose x grows evenly: a deformation with a closed form."""
+    """A sheet whose x grows linearly: a deformation in closed form."""
 
     def deform(self, t: float) -> np.ndarray:
         return square(1.6).vertices * (1 + 200.0 * t, 1, 1)

@@ -1,4 +1,4 @@
-"""Lights, materials and pictures in Mitsuba: radiometry against closed forms; moving them compiles nothing."""
+"""Lights, materials and pictures in Mitsuba: radiometry against closed forms; motion compiles no kernel."""
 
 from __future__ import annotations
 
@@ -63,10 +63,10 @@ def test_the_clear_sky_gives_the_ground_the_irradiances_of_its_record():
 
 
 @pytest.mark.parametrize("lights", [(SunSky(),), (Constant(0.3), AreaLamp((1, 1, 3), (0, 0, 0), 0.5, 0.5, 90.0))])
-def test_smooth_surroundings_are_rarely_drawn_which_changes_no_mean_and_lowers_the_noise(lights):
-    """Beside Mitsuba's own weights: as many samples, the same mean, at most four fifths of the error.
+def test_rare_sampling_of_smooth_surroundings_keeps_the_mean_and_lowers_the_noise(lights):
+    """Against Mitsuba's own weights with equal samples: the same mean, at most four fifths of the error.
 
-    The rms of 792 pixels is known to 2.5 %; four fifths is what is promised, not what is found (less).
+    The rms of 792 pixels has a standard error of 2.5 %. The measured ratio is below four fifths.
     """
     things = Body("floor", square(4, -1), Diffuse(0.6)), Body("plate", square(0.7), RoughPlastic(0.4))
     made = replace(scene(*things), lights=lights)
@@ -88,7 +88,7 @@ def test_an_area_lamp_is_seen_with_its_radiance_from_the_front_only():
 
 
 def test_pictures_on_surfaces_and_around_lie_as_documented():
-    """Row 0 of a texture is on top (v = 1), column 0 on the left; the middle of an environment is towards +z."""
+    """Row 0 of a texture is at the top (v = 1), column 0 on the left; an environment's middle is towards +z."""
     picture = np.full((2, 2), 0.1)
     picture[0, 1] = 0.9
     body = Body("plate", square(1.0), Diffuse(Texture(picture, nearest=True)))
@@ -104,7 +104,7 @@ def test_pictures_on_surfaces_and_around_lie_as_documented():
 
 
 def launches(made: Renderer, work: Callable[[], object]) -> list[dict]:
-    """The compiled kernels that some work starts, as Dr.Jit records them."""
+    """Return the compiled kernels that `work` launches, as Dr.Jit records them."""
     if made.engine.backend == "scalar":
         pytest.skip("the scalar engine compiles nothing")
     import drjit as dr
@@ -116,8 +116,6 @@ def launches(made: Renderer, work: Callable[[], object]) -> list[dict]:
 
 
 SHAKEN = Camera(focal_length=2e-3, f_number=2.8, pixel_pitch=5e-5, height=24, width=33, motion=Translation((1.0, 0, 0)))
-
-
 SWINGING = AreaLamp((1, 1, 3), (0, 0, 0), 0.5, 0.5, 9.0, Oscillation((0.3, 0, 0), 100.0))
 
 
@@ -131,8 +129,8 @@ SWINGING = AreaLamp((1, 1, 3), (0, 0, 0), 0.5, 0.5, 9.0, Oscillation((0.3, 0, 0)
     ],
     ids=["body", "camera", "lamp", "point"],
 )
-def test_what_moves_is_data_and_compiles_no_kernel_anew(made):
-    """A kernel per place of the camera or of a lamp costs half a second each, many times what a small frame takes."""
+def test_motion_is_data_and_compiles_no_further_kernel(made):
+    """A kernel per position of the camera or of a lamp costs half a second, many times a small frame."""
     made = renderer(made)
     seen = [{launch["hash"] for launch in launches(made, lambda t=t: made.frame(t))} for t in range(4)]
     assert seen[0]
@@ -140,7 +138,7 @@ def test_what_moves_is_data_and_compiles_no_kernel_anew(made):
 
 
 def test_the_kernel_of_the_first_frame_serves_the_second():
-    """Loading anything amid what is traced gives the first pass of a depth a kernel of its own, half a second more."""
+    """Loading a plugin during tracing gives the first pass of a depth a separate kernel, half a second more."""
     made = renderer(plate(Translation((40.0, 0, 0))))
     seen = [launches(made, lambda t=t: made.halves([made.time(t)], CHEAP, made.key(t))) for t in range(2)]
     first, second = (max(each, key=lambda launch: launch["operation_count"])["hash"] for each in seen)

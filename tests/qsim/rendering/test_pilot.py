@@ -1,4 +1,4 @@
-"""The pilot: it finds every body and every fast frame, and does not rely on chance."""
+"""The pilot: it finds bodies and fast frames, and does not rely on chance."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from qsim.rendering.renderer import Renderer
 from qsim.scene import Body, Diffuse, Glow, Oscillation, SunSky, Texture
 
 
-def test_frames_are_added_in_which_things_go_that_rest_in_the_others():
-    """A slat out of view that stands still in frames 0, 10 and 20, and runs in 5 and 15."""
+def test_frames_with_fast_motion_that_the_others_miss_are_added():
+    """A slat out of view rests in frames 0, 10 and 20, and moves in 5 and 15."""
     swing = Oscillation((1.0, 0.0, 0.0), 100.0, math.pi / 2, (0.0, 50.0, 0.0))
     made = scene(Body("wall", square(12, -1), Diffuse(0.2)), Body("slat", square(0.5), Diffuse(0.9), swing))
     seen = pilot.Pilot.of(made, 2000.0, 1.0, 21, 0)
@@ -31,7 +31,7 @@ def test_frames_are_added_in_which_things_go_that_rest_in_the_others():
     assert pilot.rests(plate(None))
 
 
-def test_an_error_that_hardly_falls_asks_for_more_samples_than_there_are():
+def test_an_error_that_hardly_falls_needs_nearly_infinite_samples():
     assert pilot.needed_samples([8, 32, 128], [1.0, 0.99999], 0.1) > 1e30
     assert pilot.needed_samples([8, 32, 128], [1.0, 1.1], 0.1) == math.inf
     assert pilot.needed_samples([8, 32, 128], [1.0, 0.5], 0.25) == pytest.approx(128)
@@ -39,7 +39,7 @@ def test_an_error_that_hardly_falls_asks_for_more_samples_than_there_are():
 
 @pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
 def test_the_denoiser_is_tried_beside_the_middle_of_a_large_frame():
-    """A lamp fills the middle, which has no noise at all: the error asked for holds for the whole frame."""
+    """A lamp without noise fills the middle: the requested error holds for the complete frame."""
     camera = CAMERA.resized(256, 512)
     lamp = Body("lamp", square(200 / camera.focal_pixels * 4), Glow(0.3))
     leaves = Texture(np.random.default_rng(1).random((96, 96)), nearest=True)
@@ -51,8 +51,8 @@ def test_the_denoiser_is_tried_beside_the_middle_of_a_large_frame():
 
 
 @pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
-def test_a_denoised_trial_with_far_less_noise_than_the_pilots_is_not_believed():
-    """Its windows have missed the rare, bright paths that the pilots found; denoising knows of none."""
+def test_a_denoised_trial_with_far_less_noise_than_the_pilots_is_rejected():
+    """Its windows missed the rare bright paths that the pilots found."""
     made = plate(None, light=SunSky(), camera=replace(CAMERA, height=48, width=64))
     loaded, allowed = pilot.Pilot.of(made, 2000.0, 0.0, 1, 0), Allowed(white=10.0, target=0.02)
     lucky, plain = (

@@ -1,7 +1,7 @@
 """Rendering: energy, exposure, repeatability and the hard cases.
 
-Every scene is small. Radiometric tolerances are Monte-Carlo errors that the renderer itself measured, times the
-critical z of tests/support/stats.py; deterministic light (one sample decides) is compared to float32 rounding.
+Every scene is small. Radiometric tolerances are the renderer's measured Monte-Carlo errors times the critical z of
+tests/support/stats.py. Deterministic light (one sample decides) is compared to float32 rounding.
 """
 
 from __future__ import annotations
@@ -10,24 +10,23 @@ import math
 
 import numpy as np
 import pytest
-from small_scenes import CAMERA, CHEAP, RATE, plate, renderer, scene, square
+from small_scenes import CAMERA, CHEAP, RATE, mirrored_sun, plate, renderer, scene, square
 from stats import assert_same_rms, critical_z
 
 from qsim.backend import choose
 from qsim.optics.camera import Camera
-from qsim.rendering.budget import Budget
+from qsim.rendering.budget import Budget, blur_error
 from qsim.rendering.denoiser import available
 from qsim.rendering.engine import select
+from qsim.rendering.renderer import Renderer
 from qsim.scene import (
     AreaLamp,
     Body,
-    Conductor,
     Constant,
     Diffuse,
     Glow,
     Oscillation,
     PointLight,
-    RoughPlastic,
     Scene,
     Spin,
     Still,
@@ -35,6 +34,13 @@ from qsim.scene import (
     Translation,
     shapes,
 )
+
+
+@pytest.fixture(scope="module")
+def spinning() -> Renderer:
+    """A spinning plate, loaded once."""
+    return renderer(plate(Spin((0, 0, 1), 200.0)))
+
 
 # Radiometry
 
@@ -58,9 +64,9 @@ def test_an_empty_furnace_is_exact():
 
 
 def test_a_wall_under_100_lux_gives_the_photons_worked_by_hand():
-    """units.md, section 4: 100 lx on a 50 % Lambertian wall, f/2, T 0.9, 1.1 um, 0.5 ms at 555 nm: 6.960548 photons.
+    """100 lx on a 50 % Lambertian wall, f/2, T 0.9, 1.1 um, 0.5 ms at 555 nm: 6.960548 photons.
 
-    An even sky of radiance E / pi gives a plane facing it the irradiance E.
+    A uniform sky of radiance E / pi gives a plane facing it the irradiance E.
     """
     from qsim.optics.radiometry import LUMINOUS_EFFICACY, expected_photons
 
@@ -85,7 +91,7 @@ def test_a_wall_under_100_lux_gives_the_photons_worked_by_hand():
     ids=["sky", "bright sky", "lamp", "point"],
 )
 def test_scalar_and_vector_engines_agree(light):
-    """Also where a radiance above 1 makes Mitsuba's RGB variant compute with a spectrum of equal energy."""
+    """Also for a radiance above 1, for which Mitsuba's RGB variant uses an equal-energy spectrum."""
     camera = Camera(2e-3, 2.8, 2e-4, 5, 7, origin=(0.5, 0.2, 4))
     body = Body("plate", square(1.5), Diffuse(0.6), Translation((100.0, 0, 0)))
     made = scene(body, camera=camera, light=light)
@@ -103,7 +109,7 @@ def test_scalar_and_vector_engines_agree(light):
 
 
 def test_the_scalar_engine_is_as_quiet_as_the_others(capfd):
-    """Mitsuba's scalar variant warns of a vertex of smooth meshes whose normals, which ours replace, it cannot make."""
+    """Mitsuba's scalar variant warns of normals of smooth meshes that it cannot compute; ours replace them."""
     ball = Body("ball", shapes.ball(0.5), Diffuse(0.6), Translation((100.0, 0, 0)))
     try:
         slow = renderer(scene(ball), budget=CHEAP, engine=choose("scalar"))
@@ -118,7 +124,7 @@ def test_the_scalar_engine_is_as_quiet_as_the_others(capfd):
 
 
 def test_an_open_shutter_blurs_by_the_motion_and_keeps_the_energy():
-    """A glowing plate before darkness: blur moves light about but keeps its sum; the sharp instant has no ramp."""
+    """A glowing plate in the dark: blur redistributes light but keeps its sum; the sharp instant has no ramp."""
     lamp = Body("lamp", square(0.8), Glow(2.0), Translation((3 * RATE * 4 / CAMERA.focal_pixels, 0, 0)))
     made = Scene("lamp", 0, CAMERA, (), (lamp,))
     frame = renderer(made, shutter=1.0, budget=Budget(18 * 8, 1, 9)).frame(0)
@@ -130,8 +136,6 @@ def test_an_open_shutter_blurs_by_the_motion_and_keeps_the_energy():
 
 
 def test_the_mean_of_more_instants_converges_like_the_stated_blur_error():
-    from qsim.rendering.budget import blur_error
-
     extent = 3.0
     lamp = Body("lamp", square(0.8), Glow(1.0), Translation((extent * RATE * 4 / CAMERA.focal_pixels, 0, 0)))
     made = Scene("lamp", 0, CAMERA, (), (lamp,))
@@ -145,10 +149,9 @@ def test_the_mean_of_more_instants_converges_like_the_stated_blur_error():
 # Repeatability
 
 
-def test_any_frame_alone_is_the_same_frame_and_seeds_differ():
+def test_any_frame_alone_is_the_same_frame_and_seeds_differ(spinning):
     made = plate(Spin((0, 0, 1), 200.0))
-    one = renderer(made)
-    in_order = [one.frame(t) for t in range(3)]
+    in_order = [spinning.frame(t) for t in range(3)]
     alone = renderer(made).frame(2)
     assert alone.radiance.tobytes() == in_order[2].radiance.tobytes()
     assert all((alone.truth[name] == in_order[2].truth[name]).all() for name in alone.truth)
@@ -166,8 +169,8 @@ def test_the_measured_error_is_the_error():
     assert_same_rms(within, (images[::2] - images[1::2]) / math.sqrt(2))
 
 
-def test_a_frame_in_parts_is_no_worse_than_a_whole_one(monkeypatch):
-    """Pixels are shared among the parts, not samples: grids of 64 in 16 parts, not 16 grids of 4 (1.7 times worse)."""
+def test_a_frame_in_parts_is_as_good_as_a_complete_one(monkeypatch):
+    """Parts divide pixels, not samples: grids of 64 in 16 parts, not 16 grids of 4 (1.7 times the error)."""
     made = plate(None, light=SunSky(), camera=CAMERA)
     entire, parts = (renderer(made, budget=Budget(128, 2)) for _ in range(2))
     whole = entire.frame(1, with_truth=False)
@@ -182,22 +185,21 @@ def test_a_frame_in_parts_is_no_worse_than_a_whole_one(monkeypatch):
 
 
 @pytest.mark.parametrize("denoise", [False, True])
-def test_a_sample_that_is_no_number_costs_one_pixel(monkeypatch, denoise):
+def test_a_sample_that_is_not_a_number_costs_one_pixel(monkeypatch, denoise):
     if denoise and not available():
         pytest.skip("Open Image Denoise is not installed: pip install 'qsim[denoise]'")
     one = renderer(plate(None, light=SunSky()), budget=Budget(8, 2, denoise=denoise))
     halves = one.halves([0.0], one.budget, one.key(0))
     halves[0, 3, 4] = np.nan
-    monkeypatch.setattr(one, "_means", lambda *_: np.stack([halves] * 3))
+    monkeypatch.setattr(one, "means", lambda *_: np.stack([halves] * 3))
     frame = one.frame(0, with_truth=False)
     assert np.isfinite(frame.radiance).all()
     assert math.isfinite(frame.error)
     assert frame.fireflies >= 1
 
 
-def test_a_crop_shows_the_window_of_the_whole():
-    made = plate(Spin((0, 0, 1), 200.0))
-    whole = renderer(made).frame(1)
+def test_a_crop_shows_its_window_of_the_frame(spinning):
+    made, whole = spinning.scene, spinning.frame(1)
     part = renderer(made, crop=(3, 5, 9, 14)).frame(1)
     assert part.radiance.shape == (9, 14)
     for name in ("flow", "valid", "depth", "body_id"):
@@ -236,10 +238,7 @@ def test_wild_motions_render(motion):
 
 
 def test_a_mirror_that_faces_the_sun_reports_its_fireflies():
-    """A mirror on the ground throws the sun at a wall: a path finds that by chance only."""
-    mirror = Body("mirror", square(4), Conductor(roughness=0.02), Still((0, -1, 1), (-math.pi / 2, 0, 0)))
-    rough = Body("wall", square(9, -1), RoughPlastic(0.5))
-    frame = renderer(scene(rough, mirror, light=SunSky()), budget=Budget(8, 4)).frame(0)
+    frame = renderer(mirrored_sun(), budget=Budget(8, 4)).frame(0)
     assert np.isfinite(frame.radiance).all()
     assert frame.fireflies > 0
 
@@ -251,7 +250,7 @@ def test_a_mirror_that_faces_the_sun_reports_its_fireflies():
         ({"shutter": 1.5}, "shutter: a share of the frame time"),
     ],
 )
-def test_rates_that_make_no_sense_are_refused(options, message):
+def test_rates_out_of_range_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         renderer(scene(), **options)
 
