@@ -6,8 +6,7 @@ The naive loop is `mi.render` per frame with the default integrator, the default
 It takes the smallest power of two of samples that reaches the level. Ours is `Renderer.frame` without ground truth,
 with the budget of `choose_budget` for the level; the measurement of its error is included. Both start from a loaded
 scene and are timed alternately. Processor seconds stand beside wall seconds, because other programs change them less.
-Rows of short frames take up to 15 rounds, since a median of three can be a fifth off. The variance of the reference is
-subtracted.
+Rows of short frames take up to 15 rounds, since medians of three scatter. The variance of the reference is subtracted.
 """
 
 from __future__ import annotations
