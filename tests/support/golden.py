@@ -1,4 +1,4 @@
-"""Weights by rule for the published network, and a recorder of its stages (spec section 3)."""
+"""Makes networks with weights by rule, and records the stages of the published one."""
 
 import math
 import zlib
@@ -16,7 +16,7 @@ from quiver.model.published_weights import published_name
 from quiver.model.quiver import QUIVER
 
 DATA = Path(__file__).parents[1] / "data"
-TINY = FoldedConfig(  # the published design with the smallest parts, for tests that need no more
+TINY = FoldedConfig(  # the published design with the smallest parts, for fast tests
     channels=2,
     deformable_kernel=3,
     denoiser_growth=2,
@@ -38,7 +38,7 @@ CONSTANTS = {"spynet.mean": 0.449, "spynet.std": 0.226}
 
 
 def rule(name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Every weight is a function of its published name and shape."""
+    """Return the values of a weight, a function of its published name and shape."""
     w = np.random.default_rng(zlib.crc32(name.encode())).standard_normal(shape, dtype=np.float32)
     if len(shape) == 1:
         return np.float32(0.05) * w
@@ -46,7 +46,7 @@ def rule(name: str, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def published_state() -> dict[str, Tensor]:
-    """All 335 entries at width 16, read from the table of published names."""
+    """Return all 335 entries at width 16, by the table of published names."""
     state: dict[str, Tensor] = {}
     for line in (DATA / "published_state_dict.tsv").read_text().splitlines()[1:]:
         name, size, kind = line.split("\t")
@@ -61,7 +61,7 @@ def published_state() -> dict[str, Tensor]:
 
 
 def network(channels: int, dtype: torch.dtype) -> QUIVER:
-    """The published network of any width with weights by rule."""
+    """Return the published network of any width with weights by rule."""
     model = QUIVER(Config(channels=channels))
     with torch.no_grad():
         for name, parameter in model.named_parameters():
@@ -70,7 +70,7 @@ def network(channels: int, dtype: torch.dtype) -> QUIVER:
 
 
 def fill_by_rule(model: nn.Module) -> nn.Module:
-    """Lively weights for any network of ours: nothing is near zero, offsets and masks included."""
+    """Set weights by rule in any network of ours, so that nothing is near zero, offsets and masks included."""
     with torch.no_grad():
         for name, parameter in model.named_parameters():
             parameter.copy_(torch.as_tensor(rule(name, tuple(parameter.shape))))
@@ -78,12 +78,12 @@ def fill_by_rule(model: nn.Module) -> nn.Module:
 
 
 def draw(*shape: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> Tensor:
-    """Codes 0..7 as the network sees them."""
+    """Return random codes 0..7, over 7, as the networks take them."""
     return torch.randint(0, 8, shape, generator=torch.Generator().manual_seed(seed)).to(dtype) / 7
 
 
 def lively(config: Config, dtype: torch.dtype = torch.float64) -> QUIVER:
-    """Weights of natural size everywhere, so that no stage is silent."""
+    """Return a network with weights by rule, so that every stage contributes."""
     network = fill_by_rule(assemble(config)).to(dtype).eval()
     assert isinstance(network, QUIVER)
     return network
@@ -91,7 +91,7 @@ def lively(config: Config, dtype: torch.dtype = torch.float64) -> QUIVER:
 
 @torch.no_grad()
 def stages(model: QUIVER, codes: np.ndarray) -> dict[str, Tensor]:
-    """One forward pass of codes/7, with what passed between the stages, under the names of the golden file."""
+    """Return the results of all stages for codes/7, under the names of the golden file."""
     calls: dict[str, list] = {}
     watched = {
         "flow": model.flow,

@@ -1,4 +1,4 @@
-"""Files with anything in them: refused in one line, in bounded time and memory."""
+"""Holds wrong values of every kind for files, and the bounds within which a file must be refused."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ VALUES: tuple[Any, ...] = (
     *NUMBERS,
     *(None, True, False, "", "3", "x" * 5000, [], {}, [2], [0], [10**9], [2] * 1000, [[2]], {"a": 1}, [None], ["2"]),
 )
-MEMORY = 200e6  # bytes, for one file of some kB: far more than it needs, far less than an unbounded one takes
+MEMORY = 200e6  # bytes for a file of some kB: far more than needed, far less than without bounds
 
 
 @functools.cache
 def patience() -> float:
-    """CPU seconds for one file of some kB: as long as hashing 2 GB takes, 200 times 10 MB here."""
+    """Return CPU seconds for a file of some kB: those of hashing 2 GB, measured with 10 MB."""
     started = time.process_time()
     hashlib.sha256(bytes(10_000_000)).digest()
     return 200 * (time.process_time() - started)
 
 
 def one_line(error: BaseException, path: Path, cure: str = "") -> None:
-    """A ValueError in one line of moderate length that names the file and the cure."""
+    """Assert that the error is a ValueError of one line that names the file and the remedy."""
     text = str(error)
     assert cure in text
     assert isinstance(error, ValueError)

@@ -1,4 +1,4 @@
-"""Training runs on a small scale."""
+"""Makes settings and networks for small training runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Warping and deformable convolution against slow loops, limits and finite differences."""
+"""Compares warping and deformable convolution with slow loops, limits and finite differences."""
 
 from itertools import product
 
@@ -18,7 +18,7 @@ def draw(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tens
 
 
 def bilinear(image: np.ndarray, y: float, x: float, padding: str = "zeros") -> float:
-    """One sample of [H, W], neighbour by neighbour."""
+    """Return one bilinear sample of [H, W], neighbour by neighbour."""
     height, width = image.shape
     if padding == "border":
         y, x = min(max(y, 0), height - 1), min(max(x, 0), width - 1)
@@ -31,7 +31,7 @@ def bilinear(image: np.ndarray, y: float, x: float, padding: str = "zeros") -> f
 
 
 def slow_deform(image, offset, weight, bias, mask, stride=1, padding=0, dilation=1) -> np.ndarray:
-    """The definition, sample by sample."""
+    """Return the convolution by its definition, sample by sample."""
     count, channels = image.shape[:2]
     out, fan, kh, kw = weight.shape
     taps, groups = kh * kw, channels // fan
@@ -88,7 +88,7 @@ def test_frames_one_pixel_wide(size):
 
 
 def test_warp_gradients():
-    """Fractions stay in [0.1, 0.9]: at whole pixels bilinear sampling has a kink."""
+    """Fractions stay in [0.1, 0.9]: at integer positions bilinear sampling has a kink."""
     image = draw(1, 2, 4, 5).requires_grad_()
     flow = torch.rand(1, 2, 4, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) * 0.8 + 0.1 - 1
     assert torch.autograd.gradcheck(warp, (image, flow.requires_grad_()))
@@ -127,7 +127,7 @@ def test_whole_offsets_shift_the_image_also_beyond_its_border(shift):
 @pytest.mark.parametrize("groups", [1, 2, 4])
 @pytest.mark.parametrize(("dtype", "limit"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
 def test_deformable_convolution_equals_a_slow_loop(groups, dtype, limit):
-    """Offsets of several pixels, many of them beyond the frame; stride 2 and dilation 2 with two convolution groups."""
+    """Offsets of several pixels, many beyond the frame; stride 2 and dilation 2 with two convolution groups."""
     image, weight, bias = (
         draw(2, 4, *SIZE, dtype=dtype),
         draw(4, 2, 3, 3, seed=1, dtype=dtype),
@@ -158,7 +158,7 @@ def test_deformable_convolution_gradients(tap_loop):
 
 
 def test_large_inputs_take_the_tap_loop_only_without_gradients(monkeypatch):
-    """Seen from outside: the number of samples drawn at once."""
+    """The number of samples computed at once shows which form runs."""
     import quiver.model.deformable as ops
 
     drawn = []
@@ -175,7 +175,7 @@ def test_large_inputs_take_the_tap_loop_only_without_gradients(monkeypatch):
 
 
 def test_half_precision_is_sampled_in_float32():
-    """bfloat16 has 8 bits: positions beyond 256 would be off by whole pixels."""
+    """bfloat16 has 8 bits: positions beyond 256 would be wrong by a pixel or more."""
     image = torch.zeros(1, 1, 1, 600, dtype=torch.bfloat16)
     image[..., 513] = 1
     flow = torch.zeros(1, 2, 1, 600)

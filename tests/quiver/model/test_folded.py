@@ -1,4 +1,4 @@
-"""FoldedQUIVER's start: about the mean of the middle frames, and lively features."""
+"""Tests the initial weights of FoldedQUIVER: about the mean of the middle frames, and features that vary."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from quiver.model.presets import assemble, build
 
 
 def test_an_untrained_nano_returns_about_the_mean_of_the_middle_frames():
-    """Where nothing moves; the random layers add less than a fifth of the noise of one frame (rms)."""
+    """On a static window the random layers add less than a fifth of the noise of one frame (rms)."""
     torch.manual_seed(0)
     network, x = build("nano"), draw(1, 1, 1, 32, 32, dtype=torch.float32).repeat(1, 11, 1, 1, 1)
     with torch.no_grad():
@@ -23,7 +23,7 @@ def test_an_untrained_nano_returns_about_the_mean_of_the_middle_frames():
 
 
 def test_the_lecun_start_keeps_the_fused_features_alive():
-    """Spread over space, four starts together: default weights leave little, as two faded signals are multiplied."""
+    """Standard deviation over space, sum of four starts: with default weights the gate multiplies two weak signals."""
     x, spread = draw(1, 11, 1, 32, 32, dtype=torch.float32), {False: 0.0, True: 0.0}
     for lecun in (False, True):
         for seed in range(4):

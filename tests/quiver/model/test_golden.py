@@ -1,4 +1,4 @@
-"""QUIVER equals the published network: numbers at every stage, for weights that are a function of their names."""
+"""Compares every stage of QUIVER with numbers of the published network, for weights by rule."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ def golden() -> dict[str, np.ndarray]:
 
 
 def errors(ours: dict[str, torch.Tensor], golden: dict[str, np.ndarray]) -> dict[str, float]:
-    """max |ours - golden| / std(golden) of every key."""
+    """Return max |ours - golden| / std(golden) of every key."""
     assert ours.keys() == golden.keys() - {"codes"}
     result = {}
     for key, tensor in ours.items():
@@ -36,14 +36,14 @@ def test_the_rule_gives_the_weights_of_the_specification():
 
 
 def test_every_stage_equals_the_published_network_in_float32(golden):
-    """Promised: 1e-3. We demand 5e-5, which also tells the exact GELU from its tanh approximation (6e-4 at `tca`)."""
+    """5e-5 also separates the exact GELU from its tanh approximation, which differs by 6e-4 at `tca`."""
     found = errors(stages(from_published(published_state()), golden["codes"]), golden)
     assert max(found.values()) < 5e-5, found
 
 
 @pytest.mark.slow
 def test_every_stage_equals_the_published_network_in_float64(golden):
-    """1e-6 is what storing the golden arrays as float32 leaves."""
+    """1e-6 is the rounding of the golden arrays, which are stored as float32."""
     found = errors(stages(from_published(published_state()).double(), golden["codes"]), golden)
     assert max(found.values()) < 1e-6, found
 
@@ -58,7 +58,7 @@ class Summary:
     last: float
 
 
-# No multiples of 32, two clips at once, 13 frames (spec 3.4, case A).
+# Sizes that are not multiples of 32, two clips in a batch, 13 frames.
 CASE_A = {
     "denoised": Summary((2, 13, 1, 36, 44), 0.4965304603, 0.4525002964, 0.3631571475),
     "flow1": Summary((24, 2, 36, 44), 0.3458710136, 0.8654593401, -0.5263080308),
@@ -71,7 +71,7 @@ CASE_A = {
     "out2": Summary((2, 3, 1, 18, 22), -0.0511396432, 0.0162652916, -0.0305866918),
     "out1": Summary((2, 3, 1, 36, 44), -0.0209870157, 0.0175746591, -0.0058943731),
 }
-# Four channels in each deformable group (case B).
+# Four channels in each deformable group.
 CASE_B = {
     "denoised": Summary((1, 11, 1, 32, 32), 0.0590104579, 0.4332943623, 0.2382229363),
     "flow1": Summary((10, 2, 32, 32), 0.4134338407, 1.4150452001, -0.9606242688),
@@ -93,7 +93,7 @@ CASE_B = {
     ids=["odd-sizes-two-clips-thirteen-frames", "full-width"],
 )
 def test_other_sizes_and_widths_equal_the_published_network(channels, seed, shape, wanted):
-    """Ten digits are printed, so 1e-9 of the standard deviation is out of reach; 2e-8 is not."""
+    """The published numbers have ten digits, which allows 2e-8 of the standard deviation."""
     codes = np.random.default_rng(seed).integers(0, 8, shape)
     found = stages(network(channels, torch.float64), codes)
     for key, summary in wanted.items():

@@ -1,4 +1,4 @@
-"""The initial estimate: velocities turn with their frames, and the answer does with the window."""
+"""Tests that the initial estimate turns with its window, and velocities with their frames."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from quiver.model.plane_sweep import aligned
 
 @pytest.mark.parametrize("change", [turned, mirrored])
 def test_velocities_turn_with_their_frames(change):
-    """Frames drawn along turned velocities are the turned frames drawn along the velocities."""
+    """Turned frames aligned by turned velocities equal the turned aligned frames."""
     frames, rest = draw(2, 11, 9, 12), torch.zeros(2, 2, 9, 12, dtype=torch.float64)
     velocity = 3 * draw(2, 2, 9, 12, seed=1) - 1
     seen = change(torch.cat([frames, velocity], 1), 11)
@@ -19,8 +19,8 @@ def test_velocities_turn_with_their_frames(change):
 
 
 @pytest.mark.parametrize("largest", [0.0, 7.0])
-def test_an_estimate_in_use_answers_turned_windows_alike(largest):
-    """Its own answers differ, their mean over the eight symmetries does not; while training nothing is averaged."""
+def test_an_estimate_outside_training_turns_with_its_window(largest):
+    """A single correction differs, its mean over the eight symmetries does not; training uses no mean."""
     torch.manual_seed(0)
     estimate = InitialEstimate(4, largest).double().eval()
     seen, x = draw(1, 25 if largest else 11, 8, 12), 22 if largest else None

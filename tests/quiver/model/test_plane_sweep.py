@@ -1,4 +1,4 @@
-"""The velocity sweep: known motion, the obvious loop's choice, rest where nothing is to be seen, hard sizes."""
+"""Tests the velocity search: known motion, the choice of a naive loop, rest in flat regions, small sizes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GRID = 2 * plane_sweep.STEP  # px/frame at full size
 def sliding(
     velocity: tuple[float, float], size: tuple[int, int] = (40, 48), acceleration: tuple[float, float] = (0.0, 0.0)
 ) -> torch.Tensor:
-    """[1, 11, h, w]: a sum of waves of 8 to 16 px that moves by `velocity` (x, y) px per frame, values 0.1 to 0.9."""
+    """Return [1, 11, h, w]: waves of 8 to 16 px that move by `velocity` (x, y) px per frame, values 0.1 to 0.9."""
     rng = np.random.default_rng(5)
     y, x = np.mgrid[: size[0], : size[1]]
     angles, lengths, phases = rng.uniform(0, 2 * np.pi, 9), rng.uniform(8, 16, 9), rng.uniform(0, 2 * np.pi, 9)
@@ -32,7 +32,7 @@ def sliding(
 
 @pytest.mark.parametrize("velocity", [(0.0, 0.0), (1.0, 0.0), (-0.5, 2.0), (1.3, -0.8), (3.0, 2.5)])
 def test_known_motion_is_found(velocity):
-    """Away from the border: within half a step of the grid, nearly everywhere a tenth. The frames then agree."""
+    """Away from the border the error is below half a step of the grid, mostly below a tenth. The frames then agree."""
     window = sliding(velocity, (56, 64))
     found = paths(window, 7.0)
     inner = (..., slice(18, -18), slice(18, -18))
@@ -46,7 +46,7 @@ def test_known_motion_is_found(velocity):
 
 @pytest.mark.parametrize("acceleration", [(0.2, 0.0), (-0.1, 0.15)])
 def test_known_acceleration_is_found(acceleration):
-    """The few corrections find more than half of it in most places; then the frames agree far better than before."""
+    """The corrections find more than half of it at most pixels, and the frames agree far better than before."""
     window = sliding((1.0, -0.5), (64, 72), acceleration)
     velocity, found = paths(window, 7.0)
     inner = (..., slice(18, -18), slice(18, -18))
@@ -57,7 +57,7 @@ def test_known_acceleration_is_found(acceleration):
 
 
 def test_the_grid_is_searched_as_the_obvious_loop_does():
-    """Pixel by pixel in NumPy, float64: weights, whole-pixel shifts, box means and the choice are the same."""
+    """A loop over pixels in NumPy, float64: weights, shifts by pixels, box means and the choice are the same."""
     window = sliding((1.0, -0.5), (12, 14))[0].double().numpy()[1:10]
     weights = np.exp(-0.5 * (np.arange(-4, 5) / plane_sweep.SIGMA) ** 2)
     weights /= weights.sum()
@@ -82,7 +82,7 @@ def test_the_grid_is_searched_as_the_obvious_loop_does():
 
 
 def test_noise_is_averaged_along_the_way():
-    """Photon noise on a moving pattern: drawn together, the mean over time is unbiased and far closer to the truth."""
+    """With photon noise, the mean over time of aligned frames is unbiased and far closer to the truth."""
     clean = sliding((1.5, -1.0), (64, 64))
     photons = torch.from_numpy(np.random.default_rng(1).poisson(6.0 * clean.numpy()).astype(np.float32)) / 6
     found = paths(photons, 7.0)

@@ -1,4 +1,4 @@
-"""Networks by name: their sizes, and the ablations of the paper."""
+"""Tests networks by name: their sizes, and the ablations of the paper."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ def test_the_published_sizes_to_the_last_parameter():
 
 
 def test_nano_fits_its_file():
-    """The shipped weights may take 5 MB of float32; the control is of the same kind of size."""
+    """The shipped weights may have 5 MB of float32; the control has a similar size."""
     assert 4 * parameter_count(PRESETS["nano"]) < 5e6
     assert sum(p.numel() for p in UNet().parameters()) == 911_841
 

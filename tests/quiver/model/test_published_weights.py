@@ -1,4 +1,4 @@
-"""The 335 published entries, their conversion, and everything that must be refused."""
+"""Tests the 335 published entries, their conversion, and the refusal of everything else."""
 
 import pickle
 from pathlib import Path
@@ -88,7 +88,7 @@ def test_a_checkpoint_is_converted(tmp_path: Path, state, wrap, prefix):
 
 
 class Bomb:
-    """Pickled, this writes a file when it is loaded."""
+    """An object whose pickle writes a file when it is loaded."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

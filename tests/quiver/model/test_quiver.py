@@ -1,4 +1,4 @@
-"""QUIVER beyond the golden numbers: parts, shapes, batches, hard inputs."""
+"""Tests QUIVER beyond the golden numbers: parts, shapes, batches, hard inputs."""
 
 from dataclasses import replace
 
@@ -73,7 +73,7 @@ def test_inputs_that_do_not_fit_are_refused(shape, message):
 
 @BOTH
 def test_output_shapes_and_units(config):
-    """Flow is in full-size pixels on the grid of the frames also where they are folded."""
+    """The flow of folded frames is also in full-size pixels, on the grid of the frames."""
     out = lively(config, torch.float32)(draw(2, 13, 1, 16, 24, dtype=torch.float32))
     assert out.denoised.shape == (2, 13, 1, 16, 24)
     assert out.scale1.shape == (2, 3, 1, 16, 24)
@@ -85,7 +85,7 @@ def test_output_shapes_and_units(config):
 @pytest.mark.parametrize("lecun", [False, True])
 @pytest.mark.parametrize("kernel", [1, 3])
 def test_alignment_starts_from_the_flow_alone(kernel, lecun):
-    """Offsets of zero and masks of one half: half a convolution of the image moved by the flow."""
+    """With offsets of zero and masks of one half the result is half a convolution of the image moved by the flow."""
     torch.manual_seed(0)
     alignment = assemble(replace(SMALL, deformable_kernel=kernel, lecun=lecun)).double().alignment
     previous, current, flow = draw(1, 4, 8, 8), draw(1, 4, 8, 8, seed=1), torch.zeros(1, 2, 8, 8, dtype=torch.float64)
@@ -99,7 +99,7 @@ def test_alignment_starts_from_the_flow_alone(kernel, lecun):
 
 
 def test_inference_in_small_pieces_gives_the_same_numbers(monkeypatch):
-    """Frames one by one and taps one by one, as for frames too large for one go."""
+    """Frames and taps are computed one by one, as for frames that are too large."""
     network, x = lively(SMALL), draw(2, 12, 1, 16, 16)
     with_gradients = network(x).scale1.detach()
     monkeypatch.setattr(model_module, "CHUNK_PIXELS", 1)
@@ -152,7 +152,7 @@ def test_one_bright_pixel_is_seen():
 
 @pytest.mark.parametrize("far", [1e3, 1e6, -1e6])
 def test_flow_beyond_the_frame_is_survived(far):
-    """Everything then comes from outside, which counts as zero: finite values and gradients."""
+    """All samples then are outside and count as zero; values and gradients are finite."""
     network = lively(SMALL, torch.float32)
     assert network.flow is not None
     with torch.no_grad():
@@ -177,7 +177,7 @@ def test_the_smallest_frames(config):
 
 @pytest.mark.parametrize(("dtype", "promised"), [(torch.bfloat16, 0.04), (torch.float16, 0.005)])
 def test_half_precision_has_the_stated_error(dtype, promised):
-    """RMS difference to float32 over the standard deviation, published design at width 16, every output."""
+    """RMS difference to float32 over the standard deviation, at width 16, for every output."""
     network16, x = network(16, torch.float32), draw(1, 11, 1, 16, 16, dtype=torch.float32)
     with torch.no_grad():
         full = network16(x)

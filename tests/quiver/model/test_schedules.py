@@ -1,4 +1,4 @@
-"""The same numbers by other roads: work that windows share is done once."""
+"""Tests that schedules with shared work give the numbers of windows or of one pass."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -17,7 +17,7 @@ BOTH = pytest.mark.parametrize("config", [SMALL, FOLDED], ids=["small", "folded"
 
 @torch.no_grad()
 def run(schedule: Callable[[QUIVER, Iterable[Tensor]], Iterator[Tensor]], network: QUIVER, x: Tensor) -> Tensor:
-    """[B, T, 1, H, W] -> [B, T-10, 1, H, W]."""
+    """Run a schedule on [B, T, 1, H, W] -> [B, T-10, 1, H, W]."""
     return torch.stack(list(schedule(network, x.unbind(1))), dim=1)
 
 
@@ -47,7 +47,7 @@ def test_the_published_network_runs_by_every_schedule():
 
 
 def test_streaming_is_not_the_same_as_windows():
-    """The carried state and the missing zeros are visible: the difference is real, and it is not large."""
+    """The kept state and the missing zeros make a difference, which is not large."""
     network, x = lively(SMALL), draw(1, 16, 1, 16, 24)
     windows, stream = run(schedules.windows, network, x), run(schedules.stream, network, x)
     difference = (windows - stream).square().mean().sqrt() / windows.std()

@@ -1,4 +1,4 @@
-"""Weights in and out: our files, those of earlier versions, and files with anything in them."""
+"""Tests weights files: ours, those of earlier versions, and files with wrong values of every kind."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_saved_networks_come_back_the_same(tmp_path: Path, build):
 
 
 def earlier(network: nn.Module, config: dict[str, object], path: Path) -> None:
-    """Weights as a program wrote them that had one configuration for QUIVER and FoldedQUIVER."""
+    """Write weights as earlier versions did, which had one configuration for QUIVER and FoldedQUIVER."""
     old = {new: name for name, new in RENAMED_PARTS.items()}
     parts = ((name.partition("."), value) for name, value in network.state_dict().items())
     tensors = {old.get(part, part) + dot + rest: value.contiguous() for (part, dot, rest), value in parts}
@@ -87,7 +87,7 @@ def earlier(network: nn.Module, config: dict[str, object], path: Path) -> None:
     ids=["quiver", "folded", "unet"],
 )
 def test_weights_of_earlier_versions_are_read(tmp_path: Path, network):
-    """Their configuration named every size of the published design; parts had other names."""
+    """Their configuration held every size of the published design, and parts had other names."""
     config = network.config.to_dict()
     if not isinstance(network, UNet):
         old = {new: name for name, new in RENAMED.items()}
@@ -124,7 +124,7 @@ def test_weights_that_do_not_fit_are_refused(tmp_path: Path):
         load(path)
 
 
-# Files with anything in them
+# Wrong values of every kind
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def tiny() -> dict[str, torch.Tensor]:
 
 
 def refused_or_loaded(path: Path) -> bool:
-    """Whether the file is refused; asserts that the answer comes in bounded time and memory."""
+    """Return whether the file is refused, and assert bounded time and memory."""
     before, started = reset_peak(), time.process_time()
     try:
         load(path)
@@ -150,7 +150,7 @@ def refused_or_loaded(path: Path) -> bool:
 
 @pytest.mark.parametrize("key", sorted(SMALLEST.to_dict()))
 def test_any_value_of_any_key_of_a_configuration(tiny, tmp_path, key):
-    """What is loaded after all has a configuration that says the same thing."""
+    """A file that is not refused loads with the same configuration."""
     path, wanted = tmp_path / "w.safetensors", SMALLEST.to_dict()
     for value in VALUES:
         config = json.dumps(wanted | {key: value})

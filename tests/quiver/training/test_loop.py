@@ -1,4 +1,4 @@
-"""One loop: killed and resumed equals uninterrupted, NaN stops it, low precision, two processes."""
+"""Tests the training loop: resumed equals uninterrupted, NaN stops it, low precision, two processes."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ ROOT = Path(__file__).parents[3]
 
 
 class Killed(Exception):
-    """Stands for a process that dies: nothing is cleaned up by the loop."""
+    """Stands for a killed process: the loop cleans up nothing."""
 
 
 @pytest.mark.parametrize(("schedule", "optimiser"), [("cosine", "adam"), ("plateau", "adam"), ("cosine", "muon")])
 def test_killed_and_resumed_equals_uninterrupted(tiny_dataset, tmp_path, monkeypatch, schedule, optimiser):
-    """Killed after step 5 with the last state saved at step 3: steps 4 and 5 are done again, to the same bits."""
+    """Killed after step 5 with the last state saved at step 3: steps 4 and 5 are repeated bit for bit."""
     through = small_network()
     kinds = {"schedule": schedule, "optimiser": optimiser}
     whole = train(through, settings(tiny_dataset, tmp_path / "a", **kinds), progress=False)
@@ -55,7 +55,7 @@ def test_killed_and_resumed_equals_uninterrupted(tiny_dataset, tmp_path, monkeyp
     with pytest.raises(Killed):
         train(small_network(), again, should_stop=die, progress=False)
     assert torch.load(tmp_path / "b/checkpoint.pt", weights_only=True)["state"]["step"] in (2, 3)
-    resumed = small_network(seed=99)  # its own weights must not matter
+    resumed = small_network(seed=99)  # its initial weights must not matter
     state = train(resumed, again, progress=False)
     assert same_weights(through, resumed)
     assert state.step == whole.step == 6
@@ -102,7 +102,7 @@ def test_it_learns(tiny_dataset, tmp_path):
 
 
 class Poisoned(nn.Module):
-    """Turns to NaN at its third call with gradients, as a network does whose weights have left the road."""
+    """Returns NaN from its third call with gradients on, as a network that diverges."""
 
     multiple = 4
     config = UNetConfig(1)
@@ -133,7 +133,7 @@ def test_nan_stops_with_step_samples_and_state(tiny_dataset, tmp_path):
 
 @pytest.mark.parametrize(("network", "optimiser", "rate"), [("unet", "adam", 1e-3), ("nano", "muon", 6e-3)])
 def test_ten_times_the_rate_stays_finite_or_stops(tiny_dataset, tmp_path, network, optimiser, rate):
-    """200 steps of a protocol's optimiser; of nano a narrow one, for time."""
+    """200 steps of a protocol's optimiser; a narrow nano saves time."""
     kinds = {"optimiser": optimiser, "learning_rate": 10 * rate, "loss": "scales-l1", "head_start": 0.85}
     fast = settings(tiny_dataset, tmp_path / "r", steps=200, batch=1, validate_every=100, **kinds)
     torch.manual_seed(0)
@@ -170,7 +170,7 @@ def test_without_validation_clips_the_training_clips_serve(tmp_path):
 
 
 def test_bfloat16_trains_with_float32_losses(tiny_dataset, tmp_path):
-    """Same samples, same start: the first losses differ by less than bfloat16's 2^-8 of them."""
+    """From the same samples and weights, the first losses differ by less than bfloat16's 2^-8 of them."""
     full = train(small_network(), settings(tiny_dataset, tmp_path / "a", steps=1), progress=False)
     low = train(small_network(), settings(tiny_dataset, tmp_path / "b", steps=1, precision="bfloat16"), progress=False)
     a, b = full.history[0]["loss"], low.history[0]["loss"]
@@ -180,7 +180,7 @@ def test_bfloat16_trains_with_float32_losses(tiny_dataset, tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_train_as_one_with_twice_the_batch(tiny_dataset, tmp_path):
-    """torchrun, gloo: gradients are averaged over both shares, so weights agree with a batch of four to rounding."""
+    """torchrun with gloo averages gradients over both shares: weights agree with a batch of four to rounding."""
     alone = small_network()
     train(alone, settings(tiny_dataset, tmp_path / "a", batch=4, steps=3), progress=False)
     program = tmp_path / "run.py"
@@ -207,7 +207,7 @@ def test_two_processes_train_as_one_with_twice_the_batch(tiny_dataset, tmp_path)
 
 
 def test_a_head_start_trains_the_estimate_alone(tiny_dataset, tmp_path):
-    """After the first half only the estimate has moved; the second half moves the rest, from its last layers on."""
+    """In the first half only the estimate changes; in the second half the other parts do, from the last layers on."""
 
     def moved(steps: int, out: str) -> set[str]:
         torch.manual_seed(0)
@@ -230,7 +230,7 @@ def test_a_head_start_trains_the_estimate_alone(tiny_dataset, tmp_path):
 
 
 def test_validation_has_one_peak_for_every_sensor(tiny_dataset, tmp_path):
-    """A 1-bit code at 10 PPP: the peak is 25 photons, not the white of 1 that every pixel of the truth passes."""
+    """Of 1-bit codes at 10 PPP the peak is 25 photons, not the white of 1, which every pixel of the truth exceeds."""
     asked = settings(tiny_dataset, tmp_path / "r", sensor="spad-320x240", ppp=(10.0,), bits=(1,))
     windows = make_windows(settled(asked)[0], 4)[1]
     sample = windows[0]
@@ -238,7 +238,7 @@ def test_validation_has_one_peak_for_every_sensor(tiny_dataset, tmp_path):
     assert float(sample["target"].max()) > 8  # the ceiling of training targets does not cut the truth
 
     class Exact(torch.nn.Module):
-        """Answers with so much of the truth."""
+        """Returns a share of the truth."""
 
         share = 0.8
 

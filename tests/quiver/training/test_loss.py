@@ -1,4 +1,4 @@
-"""The loss against slow NumPy, its published weights, and its place in time."""
+"""Compares the loss with slow NumPy, and tests its published weights and its target frames."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def draw(*shape: int, seed: int = 0) -> Tensor:
 
 
 def slow_pair_loss(a: np.ndarray, b: np.ndarray, loss: Loss) -> float:
-    """Each gradient image made on its own, frame by frame, with scipy's convolution."""
+    """Return the loss with every gradient image computed separately by SciPy's convolution."""
     sobel = np.array([[1.0, 0, -1], [2, 0, -2], [1, 0, -1]])
     total = np.abs(a - b).mean()
     for axis in (0, 1):
@@ -53,7 +53,7 @@ def test_a_constant_difference_has_no_gradient():
 
 
 def test_weights_are_those_of_the_paper():
-    """A constant error in one output at a time: 0.85, 0.10, 0.05 and 0.20 of it arrive; all together 1.2."""
+    """A constant error in one output counts 0.85, 0.10, 0.05 and 0.20; in all of them 1.2."""
     target = torch.full((1, 11, 1, 8, 8), 0.5)
     exact = Output(target.clone(), target[:, :1], target[:, :1, :, :4, :4], target[:, :1, :, :2, :2])
     assert training_loss(exact, target, PUBLISHED, first=5).item() == 0
@@ -71,7 +71,7 @@ def test_outputs_that_are_not_built_cost_nothing():
 
 
 def test_the_centre_frame_is_the_target():
-    """Thirteen frames, three outputs from frame 5 on: only frames 5, 6, 7 give zero."""
+    """Of thirteen frames and three outputs from frame 5 on, only frames 5, 6, 7 give zero."""
     target = draw(2, 13, 1, 8, 8)
     assert training_loss(target[:, 5:8], target, L1, first=5).item() == 0
     assert training_loss(target[:, 4:7], target, L1, first=5).item() > 0.1

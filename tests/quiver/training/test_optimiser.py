@@ -1,4 +1,4 @@
-"""Adam alone or with Muon: who changes what, by how much, and that a kernel is a matrix in the same memory."""
+"""Tests Adam and Muon: the weights that each updates, the size of a step, and kernels as matrices."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ RATE = 0.01
 
 
 def network() -> UNet:
-    """With gradients of singular values from 1 to 100 in every kernel."""
+    """Return a U-Net with gradients of singular values from 1 to 100 in every kernel."""
     torch.manual_seed(0)
     unet = UNet(UNetConfig(8))
     for weight in unet.parameters():
@@ -32,9 +32,9 @@ def steps(unet: UNet, kind: str) -> dict[str, torch.Tensor]:
 
 
 def check_first_step_of_adam(unet: UNet, name: str, step: torch.Tensor) -> None:
-    """Against its gradient by the rate, less only where the gradient g is near 1e-8: by g / (|g| + 1e-8).
+    """Assert a step of -rate * g / (|g| + 1e-8) for the gradient g.
 
-    rtol covers float32: the difference of weights below 1, 6e-8 of them, is 6e-6 of the step.
+    rtol covers float32: a rounding of 6e-8 in the difference of weights below 1 is 6e-6 of the step.
     """
     gradient = unet.get_parameter(name).grad
     assert gradient is not None
@@ -49,7 +49,7 @@ def test_adam_moves_every_weight_by_the_rate():
 
 
 def test_muon_moves_every_direction_of_a_kernel_alike():
-    """The polar factor of the gradient, found anew by a singular value decomposition, as large as a step of Adam."""
+    """The step is the polar factor of the gradient, here by singular values, in the size of a step of Adam."""
     unet = network()
     inner = 0
     for name, step in steps(unet, "muon").items():
@@ -61,7 +61,7 @@ def test_muon_moves_every_direction_of_a_kernel_alike():
         assert gradient is not None
         u, _, v = torch.linalg.svd(gradient.flatten(1), full_matrices=False)
         strengths = torch.diag(u.T @ -step.flatten(1) @ v.T) / (0.2 * RATE * max(gradient.flatten(1).shape) ** 0.5)
-        # torch's five iterations end between 0.7 and 1.2 for all that is above 1/500 of the norm
+        # torch's five iterations give 0.7 to 1.2 for singular values above 1/500 of the norm
         assert 0.6 < strengths.min() <= strengths.max() < 1.25, name
     assert inner > 10
 
@@ -77,7 +77,7 @@ def test_a_weight_without_gradient_stays(kind):
 
 
 def test_kernels_that_are_no_matrices_are_refused():
-    """Their copy would be trained in their stead."""
+    """Muon would otherwise update a copy of them."""
     unet = network().to(memory_format=torch.channels_last)
     with pytest.raises(ValueError, match=r"body\..*weight: Muon sees kernels as matrices"):
         steps(unet, "muon")

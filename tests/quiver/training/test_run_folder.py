@@ -1,4 +1,4 @@
-"""The folder of a run: its files, its lock, a full disk, and states with anything in them."""
+"""Tests the folder of a run: files, lock, a full disk, and states with wrong values of every kind."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_files_of_a_run(tiny_dataset, tmp_path):
 
 def test_other_settings_are_refused(tiny_dataset, tmp_path):
     opened(settings(tiny_dataset, tmp_path / "r"))
-    opened(settings(tiny_dataset, tmp_path / "r", workers=3))  # decides nothing
+    opened(settings(tiny_dataset, tmp_path / "r", workers=3))  # does not change the run
     with pytest.raises(FileExistsError, match="holds a run with seed 0, now it is 1"):
         opened(settings(tiny_dataset, tmp_path / "r", seed=1))
     (tmp_path / "other").mkdir()
@@ -63,7 +63,7 @@ def opened(wanted: Settings, *, force: bool = False) -> None:
 
 
 def test_one_process_at_a_time_trains_in_a_folder(tiny_dataset, tmp_path):
-    """A second command, with --force or without, is refused in one line; the folder stays as it is, and free after."""
+    """A second command is refused in one line, also with --force; the folder does not change."""
     mine = settings(tiny_dataset, tmp_path / "r")
     words = [sys.executable, "-m", "quiver", "train", tiny_dataset, "-o", mine.out, "--steps", 6, "--crop", 16]
     words += ["--preset", "unet"]
@@ -79,7 +79,7 @@ def test_one_process_at_a_time_trains_in_a_folder(tiny_dataset, tmp_path):
 
 
 def test_a_full_disk_inside_a_checkpoint(tiny_dataset, tmp_path, monkeypatch):
-    """The system's error with the file's name, and nothing half-written: every file of the folder is whole."""
+    """The error of the system names the file, and every file of the folder is complete."""
     mine = settings(tiny_dataset, tmp_path / "r", steps=2)
     train(small_network(), mine, progress=False)
     whole = (tmp_path / "r/checkpoint.pt").read_bytes()
@@ -120,7 +120,7 @@ for share in (0.9, 0.5, 0.1, 0.0):
 
 
 def test_a_disk_that_is_full_after_some_bytes_of_a_checkpoint(tmp_path):
-    """The write itself fails halfway, at the system's limit on a file's size: its error, and the old file stays."""
+    """The write fails halfway, at the system's limit on file sizes; the old file stays."""
     words = [sys.executable, "-c", FILLED, str(tmp_path)]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == 4 * [f"{tmp_path / 'checkpoint.pt'} True 1"]
@@ -135,7 +135,7 @@ def test_a_damaged_state_is_named(tiny_dataset, tmp_path):
 
 
 def trained(folder: Path) -> tuple[Run, dict[str, Any]]:
-    """A run with a state after one step."""
+    """Return a run after one step, and its state."""
     run = Run(Settings("data", str(folder), steps=3))
     with run.open():
         pass
@@ -153,7 +153,7 @@ def resumed(run: Run) -> State:
     optimiser = Optimiser(model, "muon", 1e-3, (0.9, 0.99))
     state = run.load(model, optimiser, torch.device("cpu"))
     model(torch.rand(1, 11, 1, 8, 8)).scale1.sum().backward()
-    optimiser.step(1e-3)  # what was taken in can be worked with
+    optimiser.step(1e-3)  # the loaded state is usable
     return state
 
 
@@ -167,7 +167,7 @@ ODD: tuple[Any, ...] = (
 
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Where something can be replaced in nested dictionaries and lists."""
+    """Return the path of every value in nested dictionaries and lists."""
     found = [path] if path else []
     if isinstance(value, dict | list):
         for key in value if isinstance(value, dict) else range(len(value)):
@@ -185,9 +185,9 @@ def replaced(value: Any, path: tuple[Any, ...], new: Any) -> Any:
 
 @pytest.mark.parametrize("cases", [60, pytest.param(600, marks=pytest.mark.slow)])
 def test_any_value_at_any_place_of_a_checkpoint(tmp_path, cases):
-    """Refused in one line that says what to do, or a state that training can go on from.
+    """The file is refused in one line with a remedy, or training can continue from it.
 
-    What stands for the optimiser's settings is not read: the run has its own.
+    The stored settings of the optimiser are not read: the run has settings.
     """
     run, content = trained(tmp_path / "r")
     assert asdict(resumed(run)) == content["state"]
@@ -203,7 +203,7 @@ def test_any_value_at_any_place_of_a_checkpoint(tmp_path, cases):
             refusals += 1
         assert time.process_time() - started < patience()
         assert peak_memory() - before < MEMORY
-    assert refusals > 0.8 * cases  # the others hold a number that could have been
+    assert refusals > 0.8 * cases  # the others hold a possible number
 
 
 @pytest.mark.parametrize("content", [{"model": {1: 2}}, {}, [], None, 3, {"state": {}}, {"state": None, "model": {}}])
@@ -216,7 +216,7 @@ def test_a_checkpoint_of_something_else(tmp_path, content):
 
 
 def test_a_checkpoint_that_unpacks_to_more_than_it_is(tmp_path):
-    """Torch stores its parts as they are; a compressed part of zeros could fill the memory."""
+    """Torch does not compress; a compressed part of zeros could fill the memory."""
     import zipfile
 
     run, _ = trained(tmp_path / "r")

@@ -1,4 +1,4 @@
-"""Learning rate, plateau and the time limit."""
+"""Tests the learning rate, the plateau and the time limit."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ def test_cosine_follows_steps_or_time():
     assert learning_rate(short, State(step=2)) == pytest.approx(0.4)  # the rise ends after a twentieth: at step 5
     assert learning_rate(short, State(step=5)) == 1.0
     assert learning_rate(by_steps, State(step=500)) == pytest.approx(0.5)
-    assert learning_rate(by_steps, State(step=1000)) == pytest.approx(0.01)  # never quite zero
+    assert learning_rate(by_steps, State(step=1000)) == pytest.approx(0.01)  # never zero
     by_time = Settings("d", "o", minutes=10, learning_rate=1.0, warmup=0)
     assert learning_rate(by_time, State(step=77, elapsed=300)) == pytest.approx(0.5)
 
 
 def test_plateau_halves_at_the_ninth_validation_without_gain():
-    """Patience 8: eight validations without a relative gain of 1e-4 are borne, the ninth halves the rate."""
+    """With patience 8, the ninth validation in a row without a relative gain of 1e-4 halves the rate."""
     state, plan = State(), Settings("d", "o", steps=9, schedule="plateau", warmup=0, learning_rate=1.0)
     note_plateau(8, state, 30.0)
     for _ in range(8):

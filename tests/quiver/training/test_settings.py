@@ -1,4 +1,4 @@
-"""Settings of a run: protocols, mixed light, and what is refused."""
+"""Tests the settings of a run: protocols, mixed light, and wrong values."""
 
 from __future__ import annotations
 
