@@ -82,7 +82,7 @@ class Device:
 
     name: str
     what: str  # one line
-    bits: int  # where the caller does not say
+    bits: int  # unless the caller gives others
     make: Callable[[float | None, int, float], Sensor]  # (ppp, bits, exposure [s]) -> Sensor
     sources: Mapping[str, str]  # field -> source, condition
     follows_light: bool = False  # the gain is set from the PPP
@@ -97,7 +97,7 @@ _RULE = "0.5 (2^bits - 1) / PPP; the rule behind the default of the authors' pro
 
 def _need(name: str, ppp: float | None) -> float:
     if ppp is None:
-        raise ValueError(f"{name}: the gain follows the light level; say the photons per pixel (--ppp)")
+        raise ValueError(f"{name}: the gain follows the light level; give the photons per pixel (--ppp)")
     return ppp
 
 
@@ -232,7 +232,7 @@ def load(name: str | Path, *, ppp: float | None = None, bits: int | None = None,
         )
     sensor = from_toml(path)
     if bits is not None and bits != sensor.bits:
-        raise ValueError(f"{path}: the file says bits = {sensor.bits}, asked for {bits}; change one of them")
+        raise ValueError(f"{path}: the file has bits = {sensor.bits}, asked for {bits}; change one of them")
     return sensor
 
 

@@ -31,7 +31,7 @@ class Distribution(ABC):
     """The law of the codes of one pixel. Subclasses are frozen dataclasses of its parameters."""
 
     bits: int  # of a code, 1 ... 16
-    code_model: ClassVar[str]  # what a code is: "multibit" read, "binary_sum" of planes, "counting"
+    code_model: ClassVar[str]  # kind of code: "multibit" read, "binary_sum" of planes, "counting"
 
     @property
     @abstractmethod

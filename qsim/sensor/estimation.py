@@ -181,7 +181,9 @@ def _refuse_impossible(sensor: Distribution, exposure: float, counts: Array) -> 
     impossible = (counts > 0) & (_grid(sensor, exposure).log_pmf <= _NEVER).all(axis=0)
     if impossible.any():
         *where, code = (int(i) for i in np.argwhere(impossible)[0])
-        raise ValueError(f"histogram{where or ''} holds code {code}, which no light gives with this {sensor!r}")
+        raise ValueError(
+            f"histogram{where or ''} contains code {code}, which has probability 0 at every light level for {sensor!r}"
+        )
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""One sensor of every kind of law, for tests of what all sensors share."""
+"""One sensor of every kind of law, for tests of the code that all sensors share."""
 
 from __future__ import annotations
 

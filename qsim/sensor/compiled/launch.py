@@ -81,8 +81,8 @@ def _octets(pairs: Array, bits: int) -> Array:
         return (pairs.view(np.uint32) * np.uint32(0x40100401)) >> np.uint32(24)
     eights = _join(_join(pairs, 2 * bits), 4 * bits)
     size = eights.dtype.itemsize
-    whole = eights.byteswap().view(np.uint8).reshape(*eights.shape, size)[..., size - bits :]
-    return whole.reshape(*eights.shape[:-1], -1)
+    octets = eights.byteswap().view(np.uint8).reshape(*eights.shape, size)[..., size - bits :]
+    return octets.reshape(*eights.shape[:-1], -1)
 
 
 def _join(numbers: Array, bits: int) -> Array:

@@ -40,7 +40,7 @@ class Electrons:
     highest: float  # arrivals beyond which every step without a floor is 0; more light changes nothing
     halved: bool  # exp(highest) overflows, so both sides carry half of the exponent
     scale: float
-    full: Array  # [n] coefficient of a whole term, scale^n / n!
+    full: Array  # [n] coefficient of a full term, scale^n / n!
     prefix: tuple[int, ...]  # per step: terms 0 ... prefix - 1 in full
     band: tuple[Array, ...]  # per step: coefficients of terms prefix, prefix + 1, ...
     floor: Array  # per step: what every number of electrons contributes (full well), else 0

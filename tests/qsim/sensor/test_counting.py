@@ -186,7 +186,7 @@ def test_settings_that_make_no_sense_are_named():
     ("k", "live"), [(255, 240.0), (1023, 1050.0), (4095, 4000.0), (65_000, 65_200.0), (65_534, 64_800.0)]
 )
 def test_the_error_of_deep_counters_is_below_1e_11(k, live):
-    """P(N <= k) summed downwards from n = k with 40 digits: what the bisection of codes above 8 bits looks at."""
+    """P(N <= k) summed downwards from n = k with 40 digits: the bisection above 8 bits compares these."""
     from scipy.special import gammainc, gammaincc
 
     with mp.workdps(40):

@@ -144,7 +144,7 @@ def test_a_wrong_file_is_refused_with_what_and_where(tmp_path, change, text):
 def test_other_mistakes_say_what_to_do(tmp_path):
     with pytest.raises(ValueError, match="unknown sensor 'quiver-phisical' \\(did you mean 'quiver-physical'"):
         load("quiver-phisical")
-    with pytest.raises(ValueError, match="say the photons per pixel"):
+    with pytest.raises(ValueError, match="give the photons per pixel"):
         load("quiver-physical")
     with pytest.raises(ValueError, match="photons per pixel above 0, got 0"):
         load("quiver-physical", ppp=0)
@@ -152,5 +152,5 @@ def test_other_mistakes_say_what_to_do(tmp_path):
         load(tmp_path / "absent.toml")
     path = tmp_path / "mine.toml"
     path.write_text("[sensor]\n" + "".join(f"{key} = {value}\n" for key, value in GOOD.items()))
-    with pytest.raises(ValueError, match="the file says bits = 1, asked for 3"):
+    with pytest.raises(ValueError, match="the file has bits = 1, asked for 3"):
         load(path, bits=3)

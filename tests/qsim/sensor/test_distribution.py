@@ -1,4 +1,4 @@
-"""What follows from a cdf: probabilities, moments, likelihood, information, and codes of uniform numbers."""
+"""The laws that follow from a cdf: probabilities, moments, likelihood, information, and codes of uniform numbers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_the_three_descriptions_agree(sensor: Sensor):
 @each
 @pytest.mark.parametrize("light", [0.0, 1e-12, 1e4, 1e12])
 def test_extreme_light_is_a_distribution(sensor: Sensor, light):
-    """One pixel among them, and a whole frame drawn: no NaN, no code without probability, nothing above 1."""
+    """One pixel, and a frame that is drawn: no NaN, no code without probability, nothing above 1."""
     cdf, pmf, log_pmf = (f(light, EXPOSURE) for f in (sensor.cdf, sensor.pmf, sensor.log_pmf))
     assert np.all((cdf >= 0) & (cdf <= 1) & (np.diff(cdf, prepend=0.0) >= -1e-15))
     assert pmf.sum() == pytest.approx(1.0, abs=1e-12)

@@ -85,7 +85,8 @@ def test_histograms_without_answer_are_named():
     with pytest.raises(ValueError, match=r"^histogram\[1, 0\] counts codes: finite, not negative, at least one"):
         sensor.maximum_likelihood(counts, EXPOSURE)
     counts[1, 0, 0] = 1
-    with pytest.raises(ValueError, match=r"^histogram\[0, 0\] holds code 1, which no light gives with this QIS\("):
+    message = r"^histogram\[0, 0\] contains code 1, which has probability 0 at every light level for QIS\("
+    with pytest.raises(ValueError, match=message):
         sensor.maximum_likelihood(counts, EXPOSURE)  # gain 2 without read noise: codes are even
 
 

@@ -1,4 +1,4 @@
-"""Packing: there and back for every width and depth, the field's golden bytes, and messages that say where."""
+"""Packing: there and back for every width and depth, the field's golden bytes, and messages with the place."""
 
 import re
 
@@ -11,7 +11,7 @@ from qsim.sensor.packing import MAX_BITS, check, code_dtype, pack, packed_width,
 
 
 def bit_string(codes: np.ndarray, bits: int) -> str:
-    """One row written the slow and obvious way: binary digits side by side, zeros up to a whole byte."""
+    """Return one row written the slow way: binary digits side by side, with zeros up to a full byte."""
     digits = "".join(format(int(code), f"0{bits}b") for code in codes)
     return digits + "0" * (-len(digits) % 8)
 

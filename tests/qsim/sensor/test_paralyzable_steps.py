@@ -102,7 +102,7 @@ def test_all_light_up_to_a_million_photons_is_served(seed):
 
 @pytest.mark.parametrize(("ratio", "arrivals"), [(1e4, 3e4), (200.0, 1e3), (50.0, 60.0)])
 def test_bright_codes_are_counts_of_arrivals_one_by_one(ratio, arrivals):
-    """Against arrivals that are drawn and looked at; the first had no closed form."""
+    """Against arrivals that are drawn one by one; the first case had no closed form."""
     rng = np.random.default_rng(9)
     counts = []
     for n in rng.poisson(arrivals, 2000):

@@ -31,7 +31,7 @@ def oracle(sensor: QIS, photons: np.ndarray, levels: list[int]) -> tuple[list, l
             if k in (-1, top):
                 return (mp.mpf(k == top), mp.mpf(k != top))
             electrons = min(mp.mpf(n), well)
-            if sigma == 0:  # the ADC sees what float64 makes of gain n + offset; Python rounds half to even
+            if sigma == 0:  # the ADC rounds the float64 value of gain n + offset; Python rounds half to even
                 code = round(sensor.gain * float(electrons) + sensor.offset)
                 return (mp.mpf(code <= k), mp.mpf(code > k))
             z = ((k + mp.mpf(0.5) - mp.mpf(sensor.offset)) / mp.mpf(sensor.gain) - electrons) / sigma / mp.sqrt(2)
@@ -81,7 +81,7 @@ def test_probabilities_agree_with_the_oracle(bits, read_noise, gain):
 
 @pytest.mark.parametrize("well", [3.0, 4.5, 200.0])
 def test_full_well_agrees_with_the_oracle(well):
-    """N above the well counts as the well, whole or not; read noise comes after it."""
+    """N above the well counts as the well, also if that is no integer; read noise comes after it."""
     sensor = QIS(0.8, 1.6, 0.6, 3, 0.9, offset=0.3, full_well=well)
     errors = largest_errors(sensor, LIGHT, list(range(8)))
     assert np.all(np.array(errors) < (1e-10, 1e-8, 1e-8)), errors
@@ -183,7 +183,7 @@ def test_the_process_has_the_distribution_of_the_cdf(bits, read_noise, photons):
 
 
 def test_fewer_bits_of_the_same_pixel_are_the_clipped_code():
-    """The same key, gain and offset: a 1-bit and a 3-bit read-out see the same electrons as 5 bits do."""
+    """The same key, gain and offset: a 1-bit, a 3-bit and a 5-bit read-out have the same electrons."""
     light = np.random.default_rng(0).uniform(0, 30, (40, 37))
     wide = QIS(0.8, 1.6, 0.2, 5).sample(light, EXPOSURE, key=Key(1, 2), engine="reference")
     for bits in (1, 3):
@@ -191,7 +191,7 @@ def test_fewer_bits_of_the_same_pixel_are_the_clipped_code():
         np.testing.assert_array_equal(narrow, np.minimum(wide, 2**bits - 1))
 
 
-def test_white_is_known_from_the_settings_alone():
+def test_white_follows_from_the_settings_alone():
     """8.125 photons at the gain of 3.25 PPP: 7 / (0.5 * 7 / 3.25 * 0.8)."""
     assert QIS(0.8, 1.6, 0.2, 3, gain=0.5 * 7 / 3.25).white(EXPOSURE) == pytest.approx(8.125)
 

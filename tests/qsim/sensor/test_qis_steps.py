@@ -51,7 +51,7 @@ def test_steps_and_their_slopes_are_the_tables(seed):
 
 @pytest.mark.parametrize("seed", range(30))
 def test_codes_found_step_by_step_are_those_of_the_whole_table(seed):
-    """The same law at the same numbers: `decide` of the sensor against that of the base class, which looks at all."""
+    """The same law at the same numbers: `decide` of the sensor against the base class, which compares all steps."""
     rng = np.random.default_rng(1000 + seed)
     sensor = random_qis(rng, 5000)
     photons = rng.permutation(np.tile(light(rng, sensor, 100), 2))
@@ -67,7 +67,7 @@ def test_codes_found_step_by_step_are_those_of_the_whole_table(seed):
 
 @pytest.mark.parametrize(("bits", "gain", "noise"), [(8, 0.0085, 0.0), (8, 0.05, 2.0), (8, 1e-3, 10.0), (3, 1e-3, 5.0)])
 def test_a_long_table_costs_a_few_steps_a_pixel(bits, gain, noise, monkeypatch):
-    """Steps looked at, and electrons summed, a pixel: bounded by bits and read noise, not by the table's length."""
+    """Steps computed and electrons summed per pixel are bounded by bits and read noise, not by the table's length."""
     sensor = QIS(0.8, 1.6, noise, bits, gain=gain)
     photons = np.random.default_rng(0).uniform(0, 1.2 * sensor.white(EXPOSURE), (64, 64))
     looked = []

@@ -49,7 +49,7 @@ def test_frames_may_be_drawn_in_any_order(sensor: Sensor):
 
 
 def test_another_process_draws_the_same():
-    """Frames 3 and 1 by a fresh interpreter with another hash seed: neither state, order nor worker is in the noise."""
+    """Frames 3 and 1 by a fresh interpreter with another hash seed: state, order and worker change no noise."""
     light = np.full((4, 7, 9), 3.25)
     here = SENSORS[0].sample(light, EXPOSURE, key=Key(5, 6), engine="reference")
     program = (
@@ -83,7 +83,7 @@ def test_blocks_of_rows_do_not_show():
 
 @pytest.mark.parametrize("sensor", SENSORS[:-1])
 def test_more_light_never_lowers_a_code(sensor: Sensor):
-    """At a fixed key u is fixed and F falls with light (but for paralysis): a brighter world differs upwards only."""
+    """At a fixed key u is fixed and F falls with light (but for paralysis): more light changes codes upwards only."""
     low, high = (sensor.sample(np.full((40, 41), v), EXPOSURE, key=Key(2, 2), engine="reference") for v in (3.0, 3.6))
     assert np.all(high >= low)
     assert np.any(high > low)

@@ -15,7 +15,11 @@ from quiver.baselines import METHODS, moment
 
 EXPOSURE = 5e-4
 DEAD_TIMES = (0.0, 35e-9, 1e-6, 1e-4, 4e-4, 2e-3)
-REFUSALS = ("does not rise with light", "does not resolve; use a longer window", "which no light gives with this")
+REFUSALS = (
+    "does not rise with light",
+    "does not resolve; use a longer window",
+    "which has probability 0 at every light level",
+)
 
 
 def random_sensor(rng, photons, most):

@@ -181,7 +181,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ),
     ("train", "--ppp"): of_training("--ppp", "9"),
     ("train", "--bits"): of_training(
-        "--bits", "1", Refused(f"{TRAIN} --sensor spad.toml", "--bits 2", "the file says bits = 1")
+        "--bits", "1", Refused(f"{TRAIN} --sensor spad.toml", "--bits 2", "the file has bits = 1")
     ),
     ("train", "--crop"): of_training("--crop", "8", Refused(TRAIN, "--crop 6", "needs a multiple of 4")),
     ("train", "--frames"): of_training(

@@ -1,7 +1,7 @@
-"""The compiled engine against the reference over random sensors: the whole range of every parameter, not chosen ones.
+"""The compiled engine against the reference over random sensors: the full range of every parameter, not chosen ones.
 
 A sensor may differ in 3 of its 41 472 pixels, all of a batch together in 5 pixels per million. Sensors that the engine
-hands to the reference, as a whole or in more than half of their pixels, are counted: fewer than a tenth up to 8 bits.
+hands to the reference, for all or more than half of their pixels, are counted: fewer than a tenth up to 8 bits.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def random_light(rng: np.random.Generator, sensor: Sensor) -> np.ndarray:
 
 @dataclass
 class Count:
-    """What a batch found."""
+    """The results of a batch."""
 
     pixels: int = 0
     differ: int = 0
@@ -189,7 +189,7 @@ def corner_sensor(rng: np.random.Generator, bits: int) -> Sensor:
 
 
 def corner_light(rng: np.random.Generator, sensor: Sensor, shape: tuple[int, ...]) -> np.ndarray:
-    """All orders of magnitude; none, denormal and much; usual; float64 that is no float32; next to whole photons."""
+    """All orders of magnitude; none, denormal and much; usual; float64 beyond float32's digits; next to integers."""
     kind = rng.integers(5)
     if kind == 0:
         return 10 ** rng.uniform(-2, 6, shape)

@@ -20,10 +20,10 @@ def test_float32_alone_stays_well_within_its_margin(name, monkeypatch):
     sensor = SENSORS[name]
     photons = light(sensor, (2, 300, 500), seed=3)
     expected = fast(sensor, photons)
-    whole = plan_of(sensor, EXPOSURE)
-    monkeypatch.setattr(sensor_module, "plan_of", lambda *_: replace(whole, margin=whole.margin / 4))
+    plan = plan_of(sensor, EXPOSURE)
+    monkeypatch.setattr(sensor_module, "plan_of", lambda *_: replace(plan, margin=plan.margin / 4))
     np.testing.assert_array_equal(fast(sensor, photons), expected)
-    monkeypatch.setattr(sensor_module, "plan_of", lambda *_: replace(whole, margin=0.0))
+    monkeypatch.setattr(sensor_module, "plan_of", lambda *_: replace(plan, margin=0.0))
     assert (fast(sensor, photons) != expected).mean() <= 2e-5
 
 

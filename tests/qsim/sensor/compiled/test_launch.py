@@ -190,6 +190,6 @@ os._exit(0)
 
 @needs_engine
 def test_no_kernel_reads_beyond_its_light():
-    """32 bytes below two mebibytes: the last packet reached into a page that is not there, and the process ended."""
+    """32 bytes below two mebibytes: the last packet reached into a missing page, which ended the process."""
     done = subprocess.run([sys.executable, "-c", ODD], timeout=120, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

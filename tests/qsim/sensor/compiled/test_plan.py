@@ -28,17 +28,17 @@ def test_the_sums_are_the_cdf(name):
 def test_curves_are_the_cdf(name):
     """At random light, dark to beyond the last step, to half of their margin: their error and float32's rounding."""
     sensor = SENSORS[name]
-    whole = plan_of(sensor, EXPOSURE)
-    assert isinstance(whole.steps, Curves)
-    brightest = min(1.5 * sensor.white(EXPOSURE), 0.98 * whole.steps.brightest**2 / sensor.efficiency)
+    plan = plan_of(sensor, EXPOSURE)
+    assert isinstance(plan.steps, Curves)
+    brightest = min(1.5 * sensor.white(EXPOSURE), 0.98 * plan.steps.brightest**2 / sensor.efficiency)
     photons = np.random.default_rng(1).uniform(0, brightest, 500).astype(np.float32)
-    at = (np.sqrt(sensor.arrivals(photons, EXPOSURE))[:, None] - whole.steps.start) * whole.steps.rate
-    cells = whole.steps.cubics.shape[1]
+    at = (np.sqrt(sensor.arrivals(photons, EXPOSURE))[:, None] - plan.steps.start) * plan.steps.rate
+    cells = plan.steps.cubics.shape[1]
     at = np.clip(at, 0, cells)
     cell = np.minimum(at.astype(int), cells - 1)
-    cubic = whole.steps.cubics[np.arange(len(whole.steps.rate)), cell].astype(float)
+    cubic = plan.steps.cubics[np.arange(len(plan.steps.rate)), cell].astype(float)
     found = (cubic * (at - cell)[..., None] ** np.arange(4)).sum(axis=-1)
-    np.testing.assert_allclose(found, sensor.cdf(photons, EXPOSURE)[:, :-1], rtol=0, atol=whole.margin / 2)
+    np.testing.assert_allclose(found, sensor.cdf(photons, EXPOSURE)[:, :-1], rtol=0, atol=plan.margin / 2)
 
 
 @pytest.mark.parametrize("name", OTHERS)
