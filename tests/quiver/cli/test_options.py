@@ -382,7 +382,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         "--split",
         "val",
         Acts(CELLS.replace("clip", "data"), "--split val", cells),
-        Refused(CELLS, "--split val", "only clip folders are named"),
+        Refused(CELLS, "--split val", "only clip folders are given"),
     ),
     ("domain", "--sensor"): of_measuring("--sensor", "quiver-paper", Acts(CELLS, "--sensor quiver-paper", cells)),
     ("domain", "--bits"): of_measuring("--bits", "1", Acts(CELLS, "--bits 1,3", cells)),

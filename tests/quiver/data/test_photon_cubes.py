@@ -93,7 +93,7 @@ def test_photon_cubes(tmp_path, rng_planes: Array):
     assert codes.shape == (2, 5, 13)
     np.testing.assert_array_equal(codes.read(0, 2), rng_planes[:14].reshape(2, 7, 5, 13).sum(axis=1))
     assert codes.white == pytest.approx(7.0)
-    with pytest.raises(ValueError, match=r"no cube of packed planes 30 px wide"):
+    with pytest.raises(ValueError, match=r"is not a cube of packed planes 30 px wide"):
         cube_codes(tmp_path / "cube.npy", light, 1428.0, planes=7, width=30)
     with pytest.raises(ValueError, match="fewer than the 31 of one code"):
         cube_codes(tmp_path / "cube.npy", Illumination("spad-320x240", None, 5), 300.0, planes=31, width=13)
