@@ -1,4 +1,4 @@
-"""What sets pixels apart: fixed-pattern noise, correlated noise, the [defects] table, photon-by-photon simulation."""
+"""Deviations from an ideal pixel: fixed-pattern and correlated noise, and photons followed one by one."""
 
 from typing import TYPE_CHECKING
 

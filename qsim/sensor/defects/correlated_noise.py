@@ -1,9 +1,9 @@
-"""Noise correlated in time and space: afterpulses of clocked pixels and optical crosstalk. Off by default.
+"""Adds noise correlated in time and space: afterpulses of clocked pixels, optical crosstalk. Off by default.
 
     codes of independent pixels [T, H, W] --disturb--> codes
 
-Afterpulses have a memory: they need the clip from its first frame. Crosstalk has neighbours: it needs a margin of one
-pixel around a crop. Afterpulses of counting pixels are followed in event_simulation.py.
+Afterpulses depend on earlier frames: they need the clip from its first frame. Crosstalk depends on neighbours: it needs
+a margin of one pixel around a crop. Afterpulses of counting pixels are simulated in event_simulation.py.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ class CorrelatedNoise:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not 0 <= value < 1:
-                raise ValueError(f"{name} is a probability below 1, got {value!r}")
+                raise ValueError(f"{name} must be a probability below 1, got {value!r}")
 
     def disturb(
         self, before: Array | None, codes: Array, top: int, key: Key, dead: Array | None, origin: tuple[int, int]
     ) -> tuple[Array, Array | None]:
-        """Codes [T, H, W] up to `top` with afterpulses and crosstalk, and the memory [H, W] for the frame after them.
+        """Return codes [T, H, W] up to `top` with afterpulses and crosstalk, and the memory [H, W] for the next frame.
 
-        `before` is the memory of the frame before them, None at the clip's first; pixels that are `dead` [H, W] stay 0.
+        `before` is the memory from the frame before, None at the first of the clip; `dead` pixels [H, W] stay 0.
         """
         if not (self.afterpulse or self.crosstalk):
             return codes, None
@@ -51,9 +51,10 @@ class CorrelatedNoise:
 def _afterpulses(
     plane: Array, before: Array | None, key: Key, dead: Array | None, probability: float, origin: tuple[int, int]
 ) -> tuple[Array, Array]:
-    """The plane with afterpulses of the one before, and itself as the memory of the next (before any crosstalk).
+    """Return a plane [H, W] with afterpulses of the plane before, and the memory [H, W] for the next.
 
-    At constant light, P(fire) = p / (1 - a (1 - p)) after some planes: p alone, a the probability.
+    The memory is the plane before crosstalk. At constant light, P(fire) tends to p / (1 - a (1 - p)), where p is the
+    probability without afterpulses and a that of an afterpulse.
     """
     if not probability or before is None:
         return plane, plane
@@ -66,9 +67,10 @@ def _afterpulses(
 def _crosstalk(
     codes: Array, top: int, key: Key, dead: Array | None, probability: float, origin: tuple[int, int]
 ) -> Array:
-    """Each avalanche of a pixel sets off each of its four neighbours with this probability; those go no further.
+    """Return codes [H, W] up to `top`, each avalanche with this probability of one more in each of four neighbours.
 
-    A code n brings Binomial(n, probability) avalanches to a neighbour, drawn under the key of the pixel they come from.
+    The additional avalanches cause no others. A code n adds Binomial(n, probability) to a neighbour, drawn under the
+    key of the source pixel.
     At constant light a plane fires with 1 - (1 - p) (1 - p probability)^4.
     """
     if not probability:

@@ -1,6 +1,6 @@
 """Reads the [defects] table of a sensor file, and writes it beside streams. All defects are off by default.
 
-    # my_sensor.toml, below [sensor]; every line may be left out, and then changes no bit
+    # my_sensor.toml, below [sensor]; every line is optional, and a missing one changes no bit
     [defects]
     device_seed = 7                # which device of its kind: the fixed pattern is a function of it
     prnu = 0.01                    # relative standard deviation of the efficiency
@@ -19,7 +19,7 @@
     carry_dead_time = true         # counting: a dead time continues in the next exposure
 
 Counting pixels whose light changes inside the exposure, whose dead time is carried over, or that afterpulse are
-followed photon by photon (event_simulation.py) where the largest of these effects passes its TOLERANCE; below, the
+followed photon by photon (event_simulation.py) if the largest of these effects exceeds its TOLERANCE; otherwise the
 closed form draws.
 """
 
@@ -50,7 +50,7 @@ _TABLE: Table = {
 
 @dataclass(frozen=True)
 class Defects:
-    """What a table [defects] says."""
+    """The contents of a table [defects]."""
 
     pattern: FixedPattern = field(default_factory=FixedPattern)
     maps: Mapping[str, str] = field(default_factory=dict)  # key of the table -> .npy file
@@ -61,14 +61,14 @@ class Defects:
 
     @property
     def none(self) -> bool:
-        """Whether nothing is switched on."""
+        """Whether all defects are off."""
         pattern = replace(self.pattern, device_seed=0)
         return pattern == FixedPattern() and not (
             self.maps or self.crosstalk or self.afterpulse or self.carry_dead_time
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As written beside a stream; measured maps with their checksums."""
+        """Return the table as stored with a stream; measured maps with their checksums."""
         pattern = {key: getattr(self.pattern, key) for key in _PATTERN if getattr(self.pattern, key)}
         if self.pattern.dark is not None:
             pattern["dark"] = asdict(self.pattern.dark)
@@ -78,22 +78,25 @@ class Defects:
 
 
 def from_toml(path: str | Path) -> Defects | None:
-    """The table [defects] of a TOML file, None if there is none or all of it is off; strict, `ValueError`."""
+    """Return the table [defects] of a TOML file, None if it is missing or all of it is off; `ValueError` if invalid."""
     path = Path(path)
     table = files.read_toml(path, "file of defects").get("defects", {})
     if not isinstance(table, dict):
-        raise ValueError(f"{path}: [defects] is a table, got {table!r}")
+        raise ValueError(f"{path}: [defects] must be a table, got {table!r}")
     files_of = {key: str((path.parent / table[key]).resolve()) for key in _MAPS if isinstance(table.get(key), str)}
     found = from_dict(table | files_of, f"{path}: [defects]")
     return None if found.none else found
 
 
 def from_dict(table: Mapping[str, Any], where: str = "defects") -> Defects:
-    """Defects of a table, or of what `to_dict` wrote, whose maps have to be unchanged; strict, `ValueError`."""
+    """Return the defects of a table, or of the output of `to_dict`, whose maps must be unchanged.
+
+    `ValueError` for unknown keys and invalid values.
+    """
     structure(table, _TABLE, where)
     for name, pattern in _MAPS.items():
         if name in table and pattern in table:
-            raise ValueError(f"{where}: {pattern} and {name} say the same thing twice; leave one out")
+            raise ValueError(f"{where}: {pattern} and {name} state the same defect twice; leave one out")
     try:
         spread = DarkSpread(**table["dark"]) if "dark" in table else None
         pattern_of_device = FixedPattern(**{key: table[key] for key in _PATTERN if key in table}, dark=spread)
@@ -103,15 +106,15 @@ def from_dict(table: Mapping[str, Any], where: str = "defects") -> Defects:
     disturbances = {key: float(table[key]) for key in _DISTURBANCES if key in table}
     for key in ("crosstalk", "afterpulse"):
         if not disturbances.get(key, 0.0) < 1:
-            raise ValueError(f"{where}: {key} is a probability below 1, got {table[key]!r}")
+            raise ValueError(f"{where}: {key} must be a probability below 1, got {table[key]!r}")
     return Defects(pattern_of_device, maps, **disturbances, carry_dead_time=table.get("carry_dead_time", False))
 
 
 def _map_file(value: Any, key: str, where: str) -> str:
-    """The path of a map that is there and, where a checksum is given, unchanged."""
+    """Return the path of a map; errors if it does not exist, or differs from its checksum."""
     path, digest = (value.get("file"), value.get("sha256")) if isinstance(value, Mapping) else (value, None)
     if not isinstance(path, str):
-        raise ValueError(f"{where}: {key} is the name of a .npy file, got {value!r}")
+        raise ValueError(f"{where}: {key} must be the name of a .npy file, got {value!r}")
     if not Path(path).is_file():
         raise FileNotFoundError(f"{where}: {key}: {path}: no such file")
     if digest is not None and files.sha256(Path(path)) != digest:

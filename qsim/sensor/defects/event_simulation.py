@@ -1,16 +1,16 @@
-"""Photon by photon: the slow and obvious simulator of counting pixels, and the oracle of `spad.CountingSPAD`.
+"""Simulates counting pixels photon by photon: slow, and the reference of `CountingSPAD`.
 
     flux inside each exposure -> arrival times -> avalanches that find the pixel live -> counts -> codes
 
-It covers what the closed forms leave out: light that varies inside an exposure, dead time carried into the next
-frame, and afterpulses. `effects` says how large each of them is for a given scene, and `sample` follows the photons
-only where one of them exceeds the tolerance; otherwise the closed form draws.
+It covers three effects that the closed forms leave out: light that varies within an exposure, dead time carried into
+the next frame, and afterpulses. `effects` estimates the size of each. `sample` follows photons only if one of them
+exceeds TOLERANCE; otherwise the closed form draws.
 
-The pixel is gated: it sees nothing between the exposures, while dead times and trapped carriers go on in real time.
-Afterpulses: a counted avalanche leaves, with probability `afterpulse`, one trapped carrier that is released after an
-exponential delay of mean `afterpulse_delay`. Released while the pixel is dead, or between exposures, it is lost
-(though it restarts the dead time of a paralyzable pixel); released while the pixel is live, it is a count like any
-other and may leave its own.
+The pixel is gated: between exposures it detects nothing, but dead times and trapped carriers continue in real time.
+A counted avalanche leaves, with probability `afterpulse`, one trapped carrier. It is released after an exponential
+delay of mean `afterpulse_delay`. A release while the pixel is dead, or between exposures, is not counted, but it
+restarts the dead time of a paralyzable pixel. A release while the pixel is live is counted as any other avalanche, and
+may leave a carrier as well.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ IncidentLight = Callable[[int, int, int], Array]  # (frame, first row, rows) -> 
 
 @dataclass(frozen=True)
 class Memory:
-    """What a pixel remembers; without any of it, it is the memoryless `CountingSPAD`."""
+    """The memory of a pixel; without it, the pixel is the memoryless `CountingSPAD`."""
 
-    carry: bool = False  # dead times and trapped carriers go on from one frame to the next
+    carry: bool = False  # dead times and trapped carriers continue in the next frame
     afterpulse: float = 0.0  # probability that a counted avalanche leaves a trapped carrier
     afterpulse_delay: float = 0.0  # s, mean of the exponential delay from avalanche to release
 
     def __post_init__(self) -> None:
         if not 0 <= self.afterpulse < 1:
-            raise ValueError(f"Memory.afterpulse is a probability below 1, got {self.afterpulse!r}")
+            raise ValueError(f"Memory.afterpulse must be a probability below 1, got {self.afterpulse!r}")
         if self.afterpulse > 0 and not self.afterpulse_delay > 0:
-            raise ValueError(f"Memory.afterpulse_delay is in seconds and above 0, got {self.afterpulse_delay!r}")
+            raise ValueError(f"Memory.afterpulse_delay must be in seconds and above 0, got {self.afterpulse_delay!r}")
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class State:
 
 @dataclass(frozen=True)
 class Effects:
-    """Relative change of the mean count that the closed form misses, each to leading order, for the worst pixel."""
+    """Relative error of the mean count of the closed form, to leading order, for the worst pixel."""
 
     varying_flux: float
     carried_dead_time: float
@@ -87,16 +87,17 @@ def sample(
     memory: Memory = Memory(),
     origin: tuple[int, int] = (0, 0),
 ) -> tuple[Array, Effects, str]:
-    """Codes [T, H, W] for photons [T, S, H, W] in S equal slices of each exposure, the effects, and who drew the codes.
+    """Return codes [T, H, W], the effects, and the method used ("closed form" or "events").
 
-    "closed form" draws where no effect exceeds TOLERANCE; else "events", photon by photon. Each pixel has a stream of
-    its own, so crops agree with the whole; frames do not, unless they start with the clip: a memory is replayed.
+    `photons` [T, S, H, W] are expected in S equal slices of each exposure [s]; `frame_time` [s] is the period of the
+    frames. Photons are followed if an effect exceeds TOLERANCE. Each pixel has a separate random stream, so a crop at
+    its `origin` (y, x) gets the codes of the full frame. Single frames do not: a memory is simulated from the first.
     """
     if photons.ndim != 4 or not photons.size:
         raise ValueError(f"photons have the shape [T, slices, H, W], got {list(photons.shape)}")
     if not frame_time >= exposure > 0:
-        raise ValueError(f"frame_time {frame_time!r} s is at least the exposure {exposure!r} s, both above 0")
-    sensor.arrivals(photons, exposure)  # refuses what is no light level
+        raise ValueError(f"frame_time {frame_time!r} s must be at least the exposure {exposure!r} s, both above 0")
+    sensor.arrivals(photons, exposure)  # checks the light level
     found = effects(sensor, photons, exposure, frame_time, memory)
     if found.largest <= TOLERANCE:
         return sensor.sample(photons.sum(axis=1), exposure, key=key, origin=origin), found, "closed form"
@@ -112,7 +113,7 @@ def _follow_pixels(
     key: Key,
     origin: tuple[int, int],
 ) -> Array:
-    """Codes [T, H, W] of photons [T, S, H, W], each pixel with its own stream of random numbers."""
+    """Return codes [T, H, W] of photons [T, S, H, W], each pixel from a separate random stream."""
     frames, _, height, width = photons.shape
     codes = np.empty((frames, height, width), sensor.dtype)
     for y, x in np.ndindex(height, width):
@@ -123,11 +124,11 @@ def _follow_pixels(
 
 
 def effects(sensor: CountingSPAD, photons: Array, exposure: float, frame_time: float, memory: Memory) -> Effects:
-    """How much of the mean count each effect changes, for photons [T, S, ...]: the largest of all pixels and frames.
+    """Return the relative size of each effect for photons [T, S, ...]: the largest of all pixels and frames.
 
-    With r arrivals per second a dead time tau loses about r^2 tau counts per second. If r varies with the coefficient
-    of variation c that grows by the factor 1 + c^2; a pixel is dead at the start of a frame with probability r tau, for
-    tau / 2 on average, if no longer gap than tau lies before it; an afterpulse adds its probability (at most).
+    At r arrivals per second a dead time tau loses about r^2 tau counts per second. If r varies with the coefficient of
+    variation c, the loss grows by the factor 1 + c^2. A pixel is dead at the start of a frame with probability r tau,
+    for tau / 2 on average, if the gap before it is not longer than tau. An afterpulse adds at most its probability.
     """
     slices = photons.shape[1]
     rates = sensor.efficiency * np.asarray(photons, float) + sensor.dark_rate * exposure / slices
@@ -148,7 +149,7 @@ def simulate(
     memory: Memory,
     rng: np.random.Generator,
 ) -> Array:
-    """Counts [T], not clipped, of one pixel for expected photons [T, S] in S equal slices of each exposure."""
+    """Return counts [T], not clipped, of one pixel for expected photons [T, S] in S equal slices of each exposure."""
     rates = sensor.efficiency * photons + sensor.dark_rate * exposure / photons.shape[1]
     counts = np.zeros(len(photons), np.int64)
     state = State()
@@ -161,7 +162,7 @@ def simulate(
 
 
 def arrival_times(rates: Array, start: float, exposure: float, rng: np.random.Generator) -> list[float]:
-    """Times [s] of a Poisson process with `rates` [S] expected arrivals in equal slices of the exposure."""
+    """Return the times [s] of a Poisson process with `rates` [S] expected arrivals in equal slices of the exposure."""
     slices = np.repeat(np.arange(len(rates)), rng.poisson(rates))
     return list(start + (slices + rng.random(slices.size)) * (exposure / len(rates)))
 
@@ -175,7 +176,7 @@ def expose(
     state: State,
     rng: np.random.Generator,
 ) -> tuple[int, State]:
-    """One exposure: every arrival and every released carrier in the order of time -> counts, state afterwards."""
+    """Return the count of one exposure and the state after it; arrivals [s] and released carriers in time order."""
     waiting = [*arrivals, *(time for time in state.trapped if time >= start)]
     heapify(waiting)
     count, dead_until = 0, state.dead_until
@@ -192,7 +193,7 @@ def expose(
 
 
 def pixel_stream(key: Key, row: int, column: int) -> np.random.Generator:
-    """The generator of one pixel of the full frame; events take as many numbers as they need."""
+    """Return the random generator of one pixel of the full frame."""
     return np.random.Generator(np.random.Philox(key=[key.philox_key, row << 32 | column], counter=[0, 0, 0, key.frame]))
 
 
@@ -200,7 +201,7 @@ def pixel_stream(key: Key, row: int, column: int) -> np.random.Generator:
 
 
 def memory_of(defects: Defects | None) -> Memory:
-    """What counting pixels remember."""
+    """Return the memory of counting pixels with these defects."""
     if defects is None:
         return Memory()
     return Memory(defects.carry_dead_time, defects.afterpulse, defects.afterpulse_delay)
@@ -209,7 +210,7 @@ def memory_of(defects: Defects | None) -> Memory:
 def clip_effects(
     array: PixelArray, light: IncidentLight, shape: tuple[int, int, int], exposure: float, frame_time: float
 ) -> Effects:
-    """The largest effects of a clip [T, H, W] that a closed form would miss."""
+    """Return the largest effects of a clip of `shape` (T, H, W) that the closed form leaves out."""
     frames, height, _ = shape
     each = (
         effects(sensor, photons[None], exposure, frame_time, memory_of(array.defects))
@@ -219,11 +220,12 @@ def clip_effects(
 
 
 def _largest(a: Effects, b: Effects) -> Effects:
+    """Return the larger of each effect."""
     return Effects(*(max(getattr(a, f.name), getattr(b, f.name)) for f in fields(Effects)))
 
 
 def _lit(array: PixelArray, photons: Array, row: int, exposure: float) -> tuple[CountingSPAD, Array]:
-    """Light [slices, rows, W] of rows from `row` on, with the pixels' own efficiencies and dark rates in it."""
+    """Return the sensor and the light [slices, rows, W] of rows from `row` on, with the maps applied."""
     slices, rows, width = photons.shape
     sensor, light = lit(array.sensor, photons, exposure / slices, array.maps.crop(row, 0, rows, width))
     assert isinstance(sensor, CountingSPAD)
@@ -233,7 +235,7 @@ def _lit(array: PixelArray, photons: Array, row: int, exposure: float) -> tuple[
 def follow(
     array: PixelArray, light: IncidentLight, shape: tuple[int, int, int], exposure: float, frame_time: float, key: Key
 ) -> Array:
-    """Codes [T, H, W] of a clip, every pixel followed photon by photon from the first frame on; slow."""
+    """Return codes of a clip of `shape` (T, H, W), each pixel followed photon by photon from the first frame."""
     frames, height, width = shape
     codes = np.empty(shape, array.sensor.dtype)
     memory = memory_of(array.defects)

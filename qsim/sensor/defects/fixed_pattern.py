@@ -1,11 +1,11 @@
-"""Fixed-pattern noise: gain, dark rate, dead pixels, offset and read noise, one value per pixel. Off by default.
+"""Draws fixed-pattern noise: maps of gain, dark rate, dead pixels, offset and read noise. Off by default.
 
     FixedPattern (a few numbers)  --draw_maps-->  Maps (one value per pixel)
 
-Maps only change the coefficients of a pixel's light: arrivals = efficiency gain photons + dark dark_rate exposure, so
-codes are drawn by the sensor's own cdf. Maps of gain and dark have the mean 1: they spread the signal and do not shift
-it. A map is a function of (device seed, row, column) of the full frame, so every frame and every crop sees the same
-one. Read noise and offset maps reach into the ADC and are drawn step by step.
+Maps of gain and dark change the coefficients of a pixel's light only: arrivals = efficiency gain photons + dark
+dark_rate exposure. So the cdf of the sensor draws the codes. These maps have the mean 1: they spread the signal and do
+not shift it. A map is a function of (device seed, row, column) of the full frame, so all frames and crops have the same
+one. Maps of read noise and offset change the ADC; their codes are drawn step by step.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ class DarkSpread:
 
     @property
     def mean(self) -> float:
-        """Mean rate over median rate: what a data sheet's median has to be multiplied by to get the sensor's rate."""
+        """Mean rate over median rate: the factor from a data sheet's median to the sensor's rate."""
         low, high, a = self.hot_from, self.hot_to, self.tail
         norm = low**-a - high**-a
         hot = np.log(high / low) / norm if a == 1 else a / (1 - a) * (high ** (1 - a) - low ** (1 - a)) / norm
         return (1 - self.hot_share) * float(np.exp(self.spread**2 / 2)) + self.hot_share * float(hot)
 
     def draw(self, u: Array, v: Array) -> Array:
-        """Rates over the mean rate, from two uniform numbers per pixel: which kind, and how much."""
+        """Return rates over the mean rate [...] from two uniform numbers [...] per pixel: kind and size."""
         from scipy.special import ndtri
 
         low, high, a = self.hot_from, self.hot_to, self.tail
@@ -63,7 +63,7 @@ class DarkSpread:
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """The fixed pattern of a device in a few numbers; `draw_maps` makes it."""
+    """The strengths of the fixed-pattern noise of a device; `draw_maps` draws its maps."""
 
     device_seed: int = 0
     prnu: float = 0.0  # relative standard deviation of the efficiency
@@ -81,7 +81,7 @@ class FixedPattern:
 
 @dataclass(frozen=True, eq=False)
 class Maps:
-    """One value per pixel [H, W]; None is no map. Measured maps go in here as well."""
+    """Per-pixel maps [H, W], drawn or measured; None without a map."""
 
     gain: Array | None = None  # efficiency over the sensor's, mean 1
     dark: Array | None = None  # dark rate over the sensor's, mean 1
@@ -90,7 +90,7 @@ class Maps:
     read_noise: Array | None = None  # over the sensor's, mean 1
 
     def crop(self, y: int, x: int, height: int, width: int) -> Maps:
-        """The maps of a part of the frame."""
+        """Return the maps of a crop [px] of the frame."""
         parts = {name: None if m is None else m[y : y + height, x : x + width] for name, m in vars(self).items()}
         return Maps(**parts)
 
@@ -99,14 +99,14 @@ PERFECT = Maps()
 
 
 def draw_maps(pattern: FixedPattern, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> Maps:
-    """The maps of one device for the crop [H, W] at `origin` = (y, x); a strength of 0 makes no map."""
+    """Return the maps of a device for the crop of `shape` (H, W) at `origin` (y, x); a strength of 0 makes no map."""
 
     def numbers(name: str, redraw: int = 0) -> Array:
         key = Key(pattern.device_seed, _DEVICE, stage=hash_name(name))
         return uniform(words(key, shape, origin, redraw))
 
     def around_one(name: str, spread: float) -> Array | None:
-        """Log-normal factors with the mean 1 and the standard deviation `spread`."""
+        """Return log-normal factors [H, W] with the mean 1 and the standard deviation `spread`."""
         from scipy.special import ndtri
 
         sigma = np.sqrt(np.log1p(spread**2))
@@ -124,7 +124,10 @@ def draw_maps(pattern: FixedPattern, shape: tuple[int, int], origin: tuple[int, 
 
 
 def measured_dark_map(rates: Array) -> tuple[float, Array]:
-    """(mean rate, map of mean 1) of measured dark rates [H, W]; `ValueError` for negative or no rates at all."""
+    """Return the mean [1/s] and a map of mean 1 of measured dark rates [H, W] [1/s].
+
+    `ValueError` if a rate is negative or not finite, or if all are 0.
+    """
     values = np.asarray(rates, float)
     if not (np.isfinite(values).all() and (values >= 0).all() and values.any()):
         raise ValueError("measured dark rates: expected finite numbers, none negative and not all 0")
@@ -132,9 +135,9 @@ def measured_dark_map(rates: Array) -> tuple[float, Array]:
 
 
 def lit(sensor: Sensor, photons: Array, exposure: float, maps: Maps) -> tuple[Sensor, Array]:
-    """A sensor and light [..., H, W] that together have the efficiency and dark rate of every pixel of the maps.
+    """Return a sensor and photons [..., H, W] that have the efficiency and dark rate of each pixel of the maps.
 
-    Dark events become the light that would cause them, so that the sensor's own cdf serves every pixel.
+    Dark events become the photons that would cause them, so that the cdf of the sensor holds for each pixel.
     """
     light = photons if maps.gain is None else photons * maps.gain
     if maps.dark is None:
@@ -143,7 +146,7 @@ def lit(sensor: Sensor, photons: Array, exposure: float, maps: Maps) -> tuple[Se
 
 
 def pmf(sensor: Sensor, photons: Array, exposure: float, maps: Maps) -> Array:
-    """P(code) of every pixel of a frame with maps, [..., H, W] -> [..., H, W, levels]; exact, without disturbances."""
+    """Return P(code), [..., H, W, levels], of photons [..., H, W] with maps; exact, without correlated noise."""
     sensor, light = lit(sensor, photons, exposure, maps)
     if maps.offset is None and maps.read_noise is None:
         chances = sensor.pmf(light, exposure)

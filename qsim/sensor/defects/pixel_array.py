@@ -1,4 +1,4 @@
-"""A sensor with one value per pixel and correlated noise: the draw of its codes.
+"""Draws the codes of a sensor with per-pixel maps and correlated noise.
 
 Defects --PixelArray.of--> PixelArray: a sensor and its maps --sample, blocks--> codes
 """
@@ -28,7 +28,7 @@ Sampler = Callable[[Sensor, Array, float, Key, tuple[int, int]], Array]  # photo
 
 @dataclass(frozen=True, eq=False)
 class PixelArray:
-    """A sensor model with one value per pixel: its record, the maps of one frame size, and its correlated noise."""
+    """A sensor model with per-pixel maps of one frame size, and its defects."""
 
     sensor: Sensor
     maps: Maps = PERFECT
@@ -36,9 +36,10 @@ class PixelArray:
 
     @classmethod
     def of(cls, defects: Defects, sensor: Sensor, height: int, width: int) -> PixelArray:
-        """The maps of the device for frames of this size; `ValueError` where they do not fit the sensor or the size.
+        """Return the pixel array of a device for frames of `height` x `width` pixels.
 
-        Measured maps may be larger: frames lie in their upper left corner.
+        Measured maps may be larger: frames lie in their upper left corner. `ValueError` if the defects do not fit the
+        sensor, or a map the size.
         """
         _check_model(defects, sensor)
         drawn = draw_maps(defects.pattern, (height, width))
@@ -48,7 +49,7 @@ class PixelArray:
             if whole.shape[0] < height or whole.shape[1] < width:
                 raise ValueError(
                     f"{path}: the {key} has {whole.shape[0]} x {whole.shape[1]} pixels, the frames {height} x {width}; "
-                    "a map covers the whole sensor"
+                    "a map must cover the frames: measure a larger one, or draw smaller frames"
                 )
             name = key.removesuffix("_map")
             if name == "dark":
@@ -56,19 +57,19 @@ class PixelArray:
                 sensor = sensor.with_dark_rate(rate)
             elif name == "read_noise" and isinstance(sensor, QIS):
                 if not sensor.read_noise:
-                    raise ValueError(f"{path}: a map of read noise needs a sensor whose read_noise is above 0")
+                    raise ValueError(f"{path}: a map of read noise needs a sensor with read_noise above 0")
                 whole = whole / sensor.read_noise
             measured[name] = whole[:height, :width] != 0 if name == "dead" else whole[:height, :width]
         return cls(sensor, replace(drawn, **measured), defects)
 
     @property
     def memory(self) -> bool:
-        """Whether a frame depends on those before it."""
+        """Whether a frame depends on earlier frames."""
         return bool(self.defects.afterpulse and isinstance(self.sensor, BinarySPAD))
 
     @property
     def follows_photons(self) -> bool:
-        """Whether a counting pixel remembers the exposure before."""
+        """Whether a counting pixel depends on the exposure before."""
         return isinstance(self.sensor, CountingSPAD) and bool(self.defects.carry_dead_time or self.defects.afterpulse)
 
     @property
@@ -77,22 +78,22 @@ class PixelArray:
         return 1 if self.defects.crosstalk else 0
 
     def lead(self, chance: float) -> int:
-        """Frames before a frame after which what went before matters with this chance at most."""
+        """Return the number of earlier frames beyond which an influence has at most this probability."""
         if not (self.memory and isinstance(self.sensor, BinarySPAD)):
             return 0
         return ceil(log(chance) / log(self.defects.afterpulse) / self.sensor.planes)
 
     def crop(self, y: int, x: int, height: int, width: int) -> PixelArray:
-        """A part of the frame, with the maps of its pixels."""
+        """Return the array of a crop [px] of the frame."""
         return replace(self, maps=self.maps.crop(y, x, height, width))
 
     def sample(
         self, photons: Array, exposure: float, *, key: Key, origin: tuple[int, int] = (0, 0), engine: str = "auto"
     ) -> Array:
-        """Codes of photons [T, H, W] as `Sensor.sample`, with defects; without any the same bits.
+        """Return codes [T, H, W] of expected photons [T, H, W]; without defects the bits of `Sensor.sample`.
 
-        `ValueError` for afterpulses of a counting pixel (event_simulation.py), or of a clip that does not start at
-        frame 0.
+        `exposure` is in s, `origin` (y, x) places a crop in the full frame. `ValueError` for afterpulses of a counting
+        pixel (event_simulation.py), or of a clip that does not start at frame 0.
         """
         if self.defects.afterpulse and key.frame:
             raise ValueError(f"afterpulse has a memory: sample the clip from frame 0, not from frame {key.frame}")
@@ -110,10 +111,10 @@ class PixelArray:
         origin: tuple[int, int] = (0, 0),
         engine: str | Sampler = "auto",
     ) -> Iterator[Array]:
-        """Codes of successive blocks of photons [t, H, W], the first of which is frame key.frame.
+        """Yield codes [t, H, W] of successive blocks of expected photons [t, H, W]; the first frame is key.frame.
 
-        `origin` (y, x) places a crop in the full frame. `engine` is that of `Sensor.sample`, or a function that draws
-        the codes of pixels without defects in its place.
+        `exposure` is in s, `origin` (y, x) places a crop in the full frame. `engine` is that of `Sensor.sample`, or a
+        function that draws the codes of pixels without correlated noise.
         """
         before = None
         for block in photons:
@@ -130,7 +131,7 @@ class PixelArray:
         origin: tuple[int, int],
         engine: str | Sampler,
     ) -> tuple[Array, Array | None]:
-        """Codes of a block, and the memory for the next; `before` is that of the block before, None at the first."""
+        """Return codes [t, H, W] of a block, and the memory [H, W] for the next; `before` is that of the last."""
         clocked = isinstance(self.sensor, BinarySPAD)
         noise = CorrelatedNoise(self.defects.afterpulse if clocked else 0.0, self.defects.crosstalk)
         stack = np.asarray(photons)
@@ -153,7 +154,7 @@ class PixelArray:
         origin: tuple[int, int],
         engine: str | Sampler,
     ) -> tuple[Array, Array | None]:
-        """A code as its M planes one after the other, as BinarySPAD draws them, each disturbed by the one before."""
+        """Return codes as sums of M planes, as BinarySPAD draws them, each with afterpulses of the plane before."""
         assert isinstance(self.sensor, BinarySPAD)
         m, plane = self.sensor.planes, replace(self, sensor=replace(self.sensor, bits=1))
         codes = np.zeros(photons.shape, self.sensor.dtype)
@@ -167,7 +168,7 @@ class PixelArray:
     def _independent(
         self, photons: Array, exposure: float, key: Key, origin: tuple[int, int], engine: str | Sampler
     ) -> Array:
-        """Codes [T, H, W] of pixels that differ from each other and do not disturb each other."""
+        """Return codes [T, H, W] of pixels with maps and without correlated noise."""
         maps = self.maps
         sensor, light = lit(self.sensor, photons, exposure, maps)
         if maps.offset is None and maps.read_noise is None:
@@ -191,7 +192,7 @@ class PixelArray:
 
 
 def _check_model(defects: Defects, sensor: Sensor) -> None:
-    """`ValueError` for what this model of sensor cannot have."""
+    """Raise `ValueError` for defects that this model of sensor cannot have."""
     name = type(sensor).__name__
     read_out = (
         defects.pattern.offset or defects.pattern.read_noise or {"offset_map", "read_noise_map"} & set(defects.maps)
@@ -208,9 +209,10 @@ def _check_model(defects: Defects, sensor: Sensor) -> None:
 
 
 def _read_map(path: str, key: str) -> Array:
+    """Return a measured map [H, W]; `ValueError` for another shape, or values that it cannot have."""
     array = np.array(files.load_array(Path(path)))
     if array.ndim != 2 or not array.size or array.dtype.kind not in "fuib" or not np.isfinite(array).all():
-        raise ValueError(f"{path}: a {key} is [H, W] of finite numbers, found {array.dtype} {list(array.shape)}")
+        raise ValueError(f"{path}: a {key} must be [H, W] of finite numbers, found {array.dtype} {list(array.shape)}")
     if key != "offset_map" and (array < 0).any():
-        raise ValueError(f"{path}: a {key} has no negative values")
+        raise ValueError(f"{path}: a {key} must not have negative values")
     return array

@@ -158,7 +158,7 @@ def test_dead_pixels_of_counters_stay_dead_when_followed(tmp_path):
     [
         (BINARY, "prnuu = 0.1", "unknown key 'prnuu' (did you mean 'prnu'?)"),
         (BINARY, "prnu = -1", "[defects]: prnu is a number"),
-        (BINARY, "crosstalk = 1.0", "crosstalk is a probability below 1, got 1.0"),
+        (BINARY, "crosstalk = 1.0", "crosstalk must be a probability below 1, got 1.0"),
         (BINARY, 'dark_map = "none.npy"', "none.npy: no such file"),
         (BINARY, "dark = { spreed = 1.0 }", "unknown key 'dark.spreed' (did you mean 'spread'?)"),
         (BINARY, "offset = 1.0", "a BinarySPAD has no read-out"),
@@ -166,7 +166,7 @@ def test_dead_pixels_of_counters_stay_dead_when_followed(tmp_path):
         (BINARY, "carry_dead_time = 1", "carry_dead_time: expected true or false, got 1"),
         (QUANTA, "crosstalk = 0.1", "a QIS has no avalanches"),
         (COUNTING, "afterpulse = 0.1", "needs afterpulse_delay in seconds"),
-        (COUNTING, 'prnu = 0.1\ngain_map = "x.npy"', "prnu and gain_map say the same thing twice"),
+        (COUNTING, 'prnu = 0.1\ngain_map = "x.npy"', "prnu and gain_map state the same defect twice"),
     ],
 )
 def test_mistakes_are_named(clip, tmp_path, sensor, table, message):

@@ -202,8 +202,8 @@ def test_no_effect_without_dead_time_gap_or_memory():
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ({"afterpulse": 1.0}, "Memory.afterpulse is a probability below 1, got 1.0"),
-        ({"afterpulse": 0.1}, "Memory.afterpulse_delay is in seconds and above 0, got 0.0"),
+        ({"afterpulse": 1.0}, "Memory.afterpulse must be a probability below 1, got 1.0"),
+        ({"afterpulse": 0.1}, "Memory.afterpulse_delay must be in seconds and above 0, got 0.0"),
     ],
 )
 def test_impossible_memories_are_refused(arguments, text):
@@ -217,7 +217,7 @@ def test_wrong_light_is_refused():
     light[1, 0, 2, 0] = np.nan
     with pytest.raises(ValueError, match=re.escape("photons[1, 0, 2, 0] is nan")):
         sample(sensor, light, EXPOSURE, frame_time=EXPOSURE, key=KEY)
-    with pytest.raises(ValueError, match="is at least the exposure"):
+    with pytest.raises(ValueError, match="must be at least the exposure"):
         sample(sensor, np.ones((2, 1, 3, 3)), EXPOSURE, frame_time=EXPOSURE / 2, key=KEY)
     with pytest.raises(ValueError, match=re.escape("[T, slices, H, W], got [3, 3]")):
         sample(sensor, np.ones((3, 3)), EXPOSURE, frame_time=EXPOSURE, key=KEY)
