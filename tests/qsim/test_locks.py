@@ -1,4 +1,4 @@
-"""Locks: whoever waited for a deleted file is not alone with the new one."""
+"""Tests locks whose file is deleted."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ from qsim import locks
 
 
 def test_a_lock_whose_file_is_deleted_is_taken_on_the_new_one(tmp_path: Path):
-    """Who waited for a deleted file must not believe to be alone."""
+    """A process that waited for a deleted file must not hold the lock as well."""
     first, second, third = (locks.Lock(tmp_path / "lock") for _ in range(3))
     assert first.acquire()
     (tmp_path / "lock").unlink()

@@ -1,4 +1,4 @@
-"""A clip of five frames of 10 x 7 pixels with ground truth, for the tests of its folder."""
+"""Makes a clip of five frames of 10 x 7 pixels with ground truth, for tests of clip folders."""
 
 from pathlib import Path
 from typing import Any

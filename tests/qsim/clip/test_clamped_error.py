@@ -1,4 +1,4 @@
-"""White and errors clamped there: against what they are, over random pictures; what clips say of them."""
+"""Tests white and errors clamped there, against known errors of random images, and the fields of clips."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from qsim.clip.clip import Clip
 from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.report import report
 
-SIZE = 200  # px, sides of the pictures of noise
+SIZE = 200  # px, sides of the noise images
 
 
 def truth_of(rng: np.random.Generator) -> np.ndarray:
-    """A picture whose brightest pixels lie 1 to 100 times above white."""
+    """Return an image [SIZE, SIZE] whose brightest pixels lie 1 to 100 times above white."""
     return np.exp(rng.uniform(0.2, 2.0) * rng.standard_normal((SIZE, SIZE)))
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_halves_tell_the_error_at_white(seed):
-    """Noise in proportion to the light or even, weak or strong, and rare bright stray paths: any picture, any white.
+def test_two_halves_give_the_error_at_white(seed):
+    """For random images and whites: noise proportional to light or uniform, weak or strong, and rare bright paths.
 
-    The squares are drawn once for the estimate and once for the real error. What noise carries over white and back
-    counts once more than it should: at most a third too much, never too little beyond what the draws explain.
+    The squares are drawn once for the estimate and once for the real error. Noise that crosses white counts twice: the
+    estimate is at most a third too large, and never too small beyond the scatter of the draws.
     """
     rng = np.random.default_rng([7, seed])
     truth = truth_of(rng)
@@ -46,7 +46,7 @@ def test_halves_tell_the_error_at_white(seed):
     level = 10 ** rng.uniform(-3, -0.7)
     sigma = level * (truth if seed % 2 else truth.mean())
     halves = truth + math.sqrt(2) * sigma * rng.standard_normal((2, SIZE, SIZE))
-    if seed % 4 >= 2:  # in one of 200 pixels of a half a path of up to 30 whites, whose mean belongs to the truth
+    if seed % 4 >= 2:  # 1 in 200 pixels of a half has a path of up to 30 whites; its mean belongs to the truth
         stray = 30 * white * rng.random()
         halves += stray * (rng.random(halves.shape) < 0.005)
         truth = truth + 0.005 * stray
@@ -72,8 +72,8 @@ def test_white_is_the_lower_of_two():
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_an_error_is_read_off_at_any_white(seed):
-    """Between the whites at which a frame states it, to 3 %; the true one is smooth."""
+def test_an_error_is_interpolated_at_any_white(seed):
+    """Between the stored whites the interpolation is right to 3 %; the true error is smooth."""
     rng = np.random.default_rng([8, seed])
     truth = truth_of(rng)
     halves = truth + 0.05 * rng.standard_normal((2, SIZE, SIZE)) * truth
@@ -93,7 +93,7 @@ def test_a_clip_states_both_figures_below_its_own_white():
     assert found["psnr_unclamped"] == pytest.approx(20.0)
     line = stated(found | {"mean_radiance": 0.4}).line
     assert line == "36.0 dB below white (2.5 x the mean), clamped there; 20.0 dB unclamped"
-    plain = measured(0.4, 5.0, [0.1, 0.1], [[], []])  # a writer that knows no clamp: the plain error is no less
+    plain = measured(0.4, 5.0, [0.1, 0.1], [[], []])  # without clamped errors: the plain error is never smaller
     assert plain["psnr_of_truth"] == plain["psnr_unclamped"]
     assert "psnr_of_truth" not in measured(0.0, 0.0, [0.1], [[]])
 

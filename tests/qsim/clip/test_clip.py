@@ -1,4 +1,4 @@
-"""Clip folders: what is written is read, and damage is named."""
+"""Tests reading of clip folders: contents, crops, and messages about damage."""
 
 from pathlib import Path
 
@@ -54,7 +54,7 @@ def test_each_kind_of_damage_is_named(tmp_path: Path):
         clip.sharp(2)
 
 
-def test_a_truncated_radiance_file_is_an_error_not_garbage(tmp_path: Path):
+def test_a_truncated_radiance_file_is_refused(tmp_path: Path):
     clip = write(tmp_path / "a")
     path = clip.path / "radiance" / "000001.exr"
     whole = path.read_bytes()

@@ -1,4 +1,4 @@
-"""OpenEXR files: the OpenEXR library reads the same, and the largest half is kept and counted."""
+"""Tests OpenEXR files against the OpenEXR library, and the clipping to the largest half."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def test_the_largest_half_is_kept_and_counted(tmp_path: Path):
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (8, 10), (17, 33), (16, 7), (33, 128)])
 def test_exr_agrees_with_the_openexr_library(tmp_path: Path, height: int, width: int):
-    """Our writer's files, zipped and not, read by the reference library; odd sizes around the 16-row chunks."""
+    """The reference library reads our files, zipped and not; odd sizes around the 16-row chunks."""
     rng = np.random.default_rng(height)
     smooth = np.cumsum(rng.normal(size=(height, width)), axis=0)
     channels = {

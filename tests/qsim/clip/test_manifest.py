@@ -1,4 +1,4 @@
-"""clip.json: impossible clips, other versions and damage are refused and named."""
+"""Tests the checks of clip.json: impossible clips, other versions, damage."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Photons of a clip: crops, light levels, relative radiance."""
+"""Tests the photons of a clip: crops, light levels, relative radiance."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Several processes that sense and read one clip at once: a lock per clip, and readers that never mix two streams."""
+"""Tests concurrent sensing and reading of a clip: one writer at a time, and no reader mixes two streams."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from qsim.clip.sensing import Sensing, sense
 FORK = multiprocessing.get_context("fork")  # everything is imported already: the processes start together
 
 
-def stored(codes: np.ndarray) -> str:
-    """SHA-256 of the .npy file that holds these packed codes."""
+def checksum(codes: np.ndarray) -> str:
+    """Return the SHA-256 of the .npy file of packed codes."""
     file = io.BytesIO()
     np.save(file, codes)
     return hashlib.sha256(file.getvalue()).hexdigest()
 
 
 def sense_again(path: Path, seed: int, seconds: float, answers: multiprocessing.Queue) -> None:
-    """Replace the stream `same` over and over; half of the reads follow at once, half a moment after opening."""
+    """Replace and read the stream `same` repeatedly; half of the reads follow at once, half after a delay."""
     clip, rng, found = Clip.open(path), random.Random(seed), Counter[str]()
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -40,9 +40,9 @@ def sense_again(path: Path, seed: int, seconds: float, answers: multiprocessing.
         try:
             opened = clip.stream("same")
             time.sleep(rng.choice([0, 0.001, 0.01]))
-            content = stored(opened.packed)
+            content = checksum(opened.packed)
             time.sleep(rng.choice([0, 0.01]))
-            found["whole" if content == opened.meta["sha256"] == stored(opened.packed) else "mixed"] += 1
+            found["intact" if content == opened.meta["sha256"] == checksum(opened.packed) else "mixed"] += 1
         except ValueError as error:
             found["replaced" if "was replaced since it was opened" in str(error) else str(error)] += 1
         except FileNotFoundError:
@@ -51,34 +51,34 @@ def sense_again(path: Path, seed: int, seconds: float, answers: multiprocessing.
 
 
 def together(target, arguments: list[tuple]) -> list:
-    """What the processes put into the queue that is their last argument."""
+    """Return the answers of processes that start together; the queue is their last argument."""
     answers = FORK.Queue()
-    crew = [FORK.Process(target=target, args=(*given, answers)) for given in arguments]
+    workers = [FORK.Process(target=target, args=(*given, answers)) for given in arguments]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # fork in a process with threads, from Python 3.12 on
-        for process in crew:
+        for process in workers:
             process.start()
-    found = [answers.get(timeout=120) for _ in crew]
-    for process in crew:
+    found = [answers.get(timeout=120) for _ in workers]
+    for process in workers:
         process.join()
     return found
 
 
 @pytest.mark.parametrize("seconds", [2.0, pytest.param(30.0, marks=pytest.mark.slow)])
 def test_no_reader_sees_codes_of_another_seed_than_its_json(tmp_path: Path, seconds: float):
-    """Four replace a stream, four read it. Before there was a lock 68 of 575 reads were mixed."""
+    """Four processes replace a stream, four read it."""
     path = write_clip(tmp_path / "c", frames=3).path
     sense(Clip.open(path), Sensing("quiver-physical", 3, 3.25, name="same"))
     found = sum(together(sense_again, [(path, seed, seconds) for seed in range(8)]), Counter[str]())
-    assert set(found) <= {"made", "whole", "replaced", "absent"}, found
-    assert found["whole"] > 20, found
+    assert set(found) <= {"made", "intact", "replaced", "absent"}, found
+    assert found["intact"] > 20, found
     assert found["replaced"] + found["absent"] > 0, "nothing was ever replaced beside a reader"
     assert Clip.open(path).verify() == []
     assert sorted(item.name for item in (path / "streams").iterdir()) == ["same.json", "same.npy"]
 
 
 def sense_first(path: Path, start: float, answers: multiprocessing.Queue) -> None:
-    """Sense the same thing at the same moment as the others."""
+    """Sense a stream at the same time as the other processes."""
     clip, waits, drawn = Clip.open(path), [], []
     time.sleep(max(0.0, start - time.monotonic()))
     try:
@@ -88,22 +88,22 @@ def sense_first(path: Path, start: float, answers: multiprocessing.Queue) -> Non
             progress=lambda done, total: drawn.append(done),
             on_wait=lambda: waits.append(1),
         )
-        answers.put((made.meta["sha256"], stored(made.packed), bool(drawn), len(waits)))
+        answers.put((made.meta["sha256"], checksum(made.packed), bool(drawn), len(waits)))
     except BaseException as error:
         answers.put(repr(error))
 
 
-def test_eight_that_sense_the_same_for_the_first_time_make_it_once(tmp_path: Path):
+def test_eight_processes_that_sense_a_new_stream_draw_it_once(tmp_path: Path):
     for n in range(5):
         path = write_clip(tmp_path / f"c{n}", frames=3).path
         found = together(sense_first, [(path, time.monotonic() + 0.3)] * 8)
         assert all(isinstance(one, tuple) for one in found), found
         assert {one[:2] for one in found} == {(found[0][0], found[0][0])}
-        assert [one[2] for one in found].count(True) == 1, "one draws, the others get what it made"
+        assert [one[2] for one in found].count(True) == 1, "one process draws, the others open its stream"
         assert all(one[3] <= 1 for one in found)
 
 
-def test_a_stream_that_was_replaced_says_so_and_a_mapped_one_stays(tmp_path: Path):
+def test_a_replaced_stream_is_reported_and_a_mapped_one_stays(tmp_path: Path):
     clip = write_clip(tmp_path / "c", frames=3)
     wanted = [Sensing("quiver-physical", 3, 3.25, seed=seed, name="same") for seed in (1, 2)]
     first, _ = sense(clip, wanted[0])
@@ -119,8 +119,8 @@ def test_a_stream_that_was_replaced_says_so_and_a_mapped_one_stays(tmp_path: Pat
     np.testing.assert_array_equal(first.codes(), before)  # the same codes again: nothing was mixed
 
 
-def test_what_a_failed_sensing_leaves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The old stream stays whole until the new one is on the disk."""
+def test_failed_sensing_keeps_the_old_stream(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The old stream stays complete until the new one is on the disk."""
     clip = write_clip(tmp_path / "c", frames=3)
     wanted = Sensing("quiver-physical", 3, 3.25, name="same")
     old, _ = sense(clip, wanted)
@@ -132,7 +132,7 @@ def test_what_a_failed_sensing_leaves(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_two_light_levels_share_their_random_numbers_and_another_seed_does_not(tmp_path: Path):
-    """3.25 and 4 PPP, 3 bits: correlated by 0.96, as docs/datasets.md says; with another seed by 0 within 5 sigma.
+    """At 3.25 and 4 PPP and 3 bits, the correlation is 0.96 (docs/datasets.md); with another seed 0 within 5 sigma.
 
     0.01 is half a unit of the last digit and 5 sigma = 5 (1 - 0.96^2) / sqrt(8192) = 0.0043.
     """

@@ -1,4 +1,4 @@
-"""Writing clips: interruptions at every step, other settings, two writers, and what is refused."""
+"""Tests the writing of clips: interruptions at every step, other settings, two writers, refusals."""
 
 import functools
 import os
@@ -15,7 +15,7 @@ from qsim.clip.writer import ClipWriter
 
 
 def interrupted(path: Path, *frames: int, force: bool = False, **changes: Any) -> list[int]:
-    """A writer that is stopped after some frames; returns those which it found done."""
+    """Stop a writer after some frames; return the frames that it found finished."""
     found: list[int] = []
     try:
         with ClipWriter(path, meta(**changes), force=force) as writer:
@@ -27,12 +27,12 @@ def interrupted(path: Path, *frames: int, force: bool = False, **changes: Any) -
         return found
 
 
-def test_an_interrupted_writer_leaves_nothing_readable_and_goes_on(tmp_path: Path):
+def test_an_interrupted_writer_leaves_no_clip_and_resumes(tmp_path: Path):
     path = tmp_path / "a"
     interrupted(path, 1, 0)
     with pytest.raises(FileNotFoundError, match=r"unfinished \(only a.part is there\)"):
         Clip.open(path)
-    # Death in the middle of a journal line and of a temporary file.
+    # Killed within a journal line and a temporary file.
     with open(tmp_path / "a.part" / "journal.jsonl", "ab") as journal:
         journal.write(b'{"t": 2, "che')
     with ClipWriter(path, meta()) as writer:
@@ -58,10 +58,10 @@ def test_an_interrupted_writer_leaves_nothing_readable_and_goes_on(tmp_path: Pat
         ({}, True, True),
     ],
 )
-def test_a_writer_killed_at_every_step_can_begin_again(
+def test_a_writer_killed_at_any_step_can_start_again(
     tmp_path: Path, left: dict[str, Any] | None, replaced: bool, force: bool
 ):
-    """Before each file it opens, removes or renames: in an empty folder, going on, clearing, replacing a clip."""
+    """Killed before each open, removal and rename: in an empty folder, resuming, clearing, replacing a clip."""
     killed, steps = True, 0
     while killed:
         path = tmp_path / str(steps) / "a"
@@ -82,8 +82,8 @@ def test_a_writer_killed_at_every_step_can_begin_again(
 
 
 @pytest.mark.parametrize("gone", [(), ("begun.json",), ("begun.json", "journal.jsonl"), ("begun.json", "lock")])
-def test_a_clip_that_lacks_only_its_name_is_not_made_again(tmp_path: Path, monkeypatch, gone: tuple[str, ...]):
-    """Killed after clip.json was written: no frame is lost, and other settings do not get it."""
+def test_a_clip_that_only_lacks_the_rename_is_not_made_again(tmp_path: Path, monkeypatch, gone: tuple[str, ...]):
+    """Killed after clip.json was written: all frames are kept, and other settings are refused."""
     part = tmp_path / "a.part"
 
     def killed(*_: object) -> None:
@@ -104,11 +104,11 @@ def test_a_clip_that_lacks_only_its_name_is_not_made_again(tmp_path: Path, monke
     assert (clip.path / "radiance" / "000000.exr").stat().st_ino == made
     assert clip.meta == write(tmp_path / "b" / "a").meta
     clip.path.rename(part)
-    frame.write_bytes(kept[:-1])  # and what is damaged is not taken for whole
+    frame.write_bytes(kept[:-1])  # a damaged clip does not count as complete
     assert interrupted(tmp_path / "a") == []
 
 
-def test_a_damaged_frame_of_an_interrupted_writer_is_done_again(tmp_path: Path):
+def test_a_damaged_frame_of_an_interrupted_writer_is_written_again(tmp_path: Path):
     interrupted(tmp_path / "a", 0)
     frame = tmp_path / "a.part" / "radiance" / "000000.exr"
     frame.write_bytes(frame.read_bytes()[:-1])
@@ -146,8 +146,8 @@ def test_nothing_is_overwritten_without_force(tmp_path: Path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a"]
 
 
-def test_what_is_no_clip_is_never_replaced(tmp_path: Path):
-    """Not a folder, not a file, not somebody's folder that has the name of the unfinished one."""
+def test_files_and_other_folders_are_never_replaced(tmp_path: Path):
+    """Neither a folder, nor a file, nor a folder of another origin with the name of the temporary one."""
     (tmp_path / "thesis").mkdir()
     for path in (tmp_path / "thesis" / "a.txt", tmp_path / "b", tmp_path / "c.part" / "notes.txt"):
         path.parent.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Cameras: impossible ones are refused in one line; points project where geometry says."""
+"""Tests the checks of a camera and its projection."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CAMERA = Camera(focal_length=8e-3, f_number=2.8, pixel_pitch=1e-5, height=7, wid
         ({"target": (0.0, 9.0, 5.0)}, "give no orientation"),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused(changes, message):
+def test_impossible_cameras_are_refused(changes, message):
     values = {"focal_length": 8e-3, "f_number": 2.8, "pixel_pitch": 1e-6, "height": 4, "width": 4}
     with pytest.raises(ValueError, match=message):
         Camera(**(values | changes))

@@ -1,4 +1,4 @@
-"""The Airy disk: its width, its contrast and the light that it keeps."""
+"""Tests width, contrast and energy of the Airy pattern."""
 
 import dataclasses
 
@@ -34,7 +34,7 @@ def test_diffraction_keeps_a_constant_and_spreads_a_point_as_airy_says():
 
 
 def test_the_kernel_has_the_contrast_of_the_closed_form():
-    """Its transform is mtf times the pixel's own sinc; cutting at six diameters changes it by about 2 %."""
+    """Its transform is the MTF times the sinc of the pixel; the cut at six diameters changes it by about 2 %."""
     camera = dataclasses.replace(CAMERA, f_number=11.0)
     kernel = airy_kernel(camera)
     n = kernel.shape[0]

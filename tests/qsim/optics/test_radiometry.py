@@ -1,4 +1,4 @@
-"""Units: the table of worked numbers, the laws, the EMVA 1288 hand formula."""
+"""Tests units by worked numbers, laws and the EMVA 1288 formula."""
 
 import dataclasses
 
@@ -51,7 +51,7 @@ def test_lux_of_the_papers_light_levels(ppp: float, lux: float):
 
 
 def test_emva_1288_hand_formula():
-    """50.3412 * A [um2] * t [ms] * lambda [um] * E [uW/cm2], from the standard, with other numbers than ours."""
+    """50.3412 * A [um2] * t [ms] * lambda [um] * E [uW/cm2], from the standard; its constants are not ours."""
     camera = dataclasses.replace(PAPER, pixel_pitch=5e-6, wavelength=625e-9)
     ours = float(to_photons(np.array(3.7e-2), camera, 2e-3))
     assert ours == pytest.approx(50.3412 * 25 * 2 * 0.625 * 3.7, rel=1e-6)

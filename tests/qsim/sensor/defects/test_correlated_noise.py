@@ -1,4 +1,4 @@
-"""Afterpulses and crosstalk: their rates, their margin, dead pixels, and what is refused."""
+"""Tests afterpulses and crosstalk: rates, margins, dead pixels, refusals."""
 
 import re
 
@@ -33,15 +33,15 @@ def sample(sensor, photons, exposure=EXPOSURE, *, key=KEY, maps=PERFECT, afterpu
     return array.sample(photons, exposure, key=key, origin=origin)
 
 
-def test_the_limit_of_weak_disturbances_is_none():
-    """Probabilities of 1e-12 in 5000 avalanches: a change would be a 1 in 10^7 accident."""
+def test_vanishing_probabilities_change_nothing():
+    """At a probability of 1e-12, 5000 avalanches cause a change once in 10^7 runs."""
     plane = BinarySPAD(0.5, 0.0, 3)
     expected = plane.sample(light(), EXPOSURE, key=KEY)
     weak = sample(plane, light(), EXPOSURE, afterpulse=1e-12, crosstalk=1e-12)
     np.testing.assert_array_equal(weak, expected)
 
 
-def test_dead_pixels_never_fire_and_the_others_do_not_notice():
+def test_dead_pixels_never_fire_and_do_not_change_others():
     sensor = BinarySPAD(0.5, 100.0, 3)
     maps = draw_maps(FixedPattern(dead=0.1), (30, 31))
     photons = np.full((2, 30, 31), 50.0)
@@ -88,7 +88,7 @@ def test_crosstalk_of_counts_adds_binomial_numbers():
 
 
 @pytest.mark.parametrize("bits", [1, 3])
-def test_a_crop_with_a_margin_equals_the_whole(bits):
+def test_a_crop_with_a_margin_equals_the_frame(bits):
     sensor = BinarySPAD(0.5, 200.0, bits)
     photons = light((4, 17, 23), seed=1)
     maps = draw_maps(FixedPattern(prnu=0.1, dark=DarkSpread(), dead=0.05), (17, 23))
@@ -120,6 +120,6 @@ def test_frames_of_a_disturbed_clip_all_differ():
         (SENSORS[1], {"key": KEY.at(3), "afterpulse": 0.1}, "sample the clip from frame 0, not from frame 3"),
     ],
 )
-def test_what_makes_no_sense_is_refused(sensor, settings, text):
+def test_impossible_settings_are_refused(sensor, settings, text):
     with pytest.raises(ValueError, match=re.escape(text)):
         sample(sensor, light(), **settings)

@@ -1,4 +1,4 @@
-"""Tables [defects], from files to streams: strict, off at zero, drawn like `defects` and `events`, replayed."""
+"""Tests tables [defects] from files to streams: strict, off at zero, drawn as by PixelArray, replayed."""
 
 import json
 import re
@@ -12,8 +12,7 @@ from qsim.cli import program
 from qsim.clip.photons import clip_photons
 from qsim.clip.sensing import Sensing, prepare, replay, sense
 from qsim.keys import Key, hash_name
-from qsim.sensor import devices, packing
-from qsim.sensor.counting import CountingSPAD
+from qsim.sensor import devices
 from qsim.sensor.defects import defect_table, event_simulation, fixed_pattern
 from qsim.sensor.defects.pixel_array import PixelArray
 
@@ -39,7 +38,7 @@ def drawn(clip, sensor: str, **settings):
 
 @pytest.mark.parametrize("sensor", [BINARY, COUNTING, QUANTA])
 @pytest.mark.parametrize("table", [None, "", "device_seed = 9", "prnu = 0.0\ndead = 0\ncrosstalk = 0.0"])
-def test_what_is_off_changes_no_bit_and_is_not_mentioned(clip, tmp_path, sensor, table):
+def test_defects_that_are_off_change_no_bit_and_are_not_stored(clip, tmp_path, sensor, table):
     plain = drawn(clip, device(tmp_path, sensor))[0].codes()
     stream, _ = drawn(clip, device(tmp_path, sensor, table))
     np.testing.assert_array_equal(stream.codes(), plain)
@@ -47,7 +46,7 @@ def test_what_is_off_changes_no_bit_and_is_not_mentioned(clip, tmp_path, sensor,
 
 
 def test_a_stream_holds_the_codes_that_the_device_draws(clip, tmp_path):
-    """Maps, dead pixels and crosstalk: as `PixelArray.sample`, in one block or in many, and drawn again alone."""
+    """Maps, dead pixels and crosstalk: codes of `PixelArray.sample`, in one block or several, and in a replay."""
     table = "device_seed = 4\nprnu = 0.2\ndark = { spread = 0.3, hot_share = 0.1 }\ndead = 0.1\ncrosstalk = 0.05"
     sensor = device(tmp_path, BINARY, table)
     stream, _ = drawn(clip, sensor)
@@ -62,7 +61,7 @@ def test_a_stream_holds_the_codes_that_the_device_draws(clip, tmp_path):
         np.testing.assert_array_equal(*replay(clip, stream, frame))
 
 
-def test_afterpulses_go_on_from_block_to_block_and_replay(clip, tmp_path):
+def test_afterpulses_continue_across_blocks_and_in_a_replay(clip, tmp_path):
     sensor = device(tmp_path, BINARY, "afterpulse = 0.5")
     stream, _ = drawn(clip, sensor)
     draw = prepare(clip, Sensing(sensor, ppp=2.0))
@@ -82,7 +81,7 @@ def test_planes_of_a_sum_are_disturbed_one_by_one(clip, tmp_path):
 
 
 def test_measured_maps_are_used_checked_and_replayed(clip, tmp_path):
-    """A dark map [1/s] larger than the frame: its mean is the sensor's rate; a hot pixel fires; a change is noticed."""
+    """A dark map [1/s] larger than the frame: its mean is the sensor's rate, a hot pixel fires, a change is refused."""
     rates = np.full((12, 20), 10.0)
     rates[2, 3] = 1e7
     bad = np.zeros((12, 20), bool)
@@ -103,7 +102,7 @@ def test_measured_maps_are_used_checked_and_replayed(clip, tmp_path):
 
 
 def test_light_that_changes_inside_an_exposure_is_followed_photon_by_photon(tmp_path):
-    """Slices of one exposure: the codes of `events.sample`; the effect is said; one frame is drawn again alone."""
+    """Slices of one exposure: codes of `event_simulation.sample`; the effect is reported; one frame is replayed."""
     radiance = np.full((6, 4, 5), 0.01)
     radiance[::3] = 1.0
     clip = write_clip(tmp_path / "flash", radiance=radiance)
@@ -140,19 +139,6 @@ def test_effects_below_the_tolerance_take_the_closed_form(tmp_path):
     np.testing.assert_array_equal(stream.codes(), expected)
 
 
-def test_dead_pixels_of_counters_stay_dead_when_followed(tmp_path):
-    clip = write_clip(tmp_path / "lit", radiance=np.ones((3, 4, 5)))
-    maps = fixed_pattern.Maps(dead=np.arange(20).reshape(4, 5) % 2 == 0)
-    sensor = CountingSPAD(0.5, 10.0, 1e-4, 3)
-    array = PixelArray(sensor, maps, defect_table.Defects(carry_dead_time=True))
-    counts = event_simulation.follow(
-        array, lambda t, y, rows: np.full((1, rows, 5), 20.0), (3, 4, 5), 5e-4, 5e-4, Key(0, 0)
-    )
-    assert not counts[:, maps.dead].any()
-    assert counts[:, ~maps.dead].all()
-    assert len(clip) == 3
-
-
 @pytest.mark.parametrize(
     ("sensor", "table", "message"),
     [
@@ -183,10 +169,3 @@ def test_the_command_takes_defects_for_any_sensor(clip, tmp_path, capsys):
     never = ~clip.stream("dead").codes().any(axis=0)
     assert never.mean() > 0.1
     assert program.main(["sense", str(clip.path), "-o", "dead", "--replay", f"{clip.name}:4"]) == 0
-
-
-def test_packed_blocks_are_the_codes(clip):
-    """What is written without an unpacked detour is what `frames` draws."""
-    draw = prepare(clip, Sensing("quiver-physical", bits=3, ppp=3.25))
-    packed = np.concatenate(list(draw.packed(clip, 6)))
-    np.testing.assert_array_equal(packed, packing.pack(draw.frames(clip, 0, 6), 3))

@@ -1,4 +1,4 @@
-"""The photon-by-photon simulator: limits, its own laws, and the closed forms that it checks."""
+"""Tests the photon-by-photon simulation: limits, laws of renewal theory, and the closed forms."""
 
 import re
 
@@ -8,7 +8,10 @@ from stats import assert_histogram, assert_mean, assert_share
 
 from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
-from qsim.sensor.defects.event_simulation import Effects, Memory, State, effects, expose, sample, simulate
+from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.defects.event_simulation import Effects, Memory, State, effects, expose, follow, sample, simulate
+from qsim.sensor.defects.fixed_pattern import Maps
+from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.spad import BinarySPAD
 
 KEY = Key(seed=1, clip=7)
@@ -37,7 +40,7 @@ def exposed(sensor: CountingSPAD, times: list[float], state: State = State()) ->
 # ---- By hand
 
 
-def test_arrivals_within_the_dead_time_are_lost_and_only_paralyzable_pixels_notice_them():
+def test_arrivals_within_the_dead_time_are_lost_and_restart_it_in_paralyzable_pixels():
     """Dead time 0.3: 0.0 counts, 0.2 does not; 0.4 counts unless 0.2 has started a new dead time."""
     times = [0.0, 0.2, 0.4, 0.75]
     assert exposed(CountingSPAD(1, 0, 0.3, 5), times)[0] == 3
@@ -83,14 +86,14 @@ def test_dark_counts_and_efficiency_enter_as_in_the_closed_form():
     assert_histogram(np.minimum(drawn, 15), np.exp(sensor.log_pmf(np.array(5.0), EXPOSURE)))
 
 
-def test_a_clocked_pixel_asks_whether_anything_arrived():
-    """One plane of a BinarySPAD is a counter that is dead for good after its first count."""
+def test_a_clocked_pixel_detects_whether_anything_arrived():
+    """One plane of a BinarySPAD is a counter that stays dead after its first count."""
     drawn = counts(counter(2.0), constant(0.7, 20_000))
     share = float(np.exp(BinarySPAD(1.0, 0.0).log_pmf(np.array(0.7), EXPOSURE))[1])
     assert_share(int(drawn.sum()), drawn.size, share)
 
 
-# ---- What only the events know
+# ---- Effects beyond the closed forms
 
 
 def test_light_that_comes_at_once_loses_more_counts():
@@ -102,9 +105,9 @@ def test_light_that_comes_at_once_loses_more_counts():
 
 
 def test_a_carried_dead_time_gives_the_renewal_rate():
-    """A non-paralyzable pixel that never rests counts r / (1 + r tau), with a variance that tends to r / (1 + r tau)^3.
+    """A non-paralyzable pixel counts r / (1 + r tau) without gaps; the variance tends to r / (1 + r tau)^3.
 
-    With a new start in every frame it counts more, as the closed form says.
+    With a new start in every frame it counts more, as in the closed form.
     """
     arrivals, share, frames = 6.0, 0.25, 10_000
     expected = arrivals / (1 + arrivals * share)
@@ -155,7 +158,7 @@ def test_small_effects_take_the_closed_form_and_equal_it_bit_by_bit():
     np.testing.assert_array_equal(codes, sensor.sample(light.sum(axis=1), EXPOSURE, key=KEY))
 
 
-def test_large_effects_follow_the_photons_and_say_how_large_they_are():
+def test_large_effects_are_reported_and_photons_are_followed():
     sensor = counter(0.2, bits=3)
     light = np.zeros((2, 4, 3, 5))
     light[:, 0] = 4.0
@@ -167,7 +170,7 @@ def test_large_effects_follow_the_photons_and_say_how_large_they_are():
     assert "varying flux 2.4" in str(found)
 
 
-def test_a_crop_has_the_codes_of_the_whole():
+def test_a_crop_has_the_codes_of_the_frame():
     sensor = counter(0.3, bits=3)
     light = np.random.default_rng(0).uniform(0, 3, (4, 2, 5, 6))
     memory = Memory(carry=True, afterpulse=0.1, afterpulse_delay=EXPOSURE)
@@ -181,7 +184,7 @@ def test_a_crop_has_the_codes_of_the_whole():
 
 @pytest.mark.parametrize(("arrivals", "share"), [(1.0, 0.05), (2.0, 0.03)])
 def test_the_stated_effects_are_those_found(arrivals, share):
-    """Leading order: within 30 % of the difference of the simulated means, whose error is stated from n and sigma."""
+    """To leading order: within 30 % of the difference of simulated means, whose error follows from n and sigma."""
     frames = 40_000
     sensor = counter(share)
     light = np.tile([2 * arrivals, 0.0], (frames, 1))
@@ -221,3 +224,12 @@ def test_wrong_light_is_refused():
         sample(sensor, np.ones((2, 1, 3, 3)), EXPOSURE, frame_time=EXPOSURE / 2, key=KEY)
     with pytest.raises(ValueError, match=re.escape("[T, slices, H, W], got [3, 3]")):
         sample(sensor, np.ones((3, 3)), EXPOSURE, frame_time=EXPOSURE, key=KEY)
+
+
+def test_dead_pixels_of_counters_stay_dead_when_followed():
+    maps = Maps(dead=np.arange(20).reshape(4, 5) % 2 == 0)
+    sensor = CountingSPAD(0.5, 10.0, 1e-4, 3)
+    array = PixelArray(sensor, maps, Defects(carry_dead_time=True))
+    counts = follow(array, lambda t, y, rows: np.full((1, rows, 5), 20.0), (3, 4, 5), 5e-4, 5e-4, Key(0, 0))
+    assert not counts[:, maps.dead].any()
+    assert counts[:, ~maps.dead].all()

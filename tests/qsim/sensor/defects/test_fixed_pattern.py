@@ -1,4 +1,4 @@
-"""FixedPattern: nothing at strength zero, maps that spread without shifting, a pattern that stays, and closed forms."""
+"""Tests fixed-pattern noise: strength zero, mean and spread of maps, constancy in time, exact distributions."""
 
 from dataclasses import replace
 
@@ -68,7 +68,7 @@ def test_a_gain_map_has_mean_1_and_the_declared_spread():
 
 
 def test_uneven_response_does_not_shift_the_signal():
-    """The mean count stays, the variance between pixels grows by (s lambda)^2: 1 + lognormal would double the mean."""
+    """The mean count stays, and the variance between pixels grows by (s lambda)^2."""
     sensor, spread, photons = CountingSPAD(1.0, 0.0, 0.0, 8), 0.1, 20.0
     maps = draw_maps(FixedPattern(prnu=spread), (200, 201))
     codes = PixelArray(sensor, maps).sample(np.full((1, 200, 201), photons), EXPOSURE, key=KEY).astype(float)
@@ -104,13 +104,13 @@ def test_a_map_is_a_function_of_device_and_place():
         np.testing.assert_array_equal(vars(crop)[name], value[11:18, 13:22])
         np.testing.assert_array_equal(vars(whole.crop(11, 13, 7, 9))[name], value[11:18, 13:22])
         assert (vars(other)[name] != value).any()
-        for second, values in vars(whole).items():  # no two kinds of map share their numbers
+        for second, values in vars(whole).items():  # no two kinds of map have common random numbers
             if name != second and value.dtype == values.dtype:
                 assert abs(np.corrcoef(value.ravel(), values.ravel())[0, 1]) < 6 / np.sqrt(value.size)
 
 
 def test_the_pattern_is_fixed_while_the_noise_is_not():
-    """200 dark frames: the mean of a pixel follows its own rate; a pattern that was drawn anew would average out."""
+    """200 dark frames: the mean of a pixel follows its rate; a pattern drawn per frame would average out."""
     sensor = BinarySPAD(0.5, 800.0)
     maps = draw_maps(FixedPattern(dark=DarkSpread(hot_share=0.1, hot_to=20.0)), (20, 21))
     frames = PixelArray(sensor, maps).sample(np.zeros((400, 20, 21)), EXPOSURE, key=KEY)
@@ -134,8 +134,8 @@ def test_measured_rates_become_a_map_of_mean_1():
 # ---- Read-out maps
 
 
-def test_read_out_maps_draw_from_the_pixels_own_cdf():
-    """Two halves with their own offset and read noise: each follows the closed form of such a sensor."""
+def test_read_out_maps_draw_from_the_cdf_of_each_pixel():
+    """Two halves differ in offset and read noise; each follows the closed form of such a sensor."""
     sensor, n = QIS(0.8, 1.6, 0.3, 3), 200
     offset, noise = np.zeros((n, 2 * n)), np.ones((n, 2 * n))
     offset[:, n:], noise[:, n:] = 0.75, 3.0
@@ -176,7 +176,7 @@ def drawn_device(rng: np.random.Generator, shape: tuple[int, int]):
 
 
 def test_the_exact_distribution_holds_for_random_devices():
-    """Drawn codes of random sensors and maps against `pmf`, by chi-square; without the maps most of them fail."""
+    """Codes of random sensors and maps agree with `pmf` by chi-square; without the maps most disagree."""
     rng = np.random.default_rng(21)
     devices, shape, blind = 60, (24, 25), 0
     for i in range(devices):
@@ -193,7 +193,7 @@ def test_the_exact_distribution_holds_for_random_devices():
     assert blind < devices / 2
 
 
-def test_the_exact_distribution_without_maps_is_the_sensor_s_own():
+def test_the_exact_distribution_without_maps_is_that_of_the_sensor():
     photons = light((4, 5))
     for sensor in (QIS(0.8, 100.0, 0.2, 3), BinarySPAD(0.4, 50.0, 2)):
         np.testing.assert_array_equal(pmf(sensor, photons, 5e-4, PERFECT), sensor.pmf(photons, 5e-4))
