@@ -80,7 +80,7 @@ class Stream:
 
     @property
     def exposure(self) -> float:
-        """Seconds of one code (of one plane, where a code sums planes of its own clip frames, times their number)."""
+        """Seconds of light in one code; for a sum of planes, of all its planes."""
         return float(self.meta["exposure"])
 
     @property

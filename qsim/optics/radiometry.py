@@ -68,7 +68,7 @@ def expected_photons(
     camera's frame; without it the image is centred on the optical axis. `ValueError` if the exposure is not positive.
     """
     if not exposure > 0:
-        raise ValueError(f"exposure: expected seconds above 0, got {exposure!r}; a whole frame at 2000 fps is 5e-4")
+        raise ValueError(f"exposure: expected seconds above 0, got {exposure!r}; a full frame time at 2000 fps is 5e-4")
     radiance = np.asarray(radiance, np.float64)
     cosines: float | Array = 1.0
     if camera.vignetting and radiance.ndim >= 2:

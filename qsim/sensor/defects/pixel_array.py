@@ -45,21 +45,21 @@ class PixelArray:
         drawn = draw_maps(defects.pattern, (height, width))
         measured: dict[str, Array] = {}
         for key, path in defects.maps.items():
-            whole = _read_map(path, key)
-            if whole.shape[0] < height or whole.shape[1] < width:
+            full = _read_map(path, key)
+            if full.shape[0] < height or full.shape[1] < width:
                 raise ValueError(
-                    f"{path}: the {key} has {whole.shape[0]} x {whole.shape[1]} pixels, the frames {height} x {width}; "
+                    f"{path}: the {key} has {full.shape[0]} x {full.shape[1]} pixels, the frames {height} x {width}; "
                     "a map must cover the frames: measure a larger one, or draw smaller frames"
                 )
             name = key.removesuffix("_map")
             if name == "dark":
-                rate, whole = measured_dark_map(whole)
+                rate, full = measured_dark_map(full)
                 sensor = sensor.with_dark_rate(rate)
             elif name == "read_noise" and isinstance(sensor, QIS):
                 if not sensor.read_noise:
                     raise ValueError(f"{path}: a map of read noise needs a sensor with read_noise above 0")
-                whole = whole / sensor.read_noise
-            measured[name] = whole[:height, :width] != 0 if name == "dead" else whole[:height, :width]
+                full = full / sensor.read_noise
+            measured[name] = full[:height, :width] != 0 if name == "dead" else full[:height, :width]
         return cls(sensor, replace(drawn, **measured), defects)
 
     @property
