@@ -15,6 +15,9 @@ from qsim.dataset.dataset import Dataset
 
 RECIPE = fakes.RECIPE.replace("height = 8\nwidth = 10\n", "height = 24\nwidth = 32\npsnr = 25.0\n")
 RECIPE = RECIPE.replace("bits = [1, 3]\nppp = 3.25", "bits = 3\nppp = [3.25, 26.0]")
+RECIPE = RECIPE.replace(
+    'seeds = [4]\nsplit = "test"\nframes = 2', 'split = "test"'
+)  # a scene without shared photographs
 
 
 def generate(recipe: Path, folder: Path, *options: str) -> subprocess.Popen[bytes]:
