@@ -100,8 +100,8 @@ TESTS = """## What the tests hold
 | claim | test |
 |---|---|
 | light is counted right: worked numbers, EMVA formula, laws | `tests/qsim/optics/test_radiometry.py` |
-| radiance of a closed box and of a Lambertian plane | `tests/qsim/rendering/test_renderer.py` |
-| stated error of a frame is its error | `test_fidelity.py`, `test_fidelity_white.py`, `test_rendering.py` |
+| radiance of a closed box and of a Lambertian plane | `test_renderer.py`, `test_mitsuba_scene.py` |
+| stated error of a frame is its error | `test_renderer.py`, `test_fidelity.py`, `test_fidelity_white.py` |
 | mean light is that of a converged frame, as far as is announced | `test_idle_options.py`, `test_denoiser.py` |
 | compiled and reference engine agree over 10 000 random sensors | `tests/qsim/sensor/compiled/test_codes_search.py` |
 | codes have the exact distribution: tails, ties, dead times | `tests/qsim/sensor/test_qis.py`, `test_counting.py` |

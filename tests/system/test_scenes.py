@@ -1,7 +1,7 @@
-"""The scene library: every family builds, repeats with its seed, varies between seeds, and moves as fast as it says.
+"""The scene library: families build, repeat with their seed, vary between seeds, and move as fast as documented.
 
-Motion is measured by projecting points of the bodies: nothing is rendered. The quick tier builds one seed of every
-family; other seeds and speeds are slow tests of the same laws.
+Motion is measured by projecting points of the bodies, without rendering. The quick tier builds one seed of every
+family; slow tests check the same laws for other seeds and speeds.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def vertices_in_world(body: Body, t: float) -> np.ndarray:
 
 
 def points_on(body: Body, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, float]:
-    """(faces [N], barycentric [N, 3], surface) of points spread evenly over the surface at time 0."""
+    """Return faces [N] and barycentric weights [N, 3] of random points on a body at time 0, and the area [m^2]."""
     corner = body.vertices(0.0)[body.mesh.faces]
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 2
     faces = rng.choice(len(area), count, p=area / area.sum())
@@ -57,7 +57,7 @@ def points_on(body: Body, count: int, rng: np.random.Generator) -> tuple[np.ndar
 
 
 def image_motion(scene: Scene, times: tuple[float, ...] = (0.002, 0.008), count: int = 800) -> float:
-    """Mean motion [px/frame] of moving points in view, weighted by the picture's area; what hides what is ignored."""
+    """Return the mean motion [px/frame] of moving points in view, weighted by image area; occlusion is ignored."""
     rng, camera, speeds, weights = np.random.default_rng(9), scene.camera, [], []
     for body in scene.bodies:
         faces, share, surface = points_on(body, count, rng)
@@ -143,7 +143,7 @@ def test_other_seeds_differ_in_layout_and_texture_and_light(family):
 
 @pytest.mark.parametrize("family", SOME_FAMILIES)
 def test_twice_the_speed_moves_as_far_in_half_the_time(family):
-    """Steps from time 0, in the body's own frame; gravity does not scale: it moves 5 um in a frame."""
+    """Steps from time 0 in body coordinates; gravity does not scale and moves 5 um in a frame."""
     once, twice = built(family, 0), built(family, 0, 2.0)
     step = 1 / FRAME_RATE
     moving = 0
@@ -188,7 +188,7 @@ def test_loading_by_name_and_by_file(tmp_path):
 
 
 def test_a_folder_of_meshes_textures_and_environments_becomes_scenes(tmp_path):
-    """What the folder holds is used; other seeds choose otherwise; kinds that are missing are made."""
+    """The files of the folder are used, differently for other seeds; missing kinds are made."""
     import OpenEXR
     from PIL import Image
 

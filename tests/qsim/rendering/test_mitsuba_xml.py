@@ -1,4 +1,4 @@
-"""Scenes in Mitsuba's own XML: our camera sees what Mitsuba's camera sees, named shapes move with true flow."""
+"""Scenes in Mitsuba's XML: our camera gives the same picture as Mitsuba's, and named shapes move with true flow."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_a_spinning_mesh_turns_its_normals_too(room):
     assert np.hypot(*first.flow)[on].max() > 0.5
 
 
-def test_our_camera_sees_what_the_files_camera_sees(room):
+def test_our_camera_gives_the_picture_of_the_files_camera(room):
     from qsim.rendering import engine
 
     engine.select()
@@ -87,7 +87,7 @@ def test_our_camera_sees_what_the_files_camera_sees(room):
     assert np.sqrt(np.mean((theirs - ours.radiance) ** 2)) < 0.03 * ours.radiance.mean()
 
 
-def test_a_clip_of_a_file_says_which_and_rendering_by_name_works(room, tmp_path):
+def test_a_clip_names_its_file_and_rendering_by_name_works(room, tmp_path):
     scene = scenes.load(room)
     clip = render_clip(scene, tmp_path / "clip", frames=1, budget=Budget(2, 1))
     assert clip.meta["scene"]["family"] == "room"
@@ -115,7 +115,7 @@ MEDIUM = """<shape type="sphere" id="fog"><bsdf type="null"/>
         ((SENSOR, LIGHT, SHAPES), {"box": Flag(np.eye(3), ())}, "shape box: shapes of a Mitsuba file move rigidly"),
     ],
 )
-def test_what_cannot_be_taken_over_is_refused(tmp_path, parts, motions, message):
+def test_unsupported_files_and_motions_are_refused(tmp_path, parts, motions, message):
     with pytest.raises(ValueError, match=message):
         read_mitsuba(written(tmp_path, *parts), motions)
 

@@ -1,4 +1,4 @@
-"""Cloth: held at its pole, periodic, with ripples that travel away from it."""
+"""Cloth: fixed at its pole, periodic, with ripples that move away from it."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ FLAG = Flag(REST, (Ripple(0.05, 0.3, 4.0, 3.0, 0.5), Ripple(0.02, 0.11, -7.0)), 
 STEP = 1e-6  # s: central differences err by step^2 * third derivative, below 1e-6 here
 
 
-def test_the_flag_is_held_at_its_pole_and_repeats():
+def test_the_flag_is_fixed_at_its_pole_and_periodic():
     t = 0.123
     np.testing.assert_array_equal(FLAG.deform(t)[REST[:, 0] == 0], REST[REST[:, 0] == 0])
     np.testing.assert_array_equal(FLAG.deform(t)[:, :2], REST[:, :2])
     slope = (FLAG.deform(t + STEP) - FLAG.deform(t - STEP)) / (2 * STEP)
-    assert np.abs(slope).max() > 0.1  # m/s: it does move
+    assert np.abs(slope).max() > 0.1  # m/s: it moves
     edge = FLAG.rest[:, 0] == FLAG.width
     assert np.abs(FLAG.deform(t)[edge, 2]).max() <= 0.05 + 0.02
     period = Flag(REST, FLAG.ripples[:1])

@@ -81,7 +81,7 @@ def test_every_pose_is_rigid_and_its_points_move_as_stated(name):
 
 
 @pytest.mark.parametrize("name", MOTIONS)
-def test_poses_are_continuous_and_do_not_depend_on_the_order_of_asking(name):
+def test_poses_are_continuous_and_independent_of_the_order_of_evaluation(name):
     motion = MOTIONS[name]
     times = np.linspace(-0.1, 1.2, 521)  # 2.5 milliseconds apart
     forward = np.array([motion.pose(t) for t in times])
@@ -126,7 +126,7 @@ def test_keyframes_pass_their_keys_and_rest_outside():
     assert not np.any(KEYS.velocity(-0.1))
 
 
-def test_keyframes_turn_evenly_and_their_places_have_no_kink():
+def test_keyframes_rotate_uniformly_and_their_paths_have_no_kink():
     for key in KEYS.times[1:-1]:
         before, after = KEYS.velocity(key - 1e-9)[0], KEYS.velocity(key + 1e-9)[0]
         np.testing.assert_allclose(before, after, atol=1e-6)

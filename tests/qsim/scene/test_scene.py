@@ -79,13 +79,13 @@ def test_a_motion_without_a_pose_names_the_body():
         scene(bodies=(Body("a", TRIANGLE, motion=Lost()),))
 
 
-def test_provenance_is_json_and_tells_textures_apart():
+def test_a_description_is_json_and_distinguishes_textures():
     bodies = [Body("a", TRIANGLE, Diffuse(Texture(np.full((5, 5), v))), Translation((1, 0, 0))) for v in (0.1, 0.2)]
     texts = [json.dumps(scene(bodies=(body,)).to_dict()) for body in bodies]
     assert texts[0] != texts[1]
     assert describe(np.float32(2)) == 2.0
 
 
-def test_an_environment_of_darkness_is_no_light():
+def test_a_black_environment_does_not_count_as_light():
     with pytest.raises(ValueError, match="no light"):
         scene((EnvironmentImage(np.zeros((4, 8))),))

@@ -57,7 +57,7 @@ SHEETS = {"sheet": sheet(2, 1, 3, 5), "rotor": rotor(5, 0.3), "spring": spring(0
 
 
 @pytest.mark.parametrize("name", SOLIDS)
-def test_solids_are_watertight_and_look_outward(name):
+def test_solids_are_watertight_with_outward_faces(name):
     mesh = SOLIDS[name]
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     solid.merge_vertices(merge_tex=True, merge_norm=True)
@@ -68,7 +68,7 @@ def test_solids_are_watertight_and_look_outward(name):
 
 
 @pytest.mark.parametrize("name", PLATES)
-def test_plates_have_no_net_area_and_look_outward(name):
+def test_plates_have_no_net_area_and_outward_faces(name):
     mesh = PLATES[name]
     np.testing.assert_allclose(area_vectors(mesh).sum(0), 0, atol=1e-12)  # the law of every closed surface
     assert volume(mesh) > 0
@@ -117,7 +117,7 @@ def test_finer_meshes_converge_quadratically_to_the_smooth_solid(make, volume_of
     np.testing.assert_allclose(errors[:-1] / errors[1:], 4, rtol=0.05)
 
 
-def test_sizes_are_those_asked_for():
+def test_sizes_are_the_requested_ones():
     for mesh, size in (
         (box(0.3, 0.2, 0.1), (0.3, 0.2, 0.1)),
         (ball(0.5), (1, 1, 1)),
@@ -197,7 +197,7 @@ def test_flat_faces_keep_the_size_of_their_texture():
     assert (turn > 0).all()  # readable from outside, not mirrored
 
 
-def test_a_sheet_looks_to_z_with_u_to_the_right_and_v_up():
+def test_a_sheet_faces_z_with_u_to_the_right_and_v_up():
     mesh = sheet(2, 3)
     assert (area_vectors(mesh)[:, 2] > 0).all()
     np.testing.assert_allclose(mesh.uv, mesh.vertices[:, :2] / (2, 3) + 0.5)

@@ -1,4 +1,4 @@
-"""Textures: within 0..1, the same from the same generator, seamless where they say so; photographs from the wheel."""
+"""Textures: within 0..1, equal for equal generators, seamless if documented; photographs of the installed wheel."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_drawn_textures_reach_both_their_levels(name):
 
 
 @pytest.mark.parametrize("name", ["noise", "bricks", "cells", "speckles"])
-def test_what_tiles_has_no_seam(name):
+def test_tiling_textures_have_no_seam(name):
     picture = MADE[name](np.random.default_rng(6)).astype(float)
     for axis in (0, 1):
         steps = np.abs(np.diff(picture, axis=axis)).mean()
@@ -65,7 +65,7 @@ def test_drawn_patterns_have_their_periods():
 
 
 @pytest.mark.parametrize("slope", [0.5, 1.0, 1.5])
-def test_noise_has_the_slope_asked_for(slope):
+def test_noise_has_the_requested_slope(slope):
     raw = textures.noise(np.random.default_rng(7), (256, 256), slope).astype(float)
     power = np.abs(np.fft.fft2(raw - raw.mean())) ** 2
     f = np.hypot(*np.meshgrid(np.fft.fftfreq(256) * 256, np.fft.fftfreq(256) * 256))
