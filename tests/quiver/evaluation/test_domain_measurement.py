@@ -85,7 +85,7 @@ def test_the_command_shows_and_measures(capsys, tiny_dataset, tmp_path):
     path = weights(tmp_path)
     code, _, err = run(capsys, "domain", path)
     assert (code, err.count("\n")) == (2, 1)
-    assert "was never measured; name clips" in err
+    assert "was never measured; give clips" in err
     for option in (
         ("--bits", 1),
         ("--seed", 3),
