@@ -13,7 +13,7 @@ from quiver.model.unet import UNet
 PRESETS: dict[str, Config] = {
     "quiver": Config(),
     "quiver-s": Config(channels=16),
-    "nano": FoldedConfig(),  # small in everything; docs/results/starter.md has what it reaches
+    "nano": FoldedConfig(),  # small in every part; results: docs/results/starter.md
 }
 
 # Rows of the paper's Table 4, without that of the pretrained flow: pre-denoiser, flow, multi-scale outputs.
