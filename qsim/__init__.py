@@ -1,6 +1,6 @@
 """qsim: moving scenes at 2000 fps into the few-bit streams of quanta image sensors.
 
-The names of `__all__` are all that a notebook needs; each is imported when it is first asked for.
+A notebook needs the names of `__all__` only; each is imported on first use.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`python -m qsim`: the same as the command `qsim`."""
+"""Runs the command `qsim` as `python -m qsim`."""
 
 import sys
 

@@ -1,12 +1,12 @@
-"""Which machine renders: finds CUDA or a usable LLVM, proves it in a child process.
+"""Chooses the Mitsuba variant: tests CUDA, then every LLVM, in a child process.
 
-    CUDA with OptiX -> LLVM 16 or newer -> scalar (slow, always there)
+    CUDA with OptiX -> LLVM 16 or newer -> scalar (slow, always available)
 
-Dr.Jit 1.5 refuses LLVM 14 with an ImportError and with LLVM 15 the first render aborts the whole process. So no library
-is loaded here before a child process has rendered with it; the answer is kept in the user's cache folder, keyed by the
+Dr.Jit 1.5 refuses LLVM 14 with an ImportError. With LLVM 15 the first render aborts the process. So no library is
+loaded before a child process has rendered with it. Results are stored in the user's cache folder; their key is the
 library's path and time and the versions of Mitsuba and Dr.Jit.
 
-Environment: DRJIT_LIBLLVM_PATH names an LLVM to try first, QSIM_ENGINE=cuda|llvm|scalar insists on one engine.
+Environment: DRJIT_LIBLLVM_PATH names an LLVM to try first; QSIM_ENGINE=cuda|llvm|scalar requires one engine.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from typing import Any
 
 from qsim.files import write_bytes
 
-LLVM_VERSIONS = (22, 21, 20, 19, 18, 17, 16)  # newest first; 21 is tried like the others, its probe decides
+LLVM_VERSIONS = (22, 21, 20, 19, 18, 17, 16)  # newest first
 BACKENDS = ("cuda", "llvm", "scalar")
 VARIANTS = {"cuda": "cuda_ad_mono", "llvm": "llvm_ad_mono", "scalar": "scalar_rgb"}
 PROBE_SECONDS = 180
@@ -69,7 +69,7 @@ class Engine:
 
 @dataclass(frozen=True)
 class Probe:
-    """What a child process found out about one candidate."""
+    """The result of a child process that tested one candidate."""
 
     backend: str
     library: str | None
@@ -78,9 +78,9 @@ class Probe:
 
 
 def choose(prefer: str | None = None) -> Engine:
-    """Choose an engine, once per process; `prefer` or QSIM_ENGINE insists on "cuda", "llvm" or "scalar".
+    """Return the engine, chosen once per process; `prefer` or QSIM_ENGINE requires "cuda", "llvm" or "scalar".
 
-    `ValueError` when the wanted engine does not work here, with the reason and what to install.
+    `ValueError` if the required engine does not work; it states the reason and what to install.
     """
     wanted = prefer or os.environ.get("QSIM_ENGINE") or None
     if wanted not in (None, *BACKENDS):
@@ -89,11 +89,11 @@ def choose(prefer: str | None = None) -> Engine:
 
 
 def limit_threads() -> None:
-    """Give Dr.Jit the number of threads that QSIM_THREADS names, if any; processes that are started inherit it."""
+    """Set the number of Dr.Jit's threads to QSIM_THREADS, if that is set; child processes inherit it."""
     wanted = os.environ.get("QSIM_THREADS")
     if wanted:
         if not (wanted.isdigit() and int(wanted)):
-            raise ValueError(f"QSIM_THREADS={wanted}: expected a number of threads, at least 1")
+            raise ValueError(f"QSIM_THREADS={wanted}: expected a number of threads of at least 1")
         import drjit as dr
 
         if dr.thread_count() != int(wanted):
@@ -101,7 +101,7 @@ def limit_threads() -> None:
 
 
 def report() -> dict[str, Any]:
-    """Everything `qsim doctor` says about rendering: the choice, every probe, versions, cache file."""
+    """Return what `qsim doctor` prints about rendering: the choice, every probe, versions, cache file."""
     engine = choose()
     probes = [asdict(probe) for probe in _cached_probes()]
     software = {"mitsuba": version("mitsuba"), "drjit": version("drjit")}
@@ -137,7 +137,7 @@ def decide(wanted: str | None) -> Engine:
 
 
 def llvm_candidates() -> list[str]:
-    """Paths of LLVM libraries worth a trial: DRJIT_LIBLLVM_PATH first, then the newest; each real file once."""
+    """Return the paths of LLVM libraries to test: DRJIT_LIBLLVM_PATH first, then the newest; each file once."""
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     found = [named] if named else []
     for number in LLVM_VERSIONS:
@@ -162,7 +162,7 @@ def llvm_patterns(number: int) -> list[str]:
 
 
 def probe_cuda() -> Probe:
-    """CUDA is tried only where a driver is present; its version is part of the cache key."""
+    """Test CUDA if there is a driver; its version is part of the cache key."""
     driver = Path("/proc/driver/nvidia/version")
     if not (driver.exists() or ctypes.util.find_library("cuda") or ctypes.util.find_library("nvcuda")):
         return Probe("cuda", None, False, "no NVIDIA driver on this machine")
@@ -171,7 +171,7 @@ def probe_cuda() -> Probe:
 
 
 def cached_probe(variant: str, library: str | None, stamp: str = "") -> Probe:
-    """Render once in a child process, or recall the answer of an earlier child."""
+    """Return the stored result of an earlier test, or test in a child process."""
     modified = os.stat(library).st_mtime_ns if library else 0
     software = [version("mitsuba"), version("drjit"), sys.version.split()[0]]
     key = json.dumps([variant, os.path.realpath(library) if library else None, modified, stamp, *software])
@@ -194,7 +194,7 @@ def run_probe(variant: str, library: str | None) -> Probe:
         return Probe(backend, library, True, f"LLVM {numbers.group(1)}" if numbers else "CUDA with OptiX")
     lines = [line.strip() for line in (child.stderr + "\n" + child.stdout).splitlines() if line.strip()]
     last = next((line for line in lines if "ERROR" in line.upper()), lines[-1] if lines else "no message")
-    ended = f"child process died with signal {-child.returncode}: " if child.returncode < 0 else ""
+    ended = f"child process crashed with signal {-child.returncode}: " if child.returncode < 0 else ""
     if backend == "cuda" and any("optix" in line.lower() for line in lines):
         last = f"OptiX is missing or too old ({last}); update the NVIDIA driver"
     return Probe(backend, library, False, (ended + last)[:300])
@@ -214,12 +214,12 @@ def _read_cache() -> dict[str, dict[str, Any]]:
 
 
 def _write_cache(answers: dict[str, dict[str, Any]]) -> None:
-    """Best effort: a machine without a writable home probes again each time."""
+    """Store the results if possible; without a writable home every process tests again."""
     try:
         _cache_file().parent.mkdir(parents=True, exist_ok=True)
         write_bytes(_cache_file(), json.dumps(answers, indent=1).encode())
     except OSError as error:
-        warnings.warn(f"{_cache_file()}: cannot keep the engine's choice ({error})", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"{_cache_file()}: cannot store the choice of the engine ({error})", RuntimeWarning, stacklevel=2)
 
 
 def _cached_probes() -> list[Probe]:

@@ -1,4 +1,4 @@
-"""Checks of what people write: a value in its type, or a `ValueError` that says what was expected or meant."""
+"""Checks single values of options and files: returns the value in its type, or says what was expected."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MAX_PIXELS = 1 << 26  # of one frame: 8192 x 8192
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
-    """` (did you mean '...'?)`, or nothing if no known word is close."""
+    """Return ` (did you mean '...'?)`, or an empty text if no known word is close."""
     close = difflib.get_close_matches(word, list(known), n=1)
     return f" (did you mean '{close[0]}'?)" if close else ""
 
@@ -123,7 +123,7 @@ def split(value: Any) -> str:
 
 
 def list_of(check: Callable[[Any], Any]) -> Callable[[Any], list[Any]]:
-    """A check of one value or of a list of them, without repetitions."""
+    """Return a check that takes one value or a list of different values, and returns a list."""
 
     def checked(value: Any) -> list[Any]:
         values = [check(item) for item in value] if isinstance(value, list) else [check(value)]
@@ -140,7 +140,7 @@ def list_of(check: Callable[[Any], Any]) -> Callable[[Any], list[Any]]:
 
 
 def require_finite(name: str, values: np.ndarray) -> None:
-    """`ValueError` that names the first value which is not finite, and its index."""
+    """Raise `ValueError` with value and index of the first one that is not finite."""
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):
         index = tuple(int(i) for i in bad[0])
@@ -148,7 +148,7 @@ def require_finite(name: str, values: np.ndarray) -> None:
 
 
 def check_shape(path: Path, shape: tuple[int, ...]) -> tuple[int, int, int]:
-    """(T, H, W) if there is at least one frame of a sane size, else `ValueError`."""
+    """Return (T, H, W) if there is at least one frame of 1 to MAX_PIXELS pixels, else raise `ValueError`."""
     if len(shape) != 3:
         raise ValueError(f"{path}: expected frames [T, H, W], found an array of shape {list(shape)}")
     frames, height, width = (int(n) for n in shape)

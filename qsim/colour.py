@@ -1,6 +1,6 @@
-"""Numbers -> pictures for people: one tone curve; flow, depth and bodies as colour. Nothing computes on these.
+"""Transfer curves, luminance, peak and PSNR; and arrays as pictures: one tone curve, false colours.
 
-All take stacks or single frames [..., H, W] and return uint8 [..., H, W] or [..., H, W, 3].
+Pictures are made of frames [..., H, W] and are uint8 [..., H, W] or [..., H, W, 3].
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 TRANSFERS = ("linear", "srgb", "gamma 2.2")
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue: ITU-R BT.709
-GAMMA = 2.2  # the one tone curve of every picture
+GAMMA = 2.2  # of the tone curve of every picture
 AVERAGE = 11  # frames of a naive mean, the window of QUIVER
 
 
 def to_linear(values: NDArray[Any], transfer: str, top: float) -> NDArray[Any]:
-    """Linear light, float32 in 0..1, from coded values 0 ... top (IEC 61966-2-1 for srgb)."""
+    """Return linear light, float32 in 0..1, of coded values 0 ... top (IEC 61966-2-1 for srgb)."""
     coded = np.asarray(values, np.float32) / np.float32(top)
     if transfer == "linear":
         return coded
@@ -30,7 +30,7 @@ def to_linear(values: NDArray[Any], transfer: str, top: float) -> NDArray[Any]:
 
 
 def from_linear(light: NDArray[Any], transfer: str, top: int) -> NDArray[Any]:
-    """Coded values 0 ... top, rounded, of linear light in 0..1 (clipped): the inverse of `to_linear`."""
+    """Return coded values 0 ... top, rounded, of linear light in 0..1 (clipped): the inverse of `to_linear`."""
     light = np.clip(np.asarray(light, np.float64), 0, 1)
     if transfer == "linear":
         coded = light
@@ -44,14 +44,14 @@ def from_linear(light: NDArray[Any], transfer: str, top: int) -> NDArray[Any]:
 
 
 def luminance(rgb: NDArray[Any]) -> NDArray[Any]:
-    """Rec. 709 luminance [...] of linear colours [..., 3], in the precision of the input."""
+    """Return the Rec. 709 luminance [...] of linear colours [..., 3], in the precision of the input."""
     return rgb @ LUMINANCE.astype(rgb.dtype if rgb.dtype.kind == "f" else np.float64)
 
 
 def peak(image: NDArray[np.floating]) -> float:
-    """The peak of an image, a clip or a sample of one: the 99.9th percentile of its finite values; 1 if that is 0.
+    """Return the peak of an array of any shape: the 99.9th percentile of its finite values; 1 if that is 0.
 
-    The caller's docstring says whose peak it is: of a frame, of some frames of a clip, of a reference.
+    The caller's docstring states of what: a frame, some frames of a clip, a reference.
     """
     finite = image[np.isfinite(image)]
     value = float(np.percentile(finite, 99.9)) if finite.size else 0.0
@@ -59,14 +59,14 @@ def peak(image: NDArray[np.floating]) -> float:
 
 
 def psnr(peak: float, rms: float) -> float:
-    """PSNR [dB] of an rms error below a peak, both in one unit: infinite without error, -infinite without a peak."""
+    """Return the PSNR [dB] of an rms error below a peak of the same unit: inf for no error, -inf for no peak."""
     if rms <= 0:
         return math.inf
     return 20 * math.log10(peak / rms) if peak > 0 else -math.inf
 
 
 def tone(linear: NDArray[np.floating], peak: float) -> NDArray[np.uint8]:
-    """Linear light -> 8-bit grey: 255 (v / peak)^(1/2.2), clipped to 0 ... peak and rounded; NaN is shown black."""
+    """Return linear light as 8-bit grey: 255 (v / peak)^(1/2.2), clipped to 0 ... peak and rounded; NaN is black."""
     if not peak > 0:
         raise ValueError(f"tone: the peak must be positive, got {peak!r}")
     scaled = np.clip(np.nan_to_num(np.asarray(linear, np.float64)) / peak, 0.0, 1.0)
@@ -74,14 +74,14 @@ def tone(linear: NDArray[np.floating], peak: float) -> NDArray[np.uint8]:
 
 
 def code_levels(codes: NDArray[np.integer], bits: int) -> NDArray[np.uint8]:
-    """Codes 0 ... 2^bits - 1 as grey levels 0 ... 255, without any curve."""
+    """Return codes 0 ... 2^bits - 1 as grey levels 0 ... 255, linearly."""
     return np.rint(255.0 * codes / (2**bits - 1)).astype(np.uint8)
 
 
 def flow_colours(flow: NDArray[np.floating], largest: float) -> NDArray[np.uint8]:
-    """Flow [..., 2, H, W] in pixels as colour: hue is the direction (right red, down green), depth of colour the speed.
+    """Return flow [..., 2, H, W] [px] as colour: the hue is the direction (right red, down green).
 
-    White is no motion; `largest` [px] and above is the full colour; NaN (no flow known) is grey.
+    The saturation is the speed: white is no motion, `largest` [px] and above is the full colour. NaN is grey.
     """
     if not largest > 0:
         raise ValueError(f"flow_colours: the largest flow must be positive, got {largest!r} px")
@@ -89,20 +89,20 @@ def flow_colours(flow: NDArray[np.floating], largest: float) -> NDArray[np.uint8
     unknown = ~(np.isfinite(u) & np.isfinite(v))
     u, v = np.where(unknown, 0.0, u), np.where(unknown, 0.0, v)
     speed = np.minimum(np.hypot(u, v) / largest, 1.0)
-    rgb = hue(np.arctan2(v, u) / (2 * np.pi))
+    rgb = hue_from_turns(np.arctan2(v, u) / (2 * np.pi))
     rgb = 1.0 - speed[..., None] * (1.0 - rgb)
     rgb[unknown] = 0.5
     return np.rint(255.0 * rgb).astype(np.uint8)
 
 
-def hue(turns: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Fully saturated colours around the circle, one turn from red over green and blue to red: [...] -> [..., 3]."""
+def hue_from_turns(turns: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return saturated colours [..., 3] of turns [...]; one turn goes from red over green and blue to red."""
     position = np.mod(turns, 1.0)[..., None] * 6.0 + np.array([0.0, 4.0, 2.0])
     return np.clip(np.abs(np.mod(position, 6.0) - 3.0) - 1.0, 0.0, 1.0)
 
 
 def flow_legend(size: int = 96) -> NDArray[np.uint8]:
-    """The colour wheel of `flow_colours` [size, size, 3]: the rim is the largest flow."""
+    """Return the colour wheel of `flow_colours` [size, size, 3]; the rim is the largest flow."""
     y, x = np.mgrid[0:size, 0:size] * (2.0 / (size - 1)) - 1.0
     inside = np.hypot(x, y) <= 1.0
     wheel = flow_colours(np.stack([x, y]), 1.0)
@@ -117,7 +117,7 @@ _DEPTH_RAMP = np.array(
 
 
 def depth_range(depth: NDArray[np.floating]) -> tuple[float, float]:
-    """(near, far) [m]: the 1st and 99th percentile of what was hit; (1, 1) where nothing was."""
+    """Return (near, far) [m]: the 1st and 99th percentile of finite depths; (1, 1) if there are none."""
     hit = depth[np.isfinite(depth) & (depth > 0)]
     if hit.size == 0:
         return 1.0, 1.0
@@ -126,9 +126,9 @@ def depth_range(depth: NDArray[np.floating]) -> tuple[float, float]:
 
 
 def depth_colours(depth: NDArray[np.floating], near: float, far: float) -> NDArray[np.uint8]:
-    """Depth [..., H, W] in metres as colour [..., H, W, 3]: near is light yellow, far is dark blue, even in 1/depth.
+    """Return depth [..., H, W] [m] as colour [..., H, W, 3], linear in 1/depth: near is yellow, far is dark blue.
 
-    Nothing hit (infinite, zero, NaN) is black.
+    Pixels without a hit (infinite, zero, NaN) are black.
     """
     if not 0 < near <= far < np.inf:
         raise ValueError(f"depth_colours: expected 0 < near <= far in metres, got {near!r} and {far!r}")
@@ -142,6 +142,6 @@ def depth_colours(depth: NDArray[np.floating], near: float, far: float) -> NDArr
 
 
 def depth_legend(height: int = 12, width: int = 96) -> NDArray[np.uint8]:
-    """The bar of `depth_colours` [height, width, 3]: the near end is left, the far end right, even in 1/depth."""
+    """Return the bar of `depth_colours` [height, width, 3], linear in 1/depth; near is left, far is right."""
     nearness = np.linspace(1.0, 0.5, width)
     return np.tile(depth_colours(1.0 / nearness, 1.0, 2.0), (height, 1, 1))

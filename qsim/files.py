@@ -1,8 +1,9 @@
 """Reads and writes files: atomic writes (temporary file, fsync, rename), checksums, JSON, TOML and arrays.
 
-    write_bytes / write_json:  NAME.tmp-PID -> fsync -> rename, so that a killed writer leaves nothing a reader accepts.
+    write_bytes / write_json:  NAME.tmp-PID -> fsync -> rename
 
-Every file that `qsim` makes goes through here, which is also where tests inject a full disk.
+A killed writer leaves nothing that a reader accepts. All files of `qsim` are written here, and tests inject a full
+disk here.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ FULL = (errno.ENOSPC, errno.EDQUOT)  # of an `OSError`: no space left
 
 
 def _version() -> str:
-    """The version of the installed package, or of the source tree that is used without installation."""
+    """Return the version of the installed package, or of a source tree without installation."""
     try:
         return metadata.version("qsim")
     except metadata.PackageNotFoundError:
@@ -43,7 +44,7 @@ VERSION = _version()
 
 
 def sha256(source: bytes | memoryview | Path) -> str:
-    """Hexadecimal SHA-256 of some bytes or of a file."""
+    """Return the hexadecimal SHA-256 of bytes or of a file."""
     if not isinstance(source, Path):
         return hashlib.sha256(source).hexdigest()
     with open(source, "rb") as file:
@@ -51,7 +52,7 @@ def sha256(source: bytes | memoryview | Path) -> str:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make renames inside `folder` survive a power cut."""
+    """Sync a folder, so that renames inside it survive a power cut."""
     with _naming(folder):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -62,9 +63,9 @@ def sync_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A binary file that appears under `path` when the block ends well, and not at all otherwise.
+    """Open a binary file that appears under `path` only if the block succeeds.
 
-    An `OSError` of the system (a full disk, a folder that is not ours) names the file.
+    An `OSError` of the system (a full disk, a folder without permission) names the file.
     """
     temporary = path.with_name(f"{path.name}.tmp-{os.getpid()}")
     try:
@@ -82,9 +83,9 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 @contextlib.contextmanager
 def replacing_described(path: Path, description: Path) -> Iterator[tuple[BinaryIO, BinaryIO]]:
-    """As `replacing`, for a file and its description: what is there under the second name always describes the first.
+    """Open a file and its description as `replacing` does; a description that exists always describes its file.
 
-    Both are complete and synced before the old description goes, so that it is missing for three renames only.
+    Both are complete and synced before the old description is deleted: it is missing during three renames only.
     """
     parts = [file.with_name(f"{file.name}.tmp-{os.getpid()}") for file in (path, description)]
     try:
@@ -105,7 +106,7 @@ def replacing_described(path: Path, description: Path) -> Iterator[tuple[BinaryI
 
 
 def append_line(path: Path, line: bytes) -> None:
-    """Add a line to a journal, synced; a killed writer leaves at most a last line cut short."""
+    """Append a line to a journal and sync it; a killed writer leaves at most an incomplete last line."""
     with _naming(path), open(path, "ab") as journal:
         journal.write(line + b"\n")
         journal.flush()
@@ -114,7 +115,7 @@ def append_line(path: Path, line: bytes) -> None:
 
 @contextlib.contextmanager
 def _naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Writes that fail do not say where, or name a temporary file: put the file's own name into their `OSError`."""
+    """Put the name of the file into an `OSError` that names no file, or a temporary one."""
     try:
         yield
     except OSError as error:
@@ -126,7 +127,7 @@ def _naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
 
 
 def wording(error: BaseException) -> str:
-    """An error in one line; an `OSError` of the system as `FILE: reason`, without number, quotes and second file."""
+    """Return an error in one line; an `OSError` of the system as `FILE: reason`, without number and second file."""
     if isinstance(error, OSError) and error.strerror:
         return f"{os.fsdecode(error.filename)}: {error.strerror}" if error.filename else error.strerror
     return " ".join(str(error).split()) or type(error).__name__
@@ -136,9 +137,9 @@ _LEFTOVER = re.compile(r"(.+)\.(?:tmp|removed)-\d+", re.DOTALL)
 
 
 def remove_leftovers(path: Path) -> None:
-    """Delete what killed writers of `path` left beside it: NAME.tmp-PID and NAME.removed-PID, of this exact NAME.
+    """Delete NAME.tmp-PID and NAME.removed-PID beside `path`, which killed writers of this exact NAME left.
 
-    Only for a caller who holds the lock that all writers of `path` take.
+    The caller must hold the lock that all writers of `path` take.
     """
     for leftover in path.parent.iterdir():
         found = _LEFTOVER.fullmatch(leftover.name)
@@ -147,7 +148,7 @@ def remove_leftovers(path: Path) -> None:
 
 
 def remove_leftovers_below(folder: Path) -> None:
-    """Delete every temporary file in `folder` and below; for a caller who is the only writer there."""
+    """Delete every temporary file in `folder` and below; the caller must be the only writer there."""
     for leftover in list(folder.rglob("*.tmp-*")):
         if _LEFTOVER.fullmatch(leftover.name):
             _remove(leftover)
@@ -162,52 +163,52 @@ def _remove(path: Path) -> None:
 
 
 def write_bytes(path: Path, content: bytes | memoryview) -> str:
-    """Write a whole file atomically; returns its SHA-256."""
+    """Write a file atomically; return its SHA-256."""
     with replacing(path) as file:
         file.write(content)
     return sha256(content)
 
 
 def to_json(value: Any) -> bytes:
-    """JSON with sorted keys and one stable spelling, so that equal contents are equal bytes; NaN is refused."""
+    """Return JSON with sorted keys: equal contents are equal bytes. NaN is refused."""
     return (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
 
 
 def write_json(path: Path, value: Any) -> str:
-    """Write `value` atomically as JSON; returns the SHA-256 of the file."""
+    """Write `value` atomically as JSON; return the SHA-256 of the file."""
     return write_bytes(path, to_json(value))
 
 
 def checksum(description: dict[str, Any]) -> str:
-    """SHA-256 of what a description says, without the checksum that it holds itself."""
+    """Return the SHA-256 of a description without its key `checksum`."""
     return sha256(to_json({key: value for key, value in description.items() if key != "checksum"}))
 
 
 def sealed(description: dict[str, Any]) -> dict[str, Any]:
-    """The description with the checksum of its other keys, as all descriptions are written."""
+    """Return the description with the checksum of its other keys, as all descriptions are stored."""
     return description | {"checksum": checksum(description)}
 
 
 def write_description(path: Path, value: dict[str, Any]) -> str:
-    """Write `value`, sealed, atomically as JSON; returns the SHA-256 of the file."""
+    """Write `value` with its checksum atomically as JSON; return the SHA-256 of the file."""
     return write_json(path, sealed(value))
 
 
 def check_own(path: Path, description: dict[str, Any], cure: str) -> None:
-    """`ValueError` if a description is not what was written; one without a checksum (earlier versions) passes."""
+    """Raise `ValueError` if a description was changed; one without a checksum (earlier versions) passes."""
     if "checksum" in description and description["checksum"] != checksum(description):
         raise ValueError(f"{path}: contents changed (checksum differs); {cure}")
 
 
 def differs(path: Path, expected: str | None) -> list[str]:
-    """What is wrong with a file that had this SHA-256, in words; empty if nothing is."""
+    """Return one message if a file is missing or has another SHA-256; else an empty list."""
     if not path.is_file():
         return [f"{path}: missing"]
     return [] if sha256(path) == expected else [f"{path}: contents changed (checksum differs)"]
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """A TOML file; `FileNotFoundError` that says `what` is missing, `ValueError` with the line for another content."""
+    """Return the tables of a TOML file; `FileNotFoundError` names `what` is missing, `ValueError` names the line."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such {what}")
     try:
@@ -218,7 +219,7 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; `ValueError` as `parse_json`, also for what is not text."""
+    """Return the object in a JSON file; `ValueError` as `parse_json`, also for a file that is not text."""
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -227,7 +228,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def check_version(path: Path, found: object, known: int) -> None:
-    """`ValueError` that names both versions if a file has another format version than this program."""
+    """Raise `ValueError` with both versions if a file has another format version than this program."""
     if found == known:
         return
     newer = isinstance(found, int) and found > known
@@ -236,9 +237,9 @@ def check_version(path: Path, found: object, known: int) -> None:
 
 
 def check_ours(folder: Path, names: str) -> None:
-    """`FileExistsError` that names what a folder holds beside files whose relative paths match the pattern `names`.
+    """Raise `FileExistsError` if a folder holds files whose relative paths do not match the pattern `names`.
 
-    For whoever is about to delete the folder: only what the program made itself is replaced.
+    Called before the folder is deleted: `--force` replaces only files that this program wrote.
     """
     for item in sorted(folder.rglob("*")):
         relative = item.relative_to(folder).as_posix()
@@ -250,9 +251,9 @@ def check_ours(folder: Path, names: str) -> None:
 
 
 def remove_folder(folder: Path) -> None:
-    """Delete a folder so that no moment leaves something that looks whole: it first loses its name.
+    """Delete a folder; it is renamed first, so that an interrupted deletion leaves nothing that looks complete.
 
-    `ValueError` for a symbolic link, which stays, with what it points to.
+    `ValueError` for a symbolic link; the link and its target stay.
     """
     if folder.is_symlink():
         raise ValueError(
@@ -280,7 +281,7 @@ def lazy_names(package: str, homes: dict[str, str]) -> Callable[[str], Any]:
 
 
 def check_name(name: Any) -> str:
-    """A stream or clip name that is also a safe file name, else `ValueError`."""
+    """Return the name of a stream or clip if it is a safe file name, else raise `ValueError`."""
     if not isinstance(name, str) or not NAME.fullmatch(name):
         raise ValueError(f"name {name!r:.80}: use letters, digits, '.', '_' and '-' only, as in fan_03 or qis-3bit")
     return name
@@ -288,14 +289,14 @@ def check_name(name: Any) -> str:
 
 @contextlib.contextmanager
 def decoding_errors(path: Path, what: str) -> Iterator[None]:
-    """Turn whatever a decoder raises or warns about into one `ValueError`; a missing file stays `FileNotFoundError`."""
+    """Turn errors and warnings of a decoder into one `ValueError`; a missing file stays `FileNotFoundError`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             yield
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
-    except Exception as error:  # decoders raise what they like: tokenizer, zlib, struct and their own errors
+    except Exception as error:  # decoders raise errors of tokenizer, zlib, struct and their own
         text = " ".join(str(error).split())
         if text.startswith(str(path)):
             raise ValueError(text) from None
@@ -303,9 +304,9 @@ def decoding_errors(path: Path, what: str) -> Iterator[None]:
 
 
 def load_array(path: Path) -> np.ndarray:
-    """A .npy array of numbers as a memory map, or a .npy.gz in memory.
+    """Return a .npy array of numbers as a memory map, or a .npy.gz in memory.
 
-    `FileNotFoundError` or `ValueError` for another kind of file, objects, a number without axes, lying headers.
+    `FileNotFoundError`, or `ValueError` for other files, objects, a number without axes, and wrong headers.
     """
     if path.suffix == ".gz":
         with decoding_errors(path, "gzipped .npy"), gzip.open(path, "rb") as packed:
@@ -325,7 +326,7 @@ def load_array(path: Path) -> np.ndarray:
 
 
 def _read_npy(path: Path, file: gzip.GzipFile | BinaryIO) -> np.ndarray:
-    """An array from a stream; memory grows with what is really there, not with what the header says."""
+    """Return an array from a stream; memory grows with the bytes that are there, not with the header."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise ValueError(f"{path}: version {version} of .npy is not known")

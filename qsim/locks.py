@@ -1,4 +1,4 @@
-"""Advisory locks on files, exclusive or shared, which the system releases when their holder ends."""
+"""Locks files, exclusively or shared; the system releases a lock when its process ends."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import BinaryIO
 
 
 class Lock:
-    """An exclusive or shared advisory lock on a file; the system frees it when the process ends, however it ends.
+    """An advisory lock on a file, exclusive or shared.
 
-    `acquire` returns False when another process holds it and `wait` is False.
+    `acquire` returns False if another process holds the lock and `wait` is False.
     """
 
     def __init__(self, path: Path, *, shared: bool = False) -> None:
@@ -24,7 +24,7 @@ class Lock:
     def acquire(self, *, wait: bool = False, on_wait: Callable[[], None] | None = None) -> bool:
         """Take the lock. With `wait`, `on_wait` is called once before waiting for another holder."""
         while True:
-            # Open as long as the lock is held; for reading too, because NFS wants that for a shared lock.
+            # The file is open while the lock is held; NFS needs it open for reading too for a shared lock.
             file = open(self.path, "a+b")  # noqa: SIM115
             try:
                 try:
@@ -43,23 +43,23 @@ class Lock:
             except BaseException:
                 file.close()
                 raise
-            file.close()  # its holder deleted it: the lock is on another file by now
+            file.close()  # its holder deleted it: this lock is on a file without a name
 
     def _is_current(self, file: BinaryIO) -> bool:
-        """Whether the opened file is still the one of that name."""
+        """Return whether the opened file still has its name."""
         try:
             return os.path.samestat(os.fstat(file.fileno()), os.stat(self.path))
         except FileNotFoundError:
             return False
 
     def delete(self) -> None:
-        """Delete the lock's file and give the lock back; who waits for it takes a new one."""
+        """Delete the file and release the lock; a waiting process then locks a new file."""
         if self._file is not None:
             self.path.unlink(missing_ok=True)
         self.release()
 
     def release(self) -> None:
-        """Give the lock back; harmless if it is not held."""
+        """Release the lock; does nothing if it is not held."""
         if self._file is not None:
             self._file.close()
             self._file = None

@@ -15,7 +15,7 @@ _TOO_DEEP = f"nested more than {DEEPEST} levels deep"
 
 
 def parse_toml(path: Path, text: str) -> dict[str, Any]:
-    """The tables of a TOML text; `ValueError` as `FILE:LINE: ...` if it is not TOML, nests deeply or counts too far."""
+    """Return the tables of a TOML text; `ValueError` as `FILE:LINE: ...` for bad TOML, deep nesting, huge numbers."""
     if re.search(
         rf"(?<![\w\"'.-])(?:[\w\"'-]+[ \t]*\.[ \t]*){{{DEEPEST}}}", text
     ):  # the parser takes quadratic time for these
@@ -36,9 +36,9 @@ def parse_toml(path: Path, text: str) -> dict[str, Any]:
 
 
 def parse_json(path: Path, text: str) -> dict[str, Any]:
-    """The object in a JSON text; `ValueError` with the file's name if it is damaged or not an object.
+    """Return the object in a JSON text; `ValueError` with the name of the file if it is damaged or no object.
 
-    NaN, infinity, whole numbers beyond 64 bits and deep nesting are refused: nothing of ours writes them.
+    NaN, infinity, whole numbers beyond 64 bits and deep nesting are refused: this program never writes them.
     """
     try:
         value = json.loads(text, parse_constant=_no_constant)
@@ -67,7 +67,7 @@ def _no_constant(name: str) -> float:
 
 
 def _too_much(value: Any, text: str, infinite: bool = False) -> tuple[int, str] | None:
-    """(line, problem) of the first value that is nested too deeply or too large; None if there is none."""
+    """Return (line, problem) of the first value that is nested too deeply or too large; None if there is none."""
     waiting: list[tuple[Any, int]] = [([value], 0)]
     while waiting:
         item, depth = waiting.pop()
@@ -84,7 +84,7 @@ def _too_much(value: Any, text: str, infinite: bool = False) -> tuple[int, str] 
 
 
 def _line_of_depth(text: str) -> int:
-    """The first line that nests too deeply, by brackets or by dots; 1 if none is found."""
+    """Return the first line that nests too deeply, by brackets or by dots; 1 if none is found."""
     depth = 0
     for n, line in enumerate(text.splitlines(), 1):
         bare = re.sub(r'"(?:\\.|[^"\\])*"', "", line)
@@ -98,6 +98,6 @@ def _line_of_depth(text: str) -> int:
 
 
 def _line_of_number(text: str) -> int:
-    """The line of the first whole number of more than 18 digits; 1 if none is found."""
+    """Return the line of the first whole number of more than 18 digits; 1 if none is found."""
     digits = r"(?<![\w\"'.])(?:0[xob][0-9A-Fa-f_]{16,}|[0-9][0-9_]{18,})(?![\w\"'.])"
     return next((n for n, line in enumerate(text.splitlines(), 1) if re.search(digits, line)), 1)

@@ -1,4 +1,4 @@
-"""Checks tables of TOML and JSON files, and makes dataclasses of them: keys, kinds and ranges, by one function.
+"""Checks tables of TOML and JSON files by one function, and makes dataclasses of them.
 
     table:  {key: check}; "key" must be there, "key, if any" may be missing or null, "key or null" may be null
     check:  a function that returns the value or raises `ValueError("expected ..., got ...")`, or a table of its own
@@ -20,7 +20,7 @@ from qsim import checks
 from qsim.checks import SPLITS, shown, suggest
 from qsim.files import NAME
 
-SMALLEST, LARGEST = 1e-30, 1e30  # of numbers above 0 in SI units: whatever lies outside overflows in the next product
+SMALLEST, LARGEST = 1e-30, 1e30  # of numbers above 0 in SI units: products of larger ones overflow
 
 Check = Callable[[Any], Any]
 Table = Mapping[str, "Check | Table"]
@@ -134,12 +134,12 @@ def is_whole(value: Any) -> bool:
 
 
 def list_of(good: Callable[[Any], bool], length: int | None = None) -> Callable[[Any], bool]:
-    """A test of lists, of any length or of this one, whose items all pass `good`."""
+    """Return a test of lists whose items all pass `good`, of this length if it is given."""
     return lambda value: isinstance(value, list) and length in (None, len(value)) and all(good(item) for item in value)
 
 
 def mapping_of(key: str, good: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    """A test of JSON objects whose keys all match a pattern and whose values all pass `good`."""
+    """Return a test of JSON objects whose keys match a pattern and whose values pass `good`."""
     pattern = re.compile(key)
     return lambda value: (
         isinstance(value, dict) and all(pattern.fullmatch(name) and good(item) for name, item in value.items())

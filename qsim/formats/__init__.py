@@ -1,4 +1,4 @@
-"""Other programs' files into clips and streams, and back."""
+"""Reads recordings of other programs as clips and streams, and writes ours for them."""
 
 from typing import TYPE_CHECKING
 

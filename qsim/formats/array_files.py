@@ -1,7 +1,7 @@
 """Reads and writes recordings in files that state their shape: .npy, zarr and the folders of visionsim.
 
-Each reader takes a path and the user's hints and returns a `Recording` of codes; `ValueError` names the file, and the
-pixel whose value is no code. Bare streams of bits: raw_cameras.py.
+Each reader takes a path and the user's hints and returns a `Recording`; `ValueError` names the file, and the pixel
+whose value is not a code. Streams of bits without a shape: raw_cameras.py.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _CODECS = {"blosc", "bytes", "crc32c", "delta", "gzip", "lz4", "packbits", "shar
 
 
 def read_cube(path: Path, hints: Hints) -> Recording:
-    """Photon cube: uint8 [T, H, ceil(W/8)], rows padded, most significant bit first; [.., C] of colour needs a channel.
+    """Read a photon cube: uint8 [T, H, ceil(W/8)], rows padded, most significant bit first; [.., C] needs a channel.
 
     Without a given width every bit of the last byte is a pixel. `ValueError` for another array.
     """
@@ -65,12 +65,12 @@ def read_cube(path: Path, hints: Hints) -> Recording:
 
 
 def read_codes_npy(path: Path, hints: Hints) -> Recording:
-    """Unpacked codes: bool or unsigned [T, H, W] with one code per pixel; the bits are those given, else 1 for bool."""
+    """Read unpacked codes: bool or unsigned [T, H, W], one code per pixel; bits as given, 1 for bool."""
     array = load_array(path)
     frames, height, width = check_shape(path, array.shape)
     bits = 1 if array.dtype == bool else hints.bits
     if bits is None or array.dtype.kind not in "bu":
-        raise ValueError(f"{path}: {array.dtype} codes need their number of bits, as in --bits 3")
+        raise ValueError(f"{path}: {array.dtype} codes need a number of bits, as in --bits 3")
 
     def read(start: int, stop: int) -> Array:
         return checked_codes(path, np.asarray(array[start:stop]), bits, start)
@@ -79,7 +79,7 @@ def read_codes_npy(path: Path, hints: Hints) -> Recording:
 
 
 def read_light_npy(path: Path, hints: Hints) -> Recording:
-    """Numbers [T, H, W] as light: integers are coded by --transfer (full scale of their type), floats are linear."""
+    """Read numbers [T, H, W] as light: integers by --transfer (full scale of their type), floats are linear."""
     array = load_array(path)
     shape = check_shape(path, array.shape)
     floats = array.dtype.kind == "f"
@@ -97,7 +97,7 @@ def read_light_npy(path: Path, hints: Hints) -> Recording:
 
 
 def read_zarr(path: Path, hints: Hints) -> Recording:
-    """zarr v2 or v3 in a folder: array `frames` of a group, or an array at the root; [T, H, W], one code a pixel."""
+    """Read zarr v2 or v3: the array `frames` of a group, or an array at the root, [T, H, W], one code a pixel."""
     import zarr
 
     folder = path / "frames" if (path / "frames").is_dir() else path
@@ -135,7 +135,7 @@ def read_zarr(path: Path, hints: Hints) -> Recording:
 
 
 def _zarr_codecs(path: Path, folder: Path) -> set[str]:
-    """The codecs named by an array's own metadata; `ValueError` if `folder` holds no array, or too much metadata."""
+    """Return the codecs in an array's metadata; `ValueError` if `folder` holds no array, or too much metadata."""
     if not path.is_dir():
         raise ValueError(f"{path}: is a single file; a zarr is read from its folder, so unpack it first")
     described = [folder / name for name in ("zarr.json", ".zarray") if (folder / name).is_file()]
@@ -161,7 +161,7 @@ def _zarr_codecs(path: Path, folder: Path) -> set[str]:
 
 
 def _count_files(folder: Path, enough: int) -> int:
-    """Files below a folder other than zarr's metadata, counted no further than `enough`."""
+    """Count the files below a folder without zarr's metadata, up to `enough`."""
     count = 0
     for _, _, names in os.walk(folder):
         count += sum(name not in _ZARR_METADATA for name in names)
@@ -171,7 +171,7 @@ def _count_files(folder: Path, enough: int) -> int:
 
 
 def read_visionsim(path: Path, hints: Hints) -> Recording:
-    """visionsim: transforms.json with frames.npy [T, H, bytes, C] (0.1), or with shards 0000.npy, ... (later)."""
+    """Read visionsim: transforms.json with frames.npy [T, H, bytes, C] (0.1) or shards 0000.npy, ... (later)."""
     description = path / "transforms.json"
     with decoding_errors(description, "JSON"):
         info = json.loads(description.read_text("utf-8"))
@@ -214,17 +214,17 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
 
 
 def _checked_light(path: Path, values: Array, first: int) -> Array:
-    """The values if they are light: finite, not negative, within single precision; else `ValueError` with the place."""
+    """Return the values if they are finite, not negative and within float32; else `ValueError` with the pixel."""
     good = (values >= 0) & (values < 3e38)
     if not good.all():
         t, y, x = (int(i) for i in np.argwhere(~good)[0])
         place = f"(t, y, x) = ({first + t}, {y}, {x})"
-        raise ValueError(f"{path}: value {values[t, y, x]} at {place} is no light: expected finite numbers from 0 up")
+        raise ValueError(f"{path}: value {values[t, y, x]} at {place} is not a light level: expected finite and >= 0")
     return np.asarray(values)
 
 
 def write_cube(path: Path, blocks: Iterator[Array], shape: tuple[int, int, int]) -> None:
-    """Binary planes as a photon cube: uint8 [T, H, ceil(W/8)], rows padded, most significant bit first."""
+    """Write binary planes as a photon cube: uint8 [T, H, ceil(W/8)], rows padded, most significant bit first."""
     frames, height, width = shape
     with files.replacing(path) as file:
         header = {"descr": "|u1", "fortran_order": False, "shape": (frames, height, packing.packed_width(width, 1))}
@@ -234,7 +234,7 @@ def write_cube(path: Path, blocks: Iterator[Array], shape: tuple[int, int, int])
 
 
 def write_zarr(folder: Path, blocks: Iterator[Array], shape: tuple[int, int, int], attributes: dict[str, Any]) -> None:
-    """A zarr v3 group with `frames` [T, H, W], chunks of whole frames; binary codes as quanta-spad-sim stores them."""
+    """Write a zarr v3 group with `frames` [T, H, W] in chunks of full frames, as quanta-spad-sim stores them."""
     import zarr
 
     group = zarr.open_group(str(folder), mode="w", zarr_format=3)

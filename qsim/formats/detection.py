@@ -28,17 +28,17 @@ LAYOUTS: dict[str, Reader] = {  # the names of --layout
     "spike": raw_cameras.read_spike,
 }
 _WHOLE = "none: whole bytes per pixel"
-# (bit order, orientation) of the layouts whose readers leave it out, and why it is assumed.
+# (bit order, orientation) of layouts whose readers do not state it, and the reason for it.
 ASSUMED: dict[str, tuple[str, str]] = {
     "cube": ("msb", "upright"),  # np.packbits along rows, row 0 on top: so photoncube shows it
-    "codes": (_WHOLE, "upright"),  # row 0 on top, as whatever draws an array draws it
+    "codes": (_WHOLE, "upright"),  # row 0 on top, as arrays are shown
     "light": (_WHOLE, "upright"),  # the same
-    "video": (_WHOLE, "upright"),  # decoders give the top row first; a telephone's rotation tag is not followed
+    "video": (_WHOLE, "upright"),  # decoders give the top row first; a rotation tag is not applied
     "png": ("msb if 1-bit", "upright"),  # by the standard: leftmost pixel in the high bit, top row first
-    "tiff": ("msb if 1-bit", "upright"),  # tifffile undoes FillOrder; an Orientation tag is not followed
+    "tiff": ("msb if 1-bit", "upright"),  # tifffile undoes FillOrder; an Orientation tag is not applied
     "visionsim": ("msb", "upright"),  # np.packbits along rows of pictures as rendered
     "zarr": (_WHOLE, "upright"),  # quanta-spad-sim draws row 0 on top
-    "mat": (_WHOLE, "as stored"),  # OUTPUT's rows are the array's; which way the camera hung is not in a file
+    "mat": (_WHOLE, "as stored"),  # OUTPUT's rows are the array's; the camera's orientation is not in a file
 }
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv")
 PICTURES = {".png": "png", ".tif": "tiff", ".tiff": "tiff"}
@@ -46,7 +46,7 @@ _SMALL = 8_388_608  # bytes that three raw layouts share
 
 
 def detect(path: Path) -> str:
-    """The layout's name, from names, signatures, side files and sizes; `ValueError` that lists the candidates."""
+    """Return the name of the layout; `ValueError` lists the candidates if there are several or none."""
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file")
     if path.is_dir():
@@ -61,13 +61,13 @@ def detect(path: Path) -> str:
         return _detect_npy(path)
     if suffix == ".bin":
         return _detect_raw(path)
-    raise ValueError(f"{path}: unknown kind of file; say which with --layout: {', '.join(LAYOUTS)}")
+    raise ValueError(f"{path}: unknown kind of file; name it with --layout: {', '.join(LAYOUTS)}")
 
 
 def recordings(folder: Path, layout: str | None) -> list[Path]:
-    """What a folder of many recordings holds: videos anywhere below it (I2-2000FPS), or folders of pictures (X4K).
+    """Return the recordings below a folder: videos at any depth (I2-2000FPS), or folders of pictures (X4K).
 
-    Empty if `folder` is a file, or one recording itself.
+    Empty if `folder` is a file or a single recording.
     """
     if not folder.is_dir() or layout not in (None, "video", "png", "tiff"):
         return []
@@ -96,7 +96,7 @@ def _detect_folder(path: Path) -> str:
             return layout
     if any(path.rglob("*.bin")):
         return _detect_raw(raw_cameras.raw_files(path)[0], many=True)
-    raise ValueError(f"{path}: a folder of no known kind; say which with --layout: {', '.join(LAYOUTS)}")
+    raise ValueError(f"{path}: a folder of unknown kind; name it with --layout: {', '.join(LAYOUTS)}")
 
 
 def _detect_npy(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""Ours for others: a clip's light or a stream's codes as photon cube, mp4, PNG, EXR or zarr, with a .json beside it."""
+"""Writes clips and streams for other programs: photon cube, mp4, PNG, EXR or zarr, with a .json beside it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BLOCK = 16  # frames read at a time
 
 @dataclass(frozen=True)
 class Export:
-    """How to write ours for others."""
+    """The format of an export."""
 
     kind: str  # cube, mp4, png, exr, zarr
     transfer: str = "gamma 2.2"  # of pictures of light
@@ -69,7 +69,7 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
 
 
 def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = False) -> tuple[Path, str]:
-    """Export, and say in one line what was written: kind, frames, size, rates, white."""
+    """Export; return the path and one line: kind, frames, size, rates, white."""
     made = export(source, path, wanted, force=force)
     side = made / "meta.json" if made.is_dir() else made.with_name(made.name + ".json")
     meta, (frames, height, width) = files.read_json(side), source.shape
@@ -84,17 +84,15 @@ def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool 
     return made, f"{wanted.kind}, {frames} frames of {height} x {width} pixels at {rate:g} per second{shown}, {about}"
 
 
-_MARK = {"software": {"qsim": VERSION}}  # of every description of an export: we made what it describes
+_MARK = {"software": {"qsim": VERSION}}  # in every description of an export: this program wrote it
 _NAMES = r"meta\.json|[0-9]{6,}\.(png|exr)|zarr\.json|frames/zarr\.json|frames/c/[0-9]+/[0-9]+/[0-9]+"
 
 
 def _check_ours(place: Path, description: Path, single: bool) -> None:
-    """`FileExistsError` if something is at `place` that no export made: it is replaced only beside its description."""
+    """Raise `FileExistsError` if `place` exists and is not an export with its description."""
     if not place.exists() and not place.is_symlink():
         return
-    foreign = FileExistsError(
-        f"{place}: was not made by `qsim convert`, which replaces only what it made; move it away, or name another"
-    )
+    foreign = FileExistsError(f"{place}: was not written by `qsim convert`; move it, or name another output")
     if place.is_symlink() or place.is_dir() == single or not description.is_file():
         raise foreign
     try:

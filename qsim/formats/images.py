@@ -31,7 +31,7 @@ from qsim.formats.recording import (
 
 
 def read_png(path: Path, hints: Hints) -> Recording:
-    """A PNG, or a folder of PNGs in the order of their numbers: 1-bit pictures are codes, others as `picture` says."""
+    """Read a PNG, or a folder of PNGs in the order of their numbers; see `picture`."""
     pictures = [path] if path.is_file() else numbered(list(path.glob("*.png")))
     if not pictures:
         raise FileNotFoundError(f"{path}: holds no .png")
@@ -45,7 +45,7 @@ def read_png(path: Path, hints: Hints) -> Recording:
 
 
 def read_tiff(path: Path, hints: Hints) -> Recording:
-    """A TIFF with one page per frame, or a folder of single-page TIFFs; MinIsWhite is turned to MinIsBlack."""
+    """Read a TIFF with one page per frame, or a folder of TIFFs; MinIsWhite is converted to MinIsBlack."""
     found = [path] if path.is_file() else numbered([*path.glob("*.tif"), *path.glob("*.tiff")])
     if not found:
         raise FileNotFoundError(f"{path}: holds no .tif or .tiff")
@@ -62,11 +62,11 @@ def read_tiff(path: Path, hints: Hints) -> Recording:
 
 
 def picture(path: Path, shape: tuple[int, int, int], raw: Any, dtype: np.dtype, source: str, hints: Hints) -> Recording:
-    """Pictures as codes, if they are 1-bit or --bits is given, else as light by --transfer.
+    """Return pictures as codes if they are 1-bit or --bits is given, else as light by --transfer.
 
-    `ValueError` if codes seem to be stretched to 0 ... 255 and the user did not say so: the counts would be lost.
+    `ValueError` if codes exceed 2^bits - 1, as codes stretched to 0 ... 255 do.
     """
-    one_bit = dtype.kind == "b"  # then --bits and --stretched have nothing to say
+    one_bit = dtype.kind == "b"  # then --bits and --stretched have no effect
     if one_bit or hints.bits is not None:
         bits = 1 if one_bit else int(hints.bits or 0)
         stretched = not one_bit and hints.stretched
@@ -97,7 +97,7 @@ def picture(path: Path, shape: tuple[int, int, int], raw: Any, dtype: np.dtype, 
 
 
 def to_luminance(values: Array, transfer: str, top: float, colour: bool) -> Array:
-    """Linear light of grey [..., H, W] or colour [..., H, W, 3] pictures: linearised first, then weighted."""
+    """Return linear light [..., H, W] of grey [..., H, W] or colour [..., H, W, 3]: linearised, then weighted."""
     if not colour:
         return to_linear(values, transfer, top)
     if (values == values[..., :1]).all():  # grey in three channels: exact without weights
@@ -106,7 +106,7 @@ def to_luminance(values: Array, transfer: str, top: float, colour: bool) -> Arra
 
 
 def write_png(folder: Path, images: Iterator[Array]) -> None:
-    """One PNG per image, 000000.png ...: bool as 1-bit, uint8 and uint16 as they are."""
+    """Write one PNG per image, 000000.png ...: bool as 1-bit, uint8 as 8-bit, uint16 as 16-bit."""
     from PIL import Image
 
     for t, image in enumerate(images):
@@ -115,13 +115,13 @@ def write_png(folder: Path, images: Iterator[Array]) -> None:
 
 
 def write_exr(folder: Path, images: Iterator[Array]) -> None:
-    """One float32 EXR with the channel Y per image, losslessly zipped."""
+    """Write one float32 EXR per image, with the channel Y, compressed without loss."""
     for t, image in enumerate(images):
         files.write_bytes(folder / f"{t:06d}.exr", exr.encode({"Y": image.astype("<f4")}, compress=True))
 
 
 def grey(light: Array, white: float, transfer: str) -> Array:
-    """Linear light as 8-bit grey, `white` becoming 255."""
+    """Return linear light [..., H, W] as 8-bit grey; `white` becomes 255."""
     return from_linear(light / white, transfer, 255)
 
 
@@ -142,7 +142,7 @@ def _tiff_pages(path: Path) -> int:
     import tifffile
 
     with decoding_errors(path, "TIFF"), tifffile.TiffFile(path) as opened:
-        return len(opened.pages)  # a chain of pages that bites its tail is refused by the library
+        return len(opened.pages)  # the library refuses a chain of pages in a circle
 
 
 def _tiff(path: Path, page: int) -> Array:
@@ -153,7 +153,7 @@ def _tiff(path: Path, page: int) -> Array:
         check_shape(path, (1, found.imagelength, found.imagewidth))
         promised, there = found.nbytes, path.stat().st_size
         if promised > 1032 * there or (found.compression == 1 and found.bitspersample >= 8 and promised > there):
-            raise ValueError(f"{path}: page {page} promises {promised} bytes, the file has {there}")
+            raise ValueError(f"{path}: page {page} states {promised} bytes, the file has {there}")
         if float(np.prod(found.chunks, dtype=float)) > max(MAX_PIXELS, 4 * found.imagelength * found.imagewidth):
             raise ValueError(
                 f"{path}: page {page} is stored in tiles of {list(found.chunks)} pixels, too large to read"
@@ -188,7 +188,7 @@ def _unstretch(path: Path, values: Array, top: int, first: int) -> Array:
     if (back != values).any():
         t, y, x = (int(i) for i in np.argwhere(back != values)[0])
         raise ValueError(
-            f"{path}: value {int(values[t, y, x])} at (t, y, x) = ({first + t}, {y}, {x}) is no code 0..{top} "
-            "stretched to 0..255; the pictures were coded with loss"
+            f"{path}: value {int(values[t, y, x])} at (t, y, x) = ({first + t}, {y}, {x}) is not a code 0..{top} "
+            "stretched to 0..255: the pictures were compressed with loss; use lossless ones"
         )
     return found

@@ -3,9 +3,8 @@
     photon cube .npy (.gz), codes and light .npy, mp4, PNG, TIFF, SwissSPAD2 and SPAD512S .bin, visionsim, zarr, .mat,
     spike .dat  ->  Recording  ->  a clip of relative radiance (light), or a stream NAME.npy + NAME.json (codes)
 
-What a file does not say (size, rate, transfer curve, which of two layouts) is asked for, never guessed. Which bit of a
-byte is the first pixel, and which way is up, follows from the layout: what is assumed goes into the `source` of what is
-made.
+Facts that a file does not state (size, rate, transfer curve, which of two layouts) must be given; they are not guessed.
+The order of bits and the orientation follow from the layout; assumptions are stored in `source`.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ from qsim.sensor.spad import BinarySPAD
 
 
 def read(path: Path, hints: Hints | None = None, *, compared: tuple[str, ...] = ()) -> Recording:
-    """Open a foreign file or folder; frames are read when asked for.
+    """Open a foreign file or folder; frames are read on demand.
 
-    `ValueError` for a hint that the file has no use for, but for those that the caller has `compared` with it.
+    `ValueError` for a hint without effect on this file, except those that the caller `compared` with it.
     """
     hints = hints or Hints()
     layout = hints.layout or detect(path)
@@ -56,7 +55,7 @@ def read(path: Path, hints: Hints | None = None, *, compared: tuple[str, ...] = 
 
 @dataclass(frozen=True)
 class _Watched:
-    """Hints that note which of them a reader asks for: one that no reader asks for cannot act."""
+    """Hints that record which of them a reader uses."""
 
     hints: Hints
     asked: set[str]
@@ -68,7 +67,7 @@ class _Watched:
 
 @dataclass(frozen=True)
 class Import:
-    """How recording was taken, which files rarely say."""
+    """How a recording was taken, which files rarely state."""
 
     frame_rate: float  # Hz
     exposure: float | None = None  # s; None: the whole frame
@@ -92,7 +91,7 @@ class Import:
 def to_clip(
     recording: Recording, path: Path, capture: Import, *, force: bool = False, progress: Progress | None = None
 ) -> Clip:
-    """Light as a clip of relative radiance. `ValueError` for codes: they are not light."""
+    """Write light as a clip of relative radiance; `ValueError` for codes."""
     if not recording.is_light:
         raise ValueError(
             f"{path}: {recording.source} holds codes, not light; name a stream to make, as in out/capture.npy"
@@ -124,7 +123,7 @@ def to_clip(
 
 
 def _unmarked(recording: Recording) -> Marked:
-    """Light of which no reader said where it saturates."""
+    """Return the light of a recording without information on saturation."""
 
     def marked(start: int, stop: int) -> tuple[Array, Array]:
         light = recording.read(start, stop)
@@ -134,21 +133,23 @@ def _unmarked(recording: Recording) -> Marked:
 
 
 def saturation_line(clip: Clip) -> str:
-    """What is known of the saturation of an imported clip, and the share of its pixels."""
+    """Return a line about the saturation of an imported clip: its white and the share of saturated pixels."""
     known = clip.meta.get("saturation") or {"white": None, "assumed": True}
     white, count = known["white"], int(clip.meta.get("saturated_pixels") or 0)
     if white is None:
-        return "saturation not known: floats have no largest value; say with --white where the camera saturates"
+        return "saturation not known: floats have no largest value; give it with --white"
     said = f"white {white:g}{' assumed' if known['assumed'] else ''}"
     if count:
         return f"{said}: {100 * count / math.prod(clip.shape):.3g} % of pixels saturated"
-    return f"{said}: no pixel reaches it" + ("; if the camera saturates below, say --white" if known["assumed"] else "")
+    return f"{said}: no pixel reaches it" + (
+        "; if the camera saturates below it, give --white" if known["assumed"] else ""
+    )
 
 
 def to_stream(
     recording: Recording, path: Path, capture: Import, *, force: bool = False, progress: Progress | None = None
 ) -> Stream:
-    """Codes as a stream beside no clip: PATH.npy and PATH.json. The sensor is the given one, else an ideal counter."""
+    """Write codes as a stream without a clip: PATH.npy and PATH.json. The default sensor is an ideal counter."""
     if recording.bits is None:
         raise ValueError(
             f"{path}: {recording.source} holds light, not codes; name a clip folder to make, as in out/clip"
@@ -178,7 +179,7 @@ def to_stream(
 
     meta = {
         "shape": [frames, height, width],
-        "orientation": recording.meta.get("orientation", "unknown"),  # never upright unless a reader says so
+        "orientation": recording.meta.get("orientation", "unknown"),  # upright only if a reader states it
         "code_model": recording.code_model,
         "planes_per_code": 2**recording.bits - 1 if recording.code_model == "binary_sum" else 1,
         "frame_rate": capture.frame_rate,
@@ -195,13 +196,13 @@ def to_stream(
 
 
 def blocks(recording: Recording) -> Iterator[tuple[int, Array]]:
-    """The frames in order, some at a time: (number of the first, frames)."""
+    """Yield the frames in order as blocks: (number of the first, frames [t, H, W])."""
     for start, stop in _ranges(recording):
         yield start, recording.read(start, stop)
 
 
 def _ranges(recording: Recording) -> Iterator[tuple[int, int]]:
-    """Numbers of the frames that are read at a time: (first, last + 1)."""
+    """Yield the range of each block: (first, last + 1)."""
     frames, height, width = recording.shape
     step = max(1, min(256, (1 << 25) // (height * width)))
     for start in range(0, frames, step):

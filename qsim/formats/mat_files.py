@@ -14,9 +14,9 @@ from qsim.formats.recording import Hints, Recording, checked_codes, numbered
 
 
 def read_mat(path: Path, hints: Hints) -> Recording:
-    """SwissSPAD .mat: OUTPUT [H, W, T] of one file, or of part_1.mat ... part_n.mat in a folder with info.json.
+    """Read SwissSPAD .mat: OUTPUT [H, W, T] of a file, or of part_1.mat ... part_n.mat in a folder with info.json.
 
-    Another name is taken from `hints.variable`, or if it is the only array of frames.
+    An array of another name is read if `hints.variable` names it or if it is the only array of frames.
     """
     files = [path]
     if path.is_dir():
@@ -28,7 +28,7 @@ def read_mat(path: Path, hints: Hints) -> Recording:
             files = [path / f"part_{k}.mat" for k in range(1, min(wanted, 100_000) + 1)]
         for file in files:
             if not file.is_file():
-                raise FileNotFoundError(f"{file}: missing, though info.json speaks of {len(files)} parts")
+                raise FileNotFoundError(f"{file}: missing, though info.json states {len(files)} parts")
         if not files:
             raise FileNotFoundError(f"{path}: holds no part_1.mat")
     parts = [mat_array(file, hints.variable) for file in files]
@@ -41,9 +41,9 @@ def read_mat(path: Path, hints: Hints) -> Recording:
 
 
 def mat_array(path: Path, variable: str | None = None) -> Array:
-    """An array of a .mat file as [T, H, W]: level 5 by scipy, 7.3 (HDF5, axes reversed) by h5py; [H, W] is one frame.
+    """Return an array of a .mat file as [T, H, W]: level 5 by scipy, 7.3 (HDF5, axes reversed) by h5py.
 
-    The one called `variable`; without a name OUTPUT, or the only array of numbers in two or three dimensions.
+    It is `variable`; without a name OUTPUT, or the only array of numbers in two (one frame) or three dimensions.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -83,7 +83,7 @@ def _hdf_array(path: Path, variable: str | None) -> Array:
 
 
 def _chosen(path: Path, variable: str | None, shapes: dict[str, tuple[int, ...]]) -> str:
-    """The array to read; `ValueError` with the names found where the choice is open."""
+    """Return the name of the array to read; `ValueError` with the names if there are several."""
     if variable is not None:
         if variable not in shapes:
             raise ValueError(f"{path}: has no array {variable}; it holds {sorted(shapes)}")
@@ -101,20 +101,20 @@ def _chosen(path: Path, variable: str | None, shapes: dict[str, tuple[int, ...]]
 
 
 def _frames_first(path: Path, name: str, planes: Array) -> Array:
-    """MATLAB's [H, W, T] or [H, W] as [T, H, W]; whole numbers stored as floats become integers."""
+    """Return MATLAB's [H, W, T] or [H, W] as [T, H, W]; whole numbers stored as floats become integers."""
     if planes.dtype.kind not in "buif" or planes.ndim not in (2, 3):
         raise ValueError(f"{path}: {name} is {planes.dtype} {list(planes.shape)}, expected unsigned [H, W, T]")
     planes = planes if planes.ndim == 3 else planes[..., None]
     if planes.dtype.kind in "if":
         whole = np.rint(planes)
         if planes.size and not (np.isfinite(planes).all() and (whole == planes).all() and whole.min() >= 0):
-            raise ValueError(f"{path}: {name} holds values that are no counts: expected whole numbers from 0 up")
+            raise ValueError(f"{path}: {name} holds values that are not counts: expected whole numbers >= 0")
         planes = whole.astype(np.uint32) if not planes.size or whole.max() < 2**32 else planes
     return np.ascontiguousarray(planes.transpose(2, 0, 1))
 
 
 def _plausible(path: Path, shape: tuple[int, ...]) -> None:
-    """Deflate shrinks at most 1032-fold: a header that promises more than that is lying."""
+    """Raise `ValueError` if a header states more values than deflate (at most 1032-fold) can hold in the file."""
     promised, size = float(np.prod(shape, dtype=float)), path.stat().st_size
     if promised > 1032.0 * size:
-        raise ValueError(f"{path}: the header promises {promised:.3g} values, which {size} bytes cannot hold")
+        raise ValueError(f"{path}: the header states {promised:.3g} values, which {size} bytes cannot hold")

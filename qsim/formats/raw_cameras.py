@@ -1,8 +1,7 @@
-"""Raw files of photon counting cameras: binary planes as streams of bits, in every layout of the field that we know.
+"""Reads raw files of photon counting cameras: binary planes as streams of bits.
 
-Each reader takes a path and the user's hints and returns a `Recording` of codes; bits come first or last in a byte,
-rows are in order or not, halves are upside down or not, as its docstring and its `meta` say: these files say nothing
-of it themselves. Files that say their shape: array_files.py.
+Each reader takes a path and the user's hints and returns a `Recording` of codes. The order of bits, rows and halves is
+not in these files; it is stated in the reader's docstring and in `meta`.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ def read_swissspad2_half(path: Path, _hints: Hints) -> Recording:
     def decode(raw: Array) -> Array:
         return np.unpackbits(raw, bitorder="little").reshape(-1, *HALF)
 
-    # Two independent readers (python-spad, quanta_SL) take bits and rows so; how the camera hung is not in a file.
+    # Two independent readers (python-spad, quanta_SL) agree on bits and rows; the orientation is not in a file.
     meta = {"bit_order": "lsb", "orientation": "as stored"}
     return _raw(files, counts, RAW_FRAME // 2, HALF, decode, "SwissSPAD2 half array", meta)
 
@@ -46,7 +45,7 @@ def read_swissspad2_full(path: Path, _hints: Hints) -> Recording:
         bottom = zones[:, ::-1, :, 1].reshape(-1, *HALF)
         return np.concatenate([top, bottom], axis=1)
 
-    # photoncube takes bits and halves so, each half from its outer row inwards; how the camera hung is not in a file.
+    # As photoncube: each half from its outer row inwards. The camera's orientation is not in a file.
     meta = {"bit_order": "lsb", "orientation": "as stored, the bottom half turned: it is stored upside down"}
     return _raw(files, counts, RAW_FRAME, FULL, decode, "SwissSPAD2 full array", meta)
 
@@ -54,8 +53,8 @@ def read_swissspad2_full(path: Path, _hints: Hints) -> Recording:
 def read_spad512s(path: Path, _hints: Hints) -> Recording:
     """SPAD512S: raw planes of 512 x 512, row by row, most significant bit first; some files end with 4 more bytes.
 
-    Public readers disagree about left and right: the file is read as it lies, `orientation` says so, and `flip_lr` is
-    stored as unknown.
+    Public readers disagree about left and right: the file is read as stored, `orientation` states it, and `flip_lr` is
+    unknown.
     """
     files = raw_files(path)
     counts = [check_size(file, file.stat().st_size, RAW_FRAME, "SPAD512S", footer=(0, 4)) for file in files]
@@ -63,7 +62,7 @@ def read_spad512s(path: Path, _hints: Hints) -> Recording:
     def decode(raw: Array) -> Array:
         return np.unpackbits(raw).reshape(-1, *FULL)
 
-    # Both public readers take bits and rows so, one of them mirrored; nothing in a file tells which of them is right.
+    # Both public readers agree on bits and rows, one of them mirrored; a file does not state which is right.
     meta = {"bit_order": "msb", "orientation": "as stored, left and right are disputed", "flip_lr": "unknown"}
     return _raw(files, counts, RAW_FRAME, FULL, decode, "SPAD512S", meta)
 
@@ -86,13 +85,13 @@ def read_spike(path: Path, hints: Hints) -> Recording:
     def decode(raw: Array) -> Array:
         return np.unpackbits(raw, bitorder="little").reshape(-1, height, width)[:, ::-1]
 
-    # On published streams this bit order is the smoother one, and turned frames agree with their ground truth.
+    # On published streams this bit order gives the smoother frames; flipped, they agree with their ground truth.
     meta = {"bit_order": "lsb", "orientation": "stored upside down, turned upright"}
     return _raw([path], [count], frame, (height, width), decode, "spike camera", meta)
 
 
 def roughness(planes: Array) -> float:
-    """Roughness of the mean plane over its shot noise, about 1 for smooth scenes read rightly; evidence, no proof."""
+    """Return the roughness of the mean plane over its shot noise, about 1 for smooth scenes in the right layout."""
     mean = planes.mean(axis=0, dtype=np.float64)
     steps = np.mean(np.diff(mean, axis=1) ** 2) + np.mean(np.diff(mean, axis=0) ** 2)
     floor = 4 * np.mean(mean * (1 - mean) / len(planes))
@@ -100,7 +99,7 @@ def roughness(planes: Array) -> float:
 
 
 def raw_files(path: Path) -> list[Path]:
-    """One file, or the .bin files in a folder tree, in the order of their numbers."""
+    """Return one file, or the .bin files of a folder tree in the order of their numbers."""
     if path.is_file():
         return [path]
     found = list(path.rglob("*.bin"))

@@ -1,8 +1,8 @@
-"""Frames from anywhere: one small record between foreign files and ours, and the care that reading them needs.
+"""Holds `Recording`, the common form of imported frames, and the checks that all readers share.
 
-A `Recording` is either codes (0 ... 2^bits - 1, of a photon counting sensor) or light (linear, in arbitrary units).
-Readers trust no header: sizes are compared with the file before anything is allocated, and whatever a decoder raises or
-warns about becomes one `ValueError` with the file's name.
+A `Recording` holds codes (0 ... 2^bits - 1, of a photon counting sensor) or light (linear, in arbitrary units). Headers
+are compared with the size of the file before memory is allocated. Errors and warnings of decoders become one
+`ValueError` with the name of the file.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ Marked = Callable[[int, int], tuple[Array, Array]]
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Frames [T, H, W] that are read when asked for."""
+    """Frames [T, H, W] that are read on demand."""
 
     shape: tuple[int, int, int]
     read: Callable[[int, int], Array]  # frames start ... stop - 1: codes (uint8, uint16), or light (float32)
     source: str  # the format it came from
     bits: int | None = None  # of codes; None: light
     code_model: str = "binary_sum"
-    meta: dict[str, Any] = field(default_factory=dict)  # what else the file said, or its reader assumed
+    meta: dict[str, Any] = field(default_factory=dict)  # further facts of the file, and assumptions of its reader
     marked: Marked | None = None  # light, and bool [t, H, W]: True where the camera was saturated
     white: float | None = None  # pixel value at which the camera saturates; None: not known
-    white_assumed: bool = False  # it is the largest value that the pixels can hold: nobody said so
+    white_assumed: bool = False  # it is the largest value that the pixels can hold
 
     @property
     def is_light(self) -> bool:
@@ -42,7 +42,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Hints:
-    """What the user knows and a file may not say."""
+    """Facts that a file may not state and the user can."""
 
     layout: str | None = None  # a name of formats.LAYOUTS
     height: int | None = None
@@ -58,7 +58,7 @@ class Hints:
 
 
 def check_size(path: Path, size: int, frame_bytes: int, what: str, footer: tuple[int, ...] = (0,)) -> int:
-    """Frames in a raw file of `size` bytes; `ValueError` with the size if it is not a whole number of them."""
+    """Return the number of frames in a raw file of `size` bytes; `ValueError` if it is not a whole number."""
     frames, rest = divmod(size, frame_bytes)
     if rest not in footer or frames < 1:
         raise ValueError(
@@ -69,7 +69,7 @@ def check_size(path: Path, size: int, frame_bytes: int, what: str, footer: tuple
 
 
 def numbered(paths: list[Path]) -> list[Path]:
-    """Files in the order of the last number in their names: a text sort puts 10 before 2."""
+    """Return files in the order of the last number in their names; a text sort puts 10 before 2."""
 
     def key(path: Path) -> tuple[str, int, str]:
         numbers = re.findall(r"\d+", path.stem)
@@ -87,13 +87,13 @@ def light_recording(
     hints: Hints,
     full: float,
 ) -> Recording:
-    """Recording of light; `full` is the largest value that the file's pixels can hold, infinite for floats."""
+    """Return a recording of light; `full` is the largest value of the file's pixels, infinite for floats."""
     white, assumed = white_of(path, hints, full)
     return Recording(shape, lambda a, b: marked(a, b)[0], source, None, "", meta, marked, white, assumed)
 
 
 def white_of(path: Path, hints: Hints, full: float) -> tuple[float | None, bool]:
-    """The pixel value at which the camera saturates, and whether it is only assumed; `ValueError` for one beyond."""
+    """Return the pixel value at which the camera saturates and whether it is assumed; `ValueError` beyond `full`."""
     if hints.white is None:
         return (None, True) if full == float("inf") else (full, True)
     if not 0 < hints.white <= full or hints.white == float("inf"):
@@ -102,7 +102,7 @@ def white_of(path: Path, hints: Hints, full: float) -> tuple[float | None, bool]
 
 
 def reached(values: Array, white: float | None, colour: bool = False) -> Array:
-    """bool [..., H, W]: where a value (of colours any of them) is at or above the white of the camera."""
+    """Return bool [..., H, W]: pixels at or above the white of the camera (in colour: any of the three)."""
     if white is None:
         return np.zeros(values.shape[:-1] if colour else values.shape, bool)
     found: Array = values >= white
@@ -110,22 +110,22 @@ def reached(values: Array, white: float | None, colour: bool = False) -> Array:
 
 
 def need_transfer(path: Path, hints: Hints) -> str:
-    """The declared transfer curve; `ValueError` if the user did not say."""
+    """Return the transfer curve that the user states; `ValueError` without one."""
     if hints.transfer is None:
         known = " or ".join(f"--transfer '{name}'" for name in TRANSFERS)
-        raise ValueError(f"{path}: a picture does not say how light was coded; add {known}")
+        raise ValueError(f"{path}: a picture does not state its transfer curve; add {known}")
     if hints.transfer not in TRANSFERS:
         raise ValueError(f"transfer {hints.transfer!r}: known are {', '.join(TRANSFERS)}")
     return hints.transfer
 
 
 def with_stated_layout(recording: Recording, bit_order: str, orientation: str) -> Recording:
-    """The recording with bit order and orientation in its `meta`; what its reader says of them itself is kept."""
+    """Return the recording with bit order and orientation in `meta`; statements of its reader are kept."""
     return replace(recording, meta={"bit_order": bit_order, "orientation": orientation} | recording.meta)
 
 
 def reoriented(recording: Recording, hints: Hints) -> Recording:
-    """The recording with the user's flips and column cut applied; its `orientation` says that it was flipped."""
+    """Return the recording with the user's flips and columns; `orientation` states a flip."""
     frames, height, width = recording.shape
     columns = hints.columns or width
     if not 0 < columns <= width:
@@ -153,12 +153,12 @@ def reoriented(recording: Recording, hints: Hints) -> Recording:
 
 
 def checked_codes(path: Path, values: Array, bits: int, first: int) -> Array:
-    """Codes as uint8 (uint16 above 8 bits); `ValueError` with frame and pixel if one is above 2^bits - 1."""
+    """Return codes as uint8 (uint16 above 8 bits); `ValueError` with frame and pixel of one above 2^bits - 1."""
     top = 2**bits - 1
     if values.dtype != bool and values.size and int(values.max()) > top:
         t, y, x = (int(i) for i in np.argwhere(values > top)[0])
         raise ValueError(
-            f"{path}: value {int(values[t, y, x])} at (t, y, x) = ({first + t}, {y}, {x}) is no {bits}-bit code "
-            f"(0..{top}); say the right --bits, or --stretched"
+            f"{path}: value {int(values[t, y, x])} at (t, y, x) = ({first + t}, {y}, {x}) is not a {bits}-bit code "
+            f"(0..{top}); give the right --bits, or --stretched"
         )
     return values.astype(np.uint8 if bits <= 8 else np.uint16)

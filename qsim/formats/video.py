@@ -23,8 +23,8 @@ from qsim.formats.recording import (
 )
 
 _FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG
-EXACT = 2 | 0x2000 | 0x40000  # FFmpeg's BILINEAR, FULL_CHR_H_INT, ACCURATE_RND; else colours come a code dark
-# FFmpeg's readers of files that hold their frames themselves; its "concat" and "hls" open whatever a text names.
+EXACT = 2 | 0x2000 | 0x40000  # FFmpeg's BILINEAR, FULL_CHR_H_INT, ACCURATE_RND; else colours are a code too dark
+# Containers that hold their frames; FFmpeg's "concat" and "hls" open any file that a text names.
 _CONTAINERS = (
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,mpegvideo,m4v,h264,hevc,yuv4mpegpipe,flv,asf,ogg,mxf,nut,ivf,"
     "mjpeg,gif"
@@ -32,9 +32,9 @@ _CONTAINERS = (
 
 
 def read_video(path: Path, hints: Hints) -> Recording:
-    """An mp4 (or what else FFmpeg decodes) as light; the container's frame rate is not the capture rate.
+    """Read a video as light; the container's frame rate is not the capture rate.
 
-    Frames are decoded in order and kept only while they are needed: ask for them in order.
+    Frames are decoded in order and not kept: reading backwards decodes from the start again.
     """
     transfer = need_transfer(path, hints)
     with decoding_errors(path, "video"):
@@ -54,7 +54,7 @@ def read_video(path: Path, hints: Hints) -> Recording:
 
 
 def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossless: bool) -> None:
-    """8-bit grey frames [H, W] (lossy: colour [H, W, 3] too) as H.264: bit-exact grey (`qp 0`), or FFmpeg's yuv420p."""
+    """Write 8-bit grey [H, W] (lossy: or colour [H, W, 3]) as H.264: exact (`qp 0`), or FFmpeg's yuv420p."""
     import av
 
     with files.replacing(path) as file, av.open(file, "w", format="mp4") as container:
@@ -71,7 +71,7 @@ def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossl
                         f"{path}: lossy H.264 needs even sizes, the frames are {image.shape[:2]}; use --lossless"
                     )
             picture = av.VideoFrame.from_ndarray(image, format="gray" if image.ndim == 2 else "rgb24")
-            if lossless:  # say that 0 ... 255 are meant, or decoders stretch 16 ... 235
+            if lossless:  # mark the range as 0 ... 255, or decoders stretch 16 ... 235
                 picture.color_range = stream.codec_context.color_range = _FULL_RANGE
             for packet in stream.encode(picture):
                 container.mux(packet)
@@ -80,7 +80,7 @@ def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossl
 
 
 class _Decoder:
-    """Frames of a video in order; going back starts again."""
+    """Decodes frames in order; an earlier frame starts again at the first."""
 
     def __init__(self, path: Path, height: int, width: int) -> None:
         self.path, self.size = path, (height, width)
@@ -94,7 +94,9 @@ class _Decoder:
         while self.next < stop:
             frame = next(self.source, None)
             if frame is None:
-                raise ValueError(f"{self.path}: ends after {self.next} frames, though it says more; it is truncated")
+                raise ValueError(
+                    f"{self.path}: ends after {self.next} frames, fewer than stated: the file is truncated"
+                )
             if self.next >= start:
                 found.append(frame)
             self.next += 1
@@ -112,7 +114,7 @@ class _Decoder:
 
 
 def _open_video(path: Path) -> Any:
-    """A video's container; a file that names other files (a playlist) or promises too large frames is not read."""
+    """Open a container; files that name other files (playlists) and frames above MAX_PIXELS are refused."""
     import av
 
     container = av.open(str(path), options={"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"})

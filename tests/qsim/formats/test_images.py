@@ -24,7 +24,7 @@ def test_png_and_tiff_pictures_of_light(tmp_path: Path):
             path = tmp_path / f"{photometric}.tif"
             tifffile.imwrite(path, stored, photometric=photometric)
             np.testing.assert_array_equal(everything(path, transfer="srgb"), expected)
-        with pytest.raises(ValueError, match="does not say how light was coded"):
+        with pytest.raises(ValueError, match="does not state its transfer curve"):
             importing.read(folder)
 
 
@@ -48,13 +48,13 @@ def test_codes_in_pictures(tmp_path: Path):
     np.testing.assert_array_equal(everything(tmp_path / "one"), bits1)
     np.testing.assert_array_equal(everything(tmp_path / "three", bits=3), codes)
     np.testing.assert_array_equal(everything(tmp_path / "wide", bits=3, stretched=True), codes)
-    with pytest.raises(ValueError, match=r"value \d+ at \(t, y, x\) = .* is no 3-bit code .* --stretched"):
+    with pytest.raises(ValueError, match=r"value \d+ at \(t, y, x\) = .* is not a 3-bit code .* --stretched"):
         everything(tmp_path / "wide", bits=3)
     lossy = code_levels(codes, 3)
     lossy[1, 2, 3] ^= 2
     (tmp_path / "lossy").mkdir()
     images.write_png(tmp_path / "lossy", iter(lossy))
-    with pytest.raises(ValueError, match=r"\(t, y, x\) = \(1, 2, 3\).*coded with loss"):
+    with pytest.raises(ValueError, match=r"\(t, y, x\) = \(1, 2, 3\).*compressed with loss"):
         everything(tmp_path / "lossy", bits=3, stretched=True)
 
 

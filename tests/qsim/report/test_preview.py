@@ -135,7 +135,7 @@ def test_json_declares_without_drawing(clip, capsys):
         ("{clip} --scale 0", "--scale: expected a whole factor of 1 to 64, got 0"),
         ("{clip} --stream other", "no stream 'other'; there are: mine"),
         ("codes.npy", "codes.npy: whole numbers are codes or packed planes; add --bits 3, or --width 320"),
-        ("codes.npy --bits 2", "value 5 at (t, y, x) = (0, 1, 1) is no 2-bit code"),
+        ("codes.npy --bits 2", "value 5 at (t, y, x) = (0, 1, 1) is not a 2-bit code"),
         ("codes.npy --bits 17", "--bits: expected 1 to 16, got 17"),
         ("codes.npy --width 99", "does not hold packed planes of 99 columns; a row of those has 13 bytes of uint8"),
         ("four.npy", "four.npy: expected frames [T, H, W], found an array of shape [1, 2, 3, 4]"),
