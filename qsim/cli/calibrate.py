@@ -1,4 +1,4 @@
-"""The command `qsim calibrate`: dark and flat frames into a sensor file; a pair as in cli.py."""
+"""Runs `qsim calibrate`: measures a sensor from dark and flat frames and writes its file."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from qsim.cli.options import checked
 
 
 def add_calibrate(sub: Any) -> None:
+    """Add the command `calibrate` to a program."""
     parser = command(
-        sub, "calibrate", _run_calibrate, "Dark and flat frames -> a sensor file, numbers with confidence intervals.",
+        sub, "calibrate", _run_calibrate, "Measure a sensor from dark and flat frames; write its file.",
         "qsim calibrate --bits 8 --dark d1.npy 1e-3 --dark d2.npy 0.1 --flat f.npy 1e-3 --flat g.npy 1e-3 -o my.toml\n"
         "qsim calibrate --model spad --bits 1 --dark dark.npy 1e-5 --flat flat.npy 1e-5 0.8 -o spad.toml\n"
         "qsim calibrate --bits 8 --static counts.npy 6.33e-6 -o counter.toml",
@@ -39,7 +40,7 @@ def add_calibrate(sub: Any) -> None:
     parser.add_argument("--variable", help="array of a .mat file (default: OUTPUT, or the only one)")
     parser.add_argument("--model", choices=("qis", "spad"), help="default qis; spad with --planes")
     parser.add_argument("--paralyzable", action="store_true", help="spad: every arrival restarts the dead time")
-    parser.add_argument("--ignore-dead-time", action="store_true", help="spad: take the counts as Poisson")
+    parser.add_argument("--ignore-dead-time", action="store_true", help="spad: model the counts as Poisson")
     parser.add_argument("--width", type=int, help=".npy files are photon cubes (packed planes) of so many pixels")
     parser.add_argument("-o", "--output", type=Path, required=True, help=".toml to write; .json and .png beside it")
     parser.add_argument("--force", action="store_true", help="replace existing files")
@@ -76,11 +77,11 @@ def _run_calibrate(args: argparse.Namespace) -> int:
     return 0
 
 
-COUNTS = 8  # bits; larger codes of a SPAD may well be sums of planes, so the user says which
+COUNTS = 8  # bits; larger codes of a SPAD may be sums of planes, which the user must state
 
 
 def _calibration_kind(args: argparse.Namespace) -> tuple[str, int]:
-    """(qis or spad, bits of a code); `ValueError` for options that cannot act together."""
+    """Return (qis or spad, bits of a code); `ValueError` for options that exclude each other."""
     if args.static and (args.dark or args.flat):
         raise ValueError("--static stands alone: a static scene takes the place of dark and flat frames")
     sums = args.planes is not None and args.planes > 1
@@ -113,14 +114,14 @@ def _calibration_kind(args: argparse.Namespace) -> tuple[str, int]:
         raise ValueError(f"--width: it is for packed binary planes, and --bits is {bits}; leave it out")
     if model == "spad" and bits > COUNTS and args.planes is None and not args.static:
         raise ValueError(
-            f"--bits {bits}: values this large may be sums of binary planes; say --planes N for sums of N planes, or "
+            f"--bits {bits}: values this large may be sums of binary planes; give --planes N for sums of N planes, or "
             "--planes 1 if every value counts one exposure"
         )
     return model, bits
 
 
 def _assumed(args: argparse.Namespace, model: str, bits: int) -> str:
-    """What the numbers in the files are taken for, in a line."""
+    """Return a line that states how the numbers in the files are interpreted."""
     if args.planes is not None and args.planes > 1:
         return f"sums of {args.planes} binary planes of a SPAD; seconds and photons are those of one plane"
     if args.static:
@@ -142,7 +143,7 @@ def _number(word: str) -> float:
     try:
         return float(word)
     except ValueError:
-        raise ValueError(f"{word!r} is no number; give seconds, as in 1e-3") from None
+        raise ValueError(f"{word!r} is not a number; give seconds, as in 1e-3") from None
 
 
 def _stack(words: list[str], args: argparse.Namespace, bits: int, *, dark: bool) -> Any:

@@ -1,7 +1,7 @@
-"""Shell completion: `qsim completion bash` prints a script made from the parsers, so that it never lags behind them.
+"""Prints completion scripts for bash, zsh and fish, made from the parsers.
 
-bash completes commands, options and the values of options with choices; elsewhere files. zsh runs the same script
-through its bash mode. fish gets one line per option, with its help.
+bash completes commands, options and choices, else files. zsh runs the same script in its bash mode. fish has one line
+per option, with its help.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ SHELLS = ("bash", "zsh", "fish")
 
 
 def add_completion(sub: Any, parser: argparse.ArgumentParser) -> None:
-    """The command `completion` of a program with all its other commands in `parser`."""
+    """Add the command `completion` for all commands of `parser`."""
 
     def _run_completion(args: argparse.Namespace) -> int:
         text = script(parser, args.shell)
@@ -30,16 +30,16 @@ def add_completion(sub: Any, parser: argparse.ArgumentParser) -> None:
         f"{prog} completion zsh >> ~/.zshrc\n"
         f"{prog} completion fish > ~/.config/fish/completions/{prog}.fish",
     )  # fmt: skip
-    own.add_argument("shell", choices=SHELLS, help="whose script")
+    own.add_argument("shell", choices=SHELLS, help="the shell")
 
 
 def script(parser: argparse.ArgumentParser, shell: str) -> str:
-    """The completion script of a program for one of SHELLS."""
+    """Return the completion script of a program for one of SHELLS."""
     return _fish(parser) if shell == "fish" else _bash(parser, shell)
 
 
 def _words(parser: argparse.ArgumentParser) -> list[str]:
-    """Long options of a command and the choices of its arguments."""
+    """Return the long options of a command and the choices of its arguments."""
     options, positional, _ = options_of(parser)
     names = [action.option_strings[-1] for action in options]
     return [*names, *(str(choice) for action in positional for choice in action.choices or ())]

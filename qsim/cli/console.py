@@ -1,7 +1,7 @@
-"""What every command shares: a parser that suggests, a bar that waits two seconds, and errors of one line.
+"""Runs commands: a parser that suggests options, progress bars, and errors of one line.
 
-Exit codes: 0 well, 1 done but something is wrong with what was found (a damaged file, a failed job), 2 the user's
-mistake, 130 interrupted. `--verbose` or `QSIM_DEBUG=1` shows the traceback of a mistake.
+Exit codes: 0 success, 1 done with findings (a damaged file, a failed job), 2 wrong input, 130 interrupted. `--verbose`
+or `QSIM_DEBUG=1` shows the traceback of an error.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from qsim.checks import suggest
 from qsim.files import FULL, Progress, wording
 from qsim.process import peak_memory
 
-GOES_ON = "the same command goes on where it stopped"
-STARTS_AGAIN = "nothing half-written is left; run the same command again"
-_MAKE_SPACE = "nothing half-written is left; make space and run the same command again"
+RESUMES = "the same command resumes where it stopped"
+STARTS_AGAIN = "no incomplete file is left; run the same command again"
+_MAKE_SPACE = "no incomplete file is left; make space and run the same command again"
 
-# Options as other programs call them -> ours, suggested where a command has ours.
+# Names of options in other programs -> ours, suggested if the command has ours.
 _ALSO_CALLED = {
     "--fps": "--frame-rate",
     "--framerate": "--frame-rate",
@@ -49,11 +49,11 @@ _ALSO_CALLED = {
     "--silent": "--quiet",
 }
 
-# Packages that are extras of this one: module -> extra.
+# Modules of optional packages -> the extra that installs them.
 EXTRAS = {"av": "video", "zarr": "formats", "h5py": "formats", "distributed": "cluster", "pyoidn": "denoise"}
 EXTRAS |= dict.fromkeys(("torch", "safetensors", "tensorboard"), "train")
 
-quiet: ContextVar[bool] = ContextVar("quiet", default=False)  # of the command that runs now
+quiet: ContextVar[bool] = ContextVar("quiet", default=False)  # of the running command
 
 
 class Parser(argparse.ArgumentParser):
@@ -65,7 +65,7 @@ class Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         words = list(sys.argv[1:] if args is None else args)
-        self._refuse_unknown(words)  # before argparse complains of what is missing because a name is misspelt
+        self._refuse_unknown(words)  # before argparse reports a missing argument whose name is misspelt
         found, extra = super().parse_known_args(words, namespace)
         if extra:
             self.error(f"unexpected argument {extra[0]}")
@@ -76,7 +76,7 @@ class Parser(argparse.ArgumentParser):
         known = [name for action in options for name in action.option_strings]
         for word in words:
             if word == "--" or (commands and not word.startswith("-")):
-                return  # values from here on, or the words of a command
+                return  # the rest are values, or the words of a command
             option = word.split("=")[0]
             short = re.match(r"-[A-Za-z]", word)
             if (short and word[:2] not in known) or (word.startswith("--") and option not in known):
@@ -128,9 +128,9 @@ def command(
     *,
     threads: str | None = None,
 ) -> argparse.ArgumentParser:
-    """A command's parser with its example and what all have; `run(args)` does it and returns the exit code.
+    """Add a command with its example and the options of all commands; `run(args)` returns the exit code.
 
-    With `threads`, which says of what, it has the option --threads.
+    With `threads`, the help of the option, the command has --threads.
     """
     parser: argparse.ArgumentParser = sub.add_parser(
         name, help=what, description=what, epilog="example:\n" + "".join(f"  {line}\n" for line in example.split("\n"))
@@ -147,7 +147,7 @@ def command(
 
 
 def _with_threads(run: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
-    """The command with as many threads of the compiled engine as --threads asks for, in its worker processes too."""
+    """Return the command with --threads threads of the compiled engine, also in its worker processes."""
 
     def limited(args: argparse.Namespace) -> int:
         if args.threads is None:
@@ -159,7 +159,7 @@ def _with_threads(run: Callable[[argparse.Namespace], int]) -> Callable[[argpars
         try:
             _limit(str(args.threads))
             return run(args)
-        finally:  # later commands of this process are not limited
+        finally:  # later commands of this process have all threads
             _limit(before or str(cores))
             if before is None:
                 del os.environ["QSIM_THREADS"]
@@ -168,7 +168,7 @@ def _with_threads(run: Callable[[argparse.Namespace], int]) -> Callable[[argpars
 
 
 def _limit(threads: str) -> None:
-    """Threads of the compiled engine, if it is loaded already, and of processes that are started from now on."""
+    """Set the threads of the compiled engine, if it is loaded, and of processes that are started later."""
     os.environ["QSIM_THREADS"] = threads
     if "drjit" in sys.modules:
         from qsim.backend import limit_threads
@@ -177,7 +177,7 @@ def _limit(threads: str) -> None:
 
 
 def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
-    """Parse and do a command; mistakes become one line on stderr and exit code 2, Ctrl-C becomes 130."""
+    """Parse and run a command; return its exit code. Wrong input becomes one line on stderr and 2, Ctrl-C 130."""
     try:
         args = parser.parse_args(argv)
     except SystemExit as stop:
@@ -188,7 +188,7 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
         with _warnings_as_lines(parser.prog):
             return int(args.run(args))
     except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
-        if isinstance(error, BrokenPipeError):  # the reader of our output has gone, as in `| head`
+        if isinstance(error, BrokenPipeError):  # the reader of the output has ended, as in `| head`
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
         unknown_module = isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in EXTRAS
@@ -208,7 +208,7 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
 
 @contextlib.contextmanager
 def _warnings_as_lines(prog: str) -> Iterator[None]:
-    """Warnings become one line each on stderr, without the place in our source; none with --quiet."""
+    """Print each warning as one line on stderr, without its place in the source; none with --quiet."""
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
         note(f"{prog}: warning: {' '.join(str(message).split())}")
@@ -219,13 +219,13 @@ def _warnings_as_lines(prog: str) -> Iterator[None]:
 
 
 def note(text: str) -> None:
-    """A line for people on stderr, unless the command runs with --quiet."""
+    """Print a line on stderr, unless the command runs with --quiet."""
     if not quiet.get():
         print(text, file=sys.stderr)
 
 
 def one_line(error: BaseException) -> str:
-    """The message of an error in one line; an `OSError` of the system names its file and the reason."""
+    """Return an error in one line; an `OSError` of the system names its file and the reason."""
     if isinstance(error, OSError) and error.filename and error.errno in (errno.ENOTDIR, errno.EEXIST):
         path = Path(os.fsdecode(error.filename))
         for in_the_way in filter(Path.is_file, (path, *path.parents)):
@@ -236,12 +236,12 @@ def one_line(error: BaseException) -> str:
         package = (error.name or "").split(".")[0]
         return f"needs the package {package}, which is not installed: pip install 'qsim[{EXTRAS[package]}]'"
     if isinstance(error, MemoryError):
-        return f"not enough memory ({' '.join(str(error).split()) or 'no more to have'}); try fewer or smaller frames"
+        return f"not enough memory ({' '.join(str(error).split()) or 'none is left'}); try fewer or smaller frames"
     return wording(error)
 
 
 def output(args: argparse.Namespace, found: dict[str, Any], text: str | Sequence[str]) -> None:
-    """The result of a command: JSON where asked for, else text."""
+    """Print the result of a command: JSON with --json, else text."""
     if args.json:
         print(json.dumps(found, sort_keys=True))
     else:
@@ -249,17 +249,17 @@ def output(args: argparse.Namespace, found: dict[str, Any], text: str | Sequence
 
 
 def refuse_idle(args: argparse.Namespace, where: str, names: Sequence[str]) -> None:
-    """A `ValueError` if one of these options is given, which change nothing there; their defaults are None or False."""
+    """Raise `ValueError` if an option without effect is given; the defaults of `names` are None or False."""
     for name in names:
         value = getattr(args, name)
-        if value is not None and value is not False:  # 0 is a value that was given
+        if value is not None and value is not False:  # 0 is a given value
             raise ValueError(f"{where}: --{name.replace('_', '-')} changes nothing here; leave it out")
 
 
 def refuse_existing(path: Path, force: bool) -> None:
-    """An `OSError` with the cure if a file cannot be written, or is there already and `force` is not set.
+    """Raise an `OSError` with the cure if a file cannot be written, or exists and `force` is not set.
 
-    Called before the work, so that nothing is computed that has no place to go.
+    Called before the computation, so that its result can be stored.
     """
     if path.is_dir():
         raise FileExistsError(f"{path}: is a folder; name a file with -o")
@@ -269,12 +269,12 @@ def refuse_existing(path: Path, force: bool) -> None:
     if not folder.is_dir():
         raise NotADirectoryError(f"{folder}: is a file where a folder is needed; name another with -o")
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise PermissionError(f"{path}: nothing may be written into {folder}; name another with -o")
+        raise PermissionError(f"{path}: no permission to write into {folder}; name another with -o")
 
 
 @contextlib.contextmanager
 def bar(label: str, unit: str = "frame") -> Iterator[Progress]:
-    """A progress bar with rate and time left on stderr, shown after two seconds; call it with (done, total)."""
+    """Show a progress bar on stderr after two seconds; the block calls it with (done, total)."""
     from tqdm import tqdm
 
     interval = 0.2 if sys.stderr.isatty() else 10.0

@@ -1,4 +1,4 @@
-"""The command `qsim convert`: foreign files into clips and streams, ours into files for others."""
+"""Runs `qsim convert`: imports foreign files as clips and streams, and exports ours."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr"}
 
 
 def add_convert(sub: Any) -> None:
-    """The options of `qsim convert`."""
+    """Add the command `convert` to a program."""
     parser = command(
         sub, "convert", _run_convert, "Read foreign recordings as clips or streams; write ours for others.",
         "qsim convert ball.npy out/ball --frame-rate 30000 --exposure 20e-6 --transfer linear\n"
@@ -33,10 +33,10 @@ def add_convert(sub: Any) -> None:
     parser.add_argument(
         "output", type=Path, help="clip folder, stream name, .npy, .mp4 or .zarr, or a folder with --to"
     )
-    reading = parser.add_argument_group("what a foreign file may not say")
+    reading = parser.add_argument_group("what a foreign file may not state")
     reading.add_argument("--layout", help=f"kind of the input: {', '.join(detection.LAYOUTS)}")
     reading.add_argument("--frame-rate", type=float, help="frames per second of the capture (not of a video file)")
-    reading.add_argument("--exposure", type=float, help="seconds of light per frame (default: the whole frame)")
+    reading.add_argument("--exposure", type=float, help="seconds of light per frame (default: the full frame time)")
     reading.add_argument("--transfer", help=f"how pictures code light: {', '.join(TRANSFERS)} (also for writing)")
     reading.add_argument("--height", type=int, help="pixels")
     reading.add_argument("--width", type=int, help="pixels, before packing")
@@ -50,21 +50,21 @@ def add_convert(sub: Any) -> None:
     reading.add_argument("--ppp", type=float, help="light level the sensor's gain was set for")
     reading.add_argument("--split", choices=SPLITS, help="stored in the clips")
     writing = parser.add_argument_group("writing for others")
-    writing.add_argument("--to", choices=sorted(exporting.EXPORTS), help="kind of the output, if its name does not say")
     writing.add_argument(
-        "--lossy", action="store_true", help="mp4 with FFmpeg's ordinary settings: noise does not survive"
+        "--to", choices=sorted(exporting.EXPORTS), help="kind of the output, if its name has no ending"
     )
+    writing.add_argument("--lossy", action="store_true", help="mp4 with FFmpeg's default settings: noise is lost")
     parser.add_argument(
         "--white", type=float,
         help="reading: pixel value at which the camera saturates, as in 4095 (default: the largest that whole numbers "
         "hold); writing mp4 and png: light that becomes full scale (default: the 99.9th percentile)",
     )  # fmt: skip
-    parser.add_argument("--force", action="store_true", help="replace what is there")
+    parser.add_argument("--force", action="store_true", help="replace an existing output")
 
 
 def _run_convert(args: argparse.Namespace) -> int:
     source = args.input
-    if source.suffix == ".npy" and _is_stream(source.with_suffix(".json")):  # its codes name a stream as well
+    if source.suffix == ".npy" and _is_stream(source.with_suffix(".json")):  # its codes name a stream too
         source = args.input = source.with_suffix(".json")
     ours = source.is_dir() and any((source / name).is_file() for name in ("clip.json", "dataset.json"))
     made = _export(args) if ours or _is_stream(source) else _import(args)
@@ -81,7 +81,7 @@ _READING = ("layout", "frame_rate", "exposure", "height", "width", "bits", "stre
 
 
 def _refuse_what_cannot_act(args: argparse.Namespace, kind: str, light: bool) -> None:
-    """A `ValueError` for options of writing that this kind of output has no use for."""
+    """Raise `ValueError` for options of writing without effect on this kind of output."""
     where = f"{args.output}, a {kind} of {'light' if light else 'codes'}"
     if not (light and kind in ("mp4", "png")):
         refuse_idle(args, where, ["transfer"])
@@ -90,13 +90,13 @@ def _refuse_what_cannot_act(args: argparse.Namespace, kind: str, light: bool) ->
 
 
 def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
-    refuse_idle(args, f"{args.input} is ours and says it itself", _READING)
+    refuse_idle(args, f"{args.input} is ours and states it", _READING)
     if args.flip != "none":
-        raise ValueError(f"{args.input} is ours and says it itself: --flip changes nothing here; leave it out")
+        raise ValueError(f"{args.input} is ours and states it: --flip changes nothing here; leave it out")
     kind = args.to or _SUFFIXES.get(args.output.suffix)
     if kind is None:
         known = ", ".join(sorted(exporting.EXPORTS))
-        raise ValueError(f"{args.output}: say what to write with --to: {known}")
+        raise ValueError(f"{args.output}: name the kind of output with --to: {known}")
     _refuse_what_cannot_act(args, kind, args.input.suffix != ".json")
     wanted = exporting.Export(kind, args.transfer or "gamma 2.2", args.white, not args.lossy)
     if args.white is not None and (kind not in ("mp4", "png") or args.input.suffix == ".json"):
@@ -120,7 +120,7 @@ def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
 def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
     refuse_idle(args, f"{args.input} is read, not written for others", ["to", "lossy"])
     if args.frame_rate is None:
-        raise ValueError(f"{args.input}: files do not say how fast the capture was; add --frame-rate, as in 2000")
+        raise ValueError(f"{args.input}: files do not state the capture rate; add --frame-rate, as in 2000")
     hints = Hints(args.layout, args.height, args.width, args.bits, args.transfer, args.channel, args.flip, args.columns,
                   args.stretched, args.variable, args.white)  # fmt: skip
     capture = importing.Import(args.frame_rate, args.exposure, args.sensor, args.ppp, args.split)
@@ -150,6 +150,6 @@ def _size(made: Clip | Stream) -> str:
 
 
 def _flat_name(file: Path, folder: Path) -> str:
-    """`scene/clip.mp4` (or the folder `scene/clip`) below `folder` as `scene_clip`."""
+    """Return `scene/clip.mp4` (or the folder `scene/clip`) below `folder` as `scene_clip`."""
     inside = file.relative_to(folder)
     return "_".join((inside if file.is_dir() else inside.with_suffix("")).parts).replace(" ", "_")

@@ -1,4 +1,4 @@
-"""Commands of data sets: `generate`, `plan` and `check`; pairs as in cli.py."""
+"""Runs `qsim generate`, `qsim plan` and `qsim check` on data sets."""
 
 from __future__ import annotations
 
@@ -9,28 +9,27 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks, files
-from qsim.cli.console import GOES_ON, bar, command, note, output
+from qsim.cli.console import RESUMES, bar, command, note, output
 from qsim.cli.options import checked, part_of
 from qsim.dataset.job import Job
 
-# generate
-
 
 def add_generate(sub: Any) -> None:
+    """Add the command `generate` to a program."""
     parser = command(
-        sub, "generate", _run_generate, "Make a data set from a recipe; whatever is done already is kept.",
+        sub, "generate", _run_generate, "Make a data set from a recipe; finished jobs are kept.",
         "qsim generate scenes/starter.toml -o out/starter --workers 2\n"
-        "qsim generate scenes/i2_2000fps.toml -o /data/i2 --shard 7/100", GOES_ON,
+        "qsim generate scenes/i2_2000fps.toml -o /data/i2 --shard 7/100", RESUMES,
         threads="of the renderer (Dr.Jit) in each worker",
     )  # fmt: skip
-    parser.add_argument("recipe", type=Path, help="a .toml file; its format is described in qsim/dataset/recipe.py")
+    parser.add_argument("recipe", type=Path, help="a .toml file; its format is in qsim/dataset/recipe.py")
     parser.add_argument("-o", "--output", type=Path, help="data set folder (default out/NAME of the recipe)")
     parser.add_argument("--workers", type=int, help="processes, each with its own renderer (default 1)")
     parser.add_argument("--shard", type=part_of, metavar="I/N", help="only the I-th of N parts, as in 7/100")
     memory = checked(checks.positive)
-    parser.add_argument("--memory", type=memory, help="GiB per process before it gives up (default 4)")
+    parser.add_argument("--memory", type=memory, help="largest GiB per process (default 4)")
     parser.add_argument("--retry", action="store_true", help="try failed jobs again")
-    parser.add_argument("--repair", action="store_true", help="check all files and make the damaged ones again")
+    parser.add_argument("--repair", action="store_true", help="check all files and make damaged ones again")
     parser.add_argument("--wait", action="store_true", help="wait while another generator is at work in the folder")
     parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask scheduler, as in tcp://10.0.0.1:8786")
     parser.add_argument(
@@ -46,7 +45,7 @@ def _run_generate(args: argparse.Namespace) -> int:
 
     wanted = recipe.load(args.recipe)
     folder = args.output or Path("out") / wanted.name
-    # None: not given, which --cluster must tell from given (`_cluster`).
+    # None: not given, as --cluster needs it (`_cluster`).
     count = generation.Options.workers if args.workers is None else args.workers
     limits = Limits() if args.memory is None else Limits(memory=args.memory)
     if count == 0 and args.memory is not None:
@@ -63,13 +62,13 @@ def _run_generate(args: argparse.Namespace) -> int:
     lines += [f"SHARED {problem}" for problem in summary.shared]
     lines += [f"NOISY {line}" for line in _noisy(folder, chosen)]
     if summary.failed:
-        lines.append("run again with --retry after mending the cause")
+        lines.append("run again with --retry after removing the cause")
     output(args, {"dataset": str(folder)} | dataclasses.asdict(summary), lines)
     return 0 if summary.done == summary.jobs and not summary.shared else 1
 
 
 def _noisy(folder: Path, jobs: list[Job]) -> list[str]:
-    """The finished clips whose radiance misses the error that the recipe asks for."""
+    """Return a line for each finished clip whose error exceeds that of the recipe."""
     from qsim.clip.clamped_error import stated
     from qsim.rendering.fidelity import shortfall
 
@@ -80,7 +79,7 @@ def _noisy(folder: Path, jobs: list[Job]) -> list[str]:
 
 
 def _cluster(args: argparse.Namespace) -> Any:
-    """The cluster asked for or None; `ValueError` if options for processes of this machine are given with it."""
+    """Return the cluster of --cluster or None; `ValueError` for options of local processes beside it."""
     if not 0 <= args.gpus < float("inf"):
         raise ValueError(f"--gpus: expected 0 or more, got {args.gpus}")
     if args.cluster is None:
@@ -102,12 +101,10 @@ def _cluster(args: argparse.Namespace) -> Any:
     return Cluster(args.cluster, gpus=args.gpus)
 
 
-# plan
-
-
 def add_plan(sub: Any) -> None:
+    """Add the command `plan` to a program."""
     parser = command(
-        sub, "plan", _run_plan, "Render one tiny job of each kind and say what the recipe will cost.",
+        sub, "plan", _run_plan, "Render one small job of each kind and print the forecast of a recipe's cost.",
         "qsim plan scenes/i2_2000fps.toml --machines 10",
         threads="of the renderer (Dr.Jit)",
     )  # fmt: skip
@@ -129,18 +126,18 @@ def _run_plan(args: argparse.Namespace) -> int:
     return 0
 
 
-# check
-
-
 def add_check(sub: Any) -> None:
+    """Add the command `check` to a program."""
     parser = command(
-        sub, "check", _run_check, "Compare what was made with its checksums; exit code 1 if a file is damaged.",
+        sub, "check", _run_check, "Compare files with their checksums; exit code 1 if one is damaged.",
         "qsim check out/starter out/fan out/fan_restored.npy\n"
         "qsim check out/starter --redraw",
     )  # fmt: skip
     parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="data sets, clips, streams, restored video")
     parser.add_argument(
-        "--redraw", action="store_true", help="draw streams again by the reference engine, name those that differ; slow"
+        "--redraw",
+        action="store_true",
+        help="draw streams again by the reference engine, name those that differ; slow",
     )
 
 

@@ -1,4 +1,4 @@
-"""Commands to look: `preview` (one picture, a film, the terminal) and `report` (a page); pairs as in cli.py."""
+"""Runs `qsim preview` (a picture, a film, the terminal) and `qsim report` (a page)."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from qsim.cli.console import bar, command, output, refuse_existing, refuse_idle
 PREVIEWS = (".mp4", ".gif", ".png")
 
 
-# preview
-
-
 def add_preview(sub: Any) -> None:
+    """Add the command `preview` to a program."""
     parser = command(
-        sub, "preview", _run_preview, "A quick look at a clip, stream or array: in the terminal, as film or picture.",
+        sub, "preview", _run_preview, "Show a clip, stream or array: in the terminal, as film or picture.",
         "qsim preview out/fan\n"
         "qsim preview out/fan --what flow --frame 3\n"
         "qsim preview out/fan -o out/fan.mp4 --fps 25\n"
         "qsim preview out/fan.npy -o out/fan.png --frame 10",
     )  # fmt: skip
     parser.add_argument("path", type=Path, help="clip folder, stream (.npy or .json), or array [T, H, W] (.npy)")
-    parser.add_argument("-o", "--output", type=Path, help=".mp4, .gif or .png to write (default: show it here)")
+    parser.add_argument(
+        "-o", "--output", type=Path, help=".mp4, .gif or .png to write (default: show it in the terminal)"
+    )
     parser.add_argument("--what", type=_kinds, help="of sharp,radiance,codes,average,flow,depth; with commas")
     parser.add_argument("--stream", help="which stream of a clip (default: the first)")
     parser.add_argument("--frame", type=int, help="one frame (default: the middle one, or all in a film)")
     parser.add_argument("--fps", type=float, help="frames of a film shown per second (default 12)")
-    parser.add_argument("--scale", type=int, help="pixels per pixel (default: so that captions can be read)")
+    parser.add_argument("--scale", type=int, help="pixels per pixel (default: so that captions fit)")
     parser.add_argument("--bits", type=int, help="a bare array holds codes of so many bits")
     parser.add_argument("--width", type=int, help="a bare array holds packed binary planes of so many columns")
     parser.add_argument("--play", action="store_true", help="in the terminal: all frames, one after the other")
@@ -96,7 +96,7 @@ def _run_preview(args: argparse.Namespace) -> int:
 
 
 def _show(args: argparse.Namespace, source: Any, views: list[Any], frames: range) -> int:
-    """Pictures on stdout: colour if it is a terminal (and NO_COLOR is not set), else shades of text."""
+    """Print pictures: in colour on a terminal (unless NO_COLOR is set), else as text."""
     from qsim.report import preview
     from qsim.report.views import declaration
 
@@ -120,15 +120,13 @@ def _show(args: argparse.Namespace, source: Any, views: list[Any], frames: range
     return 0
 
 
-# report
-
-
 def add_report(sub: Any) -> None:
+    """Add the command `report` to a program."""
     parser = command(
-        sub, "report", _run_report, "Draw one self-contained page of clips, data sets, runs, restored video, scores.",
+        sub, "report", _run_report, "Write one self-contained page of clips, data sets, runs, restored video, scores.",
         "qsim report out/fan\nqsim report out/demo -o out/demo/index.html --title 'My run'",
     )  # fmt: skip
-    parser.add_argument("path", type=Path, help="clip, data set, or any folder with such things in it")
+    parser.add_argument("path", type=Path, help="clip, data set, or a folder that holds some")
     parser.add_argument("-o", "--output", type=Path, help=".html file to write (default: NAME.html here)")
     parser.add_argument("--title", help="of the page")
     parser.add_argument("--note", action="append", default=[], help="a line for the top of the page; may be repeated")
@@ -147,5 +145,5 @@ def _run_report(args: argparse.Namespace) -> int:
     target.parent.mkdir(parents=True, exist_ok=True)
     files.write_bytes(target, page)
     found = {"page": str(target), "bytes": len(page)}
-    output(args, found, f"{target}: {len(page) / 1e6:.1f} MB, loads nothing from elsewhere; open it in a browser")
+    output(args, found, f"{target}: {len(page) / 1e6:.1f} MB, self-contained; open it in a browser")
     return 0

@@ -1,4 +1,4 @@
-"""Argument types: what the values of options mean, for the commands of qsim and quiver.
+"""Converts the texts of options to values, for the commands of qsim and quiver.
 
 Every type raises `argparse.ArgumentTypeError`, which becomes one line that names the option.
 """
@@ -12,7 +12,7 @@ from typing import Any
 
 
 def checked(check: Callable[[Any], Any]) -> Callable[[str], Any]:
-    """An argparse type from a check of recipe values (checks.py), so that files and options obey the same rules."""
+    """Return an argparse type from a check of qsim.checks: files and options have the same rules."""
 
     def parse(text: str) -> Any:
         value: int | float | str = text
@@ -28,12 +28,12 @@ def checked(check: Callable[[Any], Any]) -> Callable[[str], Any]:
 
 
 def numbers(text: str) -> tuple[float, ...]:
-    """`3.25,9.75` -> (3.25, 9.75)"""
+    """Return numbers above 0: `3.25,9.75` -> (3.25, 9.75)."""
     return tuple(positive(part) for part in text.split(","))
 
 
 def whole_numbers(text: str) -> tuple[int, ...]:
-    """`1,3` -> (1, 3)"""
+    """Return whole numbers of at least 1: `1,3` -> (1, 3)."""
     return tuple(count(part) for part in text.split(","))
 
 
@@ -71,7 +71,7 @@ def frame_size(text: str) -> tuple[int, int]:
 
 
 def memory_size(text: str) -> int:
-    """Bytes of `2GB`, `500MB`, `1.5GiB` or a bare number."""
+    """Return the bytes of `2GB`, `500MB`, `1.5GiB` or a number."""
     units = {"kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2**10, "mib": 2**20, "gib": 2**30, "b": 1, "": 1}
     number = text.rstrip("KMGiBkmgb")
     unit = text[len(number) :].lower()
@@ -85,7 +85,7 @@ def memory_size(text: str) -> int:
 
 
 def words(text: str) -> tuple[str, ...]:
-    """`naive,moment:3,out/run` -> its parts; none may be empty."""
+    """Return the parts of `naive,moment:3,out/run`; none may be empty."""
     parts = tuple(part.strip() for part in text.split(","))
     if not all(parts):
         raise argparse.ArgumentTypeError(f"expected names with commas between them, got {text!r}")
@@ -101,7 +101,7 @@ def part_of(text: str) -> tuple[int, int]:
 
 
 def steps(text: str) -> list[float]:
-    """`3.25`, `0.5,3,26`, `0.1:30` (six geometric steps) or `0.5:8:5` (five of them) -> numbers above 0."""
+    """Return numbers above 0 of `3.25`, `0.5,3,26`, `0.1:30` (geometric steps) or `0.5:8:5` (five of them)."""
     import numpy as np
 
     words = text.split(":")
@@ -122,7 +122,7 @@ def steps(text: str) -> list[float]:
 
 
 def _doublings(low: float, high: float) -> int:
-    """Steps of 2 if the range is so many times 2 (up to 32), else six steps."""
+    """Return the number of steps: one per factor of 2 if the range is a power of 2 up to 32, else six."""
     from math import isclose, log2
 
     octaves = log2(high / low)

@@ -1,5 +1,6 @@
-"""The command `qsim`: parse, call, print. Each command is a pair `_add_X` (its options) and `_run_X` (what it does);
-most are in cli_data.py, cli_look.py, cli_studies.py, cli_validate.py and convert.py.
+"""Runs `qsim`: all commands, and the command `doctor`.
+
+Each command is a pair of functions: `add_X` adds its options, `_run_X` runs it and returns the exit code.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from qsim.files import VERSION
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command line; returns the exit code."""
+    """Run a command line; return the exit code."""
     parser = Parser(prog="qsim", description="Render moving scenes and turn them into few-bit quanta-sensor streams.")
     parser.add_argument("--version", action="version", version=f"qsim {VERSION}")
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
@@ -48,8 +49,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _add_doctor(sub: Any) -> None:
+    """Add the command `doctor` to a program."""
     parser = command(
-        sub, "doctor", _run_doctor, "Say what this machine renders with, what was tried, and which extras are missing.",
+        sub, "doctor", _run_doctor, "Print the renderer of this machine, every tested one, and the missing extras.",
         "qsim doctor\nqsim doctor --devices",
     )  # fmt: skip
     parser.add_argument("--devices", action="store_true", help="list the named sensors and the source of each number")

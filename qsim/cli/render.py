@@ -1,4 +1,4 @@
-"""The command `qsim render`: a scene into a clip of stated error."""
+"""Runs `qsim render`: renders a scene as a clip of stated error."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks
-from qsim.cli.console import GOES_ON, bar, command, output, refuse_idle
+from qsim.cli.console import RESUMES, bar, command, output, refuse_idle
 from qsim.cli.options import checked
 
 
 def add_render(sub: Any) -> None:
+    """Add the command `render` to a program."""
     parser = command(
         sub, "render", _run_render, "Render a scene into a clip: radiance, sharp frames, flow, depth, body ids.",
         "qsim render fan -o out/fan --frames 21 --height 128 --width 128\n"
-        "qsim render fan --explain", GOES_ON,
+        "qsim render fan --explain", RESUMES,
         threads="of the renderer (Dr.Jit); the picture does not depend on it",
     )  # fmt: skip
     parser.add_argument(
@@ -26,7 +27,7 @@ def add_render(sub: Any) -> None:
     )
     parser.add_argument("-o", "--output", type=Path, help="clip folder to make (may be left out with --explain)")
     parser.add_argument(
-        "--explain", action="store_true", help="say what is modelled, what is left out and how large it would have been"
+        "--explain", action="store_true", help="print which effects are modelled, and the size of those that are not"
     )
     whole = checked(checks.whole)
     parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the scene and its samples (default 0)")
@@ -46,7 +47,7 @@ def add_render(sub: Any) -> None:
     light = checked(checks.positive)
     parser.add_argument("--ppp", type=light, help="brightest light level that will be sensed, photons per pixel")
     parser.add_argument(
-        "--engine", choices=("cuda", "llvm", "scalar"), help="insist on one (default: QSIM_ENGINE, else the fastest)"
+        "--engine", choices=("cuda", "llvm", "scalar"), help="require one (default: QSIM_ENGINE, else the fastest)"
     )
     parser.add_argument("--force", action="store_true", help="replace an existing clip")
 

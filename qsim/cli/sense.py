@@ -1,4 +1,4 @@
-"""The command `qsim sense`: clips into few-bit streams, or one frame drawn again."""
+"""Runs `qsim sense`: draws few-bit streams of clips, or draws one frame again."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from qsim.cli.options import checked, numbers
 
 
 def add_sense(sub: Any) -> None:
+    """Add the command `sense` to a program."""
     parser = command(
         sub, "sense", _run_sense, "Turn clips into few-bit streams, or draw one frame again and compare.",
         "qsim sense out/fan --bits 3 --ppp 3.25\n"
         "qsim sense out/starter --sensor spad-320x240 --bits 1 --ppp 0.5,3.25,26\n"
         "qsim sense out/starter --name quiver-physical_3bit_3.25ppp --replay fan_0003:7",
-        "the same command goes on with the streams that are missing",
+        "the same command resumes with the missing streams",
         threads="of the compiled engine (Dr.Jit) that draws codes; codes do not depend on it",
     )  # fmt: skip
     parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="clips or data sets")
@@ -26,7 +27,7 @@ def add_sense(sub: Any) -> None:
         "--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default: quiver-physical)"
     )
     parser.add_argument("--bits", type=checked(checks.bits), help="bits per code (default: the sensor's own)")
-    parser.add_argument("--ppp", type=numbers, help="photons per pixel and code over the whole clip; several: 3.25,26")
+    parser.add_argument("--ppp", type=numbers, help="photons per pixel and code mean of the clip; several: 3.25,26")
     parser.add_argument("--lux", type=numbers, help="faceplate lux at 555 nm instead of --ppp")
     parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the noise (default 0)")
     parser.add_argument("-o", "--name", help="name of the stream (default: made from sensor, bits and light)")
@@ -82,7 +83,7 @@ def _run_sense(args: argparse.Namespace) -> int:
                 made.append(facts | _light(found.meta))
     if len(levels) > 1:
         note("streams of a clip with the same --seed share their random numbers: another --seed makes them independent")
-    lines = [f"{m['light']}; {'made' if m['made'] else 'there already'}: stream {m['stream']}" for m in made]
+    lines = [f"{m['light']}; {'made' if m['made'] else 'exists already'}: stream {m['stream']}" for m in made]
     output(args, {"streams": made}, lines)
     return 0
 
@@ -119,7 +120,7 @@ def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
 
 
 def _clips(path: Path) -> list[Any]:
-    """The clips of a data set, or the one clip of a folder."""
+    """Return the clips of a data set, or the one clip of a folder."""
     from qsim.clip.clip import Clip
     from qsim.dataset.dataset import Dataset
 

@@ -1,4 +1,4 @@
-"""The command `tradeoff`: `add_X`, `_run_X` as in cli.py."""
+"""Runs `qsim tradeoff`: bit depth against motion, light, read noise and data rate."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from qsim import checks, files
 from qsim.cli.console import bar, command, note, output, refuse_idle
 from qsim.cli.options import checked, frame_size, steps, whole_numbers
 
-# tradeoff
-
 
 def add_tradeoff(sub: Any) -> None:
+    """Add the command `tradeoff` to a program."""
     parser = command(
         sub, "tradeoff", _run_tradeoff, "Bit depth against motion, light, read noise and data rate.",
         "qsim tradeoff --table --size 240x320 --base-fps 10000 --read-noise 0.2 --bits 1,3,5,7,9\n"
@@ -136,7 +135,7 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
 
 
 def _speeds(args: argparse.Namespace, shape: Any) -> tuple[list[float], list[str]]:
-    """The factors on the motion, and a line for each motion that was asked for."""
+    """Return the factors on the motion, and a line for each given motion."""
     from functools import partial
 
     import scenes

@@ -1,4 +1,4 @@
-"""The command `validate`; a pair as in cli.py."""
+"""Runs `qsim validate`: speed against error of sensors, renderer, engines and reading."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ ACTING = {
 
 
 def add_validate(sub: Any) -> None:
+    """Add the command `validate` to a program."""
     parser = command(
-        sub, "validate", _run_validate, "Measure sensor engines, the renderer or reading here: speed against error.",
+        sub, "validate", _run_validate, "Measure speed and error of sensor engines, of the renderer or of reading.",
         "qsim validate sensor --json -o out/sensor.png\nqsim validate render -o out/render.png\n"
         "qsim validate light --scenes glossy room --height 64 --width 96\n"
         "qsim validate engines --scenes fan glass\nqsim validate reading",
@@ -41,7 +42,7 @@ def add_validate(sub: Any) -> None:
     whole, psnr = checked(checks.whole), checked(checks.psnr)
     parser.add_argument("--height", type=whole, help=f"render, engines, light: pixels (default {HEIGHT})")
     parser.add_argument("--width", type=whole, help=f"render, engines, light: pixels (default {WIDTH})")
-    parser.add_argument("--psnr", type=psnr, help=f"light: error asked for, dB below white (default {PSNR:g})")
+    parser.add_argument("--psnr", type=psnr, help=f"light: required error, dB below white (default {PSNR:g})")
     parser.add_argument("--force", action="store_true", help="replace an existing figure")
 
 

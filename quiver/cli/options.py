@@ -114,7 +114,7 @@ def command(
     sub: Any, name: str, action: Any, what: str, example: str, *, resumes: bool = False
 ) -> argparse.ArgumentParser:
     """Return a command's parser from `qsim.cli.console.command`."""
-    return console.command(sub, name, action, what, example, console.GOES_ON if resumes else console.STARTS_AGAIN)
+    return console.command(sub, name, action, what, example, console.RESUMES if resumes else console.STARTS_AGAIN)
 
 
 @contextlib.contextmanager

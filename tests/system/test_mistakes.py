@@ -72,7 +72,7 @@ MISTAKES = [
     ("qsim render fan -o x --shutter 50", "--shutter: expected the open share of a frame, 0 to 1, got 50; half"),
     ("qsim render fan -o x --psnr 500", "--psnr: expected the wanted error in dB, 10 to 80, got 500"),
     ("qsim convert light.npy x --frame-rate 2000 --exposure 500", "exposure 500.0 s: expected more than 0 and at most"),
-    ("qsim calibrate --bits 3 --dark codes.npy 1ms -o x.toml", "'1ms' is no number; give seconds, as in 1e-3"),
+    ("qsim calibrate --bits 3 --dark codes.npy 1ms -o x.toml", "'1ms' is not a number; give seconds, as in 1e-3"),
     ("qsim sense lit --ppp 3 --sensor percent.toml", "quantum_efficiency is a number, above 0 and at most 1; got 80"),
     # Light
     ("qsim sense lit --ppp 0", "--ppp: expected a number above 0, got '0'"),
@@ -123,7 +123,7 @@ MISTAKES = [
     ("qsim generate good.toml --shard 5/3", "expected I/N with 1 <= I <= N, as in 7/100, got '5/3'"),
     ("qsim generate good.toml --workers -1", "--workers: expected 0 (in this process) or more, got -1"),
     # Foreign files
-    ("qsim convert light.npy x", "files do not say how fast the capture was; add --frame-rate, as in 2000"),
+    ("qsim convert light.npy x", "files do not state the capture rate; add --frame-rate, as in 2000"),
     ("qsim convert none.npy x --frame-rate 9", "none.npy: no such file"),
     ("qsim convert nan.npy x --frame-rate 9", "nan.npy: value nan at (t, y, x) = (0, 0, 0) is not a light level"),
     ("qsim convert negative.npy x --frame-rate 9", "is not a light level: expected finite and >= 0"),
@@ -140,7 +140,7 @@ MISTAKES = [
         "is not a 2-bit code (0..3); give the right --bits",
     ),
     ("qsim convert light.npy x --frame-rate 9 --columns 99", "--columns 99: the frames have 10 columns"),
-    ("qsim convert lit x.webm", "x.webm: say what to write with --to: cube, exr, mp4, png, zarr"),
+    ("qsim convert lit x.webm", "x.webm: name the kind of output with --to: cube, exr, mp4, png, zarr"),
     # Looking and studying
     (
         "qsim report empty -o x.html",
@@ -329,7 +329,7 @@ def test_a_folder_that_is_not_ours(folder, monkeypatch, capsys):
     monkeypatch.setattr("qsim.report.report.build_page", lambda *_, **__: 1 / 0)
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != Path("empty"))
     said = told(capsys, "qsim report lit -o empty/deep/x.html")
-    assert "nothing may be written into empty; name another with -o" in said
+    assert "no permission to write into empty; name another with -o" in said
 
 
 def test_no_gpu(folder, monkeypatch, capsys):

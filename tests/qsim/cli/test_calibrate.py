@@ -58,7 +58,7 @@ def test_what_is_assumed_is_printed(folder, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--model spad --bits 13 --dark dark.npy 1e-5", "may be sums of binary planes; say --planes N"),
+        ("--model spad --bits 13 --dark dark.npy 1e-5", "may be sums of binary planes; give --planes N"),
         ("--model spad --bits 1 --dark dark.npy 1e-5", "sums of N binary planes are calibrated with --planes N"),
         ("--planes 4 --dark dark.npy 1e-5", "is not a sum of 4 planes, 0..4"),
         ("--planes 50 --bits 6 --dark dark.npy 1e-5", "--bits 6: --planes 50 are 1-bit planes; leave --bits out"),

@@ -177,6 +177,6 @@ def test_ctrl_c_of_a_command_that_starts_again(tmp_path):
     os.kill(child.pid, signal.SIGINT)
     out, err = child.communicate(timeout=60)
     assert (child.returncode, out) == (130, "")
-    assert err.splitlines()[-1] == "qsim: interrupted; nothing half-written is left; run the same command again"
+    assert err.splitlines()[-1] == "qsim: interrupted; no incomplete file is left; run the same command again"
     assert "Traceback" not in err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["long"]

@@ -84,7 +84,7 @@ def test_every_help_has_an_example_and_json(capsys: pytest.CaptureFixture[str], 
             "qsim render: argument --frames: expected a whole number from 1 to 100000, got 0",
         ),
         ("check /none", "qsim: /none: no such clip"),
-        ("convert /none never/made", "qsim: /none: files do not say how fast"),
+        ("convert /none never/made", "qsim: /none: files do not state the capture rate"),
         ("convert /none never/made --frame-rate 10", "qsim: /none: no such file"),
         ("plan /none.toml", "qsim: /none.toml: no such recipe"),
     ],
@@ -135,7 +135,7 @@ def test_sense_prints_one_line_of_light(made: Path, capsys: pytest.CaptureFixtur
     assert "lx at 555 nm, 2.6 e-/pixel" in out
     assert out.count("\n") == 1
     assert out.endswith("made: stream quiver-physical_2bit_3.25ppp\n")
-    assert "there already: stream quiver" in run(capsys, "sense", clip, "--bits", 2, "--ppp", 3.25)[1]
+    assert "exists already: stream quiver" in run(capsys, "sense", clip, "--bits", 2, "--ppp", 3.25)[1]
     stream = Clip.open(clip).stream("quiver-physical_2bit_3.25ppp")
     assert stream.codes().max() <= 3
     assert stream.meta["ppp_target"] == 3.25
@@ -322,7 +322,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path: Path):
     first.send_signal(signal.SIGINT)
     _, err = first.communicate(timeout=60)
     assert first.returncode == 130
-    assert "interrupted; the same command goes on where it stopped" in err
+    assert "interrupted; the same command resumes where it stopped" in err
     assert "Traceback" not in err
     (tmp_path / "d" / "go").touch()
     subprocess.run(line, env=env, check=True, capture_output=True)
