@@ -1,7 +1,7 @@
 """Checks tables of TOML and JSON files by one function, and makes dataclasses of them.
 
     table:  {key: check}; "key" must be there, "key, if any" may be missing or null, "key or null" may be null
-    check:  a function that returns the value or raises `ValueError("expected ..., got ...")`, or a table of its own
+    check:  a function that returns the value or raises `ValueError("expected ..., got ...")`, or a nested table
 
 Every message names the place (a file, and in recipes the line), the key, what is expected and what was found. Numbers
 are finite; NaN never passes.

@@ -1,4 +1,4 @@
-"""The engine: an unusable LLVM never ends the user's process, answers are remembered, fallbacks say so once."""
+"""Tests the choice of the backend: no unusable LLVM ends the process, results are stored, fallbacks warn once."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from qsim import backend as engine
+from qsim import backend
 
 RENDER = """
 import warnings; warnings.simplefilter("ignore")
@@ -38,8 +38,8 @@ def test_an_old_llvm_is_refused_without_ending_the_process(number, tmp_path):
     environment = os.environ | {"DRJIT_LIBLLVM_PATH": found[0], "XDG_CACHE_HOME": str(tmp_path)}
     child = subprocess.run([sys.executable, "-c", RENDER], env=environment, capture_output=True, text=True, check=False)
     assert child.returncode == 0, child.stderr
-    backend, mean = child.stdout.split()[-2:]
-    assert backend in engine.BACKENDS
+    chosen, mean = child.stdout.split()[-2:]
+    assert chosen in backend.BACKENDS
     assert float(mean) == pytest.approx(1.0, rel=1e-4)
 
 
@@ -47,10 +47,10 @@ def test_the_newest_library_is_tried_first_and_a_named_one_before_it(tmp_path, m
     for number in (16, 19, 22):
         (tmp_path / f"libLLVM.so.{number}.1").write_bytes(b"")
     (tmp_path / "mine.so").write_bytes(b"")
-    monkeypatch.setattr(engine, "llvm_patterns", lambda number: [str(tmp_path / f"libLLVM.so.{number}.*")])
-    monkeypatch.setattr(engine.ctypes.util, "find_library", lambda name: None)
+    monkeypatch.setattr(backend, "llvm_patterns", lambda number: [str(tmp_path / f"libLLVM.so.{number}.*")])
+    monkeypatch.setattr(backend.ctypes.util, "find_library", lambda name: None)
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "mine.so"))
-    names = [os.path.basename(path) for path in engine.llvm_candidates()]
+    names = [os.path.basename(path) for path in backend.llvm_candidates()]
     assert names == ["mine.so", "libLLVM.so.22.1", "libLLVM.so.19.1", "libLLVM.so.16.1"]
 
 
@@ -61,78 +61,78 @@ def test_a_library_is_probed_once_until_it_changes(tmp_path, monkeypatch):
 
     def probe(variant, path):
         calls.append(path)
-        return engine.Probe("llvm", path, True, "LLVM 19")
+        return backend.Probe("llvm", path, True, "LLVM 19")
 
-    monkeypatch.setattr(engine, "run_probe", probe)
+    monkeypatch.setattr(backend, "run_probe", probe)
     for _ in range(3):
-        assert engine.cached_probe("llvm_ad_mono", str(library)).works
+        assert backend.cached_probe("llvm_ad_mono", str(library)).works
     assert len(calls) == 1
     os.utime(library, ns=(1, 1))
-    engine.cached_probe("llvm_ad_mono", str(library))
+    backend.cached_probe("llvm_ad_mono", str(library))
     assert len(calls) == 2
 
 
 def test_a_file_that_is_no_library_fails_its_probe(tmp_path):
     library = tmp_path / "libLLVM.so.22.1"
     library.write_bytes(b"not a library")
-    probe = engine.cached_probe("llvm_ad_mono", str(library))
+    probe = backend.cached_probe("llvm_ad_mono", str(library))
     assert not probe.works
     assert probe.detail
 
 
 def test_without_a_usable_llvm_the_scalar_engine_says_what_to_install(monkeypatch):
-    failed = engine.Probe("llvm", "old.so", False, "older than LLVM 16")
-    monkeypatch.setattr(engine, "llvm_candidates", lambda: ["old.so"])
-    monkeypatch.setattr(engine, "cached_probe", lambda *args: failed)
-    monkeypatch.setattr(engine, "probe_cuda", lambda: engine.Probe("cuda", None, False, "no NVIDIA driver"))
+    failed = backend.Probe("llvm", "old.so", False, "older than LLVM 16")
+    monkeypatch.setattr(backend, "llvm_candidates", lambda: ["old.so"])
+    monkeypatch.setattr(backend, "cached_probe", lambda *args: failed)
+    monkeypatch.setattr(backend, "probe_cuda", lambda: backend.Probe("cuda", None, False, "no NVIDIA driver"))
     with pytest.warns(RuntimeWarning, match="apt install libllvm19"):
-        chosen = engine.decide.__wrapped__(None)
+        chosen = backend.decide.__wrapped__(None)
     assert chosen.variant == "scalar_rgb"
     with pytest.raises(ValueError, match=r"engine llvm does not work here .*older than LLVM 16.*install LLVM 16"):
-        engine.decide.__wrapped__("llvm")
+        backend.decide.__wrapped__("llvm")
     with pytest.raises(ValueError, match=r"engine cuda does not work here .*no NVIDIA driver"):
-        engine.decide.__wrapped__("cuda")
+        backend.decide.__wrapped__("cuda")
 
 
 def test_a_gpu_without_optix_is_told_what_to_update(monkeypatch):
-    """What Dr.Jit says where the driver has no OptiX becomes one line with the cure; the LLVM engine goes on."""
+    """Dr.Jit's error for a driver without OptiX becomes one line with the cure; LLVM is chosen."""
     said = "Traceback ...\nRuntimeError: jit_optix_api_init(): optixQueryFunctionTable() failed: OptiX not found"
 
     def child(*args, **options):
         return subprocess.CompletedProcess(args, 1, stdout="", stderr=said)
 
-    monkeypatch.setattr(engine.subprocess, "run", child)
-    probe = engine.run_probe(engine.VARIANTS["cuda"], None)
+    monkeypatch.setattr(backend.subprocess, "run", child)
+    probe = backend.run_probe(backend.VARIANTS["cuda"], None)
     assert not probe.works
     assert probe.detail.startswith("OptiX is missing or too old")
     assert probe.detail.endswith("update the NVIDIA driver")
-    works = engine.Probe("llvm", "new.so", True, "LLVM 19")
-    monkeypatch.setattr(engine, "probe_cuda", lambda: probe)
-    monkeypatch.setattr(engine, "llvm_candidates", lambda: ["new.so"])
-    monkeypatch.setattr(engine, "cached_probe", lambda *args: works)
-    assert engine.decide.__wrapped__(None).backend == "llvm"
+    works = backend.Probe("llvm", "new.so", True, "LLVM 19")
+    monkeypatch.setattr(backend, "probe_cuda", lambda: probe)
+    monkeypatch.setattr(backend, "llvm_candidates", lambda: ["new.so"])
+    monkeypatch.setattr(backend, "cached_probe", lambda *args: works)
+    assert backend.decide.__wrapped__(None).backend == "llvm"
     with pytest.raises(ValueError, match=r"engine cuda does not work here \(CUDA: OptiX is missing.*NVIDIA GPU"):
-        engine.decide.__wrapped__("cuda")
+        backend.decide.__wrapped__("cuda")
 
 
 def test_a_working_gpu_is_taken_first_and_another_engine_can_be_asked_for(monkeypatch):
     """The choice of a device, with probes that answer as on a GPU machine."""
-    cuda, llvm = engine.Probe("cuda", None, True, "CUDA with OptiX"), engine.Probe("llvm", "new.so", True, "LLVM 19")
-    monkeypatch.setattr(engine, "probe_cuda", lambda: cuda)
-    monkeypatch.setattr(engine, "llvm_candidates", lambda: ["new.so"])
-    monkeypatch.setattr(engine, "cached_probe", lambda *args: llvm)
-    variants = {name: engine.decide.__wrapped__(name).variant for name in (None, *engine.BACKENDS)}
+    cuda, llvm = backend.Probe("cuda", None, True, "CUDA with OptiX"), backend.Probe("llvm", "new.so", True, "LLVM 19")
+    monkeypatch.setattr(backend, "probe_cuda", lambda: cuda)
+    monkeypatch.setattr(backend, "llvm_candidates", lambda: ["new.so"])
+    monkeypatch.setattr(backend, "cached_probe", lambda *args: llvm)
+    variants = {name: backend.decide.__wrapped__(name).variant for name in (None, *backend.BACKENDS)}
     assert variants == {None: "cuda_ad_mono", "cuda": "cuda_ad_mono", "llvm": "llvm_ad_mono", "scalar": "scalar_rgb"}
 
 
 def test_an_unknown_engine_is_named(monkeypatch):
     monkeypatch.setenv("QSIM_ENGINE", "metal")
     with pytest.raises(ValueError, match="engine 'metal': expected one of cuda, llvm, scalar"):
-        engine.choose()
+        backend.choose()
 
 
 def test_a_broken_cache_file_is_ignored(tmp_path, monkeypatch):
     (tmp_path / "qsim").mkdir()
-    (tmp_path / "qsim" / "engine.json").write_text("{half a file")
-    monkeypatch.setattr(engine, "run_probe", lambda variant, path: engine.Probe("llvm", path, True, "LLVM 19"))
-    assert engine.cached_probe("llvm_ad_mono", sys.executable).works
+    (tmp_path / "qsim" / "backend.json").write_text("{half a file")
+    monkeypatch.setattr(backend, "run_probe", lambda variant, path: backend.Probe("llvm", path, True, "LLVM 19"))
+    assert backend.cached_probe("llvm_ad_mono", sys.executable).works

@@ -1,4 +1,4 @@
-"""Pictures: the declared tone curve, colours that mean a direction, and no surprise at NaN or empty input."""
+"""Tests transfer curves, luminance, PSNR, the tone curve and false colours, also for NaN and empty input."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Figures: the format that the name asks for, written whole."""
+"""Tests figures: the name gives the format, and other names are refused."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Files: leftovers of interrupted writes, links, and the wording of the system's errors."""
+"""Tests leftovers of interrupted writes, links, and the wording of the system's errors."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""Keyed random words: the same as Dr.Jit's, independent of crops and order, uniform, all different."""
+"""Tests keyed random words: equal to Dr.Jit's, independent of crops and order, uniform, all different."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Memory of the process: in bytes, on Linux and macOS alike."""
+"""Tests the memory of the process: bytes on Linux and on macOS."""
 
 import resource
 import subprocess

@@ -1,4 +1,4 @@
-"""The names that programs outside rely on, and the version, which is written once."""
+"""Tests the public names that other programs use, and the version, which is written once."""
 
 import subprocess
 import sys

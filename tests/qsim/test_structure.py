@@ -1,4 +1,4 @@
-"""What JSON and TOML files may say: a changed digit is found, and whatever else they hold ends in one line."""
+"""Tests the tables of JSON and TOML files: a changed digit is found, and every error is one line."""
 
 import json
 import random
@@ -177,7 +177,7 @@ HOSTILE: list[Any] = [
 
 
 def use_clip(folder: Path) -> None:
-    """Whatever reads the description of a clip and of its stream."""
+    """Every reader of the description of a clip and of its stream."""
     clip = Clip.open(folder / "clip")
     assert repr(clip)
     last = len(clip) - 1

@@ -1,4 +1,4 @@
-"""Text tables are aligned; Markdown tables keep their columns whatever the cells hold."""
+"""Tests tables: text is aligned, and Markdown keeps its columns for any cell."""
 
 import pytest
 

@@ -1,7 +1,7 @@
 """One row for every option of every command: the option changes a result, or it is refused.
 
 A row runs a command twice in copies of one small work folder, without and with the option, and compares what was made.
-What is compared is the result itself: pixels, codes, weights, numbers. A change in a description alone is no effect.
+Results are compared: pixels, codes, weights, numbers. A change of a description alone is not an effect.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from unittest import mock
 
 import drjit
 import numpy as np
+
+from qsim.cli.console import options_of
 
 Main = Callable[[list[str]], int]
 
@@ -137,21 +139,19 @@ def parser_of(main: Main, home: Any) -> argparse.ArgumentParser:
 
 def options(parser: argparse.ArgumentParser, path: str) -> Iterator[tuple[str, str]]:
     """(command, longest name) of every option of a program, but --help."""
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for name, command in action.choices.items():
-                yield from options(command, f"{path} {name}".strip())
-        elif action.option_strings and action.dest != "help":
-            yield path, action.option_strings[-1]
+    found = options_of(parser)
+    for name, command in found.commands.items():
+        yield from options(command, f"{path} {name}".strip())
+    yield from ((path, action.option_strings[-1]) for action in found.options if action.dest != "help")
 
 
 def names_of(parser: argparse.ArgumentParser, command: str, option: str) -> set[str]:
     """Every spelling of an option of a command."""
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction) and command:
-            name, _, rest = command.partition(" ")
-            return names_of(action.choices[name], rest, option)
-    return next(set(a.option_strings) for a in parser._actions if option in a.option_strings)
+    found = options_of(parser)
+    if found.commands and command:
+        name, _, rest = command.partition(" ")
+        return names_of(found.commands[name], rest, option)
+    return next(set(a.option_strings) for a in found.options if option in a.option_strings)
 
 
 def execute(main: Main, line: str, folder: Path, capsys: Any, monkeypatch: Any) -> Run:

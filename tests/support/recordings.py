@@ -1,4 +1,4 @@
-"""Random planes and codes, and files read back, for the tests of formats."""
+"""Makes random planes and codes and reads files back, for the tests of formats."""
 
 from pathlib import Path
 from typing import Any

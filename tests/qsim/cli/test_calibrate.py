@@ -1,4 +1,4 @@
-"""`qsim calibrate`: sums of planes from every kind of file, and options that cannot act."""
+"""Tests `qsim calibrate`: sums of planes from every kind of file, and options without effect."""
 
 import json
 

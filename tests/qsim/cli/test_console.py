@@ -1,4 +1,4 @@
-"""What all commands share: completion that knows every option, quiet and loud, warnings in one line, Ctrl-C."""
+"""Tests completion of every option, quiet and verbose runs, warnings in one line, Ctrl-C."""
 
 import json
 import re

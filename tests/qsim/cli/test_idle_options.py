@@ -1,4 +1,4 @@
-"""Options of the rendering commands that cannot act are refused with one sentence."""
+"""Tests that rendering commands refuse options without effect in one sentence."""
 
 from __future__ import annotations
 

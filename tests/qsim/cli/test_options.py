@@ -1,4 +1,4 @@
-"""Every option of `qsim` acts or is refused: a table that a new option fails until it has its row."""
+"""Tests that every option of `qsim` acts or is refused; a new option needs its row."""
 
 from __future__ import annotations
 
@@ -483,7 +483,7 @@ def ignores(argv: list[str]) -> int:
 
 
 def test_the_check_finds_an_option_that_is_ignored(work, tmp_path, capsys, monkeypatch):
-    """A description that differs is no effect, and an option that is taken is not refused."""
+    """Another description is not an effect, and an accepted option is not refused."""
     with pytest.raises(AssertionError, match="changes nothing"):
         check(Acts("", "--loud"), ignores, work, tmp_path / "a", capsys, monkeypatch)
     with pytest.raises(AssertionError, match="accepted"):

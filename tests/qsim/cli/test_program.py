@@ -1,4 +1,4 @@
-"""The command line: one line for a mistake, JSON for programs, nothing lost on Ctrl-C."""
+"""Tests the command line: one line for wrong input, JSON for programs, nothing lost on Ctrl-C."""
 
 import contextlib
 import json
@@ -298,7 +298,7 @@ def test_generate_reports_failures_and_resumes(
 
 
 def test_ctrl_c_says_how_to_go_on(tmp_path: Path):
-    """In a process of its own: SIGINT in the middle, exit code 130, one line; the same command finishes."""
+    """A child process: SIGINT during the run, exit code 130, one line; the same command finishes."""
     # A shell's background job ignores SIGINT, and its children with it: begin as a terminal's job does.
     code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
     code += "import sys, fakes; from qsim.dataset import generation; from qsim import cli; g = generation.generate;"

@@ -1,4 +1,4 @@
-"""Photon cubes, zarr and visionsim: golden bytes and round trips at odd sizes."""
+"""Tests photon cubes, zarr and visionsim: golden bytes and round trips at odd sizes."""
 
 import gzip
 import json

@@ -1,4 +1,4 @@
-"""Layouts: recognised by name, signature and size, or asked about; never guessed."""
+"""Tests layouts: recognised by name, signature and size, never guessed."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Exports: codes and light come back from every format at any size."""
+"""Tests exports: codes and light of any size come back from every format."""
 
 import json
 import shutil
@@ -57,7 +57,7 @@ def said(kind: str, bits: int, width: int) -> dict[str, int]:
 def test_codes_of_any_size_and_depth_come_back(
     tmp_path_factory: pytest.TempPathFactory, shape: tuple[int, int, int], bits: int, seed: int
 ):
-    """Stream -> PNG, zarr (and cube, MATLAB's parts) -> the same codes, whatever the size."""
+    """Stream -> PNG, zarr (and cube, MATLAB's parts) -> the same codes, at any size."""
     folder = tmp_path_factory.mktemp("any")
     values = np.random.default_rng(seed).integers(0, 2**bits, shape).astype(np.uint8 if bits <= 8 else np.uint16)
     np.save(folder / "codes.npy", values)

@@ -1,4 +1,4 @@
-"""Pictures as light and as codes: PNG and TIFF."""
+"""Tests pictures as light and as codes: PNG and TIFF."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ def test_colour_becomes_luminance(tmp_path: Path):
 
 
 def test_codes_in_pictures(tmp_path: Path):
-    """One-bit PNG, codes as they are, stretched codes; a stretched file is refused unless it is said."""
+    """One-bit PNG, unstretched codes, stretched codes; stretched files need --stretched."""
     bits1 = random_planes(2, 5, 7).astype(bool)
     codes = np.random.default_rng(1).integers(0, 8, (2, 5, 7)).astype(np.uint8)
     codes[0, 0, :2] = 0, 7

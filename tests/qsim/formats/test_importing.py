@@ -1,4 +1,4 @@
-"""Foreign files: golden bytes, round trips at odd sizes, ambiguity asked about, damage refused."""
+"""Tests imports: clips and streams of foreign files, saturation, and refusals."""
 
 from pathlib import Path
 

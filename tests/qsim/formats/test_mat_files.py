@@ -1,4 +1,4 @@
-"""Arrays of .mat files: the only one is taken, others by name, and only counts."""
+"""Tests .mat files: parts, the choice of an array, and counts only."""
 
 from pathlib import Path
 

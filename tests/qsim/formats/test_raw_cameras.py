@@ -1,4 +1,4 @@
-"""Raw files of cameras: golden bytes, round trips, sizes that are no whole frames."""
+"""Tests raw files of cameras: golden bytes, round trips, sizes that are not full frames."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Recordings: order of files, flips, and what a reader states about bits and orientation."""
+"""Tests recordings: order of files, flips, stated bit order and orientation."""
 
 import json
 import re

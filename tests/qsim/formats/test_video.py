@@ -1,4 +1,4 @@
-"""Video: lossless grey is bit-exact, and colour follows the standard in its file."""
+"""Tests video: lossless grey is exact, and colour follows the standard in its file."""
 
 import json
 from pathlib import Path
@@ -75,7 +75,7 @@ def from_ycbcr(luma: np.ndarray, cb: np.ndarray, cr: np.ndarray, matrix: str) ->
 
 
 def write_colour_video(path: Path, rgb: np.ndarray, matrix: str, full_range: bool) -> None:
-    """H.264 in 4:2:0 without loss of its own; FFmpeg converts no colours here, it would share its mistakes."""
+    """H.264 in 4:2:0 without loss; FFmpeg converts no colours here, because the reader uses it."""
     import av
 
     tag = MATRICES[matrix][0]
