@@ -1,13 +1,13 @@
-"""Random keys: noise is a function of (seed, clip, stage, frame, row, column), never of call order.
+"""Draws random words as a function of (seed, clip, stage, frame, row, column), never of call order.
 
 The generator is Philox4x32 with 7 rounds (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011), the
-variant that Dr.Jit offers, so that NumPy (here, the reference) and compiled kernels draw the same 32-bit words.
+variant of Dr.Jit: NumPy (this module, the reference) and compiled kernels draw the same 32-bit words.
 
 * The 64-bit Philox key is a hash of (seed, clip, stage).
 * A pixel's word is number ``x & 3`` of the block whose counters are ``(x >> 2, y, frame, redraw)``: four neighbours in
-  a row share one block, and x, y are coordinates of the **full** frame, so a crop sees the words of the whole.
-* ``redraw`` counts further words of the same pixel: 0 decides nearly every pixel, 1 refines it to 64 bits where the
-  first cannot (tails), and pixels that need more than one number take as many as they like.
+  a row share one block, and x, y are coordinates of the **full** frame, so a crop has the words of the full frame.
+* ``redraw`` counts further words of the same pixel: 0 decides nearly every pixel, 1 refines it to 64 bits in the tails.
+  Pixels that need several numbers use further ones.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _LOW, _SHIFT = np.uint64(0xFFFFFFFF), np.uint64(32)
 
 @dataclass(frozen=True)
 class Key:
-    """The name of a random stream; ``at`` moves along the frames of a clip."""
+    """The name of a random stream; ``at`` selects a frame of the clip."""
 
     seed: int  # of the study; a training sample puts its epoch in here
     clip: int  # hash_name of the clip's name, or any integer
@@ -46,7 +46,7 @@ class Key:
             raise ValueError(f"Key.frame counts frames from 0 to 2^32 - 1, got {self.frame}")
 
     def at(self, frame: int) -> Key:
-        """The same stream at another frame."""
+        """Return the key of the same stream at another frame."""
         return replace(self, frame=frame)
 
     @property
@@ -57,12 +57,12 @@ class Key:
 
 
 def hash_name(name: str) -> int:
-    """A clip's name as an integer below 2^63, the same on every machine."""
+    """Return a clip's name as an integer below 2^63, the same on every machine."""
     return int.from_bytes(blake2b(name.encode(), digest_size=8, person=b"qsim name").digest(), "little") >> 1
 
 
 def philox4x32(counters: Array, key: int) -> Array:
-    """Four random words per counter: integers [4, ...] below 2^32 -> uint32 [4, ...] under a 64-bit key."""
+    """Return four random words per counter: integers [4, ...] below 2^32 -> uint32 [4, ...] under a 64-bit key."""
     state = np.array(counters, np.uint64)
     c0, c1, c2, c3 = (state[i, ...] for i in range(4))
     even, odd = np.empty_like(c0), np.empty_like(c2)
@@ -81,7 +81,7 @@ def philox4x32(counters: Array, key: int) -> Array:
 
 
 def words(key: Key, shape: tuple[int, ...], origin: tuple[int, int] = (0, 0), redraw: int = 0) -> Array:
-    """One word per pixel of the crop at `origin` = (y, x): uint32 [H, W], or [T, H, W] = frames key.frame + t."""
+    """Return a word per pixel of the crop at `origin` = (y, x): uint32 [H, W], or [T, H, W] of frames key.frame + t."""
     *frames, height, width = shape
     y, x = origin
     last_frame = key.frame + (frames[0] if frames else 1)
@@ -109,14 +109,14 @@ def words_at(key: Key, at: Array, redraw: int = 0) -> Array:
 
 
 def uniform(first: Array, second: Array | None = None) -> Array:
-    """Numbers in (0, 1): the middle of the cell that a word names, or that two words name (2^-64 wide).
+    """Return numbers in (0, 1) of the shape of the words: the centre of the cell of one word, or of two (2^-64 wide).
 
-    Two words just below 1 round to 1 in float64: where that matters take `uniform_pair`.
+    Two words just below 1 round to 1 in float64; `uniform_pair` keeps the precision of both tails.
     """
     low = 0.5 if second is None else (second.astype(np.float64) + 0.5) * 2.0**-32
     return (first.astype(np.float64) + low) * 2.0**-32
 
 
 def uniform_pair(first: Array, second: Array) -> tuple[Array, Array]:
-    """(u, 1 - u) from two words, both with full relative precision, for tails on either side."""
+    """Return (u, 1 - u) of two words, both with full relative precision."""
     return uniform(first, second), uniform(~first, ~second)
