@@ -31,7 +31,7 @@ from qsim.rendering.ray_casting import RayCaster, pixel_rays
 from qsim.scene import Scene
 
 RENDER_STAGE = 16  # of the random keys: sampler seeds
-SHARP_STAGE = 17  # the sharp instant has seeds of its own
+SHARP_STAGE = 17  # the sharp instant has separate seeds
 SURFACE_SAMPLES = 16  # per pixel, for the denoiser's albedo and normals
 MAX_LANES = 2**23  # samples in flight, about; a frame with more is rendered in parts
 FIREFLY = 10.0  # a pixel counts as a firefly where halves differ by this many rms of the frame's difference
@@ -235,7 +235,7 @@ class Renderer:
     def _film_positions(self, seed: int, samples: int, part: range, times: int = 1) -> tuple[Any, Any]:
         """Return a seeded sampler and film positions [px], uniform in each pixel; its samples are neighbours in memory.
 
-        The pixels of `part` come `times` times over, each time with grids of their own. Size and place of the window
+        The pixels of `part` come `times` times over, each time with separate grids. Size and place of the window
         are data, not code: a pilot and a whole frame share one compiled kernel.
         """
         import drjit as dr

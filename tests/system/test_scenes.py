@@ -131,9 +131,9 @@ def test_the_same_seed_gives_the_same_things_at_any_speed(family):
 
 @pytest.mark.parametrize("family", SOME_FAMILIES)
 def test_other_seeds_differ_in_layout_and_texture_and_light(family):
-    told = [described(family, seed) for seed in SEEDS]
-    for i, one in enumerate(told):
-        for other in told[i + 1 :]:
+    descriptions = [described(family, seed) for seed in SEEDS]
+    for i, one in enumerate(descriptions):
+        for other in descriptions[i + 1 :]:
             assert one["lights"] != other["lights"]
             assert one["camera"] != other["camera"]
             motions, others = ([v["camera"]["motion"], *(b["motion"] for b in v["bodies"])] for v in (one, other))
