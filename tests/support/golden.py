@@ -1,7 +1,33 @@
-"""Makes networks with weights by rule, and records the stages of the published one."""
+"""Compares networks with golden arrays: weights by rule, every stage in float64. Makes small networks for tests.
 
+    python tests/support/golden.py NAME GOLDEN.npz TABLE.tsv [--prefix P]
+
+builds the weights of network NAME from the table of published names, runs it in float64 on the inputs that the file
+holds, at whatever size they have, and prints one JSON object: max |ours - golden| / std(golden) of every key. The exit
+code is 1 if a key is not computed, has another shape or is not finite (its error is then null). NAME is emvd, flornn,
+memdeblur, rvrt, spk2imgnet or quiver.
+
+A network contributes a file `tests/support/golden_NAME.py` with
+
+- `stages(arrays, weights) -> {key: tensor or array}`. `arrays` are those of the file (codes 0..7 and other inputs).
+  `weights` has a float64 tensor for every published name, without the `const` entries of the table. It builds our
+  network, loads it (`load_published`), and returns all keys of the golden file but the inputs, in their published
+  shapes and channel slices, for any batch, frame count and size. Forward hooks record stages (`Recorder`);
+- `INPUTS`: the names of the file's arrays that are inputs;
+- `START`, where the table has the fill `init`: published name -> start value;
+- `small() -> network`: a float64 network in evaluation mode, of the smallest width, with weights of natural size
+  (`fill_by_rule`). tests/quiver/model/rivals/test_all.py runs over all of them.
+
+Tests call `errors(name, arrays, table, prefix)`. `golden_files(name)` lists the committed file (at most 300 kB, from
+`cut`) and the full one in ../shared/rivals, if that is at hand. `DATA/NAME_state_dict.tsv` is the table.
+"""
+
+import argparse
+import importlib
+import json
 import math
 import zlib
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +42,7 @@ from quiver.model.published_weights import published_name
 from quiver.model.quiver import QUIVER
 
 DATA = Path(__file__).parents[1] / "data"
+SHARED = Path(__file__).parents[3] / "shared" / "rivals"  # the specification's full files, where they are at hand
 TINY = FoldedConfig(  # the published design with the smallest parts, for fast tests
     channels=2,
     deformable_kernel=3,
@@ -46,18 +73,9 @@ def rule(name: str, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def published_state() -> dict[str, Tensor]:
-    """Return all 335 entries at width 16, by the table of published names."""
-    state: dict[str, Tensor] = {}
-    for line in (DATA / "published_state_dict.tsv").read_text().splitlines()[1:]:
-        name, size, kind = line.split("\t")
-        shape = tuple(int(side) for side in size.split("x"))
-        if kind == "buffer":
-            state[name] = torch.full(shape, CONSTANTS[name])
-        elif kind.startswith("same tensor as "):
-            state[name] = state[kind.removeprefix("same tensor as ")]
-        else:
-            state[name] = torch.from_numpy(rule(name, shape))
-    return state
+    """All 335 entries of QUIVER at width 16, float32."""
+    constants = {name: torch.full((1, 1, 1, 1), value) for name, value in CONSTANTS.items()}
+    return {**weights_by_table(DATA / "published_state_dict.tsv", dtype=torch.float32), **constants}
 
 
 def network(channels: int, dtype: torch.dtype) -> QUIVER:
@@ -89,43 +107,110 @@ def lively(config: Config, dtype: torch.dtype = torch.float64) -> QUIVER:
     return network
 
 
-@torch.no_grad()
-def stages(model: QUIVER, codes: np.ndarray) -> dict[str, Tensor]:
-    """Return the results of all stages for codes/7, under the names of the golden file."""
-    calls: dict[str, list] = {}
-    watched = {
-        "flow": model.flow,
-        "alignment": model.alignment,
-        "fusion": model.fusions[0],
-        "r1": model.cell.fuse1,
-        "r2": model.cell.down1,
-        "r4": model.cell.smooth,
-        "state": model.cell.state,
-        "tca": model.attention,
-    }
-    hooks = [
-        module.register_forward_hook(lambda _m, _i, out, key=key: calls.setdefault(key, []).append(out))
-        for key, module in watched.items()
-    ]
-    dtype = model.alignment.weight.dtype
-    out = model(torch.from_numpy(codes).to(dtype) / 7)
-    for hook in hooks:
-        hook.remove()
-    pairs = codes.shape[1] - 1  # frames 1 .. T-1 run together, batch-major; frame 0 alone and first
-    (flow1, flow2, flow4), at5 = calls["flow"][0], slice(4, None, pairs)
-    return {
-        "denoised": out.denoised,
-        "flow1": flow1,
-        "flow2": flow2,
-        "flow4": flow4,
-        "dcn_first": calls["alignment"][1][::pairs],  # the denoised stream comes first
-        "fused1_t5": calls["fusion"][1][at5].permute(0, 2, 3, 1),
-        "rmdf1_t5": calls["r1"][1][at5],
-        "rmdf2_t5": calls["r2"][1][at5],
-        "rmdf4_t5": calls["r4"][5],
-        "state_t5": calls["state"][5],
-        "tca": calls["tca"][0],
-        "out4": out.scale4,
-        "out2": out.scale2,
-        "out1": out.scale1,
-    }
+# Golden files
+
+
+def fill_value(name: str, shape: tuple[int, ...], fill: str, prefix: str, start: Mapping[str, object]) -> np.ndarray:
+    """One entry of a table of published names, float32: a function of prefix, name, shape and fill."""
+    if fill == "zero":
+        return np.zeros(shape, np.float32)
+    w = np.random.default_rng(zlib.crc32((prefix + name).encode())).standard_normal(shape, dtype=np.float32)
+    if fill.startswith("fan"):
+        return w * np.float32(float(fill[3:]) / math.sqrt(math.prod(shape[1:])))
+    if fill == "bias":
+        return np.float32(0.05) * w
+    if fill == "one":
+        return np.float32(1) + np.float32(0.05) * w
+    if fill == "slope":
+        return np.float32(0.25) + np.float32(0.05) * w
+    if fill == "init":
+        return np.asarray(start[name], np.float32).reshape(shape) + np.float32(0.1) * w
+    raise ValueError(f"the fill of {name} is {fill}; known are fanGAIN, bias, one, slope, init, zero and const")
+
+
+def weights_by_table(
+    table: Path, prefix: str = "", start: Mapping[str, object] | None = None, dtype: torch.dtype = torch.float64
+) -> dict[str, Tensor]:
+    """All entries of a table but constants; a table without the column `fill` (QUIVER's) is filled like `rule`."""
+    state: dict[str, Tensor] = {}
+    for line in table.read_text().splitlines():
+        if line.startswith("#") or not line.strip():
+            continue
+        name, size, kind, *rest = line.split("\t")
+        if kind.startswith("same tensor as "):
+            state[name] = state[kind.removeprefix("same tensor as ")]
+            continue
+        shape = tuple(int(side) for side in size.split("x")) if size not in ("", "scalar", "()") else ()
+        fill = rest[0] if rest else "const" if kind == "buffer" else "bias" if len(shape) == 1 else "fan0.8"
+        if fill != "const":
+            state[name] = torch.from_numpy(np.asarray(fill_value(name, shape, fill, prefix, start or {}))).to(dtype)
+    return state
+
+
+class Recorder:
+    """Keeps every result of named modules: `Recorder({"key": module})`, then `recorder["key"][n]` of its n-th call."""
+
+    def __init__(self, watched: Mapping[str, nn.Module]) -> None:
+        self.calls: dict[str, list] = {key: [] for key in watched}
+        for key, module in watched.items():
+            module.register_forward_hook(lambda _module, _inputs, out, key=key: self.calls[key].append(out))
+
+    def __getitem__(self, key: str) -> list:
+        return self.calls[key]
+
+
+def compare(ours: Mapping[str, object], golden: Mapping[str, np.ndarray]) -> dict[str, float | None]:
+    """max |ours - golden| / std(golden) of every key; None where ours is missing, of another shape or not finite."""
+    result: dict[str, float | None] = {}
+    for key, array in golden.items():
+        wanted = array.astype(np.float64)
+        found = np.asarray(ours[key], np.float64) if key in ours else np.empty(0)
+        if found.shape != wanted.shape or not np.isfinite(found).all():
+            result[key] = None
+            continue
+        result[key] = float(np.abs(found - wanted).max() / (wanted.std() or 1.0))
+    return result
+
+
+def errors(name: str, golden: Mapping[str, np.ndarray], table: Path, prefix: str = "") -> dict[str, float | None]:
+    """Error of every key of a golden file that is no input, from a float64 run with weights by rule."""
+    network = importlib.import_module(f"golden_{name}")
+    weights = weights_by_table(table, prefix, getattr(network, "START", None))
+    with torch.no_grad():
+        ours = network.stages(dict(golden), weights)
+    wanted = {key: array for key, array in golden.items() if key not in network.INPUTS}
+    return compare({key: torch.as_tensor(value).numpy() for key, value in ours.items()}, wanted)
+
+
+def golden_files(name: str) -> list[Path]:
+    """The committed golden file of a network, and the full one where the specification is at hand."""
+    return [DATA / f"golden_{name}.npz", *(path for path in [SHARED / f"golden_{name}.npz"] if path.is_file())]
+
+
+def arrays_of(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of a golden file."""
+    with np.load(path) as file:
+        return dict(file)
+
+
+def cut(source: Path, target: Path, keys: list[str]) -> None:
+    """Write the golden file of some keys."""
+    arrays = arrays_of(Path(source))
+    np.savez_compressed(target, **{key: arrays[key] for key in keys})
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The program above."""
+    parser = argparse.ArgumentParser(description="compare a network with golden arrays")
+    parser.add_argument("name", choices=["emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet", "quiver"])
+    parser.add_argument("golden", type=Path)
+    parser.add_argument("table", type=Path)
+    parser.add_argument("--prefix", default="")
+    given = parser.parse_args(arguments)
+    found = errors(given.name, arrays_of(given.golden), given.table, given.prefix)
+    print(json.dumps(found, indent=1))
+    return int(any(error is None for error in found.values()))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

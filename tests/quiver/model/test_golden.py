@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from golden import DATA, network, published_state, rule, stages
+from golden import DATA, network, published_state, rule
+from golden_quiver import recorded
 
 from quiver.model.published_weights import from_published
 
@@ -37,14 +38,14 @@ def test_the_rule_gives_the_weights_of_the_specification():
 
 def test_every_stage_equals_the_published_network_in_float32(golden):
     """5e-5 also separates the exact GELU from its tanh approximation, which differs by 6e-4 at `tca`."""
-    found = errors(stages(from_published(published_state()), golden["codes"]), golden)
+    found = errors(recorded(from_published(published_state()), golden["codes"]), golden)
     assert max(found.values()) < 5e-5, found
 
 
 @pytest.mark.slow
 def test_every_stage_equals_the_published_network_in_float64(golden):
     """1e-6 is the rounding of the golden arrays, which are stored as float32."""
-    found = errors(stages(from_published(published_state()).double(), golden["codes"]), golden)
+    found = errors(recorded(from_published(published_state()).double(), golden["codes"]), golden)
     assert max(found.values()) < 1e-6, found
 
 
@@ -95,7 +96,7 @@ CASE_B = {
 def test_other_sizes_and_widths_equal_the_published_network(channels, seed, shape, wanted):
     """The published numbers have ten digits, which allows 2e-8 of the standard deviation."""
     codes = np.random.default_rng(seed).integers(0, 8, shape)
-    found = stages(network(channels, torch.float64), codes)
+    found = recorded(network(channels, torch.float64), codes)
     for key, summary in wanted.items():
         array = found[key].numpy()
         assert array.shape == summary.shape, key

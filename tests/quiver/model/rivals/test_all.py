@@ -1,0 +1,71 @@
+"""What every rival promises: any size, one frame, finite numbers and gradients, independent clips, its look-ahead.
+
+The networks come from the function `small()` of every tests/support/golden_NAME.py.
+"""
+
+import importlib
+from pathlib import Path
+
+import pytest
+import torch
+from golden import draw
+from torch import nn
+
+SUPPORT = Path(__file__).parents[3] / "support"
+MODULES = [importlib.import_module(path.stem) for path in sorted(SUPPORT.glob("golden_*.py"))]
+SMALL = {module.__name__.removeprefix("golden_"): module.small for module in MODULES if hasattr(module, "small")}
+
+
+@pytest.fixture(scope="module", params=SMALL)
+def network(request) -> nn.Module:
+    return SMALL[request.param]()
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 1, 19, 22), (1, 1, 1, 16, 9), (2, 2, 1, 1, 1)])
+def test_any_size_gives_every_frame(network, shape):
+    frames = draw(*shape)
+    with torch.no_grad():
+        restored = network(frames)
+    assert restored.shape == shape
+    assert restored.dtype == frames.dtype
+    assert restored.isfinite().all()
+
+
+@pytest.mark.parametrize("value", [0.0, 0.4, 1.0])
+def test_constant_frames_give_finite_numbers_and_gradients(network, value):
+    frames = torch.full((1, 3, 1, 9, 12), value, dtype=torch.float64)
+    restored = network(frames)
+    assert restored.isfinite().all()
+    network.zero_grad()
+    restored.square().mean().backward()
+    gradients = {name: parameter.grad for name, parameter in network.named_parameters()}
+    assert not [name for name, gradient in gradients.items() if gradient is not None and not gradient.isfinite().all()]
+    assert any(gradient is not None and gradient.abs().max() > 0 for gradient in gradients.values())
+
+
+def test_clips_of_a_batch_do_not_meet(network):
+    frames = draw(2, 3, 1, 13, 10)
+    with torch.no_grad():
+        together, alone = network(frames), torch.cat([network(frames[:1]), network(frames[1:])])
+    assert (together - alone).abs().max() < 1e-9
+
+
+def test_a_frame_uses_the_declared_future(network):
+    if network.look_ahead is None:
+        return
+    frames = draw(1, network.look_ahead + 7, 1, 8, 10)
+    changed = frames.clone()
+    changed[:, -1] = 1 - changed[:, -1]
+    with torch.no_grad():
+        differences = (network(frames) - network(changed)).abs().amax((0, 2, 3, 4))
+    assert differences[5] == 0
+    assert differences[6] > 0
+
+
+@pytest.mark.parametrize(
+    "frames", [torch.zeros(3, 1, 8, 8), torch.zeros(1, 3, 2, 8, 8), torch.zeros(1, 0, 1, 8, 8),
+               torch.zeros(1, 3, 1, 8, 8, dtype=torch.uint8)]
+)  # fmt: skip
+def test_other_shapes_and_integers_are_refused(network, frames):
+    with pytest.raises(ValueError, match=r"frames must be floating-point numbers \[B, T, 1, H, W\]"):
+        network(frames)
