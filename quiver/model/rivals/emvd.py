@@ -1,0 +1,264 @@
+"""Defines EMVD, efficient multi-stage video denoising (Maggioni et al., CVPR 2021): tiny, causal, recurrent.
+
+    frame in four channels -> learnt colour and wavelet transforms at three scales -> per scale, coarse to fine:
+    fuse with the state (gamma), denoise, pass up -> at the finest scale refine (omega) -> inverse transforms
+
+Written from a description of the article and of its port to 3-bit frames; the names of the layers are the port's.
+Look-ahead: none. The first frame is its own past; the end of a clip needs nothing.
+
+Our reading: the four output channels share one target, so their mean is the restored frame. The published port tells
+the network the noise of a 12-bit camera, about a thousandth of the true one. To find it, it clips the low-pass bands at
+1, though they carry gains of 4, 8 and 16. Both are mended here, and a slip in one colour coefficient; `as_published`
+brings them back.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import ClassVar, NamedTuple, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from qsim.checks import shown
+from qsim.structure import make
+from quiver.model.config import flag, real_number, whole_number
+from quiver.model.rivals.edges import check_frames, pad_space
+
+IMAGE = 4  # channels of an image
+BANDS = 4  # blocks of a wavelet transform, each with the channels of an image
+SCALES = 3
+# Variance of codes/7 at mean codes/7 of 0, 1/14 ... 1: a QIS of three bits with quantum efficiency 0.8, read noise
+# 0.2 e- and gain 1.077, exact to 0.9 % of the largest. White hardly fluctuates, as it is clipped.
+VARIANCE = (0.0002, 0.0107, 0.0217, 0.033, 0.0443, 0.0549, 0.064, 0.0707, 0.0742, 0.0737, 0.0687, 0.0588, 0.0437,
+            0.0235, 0.0)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class EMVDConfig:
+    """Configuration of EMVD; the defaults are the published sizes with the sensor's noise."""
+
+    width: int = 16  # hidden channels of the small networks
+    space_to_depth: bool = False  # ours: 2 x 2 pixels make four channels at half the size, instead of four copies
+    variance: tuple[float, ...] = VARIANCE  # of codes/(2^b - 1), at equal steps of their mean from 0 to 1
+    as_published: bool = False  # the port's noise and colour coefficient
+    published_noise: tuple[float, ...] = (1 / 3855, 1 / 3855**2)  # slope and offset, if as_published
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` for a value out of range."""
+        whole_number("EMVDConfig.width", self.width, 1, 1024)
+        for name in ("space_to_depth", "as_published"):
+            flag(f"EMVDConfig.{name}", getattr(self, name))
+        for name, least, most in (("variance", 2, 4096), ("published_noise", 2, 2)):
+            values = getattr(self, name)
+            if not isinstance(values, list | tuple) or not least <= len(values) <= most:
+                raise ValueError(f"EMVDConfig.{name} must be {least} to {most} numbers, got {shown(values)}")
+            for value in values:
+                real_number(f"EMVDConfig.{name}", value, 0, 1e3)
+            object.__setattr__(self, name, tuple(values))
+
+    def to_dict(self) -> dict[str, object]:
+        """Return plain values for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, object]) -> Self:
+        """Return the configuration of such values; ValueError for unknown fields and values out of range."""
+        return make(cls, values, "EMVD")
+
+
+class Fused(NamedTuple):
+    """What a scale makes of the state and the new frame."""
+
+    gamma: Tensor  # [N, 1, h, w] weight of the new frame, 0 ... 1
+    fused: Tensor  # [N, 16, h, w] bands
+    variance: Tensor  # [N, 1, h, w] of the fused low-pass band, in its units
+    denoised: Tensor  # [N, 16, h, w] bands
+
+
+class EMVD(nn.Module):
+    """EMVD for grey frames: a step takes the state and a frame, and returns the restored frame and the next state."""
+
+    look_ahead: ClassVar[int] = 0  # frames
+    unused: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, config: EMVDConfig | None = None) -> None:
+        """Make the network of a configuration; the published sizes by default."""
+        super().__init__()
+        self.config = config = config or EMVDConfig()
+        self.multiple = 2**SCALES * (2 if config.space_to_depth else 1)  # px that divide height and width inside
+        colour = _colour(0.2764 if config.as_published else 0.2784)
+        self.ct, self.cti = Colour(colour), Colour(colour.T)
+        self.ft, self.fti = Analysis(), Synthesis()
+        self.vd, self.md1, self.md0 = (Scale(config, scale) for scale in (2, 1, 0))
+        self.refine = SmallNet(2 * BANDS * IMAGE + 1, config.width, 1, sigmoid=True)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """[B, T, 1, H, W] of codes/(2^b - 1) -> restored [B, T, 1, H, W]; ValueError for another shape."""
+        check_frames(frames)
+        state, restored = None, []
+        for image in self.packed(pad_space(frames, self.multiple)).unbind(1):
+            output, state = self.step(state, image)
+            restored.append(output)
+        return self.unpacked(torch.stack(restored, dim=1))[..., : frames.shape[-2], : frames.shape[-1]]
+
+    def packed(self, frames: Tensor) -> Tensor:
+        """[B, T, 1, H, W] -> images [B, T, 4, h, w]; h, w = H, W or half of them."""
+        if self.config.space_to_depth:
+            return F.pixel_unshuffle(frames, 2)
+        return frames.expand(-1, -1, IMAGE, -1, -1)
+
+    def unpacked(self, images: Tensor) -> Tensor:
+        """Images [B, T, 4, h, w] -> frames [B, T, 1, H, W]."""
+        if self.config.space_to_depth:
+            return F.pixel_shuffle(images, 2)
+        return images.mean(dim=2, keepdim=True)
+
+    def step(self, state: Tensor | None, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Image [N, 4, h, w] -> (restored image, next state); the state before the first frame is None.
+
+        Height and width must be multiples of 8. The next state is the fused image, not the restored one.
+        """
+        old, new = (self.bands(image if x is None else x) for x in (state, image))
+        gamma, up = None, None
+        for scale, module in zip((2, 1, 0), (self.vd, self.md1, self.md0), strict=True):
+            result = module(old[scale], new[scale], gamma, up)
+            gamma = result.gamma
+            if scale:
+                up = self.fti(result.denoised)
+        omega = self.refine(torch.cat([result.fused, result.denoised, result.variance], dim=1))
+        refined = torch.lerp(result.denoised, result.fused, omega)
+        return self.cti(self.fti(refined)), self.cti(self.fti(result.fused))
+
+    def bands(self, image: Tensor) -> list[Tensor]:
+        """Image [N, 4, h, w] -> its bands [N, 16, h/2, w/2], and those of the low-pass band twice more."""
+        result, low = [], self.ct(image)
+        for _ in range(SCALES):
+            result.append(self.ft(low))
+            low = result[-1][:, :IMAGE]
+        return result
+
+
+class Scale(nn.Module):
+    """Fuses and denoises the bands of one scale: 2 is the coarsest, 0 the finest."""
+
+    def __init__(self, config: EMVDConfig, scale: int) -> None:
+        """Make the two networks of a scale; the coarsest has no result from a coarser one."""
+        super().__init__()
+        coarser = scale < SCALES - 1
+        bands = BANDS * IMAGE
+        self.noise = NoiseMap(config, scale)
+        self.fusion = SmallNet(IMAGE + 1 + coarser, config.width, 1, sigmoid=True)
+        self.denoise = SmallNet(bands + IMAGE + 1 + IMAGE * coarser, config.width, bands)
+
+    def forward(self, old: Tensor, new: Tensor, gamma: Tensor | None, up: Tensor | None) -> Fused:
+        """Bands of state and new frame [N, 16, h, w], coarser gamma [N, 1, h/2, w/2], its image `up` [N, 4, h, w]."""
+        old_low, new_low = old[:, :IMAGE], new[:, :IMAGE]
+        old_noise, new_noise = self.noise(old_low), self.noise(new_low)
+        coarser = [] if gamma is None else [gamma.repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)]
+        gamma = self.fusion(torch.cat([(new_low - old_low).abs(), *coarser, new_noise], dim=1))
+        fused = torch.lerp(old, new, gamma)
+        variance = (1 - gamma) ** 2 * old_noise + gamma**2 * new_noise
+        images = [] if up is None else [up]
+        return Fused(gamma, fused, variance, self.denoise(torch.cat([fused, *images, new_low, variance], dim=1)))
+
+
+class NoiseMap(nn.Module):
+    """The variance of the low-pass band of one scale, from its own brightness."""
+
+    def __init__(self, config: EMVDConfig, scale: int) -> None:
+        """Keep the sensor's law, or the published constants."""
+        super().__init__()
+        self.as_published, (self.slope, self.offset) = config.as_published, config.published_noise
+        self.gain = 4.0 * 2**scale  # of the low-pass band: two by colour, two by every transform
+        self.correlation = 1.0 if config.space_to_depth else 4.0  # copies add up to a larger variance
+        self.register_buffer("variance", torch.tensor(config.variance), persistent=False)
+        self.variance: Tensor
+
+    def forward(self, low: Tensor) -> Tensor:
+        """Low-pass band [N, 4, h, w] -> variance [N, 1, h, w]."""
+        brightness = low[:, :1]
+        if self.as_published:
+            return brightness.clamp(0, 1) * self.slope + self.offset
+        table = self.variance.to(low.dtype)
+        place = (brightness / self.gain).clamp(0, 1) * (len(table) - 1)
+        below = place.detach().long().clamp(max=len(table) - 2)
+        return self.correlation * torch.lerp(table[below], table[below + 1], place - below)
+
+
+class SmallNet(nn.Module):
+    """Three 3 x 3 convolutions with ReLU between; a sigmoid at the end where the result is a weight."""
+
+    def __init__(self, inputs: int, width: int, outputs: int, *, sigmoid: bool = False) -> None:
+        """Make the layers."""
+        super().__init__()
+        self.net1 = nn.Conv2d(inputs, width, 3, padding=1)
+        self.net2 = nn.Conv2d(width, width, 3, padding=1)
+        self.net3 = nn.Conv2d(width, outputs, 3, padding=1)
+        self.sigmoid = sigmoid
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[N, inputs, h, w] -> [N, outputs, h, w]."""
+        x = self.net3(F.relu(self.net2(F.relu(self.net1(x)))))
+        return torch.sigmoid(x) if self.sigmoid else x
+
+
+class Colour(nn.Module):
+    """A learnt mix of the four channels."""
+
+    def __init__(self, matrix: Tensor) -> None:
+        """Begin with the matrix [4, 4]."""
+        super().__init__()
+        self.net1 = nn.Conv2d(IMAGE, IMAGE, 1, bias=False)
+        self.net1.weight.data.copy_(matrix[..., None, None])
+
+    def forward(self, image: Tensor) -> Tensor:
+        """[N, 4, h, w] -> [N, 4, h, w]."""
+        return self.net1(image)
+
+
+class Analysis(nn.Module):
+    """A wavelet transform with two learnt taps for low and for high frequencies, along x, then along y."""
+
+    def __init__(self) -> None:
+        """Begin with the transform of Haar."""
+        super().__init__()
+        self.net1 = nn.ParameterDict({"weight": _haar().view(2, 1, 1, 2)})
+
+    def forward(self, image: Tensor) -> Tensor:
+        """[N, 4, h, w] -> bands [N, 16, h/2, w/2]: (x low, y low), (low, high), (high, low), (high, high)."""
+        taps = self.net1["weight"].view(2, 2)
+        halves = [image[..., 0::2] * low + image[..., 1::2] * high for low, high in taps]
+        return torch.cat([h[..., 0::2, :] * low + h[..., 1::2, :] * high for h in halves for low, high in taps], dim=1)
+
+
+class Synthesis(nn.Module):
+    """The inverse transform with its own taps, along y, then along x."""
+
+    def __init__(self) -> None:
+        """Begin with the inverse of Haar's transform."""
+        super().__init__()
+        low, high = _haar()
+        self.net1 = nn.ParameterDict({"weight": low.view(1, 1, 2, 1).clone()})
+        self.net2 = nn.ParameterDict({"weight": high.view(1, 1, 2, 1).clone()})
+
+    def forward(self, bands: Tensor) -> Tensor:
+        """Bands [N, 4c, h, w] -> [N, c, 2h, 2w]."""
+        low_low, low_high, high_low, high_high = bands.chunk(BANDS, dim=1)
+        low, high = self.joined(low_low, low_high, -2), self.joined(high_low, high_high, -2)
+        return self.joined(low, high, -1)
+
+    def joined(self, low: Tensor, high: Tensor, axis: int) -> Tensor:
+        """Low and high band of one axis -> twice the length along it: places 0, 2 ... and 1, 3 ... interleaved."""
+        low_taps, high_taps = self.net1["weight"].flatten(), self.net2["weight"].flatten()
+        parts = [low * low_taps[k] + high * high_taps[k] for k in (0, 1)]
+        end = low.ndim + axis
+        return torch.stack(parts, dim=end + 1).flatten(end, end + 1)
+
+
+def _haar() -> Tensor:
+    return torch.tensor([[1.0, 1.0], [1.0, -1.0]]) / 2**0.5
+
+
+def _colour(last: float) -> Tensor:
+    rows = [(0.5, 0.5, 0.5, 0.5), (-0.5, 0.5, 0.5, -0.5), (0.65, 0.2784, -0.2784, -0.65), (-0.2784, 0.65, -0.65, last)]
+    return torch.tensor(rows)
