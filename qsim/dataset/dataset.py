@@ -143,9 +143,11 @@ def _seen_in(path: Path) -> list[str]:
     """Return scene, meshes and textures of a clip; nothing if it cannot be read."""
     try:
         meta = Clip.open(path).meta
-        return [f"scene {meta['scene']['family']}:{meta['scene']['seed']}", *meta.get("assets", [])]
-    except (ValueError, OSError, KeyError):
+    except (ValueError, OSError):
         return []
+    scene = meta.get("scene") or {}  # an imported clip has none
+    named = [f"scene {scene['family']}:{scene['seed']}"] if {"family", "seed"} <= scene.keys() else []
+    return [*named, *(meta.get("assets") or [])]
 
 
 def _read_record(path: Path) -> dict[str, Any]:
