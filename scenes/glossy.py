@@ -23,8 +23,8 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         common.wall(RoughPlastic(common.backdrop(rng, 0.1, 0.6), 0.3), 2.4, 1.2, z=-0.7),
     ]
     count = int(rng.integers(6, 10))
-    lanes = rng.permutation(np.linspace(-0.3, 0.2, count))
-    for i, z in enumerate(lanes):
+    tracks = rng.permutation(np.linspace(-0.3, 0.2, count))
+    for i, z in enumerate(tracks):
         solid = shape(rng, between(rng, 0.03, 0.05))
         velocity = speed * between(rng, 1.5, 4.0) * sign(rng)
         middle = between(rng, -0.22, 0.22) * (0.3 if i < 2 else 1.0)

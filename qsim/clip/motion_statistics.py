@@ -15,7 +15,7 @@ CODE_PLANES = 2**CODE_BITS - 1
 
 
 def largest_motion(length: Array) -> float:
-    """Return the 99.9th percentile of the known lengths of a flow, in their unit; 0 if none is known."""
+    """Return the 99.9th percentile of the known lengths of a flow [2, H, W], in their unit; 0 if none is known."""
     known = length[np.isfinite(length)]
     return float(np.percentile(known, 99.9)) if known.size else 0.0
 

@@ -33,7 +33,7 @@ from qsim.scene import Scene
 RENDER_STAGE = 16  # of the random keys: sampler seeds
 SHARP_STAGE = 17  # the sharp instant has separate seeds
 SURFACE_SAMPLES = 16  # per pixel, for the denoiser's albedo and normals
-MAX_LANES = 2**23  # samples in flight, about; a frame with more is rendered in parts
+MAX_SAMPLES_IN_FLIGHT = 2**23  # samples in flight, about; a frame with more is rendered in parts
 FIREFLY = 10.0  # a pixel counts as a firefly where halves differ by this many rms of the frame's difference
 
 
@@ -154,12 +154,12 @@ class Renderer:
         return sums.reshape(3, 2, *self.shape)
 
     def parts(self, samples: int) -> list[range]:
-        """Return the window's pixels, row by row, in ranges of at most about MAX_LANES samples, `samples` per pixel.
+        """Return the window's pixels, row by row, in ranges of at most about MAX_SAMPLES_IN_FLIGHT samples.
 
         Passes divide the pixels, not the samples: the error of a complete grid falls faster than that of its parts.
         """
         pixels = math.prod(self.shape)
-        count = min(pixels, math.ceil(pixels * samples / MAX_LANES))
+        count = min(pixels, math.ceil(pixels * samples / MAX_SAMPLES_IN_FLIGHT))
         return [range(pixels * i // count, pixels * (i + 1) // count) for i in range(count)]
 
     def key(self, t: int, stage: int = RENDER_STAGE) -> Key:
@@ -241,12 +241,12 @@ class Renderer:
         import drjit as dr
 
         mi = self.mi
-        lanes = times * len(part) * samples
+        in_flight = times * len(part) * samples
         sampler = self._sampler(samples)
-        sampler.seed(seed, lanes)
+        sampler.seed(seed, in_flight)
         numbers = (len(part), part.start, self.shape[1], self.thinned, *self.crop[:2])
         count, first, columns, step, y0, x0 = (dr.opaque(mi.UInt32, n) for n in numbers)
-        pixel = dr.arange(mi.UInt32, lanes) // samples % count + first
+        pixel = dr.arange(mi.UInt32, in_flight) // samples % count + first
         row = pixel // columns
         corner = mi.Point2f(mi.Float((pixel - row * columns) * step + x0), mi.Float(row * step + y0))
         return sampler, corner + sampler.next_2d()

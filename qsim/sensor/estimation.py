@@ -150,7 +150,7 @@ def response(sensor: Distribution, exposure: float, points: int = POINTS) -> Res
 
 
 def maximum_likelihood(sensor: Distribution, histogram: Array, exposure: float, confidence: float = 0.95) -> Estimate:
-    """Return the Estimate of `Sensor.maximum_likelihood`."""
+    """See `Sensor.maximum_likelihood`."""
     counts = _checked(sensor, histogram)
     if not 0 < confidence < 1:
         raise ValueError(f"confidence is a probability above 0 and below 1, got {confidence!r}")

@@ -26,7 +26,7 @@ def packed_width(width: int, bits: int) -> int:
 
 
 def check(codes: Array, bits: int) -> None:
-    """Raise `ValueError` with the first code that is not an unsigned integer within 0 ... 2^bits - 1."""
+    """Raise `ValueError` with the first of the codes [...] that is not an unsigned integer within 0 ... 2^bits - 1."""
     _check_bits(bits)
     top = 2**bits - 1
     expected = f'codes: expected {code_dtype(bits)} "{_axes(codes.ndim)}" with values 0..{top} for a {bits}-bit sensor'

@@ -49,7 +49,7 @@ def _stirling_error(n: Array) -> Array:
 
 
 def poisson_quantile(mean: Array, below: Array, above: Array) -> Array:
-    """Return the smallest n with P(N <= n) > u as float64, from (u, 1 - u): inversion as exact as the cdf in float64.
+    """Return the smallest n with P(N <= n) > u as float64, from (u, 1 - u), broadcast: as exact as the cdf.
 
     A normal approximation gives the first guess. Galloping steps and bisection on the regularised gamma function give
     the answer, from the smaller side of the distribution.

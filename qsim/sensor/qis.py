@@ -260,7 +260,7 @@ def _normal_thresholds(sensor: QIS, electrons: Array, codes: Array) -> Array:
 
 
 def log_normal_difference(low: Array, high: Array) -> Array:
-    """Return log(Phi(high) - Phi(low)) for low <= high, without cancellation on either side of 0."""
+    """Return log(Phi(high) - Phi(low)), broadcast, for low <= high, without cancellation on either side of 0."""
     from scipy.special import erf, log_ndtr
 
     flip = low > 0  # Phi(b) - Phi(a) = Phi(-a) - Phi(-b): work on the side where both are small

@@ -192,7 +192,7 @@ def _mean_around(image: Tensor, side: int) -> Tensor:
 
 
 def means_at(image: Tensor, side: int, stride: int) -> Tensor:
-    """Return the means of `_mean_around` at every `stride`-th pixel only."""
+    """See `_mean_around`: its means at every `stride`-th pixel only."""
     height, width = image.shape[2:]
     before = (side - 1) // 2
     sums = F.pad(image, (before, side - 1 - before, before, side - 1 - before))

@@ -158,7 +158,7 @@ def _config_of(values: dict[str, object]) -> Config:
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Return tensors and metadata; FileNotFoundError or ValueError for any other file."""
+    """Return tensors of any shape and metadata; FileNotFoundError or ValueError for any other file."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such weights file")
     try:

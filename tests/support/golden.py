@@ -19,7 +19,7 @@ A network contributes a file `tests/support/golden_NAME.py` with
   (`fill_by_rule`). tests/quiver/model/rivals/test_all.py runs over all of them.
 
 Tests call `errors(name, arrays, table, prefix)`. `golden_files(name)` lists the committed file (at most 300 kB, from
-`cut`) and the full one in ../shared/rivals, if that is at hand. `DATA/NAME_state_dict.tsv` is the table.
+`cut`) and the full one in ../shared/rivals, if that is available. `DATA/NAME_state_dict.tsv` is the table.
 """
 
 import argparse
@@ -42,7 +42,7 @@ from quiver.model.published_weights import published_name
 from quiver.model.quiver import QUIVER
 
 DATA = Path(__file__).parents[1] / "data"
-SHARED = Path(__file__).parents[3] / "shared" / "rivals"  # the specification's full files, where they are at hand
+SHARED = Path(__file__).parents[3] / "shared" / "rivals"  # the specification's full files, where they are available
 TINY = FoldedConfig(  # the published design with the smallest parts, for fast tests
     channels=2,
     deformable_kernel=3,
@@ -183,7 +183,7 @@ def errors(name: str, golden: Mapping[str, np.ndarray], table: Path, prefix: str
 
 
 def golden_files(name: str) -> list[Path]:
-    """The committed golden file of a network, and the full one where the specification is at hand."""
+    """The committed golden file of a network, and the full one where the specification is available."""
     return [DATA / f"golden_{name}.npz", *(path for path in [SHARED / f"golden_{name}.npz"] if path.is_file())]
 
 

@@ -47,7 +47,7 @@ def test_the_variance_alarms_as_rarely_as_promised():
 
 
 def test_the_mixture_s_chi_square_alarms_as_rarely_as_promised():
-    """400 draws of which each has probabilities of its own; p-values of the plain chi-square would be too large."""
+    """400 draws of which each has its own probabilities; p-values of the plain chi-square would be too large."""
     rng = np.random.default_rng(0)
     pmf = rng.dirichlet([0.4] * 5, 400)
     steps = pmf.cumsum(axis=1)[:, :-1]

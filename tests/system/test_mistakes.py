@@ -1,7 +1,7 @@
 """What people do wrong, and what they are told: one line that names the cure, exit code 2, nothing half-written.
 
 Every row is a command line and words of its answer. Commands run in this process, in one folder that no mistake may
-change; what a machine may lack (GPU, new LLVM, disk, package, Python) has tests of its own below.
+change; what a machine may lack (GPU, new LLVM, disk, package, Python) has separate tests below.
 """
 
 from __future__ import annotations

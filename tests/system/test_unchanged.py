@@ -49,7 +49,7 @@ class Near:
     of: str = "mean"  # "mean", "each" (at least 1e-6), or "half": as "mean", but 1 of 200 may be the next half
 
     def differs(self, found: Array) -> str | None:
-        """What is wrong with these numbers, in words; None if they are near."""
+        """What is wrong with these numbers, as text; None if they are near."""
         wanted, found = (np.asarray(v, float) for v in (self.values, found))
         if wanted.shape != found.shape:
             return f"shape {found.shape} instead of {wanted.shape}"

@@ -247,7 +247,7 @@ def _numbers(plan: Plan) -> list[float]:
 
 @lru_cache(maxsize=32)
 def arguments(plan: Plan) -> list[Any]:
-    """Return nothing for the first plans of a process: their numbers are constants of their own kernels.
+    """Return nothing for the first plans of a process: their numbers are constants of separate kernels.
 
     For later plans the numbers are arguments of a shared kernel, about 20 % slower. So a training that varies its
     sensors compiles once.

@@ -248,7 +248,7 @@ class Synthesis(nn.Module):
         return self.joined(low, high, -1)
 
     def joined(self, low: Tensor, high: Tensor, axis: int) -> Tensor:
-        """Low and high band of one axis -> twice the length along it: places 0, 2 ... and 1, 3 ... interleaved."""
+        """Low and high band [..., n] of one axis -> [..., 2n]: places 0, 2 ... and 1, 3 ... interleaved."""
         low_taps, high_taps = self.net1["weight"].flatten(), self.net2["weight"].flatten()
         parts = [low * low_taps[k] + high * high_taps[k] for k in (0, 1)]
         end = low.ndim + axis

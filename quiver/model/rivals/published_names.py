@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 
 def load_published(network: nn.Module, state: Mapping[str, Tensor], unused: tuple[str, ...] = ()) -> list[str]:
-    """Load a published state dict; return the entries whose names begin with one of `unused`, which are not built.
+    """Load a published state dict of any shape; return the entries that begin with one of `unused` and are not built.
 
     Buffers that the state lacks keep their constants. ValueError for parameters that are missing, for unknown entries,
     and for shapes that differ.

@@ -154,7 +154,7 @@ def test_values_of_options_obey_the_rules_of_recipes():
 
 
 def test_ctrl_c_of_a_command_that_starts_again(tmp_path):
-    """A real process, SIGINT while a film is written: code 130, one line that says how to go on, no half file."""
+    """A real process, SIGINT while a film is written: code 130, one line that says how to resume, no half file."""
     import os
     import signal
 

@@ -77,11 +77,11 @@ def test_an_error_is_interpolated_at_any_white(seed):
     rng = np.random.default_rng([8, seed])
     truth = truth_of(rng)
     halves = truth + 0.05 * rng.standard_normal((2, SIZE, SIZE)) * truth
-    foreseen = white_in(truth)
-    pairs = frame_errors(lambda white: Errors.of_halves(halves, white).at_white, foreseen)
-    white = foreseen * rng.uniform(STEPS[0], STEPS[-1])
+    forecast = white_in(truth)
+    pairs = frame_errors(lambda white: Errors.of_halves(halves, white).at_white, forecast)
+    white = forecast * rng.uniform(STEPS[0], STEPS[-1])
     assert error_at(white, pairs) == pytest.approx(Errors.of_halves(halves, white).at_white, rel=0.03)
-    assert error_at(foreseen, pairs) == pytest.approx(Errors.of_halves(halves, foreseen).at_white)
+    assert error_at(forecast, pairs) == pytest.approx(Errors.of_halves(halves, forecast).at_white)
 
 
 def test_a_clip_states_both_figures_below_its_own_white():

@@ -124,6 +124,6 @@ def test_a_disputed_side_stays_disputed_and_a_flip_is_remembered(tmp_path: Path)
     assert sensed.meta["orientation"] == "upright; then --flip ud"
 
 
-def test_footage_whose_reader_says_nothing_is_not_called_upright(tmp_path: Path):
+def test_a_recording_of_unknown_orientation_is_not_called_upright(tmp_path: Path):
     recording = Recording((1, 2, 8), lambda start, stop: random_planes(stop - start, 2, 8), "somewhere", 1)
     assert importing.to_stream(recording, tmp_path / "s", CAPTURE).meta["orientation"] == "unknown"

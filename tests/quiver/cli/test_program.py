@@ -219,7 +219,7 @@ def test_nothing_is_overwritten_without_force(capsys, tmp_path, tiny_dataset, cl
     assert (folder / "thesis.txt").read_text() == "mine"
 
 
-def test_force_starts_a_run_and_a_table_anew(capsys, tmp_path, tiny_dataset):
+def test_force_starts_a_run_and_a_table_again(capsys, tmp_path, tiny_dataset):
     assert run(capsys, *train_words(tiny_dataset, tmp_path / "r"))[0] == 0
     other = [*train_words(tiny_dataset, tmp_path / "r"), "--seed", 1]
     assert "holds a run with seed 0, now it is 1" in mistake(capsys, *other)

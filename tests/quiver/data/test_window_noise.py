@@ -79,7 +79,7 @@ def test_a_window_is_the_crop_of_the_sensed_frames(make_clip: ClipMaker, tmp_pat
 
 
 def test_sums_of_planes_have_the_distribution_of_their_pixels(make_clip: ClipMaker, tmp_path):
-    """Flat light on hot and dull pixels: the mean code of each kind over many windows is that of its own cdf."""
+    """Flat light on hot and dull pixels: the mean code of each kind over many windows is that of its cdf."""
     gain = np.tile([1.0, 0.25, 0.0], (20, 9))[:, :26]
     np.save(tmp_path / "gain.npy", gain)
     file = sensor_file(tmp_path, SPAD + 'gain_map = "gain.npy"\n', 3)

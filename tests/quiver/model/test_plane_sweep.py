@@ -56,7 +56,7 @@ def test_known_acceleration_is_found(acceleration):
     assert disagreement(bent)[inner].mean() < 0.2 * disagreement(straight)[inner].mean()
 
 
-def test_the_grid_is_searched_as_the_obvious_loop_does():
+def test_the_grid_is_searched_as_the_naive_loop_does():
     """A loop over pixels in NumPy, float64: weights, shifts by pixels, box means and the choice are the same."""
     window = sliding((1.0, -0.5), (12, 14))[0].double().numpy()[1:10]
     weights = np.exp(-0.5 * (np.arange(-4, 5) / plane_sweep.SIGMA) ** 2)

@@ -43,7 +43,7 @@ def test_killed_and_resumed_equals_uninterrupted(tiny_dataset, tmp_path, monkeyp
     monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
     asked = []
 
-    def die() -> bool:
+    def kill() -> bool:
         asked.append(1)
         if len(asked) == 3:
             monkeypatch.setattr(training, "CHECKPOINT_SECONDS", math.inf)
@@ -53,7 +53,7 @@ def test_killed_and_resumed_equals_uninterrupted(tiny_dataset, tmp_path, monkeyp
 
     again = settings(tiny_dataset, tmp_path / "b", **kinds)
     with pytest.raises(Killed):
-        train(small_network(), again, should_stop=die, progress=False)
+        train(small_network(), again, should_stop=kill, progress=False)
     assert torch.load(tmp_path / "b/checkpoint.pt", weights_only=True)["state"]["step"] in (2, 3)
     resumed = small_network(seed=99)  # its initial weights must not matter
     state = train(resumed, again, progress=False)
@@ -196,11 +196,11 @@ def test_two_processes_train_as_one_with_twice_the_batch(tiny_dataset, tmp_path)
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     shared = os.environ | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
-    crew = [
+    workers = [
         subprocess.Popen([sys.executable, str(program)], cwd=ROOT, env=shared | {"RANK": str(i), "LOCAL_RANK": str(i)})
         for i in (0, 1)
     ]
-    assert [process.wait(timeout=300) for process in crew] == [0, 0]
+    assert [process.wait(timeout=300) for process in workers] == [0, 0]
     together = load(tmp_path / "b/last.safetensors")
     for ours, theirs in zip(alone.state_dict().values(), together.state_dict().values(), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
