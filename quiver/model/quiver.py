@@ -117,7 +117,7 @@ class QUIVER(nn.Module):
     def encode_next(
         self, images: Sequence[Tensor], noisy: Sequence[Pair], denoised: Sequence[Pair], flows: Sequence[Tensor]
     ) -> Encoded:
-        """Encode a later frame: images [N, 1, h, w], (previous, current) features of both streams, flows; three scales."""
+        """Encode a later frame: images [N, 1, h, w], (previous, current) features and flows, at three scales."""
         return self.cell.encode(images, self.fuse(noisy, denoised, flows))
 
     def restore(self, window: Sequence[Tensor], r1: Tensor, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
