@@ -28,20 +28,24 @@ def add_calibrate(sub: Any) -> None:
         "--static",
         nargs=2,
         metavar=("FILE", "SECONDS"),
-        help="counts of a static scene instead: dead time from Fano factors",
+        help="counts of a static scene, instead of dark and flat frames: measures the dead time from Fano factors",
     )
-    parser.add_argument("--bits", type=checked(checks.bits), help="of a code; 1 for binary planes (with --planes: 1)")
+    parser.add_argument(
+        "--bits", type=checked(checks.bits), help="bits per code; 1 for binary planes (default with --planes: 1)"
+    )
     parser.add_argument(
         "--planes",
         type=checked(checks.planes),
-        help="spad: every value is the sum of so many binary planes, SECONDS and PHOTONS are those of one plane; "
+        help="spad: every value is the sum of this many binary planes, SECONDS and PHOTONS are those of one plane; "
         "1: values are single exposures",
     )
     parser.add_argument("--variable", help="array of a .mat file (default: OUTPUT, or the only one)")
-    parser.add_argument("--model", choices=("qis", "spad"), help="default qis; spad with --planes")
+    parser.add_argument("--model", choices=("qis", "spad"), help="kind of sensor (default qis; spad with --planes)")
     parser.add_argument("--paralyzable", action="store_true", help="spad: every arrival restarts the dead time")
     parser.add_argument("--ignore-dead-time", action="store_true", help="spad: model the counts as Poisson")
-    parser.add_argument("--width", type=int, help=".npy files are photon cubes (packed planes) of so many pixels")
+    parser.add_argument(
+        "--width", type=int, help=".npy files are photon cubes (packed planes) with rows of this many pixels"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, help=".toml to write; .json and .png beside it")
     parser.add_argument("--force", action="store_true", help="replace existing files")
 

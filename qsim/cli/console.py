@@ -137,8 +137,8 @@ def command(
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, for programs")
     loudness = parser.add_mutually_exclusive_group()
-    loudness.add_argument("-q", "--quiet", action="store_true", help="no progress and no warnings, only the result")
-    loudness.add_argument("-v", "--verbose", action="store_true", help="time and memory; the traceback of a mistake")
+    loudness.add_argument("-q", "--quiet", action="store_true", help="print the result only, no progress, no warnings")
+    loudness.add_argument("-v", "--verbose", action="store_true", help="print time, memory and tracebacks of errors")
     if threads is not None:
         run = _with_threads(run)
         parser.add_argument("--threads", type=int, help=f"{threads} (default: all cores)")

@@ -39,21 +39,30 @@ def add_convert(sub: Any) -> None:
     reading.add_argument("--exposure", type=float, help="seconds of light per frame (default: the full frame time)")
     reading.add_argument("--transfer", help=f"how pictures code light: {', '.join(TRANSFERS)} (also for writing)")
     reading.add_argument("--height", type=int, help="pixels")
-    reading.add_argument("--width", type=int, help="pixels, before packing")
-    reading.add_argument("--bits", type=int, help="the input holds codes of so many bits")
+    reading.add_argument("--width", type=int, help="pixels per row, before packing")
+    reading.add_argument("--bits", type=int, help="the input holds codes of this many bits")
     reading.add_argument("--stretched", action="store_true", help="codes were stretched to 0..255")
-    reading.add_argument("--channel", type=int, help="of a colour cube: 0, 1 or 2")
-    reading.add_argument("--flip", choices=("none", "lr", "ud", "both"), default="none", help="turn the frames")
+    reading.add_argument("--channel", type=int, help="channel of a colour cube to read: 0, 1 or 2")
+    reading.add_argument(
+        "--flip",
+        choices=("none", "lr", "ud", "both"),
+        default="none",
+        help="mirror the frames: left-right, up-down or both",
+    )
     reading.add_argument("--columns", type=int, help="keep only the first columns (Vidar dumps: 400 of 416)")
     reading.add_argument("--variable", help="array of a .mat file (default: OUTPUT, or the only one)")
-    reading.add_argument("--sensor", help="that made the codes, by name or file (default: an ideal binary counter)")
-    reading.add_argument("--ppp", type=float, help="light level the sensor's gain was set for")
-    reading.add_argument("--split", choices=SPLITS, help="stored in the clips")
+    reading.add_argument(
+        "--sensor", help="sensor that made the codes, by name or file (default: an ideal binary counter)"
+    )
+    reading.add_argument("--ppp", type=float, help="light level for which the sensor's gain was set")
+    reading.add_argument("--split", choices=SPLITS, help="split to store in the clips")
     writing = parser.add_argument_group("writing for others")
     writing.add_argument(
-        "--to", choices=sorted(exporting.EXPORTS), help="kind of the output, if its name has no ending"
+        "--to", choices=sorted(exporting.EXPORTS), help="kind of the output (default: from the suffix of its name)"
     )
-    writing.add_argument("--lossy", action="store_true", help="mp4 with FFmpeg's default settings: noise is lost")
+    writing.add_argument(
+        "--lossy", action="store_true", help="write mp4 with FFmpeg's default settings, which lose noise"
+    )
     parser.add_argument(
         "--white", type=float,
         help="reading: pixel value at which the camera saturates, as in 4095 (default: the largest that whole numbers "

@@ -20,18 +20,18 @@ def add_generate(sub: Any) -> None:
         sub, "generate", _run_generate, "Make a data set from a recipe; finished jobs are kept.",
         "qsim generate scenes/starter.toml -o out/starter --workers 2\n"
         "qsim generate scenes/i2_2000fps.toml -o /data/i2 --shard 7/100", RESUMES,
-        threads="of the renderer (Dr.Jit) in each worker",
+        threads="threads of the renderer (Dr.Jit) in each worker",
     )  # fmt: skip
     parser.add_argument("recipe", type=Path, help="a .toml file; its format is in qsim/dataset/recipe.py")
     parser.add_argument("-o", "--output", type=Path, help="data set folder (default out/NAME of the recipe)")
     parser.add_argument("--workers", type=int, help="processes, each with its own renderer (default 1)")
     parser.add_argument("--shard", type=part_of, metavar="I/N", help="only the I-th of N parts, as in 7/100")
     memory = checked(checks.positive)
-    parser.add_argument("--memory", type=memory, help="largest GiB per process (default 4)")
+    parser.add_argument("--memory", type=memory, help="memory limit of a process, GiB (default 4)")
     parser.add_argument("--retry", action="store_true", help="try failed jobs again")
-    parser.add_argument("--repair", action="store_true", help="check all files and make damaged ones again")
-    parser.add_argument("--wait", action="store_true", help="wait while another generator is at work in the folder")
-    parser.add_argument("--cluster", metavar="ADDRESS", help="a Dask scheduler, as in tcp://10.0.0.1:8786")
+    parser.add_argument("--repair", action="store_true", help="check all files, and make damaged ones again")
+    parser.add_argument("--wait", action="store_true", help="wait until no other generator uses the folder")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="address of a Dask scheduler, as in tcp://10.0.0.1:8786")
     parser.add_argument(
         "--gpus", type=float, default=0, help="GPU resource that each job takes on the cluster (default 0)"
     )
@@ -39,7 +39,7 @@ def add_generate(sub: Any) -> None:
 
 def _run_generate(args: argparse.Namespace) -> int:
     if args.threads is not None and args.cluster is not None:
-        raise ValueError("--threads: is of processes of this machine; start Dask workers with QSIM_THREADS=N instead")
+        raise ValueError("--threads: acts on processes of this machine; start Dask workers with QSIM_THREADS=N instead")
     from qsim.dataset import generation, recipe
     from qsim.dataset.worker_pool import Limits
 
@@ -106,10 +106,10 @@ def add_plan(sub: Any) -> None:
     parser = command(
         sub, "plan", _run_plan, "Render one small job of each kind and print the forecast of a recipe's cost.",
         "qsim plan scenes/i2_2000fps.toml --machines 10",
-        threads="of the renderer (Dr.Jit)",
+        threads="threads of the renderer (Dr.Jit)",
     )  # fmt: skip
     parser.add_argument("recipe", type=Path, help="a .toml file")
-    parser.add_argument("--machines", type=int, default=10, help="to spread the work over (default 10)")
+    parser.add_argument("--machines", type=int, default=10, help="number of machines that share the work (default 10)")
     parser.add_argument("--frames", type=int, default=5, help="frames rendered per kind (default 5)")
 
 
@@ -137,7 +137,7 @@ def add_check(sub: Any) -> None:
     parser.add_argument(
         "--redraw",
         action="store_true",
-        help="draw streams again by the reference engine, name those that differ; slow",
+        help="draw streams again with the reference engine and name those that differ; slow",
     )
 
 

@@ -29,14 +29,14 @@ def add_preview(sub: Any) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, help=".mp4, .gif or .png to write (default: show it in the terminal)"
     )
-    parser.add_argument("--what", type=_kinds, help="of sharp,radiance,codes,average,flow,depth; with commas")
-    parser.add_argument("--stream", help="which stream of a clip (default: the first)")
-    parser.add_argument("--frame", type=int, help="one frame (default: the middle one, or all in a film)")
+    parser.add_argument("--what", type=_kinds, help="views, comma-separated: sharp,radiance,codes,average,flow,depth")
+    parser.add_argument("--stream", help="stream of a clip to show (default: the first)")
+    parser.add_argument("--frame", type=int, help="frame to show (default: the middle one; a film: all)")
     parser.add_argument("--fps", type=float, help="frames of a film shown per second (default 12)")
-    parser.add_argument("--scale", type=int, help="pixels per pixel (default: so that captions fit)")
-    parser.add_argument("--bits", type=int, help="a bare array holds codes of so many bits")
-    parser.add_argument("--width", type=int, help="a bare array holds packed binary planes of so many columns")
-    parser.add_argument("--play", action="store_true", help="in the terminal: all frames, one after the other")
+    parser.add_argument("--scale", type=int, help="enlargement, a whole factor (default: so that captions fit)")
+    parser.add_argument("--bits", type=int, help="a bare array holds codes of this many bits")
+    parser.add_argument("--width", type=int, help="a bare array holds packed binary planes of this many columns")
+    parser.add_argument("--play", action="store_true", help="play all frames in the terminal")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
 
 
@@ -126,9 +126,9 @@ def add_report(sub: Any) -> None:
         sub, "report", _run_report, "Write one self-contained page of clips, data sets, runs, restored video, scores.",
         "qsim report out/fan\nqsim report out/demo -o out/demo/index.html --title 'My run'",
     )  # fmt: skip
-    parser.add_argument("path", type=Path, help="clip, data set, or a folder that holds some")
+    parser.add_argument("path", type=Path, help="clip, data set, or a folder that contains some")
     parser.add_argument("-o", "--output", type=Path, help=".html file to write (default: NAME.html here)")
-    parser.add_argument("--title", help="of the page")
+    parser.add_argument("--title", help="title of the page")
     parser.add_argument("--note", action="append", default=[], help="a line for the top of the page; may be repeated")
     parser.add_argument("--force", action="store_true", help="replace an existing page")
 

@@ -20,34 +20,38 @@ def add_render(sub: Any) -> None:
         sub, "render", _run_render, "Render a scene into a clip: radiance, sharp frames, flow, depth, body ids.",
         "qsim render fan -o out/fan --frames 21 --height 128 --width 128\n"
         "qsim render fan --explain", RESUMES,
-        threads="of the renderer (Dr.Jit); the picture does not depend on it",
+        threads="threads of the renderer (Dr.Jit); the picture does not depend on it",
     )  # fmt: skip
     parser.add_argument(
         "scene", help="a family of scenes/, a .py file with scene(seed, speed=...), Mitsuba .xml, a folder of assets"
     )
     parser.add_argument("-o", "--output", type=Path, help="clip folder to make (may be left out with --explain)")
     parser.add_argument(
-        "--explain", action="store_true", help="print which effects are modelled, and the size of those that are not"
+        "--explain", action="store_true", help="print the modelled effects, and the size of the omitted ones"
     )
     whole = checked(checks.whole)
-    parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the scene and its samples (default 0)")
+    parser.add_argument(
+        "--seed", type=checked(checks.seed), default=0, help="seed of the scene and its samples (default 0)"
+    )
     parser.add_argument("--speed", type=checked(checks.positive), default=1.0, help="factor on all motions (default 1)")
-    parser.add_argument("--frames", type=whole, default=21, help="default 21")
+    parser.add_argument("--frames", type=whole, default=21, help="number of frames (default 21)")
     parser.add_argument("--height", type=whole, default=128, help="pixels (default 128)")
     parser.add_argument("--width", type=whole, default=128, help="pixels (default 128)")
     rate, shutter, psnr = (checked(check) for check in (checks.frame_rate, checks.shutter, checks.psnr))
     parser.add_argument("--frame-rate", type=rate, default=2000.0, help="frames per second (default 2000)")
-    parser.add_argument("--shutter", type=shutter, default=0.0, help="open share of a frame, 0..1 (default 0: sharp)")
+    parser.add_argument(
+        "--shutter", type=shutter, default=0.0, help="open fraction of a frame, 0..1 (default 0: sharp)"
+    )
     parser.add_argument(
         "--psnr",
         type=psnr,
         default=40.0,
-        help="wanted error of the radiance, dB below white, clamped there (default 40)",
+        help="requested error of the radiance, in dB below white and clamped at white (default 40)",
     )
     light = checked(checks.positive)
     parser.add_argument("--ppp", type=light, help="brightest light level that will be sensed, photons per pixel")
     parser.add_argument(
-        "--engine", choices=("cuda", "llvm", "scalar"), help="require one (default: QSIM_ENGINE, else the fastest)"
+        "--engine", choices=("cuda", "llvm", "scalar"), help="engine to use (default: QSIM_ENGINE, else the fastest)"
     )
     parser.add_argument("--force", action="store_true", help="replace an existing clip")
 
@@ -62,7 +66,7 @@ def _run_render(args: argparse.Namespace) -> int:
     from qsim.rendering.clip_rendering import render_clip
 
     if args.output is None and not args.explain:
-        raise ValueError("the following arguments are required: -o/--output; only --explain does without")
+        raise ValueError("the following arguments are required: -o/--output; only --explain works without it")
     if args.output is None:
         refuse_idle(args, "render without --output", ["force"])
     if args.output is not None and args.output.exists() and not args.force:

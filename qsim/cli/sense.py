@@ -20,19 +20,21 @@ def add_sense(sub: Any) -> None:
         "qsim sense out/starter --sensor spad-320x240 --bits 1 --ppp 0.5,3.25,26\n"
         "qsim sense out/starter --name quiver-physical_3bit_3.25ppp --replay fan_0003:7",
         "the same command resumes with the missing streams",
-        threads="of the compiled engine (Dr.Jit) that draws codes; codes do not depend on it",
+        threads="threads of the compiled engine (Dr.Jit) that draws codes; codes do not depend on it",
     )  # fmt: skip
     parser.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="clips or data sets")
     parser.add_argument(
         "--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default: quiver-physical)"
     )
     parser.add_argument("--bits", type=checked(checks.bits), help="bits per code (default: the sensor's own)")
-    parser.add_argument("--ppp", type=numbers, help="photons per pixel and code mean of the clip; several: 3.25,26")
+    parser.add_argument("--ppp", type=numbers, help="mean photons per pixel and code over the clip; several: 3.25,26")
     parser.add_argument("--lux", type=numbers, help="faceplate lux at 555 nm instead of --ppp")
-    parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the noise (default 0)")
+    parser.add_argument("--seed", type=checked(checks.seed), default=0, help="seed of the noise (default 0)")
     parser.add_argument("-o", "--name", help="name of the stream (default: made from sensor, bits and light)")
-    parser.add_argument("--group", action="store_true", help="codes sum 2^bits - 1 clip frames as binary planes")
-    parser.add_argument("--diffraction", action="store_true", help="blur by the lens's Airy pattern")
+    parser.add_argument(
+        "--group", action="store_true", help="sum 2^bits - 1 clip frames, as binary planes, to one code"
+    )
+    parser.add_argument("--diffraction", action="store_true", help="blur light with the lens's Airy pattern")
     parser.add_argument(
         "--defects",
         metavar="FILE.toml",
@@ -40,7 +42,10 @@ def add_sense(sub: Any) -> None:
         "that is carried over (default: that of the sensor's own .toml file)",
     )
     parser.add_argument(
-        "--slices", type=int, default=1, help="counting SPAD: clip frames in one exposure, whose light may change"
+        "--slices",
+        type=int,
+        default=1,
+        help="counting SPAD: clip frames per exposure, so that light may change within it",
     )
     parser.add_argument(
         "--replay", metavar="CLIP:FRAME", help="draw one frame again and compare it with the stored one"

@@ -21,29 +21,35 @@ def add_tradeoff(sub: Any) -> None:
         "qsim tradeoff fan --px 3 --ppp 2 -o out/fan_3px\n"
         "qsim tradeoff fan --speed 0.5:8 --ppp 0.1:30 -o out/sweep\n"
         "qsim tradeoff --paper-figure 1 -o out/figure1",
-        threads="of the compiled engine (Dr.Jit)",
+        threads="threads of the compiled engine (Dr.Jit)",
     )  # fmt: skip
     parser.add_argument("source", nargs="?", help="a clip of at least 10000 fps, or a scene (rendered into -o)")
-    parser.add_argument("--table", action="store_true", help="only print the table of bit depths, from numbers alone")
+    parser.add_argument(
+        "--table", action="store_true", help="print the table of bit depths only, computed without a clip"
+    )
     parser.add_argument("--paper-figure", type=int, choices=(1, 2), help="draw a figure of the QUIVER paper")
     parser.add_argument("--size", type=frame_size, help="ROWSxCOLUMNS (default 240x320, rendered scenes 96x128)")
     parser.add_argument("--base-fps", type=float, help="planes per second (default 10000; a clip has its own)")
     parser.add_argument("--read-noise", type=float, help="table: e- rms per read (default 0.2)")
-    bits = "with commas (default 1,2,3,4,5, widened up to 7 where the deepest is best; table 1,3,5,7,9)"
+    bits = "comma-separated (default 1,2,3,4,5, then up to 7 while the deepest is best; table 1,3,5,7,9)"
     parser.add_argument("--bits", type=whole_numbers, help=bits)
     parser.add_argument("--motion", type=float, help="table: image speed, px/s (default 2500)")
     parser.add_argument("--ppp", type=steps, help="photons per pixel and plane: 0.65 or 0.1,1,10 or 0.1:30 (6 steps)")
     moving = parser.add_mutually_exclusive_group()
-    moving.add_argument("--speed", type=steps, help="factors on the motion, as --ppp (default 1; a clip: whole)")
-    px = "motion of what moves, px per 3-bit frame of 7 planes, as --ppp: finds the speed"
+    moving.add_argument(
+        "--speed", type=steps, help="factors on the motion, listed as in --ppp (default 1; of a clip: whole factors)"
+    )
+    px = "motion of the moving pixels, px per 3-bit frame of 7 planes, listed as in --ppp; sets the speed"
     moving.add_argument("--px", type=steps, help=px)
-    parser.add_argument("--sensor", help="of the multi-bit read (default quiver-physical)")
-    parser.add_argument("--plane-sensor", help="of a binary plane (default: a clocked SPAD of the same efficiency)")
+    parser.add_argument("--sensor", help="sensor of the multi-bit read (default quiver-physical)")
+    parser.add_argument(
+        "--plane-sensor", help="sensor of a binary plane (default: a clocked SPAD of the same efficiency)"
+    )
     parser.add_argument("--instants", type=int, help="frames drawn and scored per depth (default 8)")
-    parser.add_argument("--frames", type=int, help="of a rendered scene (default: enough for the instants)")
+    parser.add_argument("--frames", type=int, help="frames of a rendered scene (default: enough for the instants)")
     seed = checked(checks.seed)
-    parser.add_argument("--seed", type=seed, help="of the noise and of a rendered scene (default 0)")
-    parser.add_argument("--streams", action="store_true", help="write clips and streams of each depth for restorers")
+    parser.add_argument("--seed", type=seed, help="seed of the noise and of a rendered scene (default 0)")
+    parser.add_argument("--streams", action="store_true", help="write clips and streams of each depth, for restorers")
     parser.add_argument("-o", "--output", type=Path, help="folder for numbers, figures, clips")
     parser.add_argument("--force", action="store_true", help="replace existing numbers and figures")
 
@@ -56,7 +62,7 @@ OF_FILES = ("seed", "speed", "output", "force")
 def _run_tradeoff(args: argparse.Namespace) -> int:
     if args.table:
         if args.source is not None:
-            raise ValueError(f"{args.source}: --table is made from numbers alone; leave the clip or scene out")
+            raise ValueError(f"{args.source}: --table is computed without a clip; leave the clip or scene out")
         idle = [name for name in OF_STUDIES if name not in ("bits", "base_fps")]
         refuse_idle(args, "tradeoff --table", ["paper_figure", *idle, *OF_FILES])
         return _tradeoff_table(args)

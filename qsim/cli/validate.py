@@ -30,14 +30,16 @@ def add_validate(sub: Any) -> None:
         "qsim validate sensor --json -o out/sensor.png\nqsim validate render -o out/render.png\n"
         "qsim validate light --scenes glossy room --height 64 --width 96\n"
         "qsim validate engines --scenes fan glass\nqsim validate reading",
-        threads="of the compiled engine (Dr.Jit)",
+        threads="threads of the compiled engine (Dr.Jit)",
     )  # fmt: skip
     parser.add_argument("what", choices=list(ACTING), help="what to validate")
     parser.add_argument("-o", "--output", type=Path, help="sensor, render: figure (.png, .svg or .pdf)")
-    parser.add_argument("--pixels", type=int, help=f"sensor: pixels of a draw (default {PIXELS})")
-    parser.add_argument("--seed", type=checked(checks.seed), default=0, help="of the draws (default 0)")
-    parser.add_argument("--require-speed", action="store_true", help="sensor: a speed below its target is a failure")
-    families = "render, engines, light: families or own scenes (default: four; light: all that tuned nothing)"
+    parser.add_argument("--pixels", type=int, help=f"sensor: pixels per draw (default {PIXELS})")
+    parser.add_argument("--seed", type=checked(checks.seed), default=0, help="seed of the draws (default 0)")
+    parser.add_argument("--require-speed", action="store_true", help="sensor: fail if a speed is below its target")
+    families = (
+        "render, engines, light: families or own scenes (default: four; light: all that were not used for tuning)"
+    )
     parser.add_argument("--scenes", nargs="+", metavar="FAMILY", help=families)
     whole, psnr = checked(checks.whole), checked(checks.psnr)
     parser.add_argument("--height", type=whole, help=f"render, engines, light: pixels (default {HEIGHT})")
@@ -90,7 +92,7 @@ def _engines(args: argparse.Namespace) -> int:
 
 
 def _families(args: argparse.Namespace) -> list[str]:
-    """Those asked for, or the ones that did not tune the budget."""
+    """The given scenes, or those that were not used to tune the budget."""
     import scenes
     from qsim.studies.validation import rendering
 

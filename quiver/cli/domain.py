@@ -26,14 +26,14 @@ def add_domain(sub: Any) -> None:
     parser.add_argument(
         "clips", nargs="*", type=Path, help="data sets and clip folders that were not used for training or tuning"
     )
-    parser.add_argument("--split", choices=("train", "val", "test", "all"), help="of data sets (default test)")
-    parser.add_argument("--sensor", type=words, help="names or .toml files, with commas (default quiver-physical)")
-    parser.add_argument("--bits", type=whole_numbers, help="with commas (default 3)")
-    parser.add_argument("--ppp", type=numbers, help="mean photons per pixel and code, with commas (default 3.25)")
+    parser.add_argument("--split", choices=("train", "val", "test", "all"), help="split of data sets (default test)")
+    parser.add_argument("--sensor", type=words, help="names or .toml files, comma-separated (default quiver-physical)")
+    parser.add_argument("--bits", type=whole_numbers, help="bits per code, comma-separated (default 3)")
+    parser.add_argument("--ppp", type=numbers, help="mean photons per pixel and code, comma-separated (default 3.25)")
     parser.add_argument(
-        "--methods", type=words, help="classical methods, with commas (default all without `likelihood`)"
+        "--methods", type=words, help="classical methods, comma-separated (default all but `likelihood`)"
     )
-    parser.add_argument("--seed", type=int, help="of the noise (default 0)")
+    parser.add_argument("--seed", type=int, help="seed of the noise (default 0)")
     add_running(parser)
     parser.set_defaults(memory=None)  # None: not given
     parser.add_argument("--force", action="store_true", help="measure existing cells again")

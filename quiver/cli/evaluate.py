@@ -40,12 +40,15 @@ def add_evaluate(sub: Any) -> None:
     parser.add_argument("source", nargs="?", help="data set or clip folder")
     parser.add_argument("-o", "--output", type=Path, help="folder for evaluation.md, .json, .png (needed for clips)")
     parser.add_argument(
-        "--methods", type=words, default="naive,moment", help="with commas; window as in moment:3; all = all"
+        "--methods",
+        type=words,
+        default="naive,moment",
+        help="comma-separated; moment:3 has a window of 3; all: every classical method and the shipped weights",
     )
-    parser.add_argument("--split", choices=("train", "val", "test", "all"), help="of a data set (default test)")
-    parser.add_argument("--stream", help="score this stored stream of every clip instead of sensing it now")
+    parser.add_argument("--split", choices=("train", "val", "test", "all"), help="split of a data set (default test)")
+    parser.add_argument("--stream", help="score this stored stream of every clip, instead of sensing the clip now")
     add_light(parser, several=True)
-    parser.add_argument("--seed", type=int, help="of the test noise or of the random splits (default 0)")
+    parser.add_argument("--seed", type=int, help="seed of the test noise or of the random splits (default 0)")
     parser.add_argument("--published", action="store_true", help="expose, scale and score every window separately")
     parser.add_argument(
         "--peak", type=positive, help="photons per pixel that the scores refer to (default 2.5 x the mean light)"
@@ -57,7 +60,7 @@ def add_evaluate(sub: Any) -> None:
     parser.add_argument("--splits", type=count, help="static: random splits (default 3)")
     add_running(parser)
     add_strict(parser)
-    parser.add_argument("--force", action="store_true", help="start again where an evaluation is")
+    parser.add_argument("--force", action="store_true", help="replace an existing evaluation")
 
 
 def _run_evaluate(args: argparse.Namespace) -> int:
@@ -168,13 +171,15 @@ def add_bench(sub: Any) -> None:
         "quiver bench --methods moment,nano,quiver-s --modes exact,streaming,windows --size 128x128 -o out/bench",
     )  # fmt: skip
     parser.add_argument(
-        "--methods", type=words, default="moment,unet,nano", help="with commas (default moment,unet,nano)"
+        "--methods", type=words, default="moment,unet,nano", help="comma-separated (default moment,unet,nano)"
     )
-    parser.add_argument("--modes", type=words, help="of networks (default exact,streaming)")
-    parser.add_argument("--precisions", type=words, help="of networks: float32, bfloat16 or both (default float32)")
+    parser.add_argument("--modes", type=words, help="modes of networks (default exact,streaming)")
+    parser.add_argument(
+        "--precisions", type=words, help="precisions of networks: float32, bfloat16 or both (default float32)"
+    )
     parser.add_argument("--size", type=frame_size, default="64x64", help="ROWSxCOLUMNS in px (default 64x64)")
     parser.add_argument("--ppp", type=positive, default=3.25, help="light of the fixed clip (default 3.25)")
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="of networks (default auto)")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="device of networks (default auto)")
     add_threads(parser)
     parser.add_argument("-o", "--output", type=Path, help="folder for bench.md, bench.json, bench.png")
     parser.add_argument("--force", action="store_true", help="replace an existing result")

@@ -48,14 +48,16 @@ def add_running(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--memory", type=memory_size, default="2GB", help="working memory, as in 500MB (default 2GB)")
     parser.add_argument("--mode", choices=MODES, help="networks: how frames share work (default exact)")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="networks: where they run (default auto)")
-    parser.add_argument("--precision", choices=("float32", "bfloat16"), help="networks: default float32")
+    parser.add_argument("--precision", choices=("float32", "bfloat16"), help="networks: precision (default float32)")
     add_threads(parser)
 
 
 def add_threads(parser: argparse.ArgumentParser) -> None:
     """Add --threads."""
     parser.add_argument(
-        "--threads", type=count, help="of torch on the CPU (default: measured at start; resumed work keeps its number)"
+        "--threads",
+        type=count,
+        help="torch threads on the CPU (default: measured at start; resumed work keeps its number)",
     )
 
 
@@ -71,9 +73,7 @@ def use_threads(args: argparse.Namespace, earlier: int | None = None) -> int:
 
 def add_strict(parser: argparse.ArgumentParser) -> None:
     """Add --strict."""
-    parser.add_argument(
-        "--strict", action="store_true", help="networks: refuse a stream outside of what they were measured for"
-    )
+    parser.add_argument("--strict", action="store_true", help="networks: refuse a stream outside their measured domain")
 
 
 def check_domain(args: argparse.Namespace, methods: Sequence[Any], streams: Iterable[Any]) -> list[str]:

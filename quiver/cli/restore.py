@@ -35,11 +35,11 @@ def add_restore(sub: Any) -> None:
     parser.add_argument(
         "--method",
         default=DEFAULT_METHOD,
-        help=f"classical method, shipped weights, file or run (default {DEFAULT_METHOD})",
+        help=f"classical method, shipped weights, weights file or run folder (default {DEFAULT_METHOD})",
     )
-    parser.add_argument("--stream", help="which stream of a clip (default: the only one)")
+    parser.add_argument("--stream", help="stream of a clip to restore (default: the only one)")
     add_light(parser, several=False)
-    parser.add_argument("--seed", type=int, help="of the noise, where a clip is sensed now (default 0)")
+    parser.add_argument("--seed", type=int, help="seed of the noise, if a clip is sensed now (default 0)")
     parser.add_argument("--width", type=count, help="bare array: packed binary planes of this many pixels per row")
     parser.add_argument("--planes", type=count, help="packed planes: 2^b - 1 are summed to one code (default 1)")
     parser.add_argument("--frame-rate", type=positive, help="bare array: codes per second (default 2000)")

@@ -45,18 +45,24 @@ def add_train(sub: Any) -> None:
     parser.add_argument("--minutes", type=positive, help="wall-clock limit; the learning rate follows it")
     add_noise(parser)
     parser.add_argument("--crop", type=count, help="px, side of the training windows")
-    parser.add_argument("--frames", type=count, help="of a training window (default 11, one restored frame; 16: six)")
+    parser.add_argument(
+        "--frames", type=count, help="frames of a training window (default 11: one restored frame; 16: six)"
+    )
     parser.add_argument("--batch", type=count, help="windows per step and process")
-    parser.add_argument("--optimiser", choices=("adam", "muon"), help="see quiver/training/optimiser.py")
-    parser.add_argument("--learning-rate", type=positive, help="at its highest")
-    parser.add_argument("--schedule", choices=("cosine", "plateau"), help="of the learning rate")
-    parser.add_argument("--loss", choices=("published", "paper", "l1", "scales-l1"))
-    parser.add_argument("--validate-every", type=count, help="steps")
-    parser.add_argument("--validation-split", choices=("train", "val", "test"), help="default val")
+    parser.add_argument("--optimiser", choices=("adam", "muon"), help="optimiser (default: the protocol's)")
+    parser.add_argument("--learning-rate", type=positive, help="highest learning rate")
+    parser.add_argument("--schedule", choices=("cosine", "plateau"), help="schedule of the learning rate")
+    parser.add_argument("--loss", choices=("published", "paper", "l1", "scales-l1"), help="default: the protocol's")
+    parser.add_argument("--validate-every", type=count, help="steps between validations")
+    parser.add_argument(
+        "--validation-split", choices=("train", "val", "test"), help="split to validate on (default val)"
+    )
     parser.add_argument("--workers", type=nonnegative, help="processes that draw samples (default 0: this one)")
     add_threads(parser)
-    parser.add_argument("--precision", choices=("auto", "float32", "bfloat16"), help="default auto: bfloat16 on CUDA")
-    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="default auto")
+    parser.add_argument(
+        "--precision", choices=("auto", "float32", "bfloat16"), help="precision (default auto: bfloat16 on CUDA)"
+    )
+    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="device (default auto)")
     parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
     parser.add_argument("--force", action="store_true", help="replace an existing run")
 
@@ -152,7 +158,9 @@ def add_ablate(sub: Any) -> None:
     add_noise(parser)
     parser.add_argument("--crop", type=count, help="px, side of the training windows")
     parser.add_argument("--batch", type=count, help="windows per step and process")
-    parser.add_argument("--split", default="test", choices=("train", "val", "test"), help="to score on (default test)")
+    parser.add_argument(
+        "--split", default="test", choices=("train", "val", "test"), help="split to score on (default test)"
+    )
     parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
     add_running(parser)
 

@@ -120,7 +120,7 @@ def test_render_explains_and_counts(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "bounces" not in out
     code, _, err = run(capsys, "render", "plain", *small)
     assert code == 2
-    assert "required: -o/--output; only --explain does without" in err
+    assert "required: -o/--output; only --explain works without it" in err
     code, _, err = run(capsys, "render", "plain", "--explain", "--engine", "metal")
     assert code == 2
     assert "metal" in err

@@ -78,7 +78,7 @@ def test_bits_that_were_given_are_kept_and_others_widened(clip, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--table CLIP", "--table is made from numbers alone; leave the clip or scene out"),
+        ("--table CLIP", "--table is computed without a clip; leave the clip or scene out"),
         ("--table --ppp 1", "tradeoff --table: --ppp changes nothing here"),
         ("--table --px 1", "tradeoff --table: --px changes nothing here"),
         ("--table --speed 2", "tradeoff --table: --speed changes nothing here"),
