@@ -1,0 +1,228 @@
+"""Defines MemDeblur, memory-based video deblurring (Ji and Yao, CVPR 2022): recurrent, at three scales, with a memory.
+
+    backward pass at full size -> forward passes at 1/4, 1/2 and full size; each frame sees the hidden state of its
+    neighbour, and reads by attention what earlier frames stored: keys, restored images, hidden states
+
+Written from a description of the article and of its port to 3-bit frames; the names of the layers are the port's.
+Look-ahead: the whole clip, as the backward pass begins at its end. Hidden states and memories begin empty at both ends
+of a clip; nothing is reflected.
+
+In training a memory keeps all that is written and attention is over all of it. In evaluation a query sees its 20
+nearest entries, and a memory keeps the latest five keys' worth. The mode of the network chooses.
+
+Our reading: the three output channels share one target, so their mean is the restored frame. The article centres its
+input at 0.5, the port does not; we do, and `as_published` does not. Nothing begins with weights of ImageNet. Batch
+normalisation as published sees one frame at a time; `group_norm` is ours, for small crops and batches.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import ClassVar, NamedTuple, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from qsim.structure import make
+from quiver.model.blocks import conv, join, resize, upsample
+from quiver.model.config import flag, whole_number
+from quiver.model.rivals.edges import check_frames, pad_space
+from quiver.model.rivals.memdeblur_memory import FEATURES, SLOPE, Memory, Stored, Trunk, residual_blocks
+
+IMAGE = 3  # channels of an image
+MULTIPLE = 4  # px that divide height and width at every scale
+SCALES = (4, 2, 1)  # the size of a scale is that of the frames divided by this
+EVERY = (1, 2, 5)  # frames between two writes into the forward memory, per scale
+BACKWARD_EVERY = 5  # frames between two writes into the backward memory
+
+
+@dataclass(frozen=True)
+class MemDeblurConfig:
+    """Configuration of MemDeblur; the defaults are the published sizes."""
+
+    width: int = 64  # hidden channels; all other sizes but the 48 features of a frame scale with it
+    forward_blocks: int = 30
+    backward_blocks: int = 10
+    group_norm: bool = False  # ours: group instead of batch normalisation in the memory's encoders
+    as_published: bool = False  # input in 0 ... 1, not centred
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` for a value out of range."""
+        whole_number("MemDeblurConfig.width", self.width, 8, 1024)
+        if self.width % 8:
+            raise ValueError(f"MemDeblurConfig.width must be a multiple of 8, got {self.width}")
+        for name in ("forward_blocks", "backward_blocks"):
+            whole_number(f"MemDeblurConfig.{name}", getattr(self, name), 0, 1024)
+        for name in ("group_norm", "as_published"):
+            flag(f"MemDeblurConfig.{name}", getattr(self, name))
+
+    def to_dict(self) -> dict[str, object]:
+        """Return plain values for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, object]) -> Self:
+        """Return the configuration of such values; ValueError for unknown fields and values out of range."""
+        return make(cls, values, "MemDeblur")
+
+
+class Clip(NamedTuple):
+    """The frames of a clip at one scale."""
+
+    images: list[Tensor]  # [B, 3, h, w] each
+    features: list[Tensor]  # [B, 48, h/4, w/4]
+    keys: list[Tensor]  # [B, width, h/16, w/16]
+
+
+class MemDeblur(nn.Module):
+    """MemDeblur for grey frames."""
+
+    look_ahead: ClassVar[int | None] = None  # all frames
+    unused: ClassVar[tuple[str, ...]] = ("conv_hr.", "conv_last.")
+
+    def __init__(self, config: MemDeblurConfig | None = None) -> None:
+        """Make the network of a configuration; the published sizes by default."""
+        super().__init__()
+        self.config = config = config or MemDeblurConfig()
+        width = config.width
+        self.downsampling = nn.Sequential(
+            conv(IMAGE, IMAGE, 5), Down(IMAGE, width // 4), Down(4 * IMAGE, width * 3 // 8)
+        )
+        self.upsampling = nn.Sequential(
+            *(upsample(width, width // 2), nn.LeakyReLU(SLOPE)),
+            *(upsample(width // 2, width // 4), nn.LeakyReLU(SLOPE)),
+            conv(width // 4, IMAGE, 5),
+        )
+        inputs = 2 * FEATURES + 4 * width
+        self.forward_input_convs = nn.ModuleList(
+            nn.Sequential(conv(inputs + (FEATURES if scale else 0), width, 3), nn.LeakyReLU(SLOPE))
+            for scale in range(len(SCALES))
+        )
+        self.forward_resblocks = nn.ModuleDict({"main": nn.Sequential(residual_blocks(width, config.forward_blocks))})
+        self.backward_resblocks = Trunk(2 * FEATURES + 2 * width, width, config.backward_blocks)
+        self.fusion = conv(2 * width, width, 1)
+        self.memory = Memory(width, config.group_norm)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """[B, T, 1, H, W] of codes/(2^b - 1) -> restored [B, T, 1, H, W]; ValueError for another shape."""
+        check_frames(frames)
+        images = self.images(pad_space(frames, MULTIPLE))
+        restored = self.scales(images)[-1].mean(dim=2, keepdim=True) + self.centre
+        return restored[..., : frames.shape[-2], : frames.shape[-1]]
+
+    @property
+    def centre(self) -> float:
+        """What is taken from the frames, and added to the result."""
+        return 0.0 if self.config.as_published else 0.5
+
+    def images(self, frames: Tensor) -> Tensor:
+        """Frames [B, T, 1, H, W] -> images [B, T, 3, H, W] as the network takes them."""
+        return (frames - self.centre).expand(-1, -1, IMAGE, -1, -1)
+
+    def scales(self, images: Tensor) -> list[Tensor]:
+        """Images [B, T, 3, H, W], sides multiples of 4 -> restored images at 1/4, 1/2 and full size.
+
+        The size of a scale is rounded down to pixels, then up to a multiple of 4.
+        """
+        self._check_statistics(images)
+        full = self._clip(list(images.unbind(1)))
+        behind, backward = self._backward_pass(full)
+        outputs: list[Tensor] | None = None
+        stored, results = None, []
+        for scale, divisor in enumerate(SCALES):
+            clip = full if divisor == 1 else self._clip([resize(x, *_size(x, divisor)) for x in full.images])
+            outputs, stored = self._forward_pass(scale, clip, outputs, behind, backward, stored)
+            results.append(torch.stack(outputs, dim=1))
+        return results
+
+    def _check_statistics(self, images: Tensor) -> None:
+        """Raise `ValueError` if batch normalisation in training would see one value per channel."""
+        learns = not self.config.group_norm and self.memory.key_encoder.bn1.training
+        if learns and len(images) == 1 and max(_size(images, SCALES[0])) <= 16:
+            raise ValueError(
+                f"a batch of one clip of {images.shape[-2]} x {images.shape[-1]} px leaves batch normalisation one "
+                "value per channel; take sides above 64 px, more clips, or group_norm"
+            )
+
+    def _clip(self, images: list[Tensor]) -> Clip:
+        features = [self.downsampling(image) for image in images]
+        return Clip(images, features, [self.memory.key(feature) for feature in features])
+
+    def _backward_pass(self, clip: Clip) -> tuple[list[Tensor], Stored]:
+        """Hidden states [B, width, h/4, w/4] of all frames, from the last to the first, and what was stored."""
+        last = len(clip.images) - 1
+        states: list[Tensor] = []
+        stored: Stored | None = None
+        for i in range(last, -1, -1):
+            feature, key = clip.features[i], clip.keys[i]
+            if stored is None:
+                past = [_zeros(feature, FEATURES + 2 * self.config.width)]
+            else:
+                read = self.memory.decode_feature(self.memory.read(stored, key), feature)
+                past = [clip.features[i + 1], read, states[-1]]
+            states.append(self.backward_resblocks(join(feature, *past)))
+            written = (last - i) % BACKWARD_EVERY == 0 if self.training else i % BACKWARD_EVERY == 2
+            if stored is None or written:
+                stored = self.memory.write(stored, key, self.memory.value_encoder_feat(join(feature, states[-1])))
+        assert stored is not None
+        return states[::-1], stored
+
+    def _forward_pass(
+        self, scale: int, clip: Clip, coarser: list[Tensor] | None, behind: list[Tensor], backward: Stored,
+        stored: Stored | None,
+    ) -> tuple[list[Tensor], Stored]:  # fmt: skip
+        """Restored images of a scale, and the forward memory after it, which holds those of all scales."""
+        memory, outputs = self.memory, []
+        hidden: Tensor | None = None
+        for i, (image, feature, key) in enumerate(zip(*clip, strict=True)):
+            parts = [feature, memory.decode_feature(memory.read(backward, key), feature)]
+            if coarser is not None:
+                parts.append(self.downsampling(resize(coarser[i], *image.shape[-2:])))
+            if stored is None or hidden is None:
+                parts.append(_zeros(feature, FEATURES + 3 * self.config.width))
+            else:
+                of_features, of_images = memory.read(stored, key).chunk(2, dim=1)
+                parts += [clip.features[i - 1], memory.decode_feature(of_features, feature), hidden,
+                          memory.decode_image(of_images, feature)]  # fmt: skip
+            hidden = self.forward_resblocks["main"](self.forward_input_convs[scale](join(*parts)))
+            fused = self.fusion(join(resize(behind[i], *feature.shape[-2:]), hidden))
+            outputs.append(self.upsampling(F.leaky_relu(fused, SLOPE)) + image)
+            if i % EVERY[scale] == 0:
+                image_value = memory.value_encoder_mem(join(feature, self.downsampling(outputs[-1])))
+                feature_value = memory.value_encoder_feat(join(feature, hidden))
+                stored = memory.write(stored, key, join(feature_value, image_value))
+        assert stored is not None
+        return outputs, stored
+
+
+class Down(nn.Module):
+    """A residual dense block, then half the size and four times the channels."""
+
+    def __init__(self, channels: int, growth: int) -> None:
+        """Make the layers."""
+        super().__init__()
+        self.rdb = nn.ModuleDict(
+            {
+                "dense_layers": nn.ModuleList(
+                    nn.ModuleDict({"conv": conv(channels + i * growth, growth, 3)}) for i in range(3)
+                ),
+                "conv1x1": conv(channels + 3 * growth, channels, 1),
+            }
+        )
+        self.down_sampling = conv(channels, 4 * channels, 5, stride=2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, channels, h, w] -> [B, 4 channels, h/2, w/2]."""
+        y = x
+        for layer in self.rdb["dense_layers"].children():
+            y = join(y, F.relu(layer.get_submodule("conv")(y)))
+        return self.down_sampling(self.rdb["conv1x1"](y) + x)
+
+
+def _zeros(like: Tensor, channels: int) -> Tensor:
+    return like.new_zeros(len(like), channels, *like.shape[2:])
+
+
+def _size(images: Tensor, divisor: int) -> tuple[int, int]:
+    """Height and width at a scale: rounded down to pixels, then up to a multiple of 4."""
+    height, width = (-(side // divisor) // MULTIPLE * -MULTIPLE for side in images.shape[-2:])
+    return height, width
