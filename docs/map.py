@@ -35,7 +35,7 @@ def files() -> str:
 
 
 def page(text: str) -> str:
-    """The page with its list written again; what stands before the mark stays."""
+    """Return the page with its list written again; the text before the mark is kept."""
     return text.partition(MARK)[0] + MARK + "\n" + files()
 
 

@@ -1,4 +1,4 @@
-"""Checks single values of options and files: returns the value in its type, or says what was expected."""
+"""Checks single values of options and files: returns the value in its type, or reports the expected form."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Transfer curves, luminance, peak and PSNR; and arrays as pictures: one tone curve, false colours.
+"""Computes transfer curves, luminance, peak and PSNR, and pictures of arrays: one tone curve, false colours.
 
 Pictures are made of frames [..., H, W] and are uint8 [..., H, W] or [..., H, W, 3].
 """

@@ -28,7 +28,7 @@ def figure_png(figure: Figure) -> bytes:
 
 
 def check_figure(path: Path) -> str:
-    """Return the format that a figure's name asks for; `ValueError` if it is none of ours."""
+    """Return the format of a figure from its name's suffix; `ValueError` if it is not supported."""
     kind = path.suffix.lstrip(".").lower()
     if kind not in KINDS:
         raise ValueError(f"{path}: a figure is a .png, .svg or .pdf file")

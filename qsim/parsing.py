@@ -24,7 +24,7 @@ def parse_toml(path: Path, text: str) -> dict[str, Any]:
         value = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         found = re.search(r"at line (\d+)", str(error))
-        line = found[1] if found else len(text.splitlines())  # else the parser says "at end of document"
+        line = found[1] if found else len(text.splitlines())  # else the parser reports "at end of document"
         raise ValueError(f"{path}:{line}: not valid TOML: {error}") from None
     except RecursionError:
         raise ValueError(f"{path}:{_line_of_depth(text)}: not valid TOML: {_TOO_DEEP}") from None

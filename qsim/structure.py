@@ -103,7 +103,7 @@ _CHECKS: dict[Any, Check] = {bool: checks.flag, int: checks.integer, float: chec
 
 
 def expected(what: str, good: Callable[[Any], bool]) -> Check:
-    """Return the check that passes what is `good` and says `what` is expected otherwise."""
+    """Return a check that passes values for which `good` is true, and otherwise reports that `what` is expected."""
 
     def check(value: Any) -> Any:
         if not good(value):

@@ -31,7 +31,7 @@ def pan(rng: np.random.Generator, speed: float) -> Motion:
 
 
 def shake(rng: np.random.Generator, speed: float) -> Motion:
-    """Return the shake of a hand: three waves about all axes and one that shifts."""
+    """Return the shake of a hand: three waves about all axes and one translation."""
     turns = tuple(
         Wave(vector(rng.normal(0, (0.04, 0.04, 0.02))), speed * between(rng, 18, 32), any_angle(rng)) for _ in range(3)
     )

@@ -1,4 +1,4 @@
-"""From measured frames to sensor parameters with confidence intervals."""
+"""Measures sensor parameters, with confidence intervals, from recorded frames."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""The command `qsim`: arguments in, exit codes out."""
+"""Reads the command line of `qsim` and runs its commands."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""The folder on disk: radiance, ground truth and packed streams, and the simulation of streams from radiance."""
+"""Reads and writes clips: radiance, ground truth and packed streams; simulates streams from radiance."""
 
 from typing import TYPE_CHECKING
 

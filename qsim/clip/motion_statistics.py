@@ -10,7 +10,7 @@ from numpy import ndarray as Array
 
 MOVING = 0.1  # px per frame: a pixel that moves farther counts as moving
 SLOWEST = 10_000.0  # clip frames per second: in slower clips, a plane is too long to count as an instant
-CODE_BITS = 3  # motion is stated per frame of 3 bits, whatever depths are compared
+CODE_BITS = 3  # motion is stated per frame of 3 bits, for all compared depths
 CODE_PLANES = 2**CODE_BITS - 1
 
 

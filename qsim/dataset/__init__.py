@@ -1,4 +1,4 @@
-"""From a recipe to a data set: jobs, workers, resuming, provenance, and a forecast of the cost."""
+"""Makes data sets from recipes: jobs, workers, resuming, provenance, and a forecast of the cost."""
 
 from typing import TYPE_CHECKING
 

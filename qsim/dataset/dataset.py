@@ -90,7 +90,7 @@ class Dataset:
 
     @property
     def missing(self) -> list[str]:
-        """Return the names of the clips that the recipe asks for and that are not finished."""
+        """Return the names of the recipe's unfinished clips."""
         return [name for name in self.meta["jobs"] if not record_path(self.path, name).is_file()]
 
     def verify(self, progress: Progress | None = None) -> list[str]:

@@ -55,7 +55,7 @@ def assets(described: Any) -> list[str]:
 
 
 def photographs(scene: Any) -> list[str]:
-    """Return `photograph NAME` for every texture of a scene that states its source, whatever its range."""
+    """Return `photograph NAME` for every texture of a scene that states its source, at any range of values."""
     from qsim.scene import Texture
 
     sources = {item.source for item in nested(scene) if isinstance(item, Texture)}

@@ -29,7 +29,7 @@ class Export:
     transfer: str = "gamma 2.2"  # of pictures of light
     white: float | None = None  # light that becomes full scale; None: the 99.9th percentile
     lossless: bool = True  # of mp4
-    playback: float = 30.0  # frames per second of an mp4; the capture rate stands in its .json
+    playback: float = 30.0  # frames per second of an mp4; its .json has the capture rate
 
 
 def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = False) -> Path:

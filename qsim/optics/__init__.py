@@ -1,4 +1,4 @@
-"""From radiance to expected photons: camera, lens, exposure, light level, diffraction. Nothing is random."""
+"""Converts radiance to expected photons: camera, lens, exposure, light level, diffraction. Nothing is random."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""From a scene to radiance of a stated error, with ground truth. Only this room knows Mitsuba."""
+"""Renders scenes to radiance of a stated error, with ground truth. Only this room renders with Mitsuba."""
 
 from typing import TYPE_CHECKING
 

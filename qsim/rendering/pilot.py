@@ -1,4 +1,4 @@
-"""Low-cost measurements of a scene (every n-th pixel at full resolution), from which `fidelity` chooses the budget.
+"""Measures a scene at low cost (every n-th pixel at full resolution); `fidelity` chooses the budget from this.
 
 Rays alone measure motion and bodies, in every frame or in MOST_LOOKS of them. Light is rendered in a few frames: the
 first, the middle and the last, those with bodies that these do not show, and, with an open shutter, those with the

@@ -1,4 +1,4 @@
-"""Results on disk as pages and previews: stored results only, nothing is recomputed."""
+"""Shows stored results as pages and previews; nothing is recomputed."""
 
 from typing import TYPE_CHECKING
 

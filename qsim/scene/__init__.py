@@ -1,4 +1,4 @@
-"""What is in front of the camera: bodies, materials, lights and motions as frozen records, without a renderer."""
+"""Describes scenes: bodies, materials, lights and motions as frozen records, without a renderer."""
 
 from typing import TYPE_CHECKING
 

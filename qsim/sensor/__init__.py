@@ -1,4 +1,4 @@
-"""From expected photons to codes: exact laws, keyed draws, pixel defects, named devices, bit packing."""
+"""Converts expected photons to codes: exact laws, keyed draws, pixel defects, named devices, bit packing."""
 
 from typing import TYPE_CHECKING
 

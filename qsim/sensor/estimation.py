@@ -20,12 +20,12 @@ from qsim.sensor.distribution import Distribution
 _DECADES, _PER_DECADE = 8, 128  # of the grid: linear interpolation between its points is good to 4e-5
 _FLAT = 1e-14  # change of the cdf per doubling of light, below which a sensor counts as saturated
 _DOUBLINGS = 44  # of light: within these a sensor saturates, or its mean code stops rising
-_NEVER = -1e290  # stands for log 0 where it may be multiplied by 0
+_NEVER = -1e290  # replaces log 0 where it may be multiplied by 0
 POINTS = 4096  # of a response; linear interpolation then errs by less than 1e-6 of the full scale
 _ENDED = 1e-7  # a response this close to its top (relative to the full scale) has ended
 _TOGETHER = 1 << 22  # probabilities of a response held at a time
 _STEPS = 200  # of root finding; 10 are usual
-_HUGE = 1e300  # stands for infinity in root finding
+_HUGE = 1e300  # replaces infinity in root finding
 _CHUNK = 1 << 12  # different histograms at a time
 
 

@@ -1,1 +1,1 @@
-"""Experiments about the other rooms: bit depth against motion, and validation against independent references."""
+"""Studies the other rooms: bit depth against motion, and validation against independent references."""

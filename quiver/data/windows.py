@@ -125,7 +125,7 @@ class Windows(Dataset[dict[str, Any]]):
         )
 
     def _drift(self, clip: int, rng: np.random.Generator) -> tuple[int, int]:
-        """Return the drift of the crop [px/frame], as far as the clip has room."""
+        """Return the drift of the crop [px/frame], limited by the size of the clip."""
         settings = self.settings
         if not settings.drift or rng.random() < 0.5:
             return 0, 0

@@ -140,7 +140,7 @@ def markdown(counts: Counts, scores: Sequence[StaticScore], frames: int, bits: i
         f"PSNR in dB, peak = {peak_of(counts.light, peak):.4g} photons per pixel"
         + ("" if peak is not None else " (2.5 x mean light)")
         + f", {100 * above:.1f} % of the reference's pixels are above it; the variance of the reference is taken off, "
-        "except where it says as measured. Matched: after the factor that is best behind the clamp. ± is the spread "
+        "except in the column 'as measured'. Matched: after the factor that is best behind the clamp. ± is the spread "
         "over random splits. n/a: no error is left beside the reference's noise.",
         *([] if not above > metrics.ABOVE_PEAK else ["", metrics.above_peak_warning("the reference", above)]),
         "",

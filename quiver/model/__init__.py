@@ -1,4 +1,4 @@
-"""The networks: pure functions of codes, and their weights."""
+"""Defines the networks, pure functions of codes, and their weights files."""
 
 from typing import TYPE_CHECKING
 

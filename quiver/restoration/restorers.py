@@ -69,7 +69,7 @@ def method_names() -> list[str]:
 
 
 def restorers(names: Sequence[str], options: RestoreOptions | None = None) -> list[Restorer]:
-    """Return several methods for one table; `all` stands for every method that needs no training.
+    """Return several methods for one table; `all` expands to every method that needs no training.
 
     `ValueError` as for `restorer`, and where two methods would have one name.
     """

@@ -1,1 +1,1 @@
-"""One training loop for all networks."""
+"""Trains all networks by one loop."""

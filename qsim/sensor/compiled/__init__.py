@@ -1,1 +1,1 @@
-"""The compiled draw: plans of a sensor's cdf steps, one kernel, and its launches."""
+"""Draws codes by compiled kernels: plans of a sensor's cdf steps, one kernel, and its launches."""

@@ -1,4 +1,4 @@
-"""Deviations from an ideal pixel: fixed-pattern and correlated noise, and photons followed one by one."""
+"""Models deviations from an ideal pixel: fixed-pattern and correlated noise; simulates photons one by one."""
 
 from typing import TYPE_CHECKING
 

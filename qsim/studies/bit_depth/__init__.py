@@ -1,4 +1,4 @@
-"""The best bit depth for a motion and a light level."""
+"""Finds the best bit depth for a motion and a light level."""
 
 from typing import TYPE_CHECKING
 

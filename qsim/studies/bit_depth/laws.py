@@ -1,4 +1,4 @@
-"""States the laws of bit depth against motion for a sensor that reads M = 2^b - 1 planes as one b-bit frame.
+"""Computes the laws of bit depth against motion for a sensor that reads M = 2^b - 1 planes as one b-bit frame.
 
     planes at `base_fps` -> frames of b bits at base_fps / (2^b - 1), all with the same exposure per second
 

@@ -1,1 +1,1 @@
-"""Sensors, rendering, backends and reading against independent references."""
+"""Compares sensors, rendering, backends and reading with independent references."""
