@@ -44,8 +44,8 @@ each with `--json`; run them for the numbers of your machine.*
 python docs/evidence.py
 ```
 
-Every approximate number is compared with an exact one, and every speed is shown with its error. The bounds are those of
-a correct program: exact forms to rounding, statistics to a false alarm of one in a million for the complete report.
+Every approximate number is compared with an exact one, and every speed is shown with its error. A correct program
+meets all bounds: exact forms to rounding, statistics with a false alarm of one in a million for the complete report.
 """
 
 SENSOR = """## Sensors
@@ -53,30 +53,31 @@ SENSOR = """## Sensors
 - **cdf error**: the largest difference of P(code ≤ k) from independent sums and integrals.
 - **p**: chi-square of drawn codes against the closed form; **z**: mean and variance in standard errors.
 - **differ**: pixels in a million at which the compiled and the reference engine give different codes for the same key.
-- **× NumPy**: times faster than the usual NumPy lines (Poisson, normal, round, clip) in the same process.
+- **× NumPy**: speed relative to the usual NumPy lines (Poisson, normal, round, clip) in the same process.
 """
 
 RENDERING = """## Rendering
 
 Radiance is compared with a converged reference of the same scene. fan, tumble, gears, flag, crowd, drums and text were
 used while the choice of budgets was written and are not shown. No constant was chosen on the other scenes or their
-seed, except the deepest bounce that is tried: glass had lacked light, and it makes ours slower there. **asked** is the
-wanted PSNR. **reached** is the PSNR of a frame against the reference. **stated** is the PSNR by its measured noise and
-the bounces that the pilot omits. **naive** is a loop of one `mi.render` per frame, with the power of two of samples
+seed, except the deepest bounce that is tested: glass lacked light without it, and is slower with it. **asked** is the
+requested PSNR. **reached** is the PSNR of a frame against the reference. **stated** is the PSNR by its measured noise
+and the bounces that the pilot omits. **naive** is a loop of one `mi.render` per frame, with the power of two of samples
 that reaches the same PSNR.
 """
 
 EARLIER = """\
 The PSNRs of this table have the earlier unit, dB below the 99.9th percentile without a clamp. `--psnr` now means dB
 below [white](fidelity.md), clamped there, and the table will be measured again. At equal numbers of dB a frame of
-these scenes now takes 1.12 times the processor time at 36 dB and 1.21 times at 40 dB (median of nine, 128 × 256): 0.95
-to 2.0 times, but 4 to 5 times for glossy, whose highlights had hidden what lies below white.
+these scenes now takes 1.12 times the processor time at 36 dB and 1.21 times at 40 dB (median of nine, 128 × 256). The
+range is 0.95 to 2.0 times, but 4 to 5 times for glossy: in the earlier unit its highlights hid errors below white.
 """
 
 LIGHT = """### Error and light
 
-The scenes above, each rendered with the budget of the wanted error and compared with converged frames. **reached** and
-**stated** are in dB below white, with picture and truth clamped there; **without clamp** refers to the same white.
+The scenes above, each rendered with the budget of the requested error and compared with converged frames.
+**reached** and **stated** are in dB below white, with picture and truth clamped there; **without clamp** refers
+to the same white.
 **light** is the difference of the mean light of three frames from the converged ones. **announced** is the loss by the
 omitted bounces, as `--explain` states it, and **±** is the standard error of their difference. The denoiser keeps the
 mean.
@@ -84,32 +85,32 @@ mean.
 
 ENGINES = """## Engines
 
-The same frames, radiance and ground truth, by each engine that works on the machine. **outside kernels** is the share
-of the time without a compiled kernel: moving the scene, ground truth, measuring the error.
+The same frames, radiance and ground truth, by each engine that works on the machine. **outside kernels** is the
+fraction of the time without a compiled kernel: moving the scene, ground truth, measuring the error.
 """
 
 READING = """## Reading
 
 Windows for training at random places of one clip; both readers reopen their files for every window. The clip folder is
-read by one thread, and the same windows are decoded from an mp4 by FFmpeg on all cores. Other programs change the
-figures per second of processor time less.
+read by one thread, and the same windows are decoded from an mp4 by FFmpeg on all cores. Figures per second of
+processor time depend less on other programs.
 """
 
-TESTS = """## What the tests hold
+TESTS = """## Which test checks which claim
 
 | claim | test |
 |---|---|
-| light is counted right: worked numbers, EMVA formula, laws | `tests/qsim/optics/test_radiometry.py` |
+| photons are computed correctly: worked numbers, EMVA formula, laws | `tests/qsim/optics/test_radiometry.py` |
 | radiance of a closed box and of a Lambertian plane | `test_renderer.py`, `test_mitsuba_scene.py` |
-| stated error of a frame is its error | `test_renderer.py`, `test_fidelity.py`, `test_fidelity_white.py` |
-| mean light is that of a converged frame, as far as is announced | `test_idle_options.py`, `test_denoiser.py` |
+| stated error of a frame is its true error | `test_renderer.py`, `test_fidelity.py`, `test_fidelity_white.py` |
+| mean light agrees with a converged frame's within the announced error | `test_idle_options.py`, `test_denoiser.py` |
 | compiled and reference engine agree over 10 000 random sensors | `tests/qsim/sensor/compiled/test_codes_search.py` |
 | codes have the exact distribution: tails, ties, dead times | `tests/qsim/sensor/test_qis.py`, `test_counting.py` |
-| closed forms agree with following every photon | `tests/qsim/sensor/defects/test_event_simulation.py` |
+| closed forms agree with the simulation of every photon | `tests/qsim/sensor/defects/test_event_simulation.py` |
 | no two frames are equal; any order, any workers, same bytes | `tests/qsim/dataset/test_dataset.py`, `test_keys.py` |
-| a killed run, a full disk, a damaged file | `tests/qsim/dataset/test_dataset.py`, `tests/system/test_mistakes.py` |
-| the statistical helpers have the false alarms and the power they promise | `tests/support/test_stats.py` |
-| measured photons behave as the models say | `tests/system/test_real_photons.py` |
+| killed runs, full disks, damaged files | `tests/qsim/dataset/test_dataset.py`, `tests/system/test_mistakes.py` |
+| statistical helpers have their stated false alarms and power | `tests/support/test_stats.py` |
+| measured photons agree with the models | `tests/system/test_real_photons.py` |
 | the network is the published one | `tests/quiver/model/test_golden.py` |
 """
 
@@ -189,9 +190,9 @@ def rendering(report: dict[str, Any]) -> str:
     wanted = "reached" if report["ok"] else "**not reached**"
     size = (
         f"Frames of {report['height']} × {report['width']}; the median scene at 40 dB is {report['median_ratio']:.3f} "
-        f"times faster; the wanted speed (10 times there, and nowhere slower) is {wanted} in this run. The "
-        "loop takes powers of two of samples and overshoots (**naive [dB]**): could it stop at the PSNR that ours "
-        f"reached, the median would be {equal:.1f}; could it stop at exactly 40 dB, with ours unchanged, {exact:.1f}."
+        f"times faster; the required speed (10 times there, and nowhere slower) is {wanted} in this run. The "
+        "loop uses powers of two of samples and overshoots (**naive [dB]**). If it could stop at the PSNR that ours "
+        f"reached, the median would be {equal:.1f}; if at exactly 40 dB, with ours unchanged, {exact:.1f}."
     )
     picture = f"![Seconds per frame against PSNR]({FIGURE.relative_to(HERE).as_posix()})"
     unit = [] if "unit" in report else [EARLIER]
@@ -218,7 +219,9 @@ def light(report: dict[str, Any]) -> str:
     ]
     wrong = [row["scene"] for row in report["rows"] if not row["ok"]]
     verdict = f"**not** in {', '.join(wrong)}" if wrong else "everywhere"
-    size = f"Frames of {report['height']} × {report['width']}; error and light are as wanted and announced {verdict}."
+    size = (
+        f"Frames of {report['height']} × {report['width']}; error and light are as requested and announced {verdict}."
+    )
     return "\n".join([LIGHT, _table(header, rows), "", size, ""])
 
 
@@ -251,8 +254,9 @@ def reading(report: dict[str, Any]) -> str:
     window, clip = (" × ".join(map(str, report[key])) for key in ("window_shape", "clip_shape"))
     wanted = "reached" if report["ok"] else "**not reached**"
     text = (
-        f"Windows of {window} (frames, rows, columns) in a clip of {clip}; {report['ratio']:.1f} times as many are "
-        f"ours; the pictures are equal to {report['difference']:.3f} of white, the loss of the video. The wanted speed "
+        f"Windows of {window} (frames, rows, columns) in a clip of {clip}; the clip folder gives "
+        f"{report['ratio']:.1f} times as many; the pictures are equal to {report['difference']:.3f} of "
+        "white, the loss of the video. The required speed "
         f"({report['wanted']:g} windows/s, {report['wanted_ratio']:g} times the mp4) is {wanted} in this run."
     )
     return "\n".join([READING, _table(header, rows), "", text, ""])
