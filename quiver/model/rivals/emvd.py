@@ -179,10 +179,14 @@ class NoiseMap(nn.Module):
         brightness = low[:, :1]
         if self.as_published:
             return brightness.clamp(0, 1) * self.slope + self.offset
-        table = self.variance.to(low.dtype)
-        place = (brightness / self.gain).clamp(0, 1) * (len(table) - 1)
-        below = place.detach().long().clamp(max=len(table) - 2)
-        return self.correlation * torch.lerp(table[below], table[below + 1], place - below)
+        return self.correlation * variance_at(brightness / self.gain, self.variance.to(low.dtype))
+
+
+def variance_at(mean: Tensor, table: Tensor) -> Tensor:
+    """Return the variance at means [...], clipped to 0 ... 1, from its values [n] at equal steps of the mean."""
+    place = mean.clamp(0, 1) * (len(table) - 1)
+    below = place.detach().long().clamp(max=len(table) - 2)
+    return torch.lerp(table[below], table[below + 1], place - below)
 
 
 class SmallNet(nn.Module):

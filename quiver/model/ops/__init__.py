@@ -1,0 +1,1 @@
+"""Operators that several networks share, in plain torch; they have no weights."""
