@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from qsim.files import VERSION as __version__
-from qsim.files import lazy_names
+from qsim.files import VERSION, lazy_names
 
 if TYPE_CHECKING:
     from qsim.calibration.qis import calibrate_qis
@@ -33,6 +32,8 @@ if TYPE_CHECKING:
     from qsim.sensor.qis import QIS
     from qsim.sensor.sensor import Sensor
     from qsim.sensor.spad import BinarySPAD
+
+__version__ = VERSION
 
 _HOMES = {
     "BinarySPAD": "sensor.spad",
@@ -77,7 +78,6 @@ __all__ = [
     "Sensing",
     "Sensor",
     "Stream",
-    "__version__",
     "calibrate_qis",
     "calibrate_spad",
     "choose_budget",
