@@ -6,6 +6,7 @@ from qsim.files import lazy_names
 
 if TYPE_CHECKING:
     from qsim.sensor.counting import CountingSPAD
+    from qsim.sensor.defects.pixel_array import PixelArray
     from qsim.sensor.devices import load
     from qsim.sensor.estimation import Response
     from qsim.sensor.packing import pack, unpack
@@ -13,13 +14,14 @@ if TYPE_CHECKING:
     from qsim.sensor.sensor import Sensor
     from qsim.sensor.spad import BinarySPAD
 
-__all__ = ["QIS", "BinarySPAD", "CountingSPAD", "Response", "Sensor", "load", "pack", "unpack"]
+__all__ = ["QIS", "BinarySPAD", "CountingSPAD", "PixelArray", "Response", "Sensor", "load", "pack", "unpack"]
 
 __getattr__ = lazy_names(
     __name__,
     {
         "BinarySPAD": "spad",
         "CountingSPAD": "counting",
+        "PixelArray": "defects.pixel_array",
         "QIS": "qis",
         "Response": "estimation",
         "Sensor": "sensor",
