@@ -53,9 +53,14 @@ def peak(image: NDArray[np.floating]) -> float:
 
     The caller's docstring states of what: a frame, some frames of a clip, a reference.
     """
-    finite = image[np.isfinite(image)]
-    value = float(np.percentile(finite, 99.9)) if finite.size else 0.0
+    value = bright_end(image)
     return value if value > 0 else 1.0
+
+
+def bright_end(image: NDArray[np.floating]) -> float:
+    """Return the 99.9th percentile of the finite values of an array of any shape, in their unit; 0 if none is."""
+    finite = image[np.isfinite(image)]
+    return float(np.percentile(finite, 99.9)) if finite.size else 0.0
 
 
 def psnr(peak: float, rms: float) -> float:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.colour import psnr
+from qsim.colour import bright_end, psnr
 from qsim.optics.radiometry import WHITE_PER_MEAN
 
 STEPS = tuple(2 ** (k / 2) for k in range(-3, 4))  # whites of a frame's errors, over the predicted white
@@ -56,7 +56,7 @@ def white_of(mean: float, high: float) -> float:
 
 def white_in(radiance: Array) -> float:
     """Return the white of images [...], in the unit of the radiance."""
-    return white_of(float(radiance.mean()), float(np.percentile(radiance, 99.9)))
+    return white_of(float(radiance.mean()), bright_end(radiance))
 
 
 def clamped_squares(squares: Array, picture: Array, lower: Array, white: float) -> Array:

@@ -15,7 +15,7 @@ CODE_PLANES = 2**CODE_BITS - 1
 
 
 def largest_motion(length: Array) -> float:
-    """Return the 99.9th percentile of the known lengths of a flow [2, H, W], in their unit; 0 if none is known."""
+    """Return the 99.9th percentile of the known lengths [...] of a motion, in their unit; 0 if none is known."""
     known = length[np.isfinite(length)]
     return float(np.percentile(known, 99.9)) if known.size else 0.0
 
@@ -25,6 +25,6 @@ def moving_mean(length: Array, frames: int = 1) -> float | None:
 
     `length` is that of the flow [px per clip frame], of any shape, NaN where unknown.
     """
-    travel = length[np.isfinite(length)] * frames
-    moving = travel[travel > MOVING]
+    extent = length[np.isfinite(length)] * frames
+    moving = extent[extent > MOVING]
     return float(moving.mean()) if moving.size else None

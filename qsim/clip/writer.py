@@ -20,6 +20,7 @@ from numpy import ndarray as Array
 from qsim import files, locks
 from qsim.clip import clamped_error, exr
 from qsim.clip.manifest import FORMAT_VERSION, MEASURED, OURS, TRUTH, camera_of, check_new
+from qsim.colour import bright_end
 from qsim.files import VERSION, check_name
 from qsim.optics import radiometry
 
@@ -247,7 +248,7 @@ class ClipWriter:
         samples = [
             exr.read_half(self.part / "radiance" / f"{t:06d}.exr", height, width)[::step, ::step] for t in range(frames)
         ]
-        return float(np.percentile(np.stack(samples), 99.9))
+        return bright_end(np.stack(samples))
 
 
 def _truth_channels(truth: dict[str, Array]) -> dict[str, Array]:
