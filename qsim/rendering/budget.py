@@ -54,7 +54,7 @@ class Allowed:
     target: float  # of picture and truth clamped at white
     sensor: float = math.inf  # without a clamp
 
-    def part(self, errors: Errors) -> float:
+    def fraction(self, errors: Errors) -> float:
         """Return the fraction of the allowed error that these errors take; 1 is all of it."""
         return max(errors.at_white / self.target, errors.plain / self.sensor)
 

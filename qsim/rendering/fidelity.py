@@ -98,11 +98,11 @@ def choose_budget(
     instants, blurred, about_blur = 1, 0.0, Finding("motion blur", "none, one instant", why)
     if blurs:
         low, high = (float(np.percentile(bright, share)) for share in (0.1, 99.9))
-        contrast = allowed.part(Errors(min(high, allowed.white) - low, high - low))
+        contrast = allowed.fraction(Errors(min(high, allowed.white) - low, high - low))
         instants, blurred, about_blur = fewest_instants(
-            pilot.extent, contrast, lambda k: allowed.part(pilot.changes(k, bounces, allowed.white))
+            pilot.extent, contrast, lambda k: allowed.fraction(pilot.changes(k, bounces, allowed.white))
         )
-    share = math.sqrt(1 - min(allowed.part(left_out), SHARE) ** 2 - min(blurred, SHARE) ** 2)
+    share = math.sqrt(1 - min(allowed.fraction(left_out), SHARE) ** 2 - min(blurred, SHARE) ** 2)
     noise = Noise.of(halves, allowed.white)
     samples, about_samples = fewest_samples(noise, instants, allowed, share)
     fewer, about_denoiser = None, Finding("denoiser", "off", "not asked for")
@@ -167,7 +167,7 @@ def fewest_bounces(cut_at: Callable[[int], Array], full: Array, allowed: Allowed
     for bounces in DEPTHS:
         cut = cut_at(bounces)
         left_out = Errors.between(cut, full, allowed.white)
-        if allowed.part(left_out) <= SHARE:
+        if allowed.fraction(left_out) <= SHARE:
             break
     else:
         # Deeper bounces add less than the last step did; that step is stated in their place.
@@ -263,12 +263,12 @@ def fewest_samples(noise: Noise, instants: int, allowed: Allowed, share: float) 
     each = 2 * grid_samples(COUNTS[0] // 2)
     if min(noise.plain) <= 0:
         return each * instants, Finding("samples", f"{each * instants} per pixel", "the pilot found no noise")
-    while allowed.part(noise.at(each, instants)) > share and each * instants < MOST_SAMPLES:
+    while allowed.fraction(noise.at(each, instants)) > share and each * instants < MOST_SAMPLES:
         each = 2 * grid_samples(each // 2 + 1)
     expected = noise.at(each, instants)
     size = f"expected rms {expected.at_white:.2g} = {psnr(allowed.white, expected.at_white):.1f} dB"
     size += f", without a clamp {psnr(allowed.white, expected.plain):.1f} dB"
-    if allowed.part(expected) > share:
+    if allowed.fraction(expected) > share:
         size += f", the limit of {MOST_SAMPLES} samples is reached"
     return each * instants, Finding("samples", f"{each * instants} per pixel", size)
 

@@ -170,7 +170,7 @@ def denoised_samples(
             squares += np.square(found) / len(windows)
         noisy, *cleaned = np.sqrt(squares).tolist()
         missed = LUCK * noisy < expected(samples).plain
-        errors.append(allowed.part(expected(samples) if missed else Errors(*cleaned)))
+        errors.append(allowed.fraction(expected(samples) if missed else Errors(*cleaned)))
         if errors[-1] <= share:
             break
     where = f"{'' if len(windows) == 1 else 'four windows of '}frame {t}"
