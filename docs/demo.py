@@ -9,7 +9,6 @@ and the memory of the run.
 from __future__ import annotations
 
 import json
-import resource
 import shlex
 import subprocess
 import sys
@@ -17,6 +16,8 @@ import time
 from pathlib import Path
 
 import numpy as np
+
+from qsim.process import peak_memory_of_children
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "tests" / "data"
@@ -34,7 +35,7 @@ def main(out: Path) -> int:
         print(f"demo: stopped at '{shlex.join(failed.cmd[2:])}'; `make demo` resumes there", file=sys.stderr)
         return failed.returncode
     minutes = (time.perf_counter() - started) / 60
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+    peak = peak_memory_of_children() / 2**30
     print(f"\ndemo: {minutes:.1f} minutes, largest process {peak:.2f} GB; open {out / 'index.html'}")
     return 0
 

@@ -13,8 +13,17 @@ def peak_memory() -> int:
     """Return the largest resident memory of this process since `reset_peak`, or since its start [bytes]."""
     with contextlib.suppress(OSError, IndexError):  # of a system without /proc
         return int(Path("/proc/self/status").read_text(encoding="ascii").split("VmHWM:")[1].split()[0]) * 1024
+    return _peak_of(resource.RUSAGE_SELF)
+
+
+def peak_memory_of_children() -> int:
+    """Return the resident memory of the largest child process that has ended [bytes]; 0 without one."""
+    return _peak_of(resource.RUSAGE_CHILDREN)
+
+
+def _peak_of(who: int) -> int:
     unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss: bytes on macOS, KiB elsewhere
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    return resource.getrusage(who).ru_maxrss * unit
 
 
 def reset_peak() -> int:

@@ -37,3 +37,15 @@ def test_without_proc_the_unit_is_that_of_the_system(monkeypatch, system, unit):
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert process.peak_memory() == process.resident_memory() == most * unit
     assert np.isfinite(most)
+
+
+def test_the_largest_child_is_counted_once_it_has_ended():
+    code = (
+        "import subprocess, sys; from qsim import process; before = process.peak_memory_of_children();"
+        "subprocess.run([sys.executable, '-c', 'bytearray(200_000_000)']);"
+        "print(before, process.peak_memory_of_children())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    before, after = map(int, done.stdout.split())
+    assert before == 0
+    assert 200e6 < after < 400e6
