@@ -16,6 +16,7 @@ from skimage import data
 
 from qsim.keys import Key
 from qsim.sensor.devices import quiver_physical
+from qsim.tables import markdown_table
 from quiver.baselines import METHODS
 
 EXPOSURE = 5e-4  # s
@@ -29,14 +30,15 @@ def main() -> None:
     photons *= 3.25 / photons.mean()
     sensor = quiver_physical(3.25)
     codes = sensor.sample(np.broadcast_to(photons, (FRAMES, *photons.shape)), EXPOSURE, key=Key(0, 0))
-    print("| method | s per 512 x 1024 frame | frames per s |\n|---|---|---|")
+    header = ("method", "s per 512 x 1024 frame", "frames per s")
+    print("\n".join(markdown_table([], header)))
     for name, method in METHODS.items():
         stack = codes if name in PIXELWISE else codes[:1]
         method.restore(stack, sensor, EXPOSURE)
         started = time.perf_counter()
         method.restore(stack, sensor, EXPOSURE)
         seconds = (time.perf_counter() - started) / len(stack)
-        print(f"| {name} | {seconds:.3g} | {1 / seconds:.3g} |", flush=True)
+        print(markdown_table([(name, f"{seconds:.3g}", f"{1 / seconds:.3g}")], header)[-1], flush=True)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.figures import new_figure, write_figure
-from qsim.files import replacing
+from qsim.files import load_array, replacing
 from quiver.data.clips import Clip
 from quiver.evaluation import metrics
 
@@ -106,7 +106,7 @@ def sheet(out: Path, light: str, clips: Sequence[str], methods: Sequence[str], t
             axes.set_yticks([])
             path = crop_file(out, light, clip, column)
             if path.exists():
-                picture = np.clip(np.load(path).astype(np.float32), 0, 1) ** (1 / 2.2)
+                picture = np.clip(load_array(path).astype(np.float32), 0, 1) ** (1 / 2.2)
                 axes.imshow(picture, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
             if clip == rows[0]:
                 axes.set_title(column, fontsize=8)
