@@ -30,14 +30,17 @@ def test_every_name_is_there_and_nothing_else():
             module.Clop  # noqa: B018
 
 
-def test_importing_qsim_takes_less_than_three_tenths_of_a_second():
-    """In processor time, which does not depend on what else the machine does; the best of three."""
-    code = "import time; t = time.process_time(); import qsim; print(time.process_time() - t)"
-    times = [
+def test_importing_qsim_takes_little_more_than_numpy():
+    """In processor time, as a multiple of the import of NumPy in the same process; the best of three."""
+    code = (
+        "import time; t = time.process_time; a = t(); import numpy; b = t(); import qsim; c = t();"
+        "print((c - b) / (b - a))"
+    )
+    ratios = [
         float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout)
         for _ in range(3)
     ]
-    assert min(times) < 0.3
+    assert min(ratios) < 1.5
 
 
 def test_reprs_show_shapes_and_units(tmp_path):

@@ -1,8 +1,9 @@
-"""The bench: a clip that never changes, and cases that differ. Costs: tests/quiver/cli/test_program.py, slow tier."""
+"""The bench: a clip that never changes, cases that differ. Costs: tests/quiver/cli/test_program.py (slow)."""
 
 from __future__ import annotations
 
 import math
+import time
 
 import numpy as np
 
@@ -27,9 +28,10 @@ def test_only_cases_that_differ_are_run():
 
 
 def test_a_classical_case_has_seconds_and_a_score():
+    started = time.perf_counter()
     cost = measure(CostCase("moment:3"), CostSettings(16, 16, frames=5, restored=3))
     assert cost.trained
-    assert 0 < cost.seconds_per_frame < 5
+    assert 0 < 3 * cost.seconds_per_frame < time.perf_counter() - started
     assert cost.psnr_matched > 10
     assert math.isnan(cost.gmac_per_frame)
 

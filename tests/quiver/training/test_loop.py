@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import socket
@@ -9,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -150,11 +152,14 @@ def test_ten_times_the_rate_stays_finite_or_stops(tiny_dataset, tmp_path, networ
     assert all(bool(weight.isfinite().all()) for weight in narrow.state_dict().values())
 
 
-def test_a_time_limit_ends_the_run(tiny_dataset, tmp_path):
+def test_a_time_limit_ends_the_run(tiny_dataset, tmp_path, monkeypatch):
+    """A clock that advances 0.1 s each time it is read: the length of a step does not depend on the machine."""
+    readings = itertools.count()
+    monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: 0.1 * next(readings)))
     state = train(small_network(), settings(tiny_dataset, tmp_path / "r", steps=None, minutes=0.1), progress=False)
-    assert state.elapsed < 30
+    assert 5.5 < state.elapsed < 6.5
     assert state.history[-1]["step"] == state.step
-    assert 2 <= len(state.history) <= 12  # after every tenth of the time that a step ended in, and at the end
+    assert 10 <= len(state.history) <= 11  # after every tenth of the time, and at the end
 
 
 def test_a_crop_must_fit_the_network(tiny_dataset, tmp_path):
