@@ -1,4 +1,4 @@
-"""Computes the steps F_k of a QIS one by one: P(code <= k) for pairs of a code and a light level, without a table.
+"""Computes the steps F_k of a QIS one by one: P(code <= k) for pairs of code and light level, without a table.
 
 Given n electrons, P(code <= k | n) is 1 for few of them, and 0 or a constant (full well) for many. It lies in between
 only where read noise blurs the threshold:

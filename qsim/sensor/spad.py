@@ -1,4 +1,4 @@
-"""Models clocked single-photon avalanche diodes (BinarySPAD), and the base that counting ones (counting.py) share.
+"""Models clocked single-photon avalanche diodes (BinarySPAD), and the base shared with CountingSPAD.
 
 Avalanches that the pixel could detect are a Poisson process. An exposure expects PDE photons + dark_count_rate exposure
 of them, called arrivals.

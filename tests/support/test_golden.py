@@ -1,4 +1,4 @@
-"""The program that compares networks with golden arrays: the rule's check values, errors, and files of other sizes."""
+"""The comparison of networks with golden arrays: the rule's check values, errors, and files of other sizes."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""The tests of the tests: false alarms as rare as promised, real faults caught, and nothing passes without noise."""
+"""The tests of the tests: false alarms as rare as promised, faults caught, nothing passes without noise."""
 
 import numpy as np
 import pytest

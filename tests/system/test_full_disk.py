@@ -1,4 +1,4 @@
-"""A disk that is really full under every command that writes: one line that names a file, and nothing left to read."""
+"""A full disk under every command that writes: one line that names a file, and nothing left to read."""
 
 import importlib
 import mmap

@@ -1,4 +1,4 @@
-"""Readers against damage: a mutated file is read, or refused in one line that names it; never a crash, never a flood.
+"""Readers against damage: a mutated file is read, or refused in one line that names it; no crash, no flood.
 
 Each format's files are made once and then mutated: bits flipped, bytes overwritten by extremes, cut, doubled, inserted.
 The reading happens in a fork, so that a crash of a C library or a swollen memory is seen.

@@ -1,4 +1,4 @@
-"""Approximates the steps F_k of any memoryless sensor by curves over light, where sums are too long for a kernel.
+"""Approximates the steps F_k of any memoryless sensor by curves over light where sums are too long.
 
 A step falls from F_k(0) to F_k(infinity) within about 13 of the variable 2 sqrt(lambda), in which all Poisson laws have
 the same width. Each step has its own grid over that fall: cells of equal width in sqrt(lambda). In each cell a cubic

@@ -1,4 +1,4 @@
-"""Generation: the same bytes after kills, in shards, beside another generator, and with false reports of workers."""
+"""Generation: the same bytes after kills, in shards, beside another generator, and with false reports."""
 
 import functools
 import os

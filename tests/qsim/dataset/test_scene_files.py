@@ -1,4 +1,4 @@
-"""Scene files of the user: every file that a scene reads is found, and an edit before a resume is refused by name."""
+"""Scene files of the user: every file that a scene reads is found; an edit before a resume is refused."""
 
 import os
 import random

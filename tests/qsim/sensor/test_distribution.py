@@ -1,4 +1,4 @@
-"""The laws that follow from a cdf: probabilities, moments, likelihood, information, and codes of uniform numbers."""
+"""The laws that follow from a cdf: probabilities, moments, likelihood, information, codes of uniform numbers."""
 
 from __future__ import annotations
 

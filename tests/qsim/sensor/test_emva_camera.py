@@ -1,4 +1,4 @@
-"""Our sensor beside the camera of the package emva1288, the standard's own simulator: mean and variance of the codes.
+"""Mean and variance of our codes beside those of the camera in emva1288, the standard's own simulator.
 
 The simulator adds a uniform half code before it rounds, so that its codes vary by 1/12 more than those of one rounding.
 """

@@ -1,4 +1,4 @@
-"""Training windows: exact codes, keyed noise, the same bytes for any number of workers, targets at the right place."""
+"""Training windows: exact codes, keyed noise, equal bytes for any number of workers, targets in place."""
 
 from __future__ import annotations
 

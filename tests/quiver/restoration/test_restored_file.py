@@ -1,4 +1,4 @@
-"""One writer for each restored video, resumed only with the same codes, weights and settings, on a disk that fills."""
+"""One writer for each restored video, resumed only with equal codes, weights and settings; disks that fill."""
 
 from __future__ import annotations
 

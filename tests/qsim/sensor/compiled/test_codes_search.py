@@ -1,4 +1,4 @@
-"""The compiled engine against the reference over random sensors: the full range of every parameter, not chosen ones.
+"""The compiled engine against the reference over random sensors, in the full range of every parameter.
 
 A sensor may differ in 3 of its 41 472 pixels, all of a batch together in 5 pixels per million. Sensors that the engine
 hands to the reference, for all or more than half of their pixels, are counted: fewer than a tenth up to 8 bits.

@@ -1,4 +1,4 @@
-"""What every rival promises: any size, one frame, finite numbers and gradients, independent clips, its look-ahead.
+"""What every rival promises: any size, one frame, finite numbers and gradients, separate clips, look-ahead.
 
 The networks come from the function `small()` of every tests/support/golden_NAME.py.
 """
