@@ -120,3 +120,10 @@ def uniform(first: Array, second: Array | None = None) -> Array:
 def uniform_pair(first: Array, second: Array) -> tuple[Array, Array]:
     """Return (u, 1 - u) of two words, both with full relative precision."""
     return uniform(first, second), uniform(~first, ~second)
+
+
+def normal(below: Array, above: Array) -> Array:
+    """Return the standard normal numbers of (u, 1 - u), arrays of one shape: exact to rounding in both tails."""
+    from scipy.special import ndtri
+
+    return np.where(below < 0.5, ndtri(below), -ndtri(above))

@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.keys import Key, uniform_pair, words
+from qsim.keys import Key, normal, uniform_pair, words
 from qsim.sensor import paralyzable_steps
 from qsim.sensor.compiled.curves import Curves, below, by_pairs, falling
 from qsim.sensor.compiled.plan import MOST_BITS, Live, Plan
@@ -185,7 +185,7 @@ class CountingSPAD(SPAD):
 
         Error: that of the regularised gamma function, below 1e-11 in any probability (tested to 65 534 counts).
         """
-        from scipy.special import gammainc, gammaincc, ndtri
+        from scipy.special import gammainc, gammaincc
 
         below, above = (u.ravel() for u in uniform_pair(*(words(key, photons.shape, origin, n) for n in (0, 1))))
         arrivals, share = self.arrivals(photons, exposure).ravel(), self.dead_time / exposure
@@ -198,7 +198,7 @@ class CountingSPAD(SPAD):
             result[~low] = v[~low] <= gammainc(k[~low] + 1, live[~low])
             return result
 
-        guess = self._guess(arrivals, exposure, np.where(below < 0.5, ndtri(below), -ndtri(above)))
+        guess = self._guess(arrivals, exposure, normal(below, above))
         return search(passed, self.levels - 1, guess).reshape(photons.shape).astype(self.dtype)
 
     def slope_of(self, arrivals: Array, exposure: float) -> Array:

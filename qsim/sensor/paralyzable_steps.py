@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.keys import normal
 from qsim.sensor.qis_steps import search
 
 LEAST = 48.0  # dead times in an exposure from which the principal branch is the full sum, to 1e-12
@@ -102,10 +103,8 @@ def decide(ratio: float, top: int, below: Array, above: Array, mean: Array) -> t
 
     Both are [p], of (u, 1 - u) and Poisson means [p].
     """
-    from scipy.special import ndtri
-
     first, variance, third = moments(mean, ratio)
-    z = np.where(below < 0.5, ndtri(below), -ndtri(above))
+    z = normal(below, above)
     skew = third / np.maximum(variance, 1e-9)
     guess = np.rint(first + np.sqrt(variance) * z + skew * (z * z - 1) / 6)
     codes, near = np.empty(len(mean), np.intp), np.full(len(mean), np.inf)

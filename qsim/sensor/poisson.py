@@ -15,6 +15,8 @@ from functools import cached_property
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.keys import normal
+
 _UNDERFLOW = 1e-290  # below it, products of two representable factors may lose terms; logarithms are summed instead
 _DIM = 600.0  # Poisson mean up to which the recursion from exp(-mean) does not underflow; n steps lose n 1e-16
 _CHUNK = 1 << 21  # numbers in one block of work (16 MiB)
@@ -54,13 +56,13 @@ def poisson_quantile(mean: Array, below: Array, above: Array) -> Array:
     A normal approximation gives the first guess. Galloping steps and bisection on the regularised gamma function give
     the answer, from the smaller side of the distribution.
     """
-    from scipy.special import ndtri, pdtr, pdtrc
+    from scipy.special import pdtr, pdtrc
 
     def enough(n: Array) -> Array:  # P(N <= n) > u
         with np.errstate(invalid="ignore"):
             return (n >= 0) & np.where(below < 0.5, pdtr(n, mean) > below, pdtrc(n, mean) < above)
 
-    z = np.where(below < 0.5, ndtri(below), -ndtri(above))
+    z = normal(below, above)
     guess = np.maximum(np.floor(mean + np.sqrt(mean) * z + (z * z - 1) / 6), 0.0)
     low, high, step = guess - 1, guess, 1.0  # wanted: not enough(low), enough(high)
     while (missing := ~enough(high)).any():

@@ -12,7 +12,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.keys import Key, uniform_pair, words
+from qsim.keys import Key, normal, uniform_pair, words
 from qsim.sensor.compiled.plan import MOST_BITS, Live, Plan
 from qsim.sensor.distribution import require_bits, require_number
 from qsim.sensor.qis_steps import search
@@ -133,7 +133,7 @@ class BinarySPAD(SPAD):
 
         Error: that of the regularised beta function, below 1e-11 in any probability (tested at 9 and 16 bits).
         """
-        from scipy.special import betainc, ndtri
+        from scipy.special import betainc
 
         below, above = (u.ravel() for u in uniform_pair(*(words(key, photons.shape, origin, n) for n in (0, 1))))
         m, per_plane = self.planes, self.arrivals(photons, exposure).ravel() / self.planes
@@ -145,7 +145,7 @@ class BinarySPAD(SPAD):
             tail = betainc(np.where(low, m - k, k + 1.0), np.where(low, k + 1.0, m - k), np.where(low, q, p))
             return np.where(low, u >= tail, v <= tail)
 
-        z = np.where(below < 0.5, ndtri(below), -ndtri(above))
+        z = normal(below, above)
         guess = m * lit + z * np.sqrt(m * lit * dark)
         return search(passed, m, np.rint(guess)).reshape(photons.shape).astype(self.dtype)
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from stats import assert_histogram, assert_mean
 
-from qsim.keys import Key, hash_name, philox4x32, uniform, uniform_pair, words
+from qsim.keys import Key, hash_name, normal, philox4x32, uniform, uniform_pair, words
 
 
 def test_words_are_those_of_dr_jit():
@@ -85,6 +87,15 @@ def test_uniform_numbers_keep_their_digits_at_both_ends():
     assert (below[0], above[0]) == (2.0**-65, 1.0)
     below, above = uniform_pair(highest, highest)
     assert (below[0], above[0]) == (1.0, 2.0**-65)
+
+
+def test_normal_numbers_are_exact_in_both_tails():
+    """1 - 2^-65 is 1 as a float64; its number is the mirror of that of 2^-65."""
+    below, above = np.array([2.0**-65, 0.5, 1.0]), np.array([1.0, 0.5, 2.0**-65])
+    z = normal(below, above)
+    assert z[1] == 0
+    assert z[2] == -z[0]
+    assert math.erfc(z[2] / math.sqrt(2)) / 2 == pytest.approx(2.0**-65, rel=1e-12)
 
 
 def test_names_are_hashed_the_same_for_ever():
