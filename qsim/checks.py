@@ -140,7 +140,7 @@ def list_of(check: Callable[[Any], Any]) -> Callable[[Any], list[Any]]:
 
 
 def require_finite(name: str, values: np.ndarray) -> None:
-    """Raise `ValueError` with value and index of the first one that is not finite."""
+    """Raise `ValueError` with value and index of the first value that is not finite."""
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):
         index = tuple(int(i) for i in bad[0])

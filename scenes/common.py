@@ -28,7 +28,7 @@ HEIGHT, WIDTH = 512, 1024  # pixels; other sizes by Scene.resized, which keeps t
 FRAME_RATE = 2000.0  # Hz, the rate at which speed = 1 is defined
 PITCH = 1.1e-6  # m
 PHOTOGRAPHS = ("cat", "coffee", "astronaut", "rocket", "coins", "moon", "camera")
-CLIP = 0.016  # s, 33 frames; thrown things pass their middle at half of it
+CLIP = 0.016  # s, 33 frames; thrown bodies pass their middle at half of it
 
 T = TypeVar("T")
 

@@ -64,7 +64,7 @@ def _blocks(path: Path, bits: int, width: int | None, variable: str | None) -> I
         return _array_blocks(read_counts(path))
     if path.suffix == ".mat":
         if width is not None:
-            raise ValueError(f"{path}: --width is of packed planes, and a .mat holds one value per pixel; leave it out")
+            raise ValueError(f"{path}: --width acts on packed planes, and a .mat has one value per pixel; leave it out")
         return _array_blocks(mat_array(path, variable))
     recording = importing.read(path, Hints(bits=min(bits, 16), width=width, variable=variable), compared=("bits",))
     if recording.is_light or recording.bits != bits:

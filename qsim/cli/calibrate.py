@@ -87,7 +87,7 @@ COUNTS = 8  # bits; larger codes of a SPAD may be sums of planes, which the user
 def _calibration_kind(args: argparse.Namespace) -> tuple[str, int]:
     """Return (qis or spad, bits of a code); `ValueError` for options that exclude each other."""
     if args.static and (args.dark or args.flat):
-        raise ValueError("--static stands alone: a static scene takes the place of dark and flat frames")
+        raise ValueError("--static: a static scene replaces dark and flat frames; leave out --dark and --flat")
     sums = args.planes is not None and args.planes > 1
     model = args.model or ("spad" if args.static or args.planes is not None else "qis")
     for option, given, acts, why in (

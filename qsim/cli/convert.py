@@ -109,7 +109,7 @@ def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
     _refuse_what_cannot_act(args, kind, args.input.suffix != ".json")
     wanted = exporting.Export(kind, args.transfer or "gamma 2.2", args.white, not args.lossy)
     if args.white is not None and (kind not in ("mp4", "png") or args.input.suffix == ".json"):
-        raise ValueError("--white: is of light written as mp4 or png; leave it out")
+        raise ValueError("--white: acts on light written as mp4 or png; leave it out")
     if not (args.input / "dataset.json").is_file():
         opened = Stream.open(args.input) if args.input.suffix == ".json" else Clip.open(args.input)
         return [exporting.described(opened, args.output, wanted, force=args.force)]

@@ -84,7 +84,7 @@ def _cluster(args: argparse.Namespace) -> Any:
         raise ValueError(f"--gpus: expected 0 or more, got {args.gpus}")
     if args.cluster is None:
         if args.gpus:
-            raise ValueError("--gpus: needs --cluster, whose workers say how many they have; leave it out here")
+            raise ValueError("--gpus: needs --cluster, whose workers state their GPUs; leave it out here")
         return None
     for option, given, instead in (("workers", args.workers, "nworkers"), ("memory", args.memory, "memory-limit")):
         if given is not None:

@@ -68,7 +68,7 @@ def _run_preview(args: argparse.Namespace) -> int:
     if target is None:
         refuse_idle(args, "preview in the terminal", ["force", "scale"])
     if args.fps is not None and (not args.play if target is None else target.suffix == ".png"):
-        raise ValueError("--fps: one picture has no rate; leave it out, or ask for a film (.mp4, .gif) or --play")
+        raise ValueError("--fps: one picture has no rate; leave it out, write a film (.mp4, .gif), or use --play")
     if args.frame is not None and (args.play or args.fps is not None):
         raise ValueError("--frame: shows one frame; leave out --play and --fps, or leave it out for a film of all")
     args.fps = 12.0 if args.fps is None else args.fps

@@ -223,7 +223,7 @@ class Clip:
 
     def _check_frame(self, t: int) -> None:
         if not 0 <= t < len(self):
-            raise ValueError(f"{self.path}: frame {t} asked for, the clip has frames 0..{len(self) - 1}")
+            raise ValueError(f"{self.path}: frame {t} does not exist; the clip has frames 0..{len(self) - 1}")
 
 
 def _why_not(path: Path) -> str:

@@ -179,7 +179,7 @@ def _kept(clip: Clip, sensing: Sensing, draw: Draw, meta: dict[str, Any]) -> Str
 def replay(clip: Clip, stream: Stream, frame: int) -> tuple[Array, Array]:
     """Return one frame drawn again from the stream's json, and the stored frame: codes [H, W] each."""
     if not 0 <= frame < len(stream):
-        raise ValueError(f"{stream.path}: frame {frame} asked for, the stream has frames 0..{len(stream) - 1}")
+        raise ValueError(f"{stream.path}: frame {frame} does not exist; the stream has frames 0..{len(stream) - 1}")
     return stored(stream).frames(clip, frame, frame + 1)[0], stream.codes(frame, frame + 1)[0]
 
 

@@ -142,7 +142,7 @@ class Stream:
         frames, height, width = self.shape
         stop = frames if stop is None else stop
         if not 0 <= start < stop <= frames:
-            raise ValueError(f"{self.path}: frames {start}..{stop} asked for, the stream has {frames}")
+            raise ValueError(f"{self.path}: frames {start}..{stop} do not all exist; the stream has {frames}")
         if crop is None:
             return packing.unpack(np.asarray(self.packed[start:stop]), self.bits, width)
         y, x, h, w = check_crop(crop, height, width, str(self.path))

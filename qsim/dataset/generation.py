@@ -200,7 +200,7 @@ def _begin(recipe: Recipe, folder: Path, repair: bool) -> tuple[str, ...]:
         if old[job.name]["digest"] == job.digest_with():
             raise ValueError(_of_earlier_version(folder))
         if old[job.name]["digest"] != job.digest:
-            raise ValueError(f"{folder}: its clip {job.name} was asked for with other settings; use another folder")
+            raise ValueError(f"{folder}: its clip {job.name} was made with other settings; use another folder")
     extra = sorted(set(old) - {job.name for job in recipe.jobs})
     if extra:
         raise ValueError(f"{folder}: holds the clip {extra[0]}, which is not in this recipe; use another folder")
@@ -307,7 +307,7 @@ def _runner(options: Options) -> Executor:
 
 @contextlib.contextmanager
 def watching(folder: Path, jobs: list[Job], report: Progress, every: float = 0.5) -> Iterator[None]:
-    """Call `report(frames done, frames in all)` while the block runs, whichever process or machine renders them."""
+    """Call `report(frames done, frames in all)` while the block runs, for all processes and machines."""
     total = sum(job.settings.frames for job in jobs)
     stop = threading.Event()
 

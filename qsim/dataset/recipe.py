@@ -60,7 +60,7 @@ class Recipe:
 
 
 def load(path: str | Path) -> Recipe:
-    """Read a recipe; `FileNotFoundError`, or `ValueError` as `FILE:LINE: what is wrong, what to do`."""
+    """Read a recipe; `FileNotFoundError`, or `ValueError` as `FILE:LINE: error, remedy`."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such recipe")
@@ -96,7 +96,7 @@ def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
 
 
 def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
-    """`ValueError` for a clip asked for twice, a split that shares a scene, or too few frames for a sum.
+    """`ValueError` for a clip that is listed twice, a split that shares a scene, or too few frames for a sum.
 
     A scene may be in one split only, and a family of the test split in no other split.
     """
@@ -105,15 +105,15 @@ def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
     tested = {job.stem for job, _ in jobs if job.split == "test"}
     for job, section in jobs:
         if job.name in seen:
-            raise ValueError(f"{section.where()}: the clip {job.name} is asked for twice; give one of them other seeds")
+            raise ValueError(f"{section.where()}: the clip {job.name} is listed twice; give one of them other seeds")
         seen.add(job.name)
         same = job.family.endswith(".xml")  # the seed of such a scene changes its samples only
         scene = job.stem if same else job.scene
         if split_of.setdefault(scene, job.split) != job.split:
-            cure = "an .xml scene is one scene whatever the seed: leave one of them out"
+            cure = "an .xml scene is the same scene at every seed: leave one of them out"
             raise ValueError(
                 f"{section.where()}: scene {scene} is in the splits '{split_of[scene]}' and '{job.split}'; "
-                + (cure if same else "splits are by scene, whatever the speed: give one of them other seeds")
+                + (cure if same else "splits are by scene, at any speed: give one of them other seeds")
             )
         if job.split != "test" and job.stem in tested:
             raise ValueError(
@@ -139,7 +139,7 @@ def _jobs(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[
     speeds = given.get("speed", [1.0])
     if family.endswith(".xml") and speeds != [1.0]:
         raise ValueError(
-            f"{section.where('speed')}: an .xml scene stands still, its speed changes nothing; leave it out"
+            f"{section.where('speed')}: an .xml scene has no motion, so speed changes nothing; leave it out"
         )
     split = given.get("split", "train")
     settings = Settings(**(defaults | _settings(given)))

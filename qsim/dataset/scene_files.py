@@ -147,7 +147,7 @@ def _tracing() -> Iterator[_Trace]:
 
 
 def _see(event: str, arguments: tuple[Any, ...]) -> None:
-    """Audit hook: record what a scene opens or lists while it is made, except for imports and the renderer."""
+    """Record, as an audit hook, files that a scene opens or lists while it is made; omit imports and the renderer."""
     if event not in ("open", "os.listdir", "os.scandir") or (trace := _active.get()) is None:
         return
     with contextlib.suppress(Exception):  # a hook that raises would stop the scene

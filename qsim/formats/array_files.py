@@ -247,6 +247,6 @@ def write_zarr(folder: Path, blocks: Iterator[Array], shape: tuple[int, int, int
             chunks = (per_chunk, *shape[1:])
             array = group.create_array(
                 "frames", shape=shape, chunks=chunks, dtype=block.dtype, config={"write_empty_chunks": True}
-            )  # dark chunks too: a reader cannot tell one that was left out from one that was lost
+            )  # dark chunks too: a reader cannot distinguish an omitted chunk from a lost one
         array[start : start + len(block)] = block
         start += len(block)

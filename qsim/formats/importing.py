@@ -67,7 +67,7 @@ class _Watched:
 
 @dataclass(frozen=True)
 class Import:
-    """How a recording was taken, which files rarely state."""
+    """Facts about a recording that its files rarely state."""
 
     frame_rate: float  # Hz
     exposure: float | None = None  # s; None: the whole frame

@@ -50,7 +50,7 @@ class Hints:
     bits: int | None = None
     transfer: str | None = None  # how the light in a picture was coded: linear, srgb, gamma 2.2
     channel: int | None = None  # of a colour cube: 0, 1, 2
-    flip: str = "none"  # lr, ud or both: put right what a reader of unknown convention turned
+    flip: str = "none"  # lr, ud or both: undoes the orientation of a layout with unknown convention
     columns: int | None = None  # keep only the first columns (raw Vidar dumps have 416, of which 400 are pixels)
     stretched: bool = False  # codes were stretched to 0 ... 255
     variable: str | None = None  # the array of a .mat file, where it holds several

@@ -47,7 +47,7 @@ def denoised(noisy: Array, albedo: Array, normal: Array) -> Array:
     `ValueError` if the denoiser is not installed.
     """
     if not available():
-        raise ValueError("denoising asked for, but Open Image Denoise is missing: pip install 'qsim[denoise]'")
+        raise ValueError("denoising requires Open Image Denoise, which is missing: pip install 'qsim[denoise]'")
     import pyoidn
 
     colour = np.repeat(noisy[..., None].astype(np.float32), 3, axis=2)

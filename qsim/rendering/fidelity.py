@@ -77,7 +77,7 @@ def choose_budget(
     outside 10 to 80 dB and for a scene without light.
     """
     if not 10 <= psnr <= 80:
-        raise ValueError(f"psnr: 10 to 80 dB can be asked for, got {psnr!r}")
+        raise ValueError(f"psnr: expected 10 to 80 dB, got {psnr!r}")
     pilot = Pilot.of(scene, frame_rate, shutter, frames, seed)
     full = pilot.mean(COUNTS[1], DEEPEST)
     if not full.mean() > 0:
@@ -105,7 +105,7 @@ def choose_budget(
     share = math.sqrt(1 - min(allowed.fraction(left_out), SHARE) ** 2 - min(blurred, SHARE) ** 2)
     noise = Noise.of(halves, allowed.white)
     samples, about_samples = fewest_samples(noise, instants, allowed, share)
-    fewer, about_denoiser = None, Finding("denoiser", "off", "not asked for")
+    fewer, about_denoiser = None, Finding("denoiser", "off", "not requested")
     if denoise is not False:
         fewer, about_denoiser = denoised_samples(
             pilot, instants, bounces, allowed, share, samples, denoise, lambda n: noise.at(n / instants, instants)
@@ -140,7 +140,7 @@ def shortfall(reached: Stated | None, asked: float) -> str:
     if reached is None or reached.unclamped is None or reached.psnr >= asked - 0.5:
         return ""
     why = "the pilot estimated less error or more light; request a higher psnr for more samples"
-    return f"{reached.line}, where {asked:g} were asked for: {why}"
+    return f"{reached.line}, where {asked:g} were requested: {why}"
 
 
 def allowed_in(image: Array, psnr: float, ppp: float | None, efficiency: float) -> tuple[Allowed, Finding]:

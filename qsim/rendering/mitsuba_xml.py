@@ -31,7 +31,7 @@ def read_mitsuba(xml: str | Path, motions: Mapping[str, Pose] | None = None, *, 
 
     Without `camera` the file's first sensor is taken, a pinhole of its field of view and size behind an f/2.8 lens on
     pixels of 1.1 um. The file's integrator and samples do not count. `FileNotFoundError` for a missing file;
-    `ValueError` for one that Mitsuba refuses, without light, with participating media, with a camera that is not a
+    `ValueError` for a file that Mitsuba refuses, without light, with participating media, with a camera that is not a
     plain `perspective`, and for motions of unknown shapes or of shapes that cannot be moved rigidly.
     """
     select()

@@ -26,10 +26,10 @@ from qsim.scene import Scene, Still
 COUNTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
 PIXELS = 3000  # of the frame that a pilot renders, about
 MOST_MORE = 3  # frames added for hidden bodies, and as many for fast motion
-WINDOW = 96  # px, side of the windows in which the denoiser is tried, one in the middle of each quarter of the frame
+WINDOW = 96  # px, side of the windows in which the denoiser is tested, one in the middle of each quarter of the frame
 MOST_LOOKS = 256  # frames of a clip in which motion and bodies are measured
 STAGE = 18  # of the random keys
-LUCK = 3.0  # a trial with so many times less raw noise than the pilot missed rare paths by chance
+LUCK = 3.0  # a trial with this many times less raw noise than the pilot's missed rare paths by chance
 CAREFUL = 2.0  # standard errors added to the error of a trial, whose result holds for the complete clip
 MOST_DENOISED = 256  # samples per instant up to which the error of denoised pictures is extrapolated
 

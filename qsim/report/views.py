@@ -54,7 +54,7 @@ class Source:
 def open_source(path: Path, *, bits: int | None = None, width: int | None = None, stream: str | None = None) -> Source:
     """Open a clip folder, a stream (.npy or .json) or an array [T, H, W] or [H, W] in a .npy.
 
-    For an array of whole numbers, `bits` means codes and `width` packed binary planes of so many columns. `stream`
+    For an array of whole numbers, `bits` means codes and `width` packed binary planes of that many columns. `stream`
     selects one of a clip's streams (default: the first). Raise `FileNotFoundError` or `ValueError` for other paths.
     """
     if (path / "dataset.json").is_file():
@@ -75,7 +75,7 @@ def open_source(path: Path, *, bits: int | None = None, width: int | None = None
 
 
 def _refuse(path: Path, what: str, **options: int | str | None) -> None:
-    """Raise `ValueError` for options that do not apply to what a path holds."""
+    """Raise `ValueError` for options that do not apply to the content of a path."""
     for name, value in options.items():
         if value is not None:
             raise ValueError(f"{path}: is {what}; leave out --{name}")

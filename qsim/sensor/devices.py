@@ -78,7 +78,7 @@ def _gain(name: str, ppp: float, bits: int) -> float:
 
 @dataclass(frozen=True)
 class Device:
-    """One named sensor: how it is made, and where each number comes from."""
+    """One named sensor: the function that makes it, and the source of each number."""
 
     name: str
     what: str  # one line
@@ -232,7 +232,7 @@ def load(name: str | Path, *, ppp: float | None = None, bits: int | None = None,
         )
     sensor = from_toml(path)
     if bits is not None and bits != sensor.bits:
-        raise ValueError(f"{path}: the file has bits = {sensor.bits}, asked for {bits}; change one of them")
+        raise ValueError(f"{path}: the file has bits = {sensor.bits}, the request {bits}; change one of them")
     return sensor
 
 

@@ -42,7 +42,7 @@ class Response:
     def cap(self, samples: int) -> float:
         """Return the largest estimate [photons] from the mean of `samples` codes: half a count below saturation.
 
-        `ValueError` if the mean of so many codes does not resolve the response at all.
+        `ValueError` if the mean of this many codes does not resolve the response at all.
         """
         if self.mean[-1] - 0.5 / samples <= self.mean[0]:
             raise ValueError(
@@ -240,7 +240,7 @@ def _estimate(likelihood: _Likelihood, grid: _Grid, confidence: float) -> Array:
 def _crossing(likelihood: _Likelihood, grid: _Grid, table: Array, start: Array, target: Array, direction: int) -> Array:
     """Return the light at which the log-likelihood first falls to `target` below (-1) or above (+1) `start`: [h].
 
-    It is 0 or infinity where the likelihood does not fall so far.
+    It is 0 or infinity if the likelihood does not fall that far.
     """
     photons, size = grid.photons, len(grid.photons)
     low_enough = table < target[:, None]

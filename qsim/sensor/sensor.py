@@ -168,7 +168,7 @@ class Sensor(Distribution):
         return codes
 
     def draw_block(self, photons: Array, exposure: float, key: Key, origin: tuple[int, int], planes: int = 0) -> Array:
-        """Return the reference's codes [H, W] of photons [H, W]; with `planes`, of so many frames: [planes, H, W]."""
+        """Return the reference's codes [H, W] of photons [H, W]; with `planes`, of that many frames: [planes, H, W]."""
         shape = (planes, *photons.shape) if planes else photons.shape
 
         def second(undecided: Array) -> Array:

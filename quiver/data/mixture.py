@@ -83,7 +83,9 @@ def _changed(noise: Noise, sensor: str | None, ppp: float | None, bits: int | No
         noise = replace(noise, ppp=ppp, lux=None)
     if bits is not None and bits != noise.bits:
         if noise.record is not None:
-            raise ValueError(f"{noise.sensor}: the file has bits = {noise.bits}, asked for {bits}; change one of them")
+            raise ValueError(
+                f"{noise.sensor}: the file has bits = {noise.bits}, the request {bits}; change one of them"
+            )
         noise = replace(noise, bits=bits)
     return noise
 

@@ -29,7 +29,7 @@ NEGLIGIBLE = 1e-6  # chance of an afterpulse chain that is as long as the frames
 
 @dataclass(frozen=True)
 class WindowPlace:
-    """Where sample n lies and how it is turned: enough to draw it again."""
+    """Place and orientation of sample n: enough to draw it again."""
 
     clip: int
     start: int

@@ -79,7 +79,7 @@ def measure(
     """Measure the missing cells of a weights file, and store each in its metadata at once.
 
     Several processes may measure one file. With `force`, requested cells are measured again, and cells measured
-    otherwise (other clips, methods, seed or version) are removed. The tensors of the file stay as they are.
+    otherwise (other clips, methods, seed or version) are removed. The tensors of the file are unchanged.
     `ValueError` for methods that are not classical, and for cells measured otherwise without `force`.
     """
     methods = restorers(settings.methods, options)

@@ -30,7 +30,7 @@ MAX_CELLS = 10_000
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Where a stream lies: the quantities that decide how informative its codes are."""
+    """The quantities of a stream that decide how informative its codes are."""
 
     model: str  # of the sensor: QIS, BinarySPAD, CountingSPAD
     bits: int

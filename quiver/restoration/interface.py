@@ -22,7 +22,7 @@ RestoreInto = Callable[[Codes, Array, int, Progress | None], None]
 
 @dataclass(frozen=True)
 class RestoreOptions:
-    """How to run, not what to compute: apart from `mode` and `precision` the numbers agree to rounding.
+    """Options of a run. Apart from `mode` and `precision` they change results by rounding only.
 
     There is one exception: a QUIVER network whose complete frame exceeds the memory. A warning then states the
     difference.

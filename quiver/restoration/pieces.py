@@ -1,4 +1,4 @@
-"""Decides how much of a frame a network computes at a time, so that the memory bound holds and the answer stays.
+"""Decides how much of a frame a network computes at a time, within the memory bound and with the same result.
 
 A U-Net has a reach of 36 px: tiles that overlap by twice as much give the result of the complete frame. The attention
 and the gates of QUIVER average over the frame, and its recurrence reaches far: it takes the complete frame. Only the
@@ -31,12 +31,12 @@ class Pieces:
 
     tiles: list[Tile]
     estimate_pixels: int | None = None  # of the initial estimate at a time; None: the complete tile
-    exact: bool = True  # whether the answer is that of the complete frame
+    exact: bool = True  # whether the result is that of the complete frame
     needed: int = 0  # bytes, about, for an exact cut; 0 for an exact one
 
     @property
     def text(self) -> str:
-        """Return the tiles of a cut that changes the answer; empty for one that does not."""
+        """Return the tiles of a cut that changes the result; empty for a cut that does not."""
         if self.exact:
             return ""
         tallest, widest = (max(tile.weight.shape[axis] for tile in self.tiles) for axis in (0, 1))

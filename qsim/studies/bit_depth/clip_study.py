@@ -101,7 +101,7 @@ def check_clip(clip: Clip, settings: StudySettings) -> None:
     if len(clip) < settings.longest:
         raise ValueError(
             f"{clip.path}: {len(clip)} frames; {settings.bits[-1]} bits at speed {settings.speed} need "
-            f"{settings.longest}; ask for fewer bits, or render a longer clip"
+            f"{settings.longest}; use fewer bits, or render a longer clip"
         )
 
 

@@ -28,7 +28,7 @@ class StudySettings:
     bits: tuple[int, ...] = (1, 2, 3, 4, 5)
     sensor: str = "quiver-physical"  # of the multi-bit read
     plane: str | None = None  # of a binary plane; None: a clocked SPAD of the same efficiency and dark rate
-    ppp: float | None = None  # photons per pixel and clip frame; None: light as it is
+    ppp: float | None = None  # photons per pixel and clip frame; None: light unchanged
     speed: int = 1  # every so many-th clip frame is a plane: the motion is so many times faster
     instants: int = 8  # largest number of output frames that are drawn and scored
     seed: int = 0

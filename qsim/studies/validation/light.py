@@ -50,7 +50,7 @@ class LightRow:
 
     @property
     def ok(self) -> bool:
-        """Whether the error is as wanted, and the light differs by the announced share."""
+        """Whether the error is as requested, and the light differs by the announced fraction."""
         return self.reached > self.asked - MISSED and abs(self.light + self.announced) < ENOUGH * self.light_error
 
 
@@ -65,7 +65,7 @@ class LightReport:
 
     @property
     def ok(self) -> bool:
-        """Whether all rows are."""
+        """Whether all rows are within their bounds."""
         return all(row.ok for row in self.rows)
 
     def to_dict(self) -> dict[str, Any]:

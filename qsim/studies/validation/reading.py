@@ -44,7 +44,7 @@ class ReadingReport:
 
     @property
     def ratio(self) -> float:
-        """How many times more windows per second ours reads."""
+        """Windows per second from the clip folder, divided by those from the mp4."""
         return self.clip / self.mp4
 
     @property

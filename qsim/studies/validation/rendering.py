@@ -63,12 +63,12 @@ class RenderRow:
 
     @property
     def ratio(self) -> float:
-        """How many times faster ours is."""
+        """Seconds of the naive loop divided by ours."""
         return self.naive_seconds / self.seconds
 
     @property
     def processor_ratio(self) -> float:
-        """How many times less processor time ours takes."""
+        """Processor seconds of the naive loop divided by ours."""
         return self.naive_processor / self.processor
 
     def to_dict(self) -> dict[str, Any]:

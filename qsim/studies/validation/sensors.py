@@ -3,7 +3,7 @@
     run() -> SensorReport: rows (speed, error of the cdf, chi-square, mismatches, z-scores), hard cases
     SensorReport.ok is false if any number is outside its bounds; speeds count only if required
 
-The bounds are those of a correct program: exact forms to rounding, statistics to a false alarm of 1e-6 for the whole
+A correct program meets all bounds: exact forms to rounding, statistics to a false alarm of 1e-6 for the whole
 report, compiled codes to 5 in a million.
 """
 

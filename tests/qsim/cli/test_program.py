@@ -174,7 +174,7 @@ def test_replay_draws_the_stored_frame_again(made: Path, capsys: pytest.CaptureF
     assert code == 0
     assert json.loads(out) == {"clip": "fan_0001", "stream": name, "frame": 2, "pixels": 80, "differ": 0}
     for wrong, message in [
-        ("fan_0001:3", "frame 3 asked for"),
+        ("fan_0001:3", "frame 3 does not exist"),
         ("fan_0009:0", "no clip fan_0009"),
         ("x", "CLIP:FRAME"),
     ]:

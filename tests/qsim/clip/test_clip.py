@@ -33,7 +33,7 @@ def test_crops_are_crops(tmp_path: Path):
     for crop in [(-1, 0, 2, 2), (0, 0, 0, 2), (6, 0, 5, 2), (0, 4, 2, 4)]:
         with pytest.raises(ValueError, match="is not inside 10 x 7"):
             clip.radiance(0, crop)
-    with pytest.raises(ValueError, match=r"frame 5 asked for, the clip has frames 0\.\.4"):
+    with pytest.raises(ValueError, match=r"frame 5 does not exist; the clip has frames 0\.\.4"):
         clip.radiance(5)
 
 

@@ -96,7 +96,7 @@ def test_a_clip_that_only_lacks_the_rename_is_not_made_again(tmp_path: Path, mon
             write(tmp_path / "a")
     frame = part / "radiance" / "000000.exr"
     made, kept = frame.stat().st_ino, frame.read_bytes()
-    with pytest.raises(ValueError, match=r"a\.part: 5 frames are there, asked for with other settings"):
+    with pytest.raises(ValueError, match=r"a\.part: 5 frames exist, begun with other settings"):
         write(tmp_path / "a", shape=[FRAMES - 1, HEIGHT, WIDTH])
     assert interrupted(tmp_path / "a") == list(range(FRAMES))
     clip = write(tmp_path / "a")
@@ -118,7 +118,7 @@ def test_a_damaged_frame_of_an_interrupted_writer_is_written_again(tmp_path: Pat
 def test_other_settings_are_refused_or_start_again(tmp_path: Path):
     interrupted(tmp_path / "a", 0)
     assert interrupted(tmp_path / "a", 1) == [0]
-    with pytest.raises(ValueError, match=r"a\.part: 2 frames are there, asked for with other settings"):
+    with pytest.raises(ValueError, match=r"a\.part: 2 frames exist, begun with other settings"):
         interrupted(tmp_path / "a", frame_rate=1000.0)
     assert interrupted(tmp_path / "a") == [0, 1]
     assert interrupted(tmp_path / "a", force=True, frame_rate=1000.0) == []

@@ -160,7 +160,7 @@ def test_another_recipe_in_the_same_folder_is_refused(tmp_path: Path):
     folder = tmp_path / "d"
     generate(SMALL, folder, HERE, make=make)
     for old, new, message in [
-        ("frames = 3", "frames = 4", "clip fan_0000 was asked for with other settings"),
+        ("frames = 3", "frames = 4", "clip fan_0000 was made with other settings"),
         ("seeds = [0, 1]", "seeds = [0, 1, 2]", "without the clip fan_0002"),
         ("seeds = [0, 1]", "seeds = [0]", "holds the clip fan_0001, which is not in this recipe"),
     ]:

@@ -169,7 +169,7 @@ def test_a_data_set_of_an_earlier_version_goes_by_the_scene_file_alone(place: Pa
     edit(place / "data.csv", random.Random(0))
     assert generate(own, tmp_path / "d", HERE, make=make).done == 2
     edit(path, random.Random(0))
-    with pytest.raises(ValueError, match="asked for with other settings"):
+    with pytest.raises(ValueError, match="made with other settings"):
         generate(only(wanted(path), "wheel"), tmp_path / "d", HERE, make=make)
 
 

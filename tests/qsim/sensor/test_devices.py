@@ -152,5 +152,5 @@ def test_other_mistakes_say_what_to_do(tmp_path):
         load(tmp_path / "absent.toml")
     path = tmp_path / "mine.toml"
     path.write_text("[sensor]\n" + "".join(f"{key} = {value}\n" for key, value in GOOD.items()))
-    with pytest.raises(ValueError, match="the file has bits = 1, asked for 3"):
+    with pytest.raises(ValueError, match="the file has bits = 1, the request 3"):
         load(path, bits=3)

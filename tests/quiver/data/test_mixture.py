@@ -73,7 +73,7 @@ def test_a_sensor_file_brings_its_bits_and_defects(tiny_dataset, tmp_path):
     file = sensor_file(tmp_path, QIS + "prnu = 0.02\ndead = 0.01\ndark = {{ spread = 0.3 }}\n", 4)
     found = "noise: mine, 4 bits, 3.25 PPP, dark-current spread, PRNU 2 %, 1 % dead pixels (as asked for)"
     assert lines(tiny_dataset, tmp_path / "r", sensor=file) == [found]
-    with pytest.raises(ValueError, match="the file has bits = 4, asked for 2"):
+    with pytest.raises(ValueError, match="the file has bits = 4, the request 2"):
         lines(tiny_dataset, tmp_path / "r", sensor=file, bits=(2,))
 
 
