@@ -97,7 +97,7 @@ def _cluster(args: argparse.Namespace) -> Any:
     from qsim.dataset.dask_cluster import Cluster
 
     if not args.cluster.startswith("tls://"):
-        note(f"{args.cluster}: without TLS, so anybody who reaches this port can run any program as its workers' user")
+        note(f"{args.cluster}: without TLS, so anyone who can reach this port can run any program as its workers' user")
     return Cluster(args.cluster, gpus=args.gpus)
 
 

@@ -56,7 +56,7 @@ def _run_restore(args: argparse.Namespace) -> int:
 
     target: Path = args.output
     if target.suffix != ".npy":
-        raise ValueError(f"{target}: restored video is written as .npy; name a file that ends so")
+        raise ValueError(f"{target}: restored video is written as .npy; name a .npy file")
     codes = codes_to_restore(args)
     for path in (target, target.with_suffix(".json")):
         if path.exists() and not args.force:

@@ -103,7 +103,7 @@ MISTAKES = [
         "qsim convert light.npy data --force --frame-rate 2000 --exposure 1e-4 --transfer linear",
         "data: exists and is no",
     ),
-    ("quiver restore lit -o x --ppp 3", "x: restored video is written as .npy; name a file that ends so"),
+    ("quiver restore lit -o x --ppp 3", "x: restored video is written as .npy; name a .npy file"),
     ("qsim render lit -o x", "lit: is a clip, made from a scene already"),
     ("qsim render raises.py -o x", "raises.py:2: ZeroDivisionError: division by zero"),
     ("quiver restore text.txt -o x.npy", "text.txt: not a stream, clip folder or .npy array"),

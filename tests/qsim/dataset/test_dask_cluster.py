@@ -258,7 +258,7 @@ def test_a_scheduler_without_tls_is_named(options_used: list[Options], capsys: p
     """A scheduler accepts pickled work from every client; the warning comes before anything is sent."""
     assert qsim.cli.program.main(["generate", "r.toml", "--cluster", "tcp://127.0.0.1:1"]) == 0
     assert (
-        "tcp://127.0.0.1:1: without TLS, so anybody who reaches this port can run any program"
+        "tcp://127.0.0.1:1: without TLS, so anyone who can reach this port can run any program"
         in capsys.readouterr().err
     )
     assert qsim.cli.program.main(["generate", "r.toml", "--cluster", "tls://127.0.0.1:1"]) == 0
