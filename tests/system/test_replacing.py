@@ -120,7 +120,7 @@ def test_an_export_replaces_only_an_export(tmp_path: Path, kind: str):
         else:
             place.mkdir()
             (place / "precious").write_text("mine")
-        with pytest.raises(FileExistsError, match="was not made by"):
+        with pytest.raises(FileExistsError, match="was not written by"):
             exporting.export(source, target, Export(kind), force=True)
         if place.is_dir():
             (place / "meta.json").write_text('{"software": {"qsim": "0.1.0"}}')
@@ -133,7 +133,7 @@ def test_an_export_replaces_only_an_export(tmp_path: Path, kind: str):
             place.unlink()
     (tmp_path / "elsewhere").mkdir()
     target.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(FileExistsError, match="was not made by"):
+    with pytest.raises(FileExistsError, match="was not written by"):
         exporting.export(source, target, Export(kind), force=True)
     target.unlink()
     for force in (False, True, True):

@@ -81,7 +81,7 @@ def test_denoising_without_the_package_is_refused(monkeypatch):
     from qsim.rendering import denoiser
 
     monkeypatch.setattr(denoiser, "available", lambda: False)
-    with pytest.raises(ValueError, match="Open Image Denoise is missing"):
+    with pytest.raises(ValueError, match="denoising requires Open Image Denoise, which is missing"):
         renderer(plate(None), budget=Budget(2, 1, denoise=True)).frame(0)
 
 
