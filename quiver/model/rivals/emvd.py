@@ -19,18 +19,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.checks import shown
 from qsim.structure import make
-from quiver.model.config import flag, real_number, whole_number
+from quiver.model.config import flag, whole_number
 from quiver.model.rivals.edges import check_frames, pad_space
+from quiver.model.rivals.noise import VARIANCE, numbers, variance_at, variance_table
 
 IMAGE = 4  # channels of an image
 BANDS = 4  # blocks of a wavelet transform, each with the channels of an image
 SCALES = 3
-# Variance of codes/7 at mean codes/7 of 0, 1/14 ... 1: a QIS of three bits with quantum efficiency 0.8, read noise
-# 0.2 e- and gain 1.077, exact to 0.9 % of the largest. White hardly fluctuates, as it is clipped.
-VARIANCE = (0.0002, 0.0107, 0.0217, 0.033, 0.0443, 0.0549, 0.064, 0.0707, 0.0742, 0.0737, 0.0687, 0.0588, 0.0437,
-            0.0235, 0.0)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -48,13 +44,10 @@ class EMVDConfig:
         whole_number("EMVDConfig.width", self.width, 1, 1024)
         for name in ("space_to_depth", "as_published"):
             flag(f"EMVDConfig.{name}", getattr(self, name))
-        for name, least, most in (("variance", 2, 4096), ("published_noise", 2, 2)):
-            values = getattr(self, name)
-            if not isinstance(values, list | tuple) or not least <= len(values) <= most:
-                raise ValueError(f"EMVDConfig.{name} must be {least} to {most} numbers, got {shown(values)}")
-            for value in values:
-                real_number(f"EMVDConfig.{name}", value, 0, 1e3)
-            object.__setattr__(self, name, tuple(values))
+        variance = variance_table("EMVDConfig.variance", self.variance)
+        published = numbers("EMVDConfig.published_noise", self.published_noise, 2, 2)
+        object.__setattr__(self, "variance", variance)
+        object.__setattr__(self, "published_noise", published)
 
     def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON."""
@@ -180,13 +173,6 @@ class NoiseMap(nn.Module):
         if self.as_published:
             return brightness.clamp(0, 1) * self.slope + self.offset
         return self.correlation * variance_at(brightness / self.gain, self.variance.to(low.dtype))
-
-
-def variance_at(mean: Tensor, table: Tensor) -> Tensor:
-    """Return the variance at means [...], clipped to 0 ... 1, from its values [n] at equal steps of the mean."""
-    place = mean.clamp(0, 1) * (len(table) - 1)
-    below = place.detach().long().clamp(max=len(table) - 2)
-    return torch.lerp(table[below], table[below + 1], place - below)
 
 
 class SmallNet(nn.Module):

@@ -36,11 +36,10 @@ from quiver.model.config import flag, real_number, whole_number
 from quiver.model.deformable import warp
 from quiver.model.ops.splatting import average_splat
 from quiver.model.rivals.edges import check_frames, pad_space, reflected
-from quiver.model.rivals.emvd import VARIANCE, variance_at
+from quiver.model.rivals.noise import VARIANCE, deviation_map, variance_table
 
 LEAST_SIDE = 10  # px
 VALID = 0.9999  # least part of a warped pixel that must come from inside
-LEAST_VARIANCE = 1e-6  # keeps the slope of the deviation finite
 
 
 @dataclass(frozen=True)
@@ -55,6 +54,7 @@ class FloRNNConfig:
     flow_channels: tuple[int, ...] = (32, 64, 32, 16)  # of the flow network; none: the flow must be given
     flow_kernel: int = 7
     flow_levels: int = 4
+    variance: tuple[float, ...] = VARIANCE  # of codes/(2^b - 1), at equal steps of their mean from 0 to 1
     as_published: bool = False  # noise map zero
 
     def __post_init__(self) -> None:
@@ -71,6 +71,7 @@ class FloRNNConfig:
         for channels in self.flow_channels:
             whole_number("FloRNNConfig.flow_channels", channels, 1, 1024)
         object.__setattr__(self, "flow_channels", tuple(self.flow_channels))
+        object.__setattr__(self, "variance", variance_table("FloRNNConfig.variance", self.variance))
         flag("FloRNNConfig.as_published", self.as_published)
 
     def to_dict(self) -> dict[str, object]:
@@ -109,7 +110,7 @@ class FloRNN(nn.Module):
         self.flow = (
             FlowNetwork(config.flow_channels, config.flow_kernel, config.flow_levels) if config.flow_channels else None
         )
-        self.register_buffer("variance", torch.tensor(VARIANCE), persistent=False)
+        self.register_buffer("variance", torch.tensor(config.variance), persistent=False)
         self.variance: Tensor
 
     def forward(self, frames: Tensor, flows: Flows | None = None) -> Tensor:
@@ -151,8 +152,7 @@ class FloRNN(nn.Module):
         """Frames [B, T, 1, H, W] -> noise maps of the same shape: the deviation of each pixel, or 0 if as published."""
         if self.config.as_published:
             return torch.zeros_like(frames)
-        mean = F.avg_pool2d(frames.flatten(0, 1), 5, 1, 2, count_include_pad=False).view_as(frames)
-        return variance_at(mean, self.variance.to(mean.dtype)).clamp(min=LEAST_VARIANCE).sqrt()
+        return deviation_map(frames, self.variance)
 
     def restore(self, images: Tensor, noise: Tensor, flows: Flows) -> Tensor:
         """Images [B, N, C, H, W] and noise maps [B, N, 1, H, W] -> restored images 0 ... N-k-1 [B, N-k, C, H, W].

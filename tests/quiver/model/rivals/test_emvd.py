@@ -18,7 +18,8 @@ from golden import DATA, arrays_of, draw, errors, fill_by_rule, golden_files, we
 
 from qsim import QIS
 from quiver.model.rivals import emvd
-from quiver.model.rivals.emvd import EMVD, VARIANCE, EMVDConfig, NoiseMap
+from quiver.model.rivals.emvd import EMVD, EMVDConfig, NoiseMap
+from quiver.model.rivals.noise import VARIANCE
 
 TABLE = DATA / "emvd_state_dict.tsv"
 

@@ -153,7 +153,7 @@ def test_a_warp_from_outside_gives_zero():
 
 
 def test_the_noise_map_is_the_deviation_of_the_sensor():
-    """Flat frames, at the table's light: the variances of emvd.VARIANCE; 0 as published."""
+    """Flat frames, at the table's light: the variances of noise.VARIANCE; 0 as published."""
     network = FloRNN(FloRNNConfig(width=2, blocks=1)).double()
     levels = torch.linspace(0, 1, 15).double().view(15, 1, 1, 1, 1).expand(15, 1, 1, 6, 7)
     assert (network.noise(levels)[:, 0, 0, 3, 3] ** 2 - network.variance).abs().max() < 1.1e-6
