@@ -99,18 +99,27 @@ class Spk2ImgNet(nn.Module):
     def forward(self, frames: Tensor) -> Tensor:
         """[B, T, 1, H, W] of codes/(2^b - 1) -> restored [B, T, 1, H, W]; ValueError for another shape."""
         check_frames(frames)
-        padded = pad_space(frames[:, :, 0], MULTIPLE)
+        count = frames.shape[1]
+        order = reflected(-BEFORE, count + self.frames_in - 1, count)
+        restored = self.windows(pad_space(frames, MULTIPLE)[:, order])
+        return restored[..., : frames.shape[-2], : frames.shape[-1]]
+
+    def windows(self, frames: Tensor) -> Tensor:
+        """[B, T, 1, H, W], T >= frames_in, H and W multiples of 4 -> restored frames [B, T - frames_in + 1, 1, H, W].
+
+        The first is frame 5. Pyramids of groups are computed once.
+        """
         pyramids: dict[int, list[Tensor]] = {}  # by the first frame of the group
         restored = []
-        for t in range(frames.shape[1]):
-            starts = [t - BEFORE + 2 * j for j in range(GROUPS)]
+        for t in range(frames.shape[1] - self.frames_in + 1):
+            starts = [t + 2 * j for j in range(GROUPS)]
             pyramids = {start: pyramids[start] for start in pyramids if start >= starts[0]}
             for start in starts:
                 if start not in pyramids:
-                    group = padded[:, reflected(start, self.config.group_frames, frames.shape[1])]
+                    group = frames[:, start : start + self.config.group_frames, 0]
                     pyramids[start] = self.pcd_align.levels(self.extractor(group).features)
             restored.append(self.fuse([pyramids[start] for start in starts]) / self.unit)
-        return torch.stack(restored, dim=1)[..., : frames.shape[-2], : frames.shape[-1]]
+        return torch.stack(restored, dim=1)
 
     def window(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Window [N, 10 or 11, H, W] of codes/(2^b - 1) -> (restored frame 5 [N, 1, H, W], estimates [N, 5, 4, H, W]).
