@@ -1,4 +1,4 @@
-"""The learned networks that QUIVER is compared with, one file each, under their published names.
+"""Defines the learned networks that QUIVER is compared with, one file each, under the names of their articles.
 
 Every network has the same outside:
 
@@ -8,6 +8,11 @@ Every network has the same outside:
   frame, unclamped; ValueError for another shape or integers (`edges.check_frames`). Space is padded by repeating the
   edge (`edges.pad_space`), time by reflection (`edges.reflected`).
 - `look_ahead`: the number of future frames that a restored frame uses; None if it uses all of them.
-- `unused`: beginnings of published names that are declared there but never used, and not built here.
-- The names of its state dict are the published ones; `published_names.load_published` loads such a state.
+
+A network that restores the middle of a window has `frames_in`, the length of its window, and `windows(frames)`: frames
+[B, T, 1, H, W], T >= frames_in, sides as inside -> the frames whose window lies in the clip [B, T - frames_in + 1, 1, H, W].
+
+Those with published programs (EMVD, FloRNN, MemDeblur, RVRT, Spk2ImgNet) have published names in their state dict;
+`published_names.load_published` loads such a state. `unused` are beginnings of published names that are declared there
+but never used, and not built here.
 """

@@ -1,19 +1,13 @@
 """What every rival promises: any size, one frame, finite numbers and gradients, separate clips, look-ahead.
 
-The networks come from the function `small()` of every tests/support/golden_NAME.py.
+The networks come from tests/support/rivals.py.
 """
-
-import importlib
-from pathlib import Path
 
 import pytest
 import torch
 from golden import draw
+from rivals import SMALL
 from torch import nn
-
-SUPPORT = Path(__file__).parents[3] / "support"
-MODULES = [importlib.import_module(path.stem) for path in sorted(SUPPORT.glob("golden_*.py"))]
-SMALL = {module.__name__.removeprefix("golden_"): module.small for module in MODULES if hasattr(module, "small")}
 
 
 @pytest.fixture(scope="module", params=SMALL)
