@@ -1,1 +1,1 @@
-"""Operators that several networks share, in plain torch; they have no weights."""
+"""Provides operators that several networks share, in plain torch; they have no weights."""

@@ -1,4 +1,4 @@
-"""Computes guided deformable attention in plain torch: every pixel attends to moved taps of several source images.
+"""Computes guided deformable attention in plain torch: a pixel attends to moved taps of several images.
 
 A pixel reads each source at the taps of a small kernel, each moved by its own offset. Keys and values lie at different
 places. The taps of all sources share one softmax. Sampling and attention are in float32 or float64, also under

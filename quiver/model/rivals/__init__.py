@@ -9,8 +9,8 @@ Every network has the same outside:
   edge (`edges.pad_space`), time by reflection (`edges.reflected`).
 - `look_ahead`: the number of future frames that a restored frame uses; None if it uses all of them.
 
-A network that restores the middle of a window has `frames_in`, the length of its window, and `windows(frames)`: frames
-[B, T, 1, H, W], T >= frames_in, sides as inside -> the frames whose window lies in the clip [B, T - frames_in + 1, 1, H, W].
+A network that restores one frame of a window has `frames_in`, the length of its window, and `windows(frames)`: frames
+[B, T, 1, H, W], T >= frames_in, sides as inside -> those whose window lies in the clip [B, T - frames_in + 1, 1, H, W].
 
 Those with published programs (EMVD, FloRNN, MemDeblur, RVRT, Spk2ImgNet) have published names in their state dict;
 `published_names.load_published` loads such a state. `unused` are beginnings of published names that are declared there

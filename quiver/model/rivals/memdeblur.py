@@ -1,4 +1,4 @@
-"""Defines MemDeblur, memory-based video deblurring (Ji and Yao, CVPR 2022): recurrent, at three scales, with a memory.
+"""Defines MemDeblur, memory-based video deblurring (Ji and Yao, CVPR 2022): recurrent, at three scales.
 
     backward pass at full size -> forward passes at 1/4, 1/2 and full size; each frame sees the hidden state of its
     neighbour, and reads by attention what earlier frames stored: keys, restored images, hidden states

@@ -1,6 +1,7 @@
-"""Defines SpyNet, a small pyramid network for optical flow (Ranjan and Black, CVPR 2017), under its published names.
+"""Defines SpyNet, a small pyramid network for optical flow (Ranjan and Black, CVPR 2017).
 
 From the coarsest level to the finest it adds a correction to the upsampled flow, from the two images at that level.
+The layers have their published names.
 """
 
 from itertools import pairwise
