@@ -17,7 +17,12 @@ from qsim.cli.options import count, memory_size, numbers, positive, whole_number
 from qsim.files import check_ours
 from quiver.restoration.interface import MODES
 
-NETWORKS = ("nano", "quiver-s", "quiver", "unet")  # see quiver/model/presets.py
+QUIVERS = ("nano", "quiver-s", "quiver")  # see quiver/model/presets.py
+NETWORKS = (
+    *QUIVERS,
+    *("unet", "emvd", "emvd-as-published", "flornn", "flornn-as-published", "memdeblur", "memdeblur-as-published"),
+    *("rvrt", "spk2imgnet", "spk2imgnet-as-published"),
+)
 PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see quiver/training/settings.py
 
 

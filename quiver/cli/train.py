@@ -17,6 +17,7 @@ from qsim.cli.options import count, nonnegative, positive
 from quiver.cli.options import (
     NETWORKS,
     PROTOCOLS,
+    QUIVERS,
     add_noise,
     add_running,
     add_threads,
@@ -40,19 +41,30 @@ def add_train(sub: Any) -> None:
     parser.add_argument("data", help="data set folder")
     parser.add_argument("-o", "--output", required=True, help="folder of the run")
     parser.add_argument("--preset", default="nano", choices=NETWORKS, help="network (default nano)")
-    parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
+    parser.add_argument(
+        "--protocol",
+        default="quick",
+        choices=PROTOCOLS,
+        help="bundle of defaults (default quick); compared networks have quick and published",
+    )
     parser.add_argument("--steps", type=count, help="optimiser steps")
     parser.add_argument("--minutes", type=positive, help="wall-clock limit; the learning rate follows it")
     add_noise(parser)
     parser.add_argument("--crop", type=count, help="px, side of the training windows")
     parser.add_argument(
-        "--frames", type=count, help="frames of a training window (default 11: one restored frame; 16: six)"
+        "--frames",
+        type=count,
+        help="frames of a training window (default: the protocol's, mostly 11; 16: six restored)",
     )
     parser.add_argument("--batch", type=count, help="windows per step and process")
     parser.add_argument("--optimiser", choices=("adam", "muon"), help="optimiser (default: the protocol's)")
     parser.add_argument("--learning-rate", type=positive, help="highest learning rate")
     parser.add_argument("--schedule", choices=("cosine", "plateau"), help="schedule of the learning rate")
-    parser.add_argument("--loss", choices=("published", "paper", "l1", "scales-l1"), help="default: the protocol's")
+    parser.add_argument(
+        "--loss",
+        choices=("published", "paper", "l1", "scales-l1"),
+        help="of quiver, nano and unet; default: the protocol's; compared networks have their own",
+    )
     parser.add_argument("--validate-every", type=count, help="steps between validations")
     parser.add_argument(
         "--validation-split", choices=("train", "val", "test"), help="split to validate on (default val)"
@@ -76,12 +88,11 @@ def _run_train(args: argparse.Namespace) -> int:
     from quiver.restoration.networks import pick_device
     from quiver.training.loop import Diverged, train
     from quiver.training.run_folder import draw_curve
-    from quiver.training.settings import PROTOCOLS
 
-    if args.validate_every is not None and args.steps is None and "steps" not in PROTOCOLS[args.protocol]:
+    settings = _settings(args)
+    if args.validate_every is not None and settings.steps is None:
         raise ValueError("--validate-every: counts steps of a run with --steps; a run that --minutes ends is validated "
                          "after every tenth of its time; leave it out")  # fmt: skip
-    settings = _settings(args)
     if args.validation_split is not None and not open_clips(settings.data, args.validation_split):
         raise ValueError(
             f"--validation-split {args.validation_split}: {settings.data} has no clip in that split; leave it out, and "
@@ -116,11 +127,14 @@ def _run_train(args: argparse.Namespace) -> int:
 
 def _settings(args: argparse.Namespace) -> Any:
     """Return the protocol's settings, replaced by the options that are given."""
-    from quiver.training.settings import PROTOCOLS, Settings
+    from quiver.training.settings import Settings
+    from quiver.training.system import protocol
+    from quiver.training.systems import system_named
 
     given = {field.name: getattr(args, field.name, None) for field in fields(Settings)}
     given |= {"data": args.data, "out": args.output, "network": args.preset}
-    return Settings(**PROTOCOLS[args.protocol] | {name: value for name, value in given.items() if value is not None})
+    defaults = dict(protocol(system_named(args.preset), args.protocol))
+    return Settings(**defaults | {name: value for name, value in given.items() if value is not None})
 
 
 @contextlib.contextmanager
@@ -151,7 +165,7 @@ def add_ablate(sub: Any) -> None:
     )  # fmt: skip
     parser.add_argument("data", help="data set folder")
     parser.add_argument("-o", "--output", required=True, help="folder of the six runs and their table")
-    parser.add_argument("--preset", default="nano", choices=NETWORKS[:-1], help="network (default nano)")
+    parser.add_argument("--preset", default="nano", choices=QUIVERS, help="network (default nano)")
     parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
     parser.add_argument("--steps", type=count, help="optimiser steps of each")
     parser.add_argument("--minutes", type=positive, help="wall-clock limit of each")

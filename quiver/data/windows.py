@@ -13,7 +13,7 @@ clips' streams unless the settings name others (noise.py).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,10 +29,15 @@ from qsim.keys import Key
 from qsim.sensor.sensor import Sensor
 from quiver.data.clips import has_sharp, peak_of
 from quiver.data.code_table import draw_codes
+from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
 from quiver.data.mixture import Mixture, choose
 from quiver.data.noise import Noise
 from quiver.data.window_noise import WindowPlace, check_windows, window_codes
+
+# Computes inputs of a network from the codes of a window: name -> tensor, each the same shape for all windows. It runs
+# where samples are drawn, in worker processes too, and gets no gradients; it is a function of a module, not a lambda.
+Prepare = Callable[[Codes], Mapping[str, torch.Tensor]]
 
 TRAINING, VALIDATION = 1, 2  # stages of the random keys: no two uses share noise (0 is `qsim sense`)
 
@@ -70,6 +75,7 @@ class Windows(Dataset[dict[str, Any]]):
         ppp      mean photons per pixel and exposure
         sample   its number
         key      text: clip, place, light, random key
+        ...      what `prepare` returns for the codes, their sensor, exposure and light
 
     Codes and target follow the sensor of their window. `noise` is the mixture that windows draw from; `repr` shows it.
     `ValueError` for a folder without clips, for clips shorter or smaller than a window, and for noise that windows
@@ -77,7 +83,13 @@ class Windows(Dataset[dict[str, Any]]):
     """
 
     def __init__(
-        self, clips: Sequence[Clip], settings: WindowSettings, *, fixed: bool = False, repeats: int = 1
+        self,
+        clips: Sequence[Clip],
+        settings: WindowSettings,
+        *,
+        fixed: bool = False,
+        repeats: int = 1,
+        prepare: Prepare | None = None,
     ) -> None:
         """Choose the noise. An epoch holds `repeats` windows of every clip.
 
@@ -85,7 +97,7 @@ class Windows(Dataset[dict[str, Any]]):
         in every epoch.
         """
         check_clips(clips, settings)
-        self.clips, self.settings, self.fixed = tuple(clips), settings, fixed
+        self.clips, self.settings, self.fixed, self.prepare = tuple(clips), settings, fixed, prepare
         self.noise = choose(clips) if settings.lights is None else Mixture(tuple(map(Noise.of, settings.lights)))
         for noise in self.noise.noises:
             check_windows(noise, clips[0])
@@ -156,7 +168,7 @@ class Windows(Dataset[dict[str, Any]]):
         except ValueError as error:
             raise ValueError(f"{clip.path}: window from frame {place.start}: {error}") from None
         white = draw.sensor.white(clip.exposure)
-        return {
+        sample = {
             "codes": as_input(codes, draw.sensor),
             "target": torch.from_numpy(np.minimum(sharp / white, self.settings.ceiling).astype(np.float32))[:, None],
             "white": white,
@@ -166,6 +178,10 @@ class Windows(Dataset[dict[str, Any]]):
             "key": f"{clip.name} frame {place.start}, (y, x) ({place.y}, {place.x}), turn {place.turn}, "
             f"{'backwards, ' if place.backwards else ''}{noise.label}, {place.key}",
         }
+        if self.prepare is None:
+            return sample
+        seen = array_codes(codes, draw.sensor, clip.exposure, name=clip.name)
+        return sample | dict(self.prepare(replace(seen, ppp=draw.level.ppp)))
 
     def photons_of(self, place: WindowPlace) -> tuple[Array, Array]:
         """Return the expected photons of the exposed and of the sharp window, float64 [T, h, w] each, turned."""

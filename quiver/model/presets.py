@@ -1,6 +1,7 @@
-"""Makes networks by name: the presets, the ablations of the paper, and the control."""
+"""Makes networks by name: the presets, the ablations of the paper, the control, and the compared networks."""
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import nn
@@ -8,13 +9,44 @@ from torch import nn
 from quiver.model.config import Config
 from quiver.model.folded import FoldedConfig, FoldedQUIVER
 from quiver.model.quiver import QUIVER
-from quiver.model.unet import UNet
+from quiver.model.rivals.emvd import EMVD, EMVDConfig
+from quiver.model.rivals.flornn import FloRNN, FloRNNConfig
+from quiver.model.rivals.memdeblur import MemDeblur, MemDeblurConfig
+from quiver.model.rivals.rvrt import RVRT, RVRTConfig
+from quiver.model.rivals.spk2imgnet import Spk2ImgNet, Spk2ImgNetConfig
+from quiver.model.unet import UNet, UNetConfig
 
 PRESETS: dict[str, Config] = {
     "quiver": Config(),
     "quiver-s": Config(channels=16),
     "nano": FoldedConfig(),  # small in every part; results: docs/results/starter.md
 }
+
+# The control, and the compared networks: with the sensor's noise or factor, and as their ports to three bits have them.
+OTHERS: dict[str, Any] = {
+    "unet": UNetConfig(),
+    "emvd": EMVDConfig(),
+    "emvd-as-published": EMVDConfig(as_published=True),
+    "flornn": FloRNNConfig(),
+    "flornn-as-published": FloRNNConfig(as_published=True),
+    "memdeblur": MemDeblurConfig(),
+    "memdeblur-as-published": MemDeblurConfig(as_published=True),
+    "rvrt": RVRTConfig(),
+    "spk2imgnet": Spk2ImgNetConfig(),
+    "spk2imgnet-as-published": Spk2ImgNetConfig(as_published=True),
+}
+
+# Each network with its configuration. The name of the class stands in weights files.
+NETWORKS: tuple[tuple[type[nn.Module], type], ...] = (
+    (QUIVER, Config),
+    (FoldedQUIVER, FoldedConfig),
+    (UNet, UNetConfig),
+    (EMVD, EMVDConfig),
+    (FloRNN, FloRNNConfig),
+    (MemDeblur, MemDeblurConfig),
+    (RVRT, RVRTConfig),
+    (Spk2ImgNet, Spk2ImgNetConfig),
+)
 
 # Rows of the paper's Table 4, without that of the pretrained flow: pre-denoiser, flow, multi-scale outputs.
 ABLATIONS: dict[str, tuple[bool, bool, bool]] = {
@@ -28,7 +60,7 @@ ABLATIONS: dict[str, tuple[bool, bool, bool]] = {
 
 
 def assemble(config: Config) -> QUIVER:
-    """Return the network of a configuration, with random weights."""
+    """Return the QUIVER of a configuration, with random weights."""
     return FoldedQUIVER(config) if isinstance(config, FoldedConfig) else QUIVER(config)
 
 
@@ -58,9 +90,9 @@ def parameter_count(config: Config) -> int:
 
 
 def build(name: str) -> nn.Module:
-    """Return a preset or the control "unet" with random weights; ValueError for other names."""
-    if name == "unet":
-        return UNet()
-    if name not in PRESETS:
-        raise ValueError(f"no network is called {name!r}; known: {', '.join(PRESETS)}, unet")
-    return assemble(PRESETS[name])
+    """Return a network by its name, with random weights; ValueError for other names."""
+    config = (PRESETS | OTHERS).get(name)
+    for network, kind in NETWORKS:
+        if type(config) is kind:
+            return network(config)
+    raise ValueError(f"no network is called {name!r}; known: {', '.join(PRESETS | OTHERS)}")

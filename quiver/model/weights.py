@@ -18,10 +18,8 @@ from torch import Tensor, nn
 
 from qsim.files import write_bytes
 from quiver.model.config import Config
-from quiver.model.folded import FoldedConfig, FoldedQUIVER
-from quiver.model.presets import assemble
-from quiver.model.quiver import QUIVER
-from quiver.model.unet import UNet, UNetConfig
+from quiver.model.folded import FoldedConfig
+from quiver.model.presets import NETWORKS, assemble
 
 FORMAT = "quiver-1"  # value of the metadata key "format" in our files
 MAX_CONFIG = 10_000  # characters of a configuration
@@ -83,8 +81,8 @@ def short_reason(error: BaseException) -> str:
     return lines[0][:MAX_REASON] if lines else type(error).__name__
 
 
-def save(network: nn.Module, config: Config | UNetConfig, path: Path, notes: Mapping[str, str] | None = None) -> None:
-    """Write weights and configuration as safetensors, atomically; `notes` become metadata."""
+def save(network: nn.Module, config: Any, path: Path, notes: Mapping[str, str] | None = None) -> None:
+    """Write the weights and the configuration of a network as safetensors, atomically; `notes` become metadata."""
     if path.suffix != ".safetensors":
         raise ValueError(f"weights are written as .safetensors, got {path.name}")
     metadata = {
@@ -97,7 +95,7 @@ def save(network: nn.Module, config: Config | UNetConfig, path: Path, notes: Map
     write_bytes(path, to_safetensors(tensors, metadata))
 
 
-def load(path: Path) -> QUIVER | UNet:
+def load(path: Path) -> nn.Module:
     """Return the network stored by `save`, on the CPU, in evaluation mode; ValueError for any other file.
 
     Layers are made without memory, from a configuration whose numbers are bounded. A file therefore costs about as much
@@ -117,6 +115,9 @@ def load(path: Path) -> QUIVER | UNet:
             if name in tensors and tensors[name].dtype != value.dtype:
                 raise ValueError(f"{name} holds {tensors[name].dtype}, the network {value.dtype}")
         network.load_state_dict(tensors, assign=True)
+        if any(buffer.is_meta for buffer in network.buffers()):  # constants that are not stored
+            network = _build(metadata["network"], values)
+            network.load_state_dict(tensors)
     except DAMAGE as error:
         reason = " ".join(str(error).split())[:MAX_REASON]
         raise ValueError(f"{path}: weights and configuration do not fit ({reason})") from None
@@ -136,13 +137,12 @@ def annotate(path: Path, notes: Mapping[str, str]) -> None:
     write_bytes(path, to_safetensors(tensors, metadata | dict(notes)))
 
 
-def _build(kind: str, values: dict[str, object]) -> QUIVER | UNet:
-    if kind == "UNet":
-        return UNet(UNetConfig.from_dict(values))
-    if kind == "FoldedQUIVER":
-        return FoldedQUIVER(FoldedConfig.from_dict(values))
+def _build(kind: str, values: dict[str, object]) -> nn.Module:
     if kind == "QUIVER":
         return assemble(_config_of(values))
+    for network, config in NETWORKS:
+        if kind == network.__name__:
+            return network(config.from_dict(values))  # type: ignore[attr-defined]
     raise ValueError(f"no network is called {kind[:60]!r}")
 
 

@@ -1,6 +1,8 @@
 """Trains a network: one loop for all of them, resumable at every step.
 
-    windows (new noise) -> model -> loss -> Adam or Muon; at intervals: validation, checkpoint, TensorBoard
+    windows (new noise) -> inputs -> model -> loss -> Adam or Muon; at intervals: validation, checkpoint, TensorBoard
+
+Inputs, loss and scored frame are those of the model's system (systems.py).
 
 Samples are numbered across steps and processes. A run that was killed and resumed therefore draws the same samples, and
 ends with the same weights, as one without interruption. NaN or Inf stop the run; the message names the step and the
@@ -21,20 +23,19 @@ from typing import Any, NoReturn
 
 import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Subset
+from torch.utils.data import DataLoader, Subset, default_collate
 from tqdm import tqdm
 
 from quiver import threads
 from quiver.data.clips import open_clips
 from quiver.data.windows import Batches, Windows, WindowSettings
 from quiver.evaluation import metrics
-from quiver.model.blocks import RADIUS, WINDOW
-from quiver.training.loss import PRESETS as LOSSES
-from quiver.training.loss import training_loss
 from quiver.training.optimiser import Optimiser
 from quiver.training.run_folder import Run
 from quiver.training.schedule import State, learning_rate, note_plateau, share_used, time_is_up, validation_due
 from quiver.training.settings import Settings, settled
+from quiver.training.system import Batch, Loss, System
+from quiver.training.systems import OURS, system_of
 
 CHECKPOINT_SECONDS = 120.0
 FOREVER = 10**9  # steps of a run that only time limits
@@ -92,10 +93,13 @@ def joined(device: str) -> Iterator[Process]:
             torch.distributed.destroy_process_group()
 
 
-def make_windows(settings: Settings, multiple: int) -> tuple[Windows, Subset[dict[str, Any]]]:
-    """Return training and fixed validation windows; without validation clips the training clips, with a warning."""
-    if settings.crop % multiple:
-        raise ValueError(f"--crop {settings.crop}: this network needs a multiple of {multiple}")
+def make_windows(
+    settings: Settings, multiple: int, system: System = OURS, frames: int | None = None
+) -> tuple[Windows, Subset[dict[str, Any]]]:
+    """Return training and fixed validation windows; without validation clips the training clips, with a warning.
+
+    Sides of validation windows are multiples of `multiple`; they have `frames` frames, by default those of the system.
+    """
     window = WindowSettings(
         lights=settings.noise,
         frames=settings.frames,
@@ -107,15 +111,14 @@ def make_windows(settings: Settings, multiple: int) -> tuple[Windows, Subset[dic
         seed=settings.seed,
     )
     training, split = open_clips(settings.data, "train"), settings.validation_split
-    windows = Windows(training, window)
+    windows = Windows(training, window, prepare=system.prepare)
     validation = open_clips(settings.data, split)
     if not validation:
         warnings.warn(f"{settings.data}: no clip in split '{split}'; validating on training clips", stacklevel=2)
         validation = training
     side = min(VALIDATION_SIDE, *(min(clip.shape[1:]) for clip in validation)) // multiple * multiple
-    fixed = Windows(
-        validation, replace(window, drift=0, frames=WINDOW, crop=max(side, multiple), ceiling=math.inf), fixed=True
-    )
+    middle = replace(window, drift=0, frames=frames or system.frames, crop=max(side, multiple), ceiling=math.inf)
+    fixed = Windows(validation, middle, fixed=True, prepare=system.prepare)
     return windows, Subset(fixed, range(0, len(fixed), -(-len(fixed) // settings.validation_windows)))
 
 
@@ -134,22 +137,30 @@ def batches(windows: Windows, settings: Settings, state: State, process: Process
     return iter(loader)
 
 
+def on_device(batch: Batch, device: torch.device) -> Batch:
+    """Return a batch with its tensors on the device."""
+    return {name: value.to(device) if isinstance(value, Tensor) else value for name, value in batch.items()}
+
+
 @torch.no_grad()
-def validate(model: nn.Module, windows: Subset[dict[str, Any]], device: torch.device) -> tuple[metrics.Score, Tensor]:
+def validate(
+    model: nn.Module, windows: Subset[dict[str, Any]], device: torch.device, system: System = OURS
+) -> tuple[metrics.Score, Tensor]:
     """Return the mean score, and codes, output and target of the first window side by side [h, 3w]."""
     model.eval()
     scores: list[metrics.Score] = []
     picture = torch.zeros(1, 1)
     for i in range(len(windows)):
         sample = windows[i]
-        output = model(sample["codes"][None].to(device)).scale1[0, :, 0].float().cpu()
-        target = sample["target"][RADIUS : RADIUS + len(output), 0]
+        restored, first = system.restored(model, on_device(default_collate([sample]), device))
+        output = restored[0, :, 0].float().cpu()
+        target = sample["target"][first : first + len(output), 0]
         if not bool(torch.isfinite(output).all()):
             output = torch.zeros_like(output)  # scored as black; the next training step reports the cause
         unit = float(sample["white"]) / float(sample["peak"])  # scores have one peak for every sensor
         scores.append(metrics.score(output.numpy() * unit, target.numpy() * unit))
         if i == 0:
-            picture = torch.cat([sample["codes"][RADIUS, 0], output[0], target[0]], dim=1).clamp(0, 1)
+            picture = torch.cat([sample["codes"][first, 0], output[0], target[0]], dim=1).clamp(0, 1)
     model.train()
     return metrics.mean_score(scores), picture
 
@@ -183,18 +194,35 @@ class Board:
         self.writer.close()
 
 
+class Objective(nn.Module):
+    """A network with its loss: one module, so that processes share the gradients of all that the loss computes."""
+
+    def __init__(self, network: nn.Module, loss: Loss, settings: Settings) -> None:
+        super().__init__()
+        self.network, self.loss, self.settings = network, loss, settings
+
+    def forward(self, batch: Batch, share: float) -> Tensor:
+        """Return the loss of a batch, a scalar; `share` of the run is over."""
+        return self.loss(self.network, batch, self.settings, share)
+
+
 class Trainer:
     """Training of one model: steps, validations when they are due, and checkpoints."""
 
-    def __init__(self, model: nn.Module, run: Run, fixed: Subset[dict[str, Any]], process: Process) -> None:
+    def __init__(
+        self, model: nn.Module, run: Run, fixed: Subset[dict[str, Any]], process: Process, system: System
+    ) -> None:
         settings = run.settings
+        self.system = system
         self.model, self.run, self.fixed, self.process = model.to(process.device).train(), run, fixed, process
         self.optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)
         self.state = run.load(model, self.optimiser, process.device)
+        objective = Objective(model, system.loss, settings)
         self.parallel = (
-            nn.parallel.DistributedDataParallel(model, find_unused_parameters=True) if process.world > 1 else model
+            nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
+            if process.world > 1
+            else objective
         )
-        self.has_estimate = getattr(model, "estimate", None) is not None
         self.low = settings.precision == "bfloat16" or (settings.precision == "auto" and process.device.type == "cuda")
         self.board: Board | None = None
         self.started, self.saved = time.monotonic() - self.state.elapsed, time.monotonic()
@@ -205,10 +233,8 @@ class Trainer:
         """Update the weights by one batch; `Diverged` if its loss or gradient is not finite."""
         settings, state, device = self.run.settings, self.state, self.process.device
         self.rate = learning_rate(settings, state)
-        alone = self.has_estimate and share_used(settings, state) < settings.head_start
         with torch.autocast(device.type, torch.bfloat16, enabled=self.low):
-            output = self.parallel(batch["codes"].to(device), **({"estimate_only": True} if alone else {}))
-        loss = training_loss(output, batch["target"].to(device), LOSSES[settings.loss], first=RADIUS)
+            loss = self.parallel(on_device(batch, device), share_used(settings, state))
         self.model.zero_grad(set_to_none=True)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_norm).item()
@@ -240,7 +266,7 @@ class Trainer:
             return
         began = time.monotonic()
         if self.board is not None:
-            score, picture = validate(self.model, self.fixed, self.process.device)
+            score, picture = validate(self.model, self.fixed, self.process.device, self.system)
             self.board.validation(state, score, picture)
             self._record(score)
         state.halvings = self.process.from_leader(state.halvings)
@@ -285,12 +311,14 @@ def train(
         asked = settings.threads
         settings, lines = settled(settings, force=force)
         settings = replace(settings, threads=threads.use(asked, settings.threads).number)
-        windows, fixed = make_windows(settings, int(model.multiple))  # type: ignore[arg-type]
+        system = system_of(model)
+        system.refuse(model, settings)
+        windows, fixed = make_windows(settings, system.side(model), system, system.window(model))
         run = Run(settings)
         if process.leads:
             stack.enter_context(run.open(force=force))
         process.wait()
-        trainer = Trainer(model, run, fixed, process)
+        trainer = Trainer(model, run, fixed, process, system)
         if process.leads:
             for line in lines:
                 note(line)

@@ -161,7 +161,7 @@ class Run:
         """Write NAME.safetensors with the settings in its notes, without folders, because weights files are copied."""
         settings = portable(self.settings)
         notes = {"step": str(state.step), "settings": json.dumps(settings, sort_keys=True)}
-        weights.save(model, model.config, self.folder / f"{name}.safetensors", notes)  # type: ignore[arg-type]
+        weights.save(model, model.config, self.folder / f"{name}.safetensors", notes)
 
     def save_history(self, state: State) -> None:
         """Write history.json, one entry per validation."""

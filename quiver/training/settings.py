@@ -35,7 +35,7 @@ class Settings:
     bits: tuple[int, ...] | None = None  # bit depths as given; None: those of the streams
     noise: tuple[Noise, ...] | None = None  # follows from these three, set by `settled`; every window draws one
     crop: int = 64  # px
-    frames: int = 11  # of a training window; each frame beyond eleven adds one restored frame at low cost
+    frames: int = 11  # of a training window; more give more restored frames, at low cost in QUIVER
     batch: int = 8  # of each process
     optimiser: Kind = "adam"  # or muon: see optimiser.py
     learning_rate: float = 1e-3
@@ -44,7 +44,7 @@ class Settings:
     warmup: int = 100  # steps of linear rise, at most a twentieth of the run
     patience: int = 8  # plateau: validations without gain before the rate is halved
     clip_norm: float = 20.0  # L2 norm of the gradient
-    loss: str = "published"  # published, paper, l1 or scales-l1: see loss.py
+    loss: str = "published"  # published, paper, l1, scales-l1: see loss.py; own: that of a compared network
     flips: bool = True  # the eight flips and quarter turns
     reverse: bool = True  # time reversal
     drift: int = 0  # px/frame, largest speed at which half of the crops move through their clip
@@ -63,13 +63,25 @@ class Settings:
             raise ValueError("a run needs an end: give --steps or --minutes")
         if self.threads is not None and (isinstance(self.threads, bool) or not isinstance(self.threads, int)):
             raise ValueError(f"--threads must be a whole number, got {self.threads!r}")
-        for name in ("steps", "minutes", "batch", "crop", "validate_every", "validation_windows", "learning_rate"):
+        for name in (
+            "steps",
+            "minutes",
+            "batch",
+            "crop",
+            "frames",
+            "validate_every",
+            "validation_windows",
+            "learning_rate",
+        ):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise ValueError(f"--{name.replace('_', '-')} must be above 0, got {value!r}")
-        if self.frames < 11:
-            raise ValueError(f"--frames must be at least 11, the window of the networks, got {self.frames}")
-        known_names = {"schedule": SCHEDULES, "precision": PRECISIONS, "loss": tuple(LOSSES), "optimiser": OPTIMISERS}
+        known_names = {
+            "schedule": SCHEDULES,
+            "precision": PRECISIONS,
+            "loss": (*LOSSES, "own"),
+            "optimiser": OPTIMISERS,
+        }
         for name, known in known_names.items():
             if getattr(self, name) not in known:
                 raise ValueError(f"no {name} is called {getattr(self, name)!r}; known are {', '.join(known)}")

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import nn
 
+from quiver.model.config import Config
+from quiver.model.presets import PRESETS, assemble
+from quiver.model.rivals.emvd import EMVD, EMVDConfig
+from quiver.model.rivals.flornn import FloRNN, FloRNNConfig
+from quiver.model.rivals.memdeblur import MemDeblur, MemDeblurConfig
+from quiver.model.rivals.rvrt import RVRT, RVRTConfig
+from quiver.model.rivals.spk2imgnet import Spk2ImgNet, Spk2ImgNetConfig
 from quiver.model.unet import UNet, UNetConfig
 from quiver.training.settings import Settings
+from quiver.training.systems import system_of
 
 
 def settings(data: Path, out: Path, **changes: object) -> Settings:
@@ -23,3 +33,28 @@ def small_network(seed: int = 0) -> UNet:
 
 def same_weights(a: nn.Module, b: nn.Module) -> bool:
     return all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
+
+
+TINY: dict[str, Callable[[], nn.Module]] = {  # a small network of every system that the loop trains
+    "unet": lambda: UNet(UNetConfig(4)),
+    "quiver": lambda: assemble(Config(channels=16, cell_growth=2)),
+    "nano": lambda: assemble(replace(PRESETS["nano"], estimate_width=4, attention_width=16)),
+    "emvd": lambda: EMVD(EMVDConfig(width=4)),
+    "flornn": lambda: FloRNN(FloRNNConfig(width=4, blocks=1, flow_channels=(2, 4, 2, 2), flow_kernel=3, flow_levels=3)),
+    "memdeblur": lambda: MemDeblur(MemDeblurConfig(width=8, forward_blocks=1, backward_blocks=1)),
+    "rvrt": lambda: RVRT(RVRTConfig(width=6, flow_levels=1)),
+    "spk2imgnet": lambda: Spk2ImgNet(Spk2ImgNetConfig(width=8, blocks=1)),
+}
+
+
+def tiny(name: str, seed: int = 0) -> nn.Module:
+    """Return a small network of a system, with its random weights."""
+    torch.manual_seed(seed)
+    return TINY[name]()
+
+
+def tiny_settings(network: nn.Module, data: Path, out: Path, **changes: object) -> Settings:
+    """Return the settings of a short run of a network, with its own window and loss."""
+    system = system_of(network)
+    own = {"frames": max(system.window(network), 11), "loss": system.losses[0]}
+    return settings(data, out, **own | changes)

@@ -1,0 +1,67 @@
+"""Describes what the loop must know of a network beside its weights: its window, inputs, loss and settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor, nn
+
+from quiver.data.windows import Prepare
+from quiver.training.settings import Settings
+
+Batch = Mapping[str, Any]  # of samples from `Windows`: codes and target [B, T, 1, h, w], and what `prepare` adds
+
+# (network, batch, settings, share of the run that is over, 0 ... 1) -> a scalar
+Loss = Callable[[nn.Module, Batch, Settings, float], Tensor]
+
+# (network, batch) -> restored frames [B, n, 1, h, w] in units of white, and the place of the first in the window
+Restored = Callable[[nn.Module, Batch], tuple[Tensor, int]]
+
+
+def nothing_to_refuse(network: nn.Module, settings: Settings) -> None:
+    """Accept all settings."""
+
+
+@dataclass(frozen=True)
+class System:
+    """How networks of one kind are trained: functions without state, and numbers."""
+
+    name: str  # for messages
+    loss: Loss
+    restored: Restored  # what a validation scores
+    protocols: Mapping[str, Mapping[str, Any]]  # name -> settings that options override
+    losses: tuple[str, ...] = ("own",)  # values of Settings.loss that `loss` knows
+    frames: int = 11  # of the windows of a validation, and least of those of training
+    multiple: int | None = None  # px that divides the side of a crop; None: the network's own `multiple`, else 1
+    prepare: Prepare | None = None  # computes more inputs where samples are drawn
+    check: Callable[[nn.Module, Settings], None] = nothing_to_refuse  # ValueError for settings that do not fit
+
+    def window(self, network: nn.Module) -> int:
+        """Return the least number of frames of a window: the network's own `frames_in`, if it has one."""
+        return int(getattr(network, "frames_in", self.frames))
+
+    def side(self, network: nn.Module) -> int:
+        """Return the number of px that must divide the side of a crop."""
+        return int(getattr(network, "multiple", 1)) if self.multiple is None else self.multiple
+
+    def refuse(self, network: nn.Module, settings: Settings) -> None:
+        """Raise `ValueError` for settings with which the network cannot be trained."""
+        least, multiple = self.window(network), self.side(network)
+        if settings.frames < least:
+            raise ValueError(f"--frames must be at least {least}, the window of {self.name}, got {settings.frames}")
+        if settings.crop % multiple:
+            raise ValueError(f"--crop {settings.crop}: this network needs a multiple of {multiple}")
+        if settings.loss not in self.losses:
+            raise ValueError(
+                f"--loss {settings.loss}: {self.name} is trained with {' or '.join(self.losses)}; leave --loss out"
+            )
+        self.check(network, settings)
+
+
+def protocol(system: System, name: str) -> Mapping[str, Any]:
+    """Return the settings of a protocol; `ValueError` if the system has none of that name."""
+    if name not in system.protocols:
+        raise ValueError(f"--protocol {name}: {system.name} has {' and '.join(system.protocols)}; choose one of them")
+    return system.protocols[name]

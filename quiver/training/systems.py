@@ -1,0 +1,98 @@
+"""Lists the systems that can be trained: the network of each, with its loss, its window and its protocols."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from quiver.model.blocks import RADIUS
+from quiver.model.presets import build
+from quiver.model.rivals.emvd import EMVD
+from quiver.model.rivals.flornn import FloRNN
+from quiver.model.rivals.memdeblur import MemDeblur
+from quiver.model.rivals.rvrt import RVRT
+from quiver.model.rivals.spk2imgnet import Spk2ImgNet
+from quiver.training import rival_losses as rivals
+from quiver.training.loss import PRESETS as LOSSES
+from quiver.training.loss import training_loss
+from quiver.training.settings import PROTOCOLS, Settings
+from quiver.training.system import Batch, System
+
+# The published program trains all networks alike: these settings, unless a network states others.
+_PORT: dict[str, Any] = {
+    "sensor": "quiver-published",
+    "ppp": (3.25,),
+    "bits": (3,),
+    "force_exposure": True,
+    "reverse": False,
+    "learning_rate": 1e-4,
+    "schedule": "plateau",
+    "warmup": 0,
+    "crop": 128,
+    "batch": 4,
+    "steps": 63_000,
+    "loss": "own",
+}
+_QUICK: dict[str, Any] = {"learning_rate": 1e-3, "drift": 3, "loss": "own"}
+
+
+def _protocols(published: dict[str, Any], **quick: Any) -> dict[str, dict[str, Any]]:
+    """Return the protocols of a compared network: our short runs, and the published program."""
+    common = {name: value for name, value in published.items() if name == "frames"}
+    return {"quick": _QUICK | common | quick, "published": _PORT | published}
+
+
+# ---- Networks whose output is an `Output`
+
+
+def quiver_loss(network: nn.Module, batch: Batch, settings: Settings, share: float) -> Tensor:
+    """Return the loss of loss.py that the settings name; `head_start` of a run trains the initial estimate alone."""
+    alone = getattr(network, "estimate", None) is not None and share < settings.head_start
+    output = network(batch["codes"], **({"estimate_only": True} if alone else {}))
+    return training_loss(output, batch["target"], LOSSES[settings.loss], first=RADIUS)
+
+
+def quiver_restored(network: nn.Module, batch: Batch) -> tuple[Tensor, int]:
+    """Return the restored frames 5 ... T-6 of a window [B, T-10, 1, h, w], and 5."""
+    return network(batch["codes"]).scale1, RADIUS
+
+
+OURS = System("quiver", quiver_loss, quiver_restored, PROTOCOLS, losses=tuple(LOSSES))
+
+SYSTEMS: dict[type[nn.Module], System] = {
+    EMVD: System(
+        "emvd", rivals.emvd_loss, rivals.last_frame, _protocols({"clip_norm": 5.0}, clip_norm=5.0)
+    ),
+    FloRNN: System(
+        *("flornn", rivals.flornn_loss, rivals.flornn_restored, _protocols({}, learning_rate=3e-4)),
+        check=rivals.check_flornn,
+    ),
+    MemDeblur: System(
+        *("memdeblur", rivals.memdeblur_loss, rivals.centre_frame, _protocols({}, learning_rate=3e-4)),
+        multiple=16,
+        check=rivals.check_memdeblur,
+    ),
+    RVRT: System(
+        *("rvrt", rivals.charbonnier_loss, rivals.centre_frame),
+        _protocols({"crop": 240, "batch": 2, "steps": 125_000, "frames": 12}, learning_rate=3e-4),
+        frames=12,
+    ),
+    Spk2ImgNet: System(
+        *("spk2imgnet", rivals.spk2imgnet_loss, rivals.spk2imgnet_restored),
+        _protocols({"frames": 10}, learning_rate=3e-4),
+        multiple=4,
+    ),
+}  # fmt: skip
+
+
+def system_of(network: nn.Module) -> System:
+    """Return how a network is trained; networks with the outside of QUIVER are trained alike."""
+    return SYSTEMS.get(type(network), OURS)
+
+
+def system_named(preset: str) -> System:
+    """Return how the network of a preset is trained; ValueError for an unknown name."""
+    with torch.device("meta"):
+        return system_of(build(preset))

@@ -1,0 +1,266 @@
+"""Every system that the loop trains: resumed equals uninterrupted, it learns, its protocols are the published ones."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from clips import write_dataset
+from runs import TINY, same_weights, settings, tiny, tiny_settings
+from torch import Tensor
+
+from quiver.cli.options import NETWORKS, QUIVERS
+from quiver.data.clips import open_clips
+from quiver.data.codes import Codes
+from quiver.data.windows import Windows, WindowSettings
+from quiver.model.presets import NETWORKS as KINDS
+from quiver.model.presets import OTHERS, PRESETS, build
+from quiver.model.rivals.flornn import FloRNN, FloRNNConfig
+from quiver.model.weights import load
+from quiver.training import loop as training
+from quiver.training.loop import train
+from quiver.training.settings import Settings, settled
+from quiver.training.system import protocol
+from quiver.training.systems import OURS, SYSTEMS, system_named, system_of
+
+SLOW = ("quiver", "rvrt", "flornn", "memdeblur", "spk2imgnet")  # more than a few seconds
+
+
+def slow_ones(names: object) -> list[object]:
+    return [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in names]  # type: ignore[attr-defined]
+
+
+class Killed(Exception):
+    """Stands for a killed process."""
+
+
+@pytest.mark.parametrize("name", slow_ones(TINY))
+def test_killed_and_resumed_equals_uninterrupted(tiny_dataset, tmp_path, monkeypatch, name):
+    """Killed after step 3 of 4 with the last state saved at step 2: bit for bit the same weights and validations."""
+    through = tiny(name)
+    short = {"steps": 4, "validate_every": 2, "validation_windows": 1, "crop": 32}
+    whole = train(through, tiny_settings(through, tiny_dataset, tmp_path / "a", **short), progress=False)
+
+    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
+    asked = []
+
+    def kill() -> bool:
+        asked.append(1)
+        if len(asked) == 2:
+            monkeypatch.setattr(training, "CHECKPOINT_SECONDS", math.inf)
+        if len(asked) == 3:
+            raise Killed
+        return False
+
+    again = tiny_settings(through, tiny_dataset, tmp_path / "b", **short)
+    with pytest.raises(Killed):
+        train(tiny(name), again, should_stop=kill, progress=False)
+    resumed = tiny(name, seed=99)  # its initial weights must not matter
+    state = train(resumed, again, progress=False)
+    assert same_weights(through, resumed)
+    assert state.step == whole.step == 4
+    assert [e["psnr"] for e in state.history] == [e["psnr"] for e in whole.history]
+    stored = load(tmp_path / "b/last.safetensors")
+    assert type(stored) is type(through)
+    assert same_weights(stored, through)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TINY)
+def test_two_hundred_steps_halve_the_loss(tmp_path, name):
+    """On one clip of 64 x 64 px, as section 20 of the list of acceptance tests requires."""
+    data = write_dataset(tmp_path / "d", {"train": 1, "val": 1}, height=64, width=64)
+    network = tiny(name)
+    kinds = {"steps": 200, "validate_every": 200, "crop": 64, "batch": 1, "flips": False, "reverse": False}
+    if name == "memdeblur":
+        kinds |= {"batch": 2}
+    run = tiny_settings(network, data, tmp_path / "r", learning_rate=3e-3, **kinds)
+    system, (first, _) = system_of(network), training.make_windows(settled(run)[0], 16, system_of(network), run.frames)
+    batch = torch.utils.data.default_collate([first[i] for i in range(4)])
+
+    def loss() -> float:
+        with torch.no_grad():
+            return float(system.loss(network.train(), batch, run, 1.0))
+
+    before = loss()
+    train(network, run, progress=False)
+    assert loss() < before / 2
+
+
+@pytest.mark.parametrize("name", slow_ones(TINY))
+def test_every_weight_that_is_trained_gets_a_finite_gradient(tiny_dataset, tmp_path, name):
+    """All but layers behind a zero start, whose gradients are zeros at the first step."""
+    network = tiny(name).train()
+    run = settled(tiny_settings(network, tiny_dataset, tmp_path, crop=32))[0]
+    system = system_of(network)
+    windows, _ = training.make_windows(run, system.side(network), system, system.window(network))
+    batch = torch.utils.data.default_collate([windows[0], windows[1]])
+    system.loss(network, batch, run, 1.0).backward()
+    without = {n for n, p in network.named_parameters() if p.grad is None or not bool(p.grad.isfinite().all())}
+    assert without == set()
+
+
+# ---- Losses
+
+
+def test_the_losses_of_perfect_networks_are_their_least(tiny_dataset, tmp_path):
+    """Of the frames themselves as target: L1 and squares give what the network differs by, and more for another."""
+    for name in ("emvd", "flornn", "spk2imgnet"):
+        network = tiny(name).eval()
+        codes = torch.rand(2, 12, 1, 32, 32)
+        system = system_of(network)
+        run = tiny_settings(network, tiny_dataset, tmp_path)
+        with torch.no_grad():
+            restored, first = system.restored(network, {"codes": codes})
+            assert restored.shape[2:] == codes.shape[2:]
+            target = codes.clone()
+            far = float(system.loss(network, {"codes": codes, "target": target}, run, 1.0))
+            target[:, first : first + restored.shape[1]] = restored
+            near = float(system.loss(network, {"codes": codes, "target": target}, run, 1.0))
+        assert near < far, name
+
+
+def test_emvd_as_published_multiplies_without_transposing():
+    network = tiny("emvd")
+    with torch.no_grad():
+        network.ft.net1["weight"][0, 0, 0, 1] += 0.5  # type: ignore[index]
+    codes = torch.zeros(1, 1, 1, 16, 16)
+    batch, run = {"codes": codes, "target": network(codes).detach()}, Settings("d", "o", steps=1)
+    with torch.no_grad():
+        ours = float(system_of(network).loss(network, batch, run, 1.0))
+        network.config = replace(network.config, as_published=True)
+        theirs = float(system_of(network).loss(network, batch, run, 1.0))
+    low, high = torch.tensor([[1.0, 1.0], [1.0, -1.0]]) / 2**0.5
+    analysis = torch.stack([low + torch.tensor([0.0, 0.5]), high])
+    synthesis, one = torch.stack([low, high]), torch.eye(2)
+    expected = [float((m - one).square().sum()) for m in (analysis.T @ synthesis, analysis @ synthesis)]
+    assert ours - theirs == pytest.approx(expected[0] - expected[1], abs=1e-5)
+
+
+def test_memdeblur_centres_its_targets():
+    """A network whose images come back: the loss is eps at each of the three scales."""
+    network = tiny("memdeblur")
+    codes = torch.full((1, 2, 1, 32, 32), 0.3)
+    network.scales = lambda images: [images[..., ::k, ::k] for k in (4, 2, 1)]  # type: ignore[assignment,method-assign]
+    found = system_of(network).loss(network, {"codes": codes, "target": codes}, Settings("d", "o", steps=1), 1.0)
+    assert float(found) == pytest.approx(3e-3, rel=1e-4)
+
+
+# ---- Settings
+
+
+def test_the_published_protocols_are_those_of_the_ports():
+    """Crop, batch, rate, frames, clip and steps: baselines as their published programs train them."""
+    same = {"crop": 128, "batch": 4, "learning_rate": 1e-4, "frames": 11, "clip_norm": 20, "steps": 63_000}
+    wanted = {
+        "emvd": same | {"clip_norm": 5},
+        "flornn": same,
+        "memdeblur": same,
+        "rvrt": same | {"crop": 240, "batch": 2, "frames": 12, "steps": 125_000},
+        "spk2imgnet": same | {"frames": 10},
+    }
+    for name, values in wanted.items():
+        found = Settings("d", "o", network=name, **protocol(system_named(name), "published"))
+        assert {key: getattr(found, key) for key in values} == values, name
+        assert (found.schedule, found.betas, found.force_exposure, found.reverse) == (
+            "plateau",
+            (0.9, 0.99),
+            True,
+            False,
+        )
+        assert (found.sensor, found.loss, found.patience, found.validate_every) == ("quiver-published", "own", 8, 300)
+
+
+def test_every_preset_has_a_system_and_a_quick_protocol():
+    known = {field.name for field in fields(Settings)}
+    assert set(NETWORKS) == {*PRESETS, *OTHERS}
+    assert set(QUIVERS) == set(PRESETS)
+    for name in NETWORKS:
+        system = system_named(name)
+        assert set(protocol(system, "quick")) <= known
+        assert (system is OURS) == (name in ("unet", *PRESETS))
+    assert {kind for kind, _ in KINDS} >= set(SYSTEMS)
+    with pytest.raises(ValueError, match="--protocol paper: emvd has quick and published"):
+        protocol(system_named("emvd"), "paper")
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("unet", {"frames": 10}, "--frames must be at least 11, the window of quiver, got 10"),
+        ("rvrt", {"frames": 11}, "--frames must be at least 12, the window of rvrt, got 11"),
+        ("spk2imgnet", {"frames": 9}, "at least 10"),
+        ("emvd", {"crop": 36}, "--crop 36: this network needs a multiple of 8"),
+        ("memdeblur", {"crop": 24}, "multiple of 16"),
+        ("memdeblur", {"batch": 1}, "give --batch 2"),
+        ("rvrt", {"loss": "l1"}, "--loss l1: rvrt is trained with own; leave --loss out"),
+        ("unet", {"loss": "own"}, "trained with published or paper or l1 or scales-l1"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused_before_anything_is_written(
+    tiny_dataset, tmp_path, name, changes, message
+):
+    network = tiny(name)
+    with pytest.raises(ValueError, match=message):
+        train(network, tiny_settings(network, tiny_dataset, tmp_path / "r", **changes), progress=False)
+    assert not (tmp_path / "r").exists()
+
+
+def test_flornn_needs_its_look_ahead_and_a_flow(tiny_dataset, tmp_path):
+    for config, message in (
+        (FloRNNConfig(width=4, blocks=1, look_ahead=11), "with a look-ahead of 11 frames FloRNN needs 12"),
+        (FloRNNConfig(width=4, blocks=1, flow_channels=()), "has no flow network"),
+    ):
+        network = FloRNN(config)
+        with pytest.raises(ValueError, match=message):
+            train(network, tiny_settings(network, tiny_dataset, tmp_path / "r"), progress=False)
+
+
+# ---- Inputs that are computed where samples are drawn
+
+
+def moments(codes: Codes) -> dict[str, Tensor]:
+    """The mean code of a window, and what is known of its sensor and light."""
+    mean = codes.read(0, codes.shape[0]).mean(axis=0, dtype=np.float32)
+    known = [codes.sensor.bits, codes.white, codes.ppp or 0.0, codes.exposure]
+    return {"mean": torch.from_numpy(mean), "known": torch.tensor(known)}
+
+
+def test_windows_compute_inputs_from_codes_sensor_and_light(tiny_dataset):
+    clips = open_clips(tiny_dataset, "train")
+    plain, more = Windows(clips, WindowSettings(crop=16)), Windows(clips, WindowSettings(crop=16), prepare=moments)
+    for n in (0, 5):
+        sample = more[n]
+        assert set(sample) - set(plain[n]) == {"mean", "known"}
+        assert torch.equal(sample["codes"], plain[n]["codes"])
+        torch.testing.assert_close(sample["mean"] / 7, sample["codes"].mean(dim=0)[0])
+        assert sample["known"].tolist() == pytest.approx([3, float(sample["white"]), 3.25, 5e-4])
+
+
+def test_a_network_is_trained_on_prepared_inputs(tiny_dataset, tmp_path, monkeypatch):
+    """The loop hands what `prepare` returns to the loss and to the validation."""
+    seen: list[float] = []
+
+    def loss(network, batch, run, share):
+        seen.append(float(batch["known"][0, 2]))
+        return OURS.loss(network, batch, run, share)
+
+    def restored(network, batch):
+        assert batch["mean"].shape[0] == 1
+        return OURS.restored(network, batch)
+
+    mine = replace(OURS, loss=loss, restored=restored, prepare=moments)
+    monkeypatch.setattr(training, "system_of", lambda network: mine)
+    train(tiny("unet"), settings(tiny_dataset, tmp_path / "r", steps=2), progress=False)
+    assert seen == pytest.approx([3.25, 3.25])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["emvd-as-published", "spk2imgnet-as-published", "flornn-as-published"])
+def test_networks_as_published_are_trained(tiny_dataset, tmp_path, name):
+    network = build(name)
+    state = train(network, tiny_settings(network, tiny_dataset, tmp_path / "r", steps=1), progress=False)
+    assert math.isfinite(state.history[-1]["loss"])
