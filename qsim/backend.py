@@ -88,6 +88,11 @@ def choose(prefer: str | None = None) -> Engine:
     return decide(wanted)
 
 
+def on_gpu(engine: str) -> bool:
+    """Return whether a backend, or the variant of one, runs on a GPU."""
+    return engine.startswith("cuda")
+
+
 def limit_threads() -> None:
     """Set the number of Dr.Jit's threads to QSIM_THREADS, if that is set; child processes inherit it."""
     wanted = os.environ.get("QSIM_THREADS")

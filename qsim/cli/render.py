@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks
+from qsim.backend import BACKENDS
 from qsim.cli.console import RESUMES, bar, command, output, refuse_idle
 from qsim.cli.options import checked
 
@@ -50,9 +51,7 @@ def add_render(sub: Any) -> None:
     )
     light = checked(checks.positive)
     parser.add_argument("--ppp", type=light, help="brightest light level that will be sensed, photons per pixel")
-    parser.add_argument(
-        "--engine", choices=("cuda", "llvm", "scalar"), help="engine to use (default: QSIM_ENGINE, else the fastest)"
-    )
+    parser.add_argument("--engine", choices=BACKENDS, help="engine to use (default: QSIM_ENGINE, else the fastest)")
     parser.add_argument("--force", action="store_true", help="replace an existing clip")
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
+from qsim.backend import on_gpu
 from qsim.clip.clip import Clip
 from qsim.clip.sensing import sense
 from qsim.dataset import job_runner
@@ -149,7 +150,7 @@ class Forecast:
             f"{_machines(machines)} like this: {self.hours / machines:.3g} hours{' each' if machines > 1 else ''}"
             + (", by --shard or --cluster" if machines > 1 else ""),
             f"within a day: {_machines(day)} like this{faster}"
-            + ("" if "cuda" in self.engine else "; run this command on a machine with a GPU to have that measured"),
+            + ("" if on_gpu(self.engine) else "; run this command on a machine with a GPU to have that measured"),
         ]
 
 

@@ -23,6 +23,7 @@ from quiver.cli.options import (
     running_options,
     use_threads,
 )
+from quiver.device import DEVICES
 
 if TYPE_CHECKING:
     from quiver.evaluation.comparison import Comparison
@@ -179,7 +180,7 @@ def add_bench(sub: Any) -> None:
     )
     parser.add_argument("--size", type=frame_size, default="64x64", help="ROWSxCOLUMNS in px (default 64x64)")
     parser.add_argument("--ppp", type=positive, default=3.25, help="light of the fixed clip (default 3.25)")
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="device of networks (default auto)")
+    parser.add_argument("--device", choices=DEVICES, help="device of networks (default auto)")
     add_threads(parser)
     parser.add_argument("-o", "--output", type=Path, help="folder for bench.md, bench.json, bench.png")
     parser.add_argument("--force", action="store_true", help="replace an existing result")

@@ -15,6 +15,7 @@ from qsim.cli import console
 from qsim.cli.console import note
 from qsim.cli.options import count, memory_size, numbers, positive, whole_numbers, words
 from qsim.files import check_ours
+from quiver.device import DEVICES
 from quiver.restoration.interface import MODES
 
 QUIVERS = ("nano", "quiver-s", "quiver")  # see quiver/model/presets.py
@@ -52,7 +53,7 @@ def add_running(parser: argparse.ArgumentParser) -> None:
     """Add the options of how methods run."""
     parser.add_argument("--memory", type=memory_size, default="2GB", help="working memory, as in 500MB (default 2GB)")
     parser.add_argument("--mode", choices=MODES, help="networks: how frames share work (default exact)")
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), help="networks: where they run (default auto)")
+    parser.add_argument("--device", choices=DEVICES, help="networks: where they run (default auto)")
     parser.add_argument("--precision", choices=("float32", "bfloat16"), help="networks: precision (default float32)")
     add_threads(parser)
 

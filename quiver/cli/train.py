@@ -26,6 +26,7 @@ from quiver.cli.options import (
     running_options,
     use_threads,
 )
+from quiver.device import DEVICES
 
 # train
 
@@ -74,7 +75,7 @@ def add_train(sub: Any) -> None:
     parser.add_argument(
         "--precision", choices=("auto", "float32", "bfloat16"), help="precision (default auto: bfloat16 on CUDA)"
     )
-    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="device (default auto)")
+    parser.add_argument("--device", default="auto", choices=DEVICES, help="device (default auto)")
     parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
     parser.add_argument("--force", action="store_true", help="replace an existing run")
 
@@ -84,8 +85,8 @@ def _run_train(args: argparse.Namespace) -> int:
 
     from quiver import threads
     from quiver.data.clips import open_clips
+    from quiver.device import pick_device
     from quiver.model.presets import build
-    from quiver.restoration.networks import pick_device
     from quiver.training.loop import Diverged, train
     from quiver.training.run_folder import draw_curve
 

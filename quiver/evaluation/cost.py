@@ -24,16 +24,16 @@ from qsim.checks import suggest
 from qsim.figures import new_figure, write_figure
 from qsim.files import Progress
 from qsim.keys import Key
-from qsim.process import peak_memory, reset_peak
 from qsim.tables import markdown_table
 from quiver.baselines import METHODS
 from quiver.data.clips import peak_of
 from quiver.data.code_table import draw_codes
 from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
+from quiver.device import PeakMemory, pick_device
 from quiver.evaluation import metrics
 from quiver.restoration.interface import MODES, RestoreOptions, Restorer
-from quiver.restoration.networks import network_restorer, pick_device, wrap_network
+from quiver.restoration.networks import network_restorer, wrap_network
 from quiver.restoration.restorers import restorer, weights_path
 
 EXPOSURE = 5e-4  # s
@@ -123,12 +123,9 @@ def measure(case: CostCase, settings: CostSettings) -> CostRow:
     method, trained = method_of(case, settings.device)
     first = (settings.frames - settings.restored) // 2
     last = first + settings.restored
-    cuda = method.learned and pick_device(settings.device) == "cuda"
-    if cuda:
-        torch.cuda.reset_peak_memory_stats()
-    before = reset_peak()
+    memory = PeakMemory(pick_device(settings.device) if method.learned else "cpu")
     method.restore(codes, first, first + 2)
-    peak = torch.cuda.max_memory_allocated() if cuda else peak_memory() - before
+    peak = memory.bytes()
     started = time.perf_counter()
     restored = method.restore(codes, first, last)
     seconds = (time.perf_counter() - started) / settings.restored

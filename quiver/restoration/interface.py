@@ -30,7 +30,7 @@ class RestoreOptions:
 
     memory: int = DEFAULT_MEMORY  # bytes
     mode: str = "exact"  # exact = the published windows; streaming = state kept, faster; windows = recomputed
-    device: str = "auto"  # auto, cpu, cuda
+    device: str = "auto"  # one of quiver.device.DEVICES
     precision: str = "float32"  # or bfloat16
 
     def __post_init__(self) -> None:

@@ -16,6 +16,7 @@ from numpy import ndarray as Array
 from qsim.files import Progress
 from quiver.baselines.sliding_window import reflect
 from quiver.data.codes import Codes
+from quiver.device import moved, pick_device
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.pieces import Disagreement, cut_pieces
 
@@ -75,17 +76,6 @@ def wrap_network(
     return Restorer(name, WINDOW, RADIUS, True, description, fill, mode != "streaming", identity, cut)
 
 
-def pick_device(wanted: str) -> str:
-    """Return `cpu` or `cuda`; `auto` is CUDA where there is one."""
-    import torch
-
-    if wanted == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda: torch finds no CUDA device here; use --device cpu")
-    return wanted
-
-
 def fill_network(
     model: nn.Module, codes: Codes, out: Array, first: int, options: RestoreOptions, progress: Progress | None
 ) -> None:
@@ -108,7 +98,7 @@ def fill_network(
     for tile in pieces.tiles:
         rows, columns = tile.weight.shape
         part = (slice(tile.y, tile.y + rows), slice(tile.x, tile.x + columns))
-        frames = (pad_space(frame, multiple).to(device) for frame in padded_frames(codes, part, first, len(out)))
+        frames = (moved(pad_space(frame, multiple), device) for frame in padded_frames(codes, part, first, len(out)))
         with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
             for t, picture in enumerate(pictures(model, frames, options.mode)):
                 restored = picture[0, 0, :rows, :columns].float().cpu().numpy()

@@ -14,12 +14,12 @@ from pathlib import Path
 import torch
 
 from qsim.tables import markdown_table
+from quiver.device import pick_device
 from quiver.evaluation.comparison import Comparison, ComparisonRow, evaluate
 from quiver.model.config import Config
 from quiver.model.folded import FoldedConfig
 from quiver.model.presets import ABLATIONS, PRESETS, ablated, assemble, parameter_count
 from quiver.restoration.interface import RestoreOptions, Restorer
-from quiver.restoration.networks import pick_device
 from quiver.restoration.restorers import restorer
 from quiver.training.loop import train
 from quiver.training.run_folder import alone_in

@@ -29,6 +29,7 @@ from tqdm import tqdm
 from quiver import threads
 from quiver.data.clips import open_clips
 from quiver.data.windows import Batches, Windows, WindowSettings
+from quiver.device import device_of_process, group_backend, is_gpu, moved
 from quiver.evaluation import metrics
 from quiver.training.optimiser import Optimiser
 from quiver.training.run_folder import Run
@@ -83,11 +84,10 @@ class Process:
 def joined(device: str) -> Iterator[Process]:
     """Join the process group if torchrun started this process, and leave it at the end."""
     rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
-    place = torch.device(device, int(os.environ.get("LOCAL_RANK", 0))) if device == "cuda" else torch.device(device)
     if world > 1:
-        torch.distributed.init_process_group("nccl" if device == "cuda" else "gloo")
+        torch.distributed.init_process_group(group_backend(device))
     try:
-        yield Process(rank, world, place)
+        yield Process(rank, world, device_of_process(device))
     finally:
         if world > 1:
             torch.distributed.destroy_process_group()
@@ -132,14 +132,14 @@ def batches(windows: Windows, settings: Settings, state: State, process: Process
         num_workers=settings.workers,
         multiprocessing_context="spawn" if settings.workers else None,
         generator=torch.Generator(),  # separate: the loader must not change the global random state
-        pin_memory=process.device.type == "cuda",
+        pin_memory=is_gpu(process.device),
     )
     return iter(loader)
 
 
 def on_device(batch: Batch, device: torch.device) -> Batch:
     """Return a batch with its tensors on the device."""
-    return {name: value.to(device) if isinstance(value, Tensor) else value for name, value in batch.items()}
+    return {name: moved(value, device) if isinstance(value, Tensor) else value for name, value in batch.items()}
 
 
 @torch.no_grad()
@@ -223,7 +223,7 @@ class Trainer:
             if process.world > 1
             else objective
         )
-        self.low = settings.precision == "bfloat16" or (settings.precision == "auto" and process.device.type == "cuda")
+        self.low = settings.precision == "bfloat16" or (settings.precision == "auto" and is_gpu(process.device))
         self.board: Board | None = None
         self.started, self.saved = time.monotonic() - self.state.elapsed, time.monotonic()
         self.loss, self.rate = math.nan, math.nan  # of the last step

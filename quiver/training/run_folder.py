@@ -24,6 +24,7 @@ from torch import nn
 from qsim.figures import new_figure, write_figure
 from qsim.files import check_ours, read_json, write_bytes, write_json
 from qsim.locks import Lock
+from quiver.device import random_states, set_random_states
 from quiver.model import weights
 from quiver.training.optimiser import Optimiser
 from quiver.training.schedule import State
@@ -130,7 +131,7 @@ class Run:
             "optimiser": optimiser.state_dict(),
             "state": asdict(state),
             "torch_rng": torch.get_rng_state(),
-            "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+            "cuda_rng": random_states(),
             **extra,
         }
         buffer = io.BytesIO()  # a full disk then raises the system's error, not torch's
@@ -149,8 +150,7 @@ class Run:
             _load_weights(model, content["model"])
             optimiser.load_state_dict(content["optimiser"])
             torch.set_rng_state(content["torch_rng"].cpu())
-            if content["cuda_rng"] and torch.cuda.is_available():
-                torch.cuda.set_rng_state_all([state.cpu() for state in content["cuda_rng"]])
+            set_random_states(content["cuda_rng"])
             return state
         except weights.DAMAGE as error:
             raise ValueError(

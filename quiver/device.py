@@ -1,0 +1,91 @@
+"""Chooses the device of networks, and holds all that depends on it: copies, memory, random states, process groups.
+
+No other file of quiver names a kind of device. Torch is imported when a function needs it.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+from qsim.process import peak_memory, reset_peak
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+DEVICES = ("auto", "cpu", "cuda")  # values of --device
+
+
+def pick_device(wanted: str) -> str:
+    """Return `cpu` or `cuda`; `auto` is CUDA where there is one. `ValueError` if CUDA is wanted and missing."""
+    import torch
+
+    if wanted == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: torch finds no CUDA device here; use --device cpu")
+    return wanted
+
+
+def device_of_process(kind: str) -> torch.device:
+    """Return the device of this process: under `torchrun` every process of a machine has a separate GPU."""
+    import torch
+
+    return torch.device(kind, int(os.environ.get("LOCAL_RANK", 0))) if kind == "cuda" else torch.device(kind)
+
+
+def group_backend(kind: str) -> str:
+    """Return the library by which processes on such devices exchange gradients."""
+    return "nccl" if kind == "cuda" else "gloo"
+
+
+def is_gpu(device: torch.device) -> bool:
+    """Return whether the device is a GPU: bfloat16 is then the default of training, and batches are pinned."""
+    return device.type == "cuda"
+
+
+def moved(tensor: Tensor, device: torch.device) -> Tensor:
+    """Return the tensor on the device; the copy of a pinned one does not wait for the GPU."""
+    return tensor.to(device, non_blocking=tensor.is_pinned())
+
+
+def wait(device: torch.device) -> None:
+    """Wait until the device has finished its work, before a clock is read or another library uses its memory."""
+    import torch
+
+    if is_gpu(device):
+        torch.cuda.synchronize(device)
+
+
+def random_states() -> list[Tensor]:
+    """Return the states of the random generators of all GPUs; without one an empty list."""
+    import torch
+
+    return torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
+
+
+def set_random_states(states: list[Tensor]) -> None:
+    """Restore what `random_states` returned, where there is a GPU."""
+    import torch
+
+    if states and torch.cuda.is_available():
+        torch.cuda.set_rng_state_all([state.cpu() for state in states])
+
+
+class PeakMemory:
+    """Measures from its creation on the largest memory [bytes]: allocated on a GPU, else added to this process."""
+
+    def __init__(self, kind: str) -> None:
+        import torch
+
+        self.gpu = kind == "cuda"
+        if self.gpu:
+            torch.cuda.reset_peak_memory_stats()
+        self.before = 0 if self.gpu else reset_peak()
+
+    def bytes(self) -> int:
+        """Return the peak so far."""
+        import torch
+
+        return torch.cuda.max_memory_allocated() if self.gpu else peak_memory() - self.before

@@ -1,0 +1,47 @@
+"""The device is chosen in one place; without a GPU all of it works on the CPU."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from quiver import device
+
+CPU = torch.device("cpu")
+
+
+def test_auto_is_a_gpu_where_there_is_one(monkeypatch):
+    for there, kind in ((True, "cuda"), (False, "cpu")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        assert device.pick_device("auto") == kind
+        assert device.pick_device("cpu") == "cpu"
+    with pytest.raises(ValueError, match="--device cuda: torch finds no CUDA device here; use --device cpu"):
+        device.pick_device("cuda")
+
+
+def test_every_process_of_torchrun_has_a_gpu_and_a_way_to_exchange(monkeypatch):
+    monkeypatch.setenv("LOCAL_RANK", "3")
+    assert device.device_of_process("cuda") == torch.device("cuda", 3)
+    assert device.device_of_process("cpu") == CPU
+    assert (device.group_backend("cuda"), device.group_backend("cpu")) == ("nccl", "gloo")
+
+
+def test_tensors_that_are_there_are_not_copied():
+    tensor = torch.ones(3)
+    assert device.moved(tensor, CPU) is tensor
+
+
+def test_random_states_of_a_machine_with_gpus_are_kept_on_one_without(monkeypatch):
+    restored = []
+    monkeypatch.setattr(torch.cuda, "set_rng_state_all", restored.append)
+    for there in (False, True):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        device.set_random_states([])
+        device.set_random_states([torch.zeros(16, dtype=torch.uint8)])
+        assert len(restored) == int(there)
+
+
+def test_the_peak_of_memory_grows_with_what_is_held():
+    memory = device.PeakMemory("cpu")
+    held = torch.ones(20_000_000)  # 80 MB
+    assert memory.bytes() > 0.9 * held.nbytes
