@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import cache, lru_cache
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -124,6 +125,32 @@ class Sensor(Distribution):
         packed = launch.sample_packed(plan, stack, self.bits, key, origin, exact)
         return packed if photons.ndim == 3 else packed[0]
 
+    def sample_on_device(self, photons: Any, exposure: float, *, key: Key, origin: tuple[int, int] = (0, 0)) -> Any:
+        """Return the codes of `sample` in the memory of the device that renders: Dr.Jit's tensor uint8 [T, H, W].
+
+        `torch.from_dlpack` makes a torch tensor of it without a copy. Photons [T, H, W] are float32; an array of a
+        library that knows DLPack stays on its device. `ValueError` for a sensor or machine without a compiled engine.
+        """
+        shape, plan = tuple(map(int, photons.shape)), None
+        check_exposure(exposure)
+        if len(shape) != 3 or not 0 < prod(shape) < 1 << 32 or "float32" not in str(photons.dtype):
+            wanted = "photons have the shape [T, H, W] in float32, 1 to 2^32 - 1 of them"
+            raise ValueError(f"{wanted}; got {list(shape)} in {photons.dtype}")
+        if fast_engine_works():
+            from qsim.sensor.compiled import jit
+
+            plan = plan_of(self, exposure) if jit.available() else None
+        if plan is None:
+            raise ValueError(f"{self!r}: no compiled engine draws its codes on this machine; use `sample`")
+        from qsim.sensor.compiled import on_device
+
+        def exact(light: Array, pixels: Array) -> Array:
+            _refuse_wrong(light, pixels)
+            at = pixels + np.array([[key.frame], [origin[0]], [origin[1]]])
+            return self.draw_at(light.astype(np.float64), exposure, key=key, at=at)
+
+        return on_device.sample(plan, photons.reshape(-1), shape, key, origin, exact)
+
     def draw_at(self, photons: Array, exposure: float, *, key: Key, at: Array) -> Array:
         """Return the reference's codes [p] of single pixels: photons [p], `at` int [3, p] = (frame, row, column).
 
@@ -189,6 +216,14 @@ def _checked(photons: Array, engine: str) -> Array:
     if engine not in ENGINES:
         raise ValueError(f"engine is one of {', '.join(ENGINES)}, got {engine!r}")
     return photons
+
+
+def _refuse_wrong(light: Array, pixels: Array) -> None:
+    """Raise `ValueError` with the first photons [p] that no sensor can see; `pixels` int [3, p] = (t, y, x)."""
+    wrong = ~(np.isfinite(light) & (light >= 0))
+    if wrong.any():
+        where = pixels[:, wrong][:, 0].tolist()
+        raise ValueError(f"photons{where} is {float(light[wrong][0])!r}; expected photons are finite and not negative")
 
 
 @lru_cache(maxsize=32)
