@@ -10,6 +10,7 @@ from golden import fill_by_rule
 from torch import nn
 
 from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
+from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
 
 N = TypeVar("N", bound=nn.Module)
 GOLDEN = [importlib.import_module(path.stem) for path in sorted(Path(__file__).parent.glob("golden_*.py"))]
@@ -30,5 +31,6 @@ def lively(network: N) -> N:
 
 SMALL: dict[str, Callable[[], nn.Module]] = {
     **{module.__name__.removeprefix("golden_"): module.small for module in GOLDEN if hasattr(module, "small")},
+    "student_teacher": lambda: lively(StudentTeacher(StudentTeacherConfig(width=3, blocks=1))),
     "fastdvdnet": lambda: lively(FastDVDnet(FastDVDnetConfig(width=4))),
 }

@@ -25,7 +25,6 @@ from quiver.model.rivals.edges import check_frames, pad_space, reflected
 from quiver.model.rivals.noise import VARIANCE, deviation_map, variance_table
 
 TRIPLE = 3  # frames of a U-Net
-MULTIPLE = 4  # px that divide height and width inside
 
 
 @dataclass(frozen=True)
@@ -59,6 +58,7 @@ class FastDVDnet(nn.Module):
 
     look_ahead: ClassVar[int] = 2  # frames
     frames_in: ClassVar[int] = 5  # of a window; the middle one is restored
+    multiple: ClassVar[int] = 4  # px that divide height and width inside
 
     def __init__(self, config: FastDVDnetConfig | None = None) -> None:
         """Make the network of a configuration; the published sizes by default."""
@@ -76,7 +76,7 @@ class FastDVDnet(nn.Module):
         check_frames(frames)
         count = frames.shape[1]
         order = reflected(-self.look_ahead, count + 2 * self.look_ahead, count)
-        restored = self.windows(pad_space(frames, MULTIPLE)[:, order])
+        restored = self.windows(pad_space(frames, self.multiple)[:, order])
         return restored[..., : frames.shape[-2], : frames.shape[-1]]
 
     def windows(self, frames: Tensor) -> Tensor:
