@@ -1,54 +1,30 @@
-"""Reads clips: folders with the radiance of a moving scene, its ground truth, and the streams sensed from it.
+"""Defines `Clip`: a clip folder with the streams that were sensed from it, as notebooks use it.
 
-    clip.json            shape, rates, units, camera, scene, render choices, errors, checksums; written last
-    radiance/000000.exr  Y, half, uncompressed: mean over the exposure
-    sharp/000000.exr     the same at mid-exposure, only if it differs
-    truth/000000.exr     u v bu bv valid Z id: flow to the next and the previous frame, validity, depth, body; zipped
-    saturated/000000.exr 1 where the camera of an imported video was saturated, only for frames with such pixels; zipped
-    streams/NAME.npy     codes, and NAME.json (stream.py)
-
-A clip is written to NAME.part and renamed when complete; an interrupted run resumes there (writer.py).
+clip = qsim.render("fan", frames=21)
+stream = clip.sense("quiver-physical", ppp=3.25, bits=3)
+clip[5], stream[5]      one frame: radiance, codes
 """
 
 from __future__ import annotations
 
-import functools
 import os
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy import ndarray as Array
-
-from qsim import files
-from qsim.clip import exr
-from qsim.clip.manifest import RELATIVE, TRUTH, camera_of, read_manifest
+from qsim import colour, files
+from qsim.clip.clip_folder import ClipFolder
+from qsim.clip.film import Film, card
+from qsim.clip.manifest import RELATIVE
+from qsim.clip.sensing import Sensing, sense
 from qsim.clip.stream import Stream
 from qsim.files import Progress
-from qsim.optics.camera import Camera
-from qsim.optics.radiometry import Crop, check_crop
+from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.sensor import Sensor
 
 
 @dataclass(frozen=True, eq=False)
-class Clip:
-    """A complete clip folder; frames are read on demand."""
-
-    path: Path
-    meta: dict[str, Any]  # clip.json
-
-    @staticmethod
-    def open(path: str | os.PathLike[str]) -> Clip:
-        """Open a clip; `FileNotFoundError` or `ValueError` if it is incomplete, damaged or of another version."""
-        path = Path(path)
-        manifest = path / "clip.json"
-        if not manifest.is_file():
-            raise FileNotFoundError(_why_not(path))
-        return Clip(path, read_manifest(manifest))
-
-    def __len__(self) -> int:
-        return int(self.meta["shape"][0])
+class Clip(ClipFolder):
+    """A complete clip folder and its streams; frames are read on demand."""
 
     def __repr__(self) -> str:
         frames, height, width = self.shape
@@ -59,94 +35,44 @@ class Clip:
             f"{self.exposure * 1e6:.4g} us, mean radiance {self.mean_radiance:.4g} {unit}, streams: {streams}>"
         )
 
-    @property
-    def name(self) -> str:
-        return str(self.meta.get("name") or self.path.name)
+    def _repr_html_(self) -> str:
+        """Return the middle frame and the facts of `repr`, for notebooks."""
+        middle = self.radiance(len(self) // 2)
+        return card(repr(self), colour.tone(middle, colour.peak(middle)))
 
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(frames, height, width)."""
-        frames, height, width = self.meta["shape"]
-        return frames, height, width
+    def show(self, start: int = 0, stop: int | None = None, fps: float = 12.0) -> Film:
+        """Return the radiance of frames start ... stop - 1 (at most 100 by default) as a film that notebooks show.
 
-    @property
-    def frame_rate(self) -> float:
-        """Frames per second of the scene's time."""
-        return float(self.meta["frame_rate"])
-
-    @property
-    def exposure(self) -> float:
-        """Seconds of light per frame."""
-        return float(self.meta["exposure"])
-
-    @property
-    def origin(self) -> tuple[int, int]:
-        """(y, x) of the first pixel in the camera's frame: not (0, 0) if only a crop was rendered."""
-        y, x = self.meta.get("origin") or (0, 0)
-        return int(y), int(x)
-
-    @property
-    def mean_radiance(self) -> float:
-        """Mean over all frames and pixels, in `meta["radiance_unit"]`."""
-        return float(self.meta["mean_radiance"])
-
-    @property
-    def mean_photons(self) -> float:
-        """Mean expected photons per pixel and exposure, without a light factor; `ValueError` for relative radiance."""
-        value = self.meta.get("mean_photons")
-        if value is None:
-            raise ValueError(f"{self.path}: its radiance is relative and has no photons; give a target in PPP")
-        return float(value)
-
-    @cached_property
-    def camera(self) -> Camera | None:
-        """The camera without its motion; None for relative radiance."""
-        return camera_of(self.meta, self.path / "clip.json")
-
-    def radiance(self, t: int, crop: Crop | None = None) -> Array:
-        """Return the mean radiance over the exposure of frame t, float32 [h, w]; crop = (y, x, height, width) [px]."""
-        return self._half("radiance", t, crop)
-
-    def sharp(self, t: int, crop: Crop | None = None) -> Array:
-        """Return the radiance at mid-exposure, float32 [h, w], the target of restoration; `radiance` if not stored."""
-        return self._half("sharp" if f"sharp/{t:06d}.exr" in self.meta["checksums"] else "radiance", t, crop)
-
-    def flow(self, t: int) -> Array:
-        """Return flow, float32 [2, H, W] (u right, v down) [px]: p of frame t is at p + flow(p) in frame t + 1."""
-        return np.stack([self._truth(t, "u"), self._truth(t, "v")])
-
-    def flow_back(self, t: int) -> Array:
-        """Return backward flow, float32 [2, H, W] [px]: p of frame t was at p + flow_back(p) in frame t - 1."""
-        return np.stack([self._truth(t, "bu"), self._truth(t, "bv")])
-
-    def valid(self, t: int) -> Array:
-        """Return bool [H, W]: False where the point of frame t is hidden in, or outside of, frame t + 1."""
-        return self._truth(t, "valid") != 0
-
-    def depth(self, t: int) -> Array:
-        """Return depth, float32 [H, W], metres along the optical axis; inf where no body is hit."""
-        return self._truth(t, "Z")
-
-    def body_id(self, t: int) -> Array:
-        """Return the index of the visible body, int32 [H, W]; -1 where no body is hit."""
-        return self._truth(t, "id").view(np.int32)
-
-    def saturated(self, t: int, crop: Crop | None = None) -> Array:
-        """Return bool [h, w]: True where the radiance of frame t is a lower bound, because the camera was saturated.
-
-        `meta["saturated_pixels"]` counts them over all frames; `meta["saturation"]` holds the pixel value.
+        `fps` is the speed of the film, in frames per second.
         """
-        self._check_frame(t)
-        _, height, width = self.shape
-        y, x, h, w = (0, 0, height, width) if crop is None else check_crop(crop, height, width, str(self.path))
-        if f"saturated/{t:06d}.exr" not in self.meta["checksums"]:
-            return np.zeros((h, w), bool)
-        return self._channel("saturated", t, "saturated")[y : y + h, x : x + w] != 0
+        return Film.of(self.name, self._frames, start, stop, fps)
 
-    @property
-    def has_truth(self) -> bool:
-        """Whether flow, validity, depth and body indices were stored."""
-        return "truth/000000.exr" in self.meta["checksums"]
+    def sense(
+        self,
+        sensor: str | os.PathLike[str] | Sensor = "quiver-physical",
+        *,
+        ppp: float | None = None,
+        lux: float | None = None,
+        bits: int | None = None,
+        seed: int = 0,
+        name: str | None = None,
+        group: bool = False,
+        diffraction: bool = False,
+        defects: str | Defects | None = None,
+        slices: int = 1,
+        force: bool = False,
+        progress: Progress | None = None,
+    ) -> Stream:
+        """Return the codes of a sensor that sees this clip; the stream is stored in the clip's folder.
+
+        `sensor` is a record such as `QIS(...)`, a name of `qsim doctor --devices`, or a .toml file. `ppp` is the mean
+        of photons per pixel and code over the clip, `lux` [lx] the light at 555 nm instead; with neither, the clip's
+        own light is used. `Sensing` describes the other settings. A stream of equal settings is not drawn again.
+        `ValueError` for settings that do not fit the clip; `FileExistsError` where `name` is taken by others.
+        """
+        chosen = sensor if isinstance(sensor, Sensor) else os.fspath(sensor)
+        wanted = Sensing(chosen, bits, ppp, lux, seed, name, group, diffraction, defects, slices)
+        return self.stream(sense(self, wanted, force=force, progress=progress)[0].name)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -159,7 +85,7 @@ class Clip:
         if not path.is_file():
             known = ", ".join(self.streams) or "none yet; make one with `qsim sense`"
             raise FileNotFoundError(f"{self.path}: no stream {name!r}; there are: {known}")
-        return Stream.open(path)
+        return replace(Stream.open(path), keeps=self.keeps)
 
     def verify(self, progress: Progress | None = None) -> list[str]:
         """Return one message per file whose checksum or size differs; empty if the clip is intact.
@@ -189,60 +115,3 @@ class Clip:
             except (ValueError, OSError):  # `verify` reports it
                 continue
         return found
-
-    def _half(self, folder: str, t: int, crop: Crop | None) -> Array:
-        """Return an image of frame t in a folder, float32 [h, w]."""
-        self._check_frame(t)
-        _, height, width = self.shape
-        if crop is not None:
-            check_crop(crop, height, width, str(self.path))
-        path = self.path / folder / f"{t:06d}.exr"
-        try:
-            return exr.read_half(path, height, width, crop)
-        except FileNotFoundError:
-            raise FileNotFoundError(
-                f"{path}: no such file; the clip is damaged, run `qsim check {self.path}`"
-            ) from None
-
-    def _truth(self, t: int, channel: str) -> Array:
-        return self._channel("truth", t, channel)
-
-    def _channel(self, folder: str, t: int, channel: str) -> Array:
-        """Return a channel [H, W] of frame t in a folder."""
-        self._check_frame(t)
-        path = self.path / folder / f"{t:06d}.exr"
-        if not path.is_file():
-            kept = f"{folder}/{t:06d}.exr" in self.meta["checksums"]
-            why = f"the clip is damaged, run `qsim check {self.path}`" if kept else f"frame {t} has no ground truth"
-            raise FileNotFoundError(f"{path}: no such file; {why}")
-        status = path.stat()
-        channels = _read_truth(path, *self.shape[1:], status.st_mtime_ns, status.st_size)
-        if channel not in channels:
-            raise ValueError(f"{path}: has no channel '{channel}' ({TRUTH.get(channel, channel)})")
-        return channels[channel]
-
-    def _check_frame(self, t: int) -> None:
-        if not 0 <= t < len(self):
-            raise ValueError(f"{self.path}: frame {t} does not exist; the clip has frames 0..{len(self) - 1}")
-
-
-def _why_not(path: Path) -> str:
-    """Return why a path is not a clip, and what to do."""
-    if path.with_name(path.name + ".part").is_dir():
-        return f"{path}: unfinished (only {path.name}.part is there); run the same command again, it resumes"
-    if not path.exists():
-        return f"{path}: no such clip"
-    if (path / "dataset.json").is_file():
-        return f"{path}: is a data set, not a clip; its clips are in {path / 'clips'}"
-    return f"{path}: not a clip folder (it has no clip.json)"
-
-
-@functools.lru_cache(maxsize=2)
-def _read_truth(path: Path, height: int, width: int, modified: int, size: int) -> dict[str, Array]:
-    """Return the channels [H, W] by name; `modified` and `size` only key the cache, so that a changed file is read."""
-    channels = exr.read(path, (height, width))
-    for name, array in channels.items():
-        if array.dtype != (np.uint32 if name in ("valid", "id", "saturated") else np.float32):
-            raise ValueError(f"{path}: channel '{name}' is {array.dtype}; the file is damaged, run `qsim check`")
-        array.setflags(write=False)
-    return channels

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.clip import Clip
+from qsim.clip.clip_folder import ClipFolder
 from qsim.optics.diffraction import diffract
 from qsim.optics.radiometry import Crop, LightLevel, expected_photons, photons_per_lux, ppp_factor
 
 
-def light_level(clip: Clip, *, ppp: float | None = None, lux: float | None = None) -> LightLevel:
+def light_level(clip: ClipFolder, *, ppp: float | None = None, lux: float | None = None) -> LightLevel:
     """Return the light level of a clip: `ppp` photons per pixel, `lux` on the faceplate, or factor 1 without either.
 
     `ValueError` for a black clip, for both targets at once, and for a clip of relative radiance without `ppp`.
@@ -35,7 +35,13 @@ def light_level(clip: Clip, *, ppp: float | None = None, lux: float | None = Non
 
 
 def clip_photons(
-    clip: Clip, t: int, factor: float = 1.0, crop: Crop | None = None, *, sharp: bool = False, diffraction: bool = False
+    clip: ClipFolder,
+    t: int,
+    factor: float = 1.0,
+    crop: Crop | None = None,
+    *,
+    sharp: bool = False,
+    diffraction: bool = False,
 ) -> Array:
     """Return expected photons float64 [h, w] of frame t, or of its sharp instant, times a factor.
 
@@ -59,7 +65,7 @@ def clip_photons(
     return expected_photons(radiance, camera, clip.exposure, origin=(y, x)) * factor
 
 
-def light_line(clip: Clip, level: LightLevel, electrons_per_photon: float | None = None) -> str:
+def light_line(clip: ClipFolder, level: LightLevel, electrons_per_photon: float | None = None) -> str:
     """Return a one-line summary of the light level.
 
     `fan_03: mean radiance 0.0254 W/m2/sr, 3.25 PPP (factor 0.84), then 1.31 lx at 555 nm, 2.60 e-/pixel`

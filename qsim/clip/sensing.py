@@ -15,7 +15,7 @@ from typing import Any
 from numpy import ndarray as Array
 
 from qsim import files, keys, locks
-from qsim.clip.clip import Clip
+from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.photons import light_level, light_line
 from qsim.clip.simulation import Draw, plane_of, stored
 from qsim.clip.stream import Stream, orientation, write_packed, writing
@@ -34,7 +34,7 @@ from qsim.sensor.spad import BinarySPAD
 class Sensing:
     """The settings of a stream: sensor, light level, seed; independent of the clip."""
 
-    sensor: str  # a name of qsim.devices or a .toml file
+    sensor: str | Sensor  # a name of qsim.devices, a .toml file, or a record
     bits: int | None = None  # None: the device's own
     ppp: float | None = None  # mean photons per pixel and code over the clip; neither ppp nor lux: factor 1
     lux: float | None = None  # faceplate lux at 555 nm
@@ -42,7 +42,7 @@ class Sensing:
     name: str | None = None  # of the stream; made from the rest if None
     group: bool = False  # a code sums 2^bits - 1 binary planes, each its own clip frame
     diffraction: bool = False  # blur by the lens's Airy pattern
-    defects: str | None = None  # .toml with a table [defects]; None: that of the sensor's file, if it has one
+    defects: str | Defects | None = None  # .toml with a table [defects]; None: that of the sensor's file, if it has one
     slices: int = 1  # clip frames in one exposure of a counting SPAD, for light that changes within it
 
     @property
@@ -53,28 +53,40 @@ class Sensing:
         light = (
             "asis" if self.ppp is self.lux is None else f"{self.ppp:g}ppp" if self.lux is None else f"{self.lux:g}lx"
         ).replace("e+", "e")  # a name holds no +
-        bits = "" if self.bits is None else f"_{self.bits}bit"
+        bits = "" if self.depth is None else f"_{self.depth}bit"
         seed = f"_seed{self.seed}" if self.seed else ""
-        sensor = Path(self.sensor).name.removesuffix(".toml")
+        sensor = Path(self.sensor_name).name.removesuffix(".toml")
+        if isinstance(self.sensor, Sensor):
+            sensor += f"-{files.sha256(files.to_json(self.sensor.to_dict()))[:8]}"
         return check_name(f"{sensor}{bits}_{light}{seed}")
 
+    @property
+    def sensor_name(self) -> str:
+        """The sensor's name or file; of a record, its class."""
+        return type(self.sensor).__name__ if isinstance(self.sensor, Sensor) else self.sensor
 
-def prepare(clip: Clip, sensing: Sensing) -> Draw:
+    @property
+    def depth(self) -> int | None:
+        """The bits of a code, as requested or of a record; None: the device's own."""
+        return self.sensor.bits if self.bits is None and isinstance(self.sensor, Sensor) else self.bits
+
+
+def prepare(clip: ClipFolder, sensing: Sensing) -> Draw:
     """Return the draw of a clip with these settings; `ValueError` if they do not fit the clip."""
 
-    source = sensing.defects or (sensing.sensor if sensing.sensor.endswith(".toml") else None)
-    return assemble(clip, sensing, None if source is None else defect_table.from_toml(source))
+    source = sensing.defects or (sensing.sensor_name if sensing.sensor_name.endswith(".toml") else None)
+    return assemble(clip, sensing, defect_table.from_toml(source) if isinstance(source, str) else source)
 
 
-def assemble(clip: Clip, sensing: Sensing, found: Defects | None, own: Sensor | None = None) -> Draw:
+def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sensor | None = None) -> Draw:
     """Return the draw of a clip as `prepare`, with given defects and, if given, the sensor `own`."""
     planes = sensing.slices
     if sensing.group:
-        if sensing.bits is None:
+        if sensing.depth is None:
             raise ValueError(f"{clip.name}: summing planes needs the bits of a code, as in --bits 3")
         if sensing.slices != 1:
             raise ValueError(f"{clip.name}: --group sums planes, --slices are of counting pixels; give one of them")
-        planes = 2**sensing.bits - 1
+        planes = 2**sensing.depth - 1
     if not 1 <= planes <= len(clip):
         what = f"one code of {planes} planes" if sensing.group else f"one exposure of {planes} slices"
         raise ValueError(f"{clip.name}: {len(clip)} frames are too few for {what}")
@@ -90,44 +102,48 @@ def assemble(clip: Clip, sensing: Sensing, found: Defects | None, own: Sensor | 
     return Draw(sensor, plane_of(sensor, planes), level, key, planes, sensing.diffraction, found)
 
 
-def _check_planes(sensor: Sensor, sensing: Sensing, clip: Clip) -> None:
+def _check_planes(sensor: Sensor, sensing: Sensing, clip: ClipFolder) -> None:
     """Raise `ValueError` if sums of planes or slices of exposures do not fit the sensor or the clip."""
     kind = type(sensor).__name__
     if sensing.group and not isinstance(sensor, BinarySPAD):
-        raise ValueError(f"{sensing.sensor}: only a clocked SPAD (BinarySPAD) sums planes, this is a {kind}")
+        raise ValueError(f"{sensing.sensor_name}: only a clocked SPAD (BinarySPAD) sums planes, this is a {kind}")
     if sensing.slices > 1 and not isinstance(sensor, CountingSPAD):
-        raise ValueError(f"{sensing.sensor}: slices of an exposure are for a CountingSPAD, this is a {kind}")
+        raise ValueError(f"{sensing.sensor_name}: slices of an exposure are for a CountingSPAD, this is a {kind}")
     if sensing.slices > 1 and clip.exposure < 0.999 / clip.frame_rate:
         raise ValueError(f"{clip.name}: slices of one exposure need a clip whose shutter is open all the time")
 
 
-def describe(clip: Clip, sensing: Sensing, draw: Draw) -> dict[str, Any]:
+def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> dict[str, Any]:
     """Return the json of the stream of a draw, without the fields of the written file (checksums, versions)."""
     frames, height, width = clip.shape
-    return {
-        "shape": [frames // draw.planes, height, width],
-        "sensor_name": sensing.sensor,
-        "ppp_target": sensing.ppp,
-        "lux_target": sensing.lux,
-        "ppp": draw.level.ppp * draw.planes,
-        "ppp_factor": draw.level.factor,
-        "mean_photons_before": draw.level.mean_before * draw.planes,
-        "equivalent_lux_555nm": draw.level.lux,
-        "radiance_unit": clip.meta["radiance_unit"],
-        "transfer": "linear",
-        "diffraction": draw.diffraction,
-        "seed": draw.key.seed,
-        "clip_key": draw.key.clip,
-        "clip": clip.name,
-        "frame_rate": clip.frame_rate / draw.planes,
-        "exposure": clip.exposure * draw.planes,
-        "planes_per_code": draw.planes,
-        "drawn_by": draw.law,
-    } | ({} if draw.defects is None else {"defects": draw.defects.to_dict()})
+    named = {} if isinstance(sensing.sensor, Sensor) else {"sensor_name": sensing.sensor}
+    return (
+        named
+        | {
+            "shape": [frames // draw.planes, height, width],
+            "ppp_target": sensing.ppp,
+            "lux_target": sensing.lux,
+            "ppp": draw.level.ppp * draw.planes,
+            "ppp_factor": draw.level.factor,
+            "mean_photons_before": draw.level.mean_before * draw.planes,
+            "equivalent_lux_555nm": draw.level.lux,
+            "radiance_unit": clip.meta["radiance_unit"],
+            "transfer": "linear",
+            "diffraction": draw.diffraction,
+            "seed": draw.key.seed,
+            "clip_key": draw.key.clip,
+            "clip": clip.name,
+            "frame_rate": clip.frame_rate / draw.planes,
+            "exposure": clip.exposure * draw.planes,
+            "planes_per_code": draw.planes,
+            "drawn_by": draw.law,
+        }
+        | ({} if draw.defects is None else {"defects": draw.defects.to_dict()})
+    )
 
 
 def sense(
-    clip: Clip,
+    clip: ClipFolder,
     sensing: Sensing,
     *,
     force: bool = False,
@@ -160,7 +176,7 @@ def sense(
         return _write(clip, sensing.stream_name, blocks, draw.sensor, meta), line
 
 
-def _kept(clip: Clip, sensing: Sensing, draw: Draw, meta: dict[str, Any]) -> Stream | None:
+def _kept(clip: ClipFolder, sensing: Sensing, draw: Draw, meta: dict[str, Any]) -> Stream | None:
     """Return the stored stream if its settings are these, None if there is none; `FileExistsError` for others."""
     json_path = clip.path / "streams" / f"{sensing.stream_name}.json"
     try:
@@ -176,14 +192,16 @@ def _kept(clip: Clip, sensing: Sensing, draw: Draw, meta: dict[str, Any]) -> Str
     raise FileExistsError(f"{json_path}: exists with other settings; name this stream with --name, or use --force")
 
 
-def replay(clip: Clip, stream: Stream, frame: int) -> tuple[Array, Array]:
+def replay(clip: ClipFolder, stream: Stream, frame: int) -> tuple[Array, Array]:
     """Return one frame drawn again from the stream's json, and the stored frame: codes [H, W] each."""
     if not 0 <= frame < len(stream):
         raise ValueError(f"{stream.path}: frame {frame} does not exist; the stream has frames 0..{len(stream) - 1}")
     return stored(stream).frames(clip, frame, frame + 1)[0], stream.codes(frame, frame + 1)[0]
 
 
-def write_stream(clip: Clip, name: str, codes_iter: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
+def write_stream(
+    clip: ClipFolder, name: str, codes_iter: Iterable[Array], sensor: Sensor, meta: dict[str, Any]
+) -> Stream:
     """Store codes ([H, W] frames or [t, H, W] blocks, in order) as a stream of `clip`; the json is written last.
 
     `meta` must hold shape (T, H, W), ppp_factor, exposure and frame_rate. `ValueError` if there are not T frames.
@@ -203,7 +221,7 @@ def write_stream(clip: Clip, name: str, codes_iter: Iterable[Array], sensor: Sen
         return _write(clip, name, packed(), sensor, meta)
 
 
-def _write(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
+def _write(clip: ClipFolder, name: str, blocks: Iterable[Array], sensor: Sensor, meta: dict[str, Any]) -> Stream:
     """Store packed blocks as a stream of the clip; the caller holds the lock of its streams."""
     path = clip.path / "streams" / f"{check_name(name)}.npy"
     for file in (path.with_suffix(".json"), path):
@@ -211,7 +229,7 @@ def _write(clip: Clip, name: str, blocks: Iterable[Array], sensor: Sensor, meta:
     return write_packed(path, blocks, sensor, {"orientation": orientation(clip.meta)} | meta)
 
 
-def _tidy(clip: Clip) -> None:
+def _tidy(clip: ClipFolder) -> None:
     """Delete the lock of a writer that was killed after its stream was written."""
     lock = locks.Lock(clip.path / "streams" / "lock")
     with contextlib.suppress(OSError):  # a read-only folder

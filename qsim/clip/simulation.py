@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.clip.clip import Clip
+from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.photons import clip_photons
 from qsim.clip.stream import Stream
 from qsim.files import Progress
@@ -69,13 +69,13 @@ class Draw:
         disturbed = self.defects is not None and (self.defects.afterpulse or self.defects.crosstalk)
         return "planes" if few or self.sums or disturbed or isinstance(self.sensor, PlaneByPlane) else "process"
 
-    def light(self, clip: Clip, start: int, stop: int) -> Array:
+    def light(self, clip: ClipFolder, start: int, stop: int) -> Array:
         """Return expected photons [stop - start, H, W] of clip frames, per clip frame."""
         return np.stack(
             [clip_photons(clip, t, self.level.factor, diffraction=self.diffraction) for t in range(start, stop)]
         )
 
-    def frames(self, clip: Clip, start: int, stop: int) -> Array:
+    def frames(self, clip: ClipFolder, start: int, stop: int) -> Array:
         """Return codes [stop - start, H, W] of stream frames start ... stop - 1.
 
         Pixels with a memory are simulated from the first frame of the clip.
@@ -87,7 +87,7 @@ class Draw:
         blocks = self.blocks(clip, first, stop, stop - first if first == start else 1)
         return np.concatenate([block for n, block in enumerate(blocks, first) if n >= start])
 
-    def blocks(self, clip: Clip, start: int, stop: int, step: int) -> Iterator[Array]:
+    def blocks(self, clip: ClipFolder, start: int, stop: int, step: int) -> Iterator[Array]:
         """Yield codes [t, H, W] of stream frames start ... stop - 1, `step` at a time, or (events) all at once."""
         if self.followed is not None:
             yield self._follow(clip, stop)[start:]
@@ -107,7 +107,7 @@ class Draw:
         for block in drawn:
             yield self._summed(block)
 
-    def packed(self, clip: Clip, frames: int, progress: Progress | None = None) -> Iterator[Array]:
+    def packed(self, clip: ClipFolder, frames: int, progress: Progress | None = None) -> Iterator[Array]:
         """Yield all codes of a stream, packed row by row, some frames at a time: uint8 [t, H, ceil(W bits / 8)]."""
         step = max(1, _BLOCK_PIXELS // (clip.shape[1] * clip.shape[2] * self.planes))
         if self.followed is not None or self.defects is not None or self.planes > 1:
@@ -137,7 +137,7 @@ class Draw:
         """Return the photons [t, H, W] of exposures of `plane` from those of clip frames."""
         return light if self.sums or self.planes == 1 else light.reshape(-1, self.planes, *light.shape[1:]).sum(axis=1)
 
-    def _exposure(self, clip: Clip) -> float:
+    def _exposure(self, clip: ClipFolder) -> float:
         """Return the exposure of `plane` [s]."""
         return clip.exposure if self.sums else clip.exposure * self.planes
 
@@ -152,14 +152,14 @@ class Draw:
         grouped = drawn.reshape(-1, self.planes, *drawn.shape[1:])
         return grouped.sum(axis=1).astype(packing.code_dtype(self.sensor.bits))
 
-    def _array(self, clip: Clip) -> PixelArray | None:
+    def _array(self, clip: ClipFolder) -> PixelArray | None:
         """Return the pixel array of the defects; None if neither defects nor single photons are simulated."""
         counts = self.followed is not None
         if self.defects is None and not counts:
             return None
         return PixelArray.of(self.defects or Defects(), self.plane, *clip.shape[1:])
 
-    def _slices(self, clip: Clip) -> IncidentLight:
+    def _slices(self, clip: ClipFolder) -> IncidentLight:
         """Return a function that reads the photons [slices, rows, W] of some rows of a stream frame."""
 
         def read(frame: int, row: int, rows: int) -> Array:
@@ -173,7 +173,7 @@ class Draw:
 
         return read
 
-    def missed(self, clip: Clip) -> Effects | None:
+    def missed(self, clip: ClipFolder) -> Effects | None:
         """Return the error of the closed form of counting pixels in this clip; None if it is exact."""
         if not isinstance(self.plane, CountingSPAD):
             return None
@@ -186,7 +186,7 @@ class Draw:
             array, self._slices(clip), shape, self._exposure(clip), self.planes / clip.frame_rate
         )
 
-    def _follow(self, clip: Clip, frames: int) -> Array:
+    def _follow(self, clip: ClipFolder, frames: int) -> Array:
         """Return codes [frames, H, W] of counting pixels, followed photon by photon from the first frame."""
         array = self._array(clip)
         assert array is not None

@@ -11,7 +11,7 @@ import hashlib
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files, locks, structure
+from qsim import colour, files, locks, structure
+from qsim.clip.clip_folder import ClipFolder
+from qsim.clip.film import Film, card
+from qsim.clip.lazy_array import LazyArray
+from qsim.clip.photons import clip_photons
 from qsim.files import VERSION, Progress
 from qsim.optics.radiometry import Crop, check_crop
 from qsim.sensor import packing
@@ -37,6 +41,7 @@ class Stream:
 
     path: Path  # streams/NAME.npy
     meta: dict[str, Any]  # streams/NAME.json
+    keeps: object = field(default=None, repr=False)  # a temporary folder: it lasts as long as a reference to it
 
     @staticmethod
     def open(json_path: Path) -> Stream:
@@ -63,6 +68,74 @@ class Stream:
             f"<Stream {self.name}: {frames} codes of {self.bits} bit, {height} x {width} px, at "
             f"{float(self.meta['frame_rate']):g}/s, exposure {self.exposure * 1e6:.4g} us{light}>"
         )
+
+    def _repr_html_(self) -> str:
+        """Return the codes of the middle frame and the facts of `repr`, for notebooks."""
+        middle = self[len(self) // 2]
+        return card(repr(self), colour.tone(middle, colour.peak(middle)))
+
+    def show(self, start: int = 0, stop: int | None = None, fps: float = 12.0) -> Film:
+        """Return the codes of frames start ... stop - 1 (at most 100 by default) as a film that notebooks show.
+
+        `fps` is the speed of the film, in frames per second.
+        """
+        return Film.of(self.name, self.codes, start, stop, fps)
+
+    def __getitem__(self, index: Any) -> Array:
+        """Return codes as an array [T, H, W] would: `stream[3]` is [H, W], `stream[2:5]` is [3, H, W]."""
+        return self.codes[index]
+
+    def __iter__(self) -> Iterator[Array]:
+        """Yield the codes of each frame, [H, W]."""
+        return iter(self.codes)
+
+    @property
+    def codes(self) -> LazyArray:
+        """All codes [T, H, W], uint8 or (above 8 bits) uint16, read when they are used: `stream.codes[3]`.
+
+        `stream.codes(start, stop, crop)` reads a part; crop = (y, x, height, width) [px]. `ValueError` for frames or
+        pixels that do not exist.
+        """
+        return LazyArray(self.shape, np.dtype(packing.code_dtype(self.bits)), self._read)
+
+    @cached_property
+    def clip(self) -> ClipFolder:
+        """The clip that these codes were sensed from; `FileNotFoundError` if they do not lie in its folder."""
+        folder = self.path.absolute().parents[1]
+        if not (folder / "clip.json").is_file():
+            raise FileNotFoundError(f"{self.path}: does not lie in the folder of a clip, so its light is not known")
+        return replace(ClipFolder.open(folder), keeps=self.keeps)
+
+    def truth(self, start: int = 0, stop: int | None = None) -> Array:
+        """Return the photons that a perfect restorer would find, float64 [stop - start, H, W].
+
+        They are expected photons per pixel and exposure at mid-exposure, without blur. A code of several clip frames
+        has the light of its middle one times their number. `ValueError` for frames that do not exist,
+        `FileNotFoundError` for a stream without a clip.
+        """
+        frames = self._existing(start, len(self) if stop is None else stop)
+        factor = self.photons_factor * self._planes
+        return np.stack([clip_photons(self.clip, self._middle(t), factor, sharp=True) for t in frames])
+
+    def known(self) -> Array | None:
+        """Return bool [T, H, W], False where a saturated camera cut off the light of `truth`; None if all is known."""
+        if not self.clip.meta.get("saturated_pixels"):
+            return None
+        return ~np.stack([self.clip.saturated(self._middle(t)) for t in range(len(self))])
+
+    @property
+    def _planes(self) -> int:
+        return int(self.meta.get("planes_per_code") or 1)
+
+    def _middle(self, t: int) -> int:
+        """Return the clip frame in the middle of code t."""
+        return t * self._planes + self._planes // 2
+
+    def _existing(self, start: int, stop: int) -> range:
+        """Return frames start ... stop - 1; `ValueError` if they do not all exist."""
+        if not 0 <= start < stop <= len(self):
+            raise ValueError(f"{self.path}: frames {start}..{stop} do not all exist; the stream has {len(self)}")
+        return range(start, stop)
 
     @property
     def name(self) -> str:
@@ -134,15 +207,10 @@ class Stream:
             )
         return array
 
-    def codes(self, start: int = 0, stop: int | None = None, crop: Crop | None = None) -> Array:
-        """Return codes [stop - start, h, w] of frames start ... stop - 1, uint8 or (above 8 bits) uint16.
-
-        `crop` = (y, x, height, width) [px]; only its bytes are read.
-        """
-        frames, height, width = self.shape
-        stop = frames if stop is None else stop
-        if not 0 <= start < stop <= frames:
-            raise ValueError(f"{self.path}: frames {start}..{stop} do not all exist; the stream has {frames}")
+    def _read(self, start: int, stop: int, crop: Crop | None) -> Array:
+        """Return codes [stop - start, h, w] of frames start ... stop - 1; only the bytes of the crop are read."""
+        self._existing(start, stop)
+        _, height, width = self.shape
         if crop is None:
             return packing.unpack(np.asarray(self.packed[start:stop]), self.bits, width)
         y, x, h, w = check_crop(crop, height, width, str(self.path))

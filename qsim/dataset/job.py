@@ -64,7 +64,9 @@ class Job:
             for key, off in (("defects", None), ("slices", 1)):
                 if stream[key] == off:
                     del stream[key]
-        own = [path for path in (self.family, *(stream.sensor for stream in self.streams)) if Path(path).is_absolute()]
+        own = [
+            path for path in (self.family, *(stream.sensor_name for stream in self.streams)) if Path(path).is_absolute()
+        ]
         if own:  # the content of a file decides, not its name
             described["own"] = [_contents(path) for path in own]
         return hashlib.sha256(to_json(described | more)).hexdigest()

@@ -216,12 +216,19 @@ DEVICES: Mapping[str, Device] = MappingProxyType(
 )
 
 
-def load(name: str | Path, *, ppp: float | None = None, bits: int | None = None, exposure: float = 5e-4) -> Sensor:
-    """Return the sensor of a name in `DEVICES` or of a TOML file.
+def load(
+    name: str | Path | Sensor, *, ppp: float | None = None, bits: int | None = None, exposure: float = 5e-4
+) -> Sensor:
+    """Return the sensor of a name in `DEVICES` or of a TOML file; a `Sensor` is returned as given.
 
     `ppp` [photons/pixel] sets the gain where it follows the light. `bits` replaces the device's own depth (a TOML file
-    states its own). `exposure` [s] matters for dark electrons given per frame. `ValueError` names what is wrong.
+    and a `Sensor` state their own). `exposure` [s] matters for dark electrons given per frame. `ValueError` names what
+    is wrong.
     """
+    if isinstance(name, Sensor):
+        if bits is not None and bits != name.bits:
+            raise ValueError(f"{type(name).__name__}: has bits = {name.bits}, the request {bits}; change one of them")
+        return name
     if str(name) in DEVICES:
         device = DEVICES[str(name)]
         return device.make(ppp, device.bits if bits is None else bits, exposure)

@@ -1,64 +1,132 @@
-"""Tests reading of clip folders: contents, crops, and messages about damage."""
+"""Tests what a notebook does with clips and streams: sense, index, iterate, compare with the truth, show."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_clip import FRAMES, HEIGHT, WIDTH, radiance, truth, write
+import tiny_clip
+from clips import write_clip
+
+from qsim.clip.clip import Clip
+from qsim.clip.photons import clip_photons
+from qsim.clip.sensing import Sensing, sense
+from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.defects.fixed_pattern import FixedPattern
+from qsim.sensor.qis import QIS
+from qsim.sensor.spad import BinarySPAD
+
+SENSOR = QIS(0.7, 2.0, 0.3, 3, gain=0.8)
 
 
-def test_what_is_written_is_read(tmp_path: Path):
-    clip = write(tmp_path / "a")
-    assert len(clip) == FRAMES
-    assert clip.shape == (FRAMES, HEIGHT, WIDTH)
-    assert clip.exposure == 5e-4
-    assert clip.name == "a"
-    for t in range(FRAMES):
-        np.testing.assert_array_equal(clip.radiance(t), radiance(t))
-        np.testing.assert_array_equal(clip.sharp(t), radiance(50 + t) if t == 2 else radiance(t))
-        for name, expected in truth(t).items():
-            found = getattr(clip, name)(t)
-            np.testing.assert_array_equal(found, expected)
-            assert found.dtype == expected.dtype
-    assert clip.mean_radiance == pytest.approx(np.mean([radiance(t) for t in range(FRAMES)]), rel=1e-6)
-    assert clip.verify() == []
-    assert clip.camera is not None
-    assert clip.camera.f_number == 2.8
+def test_a_clip_is_a_sequence_of_radiance(tmp_path: Path):
+    clip = tiny_clip.write(tmp_path / "a")
+    stack = np.stack([clip.radiance(t) for t in range(len(clip))])
+    np.testing.assert_array_equal(np.stack(list(clip)), stack)
+    np.testing.assert_array_equal(clip[1:4, 2:, 3], stack[1:4, 2:, 3])
+    np.testing.assert_array_equal(clip[-1], stack[-1])
+    with pytest.raises(IndexError):
+        clip[tiny_clip.FRAMES]
 
 
-def test_crops_are_crops(tmp_path: Path):
-    clip = write(tmp_path / "a")
-    np.testing.assert_array_equal(clip.radiance(3, (2, 1, 5, 4)), clip.radiance(3)[2:7, 1:5])
-    np.testing.assert_array_equal(clip.sharp(2, (9, 6, 1, 1)), clip.sharp(2)[9:, 6:])
-    for crop in [(-1, 0, 2, 2), (0, 0, 0, 2), (6, 0, 5, 2), (0, 4, 2, 4)]:
-        with pytest.raises(ValueError, match="is not inside 10 x 7"):
-            clip.radiance(0, crop)
-    with pytest.raises(ValueError, match=r"frame 5 does not exist; the clip has frames 0\.\.4"):
-        clip.radiance(5)
+def test_names_files_and_records_of_a_sensor_give_the_same_codes(tmp_path: Path):
+    clip = write_clip(tmp_path / "c", frames=4, height=9, width=10)
+    file = tmp_path / "own.toml"
+    fields = "\n".join(f"{key} = {value}" for key, value in SENSOR.to_dict().items() if type(value) in (int, float))
+    file.write_text(f'[sensor]\nmodel = "QIS"\n{fields}\n')
+    record, stored = clip.sense(SENSOR, ppp=2.5), clip.sense(file, ppp=2.5)
+    np.testing.assert_array_equal(record.codes, stored.codes)
+    assert record.sensor == stored.sensor == SENSOR
+    assert clip.sense("quiver-paper", ppp=2.5).sensor == QIS(0.8, 1.6, 0.2, 3)
+    same, line = sense(clip, Sensing(SENSOR, ppp=2.5))
+    assert (same.name, clip.sense(SENSOR, ppp=2.5).name) == (record.name, record.name)
+    assert "2.5 PPP" in line
 
 
-def test_each_kind_of_damage_is_named(tmp_path: Path):
-    clip = write(tmp_path / "a")
-    bit_flipped = clip.path / "radiance" / "000001.exr"
-    content = bytearray(bit_flipped.read_bytes())
-    content[-3] ^= 16
-    bit_flipped.write_bytes(content)
-    truncated = clip.path / "truth" / "000002.exr"
-    truncated.write_bytes(truncated.read_bytes()[:100])
-    missing = clip.path / "sharp" / "000002.exr"
-    missing.unlink()
-    assert [p.split(": ")[0] for p in clip.verify()] == [str(bit_flipped), str(missing), str(truncated)]
-    with pytest.raises(ValueError, match="not readable as OpenEXR"):
-        clip.flow(2)
-    with pytest.raises(FileNotFoundError):
-        clip.sharp(2)
+def test_records_of_other_parameters_are_other_streams(tmp_path: Path):
+    clip = write_clip(tmp_path / "c", frames=2, height=5, width=6)
+    sensors = [QIS(0.7, 2.0, noise, 3) for noise in (0.1, 0.2, 0.3)] + [BinarySPAD(0.4, 20.0)]
+    names = {clip.sense(sensor, ppp=1.0).name for sensor in sensors}
+    assert names == set(clip.streams)
+    assert len(names) == 4
+    with pytest.raises(ValueError, match=r"QIS: has bits = 3, the request 5"):
+        clip.sense(SENSOR, ppp=1.0, bits=5)
 
 
-def test_a_truncated_radiance_file_is_refused(tmp_path: Path):
-    clip = write(tmp_path / "a")
-    path = clip.path / "radiance" / "000001.exr"
-    whole = path.read_bytes()
-    for content in (b"", whole[:-1], whole + b"\0", b"\0" + whole[1:]):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match="truncated or damaged"):
-            clip.radiance(1)
+def test_defects_may_be_a_record(tmp_path: Path):
+    clip = write_clip(tmp_path / "c", frames=2, height=16, width=20)
+    stream = clip.sense(BinarySPAD(0.4, 20.0), ppp=30.0, defects=Defects(FixedPattern(dead=0.3)))
+    dark = (stream.codes == 0).all(axis=0).mean()
+    assert 0.1 < dark < 0.5
+    assert stream.meta["defects"]["dead"] == 0.3
+
+
+def test_a_stream_is_a_sequence_of_codes(tmp_path: Path):
+    stream = write_clip(tmp_path / "c", frames=6, height=7, width=9).sense(SENSOR, ppp=2.0)
+    codes = stream.codes(0, 6)
+    np.testing.assert_array_equal(np.stack(list(stream)), codes)
+    np.testing.assert_array_equal(stream[4:1:-2], codes[4:1:-2])
+    np.testing.assert_array_equal(stream.codes(2, 3, (1, 2, 3, 4)), codes[2:3, 1:4, 2:6])
+    with pytest.raises(IndexError):
+        stream[6]
+    for start, stop in ((0, 7), (-1, 2), (3, 3)):
+        with pytest.raises(ValueError, match="do not all exist; the stream has 6"):
+            stream.codes(start, stop)
+
+
+def test_the_truth_is_the_sharp_light_of_the_middle_of_each_code(tmp_path: Path):
+    clip = write_clip(tmp_path / "c", frames=7, height=5, width=6, sharp=True)
+    single = clip.sense(SENSOR, ppp=2.0)
+    factor = single.photons_factor
+    expected = np.stack([clip_photons(clip, t, factor, sharp=True) for t in range(7)])
+    np.testing.assert_allclose(single.truth(), expected, rtol=1e-12)
+    np.testing.assert_allclose(single.truth(2, 4), expected[2:4], rtol=1e-12)
+    grouped = clip.sense(BinarySPAD(0.4, 0.0, 2), ppp=2.0, group=True)
+    assert grouped.shape == (2, 5, 6)
+    middle = [3 * clip_photons(clip, t, grouped.photons_factor, sharp=True) for t in (1, 4)]
+    np.testing.assert_allclose(grouped.truth(), middle, rtol=1e-12)
+    with pytest.raises(ValueError, match="do not all exist"):
+        single.truth(5, 9)
+
+
+def test_the_truth_has_the_light_level_of_the_stream(tmp_path: Path):
+    clip = write_clip(tmp_path / "c", frames=6, height=8, width=9)
+    for sensor, planes in ((SENSOR, 1), (CountingSPAD(0.4, 20.0, 1e-8, 5), 2)):
+        stream = clip.sense(sensor, ppp=4.0, slices=planes, name=f"of{planes}")
+        assert stream.truth().mean() == pytest.approx(4.0, rel=0.05)
+
+
+def test_a_stream_without_its_clip_has_no_truth(tmp_path: Path):
+    clip = write_clip(tmp_path / "c", frames=2, height=5, width=6)
+    stream = clip.sense(SENSOR, ppp=2.0)
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for file in (stream.path, stream.path.with_suffix(".json")):
+        file.rename(moved / file.name)
+    with pytest.raises(FileNotFoundError, match="does not lie in the folder of a clip"):
+        type(stream).open(moved / f"{stream.name}.json").truth()
+
+
+def test_known_pixels_are_those_that_did_not_saturate(tmp_path: Path):
+    clip = write_clip(tmp_path / "c", frames=2, height=5, width=6)
+    assert clip.sense(SENSOR, ppp=2.0).known() is None
+    from qsim.clip.writer import ClipWriter
+
+    mask = np.random.default_rng(0).random((2, 5, 6)) < 0.3
+    with ClipWriter(tmp_path / "s", tiny_clip.meta(shape=[2, 5, 6], camera=None, radiance_unit="relative")) as writer:
+        for t in range(2):
+            writer.add(t, np.ones((5, 6)), saturated=mask[t])
+    stream = Clip.open(tmp_path / "s").sense(SENSOR, ppp=2.0)
+    np.testing.assert_array_equal(stream.known(), ~mask)
+
+
+def test_clips_and_streams_show_themselves(tmp_path: Path):
+    clip = write_clip(tmp_path / "c", frames=3, height=5, width=6)
+    stream = clip.sense(SENSOR, ppp=2.0)
+    for thing in (clip, stream):
+        html = thing._repr_html_()
+        assert html.count("data:image/png;base64,") == 1
+        assert repr(thing).strip("<>")[:12] in html
+        assert thing.show().pictures.shape == (3, 5, 6)
+        assert "data:image/gif" in thing.show()._repr_html_()
+        assert thing.show(1, 2).pictures.shape == (1, 5, 6)

@@ -1,0 +1,212 @@
+"""Reads the frames of clip folders: radiance, sharp frames and ground truth.
+
+    clip.json            shape, rates, units, camera, scene, render choices, errors, checksums; written last
+    radiance/000000.exr  Y, half, uncompressed: mean over the exposure
+    sharp/000000.exr     the same at mid-exposure, only if it differs
+    truth/000000.exr     u v bu bv valid Z id: flow to the next and the previous frame, validity, depth, body; zipped
+    saturated/000000.exr 1 where the camera of an imported video was saturated, only for frames with such pixels; zipped
+    streams/NAME.npy     codes, and NAME.json (stream.py)
+
+A clip is written to NAME.part and renamed when complete; an interrupted run resumes there (writer.py).
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.clip import exr
+from qsim.clip.lazy_array import LazyArray
+from qsim.clip.manifest import TRUTH, camera_of, read_manifest
+from qsim.optics.camera import Camera
+from qsim.optics.radiometry import Crop, check_crop
+
+
+@dataclass(frozen=True, eq=False)
+class ClipFolder:
+    """A complete clip folder; frames are read on demand."""
+
+    path: Path
+    meta: dict[str, Any]  # clip.json
+    keeps: object = field(default=None, repr=False)  # a temporary folder: it lasts as long as a reference to it
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str]) -> Self:
+        """Open a clip; `FileNotFoundError` or `ValueError` if it is incomplete, damaged or of another version."""
+        path = Path(path)
+        manifest = path / "clip.json"
+        if not manifest.is_file():
+            raise FileNotFoundError(_why_not(path))
+        return cls(path, read_manifest(manifest))
+
+    def __len__(self) -> int:
+        return int(self.meta["shape"][0])
+
+    def __getitem__(self, index: Any) -> Array:
+        """Return radiance as an array [T, H, W] would: `clip[3]` is float32 [H, W], `clip[2:5]` is [3, H, W]."""
+        return self._frames[index]
+
+    def __iter__(self) -> Iterator[Array]:
+        """Yield the radiance of each frame, float32 [H, W]."""
+        return iter(self._frames)
+
+    @property
+    def _frames(self) -> LazyArray:
+        def read(start: int, stop: int, crop: Crop | None) -> Array:
+            return np.stack([self.radiance(t, crop) for t in range(start, stop)])
+
+        return LazyArray(self.shape, np.dtype(np.float32), read)
+
+    @property
+    def name(self) -> str:
+        return str(self.meta.get("name") or self.path.name)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(frames, height, width)."""
+        frames, height, width = self.meta["shape"]
+        return frames, height, width
+
+    @property
+    def frame_rate(self) -> float:
+        """Frames per second of the scene's time."""
+        return float(self.meta["frame_rate"])
+
+    @property
+    def exposure(self) -> float:
+        """Seconds of light per frame."""
+        return float(self.meta["exposure"])
+
+    @property
+    def origin(self) -> tuple[int, int]:
+        """(y, x) of the first pixel in the camera's frame: not (0, 0) if only a crop was rendered."""
+        y, x = self.meta.get("origin") or (0, 0)
+        return int(y), int(x)
+
+    @property
+    def mean_radiance(self) -> float:
+        """Mean over all frames and pixels, in `meta["radiance_unit"]`."""
+        return float(self.meta["mean_radiance"])
+
+    @property
+    def mean_photons(self) -> float:
+        """Mean expected photons per pixel and exposure, without a light factor; `ValueError` for relative radiance."""
+        value = self.meta.get("mean_photons")
+        if value is None:
+            raise ValueError(f"{self.path}: its radiance is relative and has no photons; give a target in PPP")
+        return float(value)
+
+    @cached_property
+    def camera(self) -> Camera | None:
+        """The camera without its motion; None for relative radiance."""
+        return camera_of(self.meta, self.path / "clip.json")
+
+    def radiance(self, t: int, crop: Crop | None = None) -> Array:
+        """Return the mean radiance over the exposure of frame t, float32 [h, w]; crop = (y, x, height, width) [px]."""
+        return self._half("radiance", t, crop)
+
+    def sharp(self, t: int, crop: Crop | None = None) -> Array:
+        """Return the radiance at mid-exposure, float32 [h, w], the target of restoration; `radiance` if not stored."""
+        return self._half("sharp" if f"sharp/{t:06d}.exr" in self.meta["checksums"] else "radiance", t, crop)
+
+    def flow(self, t: int) -> Array:
+        """Return flow, float32 [2, H, W] (u right, v down) [px]: p of frame t is at p + flow(p) in frame t + 1."""
+        return np.stack([self._truth(t, "u"), self._truth(t, "v")])
+
+    def flow_back(self, t: int) -> Array:
+        """Return backward flow, float32 [2, H, W] [px]: p of frame t was at p + flow_back(p) in frame t - 1."""
+        return np.stack([self._truth(t, "bu"), self._truth(t, "bv")])
+
+    def valid(self, t: int) -> Array:
+        """Return bool [H, W]: False where the point of frame t is hidden in, or outside of, frame t + 1."""
+        return self._truth(t, "valid") != 0
+
+    def depth(self, t: int) -> Array:
+        """Return depth, float32 [H, W], metres along the optical axis; inf where no body is hit."""
+        return self._truth(t, "Z")
+
+    def body_id(self, t: int) -> Array:
+        """Return the index of the visible body, int32 [H, W]; -1 where no body is hit."""
+        return self._truth(t, "id").view(np.int32)
+
+    def saturated(self, t: int, crop: Crop | None = None) -> Array:
+        """Return bool [h, w]: True where the radiance of frame t is a lower bound, because the camera was saturated.
+
+        `meta["saturated_pixels"]` counts them over all frames; `meta["saturation"]` holds the pixel value.
+        """
+        self._check_frame(t)
+        _, height, width = self.shape
+        y, x, h, w = (0, 0, height, width) if crop is None else check_crop(crop, height, width, str(self.path))
+        if f"saturated/{t:06d}.exr" not in self.meta["checksums"]:
+            return np.zeros((h, w), bool)
+        return self._channel("saturated", t, "saturated")[y : y + h, x : x + w] != 0
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether flow, validity, depth and body indices were stored."""
+        return "truth/000000.exr" in self.meta["checksums"]
+
+    def _half(self, folder: str, t: int, crop: Crop | None) -> Array:
+        """Return an image of frame t in a folder, float32 [h, w]."""
+        self._check_frame(t)
+        _, height, width = self.shape
+        if crop is not None:
+            check_crop(crop, height, width, str(self.path))
+        path = self.path / folder / f"{t:06d}.exr"
+        try:
+            return exr.read_half(path, height, width, crop)
+        except FileNotFoundError:
+            raise FileNotFoundError(
+                f"{path}: no such file; the clip is damaged, run `qsim check {self.path}`"
+            ) from None
+
+    def _truth(self, t: int, channel: str) -> Array:
+        return self._channel("truth", t, channel)
+
+    def _channel(self, folder: str, t: int, channel: str) -> Array:
+        """Return a channel [H, W] of frame t in a folder."""
+        self._check_frame(t)
+        path = self.path / folder / f"{t:06d}.exr"
+        if not path.is_file():
+            kept = f"{folder}/{t:06d}.exr" in self.meta["checksums"]
+            why = f"the clip is damaged, run `qsim check {self.path}`" if kept else f"frame {t} has no ground truth"
+            raise FileNotFoundError(f"{path}: no such file; {why}")
+        status = path.stat()
+        channels = _read_truth(path, *self.shape[1:], status.st_mtime_ns, status.st_size)
+        if channel not in channels:
+            raise ValueError(f"{path}: has no channel '{channel}' ({TRUTH.get(channel, channel)})")
+        return channels[channel]
+
+    def _check_frame(self, t: int) -> None:
+        if not 0 <= t < len(self):
+            raise ValueError(f"{self.path}: frame {t} does not exist; the clip has frames 0..{len(self) - 1}")
+
+
+def _why_not(path: Path) -> str:
+    """Return why a path is not a clip, and what to do."""
+    if path.with_name(path.name + ".part").is_dir():
+        return f"{path}: unfinished (only {path.name}.part is there); run the same command again, it resumes"
+    if not path.exists():
+        return f"{path}: no such clip"
+    if (path / "dataset.json").is_file():
+        return f"{path}: is a data set, not a clip; its clips are in {path / 'clips'}"
+    return f"{path}: not a clip folder (it has no clip.json)"
+
+
+@functools.lru_cache(maxsize=2)
+def _read_truth(path: Path, height: int, width: int, modified: int, size: int) -> dict[str, Array]:
+    """Return the channels [H, W] by name; `modified` and `size` only key the cache, so that a changed file is read."""
+    channels = exr.read(path, (height, width))
+    for name, array in channels.items():
+        if array.dtype != (np.uint32 if name in ("valid", "id", "saturated") else np.float32):
+            raise ValueError(f"{path}: channel '{name}' is {array.dtype}; the file is damaged, run `qsim check`")
+        array.setflags(write=False)
+    return channels
