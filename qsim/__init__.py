@@ -1,6 +1,9 @@
 """qsim: moving scenes at 2000 fps into the few-bit streams of quanta image sensors.
 
 A notebook needs the names of `__all__` only; each is imported on first use.
+
+    clip = qsim.render("fan", frames=21)
+    stream = clip.sense("quiver-physical", ppp=3.25, bits=3)
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
     from qsim.clip.stream import Stream
     from qsim.clip.writer import ClipWriter
     from qsim.dataset.dataset import Dataset
+    from qsim.dataset.scene_rendering import render
     from qsim.keys import Key
     from qsim.optics.camera import Camera
     from qsim.optics.radiometry import expected_photons
@@ -57,6 +61,7 @@ _HOMES = {
     "expected_photons": "optics.radiometry",
     "load_sensor": "sensor.devices:load",
     "pack": "sensor.packing",
+    "render": "dataset.scene_rendering",
     "render_clip": "rendering.clip_rendering",
     "replay": "clip.sensing",
     "sense": "clip.sensing",
@@ -85,6 +90,7 @@ __all__ = [
     "load_sensor",
     "pack",
     "read_mitsuba",
+    "render",
     "render_clip",
     "replay",
     "sense",

@@ -58,14 +58,13 @@ def add_render(sub: Any) -> None:
 def _run_render(args: argparse.Namespace) -> int:
     from qsim import backend
     from qsim.clip.clamped_error import stated
-    from qsim.dataset import scene_files
+    from qsim.dataset.scene_rendering import load_scene, render
     from qsim.optics.diffraction import diffraction_line
-    from qsim.rendering import fidelity
-    from qsim.rendering.budget import explain
-    from qsim.rendering.clip_rendering import render_clip
+    from qsim.rendering.budget import Finding, explain
+    from qsim.rendering.fidelity import choose_budget, shortfall
 
     if args.output is None and not args.explain:
-        raise ValueError("the following arguments are required: -o/--output; only --explain works without it")
+        raise ValueError("-o/--output is required (optional only with --explain)")
     if args.output is None:
         refuse_idle(args, "render without --output", ["force"])
     if args.output is not None and args.output.exists() and not args.force:
@@ -73,43 +72,27 @@ def _run_render(args: argparse.Namespace) -> int:
     if args.engine is not None:
         os.environ["QSIM_ENGINE"] = args.engine
         backend.choose()
-    loaded, read = scene_files.load(args.scene, seed=args.seed, speed=args.speed)
-    scene = loaded.resized(args.height, args.width)
-    with bar(args.output.name if args.output else "pilot") as progress:
-        chosen = fidelity.choose_budget(
-            scene,
-            frame_rate=args.frame_rate,
-            shutter=args.shutter,
-            frames=args.frames,
-            psnr=args.psnr,
-            ppp=args.ppp,
-            seed=args.seed,
-        )
-        if args.output is None:
-            output(args, {"render": dataclasses.asdict(chosen)}, explain(chosen))
-            return 0
-        clip = render_clip(
-            scene,
-            args.output,
-            frames=args.frames,
-            frame_rate=args.frame_rate,
-            shutter=args.shutter,
-            seed=args.seed,
-            budget=chosen,
-            progress=progress,
-            extra={"reads": read} if read else None,
-            force=args.force,
-        )
+    taken = {name: getattr(args, name) for name in ("frames", "seed", "frame_rate", "shutter", "psnr", "ppp")}
+    size = {name: getattr(args, name) for name in ("height", "width", "speed")}
+    if args.output is None:
+        scene, _ = load_scene(args.scene, **size, seed=args.seed)
+        chosen = choose_budget(scene, **taken)
+        output(args, {"render": dataclasses.asdict(chosen)}, explain(chosen.findings))
+        return 0
+    with bar(args.output.name) as progress:
+        clip = render(args.scene, args.output, **taken, **size, progress=progress, force=args.force)
+    render_meta = clip.meta["render"]
     found = stated(clip.meta)
     text = f"{clip.path}: {len(clip)} frames of {args.height} x {args.width}"
     text += f", mean radiance {clip.mean_radiance:.4g} W/m2/sr"
     text += f", {clip.mean_photons:.4g} photons per pixel"
     text += "" if found is None else f"\nerror: {found.line}"
-    text += (missed := fidelity.shortfall(found, args.psnr)) and f"\nerror: {missed}"
+    text += (missed := shortfall(found, args.psnr)) and f"\nerror: {missed}"
     if "fireflies_per_frame" in clip.meta:
         fireflies, pixels = sum(clip.meta["fireflies_per_frame"]), math.prod(clip.shape)
-        how = "counted before denoising" if chosen.denoise else "counted and left in"
+        how = "counted before denoising" if render_meta["denoise"] else "counted and left in"
         text += f"\nfireflies: {fireflies} of {pixels} pixels, {how}"
-    text += "\n" + (explain(chosen) if args.explain else diffraction_line(scene.camera))
+    findings = [Finding(**finding) for finding in render_meta["findings"]]
+    text += "\n" + (explain(findings) if args.explain or clip.camera is None else diffraction_line(clip.camera))
     output(args, {"clip": str(clip.path)} | {k: v for k, v in clip.meta.items() if k != "checksums"}, text)
     return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -59,10 +60,10 @@ class Allowed:
         return max(errors.at_white / self.target, errors.plain / self.sensor)
 
 
-def explain(budget: Budget) -> str:
+def explain(findings: Sequence[Finding]) -> str:
     """Return one line per finding: effects modelled, effects left out, and their sizes."""
-    width = max((len(finding.effect) for finding in budget.findings), default=0)
-    return "\n".join(f"{f.effect:{width}}  {f.chosen}; {f.size}" for f in budget.findings)
+    width = max((len(finding.effect) for finding in findings), default=0)
+    return "\n".join(f"{f.effect:{width}}  {f.chosen}; {f.size}" for f in findings)
 
 
 def grid_samples(samples: int) -> int:

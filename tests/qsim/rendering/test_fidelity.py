@@ -39,7 +39,7 @@ def test_more_light_on_the_sensor_needs_more_samples():
     made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
     plain, bright = (choose_budget(made, psnr=25, ppp=ppp, denoise=False) for ppp in (None, 300.0))
     assert bright.samples > plain.samples
-    assert "the sensor at 300 photons" in explain(bright)
+    assert "the sensor at 300 photons" in explain(bright.findings)
 
 
 def test_bounces_follow_the_scene():
@@ -49,7 +49,7 @@ def test_bounces_follow_the_scene():
     walls = [Body(f"wall{i}", square(2.2, -1.1), Diffuse(0.95), turned) for i, turned in enumerate(BOX)]
     closed = choose_budget(Scene("box", 0, CAMERA, (), (lamp, *walls)), psnr=30, denoise=False)
     assert open_air.bounces < closed.bounces
-    assert "bounces" in explain(closed)
+    assert "bounces" in explain(closed.findings)
 
 
 BOX = [Spin((0, 1, 0), 0.0, angle) for angle in (0.0, math.pi / 2, -math.pi / 2)] + [
@@ -63,7 +63,7 @@ def test_an_open_shutter_gets_an_odd_number_of_instants():
     assert chosen.sub_frames % 2 == 1
     assert chosen.sub_frames > 1
     assert chosen.sharp
-    assert "mean of" in explain(chosen)
+    assert "mean of" in explain(chosen.findings)
 
 
 def test_a_shadow_that_moves_on_a_wall_at_rest_is_blurred_too():
@@ -78,7 +78,7 @@ def test_a_shadow_that_moves_on_a_wall_at_rest_is_blurred_too():
     chosen = choose_budget(made, shutter=1.0, psnr=55, denoise=False)
     assert chosen.sub_frames > 3
     assert chosen.sharp
-    assert "light and shadow" in explain(chosen)
+    assert "light and shadow" in explain(chosen.findings)
     means = {}
     for count in (3, chosen.sub_frames, 45):
         one = renderer(made, shutter=1.0, budget=replace(chosen, samples=64 * count, sub_frames=count))
@@ -107,7 +107,7 @@ def test_a_wheel_that_turns_once_in_the_exposure_counts_as_moving():
     assert chosen.sub_frames >= 15
     assert real < allowed
     assert 0.3 < stated / real < 4  # thirds of its instants, for a shape of fourfold symmetry
-    assert "0 % of the pixels move" not in explain(chosen)
+    assert "0 % of the pixels move" not in explain(chosen.findings)
 
 
 def test_a_body_that_no_pilot_frame_shows_is_found():
@@ -182,7 +182,7 @@ def test_a_psnr_out_of_range_is_refused(psnr):
 
 
 def test_effects_left_out_are_listed_with_their_size():
-    text = explain(choose_budget(plate(None), psnr=25, denoise=False))
+    text = explain(choose_budget(plate(None), psnr=25, denoise=False).findings)
     for word in ("depth of field", "diffraction", "Airy disk", "bounces", "samples", "motion blur"):
         assert word in text
-    assert explain(Budget()) == ""
+    assert explain(Budget().findings) == ""

@@ -1,0 +1,101 @@
+"""Renders one clip in one call: a scene record, a family, or a file with a scene."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import weakref
+from dataclasses import replace
+from pathlib import Path
+
+from qsim.clip.clip import Clip
+from qsim.dataset import scene_files
+from qsim.files import NAME, Progress
+from qsim.rendering.budget import Budget
+from qsim.rendering.clip_rendering import render_clip
+from qsim.rendering.fidelity import choose_budget
+from qsim.scene import Scene
+
+FRAMES = 21
+SIDE = 128  # px, height and width of a family or a file unless others are given
+
+
+def render(
+    scene: Scene | str | os.PathLike[str],
+    path: str | os.PathLike[str] | None = None,
+    *,
+    frames: int = FRAMES,
+    height: int | None = None,
+    width: int | None = None,
+    seed: int = 0,
+    speed: float | None = None,
+    frame_rate: float = 2000.0,
+    shutter: float = 0.0,
+    psnr: float = 40.0,
+    ppp: float | None = None,
+    budget: Budget | None = None,
+    progress: Progress | None = None,
+    force: bool = False,
+) -> Clip:
+    """Render a scene at a stated error and return its clip: radiance, sharp frames and ground truth.
+
+    `scene` is a `Scene`, or what `qsim render` takes: a family, a .py file with `scene(seed, *, speed)`, Mitsuba .xml,
+    or a folder of assets. `height` and `width` [px] default to the camera of a `Scene` and to 128 of all others. `seed`
+    is that of the scene and of its samples; `speed` is a factor on all motions (default 1). `frame_rate` is in frames
+    per second, `shutter` the open fraction of a frame, 0 for sharp frames. `psnr` [dB] is the requested error, `ppp`
+    the brightest light that will be sensed [photons/pixel] (`choose_budget`); a `budget` decides both instead.
+
+    `path` is the folder of the clip; an equal call resumes an interrupted one. Without it, the clip lies in a temporary
+    folder that is deleted after the last use of the clip and its streams. `progress(done, frames)` is called after each
+    frame. `ValueError`, `FileNotFoundError` or `FileExistsError` where the arguments do not fit.
+
+        clip = qsim.render("fan", frames=21, psnr=35)
+    """
+    if path is None and force:
+        raise ValueError("force= replaces the clip of a folder, and no path is given; leave it out")
+    loaded, read = load_scene(scene, height, width, seed, speed)
+    if budget is None:
+        budget = choose_budget(
+            loaded, frame_rate=frame_rate, shutter=shutter, frames=frames, psnr=psnr, ppp=ppp, seed=seed
+        )
+    temporary = TemporaryFolder() if path is None else None
+    name = loaded.name if NAME.fullmatch(loaded.name) else "scene"
+    clip = render_clip(
+        loaded,
+        temporary.path / name if temporary else Path(path or ""),
+        frames=frames,
+        frame_rate=frame_rate,
+        shutter=shutter,
+        seed=seed,
+        budget=budget,
+        progress=progress,
+        extra={"reads": read} if read else None,
+        force=force,
+    )
+    return replace(clip, keeps=temporary)
+
+
+def load_scene(
+    scene: Scene | str | os.PathLike[str], height: int | None, width: int | None, seed: int, speed: float | None
+) -> tuple[Scene, dict[str, str]]:
+    """Return a scene in its size, and the SHA-256 of each file that it reads; arguments and errors as of `render`."""
+    if isinstance(scene, Scene):
+        if speed is not None:
+            raise ValueError(f"scene {scene.name}: a Scene has its motions already; leave speed= out")
+        return scene.resized(height or scene.camera.height, width or scene.camera.width), {}
+    loaded, read = scene_files.load(os.fspath(scene), seed, 1.0 if speed is None else speed)
+    return loaded.resized(SIDE if height is None else height, SIDE if width is None else width), read
+
+
+class TemporaryFolder:
+    """A folder that is deleted with the last object that refers to it, in the process that made it."""
+
+    def __init__(self) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="qsim-"))
+        weakref.finalize(self, _delete, self.path, os.getpid())
+
+
+def _delete(path: Path, owner: int) -> None:
+    if os.getpid() == owner:  # a forked worker has its copy of every object
+        shutil.rmtree(path, ignore_errors=True)
