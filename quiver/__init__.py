@@ -1,7 +1,10 @@
 """Restores blur-free video from few-bit quanta streams; trains, evaluates and compares methods.
 
-In Python: `quiver.restore(codes, "moment", ...)`, and the networks `QUIVER` and `from_published`. Torch is
-imported with the first of these names, not with the package.
+    video = quiver.restore(stream)
+    quiver.score(video, stream).psnr
+    loader = DataLoader(quiver.windows("out/starter", split="train"), batch_size=8)
+
+Torch is imported with the first network or window, not with the package.
 """
 
 from __future__ import annotations
@@ -11,6 +14,8 @@ from typing import TYPE_CHECKING
 from qsim.files import lazy_names
 
 if TYPE_CHECKING:
+    from quiver.data.windows import windows
+    from quiver.evaluation.comparison import score_video as score
     from quiver.model.published_weights import from_published
     from quiver.model.quiver import QUIVER
     from quiver.restoration.api import restore
@@ -19,9 +24,11 @@ _HOMES = {
     "QUIVER": "model.quiver",
     "from_published": "model.published_weights",
     "restore": "restoration.api",
+    "score": "evaluation.comparison:score_video",
+    "windows": "data.windows",
 }
 
-__all__ = ["QUIVER", "from_published", "restore"]
+__all__ = ["QUIVER", "from_published", "restore", "score", "windows"]
 
 __getattr__ = lazy_names(__name__, _HOMES)
 

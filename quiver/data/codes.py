@@ -16,6 +16,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clip import Clip
+from qsim.clip.lazy_array import LazyArray
 from qsim.clip.photons import clip_photons
 from qsim.clip.sensing import describe
 from qsim.clip.stream import Stream
@@ -27,6 +28,7 @@ from quiver.data.illumination import Illumination
 
 __all__ = [
     "Codes",
+    "LazyArray",
     "Sensor",
     "Stream",
     "array_codes",

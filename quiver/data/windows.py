@@ -7,12 +7,12 @@ workers give the same bytes, and a killed run resumes with the next sample. Samp
 epoch e, with new noise. Dr.Jit, which does not survive a fork, is not used. Sensor, light and defects are those of the
 clips' streams unless the settings name others (noise.py).
 
-    windows = Windows(open_clips("out/starter", "train"), WindowSettings(crop=64))
-    loader = DataLoader(windows, batch_sampler=Batches(8, first=0, last=1000))
+    loader = DataLoader(windows("out/starter", split="train", crop=64), batch_size=8, shuffle=True)
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -25,9 +25,10 @@ from torch.utils.data import Dataset, Sampler
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
 from qsim.clip.simulation import Draw
+from qsim.clip.stream import Stream
 from qsim.keys import Key
 from qsim.sensor.sensor import Sensor
-from quiver.data.clips import has_sharp, peak_of
+from quiver.data.clips import has_sharp, open_clips, peak_of
 from quiver.data.code_table import draw_codes
 from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
@@ -213,6 +214,36 @@ class Windows(Dataset[dict[str, Any]]):
         if (place.clip, place.light) not in self._draws:
             self._draws[place.clip, place.light] = self.noise.noises[place.light].draw(self.clips[place.clip])
         return self._draws[place.clip, place.light]
+
+
+def windows(
+    source: Clip | Stream | Sequence[Clip] | str | os.PathLike[str],
+    *,
+    split: str | None = None,
+    frames: int = 11,
+    crop: int = 64,
+    seed: int = 0,
+    repeats: int = 1,
+) -> Windows:
+    """Return training windows for a `torch.utils.data.DataLoader`: codes, truth and light, with new noise per epoch.
+
+    `source` is a stream (its sensor and light), a clip, some clips, or the folder of a clip or a data set, of which
+    `split` names a part (train, val, test). A window has `frames` frames of `crop` x `crop` px; an epoch holds
+    `repeats` windows of every clip. `Windows` states the items; `WindowSettings` has more settings. `ValueError` where
+    no window fits.
+    """
+    settings = WindowSettings(frames=frames, crop=crop, seed=seed)
+    if isinstance(source, str | os.PathLike):
+        clips: Sequence[Clip] = open_clips(os.fspath(source), split)
+    elif split is not None:
+        raise ValueError("split= is for the folder of a data set; leave it out")
+    elif isinstance(source, Stream):
+        folder = source.clip
+        clips = [Clip(folder.path, folder.meta, folder.keeps)]
+        settings = replace(settings, lights=(Noise.of_stream(source),))
+    else:
+        clips = [source] if isinstance(source, Clip) else source
+    return Windows(clips, settings, repeats=repeats)
 
 
 def turned(window: Array, place: WindowPlace) -> Array:

@@ -25,7 +25,7 @@ from numpy import ndarray as Array
 from qsim.files import read_json, write_json
 from qsim.process import peak_memory, reset_peak
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
-from quiver.data.codes import Codes, array_codes, sensed, stored, windows_sensed
+from quiver.data.codes import Codes, Stream, array_codes, sensed, stored, windows_sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import breakdown, metrics
 from quiver.restoration.interface import Restorer
@@ -129,6 +129,20 @@ def truth_psnr(clip: Clip, factor: float, peak: float, frames: range) -> float |
         errors = clip.meta.get("error_at_white_per_frame", errors)
     unit = mean_light(clip, factor) / clip.mean_radiance / peak
     return metrics.truth_psnr([errors[t] * unit for t in frames])
+
+
+def score_video(video: Array, stream: Stream, *, peak: float | None = None) -> metrics.Score:
+    """Return the score of restored video [T, H, W] in photons against the truth of its stream.
+
+    `peak` [photons per pixel] is the light that the decibels refer to: 2.5 times the mean light of the stream by
+    default, as in `quiver evaluate`. Pixels whose light is not known do not count. `ValueError` for another shape,
+    `FileNotFoundError` for a stream without a clip.
+    """
+    if np.shape(video) != stream.shape:
+        raise ValueError(f"video has shape {list(np.shape(video))}, stream {list(stream.shape)}; they must be equal")
+    target = stream.truth()
+    white = peak_of(float(stream.meta.get("ppp") or target.mean()), peak)
+    return metrics.score(np.asarray(video) / np.float32(white), target / white, valid=stream.known())
 
 
 def peak_in_photons(comparison: Comparison, clip: Clip, codes: Codes, factor: float) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from quiver.data.clips import Clip
-from quiver.data.codes import Codes, Sensor, Stream, array_codes, open_stream, sensed, stream_codes
+from quiver.data.codes import Codes, LazyArray, Sensor, Stream, array_codes, open_stream, sensed, stream_codes
 from quiver.data.illumination import Illumination
 from quiver.restoration.domain_remarks import refuse_outside, remarks
 from quiver.restoration.interface import DEFAULT_METHOD, RestoreOptions
@@ -21,7 +21,7 @@ Source = Stream | Clip | str | os.PathLike[str] | Array
 
 
 def restore(
-    source: Source,
+    source: Source | LazyArray,
     method: str = DEFAULT_METHOD,
     *,
     sensor: Sensor | None = None,
@@ -41,9 +41,9 @@ def restore(
     are for networks. A network outside of what it was measured for warns; with `strict` it is a `ValueError`.
     `ValueError` or `FileNotFoundError` where the arguments do not fit together.
 
-        video = quiver.restore("out/fan", "moment")
+        video = quiver.restore(stream)
     """
-    codes = _codes(source, sensor, exposure, ppp)
+    codes = _codes(np.asarray(source) if isinstance(source, LazyArray) else source, sensor, exposure, ppp)
     chosen = restorer(method, RestoreOptions(device=device or "auto", mode=mode or "exact"))
     refuse_idle({"device": device, "mode": mode}, [chosen])
     found = remarks([chosen], codes)

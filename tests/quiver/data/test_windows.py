@@ -12,12 +12,13 @@ from stats import assert_mean
 from torch.utils.data import DataLoader
 
 from qsim.clip.photons import clip_photons, light_level
+from quiver.data.clips import open_clips
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
-from quiver.data.windows import Batches, Windows, WindowSettings
+from quiver.data.windows import Batches, Windows, WindowSettings, windows
 
 
-def windows(make_clip: ClipMaker, **settings: object) -> Windows:
+def three_clips(make_clip: ClipMaker, **settings: object) -> Windows:
     clips = [make_clip(f"clip_{i}", seed=i) for i in range(3)]
     return Windows(clips, WindowSettings(crop=16, **settings), repeats=2)
 
@@ -61,7 +62,7 @@ def test_codes_have_the_mean_of_their_photons(make_clip: ClipMaker):
 @pytest.mark.parametrize("backwards", [False, True])
 def test_turns_move_codes_and_target_together(make_clip: ClipMaker, turn: int, backwards: bool):
     """At a million photons noise is invisible: codes are the clipped target at every turn."""
-    data = windows(make_clip, lights=(Illumination("quiver-paper", ppp=3.25),))
+    data = three_clips(make_clip, lights=(Illumination("quiver-paper", ppp=3.25),))
     place = replace(data.place(0), turn=turn, backwards=backwards)
     exposed, sharp = data.photons_of(place)
     plain, _ = data.photons_of(replace(place, turn=0, backwards=False))
@@ -95,7 +96,7 @@ def test_a_drifting_crop_is_the_clip_under_a_moving_window(make_clip: ClipMaker)
 
 
 def test_epochs_and_samples_have_their_own_noise(make_clip: ClipMaker):
-    data = windows(make_clip)
+    data = three_clips(make_clip)
     assert len(data) == 6
     assert same(data[4], data[4])
     assert not torch.equal(data[4]["codes"], data[4 + 6]["codes"])
@@ -110,7 +111,7 @@ def windows_with_seed(data: Windows, seed: int) -> Windows:
 
 @pytest.mark.parametrize("workers", [2, pytest.param(1, marks=pytest.mark.slow)])
 def test_workers_draw_the_same_bytes(make_clip: ClipMaker, workers: int):
-    data = windows(make_clip)
+    data = three_clips(make_clip)
     alone = list(DataLoader(data, batch_sampler=Batches(2, 1, 4)))
     loader = DataLoader(data, batch_sampler=Batches(2, 1, 4), num_workers=workers, multiprocessing_context="spawn")
     for ours, theirs in zip(alone, loader, strict=True):
@@ -126,7 +127,7 @@ def test_processes_share_the_samples_without_overlap():
 
 def test_light_levels_are_mixed_and_named(make_clip: ClipMaker):
     lights = (Illumination(ppp=3.25), Illumination(ppp=26.0), Illumination(ppp=3.25, bits=1))
-    data = windows(make_clip, lights=lights)
+    data = three_clips(make_clip, lights=lights)
     found = {data.place(n).light for n in range(40)}
     assert found == {0, 1, 2}
     n = next(n for n in range(40) if data.place(n).light == 2)
@@ -174,3 +175,27 @@ def test_bad_radiance_names_its_clip(make_clip: ClipMaker, monkeypatch):
         sensed(clip, Illumination())[0].read(2, 4)
     with pytest.raises(ValueError, match=r"sliding_0: window from frame \d: photons"):
         Windows([clip], WindowSettings(crop=36))[0]
+
+
+def test_one_call_takes_streams_clips_and_folders(make_clip: ClipMaker, tiny_dataset):
+    clip = make_clip(sharp=True)
+    stream = clip.sense("spad-320x240", bits=1, ppp=1.5)
+    clip.sense("quiver-paper", bits=3, ppp=9.0)
+    expected = Windows([clip], WindowSettings((Illumination("spad-320x240", 1.5, 1),), crop=16, seed=4), repeats=3)
+    found = windows(stream, crop=16, seed=4, repeats=3)
+    assert len(found) == 3
+    assert all(same(found[n], expected[n]) for n in range(5))
+    both = Windows([clip], WindowSettings(crop=16, frames=7))
+    for source in (clip, [clip], clip.path, str(clip.path)):
+        assert same(windows(source, crop=16, frames=7)[1], both[1])
+    part = windows(tiny_dataset, split="train", crop=16)
+    assert [c.name for c in part.clips] == [c.name for c in open_clips(tiny_dataset, "train")]
+    with pytest.raises(ValueError, match="split= is for the folder of a data set"):
+        windows(clip, split="train")
+
+
+def test_a_plain_loader_batches_and_shuffles_windows(make_clip: ClipMaker):
+    data = windows(make_clip(), crop=16, repeats=4)
+    batches = list(DataLoader(data, batch_size=2, shuffle=True, generator=torch.Generator().manual_seed(0)))
+    assert [batch["codes"].shape for batch in batches] == [(2, 11, 1, 16, 16)] * 2
+    assert sorted(int(n) for batch in batches for n in batch["sample"]) == [0, 1, 2, 3]

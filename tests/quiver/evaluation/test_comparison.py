@@ -14,11 +14,12 @@ from methods import broken, method
 from numpy import ndarray as Array
 
 from qsim import files
+from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.sensing import Sensing, sense
 from qsim.clip.writer import ClipWriter
 from quiver.data.clips import open_clips, truth
-from quiver.data.codes import Codes, sensed
+from quiver.data.codes import Codes, sensed, stream_codes
 from quiver.data.illumination import Illumination
 from quiver.evaluation import summary
 from quiver.evaluation.comparison import (
@@ -28,6 +29,7 @@ from quiver.evaluation.comparison import (
     begin,
     evaluate,
     finished,
+    score_video,
     scored_frames,
     truth_psnr,
 )
@@ -253,6 +255,36 @@ def test_stored_streams_are_scored(tiny_dataset, make_clip: ClipMaker):
     assert stored[0].light == "mine"
     with pytest.raises(FileNotFoundError, match="no stream 'none'; there are: mine"):
         evaluate(Comparison(str(clip.path), None, stream="none"), [restorer("moment")])
+
+
+@pytest.mark.parametrize("peak", [None, 5.0])
+def test_a_video_has_the_score_that_an_evaluation_of_its_stream_has(make_clip: ClipMaker, peak: float | None):
+    clip = make_clip(sharp=True)
+    stream = clip.sense(ppp=3.25, bits=3, name="mine")
+    row = evaluate(Comparison(str(clip.path), None, stream="mine", peak=peak), [restorer("moment")])[0]
+    found = score_video(restorer("moment").restore(stream_codes(stream)), stream, peak=peak)
+    assert found.psnr == pytest.approx(row.score.psnr, rel=1e-9)
+    assert found.to_dict() == pytest.approx(row.score.to_dict(), rel=1e-6)
+
+
+def test_a_video_of_another_shape_or_without_truth_is_refused(make_clip: ClipMaker):
+    stream = make_clip(frames=4).sense(ppp=3.25, bits=3)
+    with pytest.raises(ValueError, match=r"video has shape \[3, .* stream \[4, "):
+        score_video(stream.truth(0, 3), stream)
+    assert score_video(stream.truth(), stream).psnr == math.inf
+
+
+def test_unknown_pixels_of_a_stream_have_no_score(tmp_path):
+    mask = np.zeros((2, 9, 9), bool)
+    mask[:, 4:6] = True
+    meta = {"shape": [2, 9, 9], "frame_rate": 2000.0, "exposure": 5e-4, "radiance_unit": RELATIVE}
+    with ClipWriter(tmp_path / "s", meta) as writer:
+        for t in range(2):
+            writer.add(t, np.full((9, 9), 2.0), saturated=mask[t])
+    stream = Clip.open(tmp_path / "s").sense("quiver-paper", ppp=2.0)
+    video = stream.truth()
+    video[mask] = 0
+    assert score_video(video, stream).psnr == math.inf
 
 
 def test_nothing_to_score_is_an_error(tmp_path, tiny_dataset):
