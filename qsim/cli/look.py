@@ -1,4 +1,4 @@
-"""Runs `qsim preview` (a picture, a film, the terminal) and `qsim report` (a page)."""
+"""Runs `qsim preview` (a picture, a film, the terminal), `qsim report` and `qsim explore` (pages)."""
 
 from __future__ import annotations
 
@@ -136,14 +136,46 @@ def add_report(sub: Any) -> None:
 def _run_report(args: argparse.Namespace) -> int:
     from qsim.report import report
 
-    target: Path = args.output or Path(f"{args.path.resolve().stem or 'report'}.html")
+    target = _page_target(args, f"{args.path.resolve().stem or 'report'}.html")
+    with bar("drawing", "thing") as progress:
+        page = report.build_page(args.path, title=args.title, notes=args.note, progress=progress)
+    return _write_page(args, target, page)
+
+
+def add_explore(sub: Any) -> None:
+    """Add the command `explore` to a program."""
+    parser = command(
+        sub, "explore", _run_explore,
+        "Write a page on which sliders set light and sensor, and the codes of a clip are drawn live in the browser.",
+        "qsim explore out/fan\nqsim explore out/fan -o out/fan_explore.html",
+    )  # fmt: skip
+    parser.add_argument("path", type=Path, metavar="CLIP", help="clip folder")
+    parser.add_argument("-o", "--output", type=Path, help=".html file to write (default: NAME_explore.html here)")
+    parser.add_argument("--force", action="store_true", help="replace an existing page")
+
+
+def _run_explore(args: argparse.Namespace) -> int:
+    from qsim.clip.clip import Clip
+    from qsim.report.explore import explore_page
+
+    if (args.path / "dataset.json").is_file():
+        raise ValueError(f"{args.path}: is a data set; name one of its clips, as in {args.path / 'clips'}/NAME")
+    target = _page_target(args, f"{args.path.resolve().stem}_explore.html")
+    return _write_page(args, target, explore_page(Clip.open(args.path)))
+
+
+def _page_target(args: argparse.Namespace, default: str) -> Path:
+    target: Path = args.output or Path(default)
     if target.suffix not in (".html", ".htm"):
         raise ValueError(f"{target}: a page is a .html file, as in -o {target.stem}.html")
     refuse_existing(target, args.force)
-    with bar("drawing", "thing") as progress:
-        page = report.build_page(args.path, title=args.title, notes=args.note, progress=progress).encode()
+    return target
+
+
+def _write_page(args: argparse.Namespace, target: Path, page: str) -> int:
+    content = page.encode()
     target.parent.mkdir(parents=True, exist_ok=True)
-    files.write_bytes(target, page)
-    found = {"page": str(target), "bytes": len(page)}
-    output(args, found, f"{target}: {len(page) / 1e6:.1f} MB, self-contained; open it in a browser")
+    files.write_bytes(target, content)
+    found = {"page": str(target), "bytes": len(content)}
+    output(args, found, f"{target}: {len(content) / 1e6:.1f} MB, self-contained; open it in a browser")
     return 0

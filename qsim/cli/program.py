@@ -16,7 +16,7 @@ from qsim.cli.completion import add_completion
 from qsim.cli.console import EXTRAS, Parser, command, output, run
 from qsim.cli.convert import add_convert
 from qsim.cli.dataset import add_check, add_generate, add_plan
-from qsim.cli.look import add_preview, add_report
+from qsim.cli.look import add_explore, add_preview, add_report
 from qsim.cli.render import add_render
 from qsim.cli.sense import add_sense
 from qsim.cli.tradeoff import add_tradeoff
@@ -39,6 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         add_convert,
         add_preview,
         add_report,
+        add_explore,
         add_tradeoff,
         add_calibrate,
         add_validate,

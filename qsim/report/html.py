@@ -143,11 +143,19 @@ def together(sections: Sequence[Markup]) -> Markup:
 
 def page(title: str, subtitle: str, sections: Sequence[Markup]) -> str:
     """Return the complete page as text; it loads nothing from elsewhere."""
-    return _templates().get_template("page.html").render(title=title, subtitle=subtitle, sections=sections)
+    return environment().get_template("page.html").render(title=title, subtitle=subtitle, sections=sections)
+
+
+def script(name: str) -> Markup:
+    """Return a script of templates/ as the content of a <script> element."""
+    from markupsafe import Markup
+
+    return Markup((Path(__file__).parent / "templates" / name).read_text(encoding="utf-8"))
 
 
 @cache
-def _templates() -> Environment:
+def environment() -> Environment:
+    """Return the templates; all text is escaped, and an unknown name is an error."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     loader = FileSystemLoader(Path(__file__).parent / "templates")
@@ -157,4 +165,4 @@ def _templates() -> Environment:
 @cache
 def _parts() -> Any:
     """Return the macros of parts.html; each of them returns `Markup`."""
-    return _templates().get_template("parts.html").module
+    return environment().get_template("parts.html").module
