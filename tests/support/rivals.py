@@ -9,6 +9,7 @@ import torch
 from golden import fill_by_rule
 from torch import nn
 
+from quiver.model.rivals.bit2bit import Bit2Bit, Bit2BitConfig
 from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
 from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
 
@@ -31,6 +32,8 @@ def lively(network: N) -> N:
 
 SMALL: dict[str, Callable[[], nn.Module]] = {
     **{module.__name__.removeprefix("golden_"): module.small for module in GOLDEN if hasattr(module, "small")},
+    "bit2bit": lambda: lively(Bit2Bit(Bit2BitConfig(width=4))),
+    "bit2bit_as_published": lambda: lively(Bit2Bit(Bit2BitConfig(width=4, as_published=True))),
     "student_teacher": lambda: lively(StudentTeacher(StudentTeacherConfig(width=3, blocks=1))),
     "fastdvdnet": lambda: lively(FastDVDnet(FastDVDnetConfig(width=4))),
 }

@@ -34,7 +34,8 @@ def test_constant_frames_give_finite_numbers_and_gradients(network, value):
     restored.square().mean().backward()
     gradients = {name: parameter.grad for name, parameter in network.named_parameters()}
     assert not [name for name, gradient in gradients.items() if gradient is not None and not gradient.isfinite().all()]
-    assert any(gradient is not None and gradient.abs().max() > 0 for gradient in gradients.values())
+    reached = any(gradient is not None and gradient.abs().max() > 0 for gradient in gradients.values())
+    assert reached or value == 0  # frames may get the brightness of their codes
 
 
 def test_clips_of_a_batch_do_not_meet(network):
