@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 BLENDED = 32  # px: half of the overlap of neighbouring tiles where no overlap makes them exact
 STARTING = 60_000_000  # bytes that torch takes for its kernels at first use
+TILING = 30_000_000  # bytes that tiles of several shapes take beyond those of the largest; 26 MB measured
 ESTIMATE_BYTES = 1_200  # per pixel of an initial estimate of width 32; 930 measured
 COUNTS = 0.1  # weight from which the result of a tile is compared with its neighbours
 
@@ -67,7 +68,7 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int, mode: str
         needed = min(needed, rest + per_pixel * min(least, padded[0]) * min(least, padded[1]))
         if memory >= needed:
             return Pieces(whole.tiles, estimate_pixels=(memory - rest) // per_pixel)
-    step = max(multiple, model.stride)
+    step, pixels = max(multiple, model.stride), max(memory - TILING, 0) // bytes_per_pixel(model, mode)
     return Pieces(cut_tiles(height, width, pixels, BLENDED, step, blend=True), None, False, needed)
 
 
