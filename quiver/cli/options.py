@@ -21,7 +21,17 @@ from quiver.restoration.interface import MODES
 QUIVERS = ("nano", "quiver-s", "quiver")  # see quiver/model/presets.py
 NETWORKS = (
     *QUIVERS,
-    *("unet", "emvd", "emvd-as-published", "flornn", "flornn-as-published", "memdeblur", "memdeblur-as-published"),
+    *(
+        "unet",
+        "fastdvdnet",
+        "student-teacher",
+        "emvd",
+        "emvd-as-published",
+        "flornn",
+        "flornn-as-published",
+        "memdeblur",
+        "memdeblur-as-published",
+    ),
     *("rvrt", "spk2imgnet", "spk2imgnet-as-published"),
 )
 PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see quiver/training/settings.py

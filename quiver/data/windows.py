@@ -40,7 +40,7 @@ from quiver.data.window_noise import WindowPlace, check_windows, window_codes
 # where samples are drawn, in worker processes too, and gets no gradients; it is a function of a module, not a lambda.
 Prepare = Callable[[Codes], Mapping[str, torch.Tensor]]
 
-TRAINING, VALIDATION = 1, 2  # stages of the random keys: no two uses share noise (0 is `qsim sense`)
+TRAINING, VALIDATION, STILL = 1, 2, 3  # stages of the random keys: no two uses share noise (0 is `qsim sense`)
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,7 @@ class WindowSettings:
     reverse: bool = True  # half of the windows run backwards in time
     drift: int = 0  # px/frame; in half of the windows the crop moves, up to this far along each side
     force_exposure: bool = False  # published: every window is brought to the light level separately
+    still: bool = False  # items also hold noisy copies of the centre frame, drawn without defects
     ceiling: float = 2.0  # of targets, in units of white: 11 codes do not distinguish light above it from saturation
     seed: int = 0
 
@@ -76,6 +77,7 @@ class Windows(Dataset[dict[str, Any]]):
         ppp      mean photons per pixel and exposure
         sample   its number
         key      text: clip, place, light, random key
+        still    float32 [T, 1, h, w] in [0, 1], codes of a scene that rests as in the centre frame, if asked for
         ...      what `prepare` returns for the codes, their sensor, exposure and light
 
     Codes and target follow the sensor of their window. `noise` is the mixture that windows draw from; `repr` shows it.
@@ -179,6 +181,10 @@ class Windows(Dataset[dict[str, Any]]):
             "key": f"{clip.name} frame {place.start}, (y, x) ({place.y}, {place.x}), turn {place.turn}, "
             f"{'backwards, ' if place.backwards else ''}{noise.label}, {place.key}",
         }
+        if self.settings.still:
+            resting = np.broadcast_to(photons[len(photons) // 2] * scale, photons.shape)
+            key = replace(place.key, stage=STILL + place.key.stage)
+            sample["still"] = as_input(draw_codes(draw.sensor, resting, clip.exposure, key), draw.sensor)
         if self.prepare is None:
             return sample
         seen = array_codes(codes, draw.sensor, clip.exposure, name=clip.name)

@@ -10,10 +10,12 @@ from quiver.model.config import Config
 from quiver.model.folded import FoldedConfig, FoldedQUIVER
 from quiver.model.quiver import QUIVER
 from quiver.model.rivals.emvd import EMVD, EMVDConfig
+from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
 from quiver.model.rivals.flornn import FloRNN, FloRNNConfig
 from quiver.model.rivals.memdeblur import MemDeblur, MemDeblurConfig
 from quiver.model.rivals.rvrt import RVRT, RVRTConfig
 from quiver.model.rivals.spk2imgnet import Spk2ImgNet, Spk2ImgNetConfig
+from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
 from quiver.model.unet import UNet, UNetConfig
 
 PRESETS: dict[str, Config] = {
@@ -22,9 +24,11 @@ PRESETS: dict[str, Config] = {
     "nano": FoldedConfig(),  # small in every part; results: docs/results/starter.md
 }
 
-# The control, and the compared networks: with the sensor's noise or factor, and as their ports to three bits have them.
+# The controls and the compared networks: mended, with the sensor's noise or factor, and as their ports have them.
 OTHERS: dict[str, Any] = {
     "unet": UNetConfig(),
+    "fastdvdnet": FastDVDnetConfig(),
+    "student-teacher": StudentTeacherConfig(),
     "emvd": EMVDConfig(),
     "emvd-as-published": EMVDConfig(as_published=True),
     "flornn": FloRNNConfig(),
@@ -41,6 +45,8 @@ NETWORKS: tuple[tuple[type[nn.Module], type], ...] = (
     (QUIVER, Config),
     (FoldedQUIVER, FoldedConfig),
     (UNet, UNetConfig),
+    (FastDVDnet, FastDVDnetConfig),
+    (StudentTeacher, StudentTeacherConfig),
     (EMVD, EMVDConfig),
     (FloRNN, FloRNNConfig),
     (MemDeblur, MemDeblurConfig),

@@ -108,6 +108,7 @@ def make_windows(
         reverse=settings.reverse,
         drift=settings.drift,
         force_exposure=settings.force_exposure,
+        still=system.still,
         seed=settings.seed,
     )
     training, split = open_clips(settings.data, "train"), settings.validation_split

@@ -9,18 +9,20 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+import torch.nn.functional as functional
 from torch import Tensor, nn
 
-from quiver.model.blocks import resize
+from quiver.model.blocks import RADIUS, WINDOW, resize
 from quiver.model.deformable import warp
 from quiver.model.rivals.spk2imgnet import BEFORE, CONVERTER, GROUPS
+from quiver.model.rivals.student_teacher import distillation_loss
 from quiver.training.settings import Settings
 from quiver.training.system import Batch
 
 EPSILON = 1e-3  # of the Charbonnier loss, in units of white
 ESTIMATES = 0.02  # weight of Spk2ImgNet's light estimates
 PHOTOMETRIC = 0.1  # ours: weight of FloRNN's flow loss, beside squared errors
-SQUARED_FRAMES = 0.5  # FloRNN: sums of squares are divided by twice the batch
+HALF = 0.5  # sums of squares are divided by twice their number
 
 
 def charbonnier(a: Tensor, b: Tensor) -> Tensor:
@@ -42,6 +44,11 @@ def last_frame(network: nn.Module, batch: Batch) -> tuple[Tensor, int]:
     """Return the last frame of a window [B, 1, 1, h, w], and its place."""
     restored = network(batch["codes"])
     return restored[:, -1:], restored.shape[1] - 1
+
+
+def windows_restored(network: Any, batch: Batch) -> tuple[Tensor, int]:
+    """Return the frames whose window lies in that of the batch [B, n, 1, h, w], and the place of the first."""
+    return network.windows(batch["codes"]), network.frames_in - 1 - network.look_ahead
 
 
 # EMVD
@@ -83,7 +90,7 @@ def flornn_loss(network: Any, batch: Batch, settings: Settings, share: float) ->
     restored = network.restore(images, network.noise(codes), flows).float()
     first = 1 if network.config.as_published else 0
     wanted = target[:, first : restored.shape[1]]
-    squares = SQUARED_FRAMES * (restored[:, first:] - wanted).square().sum() / len(codes)
+    squares = HALF * (restored[:, first:] - wanted).square().sum() / len(codes)
     if network.flow is None:
         return squares
     earlier, later = target[:, :-1].flatten(0, 1), target[:, 1:].flatten(0, 1)
@@ -133,7 +140,43 @@ def check_memdeblur(network: Any, settings: Settings) -> None:
         )
 
 
-# RVRT, and others that restore every frame
+# Student-Teacher
+
+TEACHING = 0.3  # share of a run for each teacher
+
+
+def student_teacher_loss(network: Any, batch: Batch, settings: Settings, share: float) -> Tensor:
+    """Return the loss of the part that learns now: motion teacher, noise teacher, then the student.
+
+    The motion teacher sees the sharp frames, the noise teacher noisy copies of the centre frame. Without teachers the
+    student learns all the time.
+    """
+    sharp = batch["target"][:, :WINDOW, 0]
+    centre = sharp[:, RADIUS : RADIUS + 1]
+    teachers = (network.motion_teacher, sharp), (network.noise_teacher, batch["still"][:, :WINDOW, 0])
+    if network.config.distil and share < 2 * TEACHING:
+        teacher, seen = teachers[share >= TEACHING]
+        return functional.mse_loss(teacher(seen).restored.float(), centre)
+    taught = network.student(batch["codes"][:, :WINDOW, 0])
+    if not network.config.distil:
+        return functional.mse_loss(taught.restored.float(), centre)
+    with torch.no_grad():
+        motion, noise = (teacher(seen).features[0] for teacher, seen in teachers)
+    return distillation_loss(taught, centre, motion, noise)
+
+
+# FastDVDnet
+
+
+def fastdvdnet_loss(network: Any, batch: Batch, settings: Settings, share: float) -> Tensor:
+    """Return the squared error of the restored frames, summed, over twice their number."""
+    restored, first = windows_restored(network, batch)
+    wanted = batch["target"][:, first : first + restored.shape[1]]
+    squares = (restored.float() - wanted).square().sum()
+    return HALF * squares / (restored.shape[0] * restored.shape[1])
+
+
+# RVRT
 
 
 def charbonnier_loss(network: nn.Module, batch: Batch, settings: Settings, share: float) -> Tensor:

@@ -36,6 +36,7 @@ class System:
     frames: int = 11  # of the windows of a validation, and least of those of training
     multiple: int | None = None  # px that divides the side of a crop; None: the network's own `multiple`, else 1
     prepare: Prepare | None = None  # computes more inputs where samples are drawn
+    still: bool = False  # samples also hold noisy copies of the centre frame
     check: Callable[[nn.Module, Settings], None] = nothing_to_refuse  # ValueError for settings that do not fit
 
     def window(self, network: nn.Module) -> int:

@@ -10,10 +10,12 @@ from torch import Tensor, nn
 from quiver.model.blocks import RADIUS
 from quiver.model.presets import build
 from quiver.model.rivals.emvd import EMVD
+from quiver.model.rivals.fastdvdnet import FastDVDnet
 from quiver.model.rivals.flornn import FloRNN
 from quiver.model.rivals.memdeblur import MemDeblur
 from quiver.model.rivals.rvrt import RVRT
 from quiver.model.rivals.spk2imgnet import Spk2ImgNet
+from quiver.model.rivals.student_teacher import StudentTeacher
 from quiver.training import rival_losses as rivals
 from quiver.training.loss import PRESETS as LOSSES
 from quiver.training.loss import training_loss
@@ -35,6 +37,8 @@ _PORT: dict[str, Any] = {
     "steps": 63_000,
     "loss": "own",
 }
+_FASTDVDNET = {"sensor": "quiver-published", "ppp": (3.25,), "bits": (3,), "force_exposure": True, "reverse": False,
+               "schedule": "plateau", "warmup": 0, "crop": 96, "batch": 64, "steps": 320_000}  # fmt: skip
 _QUICK: dict[str, Any] = {"learning_rate": 1e-3, "drift": 3, "loss": "own"}
 
 
@@ -73,6 +77,15 @@ SYSTEMS: dict[type[nn.Module], System] = {
         *("memdeblur", rivals.memdeblur_loss, rivals.centre_frame, _protocols({}, learning_rate=3e-4)),
         multiple=16,
         check=rivals.check_memdeblur,
+    ),
+    FastDVDnet: System(
+        *("fastdvdnet", rivals.fastdvdnet_loss, rivals.windows_restored),
+        _protocols(_FASTDVDNET | {"learning_rate": 1e-3, "frames": 5}),
+        multiple=4,
+    ),
+    StudentTeacher: System(
+        *("student-teacher", rivals.student_teacher_loss, rivals.windows_restored, _protocols({}, learning_rate=3e-4)),
+        still=True,
     ),
     RVRT: System(
         *("rvrt", rivals.charbonnier_loss, rivals.centre_frame),

@@ -12,10 +12,12 @@ from torch import nn
 from quiver.model.config import Config
 from quiver.model.presets import PRESETS, assemble
 from quiver.model.rivals.emvd import EMVD, EMVDConfig
+from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
 from quiver.model.rivals.flornn import FloRNN, FloRNNConfig
 from quiver.model.rivals.memdeblur import MemDeblur, MemDeblurConfig
 from quiver.model.rivals.rvrt import RVRT, RVRTConfig
 from quiver.model.rivals.spk2imgnet import Spk2ImgNet, Spk2ImgNetConfig
+from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
 from quiver.model.unet import UNet, UNetConfig
 from quiver.training.settings import Settings
 from quiver.training.systems import system_of
@@ -40,6 +42,8 @@ TINY: dict[str, Callable[[], nn.Module]] = {  # a small network of every system 
     "quiver": lambda: assemble(Config(channels=16, cell_growth=2)),
     "nano": lambda: assemble(replace(PRESETS["nano"], estimate_width=4, attention_width=16)),
     "emvd": lambda: EMVD(EMVDConfig(width=4)),
+    "fastdvdnet": lambda: FastDVDnet(FastDVDnetConfig(width=4)),
+    "student-teacher": lambda: StudentTeacher(StudentTeacherConfig(width=4, blocks=1)),
     "flornn": lambda: FloRNN(FloRNNConfig(width=4, blocks=1, flow_channels=(2, 4, 2, 2), flow_kernel=3, flow_levels=3)),
     "memdeblur": lambda: MemDeblur(MemDeblurConfig(width=8, forward_blocks=1, backward_blocks=1)),
     "rvrt": lambda: RVRT(RVRTConfig(width=6, flow_levels=1)),

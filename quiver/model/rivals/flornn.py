@@ -145,8 +145,12 @@ class FloRNN(nn.Module):
         if self.flow is None:
             raise ValueError("this FloRNN has no flow network; give the flows, or set FloRNNConfig.flow_channels")
         earlier, later = frames[:, :-1].flatten(0, 1), frames[:, 1:].flatten(0, 1)
-        both = self.flow(torch.cat([earlier, later]), torch.cat([later, earlier]))[0]
-        return Flows(*(flow.unflatten(0, (batch, count - 1)) for flow in both.chunk(2)))
+        pairs = len(earlier) if torch.is_grad_enabled() else 1  # at a time: the pyramids of all take gigabytes
+        parts = []
+        for i in range(0, len(earlier), pairs):
+            a, b = earlier[i : i + pairs], later[i : i + pairs]
+            parts.append(self.flow(torch.cat([a, b]), torch.cat([b, a]))[0].unflatten(0, (2, len(a))))
+        return Flows(*(flow.unflatten(0, (batch, count - 1)) for flow in torch.cat(parts, dim=1)))
 
     def noise(self, frames: Tensor) -> Tensor:
         """Frames [B, T, 1, H, W] -> noise maps of the same shape: the deviation of each pixel, or 0 if as published."""

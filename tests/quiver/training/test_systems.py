@@ -240,6 +240,22 @@ def test_windows_compute_inputs_from_codes_sensor_and_light(tiny_dataset):
         assert sample["known"].tolist() == pytest.approx([3, float(sample["white"]), 3.25, 5e-4])
 
 
+def test_samples_hold_noisy_copies_of_the_centre_frame(tiny_dataset):
+    """Their mean is the sensor's for the light of the centre frame; their noise is new in each, the codes as before."""
+    clips = open_clips(tiny_dataset, "train")
+    windows = Windows(clips, WindowSettings(crop=32, still=True))
+    sample, plain = windows[1], Windows(clips, WindowSettings(crop=32))[1]
+    assert torch.equal(sample["codes"], plain["codes"])
+    still = sample["still"].numpy()[:, 0] * 7
+    assert not np.array_equal(still[0], still[1])
+    photons, _ = windows.photons_of(windows.place(1))
+    sensor = windows.noise.noises[0].draw(clips[0]).sensor
+    mean, variance = (np.asarray(law(photons[5], 5e-4)) for law in (sensor.mean, sensor.variance))
+    z = (still.mean(axis=0) - mean) / np.sqrt(variance / len(still))
+    assert abs(z.mean()) < 5 / np.sqrt(z.size)
+    assert abs((z**2).mean() - 1) < 5 * np.sqrt(2 / z.size) * 1.5
+
+
 def test_a_network_is_trained_on_prepared_inputs(tiny_dataset, tmp_path, monkeypatch):
     """The loop hands what `prepare` returns to the loss and to the validation."""
     seen: list[float] = []
