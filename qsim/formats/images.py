@@ -44,6 +44,20 @@ def read_png(path: Path, hints: Hints) -> Recording:
     return picture(path, shape, raw, first.dtype, "PNG", hints)
 
 
+def read_pictures(folder: Path) -> Iterator[Array]:
+    """Yield the PNGs of a folder in the order of their numbers: 8-bit grey [H, W], or red, green and blue [H, W, 3].
+
+    `ValueError` for pictures of another depth or of different sizes.
+    """
+    first: Array | None = None
+    for file in numbered(list(folder.glob("*.png"))):
+        image = _png(file)
+        first = image if first is None else first
+        if image.dtype != np.uint8:
+            raise ValueError(f"{file}: pixels of {image.dtype}, not of 8 bits")
+        yield _same_size([file], [image], first.shape, first.dtype)[0]
+
+
 def read_tiff(path: Path, hints: Hints) -> Recording:
     """Read a TIFF with one page per frame, or a folder of TIFFs; MinIsWhite is converted to MinIsBlack."""
     found = [path] if path.is_file() else numbered([*path.glob("*.tif"), *path.glob("*.tiff")])

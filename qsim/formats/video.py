@@ -79,6 +79,14 @@ def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossl
             container.mux(packet)
 
 
+def read_frames(path: Path) -> Iterator[Array]:
+    """Yield the frames of a video as they are stored: grey of 8 bits [H, W], or red, green and blue [H, W, 3]."""
+    with decoding_errors(path, "video"):
+        _, height, width = _video_shape(path)
+        check_shape(path, (1, height, width))
+        yield from _decoded(path, (height, width))
+
+
 class _Decoder:
     """Decodes frames in order; an earlier frame starts again at the first."""
 
@@ -89,7 +97,7 @@ class _Decoder:
 
     def frames(self, start: int, stop: int) -> list[Array]:
         if self.source is None or start < self.next:
-            self.source, self.next = self._decode(), 0
+            self.source, self.next = _decoded(self.path, self.size), 0
         found = []
         while self.next < stop:
             frame = next(self.source, None)
@@ -102,15 +110,16 @@ class _Decoder:
             self.next += 1
         return found
 
-    def _decode(self) -> Iterator[Array]:
-        with _open_video(self.path) as container:
-            for frame in container.decode(video=0):
-                if (frame.height, frame.width) != self.size:
-                    raise ValueError(f"{self.path}: a frame of {frame.height} x {frame.width} among {self.size}")
-                if frame.format.name.startswith("gray"):
-                    yield frame.to_ndarray(format="gray")
-                else:
-                    yield frame.to_ndarray(format="rgb24", interpolation=EXACT)
+
+def _decoded(path: Path, size: tuple[int, int]) -> Iterator[Array]:
+    with _open_video(path) as container:
+        for frame in container.decode(video=0):
+            if (frame.height, frame.width) != size:
+                raise ValueError(f"{path}: a frame of {frame.height} x {frame.width} among {size}")
+            if frame.format.name.startswith("gray"):
+                yield frame.to_ndarray(format="gray")
+            else:
+                yield frame.to_ndarray(format="rgb24", interpolation=EXACT)
 
 
 def _open_video(path: Path) -> Any:

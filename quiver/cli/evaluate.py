@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qsim.cli.console import bar, output
+from qsim.cli.console import bar, note, output
 from qsim.cli.options import count, frame_size, positive, words
 from qsim.files import write_bytes, write_json
 from quiver.cli.options import (
@@ -28,6 +28,9 @@ from quiver.device import DEVICES
 if TYPE_CHECKING:
     from quiver.evaluation.comparison import Comparison
 
+# Files of an evaluation, and its clips of a test set
+OURS = r"plan\.json|rows\.jsonl|evaluation\.(json|md|png)|crops_[^/]*\.png|crops/[^/]*\.npy|lock|clips/.*"
+
 # evaluate
 
 
@@ -36,9 +39,10 @@ def add_evaluate(sub: Any) -> None:
         sub, "evaluate", _run_evaluate, "Compare methods on held-out clips, or on real photons of a static object.",
         "quiver evaluate out/starter -o out/table --methods naive,moment,out/mine,out/unet --ppp 3.25,9.75,26\n"
         "quiver evaluate out/starter/clips/fan_0003 -o out/fan_table --methods moment,nano --split all\n"
+        "quiver evaluate I2-2000FPS/test -o out/published --protocol quiver-published --methods moment,out/mine\n"
         "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,nano", resumes=True,
     )  # fmt: skip
-    parser.add_argument("source", nargs="?", help="data set or clip folder")
+    parser.add_argument("source", nargs="?", help="data set or clip folder; with --protocol the folder of a test set")
     parser.add_argument("-o", "--output", type=Path, help="folder for evaluation.md, .json, .png (needed for clips)")
     parser.add_argument(
         "--methods",
@@ -51,6 +55,11 @@ def add_evaluate(sub: Any) -> None:
     add_light(parser, several=True)
     parser.add_argument("--seed", type=int, help="seed of the test noise or of the random splits (default 0)")
     parser.add_argument("--published", action="store_true", help="expose, scale and score every window separately")
+    parser.add_argument(
+        "--protocol",
+        choices=("quiver-published", "x4k1000fps"),
+        help="the paper's test on I2-2000FPS or X4K1000FPS, read from the folders as they are published",
+    )
     parser.add_argument(
         "--peak", type=positive, help="photons per pixel that the scores refer to (default 2.5 x the mean light)"
     )
@@ -82,12 +91,8 @@ def _run_evaluate(args: argparse.Namespace) -> int:
 
     comparison = _comparison(args)
     remarks = check_domain(args, methods, streams(comparison))
-    if args.force and args.output.exists():
-        renew(
-            args.output,
-            "plan.json",
-            r"plan\.json|rows\.jsonl|evaluation\.(json|md|png)|crops_[^/]*\.png|crops/[^/]*\.npy|lock",
-        )
+    if args.force and args.output.exists() and args.protocol is None:
+        renew(args.output, "plan.json", OURS)
     with bar("rows", "row") as progress:
         rows = evaluate(comparison, methods, args.output, lambda what, done, total: progress(done, total))
     summary.write(args.output, comparison, methods, rows, remarks)
@@ -104,6 +109,8 @@ def _comparison(args: argparse.Namespace) -> Comparison:
     from quiver.restoration.sources import LIGHT, refuse
 
     refuse(args, ("frames", "splits"), "belongs to --static COUNTS")
+    if args.protocol is not None:
+        return _published_test(args)
     if (Path(args.source) / "clip.json").exists() and args.split not in (None, "all"):
         raise ValueError(
             f"--split {args.split}: chooses clips of a data set, and {args.source} is one clip; leave it out"
@@ -123,6 +130,32 @@ def _comparison(args: argparse.Namespace) -> Comparison:
     )
     split = None if args.split == "all" else args.split or "test"
     return Comparison(args.source, split, lights, args.seed or 0, args.published, args.stream, args.peak)
+
+
+def _published_test(args: argparse.Namespace) -> Comparison:
+    """Import the clips of a test set of the paper into OUT/clips, and return what is scored there."""
+    from quiver.data.illumination import Illumination
+    from quiver.data.test_sets import TEST_SETS, counted, import_test_set
+    from quiver.evaluation.comparison import CLIPS, Comparison
+
+    refuse_published(args)
+    which, folder = TEST_SETS[args.protocol], args.output / CLIPS
+    if args.force and args.output.exists():
+        renew(args.output, "plan.json", OURS)
+    with bar("clips", "clip") as progress:
+        clips = import_test_set(Path(args.source), which, folder, progress)
+    note(counted(clips, which))
+    lights = tuple(Illumination("quiver-published", ppp, 3) for ppp in args.ppp or (3.25,))
+    return Comparison(str(folder), None, lights, args.seed or 0, published=True, test_set=which.name)
+
+
+def refuse_published(args: argparse.Namespace) -> None:
+    """Raise `ValueError` for options that a protocol of the paper decides."""
+    from quiver.restoration.sources import refuse
+
+    refuse(args, ("split", "stream", "sensor", "bits", "peak"), f"--protocol {args.protocol} decides it")
+    if args.published:
+        raise ValueError(f"--published: --protocol {args.protocol} includes it; leave it out")
 
 
 def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
@@ -154,7 +187,7 @@ def _refuse_for_counts(args: argparse.Namespace) -> None:
     why = "is for clips, and --static scores measured counts"
     if args.source is not None:
         raise ValueError(f"{args.source}: {why}; leave one of them out")
-    refuse(args, ("output", "split", "stream", "sensor", "ppp"), why)
+    refuse(args, ("output", "split", "stream", "sensor", "ppp", "protocol"), why)
     for name in ("published", "force"):
         if getattr(args, name):
             raise ValueError(f"--{name}: {why}; leave it out")

@@ -32,6 +32,7 @@ from quiver.restoration.interface import Restorer
 
 FORMAT = "quiver-evaluation-2"  # 1: peak = the sensor's white, factor of the least unclamped error
 PLAN_FORMAT = "quiver-plan-2"
+CLIPS = "clips"  # folder in an evaluation that holds the imported clips of a test set
 PUBLISHED_EDGE = 5  # frames at each end that the published evaluation leaves out
 
 ComparisonProgress = Callable[[str, int, int], None]  # (text for people, rows done, rows in all)
@@ -48,11 +49,12 @@ class Comparison:
     published: bool = False  # every window exposed, drawn, scaled and scored separately; ends of clips left out
     stream: str | None = None  # score this stored stream instead of sensing at `lights`
     peak: float | None = None  # of the scores, photons per pixel; None = 2.5 x mean light (published: sensor's white)
+    test_set: str | None = None  # of the paper, in its own layout: the truth is grey / 255, its peak 1
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
-        return plain
+        return plain if self.test_set else {name: v for name, v in plain.items() if name != "test_set"}
 
 
 @dataclass(frozen=True)
@@ -115,6 +117,13 @@ def scene_of(clip: Clip) -> str:
     return f"{scene['family']}:{scene.get('seed', 0)}" if "family" in scene else clip.name
 
 
+def clips_of(comparison: Comparison) -> list[Clip]:
+    """Return the scored clips: of a data set, or the imported ones of a test set of the paper."""
+    if comparison.test_set is None:
+        return open_clips(comparison.source, comparison.split)
+    return [Clip.open(path) for path in sorted(Path(comparison.source).iterdir()) if (path / "clip.json").exists()]
+
+
 def truth_psnr(clip: Clip, factor: float, peak: float, frames: range) -> float | None:
     """Return the PSNR [dB] of the clip's own truth at a peak in photons, from its measured errors; None without them.
 
@@ -146,7 +155,12 @@ def score_video(video: Array, stream: Stream, *, peak: float | None = None) -> m
 
 
 def peak_in_photons(comparison: Comparison, clip: Clip, codes: Codes, factor: float) -> float:
-    """Return the peak of a clip's scores: as set, else 2.5 times the mean light, or as published the white."""
+    """Return the peak of a clip's scores: as set, else 2.5 times the mean light, or as published the white.
+
+    Of the paper's test sets it is the light of grey 255.
+    """
+    if comparison.test_set is not None:
+        return factor
     if comparison.peak is None and comparison.published:
         return codes.white
     return peak_of(mean_light(clip, factor), comparison.peak)
@@ -179,10 +193,11 @@ def restore_clip(
             restored = method.restore(codes)
         seconds = (time.perf_counter() - started) / len(frames)
         peak = peak_memory() - before
-        score = metrics.score(restored / np.float32(white), target, per_frame_scale=comparison.published, valid=valid)
+        unit = codes.white if comparison.test_set else white  # networks learn photons / white, the target is grey / 255
+        score = metrics.score(restored / np.float32(unit), target, per_frame_scale=comparison.published, valid=valid)
     except Exception as error:  # a method's failure is recorded as its result
         return replace(row, failure=f"{type(error).__name__}: {' '.join(str(error).split())}")
-    matched = restored * np.float32(score.scale / white)
+    matched = restored * np.float32(score.scale / unit)
     speed = breakdown.speeds(clip, frames)
     if speed is not None and valid is not None:
         speed = np.where(valid, speed, math.nan)
@@ -227,7 +242,7 @@ def evaluate(
     """
     if comparison.stream is not None and (comparison.published or len(comparison.lights) > 1):
         raise ValueError("a stored stream has one light level and one exposure; leave out --ppp and --published")
-    clips = open_clips(comparison.source, comparison.split)
+    clips = clips_of(comparison)
     if not clips:
         raise ValueError(f"{comparison.source}: no finished clip in split {comparison.split!r}")
     for clip in clips:
@@ -261,7 +276,7 @@ def evaluate(
 def streams(comparison: Comparison) -> Iterator[Codes]:
     """Yield every stream of a comparison before anything is drawn; errors as `evaluate`."""
     for light in comparison.lights:
-        for clip in open_clips(comparison.source, comparison.split):
+        for clip in clips_of(comparison):
             yield (
                 sensed(clip, light, comparison.seed) if comparison.stream is None else stored(clip, comparison.stream)
             )[0]
@@ -285,7 +300,7 @@ def begin(comparison: Comparison, out: Path, clips: Sequence[Clip]) -> list[Comp
     path = out / "plan.json"
     wanted = {"format": PLAN_FORMAT} | comparison.to_dict() | {"content_sha256": content_digest(comparison, clips)}
     if not path.exists():
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        if out.exists() and (not out.is_dir() or any(path.name != CLIPS for path in out.iterdir())):
             raise FileExistsError(f"{out} exists and is not an evaluation; choose another -o")
         out.mkdir(parents=True, exist_ok=True)
         write_json(path, wanted)

@@ -333,6 +333,9 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Refused(STORED, "--published", "is stored"),
         Refused("evaluate short -o table --methods naive", "--published", "too few"),
     ),
+    ("evaluate", "--protocol"): of_clips(  # its effect: tests/quiver/data/test_test_sets.py
+        "--protocol", "x4k1000fps", Refused(SCORE, "--protocol quiver-published", "holds no videos")
+    ),
     ("evaluate", "--peak"): [Acts(SCORE, "--peak 20", scores), Acts(COUNTS, "--peak 20", static_scores)],
     ("evaluate", "--static"): [
         Acts(COUNTS, "--static more.npy", static_scores),
@@ -438,7 +441,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("bench", "--modes"): [
         Acts(BENCH, "--modes exact,windows", costs),
         Refused(BENCH_CLASSICAL, "--modes exact", "acts on networks"),
-        Refused(BENCH_CLASSICAL.replace("moment", "unet"), "--modes exact", "it has one mode"),
+        Refused(BENCH_CLASSICAL.replace("moment", "unet"), "--modes exact", "has one mode"),
     ],
     ("bench", "--precisions"): [
         Acts(BENCH, "--precisions bfloat16", costs),

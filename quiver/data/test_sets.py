@@ -1,0 +1,136 @@
+"""Opens the test sets of the paper in their own layouts, as clips whose light is the grey value of each pixel.
+
+    FOLDER/*.mp4, I2-2000FPS, and folders of pictures or videos at any depth, X4K1000FPS  ->  OUT/NAME, one clip each
+
+As the published program does, colour becomes grey by the weights of OpenCV, 0.299 R + 0.587 G + 0.114 B in whole
+numbers, and grey / 255 is taken as light, though it is gamma-coded. Sizes are those of the program's loader. A change
+of size is bicubic (a = -0.75, no antialiasing), rounded to whole numbers.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import RELATIVE
+from qsim.clip.writer import ClipWriter
+from qsim.files import Progress
+from qsim.formats.detection import recordings
+from qsim.formats.images import read_pictures
+from qsim.formats.video import read_frames
+
+WINDOW = 11  # frames of a published window; one is restored
+WEIGHTS = (0.299, 0.587, 0.114)  # of red, green and blue in OpenCV's grey
+
+
+@dataclass(frozen=True)
+class TestSet:
+    """A test set of the paper: how its clips are read, and how many there are."""
+
+    __test__ = False  # no test of pytest
+
+    name: str  # of the protocol
+    frame_rate: float  # Hz
+    size: Callable[[int, int], tuple[int, int]]  # of the loader, for the height and width of a file
+    clips: int
+    windows: int  # one for every frame with five frames before and five after it
+
+
+def _nearly_fours(height: int, width: int) -> tuple[int, int]:
+    """Return the size of the published loader: a multiple of four for even sides."""
+    return height + height % 4, width + width % 4
+
+
+TEST_SETS = {
+    "quiver-published": TestSet("quiver-published", 2000.0, _nearly_fours, 31, 6017),
+    "x4k1000fps": TestSet("x4k1000fps", 1000.0, lambda height, width: (512, 1024), 15, 345),
+}
+
+
+def import_test_set(folder: Path, which: TestSet, out: Path, progress: Progress | None = None) -> list[Clip]:
+    """Write the clips of a test set that OUT does not hold yet, and return all of them in the order of their names.
+
+    `ValueError` if the folder holds no recordings or one of fewer than eleven frames, or if OUT holds clips of other
+    files.
+    """
+    files = recordings(folder, None)
+    if not files:
+        raise ValueError(f"{folder}: holds no videos and no folders of pictures; name the folder of the test set")
+    clips = []
+    for done, file in enumerate(files):
+        if progress is not None:
+            progress(done, len(files))
+        clips.append(_imported(file, out / _name(folder, file), which))
+    if progress is not None:
+        progress(len(files), len(files))
+    return clips
+
+
+def counted(clips: list[Clip], which: TestSet) -> str:
+    """Return one line: how many windows the clips have, and how many the published set has."""
+    windows = sum(len(clip) - WINDOW + 1 for clip in clips)
+    found = f"{which.name}: {len(clips)} clips, {windows} windows"
+    if (len(clips), windows) == (which.clips, which.windows):
+        return f"{found}, as published"
+    return f"{found}; the published set has {which.clips} clips and {which.windows} windows"
+
+
+def _name(folder: Path, file: Path) -> str:
+    place = file.relative_to(folder)
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", "_".join((*place.parts[:-1], place.stem if file.is_file() else place.name)))
+
+
+def _imported(file: Path, target: Path, which: TestSet) -> Clip:
+    """Return the clip of a recording, written now unless it is there."""
+    frames = read_frames(file) if file.is_file() else read_pictures(file)
+    first = next(frames, None)
+    if first is None:
+        raise ValueError(f"{file}: holds no frame")
+    size = which.size(*first.shape[:2])
+    count = sum(1 for _ in frames) + 1
+    if count < WINDOW:
+        raise ValueError(f"{file}: {count} frames; a published window has {WINDOW}")
+    meta = {
+        "shape": [count, *size],
+        "frame_rate": which.frame_rate,
+        "exposure": 1 / which.frame_rate,
+        "radiance_unit": RELATIVE,
+        "camera": None,
+        "source": {"file": str(file.resolve()), "test_set": which.name, "size": list(first.shape[:2])},
+        "split": "test",
+    }
+    if target.exists():
+        clip = Clip.open(target)
+        if clip.meta.get("source") != meta["source"]:
+            raise ValueError(f"{target}: is a clip of {(clip.meta.get('source') or {}).get('file')}, not of {file}; "
+                             "choose another -o")  # fmt: skip
+        return clip
+    with ClipWriter(target, meta) as writer:
+        for t, frame in enumerate(read_frames(file) if file.is_file() else read_pictures(file)):
+            if not writer.has(t):
+                writer.add(t, resized(grey(frame), size).astype(np.float32) / np.float32(255))
+    return Clip.open(target)
+
+
+def grey(frame: Array) -> Array:
+    """Return a frame of 8 bits, [H, W] or [H, W, 3] in red, green and blue, as grey of 8 bits [H, W]."""
+    if frame.ndim == 2:
+        return frame
+    return np.rint(frame @ np.array(WEIGHTS)).astype(np.uint8)
+
+
+def resized(frame: Array, size: tuple[int, int]) -> Array:
+    """Return a grey frame of 8 bits [H, W] at another size, bicubic without antialiasing."""
+    if frame.shape == size:
+        return frame
+    import torch
+    import torch.nn.functional as functional
+
+    image = torch.from_numpy(frame.astype(np.float32))[None, None]
+    return functional.interpolate(image, size=size, mode="bicubic").round().clamp(0, 255)[0, 0].numpy().astype(np.uint8)

@@ -1,0 +1,161 @@
+"""Test sets of the paper, in folders made exactly as they are published: sizes, grey values, numbers of windows."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy import ndarray as Array
+from PIL import Image
+
+from qsim.formats.video import write_video
+from quiver.cli.program import main
+from quiver.data.test_sets import TEST_SETS, counted, grey, import_test_set, resized
+
+I2, X4K = TEST_SETS["quiver-published"], TEST_SETS["x4k1000fps"]
+
+
+def moving(frames: int, height: int, width: int, seed: int) -> Array:
+    """Grey frames of 8 bits [T, H, W]: smooth texture that moves one pixel per frame."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, : width + frames].astype(float)
+    waves = sum(np.sin(a * x + b * y + c) for a, b, c in rng.uniform((-0.5, -0.5, 0), (0.5, 0.5, 6), (5, 3)))
+    picture = np.rint(120 + 25 * waves).clip(1, 255).astype(np.uint8)
+    return np.stack([picture[:, t : t + width] for t in range(frames)])
+
+
+def i2(folder: Path, lengths: tuple[int, ...], size: tuple[int, int] = (32, 48)) -> Path:
+    """A flat folder of mp4 files, as each split of I2-2000FPS."""
+    folder.mkdir()
+    for i, frames in enumerate(lengths):
+        write_video(folder / f"test_{i:05d}.mp4", iter(moving(frames, *size, i)), 30, lossless=True)
+    return folder
+
+
+def x4k(folder: Path, clips: int, frames: int = 33, size: tuple[int, int] = (36, 68)) -> Path:
+    """test/TypeN/TESTNN/0000.png ..., in colour, as the test set of X4K1000FPS."""
+    for i in range(clips):
+        place = folder / f"Type{i % 3 + 1}" / f"TEST{i + 1:02d}_000_f0433"
+        place.mkdir(parents=True)
+        for t, frame in enumerate(moving(frames, *size, i)):
+            colour = np.stack([frame, frame // 2, 255 - frame], axis=-1)
+            Image.fromarray(colour).save(place / f"{t:04d}.png")
+    return folder
+
+
+def test_grey_has_the_weights_of_the_published_reader():
+    rng = np.random.default_rng(0)
+    colour = rng.integers(0, 256, (40, 50, 3), dtype=np.uint8)
+    red, green, blue = (colour[..., i].astype(float) for i in range(3))
+    exact = 0.299 * red + 0.587 * green + 0.114 * blue
+    assert np.abs(grey(colour) - exact).max() <= 0.5 + 1e-9
+    alike = np.repeat(colour[..., :1], 3, axis=2)
+    np.testing.assert_array_equal(grey(alike), alike[..., 0])  # grey in three channels stays as it is
+    np.testing.assert_array_equal(grey(colour[..., 0]), colour[..., 0])
+
+
+def cubic(t: float, a: float = -0.75) -> float:
+    t = abs(t)
+    if t <= 1:
+        return (a + 2) * t**3 - (a + 3) * t**2 + 1
+    return a * t**3 - 5 * a * t**2 + 8 * a * t - 4 * a if t < 2 else 0.0
+
+
+def test_a_change_of_size_is_bicubic_without_antialiasing():
+    """Against a slow sum over 4 x 4 neighbours, repeated beyond the edge, at random sizes."""
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        (h, w), (oh, ow) = rng.integers(5, 12, (2, 2))
+        frame = rng.integers(0, 256, (h, w), dtype=np.uint8)
+        slow = np.zeros((oh, ow))
+        for i in range(oh):
+            for j in range(ow):
+                y, x = (i + 0.5) * h / oh - 0.5, (j + 0.5) * w / ow - 0.5
+                for m in range(int(np.floor(y)) - 1, int(np.floor(y)) + 3):
+                    for n in range(int(np.floor(x)) - 1, int(np.floor(x)) + 3):
+                        value = float(frame[min(max(m, 0), h - 1), min(max(n, 0), w - 1)])
+                        slow[i, j] += cubic(y - m) * cubic(x - n) * value
+        assert np.abs(resized(frame, (int(oh), int(ow))) - slow.clip(0, 255)).max() <= 0.5 + 1e-2
+    np.testing.assert_array_equal(resized(frame, frame.shape), frame)
+
+
+def test_a_folder_of_videos_becomes_clips_of_grey_values(tmp_path):
+    """Names, frame rate, and every grey value / 255 as it is in the file, to the precision of a half float."""
+    clips = import_test_set(i2(tmp_path / "test", (13, 11)), I2, tmp_path / "out")
+    assert [clip.name for clip in clips] == ["test_00000", "test_00001"]
+    assert [clip.shape for clip in clips] == [(13, 32, 48), (11, 32, 48)]
+    assert (clips[0].frame_rate, clips[0].exposure) == (2000.0, 5e-4)
+    for t in (0, 12):
+        wanted = moving(13, 32, 48, 0)[t] / 255
+        assert np.abs(clips[0].radiance(t) - wanted).max() <= 2.0**-11
+    assert counted(clips, I2) == "quiver-published: 2 clips, 4 windows; the published set has 31 clips and 6017 windows"
+
+
+def test_a_tree_of_pictures_becomes_clips_of_the_loaders_size(tmp_path):
+    small = replace(X4K, size=lambda height, width: (16, 32))
+    clips = import_test_set(x4k(tmp_path / "test", 2, frames=11), small, tmp_path / "out")
+    assert [clip.name for clip in clips] == ["Type1_TEST01_000_f0433", "Type2_TEST02_000_f0433"]
+    assert {clip.shape for clip in clips} == {(11, 16, 32)}
+    frame = moving(11, 36, 68, 0)[4]
+    wanted = resized(grey(np.stack([frame, frame // 2, 255 - frame], axis=-1)), (16, 32)) / 255
+    assert np.abs(clips[0].radiance(4) - wanted).max() <= 2.0**-11
+    assert X4K.size(2160, 4096) == (512, 1024)
+
+
+def test_windows_are_counted_as_published(tmp_path):
+    """345 windows of 15 clips of 33 frames: one for each but the first and last five frames of a clip."""
+    tiny = replace(X4K, size=lambda height, width: (8, 8))
+    clips = import_test_set(x4k(tmp_path / "test", 15, size=(8, 8)), tiny, tmp_path / "out")
+    assert counted(clips, X4K) == "x4k1000fps: 15 clips, 345 windows, as published"
+
+
+def test_clips_are_imported_once_and_not_mixed(tmp_path):
+    folder = i2(tmp_path / "test", (11,))
+    import_test_set(folder, I2, tmp_path / "out")
+    written = (tmp_path / "out/test_00000/clip.json").stat().st_mtime_ns
+    import_test_set(folder, I2, tmp_path / "out")
+    assert (tmp_path / "out/test_00000/clip.json").stat().st_mtime_ns == written
+    with pytest.raises(ValueError, match=r"is a clip of .*choose another -o"):
+        import_test_set(i2(tmp_path / "other", (11,)), I2, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("lengths", "message"), [((), "holds no videos"), ((10,), "10 frames; a published window has 11")]
+)
+def test_folders_that_hold_no_window_are_refused(tmp_path, lengths, message):
+    with pytest.raises(ValueError, match=message):
+        import_test_set(i2(tmp_path / "test", lengths), I2, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_scores_windows_as_published(tmp_path, capsys):
+    """A method that returns the mean light: its factor per window is right, its raw score is that of its brightness."""
+    folder, out = i2(tmp_path / "test", (13, 11)), tmp_path / "table"
+    words = ["evaluate", str(folder), "-o", str(out), "--protocol", "quiver-published", "--methods", "moment:11"]
+    assert main([*words, "--ppp", "3.25,26"]) == 0
+    shown = capsys.readouterr()
+    assert "2 clips, 4 windows; the published set has 31 clips and 6017 windows" in shown.err
+    assert "peak = grey 255, as published" in shown.out
+    rows = [json.loads(line) for line in (out / "rows.jsonl").read_text().splitlines()]
+    assert [row["score"]["frames"] for row in rows] == [3, 1, 3, 1]
+    assert {row["light"] for row in rows} == {"3.25 PPP, 3 bit", "26 PPP, 3 bit"}
+    assert main([*words, "--ppp", "3.25,26"]) == 0  # again: nothing is computed
+    assert len((out / "rows.jsonl").read_text().splitlines()) == 4
+    capsys.readouterr()
+    for more in (["--bits", "3"], ["--published"], ["--sensor", "quiver-paper"], ["--peak", "8"], ["--split", "test"]):
+        assert main([*words, *more]) == 2
+        assert "--protocol quiver-published" in capsys.readouterr().err
+    assert main([*words, "--force"]) == 0
+    assert len((out / "rows.jsonl").read_text().splitlines()) == 2
+
+
+@pytest.mark.slow
+def test_the_command_scores_x4k_at_its_size(tmp_path, capsys):
+    folder, out = x4k(tmp_path / "test", 1, frames=12, size=(54, 102)), tmp_path / "table"
+    assert main(["evaluate", str(folder), "-o", str(out), "--protocol", "x4k1000fps", "--methods", "naive:11"]) == 0
+    assert "1 clips, 2 windows" in capsys.readouterr().err
+    found = json.loads((out / "clips" / "Type1_TEST01_000_f0433" / "clip.json").read_text())
+    assert found["shape"] == [12, 512, 1024]
