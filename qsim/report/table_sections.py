@@ -65,7 +65,7 @@ def evaluation_section(path: Path) -> Markup:
     caption = f"mean ± half of the 95 % interval over scenes; {_definition(found)}"
     if any(line.get("near_truth") for line in found["table"]):
         caption += "; † within 3 dB of the truth's own PSNR in at least one clip, so its error is a large part"
-    missing = f"Not built yet: {', '.join(found['not_built_yet'])}." if found.get("not_built_yet") else ""
+    missing = f"No weights ship of {', '.join(found['no_weights'])}." if found.get("no_weights") else ""
     table = page.table(page.Table(caption, headers, rows, frozenset(best)))
     remarks = [page.text(remark) for remark in (*found.get("remarks", []), missing)]
     return page.section(f"Methods compared: {path.parent.name}", table, *remarks, _speed_against_error(found))

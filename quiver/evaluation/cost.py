@@ -13,7 +13,7 @@ import math
 import multiprocessing
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,8 @@ from quiver.restoration.networks import network_restorer, wrap_network
 from quiver.restoration.restorers import restorer, weights_path
 
 EXPOSURE = 5e-4  # s
-PRESETS = ("nano", "quiver-s", "quiver", "unet")
+MODAL = ("nano", "quiver-s", "quiver")  # presets that have several modes
+PRESETS = (*MODAL, "unet", "fastdvdnet", "student-teacher", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,9 @@ def measure(case: CostCase, settings: CostSettings) -> CostRow:
         torch.set_num_threads(settings.threads)
     codes, photons = fixed_clip(settings)
     method, trained = method_of(case, settings.device)
+    if method.together > 1:  # one part, with frames before and after it
+        settings = replace(settings, frames=3 * method.together, restored=method.together)
+        codes, photons = fixed_clip(settings)
     first = (settings.frames - settings.restored) // 2
     last = first + settings.restored
     memory = PeakMemory(pick_device(settings.device) if method.learned else "cpu")
@@ -143,9 +147,16 @@ def measure(case: CostCase, settings: CostSettings) -> CostRow:
 
 
 def multiply_accumulates(method: Restorer, codes: Codes, first: int) -> float:
-    """Return those of one more restored frame: the difference between restoring three frames and two."""
+    """Return those of one more restored frame: the difference between restoring three frames and two.
+
+    A network that restores several frames at a time: those of such a part, divided by its frames.
+    """
     from torch.utils.flop_counter import FlopCounterMode
 
+    if method.together > 1:
+        with FlopCounterMode(display=False) as counter:
+            method.restore(codes, first, first + method.together)
+        return counter.get_total_flops() / 2 / method.together
     counts = []
     for frames in (2, 3):
         with FlopCounterMode(display=False) as counter:
@@ -192,13 +203,17 @@ def _child(pipe: Any, case: CostCase, settings: CostSettings) -> None:
 
 
 def cases_of(methods: Sequence[str], modes: Sequence[str], precisions: Sequence[str]) -> list[CostCase]:
-    """Return all combinations; classical methods have one mode and precision, the U-Net has one mode."""
+    """Return all combinations; classical methods have one mode and precision, all networks but QUIVER one mode."""
     cases = []
     for method in methods:
         classical = method.partition(":")[0] in METHODS
-        for mode in modes[:1] if classical or method == "unet" else modes:
+        for mode in modes[:1] if classical or _has_one_mode(method) else modes:
             cases += [CostCase(method, mode, precision) for precision in (precisions[:1] if classical else precisions)]
     return cases
+
+
+def _has_one_mode(network: str) -> bool:
+    return network in PRESETS and network not in MODAL
 
 
 def checked_cases(
@@ -218,8 +233,8 @@ def checked_cases(
     for option, value in (("modes", modes), ("precisions", precisions), ("device", device)):
         if value is not None and not networks:
             raise ValueError(f"--{option}: acts on networks, and {', '.join(methods)} is classical; leave it out")
-    if modes is not None and networks and all(network == "unet" for network in networks):
-        raise ValueError("--modes: unet shares no work between frames, it has one mode; leave it out")
+    if modes is not None and networks and all(_has_one_mode(network) for network in networks):
+        raise ValueError(f"--modes: acts on QUIVER and nano, {', '.join(networks)} has one mode; leave it out")
     if networks:
         pick_device(device or "auto")
     return cases_of(methods, modes or ("exact", "streaming"), precisions or ("float32",))

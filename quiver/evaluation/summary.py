@@ -17,7 +17,7 @@ from quiver.evaluation.comparison import FORMAT, Comparison, ComparisonRow, json
 from quiver.evaluation.metrics import Interval, over_scenes
 from quiver.restoration.interface import Restorer
 
-PAPER_METHODS = ("Student-Teacher", "RVRT", "EMVD", "FloRNN", "MemDeblur", "Spk2ImgNet", "bit2bit")
+UNTRAINED = ("student-teacher", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")  # of the paper: no weights ship
 COLUMNS = (
     "method",
     "frames (future)",
@@ -117,7 +117,7 @@ def _interval(found: Interval, digits: int) -> str:
 def markdown(
     comparison: Comparison, methods: Sequence[Restorer], rows: Sequence[ComparisonRow], remarks: Sequence[str] = ()
 ) -> str:
-    """Return the complete evaluation as Markdown: means, caveats, failures, scores per scene, methods not built.
+    """Return the complete evaluation as Markdown: means, caveats, failures, scores per scene, networks without weights.
 
     `remarks` are lines about networks outside of what they were measured for.
     """
@@ -143,7 +143,12 @@ def markdown(
     lines = summarise(rows)
     text += markdown_table([_cells(line, by_name[line.method]) for line in lines], COLUMNS)
     text += ["", *_caveats(lines, rows), *[f"{remark}\n" for remark in remarks]]
-    text += [MEMORY, "", f"The paper also compares with {', '.join(PAPER_METHODS)}: not built yet.", ""]
+    text += [
+        MEMORY,
+        "",
+        f"No weights ship of {', '.join(UNTRAINED)}: train them with `quiver train --preset NAME`.",
+        "",
+    ]
     failures = [f"- {line.method}, {line.light}, {reason}" for line in lines for reason in line.failures]
     text += ["## Failures", "", *failures, ""] if failures else []
     return "\n".join([*text, *_by_motion(lines), *_per_scene(rows)]) + "\n"
@@ -153,6 +158,8 @@ def peak_name(comparison: Comparison) -> str:
     """Return the name of the peak that the scores of a comparison refer to."""
     if comparison.peak is not None:
         return f"{comparison.peak:g} photons per pixel"
+    if comparison.test_set is not None:
+        return "grey 255, as published"
     return "the sensor's white, as published" if comparison.published else "2.5 x the stream's mean light"
 
 
@@ -234,7 +241,7 @@ def as_dict(
                 {"name": m.name, "frames": m.window, "future": m.look_ahead, "learned": m.learned, "is": m.description}
                 for m in methods
             ],
-            "not_built_yet": list(PAPER_METHODS),
+            "no_weights": list(UNTRAINED),
             "table": [asdict(line) for line in summarise(rows)],
             "rows": [row.to_dict() for row in rows],
         }

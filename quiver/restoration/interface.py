@@ -55,6 +55,7 @@ class Restorer:
     seamless: bool = True  # a range of frames restored alone equals the same frames of the complete stream
     identity: Mapping[str, object] = field(default_factory=dict)  # settings and weights that change the answer
     cut: Callable[[int, int], str] = lambda height, width: ""  # tiles of a frame, where they change the answer
+    together: int = 1  # frames that are restored at a time and share most of the work
     scope: Scope | None = None  # of a network: the streams that it was measured for or trained on; None: not known
 
     def restore(self, codes: Codes, first: int = 0, last: int | None = None, progress: Progress | None = None) -> Array:

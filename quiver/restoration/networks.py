@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -18,12 +17,15 @@ from quiver.baselines.sliding_window import reflect
 from quiver.data.codes import Codes
 from quiver.device import moved, pick_device
 from quiver.restoration.interface import RestoreOptions, Restorer
-from quiver.restoration.pieces import Disagreement, cut_pieces
+from quiver.restoration.parts import part_of, takes_clips
+from quiver.restoration.pieces import Disagreement, cut_pieces, warn_of_cut
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
 BLOCK_PIXELS = 1 << 22  # codes read at a time: 4 MB
+# Restores into zeros; called with (network, codes, zeros, first, options, progress)
+RestoreNetwork = Callable[[Any, Codes, Array, int, RestoreOptions, Progress | None], None]
 CONTEXT = 5  # frames that a network needs before and after the one it restores
 
 
@@ -41,14 +43,17 @@ def network_restorer(path: Path, options: RestoreOptions) -> Restorer:
 
 
 def network_title(model: nn.Module) -> str:
-    """Return a title for people: `nano (U-Net on aligned frames)`, `QUIVER (quiver-s)`, `U-Net`."""
+    """Return a title for people: `nano (U-Net on aligned frames)`, `QUIVER (quiver-s)`, `U-Net`, `EMVD (emvd)`."""
     from quiver.model.folded import FoldedQUIVER
-    from quiver.model.presets import PRESETS
+    from quiver.model.presets import OTHERS, PRESETS
     from quiver.model.quiver import QUIVER
+    from quiver.model.unet import UNet
 
-    if not isinstance(model, QUIVER):
+    if isinstance(model, UNet):
         return "U-Net"
-    preset = next((name for name, config in PRESETS.items() if config == model.config), None)
+    preset = next((name for name, config in (PRESETS | OTHERS).items() if config == model.config), None)
+    if not isinstance(model, QUIVER):
+        return type(model).__name__ if preset is None else f"{type(model).__name__} ({preset})"
     if isinstance(model, FoldedQUIVER) and model.estimate is not None:  # the recurrent part hardly adds to it
         what = "U-Net on aligned frames" if model.config.largest_velocity else "U-Net with a recurrent part"
         return what if preset is None else f"{preset} ({what})"
@@ -62,18 +67,24 @@ def wrap_network(
     from quiver.model.blocks import RADIUS, WINDOW
     from quiver.model.quiver import QUIVER
 
-    mode = options.mode if isinstance(model, QUIVER) else "windows"  # other networks share no work between frames
+    mode = options.mode if isinstance(model, QUIVER) else "windows"  # other networks have one way to share work
     model.to(pick_device(options.device)).eval()
+    run: RestoreNetwork = fill_network
+    window, look_ahead, together = WINDOW, RADIUS, 1
+    if takes_clips(model):
+        part = part_of(model)
+        run, window, look_ahead, together = fill_parts, part.past + 1 + part.future, part.future, part.kept
+        description = f"{description}; look-ahead {look_ahead} frames"
 
     def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
-        fill_network(model, codes, out, first, options, progress)
+        run(model, codes, out, first, options, progress)
 
     identity = {"weights_sha256": weights_sha256, "mode": mode, "precision": options.precision}
 
     def cut(height: int, width: int) -> str:
         return cut_pieces(model, height, width, options.memory, options.mode).text
 
-    return Restorer(name, WINDOW, RADIUS, True, description, fill, mode != "streaming", identity, cut)
+    return Restorer(name, window, look_ahead, True, description, fill, mode != "streaming", identity, cut, together)
 
 
 def fill_network(
@@ -108,15 +119,45 @@ def fill_network(
                 done += 1
                 if progress is not None:
                     progress(done, len(out) * len(pieces.tiles))
-    if not pieces.exact:  # tiles that agree may still differ from the uncut frame
-        rms, most = apart.measured()
-        more = f"; --memory {-(-pieces.needed // 10**6)}MB avoids the cut" if pieces.needed else ""
-        warnings.warn(
-            f"{codes.name}: {options.memory / 1e6:.0f} MB hold no frame of {height} x {width} px; it is cut into "
-            f"{pieces.text}, which differ where they overlap by {100 * rms:.2g} % of white rms, {100 * most:.2g} % at "
-            f"most{more}",
-            stacklevel=2,
-        )
+    warn_of_cut(codes, options, pieces, apart)
+
+
+def fill_parts(
+    network: nn.Module, codes: Codes, out: Array, first: int, options: RestoreOptions, progress: Progress | None
+) -> None:
+    """Restore part after part, each tile by tile; `out` [t, H, W] must be zero and collects the weighted tiles.
+
+    Where a cut in space changes the answer (pieces.py), a warning states by how much neighbouring tiles differ.
+    """
+    import torch
+
+    device = next(network.parameters()).device
+    dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
+    length, height, width = codes.shape
+    part, last, done = part_of(network), first + len(out), 0
+    pieces = cut_pieces(network, height, width, options.memory, options.mode)
+    apart = Disagreement.nothing(height, width)
+    for start in range(first - first % part.kept, last, part.kept):
+        end = min(length, start + part.kept + part.after)
+        begin = max(0, min(start - part.before, end - 1 - part.after))  # the last frames are reflected at the end
+        wanted = slice(max(start, first), min(start + part.kept, last))
+        frames = codes.read(begin, end).astype(np.float32) / np.float32(codes.sensor.levels - 1)
+        for tile in pieces.tiles:
+            rows, columns = tile.weight.shape
+            place = (slice(tile.y, tile.y + rows), slice(tile.x, tile.x + columns))
+            seen = torch.from_numpy(frames[(slice(None), *place)])[None, :, None].to(device)
+            with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
+                result = network(seen)[0, wanted.start - begin : wanted.stop - begin, 0]
+            restored = result.float().cpu().numpy()
+            out[(slice(wanted.start - first, wanted.stop - first), *place)] += (
+                tile.weight * restored * np.float32(codes.white)
+            )
+            if wanted.start == first and not pieces.exact:
+                apart.add(tile, restored[0])
+            done += len(restored)
+            if progress is not None:
+                progress(done, len(out) * len(pieces.tiles))
+    warn_of_cut(codes, options, pieces, apart)
 
 
 def padded_frames(codes: Codes, part: tuple[slice, slice], first: int, count: int) -> Iterator[Tensor]:

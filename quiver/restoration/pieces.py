@@ -3,17 +3,22 @@
 A U-Net has a reach of 36 px: tiles that overlap by twice as much give the result of the complete frame. The attention
 and the gates of QUIVER average over the frame, and its recurrence reaches far: it takes the complete frame. Only the
 initial estimate of a FoldedQUIVER, which needs the most memory, runs tile by tile. A frame too large even for that is
-cut into tiles that are blended. Their result differs: `fill_network` measures by how much, and warns.
+cut into tiles that are blended, and so is a frame too large for a compared network. Their result differs: a warning
+states by how much.
 """
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy import ndarray as Array
 
+from quiver.data.codes import Codes
+from quiver.restoration.interface import RestoreOptions
+from quiver.restoration.parts import part_of, takes_clips
 from quiver.tiles import Tile, cut_tiles
 
 if TYPE_CHECKING:
@@ -23,6 +28,7 @@ BLENDED = 32  # px: half of the overlap of neighbouring tiles where no overlap m
 STARTING = 60_000_000  # bytes that torch takes for its kernels at first use
 TILING = 30_000_000  # bytes that tiles of several shapes take beyond those of the largest; 26 MB measured
 ESTIMATE_BYTES = 1_200  # per pixel of an initial estimate of width 32; 930 measured
+STEP = 16  # px: tiles of the compared networks begin at multiples of it
 COUNTS = 0.1  # weight from which the result of a tile is compared with its neighbours
 
 
@@ -50,11 +56,14 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int, mode: str
     from quiver.model.quiver import QUIVER
     from quiver.model.unet import SmallUNet
 
-    multiple = int(model.multiple)  # type: ignore[arg-type]
     pixels = memory // bytes_per_pixel(model, mode)
     whole = Pieces(cut_tiles(height, width, height * width, 0))
     if height * width <= pixels:
         return whole
+    if takes_clips(model):  # recurrent, or aligned along any motion: no overlap makes tiles exact
+        needed = bytes_per_pixel(model, mode) * height * width
+        return Pieces(cut_tiles(height, width, pixels, BLENDED, STEP, blend=True), None, False, needed)
+    multiple = int(model.multiple)  # type: ignore[arg-type]
     if not isinstance(model, QUIVER):
         reach = getattr(model, "reach", None)
         blend = reach is None
@@ -79,6 +88,8 @@ def bytes_per_pixel(model: nn.Module, mode: str) -> int:
     from quiver.model.folded import FoldedQUIVER
     from quiver.model.quiver import QUIVER
 
+    if type(model).__name__ in CLIP_BYTES:
+        return clip_bytes(model)
     if not isinstance(model, QUIVER):
         return 4_000
     held = 2 if mode == "windows" else 1  # windows of eleven frames at once
@@ -86,6 +97,26 @@ def bytes_per_pixel(model: nn.Module, mode: str) -> int:
     if not isinstance(model, FoldedQUIVER):
         return stages
     return int(stages / model.config.fold**2) + 64 * model.config.estimate_width  # the estimate is at full size
+
+
+# Bytes per pixel that restoring a part of a clip takes at published width: measured with one frame, and more for each.
+CLIP_BYTES = {
+    "EMVD": (650, 40),
+    "FastDVDnet": (2000, 30),
+    "FloRNN": (10_000, 60),
+    "MemDeblur": (2000, 90),
+    "RVRT": (4400, 1280),
+    "Spk2ImgNet": (15_000, 150),
+    "StudentTeacher": (4000, 50),
+}
+
+
+def clip_bytes(network: Any) -> int:
+    """Return the working memory per pixel of a network that takes clips: about 1.5 times of what was measured."""
+    part = part_of(network)
+    first, more = CLIP_BYTES[type(network).__name__]
+    share = network.config.width / type(network.config)().width
+    return 500 + int(1.5 * share * (first + more * (part.before + part.kept + part.after)))
 
 
 def frame_bytes(model: nn.Module, mode: str) -> int:
@@ -123,3 +154,20 @@ class Disagreement:
         """Return the root mean square and the largest difference; zeros where no pixel lies in two tiles."""
         apart = (self.high - self.low)[self.times > 1]
         return (float(np.sqrt(np.mean(apart**2))), float(apart.max())) if apart.size else (0.0, 0.0)
+
+
+def warn_of_cut(codes: Codes, options: RestoreOptions, pieces: Pieces, apart: Disagreement) -> None:
+    """Warn where a cut changes the answer: by how much tiles differ, and which memory avoids the cut.
+
+    Tiles that agree may still differ from the uncut frame.
+    """
+    if pieces.exact:
+        return
+    rms, most = apart.measured()
+    more = f"; --memory {-(-pieces.needed // 10**6)}MB avoids the cut" if pieces.needed else ""
+    warnings.warn(
+        f"{codes.name}: {options.memory / 1e6:.0f} MB hold no frame of {codes.shape[1]} x {codes.shape[2]} px; it is "
+        f"cut into {pieces.text}, which differ where they overlap by {100 * rms:.2g} % of white rms, "
+        f"{100 * most:.2g} % at most{more}",
+        stacklevel=3,
+    )

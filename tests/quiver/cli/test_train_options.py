@@ -88,7 +88,7 @@ def test_an_option_changes_the_weights(tiny_dataset, tmp_path, words):
         (("moment",), {"modes": ("exact",)}, "--modes: acts on networks, and moment is classical"),
         (("moment", "naive"), {"precisions": ("float32",)}, "--precisions: acts on networks, and moment, naive"),
         (("moment",), {"device": "cpu"}, "--device: acts on networks"),
-        (("unet",), {"modes": ("exact",)}, "--modes: unet shares no work between frames"),
+        (("unet",), {"modes": ("exact",)}, "--modes: acts on QUIVER and nano, unet has one mode"),
         (("nano",), {"modes": ("exat",)}, "--modes: no 'exat' (did you mean 'exact'?)"),
         (("nano",), {"precisions": ("float16",)}, "--precisions: no 'float16' (did you mean 'bfloat16'?)"),
         (("momnt",), {}, "no method 'momnt'"),

@@ -1,0 +1,198 @@
+"""Networks that take clips: every frame of any clip, the same in ranges and parts, within the memory, as stated."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from numpy import ndarray as Array
+from random_codes import random_codes
+from runs import TINY, tiny
+from torch import Tensor, nn
+
+from quiver.cli.program import main
+from quiver.data.codes import Codes
+from quiver.model.presets import OTHERS, build
+from quiver.model.rivals.edges import reflected
+from quiver.model.weights import save
+from quiver.restoration.interface import RestoreOptions
+from quiver.restoration.networks import network_restorer, wrap_network
+from quiver.restoration.parts import part_of, takes_clips
+from quiver.restoration.pieces import bytes_per_pixel
+
+CLIPS = [name for name in TINY if takes_clips(tiny(name))]
+
+
+class Means(nn.Module):
+    """Restores a frame as the mean of a window: one frame before it, and two after."""
+
+    frames_in: ClassVar[int] = 4
+    look_ahead: ClassVar[int] = 2
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.unused = nn.Parameter(torch.zeros(1))
+        self.longest = 0
+
+    def forward(self, frames: Tensor) -> Tensor:
+        count = frames.shape[1]
+        self.longest = max(self.longest, count)
+        seen = frames[:, reflected(-1, count + 3, count)]
+        return torch.stack([seen[:, t : t + 4].mean(dim=1) for t in range(count)], dim=1)
+
+
+class Sums(Means):
+    """Restores a frame as the sum of all frames up to it: sees the complete past."""
+
+    frames_in = property()  # type: ignore[assignment]
+    look_ahead = 0
+
+    def forward(self, frames: Tensor) -> Tensor:
+        self.longest = max(self.longest, frames.shape[1])
+        return frames.cumsum(dim=1)
+
+
+def restored(network: nn.Module, codes: Codes, options: RestoreOptions | None = None, *span: int) -> Array:
+    return wrap_network(network, "n", "", options or RestoreOptions()).restore(codes, *span)
+
+
+def complete(network: nn.Module, codes: Codes) -> Array:
+    """The network's own result for the complete clip, in photons."""
+    frames = torch.from_numpy(codes.read(0, codes.shape[0]) / np.float32(7))[None, :, None]
+    with torch.inference_mode():
+        return network.eval()(frames)[0, :, 0].numpy() * np.float32(codes.white)
+
+
+@pytest.mark.parametrize("frames", [1, 3, 16, 17, 50])
+def test_windows_are_those_of_the_complete_clip(frames):
+    network, codes = Means(), random_codes(frames, 5, 7)
+    np.testing.assert_allclose(restored(network, codes), complete(network, codes), rtol=1e-5)
+    part = part_of(network)
+    assert (part.before, part.after, part.past, part.future) == (1, 2, 1, 2)
+    network.longest = 0
+    restored(network, codes)
+    assert network.longest <= part.before + part.kept + part.after  # the memory does not grow with the clip
+
+
+def test_a_range_of_frames_is_that_of_the_complete_stream():
+    """Though a recurrent network sees its past from the beginning of a part on."""
+    rng, codes = np.random.default_rng(0), random_codes(60, 4, 4)
+    for network in (Means(), Sums()):
+        whole = restored(network, codes)
+        for _ in range(10):
+            first, last = sorted(int(n) for n in rng.integers(0, 61, 2))
+            if first < last:
+                np.testing.assert_array_equal(restored(network, codes, None, first, last), whole[first:last])
+
+
+@pytest.mark.parametrize("name", CLIPS)
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 3, 5), (3, 10, 7)])
+def test_every_frame_of_any_size_is_restored(name, shape):
+    """A clip shorter than a part: the result is the network's own."""
+    network, codes = tiny(name).eval(), random_codes(*shape)
+    found = restored(network, codes)
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found, complete(network, codes), rtol=1e-3, atol=1e-4 * codes.white)
+
+
+@pytest.mark.parametrize("name", CLIPS)
+def test_it_looks_ahead_as_far_as_it_says(name, tmp_path):
+    """A frame beyond the stated future changes nothing; the description states the future."""
+    network, codes = tiny(name).eval(), random_codes(40, 8, 8)
+    method, part = wrap_network(network, name, "a network", RestoreOptions()), part_of(network)
+    assert method.look_ahead == part.future
+    assert method.window == part.past + 1 + part.future
+    assert method.description == f"a network; look-ahead {part.future} frames"
+    stack = codes.read(0, 40).copy()
+    stack[9 + part.future + 1 :] = 7 - stack[9 + part.future + 1 :]
+    changed = Codes(**vars(codes) | {"read": lambda start, stop: stack[start:stop]})
+    np.testing.assert_array_equal(method.restore(changed, 8, 10), method.restore(codes, 8, 10))
+
+
+@pytest.mark.parametrize("name", CLIPS)
+def test_a_frame_beyond_the_memory_is_cut_with_a_word(name):
+    network, codes = tiny(name).eval(), random_codes(2, 96, 130)
+    whole = restored(network, codes, RestoreOptions(memory=10**12))
+    memory = bytes_per_pixel(network, "exact") * 9_000
+    with pytest.warns(UserWarning, match="differ where they overlap by .* avoids the cut") as caught:
+        cut = restored(network, codes, RestoreOptions(memory=memory))
+    assert np.isfinite(cut).all()
+    assert np.sqrt(np.mean((cut - whole) ** 2)) < 0.5 * codes.white
+    needed = int(str(caught[0].message).rpartition("--memory ")[2].partition("MB")[0]) * 10**6
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_array_equal(restored(network, codes, RestoreOptions(memory=needed)), whole)
+
+
+@pytest.mark.parametrize("name", CLIPS)
+def test_half_precision_stays_near(name):
+    network, codes = tiny(name).eval(), random_codes(3, 16, 16)
+    full, low = (restored(network, codes, RestoreOptions(precision=p)) for p in ("float32", "bfloat16"))
+    assert 0 < np.abs(low - full).max() < 0.2 * max(codes.white, np.abs(full).max())
+
+
+MEMORY_PROGRAM = """
+import warnings
+import numpy as np
+import torch
+from qsim.process import peak_memory, reset_peak
+from quiver.data.codes import array_codes
+from quiver.data.illumination import Illumination
+from quiver.model.presets import build
+from quiver.restoration.interface import RestoreOptions
+from quiver.restoration.networks import wrap_network
+warnings.simplefilter("ignore")
+torch.set_num_threads(1)
+sensor = Illumination().device(5e-4)
+codes = array_codes(np.random.default_rng(0).integers(0, 8, (40, 256, 256), dtype=np.uint8), sensor, 5e-4)
+method = wrap_network(build("{name}"), "n", "", RestoreOptions(memory={memory}))
+before = reset_peak()
+method.restore(codes, 16, 18)
+print(peak_memory() - before)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in OTHERS if "-" not in name])
+def test_the_memory_bound_holds(name):
+    """400 MB for frames of 256 x 256 px; peak of resident pages, in a separate process."""
+    run = subprocess.run(
+        [sys.executable, "-c", MEMORY_PROGRAM.format(name=name, memory=400_000_000)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    assert int(run.stdout) < 1.1 * 400_000_000
+
+
+def test_weights_are_restored_and_scored_by_the_commands(tiny_dataset, tmp_path, capsys):
+    """The file names its network; the rows and the description of the video state it."""
+    network = tiny("emvd")
+    save(network, network.config, tmp_path / "mine.safetensors")
+    clip = tiny_dataset / "clips" / "test_0"
+    weights, out = str(tmp_path / "mine.safetensors"), tmp_path / "out.npy"
+    assert main(["restore", str(clip), "--ppp", "3.25", "--method", weights, "-o", str(out), "-q"]) == 0
+    assert np.load(out).shape == (14, 36, 44)
+    described = json.loads(out.with_suffix(".json").read_text())
+    assert described["description"].startswith("EMVD, weights ")
+    assert described["description"].endswith("; look-ahead 0 frames")
+    assert main(["evaluate", str(tiny_dataset), "-o", str(tmp_path / "t"), "--methods", weights, "-q"]) == 0
+    table = json.loads((tmp_path / "t/evaluation.json").read_text())
+    assert [m["future"] for m in table["methods"]] == [0]
+    capsys.readouterr()
+    assert main(["restore", str(clip), "--ppp", "3.25", "--method", weights, "--mode", "exact", "-o", "x.npy"]) == 2
+    assert "it has one mode" in capsys.readouterr().err
+
+
+def test_presets_have_a_title(tmp_path):
+    network = build("emvd")
+    save(network, network.config, tmp_path / "w.safetensors")
+    assert network_restorer(tmp_path / "w.safetensors", RestoreOptions()).description.startswith("EMVD (emvd), weights")
