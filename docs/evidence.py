@@ -18,7 +18,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import scenes
+from qsim import scenes
 from qsim.studies.validation import rendering as validate_render
 from qsim.tables import markdown_table
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from qsim.checks import suggest
 from qsim.scene import Scene
-from scenes import (
+from qsim.scenes import (
     asset_folder,
     crowd,
     drums,

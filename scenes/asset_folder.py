@@ -16,8 +16,8 @@ import numpy as np
 from qsim.scene import Body, Diffuse, EnvironmentImage, Light, Material, Mesh, RoughPlastic, Scene, Texture
 from qsim.scene.shapes import MESH_SUFFIXES, mesh_file
 from qsim.scene.textures import PICTURE_SUFFIXES
-from scenes import common, tumble
-from scenes.common import any_angle, between, pick
+from qsim.scenes import common, tumble
+from qsim.scenes.common import any_angle, between, pick
 
 ENVIRONMENT_SUFFIXES = frozenset({".hdr", ".exr"})
 

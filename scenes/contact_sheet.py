@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-import scenes
+from qsim import scenes
 from qsim.colour import tone
-from scenes.common import FRAME_RATE, HEIGHT
+from qsim.scenes.common import FRAME_RATE, HEIGHT
 
 FRAME = 8  # index of the rendered frame
 MOVES = 0.05  # px/frame at 512 x 1024; slower pixels count as still

@@ -8,8 +8,8 @@ from qsim.scene import Body, Diffuse, Oscillation, Scene, Spin, Still, Texture, 
 from qsim.scene.rotation import vector
 from qsim.scene.shapes import ball, cylinder
 from qsim.scene.textures import Picture
-from scenes import common
-from scenes.common import between, pick, sign
+from qsim.scenes import common
+from qsim.scenes.common import between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:

@@ -8,8 +8,8 @@ from qsim.scene import Body, Conductor, Constant, Diffuse, Mesh, RoughPlastic, S
 from qsim.scene.props import rotor
 from qsim.scene.rotation import exponential, pose_matrix
 from qsim.scene.shapes import ball, cylinder, merged, moved, wire
-from scenes import common
-from scenes.common import any_angle, between, sign
+from qsim.scenes import common
+from qsim.scenes.common import any_angle, between, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:

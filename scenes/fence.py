@@ -7,8 +7,8 @@ import numpy as np
 from qsim.scene import Body, Diffuse, Mesh, Scene, Spin, Texture, Translation, textures
 from qsim.scene.rotation import exponential, pose_matrix, vector
 from qsim.scene.shapes import blob, box, merged, moved
-from scenes import common
-from scenes.common import any_angle, between, sign
+from qsim.scenes import common
+from qsim.scenes.common import any_angle, between, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:

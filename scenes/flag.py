@@ -7,8 +7,8 @@ import numpy as np
 from qsim.scene import Body, Conductor, Diffuse, Flag, Motion, Oscillation, Ripple, Scene, Still
 from qsim.scene.rotation import pose_matrix
 from qsim.scene.shapes import cylinder, moved, sheet
-from scenes import common
-from scenes.common import any_angle, between, sign
+from qsim.scenes import common
+from qsim.scenes.common import any_angle, between, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:

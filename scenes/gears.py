@@ -8,8 +8,8 @@ from qsim.scene import Body, Conductor, Diffuse, Material, RoughPlastic, Scene, 
 from qsim.scene.props import gear
 from qsim.scene.rotation import exponential, pose_matrix
 from qsim.scene.shapes import cylinder, moved
-from scenes import common
-from scenes.common import between, sign
+from qsim.scenes import common
+from qsim.scenes.common import between, sign
 
 MODULE = 0.0042  # m of pitch radius per tooth
 

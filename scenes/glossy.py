@@ -8,8 +8,8 @@ from qsim.scene import Body, Conductor, Material, Mesh, RoughPlastic, Scene, Spi
 from qsim.scene.props import gear
 from qsim.scene.rotation import exponential, pose_matrix
 from qsim.scene.shapes import ball, blob, box, cylinder, moved, polyhedron, torus
-from scenes import common
-from scenes.common import any_angle, between, pick, sign
+from qsim.scenes import common
+from qsim.scenes.common import any_angle, between, pick, sign
 
 TABLE = -0.09  # m, height of its top
 

@@ -20,8 +20,8 @@ from qsim.scene import (
     Translation,
 )
 from qsim.scene.rotation import vector
-from scenes import common, tumble
-from scenes.common import any_angle, between, sign
+from qsim.scenes import common, tumble
+from qsim.scenes.common import any_angle, between, sign
 
 TABLE = -0.09  # m
 

@@ -7,8 +7,8 @@ import numpy as np
 from qsim.scene import Ballistic, Body, Conductor, Diffuse, Material, RoughPlastic, Scene
 from qsim.scene.rotation import vector
 from qsim.scene.shapes import ball, polyhedron
-from scenes import common
-from scenes.common import any_angle, between, pick
+from qsim.scenes import common
+from qsim.scenes.common import any_angle, between, pick
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:

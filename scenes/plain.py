@@ -7,8 +7,8 @@ import numpy as np
 from qsim.scene import Body, Constant, Diffuse, Mesh, RoughPlastic, Scene, Spin, Translation
 from qsim.scene.rotation import vector
 from qsim.scene.shapes import ball, blob, box, cylinder, polyhedron, torus
-from scenes import common
-from scenes.common import any_angle, between, pick, sign
+from qsim.scenes import common
+from qsim.scenes.common import any_angle, between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:

@@ -7,8 +7,8 @@ import numpy as np
 from qsim.scene import Body, Constant, Diffuse, Motion, Scene, Shake, Spin, Translation, Wave, textures
 from qsim.scene.rotation import exponential, pose_matrix, vector
 from qsim.scene.shapes import ball, box, cylinder, moved, sheet
-from scenes import common
-from scenes.common import any_angle, between, pick, sign
+from qsim.scenes import common
+from qsim.scenes.common import any_angle, between, pick, sign
 
 WIDTH, HEIGHT, DEPTH = 4.0, 2.6, 5.0  # m
 

@@ -8,8 +8,8 @@ from qsim.scene import Body, Diffuse, Mesh, Motion, Oscillation, Scene, Spin, St
 from qsim.scene.props import rotor
 from qsim.scene.rotation import pose_matrix, rotation_between, vector
 from qsim.scene.shapes import blob, box, merged, moved, polyhedron
-from scenes import common
-from scenes.common import any_angle, between, pick, sign
+from qsim.scenes import common
+from qsim.scenes.common import any_angle, between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:

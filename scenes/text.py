@@ -20,8 +20,8 @@ from qsim.scene import (
 from qsim.scene.props import letters
 from qsim.scene.rotation import pose_matrix, vector
 from qsim.scene.shapes import box, moved, sheet
-from scenes import common
-from scenes.common import any_angle, between, pick
+from qsim.scenes import common
+from qsim.scenes.common import any_angle, between, pick
 
 WORDS = (
     "QUANTA",

@@ -8,8 +8,8 @@ from qsim.scene import Ballistic, Body, Diffuse, Mesh, Scene
 from qsim.scene.props import gear
 from qsim.scene.rotation import vector
 from qsim.scene.shapes import ball, blob, box, cylinder, polyhedron, torus
-from scenes import common
-from scenes.common import any_angle, between, pick
+from qsim.scenes import common
+from qsim.scenes.common import any_angle, between, pick
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:

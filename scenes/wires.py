@@ -8,8 +8,8 @@ from qsim.scene import Body, Conductor, Diffuse, Material, Mesh, Motion, Oscilla
 from qsim.scene.props import spring
 from qsim.scene.rotation import exponential, pose_matrix, vector
 from qsim.scene.shapes import merged, moved, torus, wire
-from scenes import common
-from scenes.common import any_angle, between, pick, sign
+from qsim.scenes import common
+from qsim.scenes.common import any_angle, between, pick, sign
 
 
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:

@@ -144,7 +144,7 @@ def _speeds(args: argparse.Namespace, shape: Any) -> tuple[list[float], list[str
     """Return the factors on the motion, and a line for each given motion."""
     from functools import partial
 
-    import scenes
+    from qsim import scenes
     from qsim.clip.clip import Clip
     from qsim.studies.bit_depth import answer as tradeoff_answer
 

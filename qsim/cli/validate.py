@@ -93,14 +93,14 @@ def _engines(args: argparse.Namespace) -> int:
 
 def _families(args: argparse.Namespace) -> list[str]:
     """The given scenes, or those that were not used to tune the budget."""
-    import scenes
+    from qsim import scenes
     from qsim.studies.validation import rendering
 
     return args.scenes or [name for name in scenes.FAMILIES if name not in rendering.TUNED]
 
 
 def _scenes(args: argparse.Namespace, names: list[str]) -> list[Any]:
-    import scenes
+    from qsim import scenes
 
     return [scenes.load(name, seed=args.seed + 3).resized(args.height, args.width) for name in names]
 

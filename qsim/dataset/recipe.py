@@ -188,7 +188,7 @@ def _family(section: Section, family: str) -> str:
         if not file.is_file():
             raise ValueError(f"{section.where('family')}: no such scene file {file}")
         return str(file)
-    from scenes import FAMILIES
+    from qsim.scenes import FAMILIES
 
     if family not in FAMILIES:
         known = ", ".join(sorted(FAMILIES))

@@ -26,8 +26,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import scenes
-from qsim import backend, files
+from qsim import backend, files, scenes
 from qsim.dataset.provenance import nested
 from qsim.rendering import engine
 from qsim.scene import Scene

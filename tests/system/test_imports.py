@@ -25,17 +25,17 @@ ROOMS: dict[str, set[str]] = {
     "qsim.clip": {"qsim", "qsim.optics", "qsim.sensor"},
     "qsim.rendering": {"qsim", "qsim.optics", "qsim.scene", "qsim.clip"},
     "qsim.formats": {"qsim", "qsim.optics", "qsim.sensor", "qsim.clip"},
-    "scenes": {"qsim", "qsim.optics", "qsim.scene", "qsim.rendering"},
-    "qsim.dataset": {"qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.rendering", "scenes"},
+    "qsim.scenes": {"qsim", "qsim.optics", "qsim.scene", "qsim.rendering"},
+    "qsim.dataset": {"qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.rendering", "qsim.scenes"},
     "qsim.calibration": {"qsim", "qsim.sensor", "qsim.clip", "qsim.formats"},
     "qsim.studies": {
-        *("qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.rendering", "qsim.formats", "scenes"),
-        "qsim.dataset",
+        *("qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.rendering", "qsim.formats"),
+        *("qsim.scenes", "qsim.dataset"),
     },
     "qsim.report": {"qsim", "qsim.optics", "qsim.sensor", "qsim.clip", "qsim.formats", "qsim.dataset"},
     "qsim.cli": {
-        *("qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.rendering", "qsim.formats", "scenes"),
-        *("qsim.dataset", "qsim.calibration", "qsim.studies", "qsim.report"),
+        *("qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.rendering", "qsim.formats"),
+        *("qsim.scenes", "qsim.dataset", "qsim.calibration", "qsim.studies", "qsim.report"),
     },
     "quiver": {"qsim"},
     "quiver.data": {"qsim", "quiver", "qsim.optics", "qsim.sensor", "qsim.clip", "qsim.dataset", "qsim.formats"},
@@ -68,16 +68,15 @@ def sources() -> list[Path]:
 
 
 def name_of(path: Path) -> str:
-    """The dotted name of a module; a package's face has the package's name."""
+    """The dotted name of a module; a package's face has the package's name. The scene library is `qsim.scenes`."""
     parts = path.relative_to(ROOT).with_suffix("").parts
+    parts = ("qsim", *parts) if parts[0] == "scenes" else parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
 def room_of(module: str) -> str:
     """The room of a module: a folder directly in qsim or quiver, or the ground floor."""
     parts = module.split(".")
-    if parts[0] == "scenes":
-        return "scenes"
     return ".".join(parts[:2]) if len(parts) > 1 and (ROOT / parts[0] / parts[1]).is_dir() else parts[0]
 
 
@@ -131,6 +130,12 @@ def circles(arrows: dict[str, set[str]]) -> set[str]:
         return seen
 
     return {node for node in arrows if node in reached(node)}
+
+
+def test_the_scene_library_is_imported_under_one_name():
+    """In a checkout qsim/scenes is a link to scenes/, so a user's own `scenes` is never imported, and none of ours."""
+    assert (ROOT / "qsim" / "scenes").readlink() == Path("../scenes")
+    assert not [name_of(p) for p in sources() if any(module.split(".")[0] == "scenes" for module, _ in asked(p))]
 
 
 def test_there_are_sources_to_check():

@@ -11,13 +11,13 @@ import functools
 import numpy as np
 import pytest
 
-import scenes
+from qsim import scenes
 from qsim.optics.camera import Camera
 from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
 from qsim.scene import AreaLamp, Body, Constant, EnvironmentImage, PointLight, Scene, SunSky, Translation
 from qsim.scene.shapes import sheet
-from scenes.common import FRAME_RATE, HEIGHT, WIDTH
+from qsim.scenes.common import FRAME_RATE, HEIGHT, WIDTH
 
 SEEDS = (0, 1, 2)
 EVERY_SEED = [
@@ -174,7 +174,7 @@ def test_motion_at_speed_one_is_some_pixels_per_frame(family, seed):
 def test_loading_by_name_and_by_file(tmp_path):
     assert scenes.load("fan", 1, 2.0).speed == 2.0
     own = tmp_path / "own.py"
-    own.write_text("from scenes.fan import scene\n")
+    own.write_text("from qsim.scenes.fan import scene\n")
     assert scenes.load(own, 3).to_dict() == scenes.load("fan", 3).to_dict()
     with pytest.raises(
         ValueError, match=r"no scene family 'fun'.*; there are .*fan.*or give a .py or .xml file or a folder"

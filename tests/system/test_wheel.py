@@ -39,7 +39,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     copy = folder / "copy"
     copy.mkdir()
     for name in SOURCES:
-        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / name, copy / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy / name)
     run(*PIP, "wheel", "--no-deps", "--no-build-isolation", "--no-index", "--wheel-dir", folder, copy, cwd=folder)
@@ -58,6 +58,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def missing(wheel: Path, tree: Path) -> set[str]:
     """Files of the packages in `tree` that the wheel lacks; the pages of a folder (README.md) stay behind."""
     found = {p.relative_to(tree).as_posix() for name in SOURCES for p in (tree / name).rglob("*") if p.is_file()}
+    found = {f"qsim/{name}" if name.startswith("scenes/") else name for name in found}
     wanted = {name for name in found if "__pycache__" not in name and not name.endswith("README.md")}
     with zipfile.ZipFile(wheel) as archive:
         return wanted - set(archive.namelist())
@@ -73,6 +74,33 @@ def test_a_missing_room_would_be_noticed(wheel: Path, tmp_path: Path):
     assert missing(wheel, tmp_path) == {"qsim/attic/__init__.py"}
 
 
+def test_the_wheel_takes_no_other_top_level_name(wheel: Path):
+    with zipfile.ZipFile(wheel) as archive:
+        tops = {name.split("/")[0] for name in archive.namelist()}
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"qsim", "quiver"}
+
+
+@pytest.mark.parametrize("place", ["wheel", "checkout"])
+def test_scenes_of_a_user_and_of_this_project_do_not_meet(installed: Path, tmp_path: Path, place: str):
+    """A user's package, module and folder called `scenes` are found first, and both programs still work."""
+    ours = installed if place == "wheel" else ROOT
+    mine = tmp_path / "scenes"
+    mine.mkdir()
+    (mine / "__init__.py").write_text("MINE = 1\n")
+    (mine / "fan.py").write_text("raise RuntimeError('the wrong fan')\n")
+    (mine / "own.py").write_text("import scenes\nfrom qsim.scenes.fan import scene\nassert scenes.MINE\n")
+    code = (
+        "import scenes, qsim, qsim.cli, qsim.scenes\n"
+        "assert scenes.MINE and 'fan' in qsim.scenes.FAMILIES\n"
+        f"assert qsim.scenes.__file__.startswith({str(ours)!r}), qsim.scenes.__file__\n"
+        "from qsim.dataset import scene_files\n"
+        "a, b = (scene_files.load(name)[0].to_dict() for name in ('fan', 'scenes/own.py'))\n"
+        "assert a == b\n"
+        "raise SystemExit(qsim.cli.main(['plan', '--help']))"
+    )
+    run(sys.executable, "-c", code, cwd=tmp_path, PYTHONPATH=f"{tmp_path}{os.pathsep}{ours}")
+
+
 def test_an_installation_renders_senses_and_restores(installed: Path, tmp_path: Path):
     """Every file that these commands import must come from the installation, not from this tree."""
 
@@ -80,7 +108,7 @@ def test_an_installation_renders_senses_and_restores(installed: Path, tmp_path: 
         code = (
             "import sys, pathlib, qsim.cli, quiver.cli\n"
             f"ended = {program}.cli.main({list(words)!r})\n"
-            "names = [n for n in sys.modules if n.split('.')[0] in ('qsim', 'quiver', 'scenes')]\n"
+            "names = [n for n in sys.modules if n.split('.')[0] in ('qsim', 'quiver')]\n"
             "files = [getattr(sys.modules[n], '__file__', None) for n in names]\n"
             f"strange = [f for f in files if f and not f.startswith({str(installed)!r})]\n"
             "sys.exit(ended or (str(strange) if strange else 0))"

@@ -28,7 +28,7 @@ def scene_motion(name: str, size: tuple[int, int], *, frames: int, frame_rate: f
 
     The flow comes from rays to the first surfaces; nothing is rendered.
     """
-    import scenes
+    from qsim import scenes
     from qsim.rendering.renderer import Renderer
 
     renderer = Renderer(scenes.load(name, seed=seed, speed=speed).resized(*size), frame_rate=frame_rate)

@@ -46,7 +46,7 @@ def render(name: str, path: Path, shape: ClipShape, *, speed: float = 1.0, progr
 
     Raise `FileExistsError` if the clip there is another one.
     """
-    import scenes
+    from qsim import scenes
     from qsim.rendering import fidelity
     from qsim.rendering.clip_rendering import render_clip
 
@@ -75,7 +75,7 @@ def clips_for(
             )
         yield from (MovingClip(v, clip, int(v)) for v in speeds)
         return
-    import scenes
+    from qsim import scenes
 
     if source not in scenes.FAMILIES and not source.endswith(".py"):
         raise FileNotFoundError(

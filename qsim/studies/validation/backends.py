@@ -100,7 +100,7 @@ def run(
 def _measure(backend: str, family: str, height: int, width: int, seed: int) -> BackendRow:
     """Time one backend on one scene; runs in a separate process, because a process selects its backend once."""
     os.environ["QSIM_ENGINE"] = backend
-    import scenes
+    from qsim import scenes
     from qsim.rendering.renderer import Renderer
 
     renderer = Renderer(scenes.load(family, seed=seed).resized(height, width), budget=BUDGET)

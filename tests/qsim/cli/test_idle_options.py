@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from clips import write_clip
 
-import scenes
+from qsim import scenes
 from qsim.cli.program import main
 from qsim.cli.validate import ACTING
 from qsim.dataset import recipe

@@ -29,7 +29,7 @@ import reads_helper
 from reads_package.inner import SIZE
 sys.path.remove(str(HERE))
 
-import scenes
+from qsim import scenes
 
 NUMBERS = (HERE / "numbers.txt").read_text()
 

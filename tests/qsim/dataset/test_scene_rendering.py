@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import scenes
+from qsim import scenes
 from qsim.dataset.scene_rendering import SIDE, TemporaryFolder, load_scene, render
 from qsim.rendering.budget import Budget
 
@@ -17,7 +17,7 @@ QUICK = {"frames": 2, "height": 12, "width": 14, "budget": Budget(samples=8, bou
 
 def test_a_family_its_record_and_its_file_give_the_same_clip(tmp_path: Path):
     file = tmp_path / "own.py"
-    file.write_text("from scenes.fan import scene\n")
+    file.write_text("from qsim.scenes.fan import scene\n")
     clips = [render(source, **QUICK, seed=3) for source in ("fan", file, scenes.load("fan", 3))]
     for clip in clips[1:]:
         np.testing.assert_array_equal(clip[:], clips[0][:])

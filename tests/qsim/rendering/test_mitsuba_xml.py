@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_scenes import CAMERA, RATE
 
-import scenes
+from qsim import scenes
 from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.mitsuba_xml import read_mitsuba

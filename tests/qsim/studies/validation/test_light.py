@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from small_scenes import plate
 
-import scenes
+from qsim import scenes
 from qsim.scene import SunSky
 from qsim.studies.validation import light
 from qsim.studies.validation.light import LightReport, LightRow
