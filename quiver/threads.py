@@ -53,8 +53,12 @@ def use(wanted: int | None = None, earlier: int | None = None) -> Threads:
     `ValueError` if fewer than 1 or more than the machine's cores are wanted.
     """
     check(wanted)
-    import torch
-
+    try:
+        import torch
+    except ModuleNotFoundError:
+        if wanted is not None:
+            raise
+        return Threads(1, "torch is not installed")
     if wanted is not None:
         chosen = Threads(wanted, "as asked for")
     elif earlier is not None:

@@ -5,18 +5,18 @@
 
 With a range `frames`, only these are restored, also from the frames around them. Any number of frames and any size is
 allowed; a clip is continued by reflection at both ends. METHODS is the complete list; the module of a method has its
-other settings.
+other settings. Methods that align patches or use BM3D import torch when they run; the others never do.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from typing import Any
 
 from numpy import ndarray as Array
 
-from quiver.baselines import likelihood, moment, naive_mean, qbp, transform_denoise
+from quiver.baselines import likelihood, moment, naive_mean
 from quiver.baselines.sliding_window import look_ahead
 
 
@@ -36,33 +36,59 @@ class Method:
         return look_ahead(self.window)
 
 
+def _transform_denoise(*given: Any, **settings: Any) -> Array:
+    from quiver.baselines import transform_denoise
+
+    return transform_denoise.restore(*given, **settings)
+
+
+def _transform_denoise_published(*given: Any, **settings: Any) -> Array:
+    return _transform_denoise(*given, kind="binomial", **settings)
+
+
+def _qbp(*given: Any, **settings: Any) -> Array:
+    from quiver.baselines import qbp
+
+    return qbp.restore(*given, **settings)
+
+
+def _qbp_bm3d(*given: Any, **settings: Any) -> Array:
+    from quiver.baselines import qbp
+
+    return qbp.restore(*given, excess=qbp.EXCESS, **settings)
+
+
+def _qbp_published(*given: Any, **settings: Any) -> Array:
+    from quiver.baselines import qbp
+
+    return qbp.restore(*given, settings=qbp.AS_PUBLISHED, **settings)
+
+
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
         Method("naive", naive_mean.restore, 11, "mean of the codes, taken as linear in light", 50),
         Method("moment", moment.restore, 11, "mean of the codes through the exact inverse response", 50),
         Method("likelihood", likelihood.restore, 11, "most likely light given the codes of one pixel", 300),
-        Method(
-            "transform-denoise", transform_denoise.restore, 3, "variance stabilised, BM3D, exact unbiased inverse", 1800
-        ),
-        Method("qbp", qbp.restore, 11, "align, Wiener merge, exact inverse response", 600),
+        Method("transform-denoise", _transform_denoise, 3, "variance stabilised, BM3D, exact unbiased inverse", 1800),
+        Method("qbp", _qbp, 11, "align, Wiener merge, exact inverse response", 600),
         Method(
             "qbp-bm3d",
-            partial(qbp.restore, excess=qbp.EXCESS),
+            _qbp_bm3d,
             11,
             "align, Wiener merge, stabilise, BM3D, exact unbiased inverse",
             1800,
         ),
         Method(
             "transform-denoise-published",
-            partial(transform_denoise.restore, kind="binomial"),
+            _transform_denoise_published,
             3,
             "Transform Denoise with the arcsine for sums of binary samples",
             1800,
         ),
         Method(
             "qbp-published",
-            partial(qbp.restore, settings=qbp.AS_PUBLISHED),
+            _qbp_published,
             11,
             "QBP with the article's noise estimate and whole-pixel shifts",
             600,
