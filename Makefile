@@ -4,7 +4,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-EXTRAS := train,cluster,denoise,video,formats,docs,dev
+EXTRAS := networks,cluster,denoise,video,formats,docs,dev
 # One thread per test process: two processes share two cores.
 TEST_ENV := OMP_NUM_THREADS=1 PYTHONWARNINGS=error::SyntaxWarning
 
@@ -21,7 +21,7 @@ setup: .venv/.ready
 	@touch $@
 
 demo: setup
-	@$(BIN)/python docs/demo.py out/demo
+	@$(BIN)/qsim demo out/demo
 
 test: setup
 	$(TEST_ENV) $(BIN)/python -m pytest -m "not slow" -n 2

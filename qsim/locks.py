@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
+
+try:
+    import fcntl
+except ModuleNotFoundError:
+    raise ImportError("qsim runs on Linux and macOS: it locks files by fcntl, which this system lacks") from None
 
 
 class Lock:

@@ -90,7 +90,7 @@ def _distributed() -> Any:
     try:
         import distributed
     except ImportError:
-        raise ValueError("a cluster needs the package 'distributed': pip install 'qsim[cluster]'") from None
+        raise ValueError("a cluster needs the package 'distributed': pip install distributed") from None
     return distributed
 
 

@@ -2,7 +2,7 @@
 
     halves [2, H, W] + albedo [H, W] + normal [H, W, 3] -> radiance [H, W], its rms error
 
-It is installed by `pip install qsim[denoise]`. A denoiser has the same bias in two halves, so their difference does not
+`pip install pyoidn` installs it. A denoiser has the same bias in two halves, so their difference does not
 contain it. The halves A and B with independent noise are therefore both denoised, and D(A) is compared with the raw
 half B, D(B) with the raw half A. Let M = (A + B) / 2 be the raw mean, C = (D(A) + D(B)) / 2 the denoised mean,
 Z = A - B and Y = D(A) - D(B). Without the terms of zero mean (the error of D(A) times the noise of B, and the reverse),
@@ -47,7 +47,7 @@ def denoised(noisy: Array, albedo: Array, normal: Array) -> Array:
     `ValueError` if the denoiser is not installed.
     """
     if not available():
-        raise ValueError("denoising requires Open Image Denoise, which is missing: pip install 'qsim[denoise]'")
+        raise ValueError("denoising requires Open Image Denoise, which is missing: pip install pyoidn")
     import pyoidn
 
     colour = np.repeat(noisy[..., None].astype(np.float32), 3, axis=2)

@@ -51,6 +51,13 @@ def test_the_version_is_that_of_the_project():
     assert qsim.__version__ == project["version"]
 
 
+def test_the_citation_has_the_version_and_the_authors_of_the_project():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = (ROOT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
+    assert f"version: {project['version']}" in lines
+    assert [f'  - name: "{author["name"]}"' for author in project["authors"]] == [x for x in lines if "name:" in x]
+
+
 def test_the_version_of_a_source_tree_without_installation_is_read_from_it():
     code = (
         "from importlib import metadata\n"

@@ -1,6 +1,6 @@
 """The models against measured photons and dark counts; expectations come from the data's description.
 
-Hazelnut: photon counts of a static object in a scanning microscope, five scans of 6 time gates (tests/data, BSD-3).
+Hazelnut: photon counts of a static object in a scanning microscope, five scans of 6 time gates (BSD-3).
 The two SPAD files may not be in the repository: they are read from ../shared/data, and skipped where that is absent.
 """
 

@@ -66,7 +66,7 @@ def test_a_filter_without_effect_lowers_no_error():
     assert mixture(halves, halves).error == pytest.approx(math.sqrt(0.5), rel=0.05)
 
 
-@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
+@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install pyoidn")
 def test_the_stated_error_of_a_denoised_frame_is_its_error():
     """A matt plate under sun and sky: the stated error of a denoised frame covers its distance from the truth."""
     made = plate(Spin((0, 0, 1), 200.0), light=SunSky(), camera=CAMERA.resized(96, 132))

@@ -37,7 +37,7 @@ def test_an_error_that_hardly_falls_needs_nearly_infinite_samples():
     assert pilot.needed_samples([8, 32, 128], [1.0, 0.5], 0.25) == pytest.approx(128)
 
 
-@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
+@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install pyoidn")
 def test_the_denoiser_is_tried_beside_the_middle_of_a_large_frame():
     """A lamp without noise fills the middle: the requested error holds for the complete frame."""
     camera = CAMERA.resized(256, 512)
@@ -50,7 +50,7 @@ def test_the_denoiser_is_tried_beside_the_middle_of_a_large_frame():
     assert psnr(white, error_at(white, frame.errors_at)) > 41
 
 
-@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install 'qsim[denoise]'")
+@pytest.mark.skipif(not available(), reason="Open Image Denoise is not installed: pip install pyoidn")
 def test_a_denoised_trial_with_far_less_noise_than_the_pilots_is_rejected():
     """Its windows missed the rare bright paths that the pilots found."""
     made = plate(None, light=SunSky(), camera=replace(CAMERA, height=48, width=64))

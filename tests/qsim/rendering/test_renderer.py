@@ -187,7 +187,7 @@ def test_a_frame_in_parts_is_as_good_as_a_complete_one(monkeypatch):
 @pytest.mark.parametrize("denoise", [False, True])
 def test_a_sample_that_is_not_a_number_costs_one_pixel(monkeypatch, denoise):
     if denoise and not available():
-        pytest.skip("Open Image Denoise is not installed: pip install 'qsim[denoise]'")
+        pytest.skip("Open Image Denoise is not installed: pip install pyoidn")
     one = renderer(plate(None, light=SunSky()), budget=Budget(8, 2, denoise=denoise))
     halves = one.halves([0.0], one.budget, one.key(0))
     halves[0, 3, 4] = np.nan
