@@ -56,6 +56,8 @@ FAMILIES: dict[str, Family] = {
     "wires": wires.scene,
 }
 
+RECIPES = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.toml"))}  # of data sets, by name
+
 
 def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
     """Return the scene of a family, a Python file with `scene(seed, *, speed)`, a folder of assets, or Mitsuba XML.

@@ -13,6 +13,7 @@ import json
 import os
 import re
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +25,7 @@ from qsim.checks import suggest
 from qsim.files import FULL, Progress, wording
 from qsim.process import peak_memory
 
+PILOT = "pilot and compilation of kernels"  # before the first frame of a renderer
 RESUMES = "the same command resumes where it stopped"
 STARTS_AGAIN = "no incomplete file is left; run the same command again"
 _MAKE_SPACE = "no incomplete file is left; make space and run the same command again"
@@ -49,9 +51,18 @@ _ALSO_CALLED = {
     "--silent": "--quiet",
 }
 
-# Modules of optional packages -> the extra that installs them.
-EXTRAS = {"av": "video", "zarr": "formats", "h5py": "formats", "distributed": "cluster", "pyoidn": "denoise"}
-EXTRAS |= dict.fromkeys(("torch", "safetensors", "tensorboard"), "train")
+# Optional packages by the extra of this project that lists them, and what needs them.
+OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
+    "networks": (
+        ("torch", "safetensors", "tensorboard"),
+        "networks, qbp and transform-denoise: all commands of quiver",
+    ),
+    "video": (("av",), "video files: qsim convert, qsim preview"),
+    "formats": (("zarr", "h5py"), "Zarr and HDF5 files: qsim convert, qsim calibrate"),
+    "cluster": (("distributed",), "qsim generate --cluster"),
+    "denoise": (("pyoidn",), "fewer samples at the same error: qsim render, qsim generate"),
+}
+_PACKAGES = {package for packages, _ in OPTIONAL.values() for package in packages}
 
 quiet: ContextVar[bool] = ContextVar("quiet", default=False)  # of the running command
 
@@ -93,8 +104,15 @@ class Parser(argparse.ArgumentParser):
         elif number:
             kind = "a whole number, as in 3" if number[2] == "int" else "a number, as in 3.25 or 20e-6"
             message = f"argument {number[1]}: expected {kind}, got {number[3]}"
-        print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
-        raise SystemExit(2)
+        raise UsageError(f"{self.prog}: {message}; see {self.prog} --help")
+
+
+class UsageError(SystemExit):
+    """Wrong options or arguments; its text is printed by `run`."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(2)
+        self.text = text
 
 
 class Arguments(NamedTuple):
@@ -177,9 +195,18 @@ def _limit(threads: str) -> None:
 
 
 def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
-    """Parse and run a command; return its exit code. Wrong input becomes one line on stderr and 2, Ctrl-C 130."""
+    """Parse and run a command; return its exit code. Wrong input becomes one line on stderr and 2, Ctrl-C 130.
+
+    With --json a failure is also an object on stdout: {"error": its line, "exit_code": 2}. Without words, print help.
+    """
+    given = list(sys.argv[1:] if argv is None else argv)
+    if not given:
+        parser.print_help()
+        return 0
     try:
-        args = parser.parse_args(argv)
+        args = parser.parse_args(given)
+    except UsageError as stop:
+        return _failed(stop.text, 2, "--json" in given)
     except SystemExit as stop:
         return int(stop.code or 0)
     token = quiet.set(args.quiet)
@@ -191,19 +218,25 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
         if isinstance(error, BrokenPipeError):  # the reader of the output has ended, as in `| head`
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
-        unknown_module = isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in EXTRAS
+        unknown_module = isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in _PACKAGES
         if os.environ.get("QSIM_DEBUG") or args.verbose or unknown_module:
             raise
-        print(f"{parser.prog}: {one_line(error)}", file=sys.stderr)
-        return 2
+        return _failed(f"{parser.prog}: {one_line(error)}", 2, args.json)
     except KeyboardInterrupt:
-        print(f"\n{parser.prog}: interrupted; {args.after_interrupt}", file=sys.stderr)
-        return 130
+        return _failed(f"\n{parser.prog}: interrupted; {args.after_interrupt}", 130, args.json)
     finally:
         quiet.reset(token)
         if args.verbose:
             spent, memory = time.perf_counter() - started, peak_memory() / 2**30
             print(f"{parser.prog}: {spent:.1f} s, at most {memory:.2f} GiB of memory", file=sys.stderr)
+
+
+def _failed(text: str, code: int, as_json: bool) -> int:
+    """Print why a command failed, with --json also as an object on stdout; return its exit code."""
+    print(text, file=sys.stderr)
+    if as_json:
+        print(json.dumps({"error": text.strip(), "exit_code": code}, sort_keys=True))
+    return code
 
 
 @contextlib.contextmanager
@@ -234,7 +267,7 @@ def one_line(error: BaseException) -> str:
         return f"{wording(error)}; {_MAKE_SPACE}"
     if isinstance(error, ModuleNotFoundError):
         package = (error.name or "").split(".")[0]
-        return f"needs the package {package}, which is not installed: pip install 'qsim[{EXTRAS[package]}]'"
+        return f"needs the package {package}, which is not installed: pip install {package}"
     if isinstance(error, MemoryError):
         return f"not enough memory ({' '.join(str(error).split()) or 'none is left'}); try fewer or smaller frames"
     return wording(error)
@@ -273,8 +306,11 @@ def refuse_existing(path: Path, force: bool) -> None:
 
 
 @contextlib.contextmanager
-def bar(label: str, unit: str = "frame") -> Iterator[Progress]:
-    """Show a progress bar on stderr after two seconds; the block calls it with (done, total)."""
+def bar(label: str, unit: str = "frame", first: str = "") -> Iterator[Progress]:
+    """Show a progress bar on stderr after two seconds; the block calls it with (done, total).
+
+    `first` names the work before the first unit is done; it is shown after two seconds, too.
+    """
     from tqdm import tqdm
 
     interval = 0.2 if sys.stderr.isatty() else 10.0
@@ -282,9 +318,19 @@ def bar(label: str, unit: str = "frame") -> Iterator[Progress]:
     with tqdm(
         desc=label, unit=unit, delay=2, mininterval=interval, dynamic_ncols=True, file=sys.stderr, disable=silent
     ) as shown:
+        waiting = threading.Timer(2.0, lambda: shown.set_description(f"{label}: {first}"))
+        waiting.daemon = True
 
         def update(done: int, total: int) -> None:
+            if done and first:
+                waiting.cancel()
+                shown.set_description(label, refresh=False)
             shown.total = total
             shown.update(done - shown.n)
 
-        yield update
+        if first and not silent:
+            waiting.start()
+        try:
+            yield update
+        finally:
+            waiting.cancel()

@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from qsim import checks, files
-from qsim.cli.console import RESUMES, bar, command, note, output
+from qsim.cli.console import PILOT, RESUMES, bar, command, note, output
 from qsim.cli.options import checked, part_of
 from qsim.dataset.job import Job
 
@@ -18,11 +19,11 @@ def add_generate(sub: Any) -> None:
     """Add the command `generate` to a program."""
     parser = command(
         sub, "generate", _run_generate, "Make a data set from a recipe; finished jobs are kept.",
-        "qsim generate scenes/starter.toml -o out/starter --workers 2\n"
-        "qsim generate scenes/i2_2000fps.toml -o /data/i2 --shard 7/100", RESUMES,
+        "qsim generate starter -o out/starter --workers 2\n"
+        "qsim generate mine.toml -o /data/mine --shard 7/100", RESUMES,
         threads="threads of the renderer (Dr.Jit) in each worker",
     )  # fmt: skip
-    parser.add_argument("recipe", type=Path, help="a .toml file; its format is in qsim/dataset/recipe.py")
+    parser.add_argument("recipe", type=Path, help="a .toml file, or a name of `qsim recipes`")
     parser.add_argument("-o", "--output", type=Path, help="data set folder (default out/NAME of the recipe)")
     parser.add_argument("--workers", type=int, help="processes, each with its own renderer (default 1)")
     parser.add_argument("--shard", type=part_of, metavar="I/N", help="only the I-th of N parts, as in 7/100")
@@ -54,7 +55,7 @@ def _run_generate(args: argparse.Namespace) -> int:
         raise ValueError(f"--workers: expected 0 (in this process) or more, got {count}")
     options = generation.Options(count, args.shard, args.retry, args.repair, args.wait, limits)
     chosen = generation.shard(wanted.jobs, args.shard)
-    with bar(wanted.name) as progress, generation.watching(folder, chosen, progress):
+    with bar(wanted.name, first=PILOT) as progress, generation.watching(folder, chosen, progress):
         summary = generation.generate(wanted, folder, options, run=_cluster(args))
     lines = [f"{folder}: {summary.done} of {summary.jobs} clips done, {summary.made} made now"]
     lines += [f"repaired {problem}" for problem in summary.repaired]
@@ -105,10 +106,10 @@ def add_plan(sub: Any) -> None:
     """Add the command `plan` to a program."""
     parser = command(
         sub, "plan", _run_plan, "Render one small job of each kind and print the forecast of a recipe's cost.",
-        "qsim plan scenes/i2_2000fps.toml --machines 10",
+        "qsim plan i2_2000fps --machines 10",
         threads="threads of the renderer (Dr.Jit)",
     )  # fmt: skip
-    parser.add_argument("recipe", type=Path, help="a .toml file")
+    parser.add_argument("recipe", type=Path, help="a .toml file, or a name of `qsim recipes`")
     parser.add_argument("--machines", type=int, default=10, help="number of machines that share the work (default 10)")
     parser.add_argument("--frames", type=int, default=5, help="frames rendered per kind (default 5)")
 
@@ -124,6 +125,40 @@ def _run_plan(args: argparse.Namespace) -> int:
     facts = {"recipe": wanted.name, "machines": args.machines, "hours_each": found.hours / args.machines}
     output(args, facts | found.to_dict(), found.lines(args.machines))
     return 0
+
+
+def add_recipes(sub: Any) -> None:
+    """Add the command `recipes` to a program."""
+    parser = command(
+        sub, "recipes", _run_recipes, "List the shipped recipes and what each one makes, or print one.",
+        "qsim recipes\nqsim recipes --print starter > mine.toml",
+    )  # fmt: skip
+    parser.add_argument("--print", metavar="NAME", help="print the text of this recipe")
+
+
+def _run_recipes(args: argparse.Namespace) -> int:
+    from qsim.dataset import recipe
+    from qsim.scenes import RECIPES
+
+    if args.print is not None:
+        path, text = recipe.text_of(args.print)
+        output(args, {"recipe": str(path), "text": text}, text.rstrip("\n"))
+        return 0
+    found = {name: recipe.load(name) for name in RECIPES}
+    made = {name: {"clips": len(one.jobs), "file": str(RECIPES[name])} for name, one in found.items()}
+    width = max(map(len, found))
+    lines = [f"{name:{width}}  {_contents(one.jobs)}" for name, one in found.items()]
+    output(args, {"recipes": made}, [*lines, "qsim generate NAME makes one; qsim recipes --print NAME prints its text"])
+    return 0
+
+
+def _contents(jobs: Sequence[Job]) -> str:
+    """Return the contents of a data set: `9 clips of 24 frames of 128 x 128 at 2000 fps; streams: ...`."""
+    sizes = dict.fromkeys(
+        f"{s.frames} frames of {s.height} x {s.width} at {s.frame_rate:g} fps" for s in (job.settings for job in jobs)
+    )
+    streams = dict.fromkeys(sensing.stream_name for job in jobs for sensing in job.streams)
+    return f"{len(jobs)} clips of {' or '.join(sizes)}; streams: {', '.join(streams) or 'none'}"
 
 
 def add_check(sub: Any) -> None:

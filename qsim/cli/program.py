@@ -12,10 +12,11 @@ from importlib.util import find_spec
 from typing import Any
 
 from qsim.cli.calibrate import add_calibrate
-from qsim.cli.completion import add_completion
-from qsim.cli.console import EXTRAS, Parser, command, output, run
+from qsim.cli.completion import add_completion, families, recipes, sensors
+from qsim.cli.console import OPTIONAL, Parser, command, output, run
 from qsim.cli.convert import add_convert
-from qsim.cli.dataset import add_check, add_generate, add_plan
+from qsim.cli.dataset import add_check, add_generate, add_plan, add_recipes
+from qsim.cli.demo import add_demo
 from qsim.cli.look import add_explore, add_preview, add_report
 from qsim.cli.render import add_render
 from qsim.cli.sense import add_sense
@@ -36,6 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         add_generate,
         add_plan,
         add_check,
+        add_recipes,
         add_convert,
         add_preview,
         add_report,
@@ -43,16 +45,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         add_tradeoff,
         add_calibrate,
         add_validate,
+        add_demo,
     ):
         add(sub)
-    add_completion(sub, parser)
+    values = {"scene": families, "source": families, "--scenes": families, "recipe": recipes, "--print": recipes}
+    add_completion(sub, parser, values | {"--sensor": sensors, "--plane-sensor": sensors})
     return run(parser, argv)
 
 
 def _add_doctor(sub: Any) -> None:
     """Add the command `doctor` to a program."""
     parser = command(
-        sub, "doctor", _run_doctor, "Print the renderer of this machine, every tested one, and the missing extras.",
+        sub, "doctor", _run_doctor, "Print the renderer of this machine, those tested, and missing optional packages.",
         "qsim doctor\nqsim doctor --devices",
     )  # fmt: skip
     parser.add_argument("--devices", action="store_true", help="list the named sensors and the source of each number")
@@ -69,21 +73,27 @@ def _run_doctor(args: argparse.Namespace) -> int:
     from qsim.optics.camera import Camera
     from qsim.optics.diffraction import diffraction_line
 
-    extras = {extra: all(find_spec(m) for m in EXTRAS if EXTRAS[m] == extra) for extra in sorted(set(EXTRAS.values()))}
+    missing = {extra: [p for p in packages if not find_spec(p)] for extra, (packages, _) in OPTIONAL.items()}
     report = backend.report() | {
-        "extras": extras,
+        "extras": {extra: not packages for extra, packages in missing.items()},
         "lens": diffraction_line(Camera(8e-3, 2.8, 1.1e-6, 512, 1024)),
     }
     width = max(len(key) for key in report)
-    missing = ", ".join(f"{extra} (pip install 'qsim[{extra}]')" for extra, there in extras.items() if not there)
+    extras = [f"{extra}: {_extra_text(extra, packages)}" for extra, packages in missing.items()]
     probes = [f"{p['library'] or p['backend']}: {p['detail']}" for p in report["probes"]]
     words = report | {
         "probes": ("\n" + " " * (width + 2)).join(probes),
         "software": ", ".join(f"{name} {found}" for name, found in report["software"].items()),
-        "extras": ", ".join(extra for extra, there in extras.items() if there) + (missing and f"; missing: {missing}"),
+        "extras": ("\n" + " " * (width + 2)).join(extras),
     }
     output(args, report, [f"{key:{width}}  {value}" for key, value in words.items()])
     return 0
+
+
+def _extra_text(extra: str, missing: list[str]) -> str:
+    """Return what an extra is for, and how to install the packages of it that are missing."""
+    purpose = OPTIONAL[extra][1]
+    return f"MISSING (pip install {' '.join(missing)}); for {purpose}" if missing else f"installed; for {purpose}"
 
 
 def _device_text(device: dict[str, Any]) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 from qsim import checks
 from qsim.backend import BACKENDS
-from qsim.cli.console import RESUMES, bar, command, output, refuse_idle
+from qsim.cli.console import PILOT, RESUMES, bar, command, output, refuse_idle
 from qsim.cli.options import checked
 
 
@@ -79,7 +79,7 @@ def _run_render(args: argparse.Namespace) -> int:
         chosen = choose_budget(scene, **taken)
         output(args, {"render": dataclasses.asdict(chosen)}, explain(chosen.findings))
         return 0
-    with bar(args.output.name) as progress:
+    with bar(args.output.name, first=PILOT) as progress:
         clip = render(args.scene, args.output, **taken, **size, progress=progress, force=args.force)
     render_meta = clip.meta["render"]
     found = stated(clip.meta)

@@ -60,15 +60,30 @@ class Recipe:
 
 
 def load(path: str | Path) -> Recipe:
-    """Read a recipe; `FileNotFoundError`, or `ValueError` as `FILE:LINE: error, remedy`."""
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such recipe")
+    """Read a recipe, a file or the name of a shipped one; errors as `text_of`, or `FILE:LINE: error, remedy`."""
+    found, text = text_of(path)
+    return parse(text, found)
+
+
+def text_of(path: str | Path) -> tuple[Path, str]:
+    """Return the file of a recipe, also of the name of a shipped one, and its text.
+
+    `FileNotFoundError`, or `ValueError` for a file that is not text.
+    """
+    from qsim.scenes import RECIPES
+
+    found = Path(path)
+    if not found.is_file():
+        if str(path) not in RECIPES:
+            known = ", ".join(RECIPES)
+            raise FileNotFoundError(
+                f"{path}: no such recipe{checks.suggest(str(path), RECIPES)}; give a .toml file, or one of {known}"
+            )
+        found = RECIPES[str(path)]
     try:
-        text = path.read_text(encoding="utf-8")
+        return found, found.read_text(encoding="utf-8")
     except UnicodeDecodeError:
         raise ValueError(f"{path}: not a text file; a recipe is TOML in UTF-8") from None
-    return parse(text, path)
 
 
 def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from qsim.cli.completion import add_completion
+from qsim.cli.completion import add_completion, sensors
 from qsim.cli.console import Parser, output, run
 from qsim.files import VERSION
 from quiver.cli.domain import add_domain
@@ -31,12 +31,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
     for add in (add_train, add_restore, add_evaluate, add_domain, add_ablate, add_bench, _add_convert_weights):
         add(sub)
-    add_completion(sub, parser)
+    several = {"--methods": lambda: [*_methods(), "all"]}
+    add_completion(sub, parser, {"--sensor": sensors, "--method": _methods, "weights": _methods} | several)
     with handling(signal.default_int_handler, signal.SIGTERM):  # termination cleans up as Ctrl-C does
         return run(parser, argv)
 
 
 # convert-weights
+
+
+def _methods() -> list[str]:
+    """Return the methods that need no training, for shells to complete."""
+    from quiver.restoration.restorers import method_names
+
+    return method_names()
 
 
 def _add_convert_weights(sub: Any) -> None:

@@ -40,13 +40,44 @@ def complete(script: str, program: str, *words: str, cwd: Path) -> list[str]:
 def test_bash_completes_commands_options_choices_and_files(capsys, tmp_path):
     script = completion(capsys, "qsim", "bash")
     (tmp_path / "reading.txt").touch()
-    assert complete(script, "qsim", "re", cwd=tmp_path) == ["render", "report"]
+    assert complete(script, "qsim", "re", cwd=tmp_path) == ["render", "recipes", "report"]
     assert complete(script, "qsim", "render", "--fr", cwd=tmp_path) == ["--frames", "--frame-rate"]
     assert complete(script, "qsim", "calibrate", "--model", "", cwd=tmp_path) == ["qis", "spad"]
     assert complete(script, "qsim", "validate", "s", cwd=tmp_path) == ["sensor"]
     assert complete(script, "qsim", "check", "read", cwd=tmp_path) == ["reading.txt"]
     script = completion(capsys, "quiver", "bash")
     assert complete(script, "quiver", "train", "--preset", "quiver-", cwd=tmp_path) == ["quiver-s"]
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
+def test_bash_completes_scenes_sensors_recipes_and_methods_or_files(capsys, tmp_path):
+    script = completion(capsys, "qsim", "bash")
+    for name in ("fan_of_mine.py", "spad.toml", "starter_of_mine.toml"):
+        (tmp_path / name).touch()
+    assert complete(script, "qsim", "render", "fa", cwd=tmp_path) == ["fan"]
+    assert complete(script, "qsim", "render", "fan_", cwd=tmp_path) == ["fan_of_mine.py"]
+    assert complete(script, "qsim", "sense", "--sensor", "spad-", cwd=tmp_path) == ["spad-320x240"]
+    assert complete(script, "qsim", "sense", "--sensor", "spad.", cwd=tmp_path) == ["spad.toml"]
+    assert complete(script, "qsim", "generate", "st", cwd=tmp_path) == ["starter"]
+    assert complete(script, "qsim", "recipes", "--print", "de", cwd=tmp_path) == ["demo"]
+    assert complete(script, "qsim", "tradeoff", "gea", cwd=tmp_path) == ["gears"]
+    script = completion(capsys, "quiver", "bash")
+    assert complete(script, "quiver", "restore", "--method", "mo", cwd=tmp_path) == ["moment"]
+    assert complete(script, "quiver", "evaluate", "--methods", "naive,na", cwd=tmp_path) == [
+        "naive,naive",
+        "naive,nano",
+    ]
+    assert complete(script, "quiver", "evaluate", "--methods", "al", cwd=tmp_path) == ["all"]
+
+
+def test_fish_completes_scenes_and_methods(capsys):
+    lines = completion(capsys, "qsim", "fish").splitlines()
+    assert any(
+        line.startswith("complete -c qsim") and "from render" in line and " -a " in line and "fan " in line
+        for line in lines
+    )
+    lines = completion(capsys, "quiver", "fish").splitlines()
+    assert any("-l method " in line and " -r -a " in line and "moment" in line for line in lines)
 
 
 @pytest.mark.parametrize("program", ["qsim", "quiver"])
@@ -98,6 +129,56 @@ def test_scripts_are_valid_where_the_shell_is_there(capsys, tmp_path, shell):
     script = tmp_path / "script"
     script.write_text(completion(capsys, "qsim", shell))
     subprocess.run([shell, "-n", script], check=True)
+
+
+@pytest.mark.parametrize("program", ["qsim", "quiver"])
+def test_a_program_alone_prints_its_help(capsys, program):
+    assert {"qsim": main, "quiver": quiver.cli.program.main}[program]([]) == 0
+    found = capsys.readouterr()
+    assert found.out.startswith(f"usage: {program} ")
+    assert not found.err
+
+
+@pytest.mark.parametrize("line", ["check none --json", "render fan --fps 3 --json", "sense --json", "frob --json"])
+def test_a_failure_with_json_is_an_object_and_a_line(capsys, line):
+    assert main(line.split()) == 2
+    found = capsys.readouterr()
+    assert json.loads(found.out) == {"error": found.err.strip(), "exit_code": 2}
+    assert len(found.err.splitlines()) == 1
+
+
+def test_an_interrupted_command_with_json_is_an_object(tmp_path, monkeypatch, capsys):
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("qsim.dataset.checking.check", interrupt)
+    assert main(["check", str(tmp_path), "--json"]) == 130
+    found = capsys.readouterr()
+    assert json.loads(found.out) == {"error": found.err.strip(), "exit_code": 130}
+
+
+def test_a_bar_names_the_work_before_the_first_frame(capsys, monkeypatch):
+    """After two seconds without a frame the bar says what is being done, and the name of the work from then on."""
+    started: list[object] = []
+
+    class Now:
+        def __init__(self, seconds: float, function) -> None:
+            started.append(seconds)
+            self.function = function
+
+        def start(self) -> None:
+            self.function()
+
+        def cancel(self) -> None: ...
+
+    monkeypatch.setattr("qsim.cli.console.threading.Timer", Now)
+    with console.bar("fan", first="pilot") as progress:
+        assert "fan: pilot" in capsys.readouterr().err
+        progress(1, 4)
+    assert started == [2.0]
+    with console.bar("fan"):
+        pass
+    assert not capsys.readouterr().err
 
 
 def test_quiet_and_verbose_exclude_each_other(capsys):

@@ -45,6 +45,8 @@ WORDS = {  # a line that each parser takes
     "generate": "generate t.toml -o d",
     "plan": "plan t.toml",
     "check": "check clip",
+    "recipes": "recipes",
+    "demo": "demo t.toml",
     "convert": CODES,
     "preview": "preview clip",
     "report": "report clip",
@@ -75,18 +77,20 @@ def validate(option: str, *acts: Row) -> list[Row]:
 
 
 ROWS: dict[tuple[str, str], list[Row]] = {
-    ("", "--version"): [Acts("", "--version", exit_code, codes=(0, 2))],
+    ("", "--version"): [Acts("", "--version", stdout)],
     **loudness(WORDS),
     **{
         (name, "--json"): [Acts(line, "--json", stdout)]
         for name, line in WORDS.items()
-        if name not in ("render", "generate", "plan", "calibrate", "validate")
+        if name not in ("render", "generate", "plan", "calibrate", "validate", "demo")
     },
     ("render", "--json"): [Acts(f"{RENDER} -o r", "--json", stdout, slow=True)],
     ("generate", "--json"): [Acts("generate t.toml -o d --workers 0", "--json", stdout, slow=True)],
     ("plan", "--json"): [Acts("plan t.toml", "--json", stdout, slow=True)],
     ("calibrate", "--json"): [Acts(CALIBRATE, "--json", stdout)],
     ("validate", "--json"): [Acts(ENGINES, "--json", stdout, slow=True)],
+    ("demo", "--json"): [Acts("demo t.toml", "--json", stdout, codes=(2,))],
+    ("recipes", "--print"): [Acts("recipes", "--print demo", stdout), Refused("recipes", "--print none", "no such")],
     ("doctor", "--devices"): [Acts("doctor", "--devices", stdout)],
     # render
     ("render", "--threads"): [Acts(f"{RENDER} -o r", "--threads 1", threads, slow=True)],

@@ -61,7 +61,6 @@ def test_every_help_has_an_example_and_json(capsys: pytest.CaptureFixture[str], 
     ("line", "message"),
     [
         ("rendr fan", "qsim: unknown command 'rendr' (did you mean 'render'?)"),
-        ("", "qsim: the following arguments are required: COMMAND"),
         ("sense x --sensr y", "qsim sense: unknown option --sensr (did you mean '--sensor'?)"),
         ("sense x --bit 3", "qsim sense: unknown option --bit (did you mean '--bits'?)"),
         ("sense x --bits three", "qsim sense: argument --bits: expected 1 to 16 bits per code, got 'three'"),
@@ -120,7 +119,7 @@ def test_render_explains_and_counts(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "bounces" not in out
     code, _, err = run(capsys, "render", "plain", *small)
     assert code == 2
-    assert "required: -o/--output; only --explain works without it" in err
+    assert "-o/--output is required (optional only with --explain)" in err
     code, _, err = run(capsys, "render", "plain", "--explain", "--engine", "metal")
     assert code == 2
     assert "metal" in err

@@ -13,6 +13,7 @@ from qsim import checks
 from qsim.dataset import job_runner, provenance, recipe
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe import Recipe, parse
+from qsim.scenes import RECIPES
 
 HEAD = """[recipe]
 name = "tiny"
@@ -180,7 +181,7 @@ def test_training_never_sees_a_family_of_the_test_split():
 
 
 def test_files_that_are_no_recipes(tmp_path: Path):
-    with pytest.raises(FileNotFoundError, match="no such recipe"):
+    with pytest.raises(FileNotFoundError, match=r"no such recipe; give a \.toml file, or one of bitdepth, demo, "):
         recipe.load(tmp_path / "none.toml")
     path = tmp_path / "binary.toml"
     path.write_bytes(b"\xff\xfe\x00")
@@ -348,3 +349,17 @@ def test_a_scene_file_is_accepted_exactly_when_its_jobs_are(tmp_path: Path, coun
     (tmp_path / "r.toml").write_text(HEAD + f'[[scenes]]\nfamily = "{long.name}"\n')
     with pytest.raises(ValueError, match=r"r\.toml:8: .* has 181 characters; at most 180"):
         recipe.load(tmp_path / "r.toml")
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_shipped_recipe_is_found_by_its_name_unless_a_file_has_it(name: str, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert recipe.load(name).name == name
+    assert recipe.text_of(name) == (RECIPES[name], RECIPES[name].read_text())
+    (tmp_path / name).write_text(HEAD)
+    assert recipe.text_of(name)[1].startswith(HEAD[:8])
+
+
+def test_a_misspelt_recipe_is_suggested():
+    with pytest.raises(FileNotFoundError, match=r"startr: no such recipe \(did you mean 'starter'\?\)"):
+        recipe.load("startr")

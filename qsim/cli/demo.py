@@ -1,0 +1,95 @@
+"""Runs `qsim demo`: the commands from scenes to restored video, and one page of the results.
+
+Every step is one printed command of `qsim` or `quiver`; a finished step is not repeated. Two real measurements
+are in the package (qsim/measurements/, with their licences).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qsim.cli.console import OPTIONAL, RESUMES, command, output
+
+MEASUREMENTS = Path(__file__).parents[1] / "measurements"
+MINUTES = "2"  # of training
+LIGHT = ("--ppp", "3.25", "--bits", "3")
+METHODS = ("naive:1", "naive:11", "moment:3", "nano")  # nano = the weights that ship with the package
+
+
+def add_demo(sub: Any) -> None:
+    """Add the command `demo` to a program."""
+    parser = command(
+        sub, "demo", _run_demo, "Render, sense, train, restore and score small scenes; write one page of the results.",
+        "qsim demo\nqsim demo out/demo", RESUMES,
+    )  # fmt: skip
+    parser.add_argument("folder", type=Path, nargs="?", default=Path("out/demo"), help="to fill (default out/demo)")
+
+
+def _run_demo(args: argparse.Namespace) -> int:
+    from qsim.process import peak_memory_of_children
+
+    for package in OPTIONAL["networks"][0]:
+        if not find_spec(package):
+            raise ModuleNotFoundError(f"No module named {package!r}", name=package)
+    started, out = time.perf_counter(), args.folder
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        steps(out, args.quiet or args.json)
+    except subprocess.CalledProcessError as failed:
+        print(f"qsim demo: stopped at '{shlex.join(failed.cmd[2:])}'; `qsim demo` resumes there", file=sys.stderr)
+        return failed.returncode
+    minutes, peak = (time.perf_counter() - started) / 60, peak_memory_of_children()
+    page = out / "index.html"
+    facts = {"page": str(page), "minutes": minutes, "largest_process_bytes": peak}
+    output(args, facts, f"\ndemo: {minutes:.1f} minutes, largest process {peak / 2**30:.2f} GB; open {page}")
+    return 0
+
+
+def steps(out: Path, quiet: bool) -> None:
+    """Render and sense, train, restore, score, draw: each step is a command. `CalledProcessError` if one fails."""
+
+    def run(what: str, program: str, *arguments: str | Path, capture: bool = False) -> str:
+        """Run one command; its progress goes to the terminal."""
+        words = [str(word) for word in (*arguments, *(["--quiet"] if quiet else []))]
+        if not quiet:
+            print(f"\n{what}\n  $ {program} {shlex.join(words)}", flush=True)
+        shown = subprocess.PIPE if capture or quiet else None
+        done = subprocess.run([sys.executable, "-m", program, *words], check=True, text=True, stdout=shown)
+        return done.stdout or ""
+
+    def restore(source: Path, target: Path, method: str) -> None:
+        if not target.with_suffix(".json").exists():
+            run(f"Restoring {source.name}", "quiver", "restore", source, "-o", target, "--method", method)
+
+    data, trained, title = out / "data", out / "trained", "From a scene to restored video"
+    run("Rendering moving scenes at 2000 fps and sensing them", "qsim", "generate", "demo", "-o", data)
+    preset = ("--preset", "nano", "--minutes", MINUTES, *LIGHT)
+    run("Training the small network", "quiver", "train", data, "-o", trained, *preset)
+    jobs = json.loads((data / "dataset.json").read_text())["jobs"]
+    for name in [name for name, job in jobs.items() if job["split"] == "test"]:
+        restore(data / "clips" / name, out / f"{name}_trained_here.npy", str(trained))
+        restore(data / "clips" / name, out / f"{name}_shipped.npy", "nano")
+    ball = out / "ball"
+    if not ball.exists():
+        np.save(out / "ball_12bit.npy", np.load(MEASUREMENTS / "ball_12bit.npz")["frames"])
+        camera = ("--frame-rate", "30000", "--exposure", "20e-6", "--transfer", "linear", "--white", "4095")
+        run("Real video at 30 000 fps becomes a clip", "qsim", "convert", out / "ball_12bit.npy", ball, *camera)
+    run("... and is sensed", "qsim", "sense", ball, *LIGHT)
+    restore(ball, out / "real_ball.npy", str(trained))
+    methods = ",".join([*METHODS, str(trained)])
+    run("Scores on held-out scenes", "quiver", "evaluate", data, "-o", out / "scores", "--methods", methods, *LIGHT)
+    real = out / "real_photons.json"
+    if not real.exists():
+        static = ("evaluate", "--static", MEASUREMENTS / "hazelnut_gates6.npz", "--methods", methods, "--json")
+        real.write_text(run("Scores on real photons", "quiver", *static, capture=True))
+    run("The page", "qsim", "report", out, "-o", out / "index.html", "--force", "--title", title)
