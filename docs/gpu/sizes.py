@@ -1,0 +1,35 @@
+"""Holds the sizes of all measurements: those of a GPU by default; tests make them small."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured."""
+
+    height: int = 512  # px, of frames that are sensed, rendered and restored
+    width: int = 1024
+    sensor_pixels: int = 1 << 24  # of a draw
+    rounds: int = 7  # of timing
+    families: tuple[str, ...] = ("fence", "glass", "glossy", "room")  # scenes that budgets were not tuned on
+    frames: int = 5  # that are timed with a budget
+    psnr: float = 40.0  # dB
+    check_height: int = 128  # px, of the comparison with a converged frame
+    check_width: int = 256
+    reference_samples: int = 2048
+    train_families: tuple[str, ...] = ("fan", "tumble", "drums", "text", "gears", "room")  # the first: validation too
+    train_psnr: float = 36.0  # dB
+    train_seeds: int = 2  # clips of each family of the training set
+    train_frames: int = 24
+    train_height: int = 192  # px
+    train_width: int = 256
+    crop: int | None = None  # px; None: that of the protocol
+    batch: int | None = None  # None: that of the protocol
+    steps: int = 1000  # of every training
+    copied_batches: int = 40  # batches that are timed for every way of copying
+    workers: int = 8  # processes that draw windows, at most one less than the cores
+    restored: int = 16  # frames of a network that are timed on a GPU
+    restored_slow: int = 2  # frames that are timed on a CPU
+    compared_side: int = 64  # px, of the frames on which precisions are compared

@@ -1,0 +1,475 @@
+"""docs/gpu.py: pieces, resuming, failures and mistakes with faked measurements; the true ones, tiny, are slow."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PARTS = ROOT / "docs" / "gpu"
+
+# Runs the true child.py with faked sections. What each measurement does stands in acts.json: {"SECTION.NAME": act}.
+FAKE = """
+import json, os, sys, time, types
+from pathlib import Path
+sys.path.insert(0, {parts!r})
+here = Path({here!r})
+import child, job
+
+def names(section):
+    acts = json.loads((here / "acts.json").read_text())
+    found = [name.partition(".")[2] for name in acts if name.startswith(section)]
+    if found == ["missing"]:
+        raise ModuleNotFoundError("No module named 'torch'", name="torch")
+    return found
+
+def measure(work):
+    act = json.loads((here / "acts.json").read_text())[work.section + "." + work.name]
+    with open(here / "made.txt", "a") as made:
+        made.write(f"{{work.section}}.{{work.name}} {{os.getpid()}}\\n")
+    if act == "fail":
+        raise ValueError("the scene is black")
+    if act == "absent":
+        raise job.Absent("no CUDA device here")
+    if act == "crash":
+        os.abort()
+    if act == "leave":
+        os._exit(0)
+    if act == "import":
+        import tinywheel
+        return [{{"found": tinywheel.VALUE}}]
+    work.stopped = act == "long"
+    time.sleep(act if isinstance(act, (int, float)) else 0)
+    return [{{"name": work.name, "pid": os.getpid()}}]
+
+for section in job.SECTIONS:
+    module = types.ModuleType(section)
+    module.names, module.measure = (lambda sizes, section=section: names(section)), measure
+    sys.modules[section] = module
+child.main()
+"""
+
+
+class Bench:
+    """A folder of results, faked measurements, and what they did."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.out = folder, folder / "out"
+        (folder / "fake.py").write_text(FAKE.format(parts=str(PARTS), here=str(folder)))
+        self.child = (sys.executable, str(folder / "fake.py"))
+        self.acts()
+
+    def acts(self, **changes: object) -> None:
+        """One measurement of each section, and changes to what they do; None removes one."""
+        usual = {"doctor.machine": 0, "sensor.one": 0, "render.one": 0, "train.one": 0, "restore.one": 0}
+        acts = usual | {name.replace("_", "."): act for name, act in changes.items()}
+        (self.folder / "acts.json").write_text(json.dumps({k: v for k, v in acts.items() if v is not None}))
+
+    def __call__(self, *words: str) -> int:
+        import pieces
+
+        return pieces.main([str(self.out), *words], child=self.child)
+
+    def made(self) -> list[str]:
+        """The measurements that began since the last call."""
+        file = self.folder / "made.txt"
+        found = [line.split()[0] for line in file.read_text().splitlines()] if file.exists() else []
+        file.unlink(missing_ok=True)
+        return found
+
+    def state(self, name: str) -> str | None:
+        found = json.loads((self.out / f"{name.replace('.', '/', 1)}.json").read_text())
+        return found["state"]
+
+
+@pytest.fixture
+def bench(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(PARTS))
+    return Bench(tmp_path)
+
+
+def told(capsys) -> str:
+    return capsys.readouterr().err
+
+
+def test_importing_the_program_runs_nothing():
+    code = "import runpy; found = runpy.run_path('docs/gpu.py', run_name='gpu'); print(sorted(set(found) & {'main'}))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--minutes", "0"], "expected a number of minutes above 0, got '0'"),
+        (["--minutes", "-3"], "expected a number of minutes above 0, got '-3'"),
+        (["--minutes", "nan"], "got 'nan'"),
+        (["--minutes", "inf"], "got 'inf'"),
+        (["--minutes", "ten"], "got 'ten'"),
+        (["--section", "rendering"], "invalid choice: 'rendering'"),
+        (["another"], "unrecognized arguments: another"),
+        (["--force"], "unrecognized arguments: --force"),
+    ],
+)
+def test_wrong_arguments_are_refused_before_anything_is_written(bench, capsys, words, message):
+    with pytest.raises(SystemExit) as ended:
+        bench(*words)
+    assert ended.value.code == 2
+    assert message in told(capsys)
+    assert not bench.out.exists()
+
+
+def test_what_is_measured_is_not_measured_again(bench, capsys):
+    assert bench() == 0
+    assert bench.made() == ["doctor.machine", "sensor.one", "render.one", "train.one", "restore.one"]
+    assert "5 of 5 measured, 0 failed, 0 not possible here, 0 to do" in capsys.readouterr().out
+    assert bench() == bench("--section", "sensor") == bench("--section", "table") == 0
+    assert bench.made() == []
+    table = json.loads((bench.out / "table.json").read_text())
+    assert table["records"]["train"]["one"]["rows"][0]["name"] == "one"
+    assert table["records"]["train"]["one"]["command"] == "python docs/gpu.py OUT --minutes 9"
+    assert "## restore" in (bench.out / "table.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("act", "state", "why"),
+    [
+        ("fail", "failed", "ValueError: the scene is black"),
+        ("crash", "failed", "its process ended with signal SIGABRT"),
+        ("leave", "failed", "its process ended with exit code 0"),
+        ("absent", "absent", "no CUDA device here"),
+    ],
+)
+def test_a_failing_section_states_why_and_the_others_are_measured(bench, capsys, act, state, why):
+    bench.acts(render_one=act)
+    assert bench() == (1 if state == "failed" else 0)
+    assert [bench.state(f"{section}.one") for section in ("sensor", "train", "restore")] == ["done"] * 3
+    assert bench.state("render.one") == state
+    assert f"render: one ... {state}, 0 s: {why}" in capsys.readouterr().out.replace("1 s", "0 s").replace("2 s", "0 s")
+    assert f"- one: {state}: {why}" in (bench.out / "table.md").read_text()
+    bench.made()
+    bench()
+    assert bench.made() == []  # the same program and packages would fail again
+    bench.acts()
+    assert bench("--section", "render") == 0
+    assert bench.made() == ["render.one"]
+    assert bench.state("render.one") == "done"
+
+
+def test_a_missing_package_is_named_and_its_section_is_measured_when_it_is_there(bench, monkeypatch):
+    import folder
+
+    bench.acts(train_one=None, train_missing=0)
+    assert bench() == 0
+    record = json.loads((bench.out / "train" / "all.json").read_text())
+    assert record["state"] == "absent"
+    assert record["why"] == (
+        "needs the package torch, which is not installed; install it, or name wheels with --wheels FOLDER"
+    )
+    assert bench.made() == ["doctor.machine", "sensor.one", "render.one", "restore.one"]
+    bench.acts()
+    version = folder.version
+    monkeypatch.setattr(folder, "version", lambda name, where: "9.9" if name == "torch" else version(name, where))
+    assert bench() == 0
+    assert bench.made() == ["doctor.machine", "train.one"]  # the doctor looks again when packages change
+    assert not (bench.out / "train" / "all.json").exists()
+
+
+def test_a_piece_ends_in_time_and_the_next_one_continues(bench, capsys):
+    bench.acts(sensor_one=60, doctor_machine=None)
+    assert bench("--minutes", "0.02") == 1  # about a second: the first measurement is given up
+    assert bench.state("sensor.one") == "late"
+    assert "took longer than the 0.02 minutes of its piece; give more --minutes" in capsys.readouterr().out
+    bench.acts(doctor_machine=None)
+    assert bench("--minutes", "0.02") == 1  # not tried again in so short a piece
+    assert bench.state("sensor.one") == "late"
+    assert bench("--minutes", "0.5") == 0
+    assert bench.state("sensor.one") == "done"
+
+
+def test_a_measurement_that_is_not_the_first_is_done_by_the_next_piece(bench):
+    import pieces
+
+    bench.acts(sensor_one=60)
+    bench.out.mkdir()
+    piece = pieces.Piece(bench.out, None, 9.0, {}, bench.child)
+    assert pieces.measure(piece, "sensor", "one", {}, 0.5, first=False) == "open"
+    assert not (bench.out / "sensor" / "one.json").exists()
+    assert pieces.measure(piece, "sensor", "one", {}, 0.5, first=True) == "late"
+
+
+def test_a_measurement_stops_before_its_end(bench):
+    import job
+    from sizes import Sizes
+
+    for seconds, left, stops in ((540.0, 21.0, False), (540.0, 19.0, True), (10.0, 3.0, False), (10.0, 1.0, True)):
+        end = time.monotonic() + left
+        work = job.Job("train", "data", Path(), Path(), Sizes(), seconds, end)
+        assert work.is_over() == work.stopped == stops
+
+
+def test_a_resumable_measurement_keeps_what_it_has(bench):
+    bench.acts(train_one="long", doctor_machine=None, sensor_one=None, render_one=None, restore_one=None)
+    assert bench() == 0
+    assert bench.state("train.one") == "unfinished"
+    assert "- one: unfinished: the next piece continues it" in (bench.out / "table.md").read_text()
+    assert "| one |" in (bench.out / "table.md").read_text()
+    bench.acts()
+    assert bench("--section", "train") == 0
+    assert bench.state("train.one") == "done"
+
+
+def _start(bench: Bench, *words: str) -> subprocess.Popen[bytes]:
+    call = f"main({[str(bench.out), *words]!r}, child={bench.child!r})"
+    code = f"import sys; sys.path.insert(0, {str(PARTS)!r}); from pieces import main; sys.exit({call})"
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+
+
+def _gone(pid: int) -> bool:
+    """Whether a process has ended, also if nobody has asked for its exit code yet."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are looked up in /proc")
+def test_killed_at_any_moment_it_continues_and_leaves_no_process(bench):
+    rng = random.Random(0)
+    bench.acts(**{f"sensor_n{i}": 0.05 for i in range(4)})
+    pids = []
+    for _ in range(3):
+        process = _start(bench)
+        time.sleep(rng.uniform(0.1, 1.0))
+        process.kill()
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+    made = bench.folder / "made.txt"
+    pids = [int(line.split()[1]) for line in made.read_text().splitlines()] if made.exists() else []
+    end = time.monotonic() + 20
+    while not all(map(_gone, pids)) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert all(map(_gone, pids))
+    assert bench() == 0
+    records = [file for section in bench.out.iterdir() if section.is_dir() for file in section.glob("*.json")]
+    assert len(records) == 9
+    assert {json.loads(file.read_text())["state"] for file in records} == {"done"}
+    bench.made()
+    assert bench() == 0
+    assert bench.made() == []
+
+
+def test_ctrl_c_ends_the_measurement_and_prints_one_line(bench):
+    bench.acts(doctor_machine=60)
+    process = _start(bench)
+    made, end = bench.folder / "made.txt", time.monotonic() + 30
+    while not made.exists() and time.monotonic() < end:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert out.decode().endswith("gpu.py: interrupted; the same command continues there\n")
+    assert _gone(int(made.read_text().split()[1]))
+
+
+def test_damaged_records_are_measured_again(bench):
+    damages = {
+        "sensor": b"",
+        "render": b"[1, 2]",
+        "train": b"\xff\xfe\x00",
+        "restore": b"[" * 5000,
+        "doctor": b'{"state": "late", "setup": []}',
+    }
+    assert bench() == 0
+    assert len(bench.made()) == 5
+    for section, damage in damages.items():
+        next((bench.out / section).glob("*.json")).write_bytes(damage)
+    for name in ("table.json", "plan.json"):
+        (bench.out / name).write_bytes(b'{"state": "done"')
+    assert bench() == 0
+    assert sorted(bench.made()) == sorted(f"{s}.{'machine' if s == 'doctor' else 'one'}" for s in damages)
+    assert json.loads((bench.out / "table.json").read_text())["records"]["sensor"]["one"]["state"] == "done"
+
+
+def test_folders_that_are_not_ours_are_refused(bench, capsys):
+    bench.out.mkdir()
+    (bench.out / "thesis.tex").write_text("x")
+    assert bench() == 2
+    assert told(capsys) == f"gpu.py: {bench.out}: holds files that this program did not write; name an empty folder\n"
+    assert [path.name for path in bench.out.iterdir()] == ["thesis.tex"]
+    shutil.rmtree(bench.out)
+    bench.out.write_text("x")
+    assert bench() == 2
+    assert told(capsys) == f"gpu.py: {bench.out}: is a file; name a folder\n"
+    bench.out = bench.out / "below"
+    assert bench() == 2
+    assert "cannot be written" in told(capsys)
+
+
+def test_results_of_another_machine_or_size_are_not_mixed(bench, monkeypatch, capsys):
+    import folder
+    import pieces
+
+    assert bench() == 0
+    (bench.folder / "made.txt").unlink()
+    assert pieces.main([str(bench.out)], child=bench.child, sizes={"steps": 2}) == 2
+    assert "holds results of another machine (measurements of other sizes); name another folder" in told(capsys)
+    here = folder.machine()
+    monkeypatch.setattr(folder, "machine", lambda: here | {"gpus": ["NVIDIA H200, 1.0, 9 MiB"]})
+    assert bench() == 2
+    assert "holds results of another machine (gpus" in told(capsys)
+    monkeypatch.undo()
+    for damage in (b"{", b"{}", b'{"machine": 3, "sizes": {}}'):
+        (bench.out / "machine.json").write_bytes(damage)
+        assert bench() == 2
+        assert told(capsys) == f"gpu.py: {bench.out / 'machine.json'}: is damaged; name another folder\n"
+    assert bench.made() == []
+
+
+def test_one_process_at_a_time(bench, capsys):
+    import fcntl
+
+    bench.out.mkdir()
+    with open(bench.out / "lock", "a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert bench() == 2
+    assert "another process measures there" in told(capsys)
+    assert bench() == 0
+
+
+def _wheel(folder: Path, name: str, version: str, text: str) -> None:
+    """Write a wheel of one module."""
+    with zipfile.ZipFile(folder / f"{name}-{version}-py3-none-any.whl", "w") as file:
+        about = f"{name}-{version}.dist-info"
+        file.writestr(f"{name}.py", text)
+        file.writestr(f"{about}/METADATA", f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
+                      "Requires-Dist: a-package-of-no-index\n")  # fmt: skip
+        file.writestr(f"{about}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        file.writestr(f"{about}/RECORD", "")
+
+
+def test_wheels_serve_measurements_and_replace_nothing(bench, tmp_path, capsys):
+    pytest.importorskip("pip")
+    wheels = tmp_path / "wheels of mine"
+    wheels.mkdir()
+    _wheel(wheels, "tinywheel", "1.0", "VALUE = 17\n")
+    _wheel(wheels, "numpy", "99.0", "raise SystemExit('a second NumPy')\n")
+    (wheels / "broken-1.0-py3-none-any.whl").write_bytes(b"no archive")
+    (wheels / "--index-url=x-1.0-py3-none-any.whl").write_bytes(b"an option")
+    (wheels / "sourced-1.0.tar.gz").write_bytes(b"would run a program")
+    bench.acts(sensor_one="import")
+    assert bench() == 0
+    assert bench.state("sensor.one") == "absent"  # no tinywheel
+    assert bench("--wheels", str(wheels), "--section", "sensor") == 0
+    out = capsys.readouterr().out
+    assert "wheels of 3 packages; this machine lacks broken, tinywheel" in out
+    assert "broken: not installed: " in out
+    record = json.loads((bench.out / "sensor" / "one.json").read_text())
+    assert record["rows"] == [{"found": 17}]
+    assert sorted(path.name for path in (bench.out / "packages").glob("*.py")) == ["tinywheel.py"]
+    assert not list(bench.out.glob("packages.tmp-*"))
+
+
+def test_a_folder_without_wheels_is_refused(bench, tmp_path, capsys):
+    assert bench("--wheels", str(tmp_path / "none")) == 2
+    assert told(capsys) == f"gpu.py: --wheels {tmp_path / 'none'}: no such folder\n"
+    assert bench("--wheels", str(tmp_path)) == 2
+    assert told(capsys) == f"gpu.py: --wheels {tmp_path}: holds no .whl file\n"
+
+
+def test_the_table_leaves_out_what_it_cannot_read(bench):
+    import table
+
+    kept = {"state": "done", "setup": {"program": "1f"}, "command": "python docs/gpu.py OUT", "minutes": 9}
+    page = "\n".join(
+        table.page(
+            {"gpus": ["NVIDIA H200"], "cores": 2},
+            {
+                "sensor": {"a": kept | {"rows": [{"by": "cu|da", "Gpixel/s": 1.23456, "more": None}]}},
+                "train": {
+                    "b": kept | {"state": "late", "why": "too long", "rows": "damaged"},
+                    "c": kept | {"rows": [3]},
+                },
+                "render": {},
+            },
+        )
+    )
+    assert page.startswith("# NVIDIA H200\n")
+    assert "| by | Gpixel/s | more |\n| --- | --- | --- |\n| cu\\|da | 1.235 |  |" in page
+    assert "- b: late: too long" in page
+    assert "render" not in page
+
+
+# The true measurements
+
+HIDE = """
+import importlib.abc, sys
+
+class Hidden(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {hidden!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Hidden())
+"""
+
+
+@pytest.mark.parametrize(
+    ("hidden", "section", "name"),
+    [("torch", "train", "all"), pytest.param("numpy", "sensor", "engine-llvm", marks=pytest.mark.slow)],
+)
+def test_without_a_package_the_true_measurements_name_it(tmp_path, hidden, section, name):
+    (tmp_path / "sitecustomize.py").write_text(HIDE.format(hidden={hidden}))
+    command = [sys.executable, "docs/gpu.py", str(tmp_path / "out"), "--section", section, "--minutes", "1"]
+    path = os.environ | {"PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=path, check=False)
+    record = json.loads((tmp_path / "out" / section / f"{name}.json").read_text())
+    assert record["state"] == "absent", done.stdout + done.stderr
+    assert record["why"].startswith(f"needs the package {hidden}, which is not installed")
+
+
+TINY = {
+    "height": 32, "width": 64, "sensor_pixels": 1 << 16, "rounds": 1, "families": ["fan"], "frames": 1, "psnr": 20.0,
+    "check_height": 16, "check_width": 24, "reference_samples": 256, "train_families": ["fan"], "train_psnr": 20.0,
+    "train_seeds": 1, "train_frames": 12, "train_height": 32, "train_width": 32, "crop": 32, "batch": 1, "steps": 2,
+    "copied_batches": 2, "restored": 2, "restored_slow": 2, "compared_side": 32,
+}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_every_section_measures_on_this_machine_at_tiny_sizes(tmp_path, monkeypatch):
+    """Without a GPU the CPU's form of everything is made, and what needs CUDA is absent with its reason."""
+    monkeypatch.syspath_prepend(str(PARTS))
+    import pieces
+
+    out = tmp_path / "out"
+    code = pieces.main([str(out), "--minutes", "60"], sizes=TINY)
+    logs = {file.name: file.read_text(errors="replace")[-2000:] for file in (out / "log").iterdir()}
+    records = json.loads((out / "table.json").read_text())["records"]
+    assert code == 0, {name: (record["why"], logs[f"{section}.{name}.txt"]) for section, found in records.items()
+                       for name, record in found.items() if record["state"] not in ("done", "absent")}  # fmt: skip
+    assert all(records.values())
+    absent = {f"{s}.{n}": r["why"] for s, found in records.items() for n, r in found.items() if r["state"] == "absent"}
+    if not json.loads((out / "machine.json").read_text())["machine"]["gpus"]:
+        assert set(absent) == {
+            *("sensor.engine-cuda", "sensor.torch-cuda", "render.frame-cuda-fan", "render.validate-cuda-fan")
+        }
+        assert all("CUDA" in why for why in absent.values())
+    for record in (r for found in records.values() for r in found.values() if r["state"] == "done"):
+        assert record["rows"]
+    assert records["train"]["quiver-s-float32"]["rows"][0]["steps"] == TINY["steps"]
+    assert records["sensor"]["engine-llvm"]["rows"][-1]["differing per million"] == 0
+    assert records["restore"]["quiver-s-float32"]["rows"][0]["weights"] == "trained here"
+    assert records["restore"]["quiver-s-float32"]["rows"][0]["largest [% of white]"] == 0
+    assert "\n## restore\n" in (out / "table.md").read_text()
