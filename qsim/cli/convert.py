@@ -8,14 +8,15 @@ from typing import Any
 
 from qsim import checks, files
 from qsim.cli.console import bar, command, output, refuse_idle
+from qsim.cli.options import count
 from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
-from qsim.formats import detection, exporting, importing
+from qsim.formats import detection, exporting, importing, pairs
 from qsim.formats.recording import TRANSFERS, Hints
 
-_SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr"}
+_SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr", ".h5": "pairs"}
 
 
 def add_convert(sub: Any) -> None:
@@ -27,6 +28,7 @@ def add_convert(sub: Any) -> None:
         "qsim convert I2-2000FPS/test out/i2_test --frame-rate 2000 --transfer 'gamma 2.2' --split test\n"
         "qsim convert capture.bin out/capture --layout swissspad2-half --frame-rate 96800\n"
         "qsim convert out/starter out/starter_mp4 --to mp4\n"
+        "qsim convert out/starter out/starter.h5 --to pairs\n"
         "qsim convert out/fan/streams/spad.json out/fan_cube.npy",
     )  # fmt: skip
     parser.add_argument("input", type=Path, help="a file, a folder, a clip, a stream (its .npy or .json), a data set")
@@ -58,8 +60,11 @@ def add_convert(sub: Any) -> None:
     reading.add_argument("--split", choices=SPLITS, help="split to store in the clips")
     writing = parser.add_argument_group("writing for others")
     writing.add_argument(
-        "--to", choices=sorted(exporting.EXPORTS), help="kind of the output (default: from the suffix of its name)"
+        "--to",
+        choices=sorted([*exporting.EXPORTS, "pairs"]),
+        help="kind of the output (default: from the suffix of its name); pairs: codes, truth and flow in one .h5",
     )
+    writing.add_argument("--window", type=count, help=f"pairs: codes in each window (default {pairs.WINDOW})")
     writing.add_argument(
         "--lossy", action="store_true", help="write mp4 with FFmpeg's default settings, which lose noise"
     )
@@ -96,6 +101,8 @@ def _refuse_what_cannot_act(args: argparse.Namespace, kind: str, light: bool) ->
         refuse_idle(args, where, ["transfer"])
     if kind != "mp4":
         refuse_idle(args, where, ["lossy"])
+    if kind != "pairs":
+        refuse_idle(args, where, ["window"])
 
 
 def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
@@ -104,12 +111,14 @@ def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
         raise ValueError(f"{args.input} is ours and states it: --flip changes nothing here; leave it out")
     kind = args.to or _SUFFIXES.get(args.output.suffix)
     if kind is None:
-        known = ", ".join(sorted(exporting.EXPORTS))
+        known = ", ".join(sorted([*exporting.EXPORTS, "pairs"]))
         raise ValueError(f"{args.output}: name the kind of output with --to: {known}")
     _refuse_what_cannot_act(args, kind, args.input.suffix != ".json")
     wanted = exporting.Export(kind, args.transfer or "gamma 2.2", args.white, not args.lossy)
     if args.white is not None and (kind not in ("mp4", "png") or args.input.suffix == ".json"):
         raise ValueError("--white: acts on light written as mp4 or png; leave it out")
+    if kind == "pairs":
+        return [_pairs(args)]
     if not (args.input / "dataset.json").is_file():
         opened = Stream.open(args.input) if args.input.suffix == ".json" else Clip.open(args.input)
         return [exporting.described(opened, args.output, wanted, force=args.force)]
@@ -126,8 +135,22 @@ def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
     return made
 
 
+def _pairs(args: argparse.Namespace) -> tuple[Path, str]:
+    """Write the windows of a data set or a clip."""
+    if args.input.suffix == ".json":
+        raise ValueError(f"{args.input}: pairs are made of a data set or a clip, with all its streams; name its folder")
+    if (args.input / "dataset.json").is_file():
+        data = Dataset.open(args.input)
+        splits = {split: data.clips(split) for split in SPLITS}
+    else:
+        splits = {"all": [Clip.open(args.input)]}
+    with bar("converting", "window") as progress:
+        about = pairs.write(splits, args.output, args.window or pairs.WINDOW, force=args.force, progress=progress)
+    return args.output, about
+
+
 def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
-    refuse_idle(args, f"{args.input} is read, not written for others", ["to", "lossy"])
+    refuse_idle(args, f"{args.input} is read, not written for others", ["to", "lossy", "window"])
     if args.frame_rate is None:
         raise ValueError(f"{args.input}: files do not state the capture rate; add --frame-rate, as in 2000")
     hints = Hints(args.layout, args.height, args.width, args.bits, args.transfer, args.channel, args.flip, args.columns,

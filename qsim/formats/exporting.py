@@ -77,9 +77,12 @@ def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool 
     if isinstance(source, Stream):
         about = f"codes of {source.bits} bits" + (", stretched to 0..255" if meta.get("stretched") else "")
     elif "white" in meta:
-        about = f"light by {meta['transfer']}, white {meta['white']:.4g} {source.meta['radiance_unit']}"
+        bits = 16 if wanted.kind == "png" else 8
+        about = f"light in {bits} bits by {meta['transfer']}, white {meta['white']:.4g} {source.meta['radiance_unit']}"
     else:
         about = f"linear light in {source.meta['radiance_unit']}"
+    if isinstance(source, Clip):
+        about += "; not written: codes, flow, depth (--to pairs writes codes, truth and flow)"
     rate = float(source.meta["frame_rate"])
     return made, f"{wanted.kind}, {frames} frames of {height} x {width} pixels at {rate:g} per second{shown}, {about}"
 
@@ -171,7 +174,7 @@ def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
 def _grey(source: Clip | Stream, wanted: Export, meta: dict[str, Any]) -> Iterator[Array]:
     if isinstance(source, Clip):
         for block in _light_blocks(source):
-            yield from images.grey(block, meta["white"], wanted.transfer)
+            yield from images.grey(block, meta["white"], wanted.transfer, 16 if wanted.kind == "png" else 8)
     else:
         for block in _code_blocks(source):
             yield from code_levels(block, source.bits)

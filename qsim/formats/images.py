@@ -134,9 +134,9 @@ def write_exr(folder: Path, images: Iterator[Array]) -> None:
         files.write_bytes(folder / f"{t:06d}.exr", exr.encode({"Y": image.astype("<f4")}, compress=True))
 
 
-def grey(light: Array, white: float, transfer: str) -> Array:
-    """Return linear light [..., H, W] as 8-bit grey; `white` becomes 255."""
-    return from_linear(light / white, transfer, 255)
+def grey(light: Array, white: float, transfer: str, bits: int = 8) -> Array:
+    """Return linear light [..., H, W] as grey of 8 or 16 bits; `white` becomes the largest value."""
+    return from_linear(light / white, transfer, 2**bits - 1)
 
 
 def _png(path: Path) -> Array:

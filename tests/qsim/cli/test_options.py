@@ -252,6 +252,11 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Acts("convert clip e", "--to png", exit_code, codes=(0, 2)),
         Refused(CODES, "--to png", "--to"),
     ],
+    ("convert", "--window"): [
+        Acts("convert clip e.h5", "--window 2", stdout),
+        Refused("convert clip e --to png", "--window 2", "--window"),
+        Refused(CODES, "--window 2", "--window"),
+    ],
     ("convert", "--lossy"): [
         Acts("convert clip e.mp4", "--lossy"),
         Refused("convert clip e --to png", "--lossy", "--lossy"),

@@ -1,0 +1,178 @@
+"""Writes windows of codes with their truth and flow as one HDF5 file, for training in other programs.
+
+    OUT.h5 / SPLIT (train, val, test; all for a clip) /
+        codes   uint8 or, above 8 bits, uint16 [N, T, H, W]
+        truth   float32 [N, T, H, W], sharp expected photons per pixel and code
+        flow    float32 [N, T, 2, H, W], px from a code to the next (u right, v down); NaN where it is not known
+        first, bits, ppp, clip, stream, sensor   [N]: frame of the stream, its bits and light, names, sensor as JSON
+
+A window is T successive codes of a stream; windows do not overlap. One chunk holds one window.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import files
+from qsim.clip.clip import Clip
+from qsim.clip.stream import Stream
+from qsim.files import VERSION, Progress
+
+WINDOW = 11  # frames, as QUIVER takes them
+
+
+@dataclass(frozen=True)
+class Window:
+    """Codes first ... first + frames - 1 of a stream of a clip."""
+
+    clip: Clip
+    stream: Stream
+    first: int
+    frames: int
+
+    def codes(self) -> Array:
+        """Return the codes [T, H, W]."""
+        return self.stream.codes(self.first, self.first + self.frames)
+
+    def truth(self) -> Array:
+        """Return the sharp photons, float32 [T, H, W]."""
+        return self.stream.truth(self.first, self.first + self.frames).astype(np.float32)
+
+    def flow(self) -> Array:
+        """Return the flow, float32 [T, 2, H, W]; NaN where hidden, without ground truth, and between sums of frames."""
+        found = np.full((self.frames, 2, *self.clip.shape[1:]), np.nan, np.float32)
+        if self.clip.has_truth and (self.stream.meta.get("planes_per_code") or 1) == 1:
+            for n, t in enumerate(range(self.first, self.first + self.frames)):
+                if t + 1 < len(self.clip):
+                    found[n] = np.where(self.clip.valid(t), self.clip.flow(t), np.nan)
+        return found
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the file states of this window beside its arrays."""
+        meta = self.stream.meta
+        ppp = meta.get("ppp")
+        sensor = json.dumps(meta["sensor"] | ({"defects": meta["defects"]} if "defects" in meta else {}))
+        light = {"bits": self.stream.bits, "ppp": np.nan if ppp is None else float(ppp)}
+        names = {"clip": self.clip.name, "stream": self.stream.name, "sensor": sensor}
+        return {"first": self.first} | light | names
+
+
+def windows(splits: Mapping[str, Sequence[Clip]], frames: int) -> dict[str, list[Window]]:
+    """Return the windows of all streams, by split; `ValueError` for none, and for clips of unequal sizes."""
+    found: dict[str, list[Window]] = {}
+    for split, clips in splits.items():
+        for clip in clips:
+            for stream in map(clip.stream, clip.streams):
+                for first in range(0, len(stream) - frames + 1, frames):
+                    found.setdefault(split, []).append(Window(clip, stream, first, frames))
+    if not found:
+        clips = [clip for clips in splits.values() for clip in clips]
+        there = "no stream" if not any(clip.streams for clip in clips) else f"no stream of {frames} codes"
+        raise ValueError(f"{there} in {len(clips)} clips; make streams with `qsim sense`, or give a smaller --window")
+    every = [window for group in found.values() for window in group]
+    sizes = {window.clip.shape[1:]: window.clip.name for window in every}
+    if len(sizes) > 1:
+        (one, a), (two, b) = list(sizes.items())[:2]
+        raise ValueError(
+            f"clips {a} and {b} are {one[0]} x {one[1]} and {two[0]} x {two[1]} px; convert them one by one"
+        )
+    return found
+
+
+def write(
+    splits: Mapping[str, Sequence[Clip]],
+    path: Path,
+    frames: int,
+    *,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> str:
+    """Write windows of `frames` codes to an HDF5 file, complete or absent; return one line on its contents.
+
+    `FileExistsError` if the file exists without `force`, or was not written by this function.
+    """
+    import h5py
+
+    groups = windows(splits, frames)
+    _check_target(path, force)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.name}.tmp-{os.getpid()}")
+    total, done = sum(map(len, groups.values())), 0
+    try:
+        with h5py.File(part, "w") as file:
+            file.attrs.update({"format": "qsim-pairs-1", "software": f"qsim {VERSION}", "truth": "photons"})
+            for split, listed in groups.items():
+                for _ in _fill(file.create_group(split), listed):
+                    done += 1
+                    if progress is not None:
+                        progress(done, total)
+        with open(part, "rb") as written:
+            os.fsync(written.fileno())
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+    files.sync_folder(path.parent)
+    return _line(groups, frames)
+
+
+def _fill(group: Any, listed: Sequence[Window]) -> Iterator[None]:
+    """Write the windows of a split; yield after each."""
+    import h5py
+
+    height, width = listed[0].clip.shape[1:]
+    shape = (listed[0].frames, height, width)
+    kinds = {
+        "codes": (np.uint16 if any(window.stream.bits > 8 for window in listed) else np.uint8, shape),
+        "truth": (np.float32, shape),
+        "flow": (np.float32, (shape[0], 2, height, width)),
+    }
+    arrays = {
+        name: group.create_dataset(name, (len(listed), *size), dtype, chunks=(1, *size), compression="gzip")
+        for name, (dtype, size) in kinds.items()
+    }
+    facts = [window.facts() for window in listed]
+    for name in facts[0]:
+        values = [fact[name] for fact in facts]
+        group.create_dataset(name, data=values, dtype=h5py.string_dtype() if isinstance(values[0], str) else None)
+    for n, window in enumerate(listed):
+        arrays["codes"][n], arrays["truth"][n], arrays["flow"][n] = window.codes(), window.truth(), window.flow()
+        yield
+
+
+def _check_target(path: Path, force: bool) -> None:
+    """Raise `FileExistsError` for a file that may not be replaced."""
+    import h5py
+
+    if path.suffix != ".h5":
+        raise ValueError(f"{path}: pairs are written to one HDF5 file; name it .h5")
+    if not (path.exists() or path.is_symlink()):
+        return
+    if not force:
+        raise FileExistsError(f"{path}: exists; name another, or use --force to replace it")
+    ours = False
+    if path.is_file() and not path.is_symlink() and h5py.is_hdf5(path):
+        with h5py.File(path, "r") as file:
+            ours = file.attrs.get("format") == "qsim-pairs-1"
+    if not ours:
+        raise FileExistsError(f"{path}: was not written by `qsim convert`; move it, or name another output")
+
+
+def _line(groups: dict[str, list[Window]], frames: int) -> str:
+    """Return what was written, and what was not."""
+    every = [window for listed in groups.values() for window in listed]
+    height, width = every[0].clip.shape[1:]
+    counts = ", ".join(f"{len(listed)} {split}" for split, listed in groups.items())
+    streams = {(window.clip.path, window.stream.name): len(window.stream) % frames for window in every}
+    return (
+        f"{len(every)} windows ({counts}) of {frames} codes of {height} x {width} pixels, from {len(streams)} streams: "
+        "codes, truth in photons, flow in pixels; not written: depth, body indices, "
+        f"and {sum(streams.values())} codes that fill no window"
+    )
