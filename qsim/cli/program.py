@@ -27,9 +27,14 @@ from qsim.files import VERSION
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; return the exit code."""
-    parser = Parser(prog="qsim", description="Render moving scenes and turn them into few-bit quanta-sensor streams.")
-    parser.add_argument("--version", action="version", version=f"qsim {VERSION}")
-    sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
+    return run(parser(), argv)
+
+
+def parser() -> Parser:
+    """Return the parser of all commands."""
+    program = Parser(prog="qsim", description="Render moving scenes and turn them into few-bit quanta-sensor streams.")
+    program.add_argument("--version", action="version", version=f"qsim {VERSION}")
+    sub = program.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
     for add in (
         _add_doctor,
         add_render,
@@ -49,8 +54,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     ):
         add(sub)
     values = {"scene": families, "source": families, "--scenes": families, "recipe": recipes, "--print": recipes}
-    add_completion(sub, parser, values | {"--sensor": sensors, "--plane-sensor": sensors})
-    return run(parser, argv)
+    add_completion(sub, program, values | {"--sensor": sensors, "--plane-sensor": sensors})
+    return program
 
 
 def _add_doctor(sub: Any) -> None:

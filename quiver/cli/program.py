@@ -24,17 +24,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     from quiver.threads import wait_without_spinning
 
     wait_without_spinning()
-    parser = Parser(
+    with handling(signal.default_int_handler, signal.SIGTERM):  # termination cleans up as Ctrl-C does
+        return run(parser(), argv)
+
+
+def parser() -> Parser:
+    """Return the parser of all commands."""
+    program = Parser(
         prog="quiver", description="Restore blur-free video from few-bit quanta streams; train and compare."
     )
-    parser.add_argument("--version", action="version", version=f"quiver {VERSION}")
-    sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
+    program.add_argument("--version", action="version", version=f"quiver {VERSION}")
+    sub = program.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
     for add in (add_train, add_restore, add_evaluate, add_domain, add_ablate, add_bench, _add_convert_weights):
         add(sub)
     several = {"--methods": lambda: [*_methods(), "all"]}
-    add_completion(sub, parser, {"--sensor": sensors, "--method": _methods, "weights": _methods} | several)
-    with handling(signal.default_int_handler, signal.SIGTERM):  # termination cleans up as Ctrl-C does
-        return run(parser, argv)
+    add_completion(sub, program, {"--sensor": sensors, "--method": _methods, "weights": _methods} | several)
+    return program
 
 
 # convert-weights
