@@ -1,30 +1,36 @@
 """Reads a recipe, one TOML file, into the jobs of a data set; every error names file, line and key.
 
     [recipe]
-    name = "starter"           # letters, digits, '.', '_', '-'
+    name = "starter"           # of the data set: letters, digits, '.', '_', '-'
+    seed = 0                   # of the samples and of the noise; default 0
     frames = 21                # per clip
     height = 128               # pixels
-    width = 128
+    width = 128                # pixels
     frame_rate = 2000.0        # frames per second of the scene's time; default 2000
-    shutter = 0.0              # open share of a frame, 0..1; 0: a sharp instant with the light of a full frame
-    psnr = 40.0                # wanted error of the radiance, dB below white, clamped there (clip/clamped_error.py)
-    seed = 0                   # of the samples and of the noise
+    shutter = 0.0              # open share of a frame; 0, the default: a sharp instant with the light of a full frame
+    psnr = 40.0                # wanted error of the radiance, dB below white, clamped there; default 40
 
     [[scenes]]                 # one clip per family, seed and speed
     family = "fan"             # a family of scenes/; or a .py file, .xml file or folder beside the recipe ("./things")
-    seeds = [0, 1, 2]          # or: count = 3 (seeds first ... first + count - 1; first = 0)
+    seeds = [0, 1, 2]          # one clip each; or give count
+    count = 3                  # clips of the seeds first ... first + count - 1
+    first = 0                  # first seed of a count; default 0
     speed = [1.0, 2.0]         # factor on all motions, a number or a list; default 1
-    split = "train"            # train, val or test
+    split = "train"            # train, the default, val or test
     # frames, height, width, frame_rate, shutter, psnr: as above, for these scenes only
 
     [[streams]]                # optional; one stream per bits and light level, in every clip
     sensor = "quiver-physical" # a name of `qsim doctor --devices`, or a .toml file beside the recipe
-    bits = 3                   # or a list
-    ppp = [3.25, 26.0]         # photons per pixel and code, mean of the clip; or lux = ...; or absolute = true
-    # seed = 1, name = "...", group = true (codes sum clip frames as binary planes), diffraction = true
+    bits = [1, 3]              # of a code, a number or a list; default: the sensor's own
+    ppp = [3.25, 26.0]         # photons per pixel and code, mean of the clip, a number or a list; or lux, or absolute
+    lux = 1.3                  # faceplate lux at 555 nm instead of ppp, a number or a list
+    absolute = true            # the light of the scene as it is, instead of ppp
+    seed = 1                   # of the noise; default: that of [recipe]
+    name = "dim"               # of the stream; default: made from sensor, bits and light
+    group = true               # a code sums 2^bits - 1 clip frames as binary planes; default false
+    diffraction = true         # blur by the lens's Airy pattern; default false
 
-Splits are by scene: a (family, seed) belongs to one split at every speed. A family of the test split is in no other
-split.
+A (family, seed) belongs to one split at every speed, and a family of the test split to no other split.
 """
 
 from __future__ import annotations
@@ -94,7 +100,7 @@ def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
     if not isinstance(document.table.get("recipe"), dict):
         raise ValueError(f"{path}: the section [recipe] is missing")
     head = Section(written, "recipe", 0, document.table["recipe"])
-    given = head.values(_HEAD)
+    given = head.values(HEAD)
     name, seed = given["name"], given.get("seed", 0)
     defaults = {"frame_rate": 2000.0} | _settings(given)
     streams: list[Sensing] = []
@@ -148,7 +154,7 @@ def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
 
 def _jobs(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[Sensing, ...]) -> list[Job]:
     """Return one job per seed and speed of a [[scenes]] section."""
-    given = section.values(_SCENES)
+    given = section.values(SCENES)
     family = _family(section, given["family"])
     seeds = _seeds(section, given)
     speeds = given.get("speed", [1.0])
@@ -233,7 +239,7 @@ def _seeds(section: Section, given: dict[str, Any]) -> list[int]:
 
 def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
     """Return one stream per bits and light level, and add their names to `taken`; `ValueError` for a taken name."""
-    given = section.values(_STREAMS)
+    given = section.values(STREAMS)
     unit, levels = _light(section, given)
     bits, name = given.get("bits", [None]), given.get("name")
     group, diffraction = given.get("group", False), given.get("diffraction", False)
@@ -316,28 +322,21 @@ def _kept(value: Any) -> Any:
 
 
 _SETTINGS: dict[str, Check] = {
-    "frames": checks.whole,
-    "height": checks.whole,
-    "width": checks.whole,
-    "frame_rate": checks.frame_rate,
-    "shutter": checks.shutter,
-    "psnr": checks.psnr,
-}
-_HEAD: Table = {
+    "frames": checks.whole, "height": checks.whole, "width": checks.whole,
+    "frame_rate": checks.frame_rate, "shutter": checks.shutter, "psnr": checks.psnr,
+}  # fmt: skip
+HEAD: Table = {
     "name": _name,
     "seed, if any": checks.seed,
     **{key if key in ("frames", "height", "width") else f"{key}, if any": check for key, check in _SETTINGS.items()},
 }
-_SCENES: Table = {
+SCENES: Table = {
     "family": checks.text,
-    "seeds, if any": checks.list_of(checks.seed),
-    "count, if any": checks.whole,
-    "first, if any": checks.seed,
-    "speed, if any": checks.list_of(checks.speed),
-    "split, if any": checks.split,
+    "seeds, if any": checks.list_of(checks.seed), "count, if any": checks.whole, "first, if any": checks.seed,
+    "speed, if any": checks.list_of(checks.speed), "split, if any": checks.split,
     **{f"{key}, if any": check for key, check in _SETTINGS.items()},
-}
-_STREAMS: Table = {
+}  # fmt: skip
+STREAMS: Table = {
     "sensor": checks.text,
     "bits, if any": checks.list_of(checks.bits),
     "ppp, if any": checks.list_of(checks.light),

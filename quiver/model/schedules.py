@@ -2,13 +2,13 @@
 
 All of them need memory that does not grow with the clip.
 
-`windows` Every window is computed from its eleven frames alone, as published; for any network.
-`exact`   The same numbers. Pre-denoised frames and flows are computed once. So are the fused features and R1, R2 of the
-          frames at window positions 3 to 8, where the 5-frame extractors do not reach beyond the window. At positions
-          0, 1, 2, 9, 10 they reach zeros beyond it, so each window computes these itself. The recurrent state starts
-          at zero in each window.
-`stream`  One pass over the clip: the state is kept, and each frame is encoded once. The numbers differ, because zeros
-          beyond the window and the zero state then occur only at the ends of the clip.
+* `windows`: every window is computed from its eleven frames alone, as published; for any network.
+* `exact`: the same numbers. Pre-denoised frames and flows are computed once. So are the fused features and R1, R2 of
+  the frames at window positions 3 to 8, where the 5-frame extractors do not reach beyond the window. At positions 0, 1,
+  2, 9, 10 they reach zeros beyond it, so each window computes these itself. The recurrent state starts at zero in each
+  window.
+* `stream`: one pass over the clip. The state is kept, and each frame is encoded once. The numbers differ, because zeros
+  beyond the window and the zero state then occur only at the ends of the clip.
 """
 
 from collections import deque

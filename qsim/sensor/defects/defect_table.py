@@ -2,17 +2,21 @@
 
     # my_sensor.toml, below [sensor]; every line is optional, and a missing one changes no bit
     [defects]
-    device_seed = 7                # which device of its kind: the fixed pattern is a function of it
+    device_seed = 7                # which device of its kind: the fixed pattern is a function of it; default 0
     prnu = 0.01                    # relative standard deviation of the efficiency
-    dark = { spread = 0.18, hot_share = 0.022, hot_from = 3.0, hot_to = 400.0, tail = 0.67 }   # of the dark rate
+    dark.spread = 0.18             # of the dark rate: standard deviation of the logarithm, without hot pixels
+    dark.hot_share = 0.022         # share of hot pixels
+    dark.hot_from = 3.0            # lowest rate of a hot pixel, in medians of the dark rate
+    dark.hot_to = 400.0            # highest rate of a hot pixel, in medians of the dark rate
+    dark.tail = 0.67               # the share of pixels above a rate falls as rate^-tail between hot_from and hot_to
     dead = 0.001                   # share of pixels that never fire
     offset = 0.2                   # QIS: codes rms (with `dark`: the dark signal non-uniformity)
     read_noise = 0.1               # QIS: relative standard deviation of the read noise
-    dark_map = "my_dark.npy"       # measured [H, W], beside this file: 1/s (its mean replaces the sensor's dark rate),
-    gain_map = "my_gain.npy"       # efficiency over the sensor's,
-    dead_map = "my_bad.npy"        # true where a pixel never fires,
-    offset_map = "my_offset.npy"   # codes,
-    read_noise_map = "my_rn.npy"   # e- rms
+    dark_map = "my_dark.npy"       # dark rates [H, W] in 1/s, beside this file; their mean replaces the sensor's
+    gain_map = "my_gain.npy"       # efficiency over the sensor's [H, W]
+    dead_map = "my_bad.npy"        # true where a pixel never fires [H, W]
+    offset_map = "my_offset.npy"   # QIS: codes [H, W]
+    read_noise_map = "my_rn.npy"   # QIS: e- rms [H, W]
     crosstalk = 0.001              # chance that an avalanche sets off one given neighbour of the four
     afterpulse = 0.01              # clocked: chance of a detection caused by one in the plane before
     afterpulse_delay = 2e-8        # counting: s, mean delay of the afterpulse of a count
@@ -40,7 +44,7 @@ _PATTERN = ("device_seed", "prnu", "dead", "offset", "read_noise")
 _DISTURBANCES = ("crosstalk", "afterpulse", "afterpulse_delay")
 _NOT_NEGATIVE = expected("a number of at least 0", lambda v: type(v) in (int, float) and 0 <= v < float("inf"))
 _FILE = expected("the name of a .npy file", lambda v: isinstance(v, str | Mapping))
-_TABLE: Table = {
+TABLE: Table = {
     **table_of(FixedPattern),
     **{f"{key}, if any": _FILE for key in _MAPS},
     **{f"{key}, if any": _NOT_NEGATIVE for key in _DISTURBANCES},
@@ -93,7 +97,7 @@ def from_dict(table: Mapping[str, Any], where: str = "defects") -> Defects:
 
     `ValueError` for unknown keys and invalid values.
     """
-    structure(table, _TABLE, where)
+    structure(table, TABLE, where)
     for name, pattern in _MAPS.items():
         if name in table and pattern in table:
             raise ValueError(f"{where}: {pattern} and {name} state the same defect twice; leave one out")
