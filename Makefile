@@ -1,6 +1,6 @@
 # make demo    scenes -> few-bit frames -> restored video, as one page: out/demo/index.html
 # make test    the quick tests (five to ten minutes); make test-slow: the long ones
-# make lint    style and types; make docs: the pages of docs/ into out/site
+# make lint    style and types; make docs: the manual into out/site
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -35,7 +35,7 @@ lint: setup
 	$(BIN)/mypy
 
 docs: setup
-	$(BIN)/mkdocs build --strict --quiet
+	$(BIN)/sphinx-build -W --keep-going -q -E -j auto -d out/doctrees docs out/site
 
 clean:
 	rm -rf out .venv build *.egg-info

@@ -16,7 +16,6 @@ import json
 import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -94,6 +93,7 @@ def test_every_command_is_in_a_block_and_every_exception_says_why(path):
     text = path.read_text(encoding="utf-8")
     outside = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
     assert not re.findall(r"^    (?:qsim|quiver|python|make) .*", outside, re.MULTILINE)
+    assert not re.findall(r"^(?:```+|:::+) *\{", text, re.MULTILINE), "code in a directive would not be run"
     for block in blocks(path):
         assert block.language in ("python", "sh", "toml", "text")
         if block.directive == "not run":
@@ -205,7 +205,7 @@ def test_every_recipe_of_the_library_is_read(path):
     assert recipe.load(path).jobs
 
 
-# Links, trees, the site
+# Links and trees
 
 
 def test_relative_links_lead_somewhere():
@@ -233,7 +233,8 @@ def test_the_map_lists_every_file():
 
 def test_the_readme_names_every_room_with_its_charter():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    rooms = [p for name in ("qsim", "quiver") for p in (ROOT / name).iterdir() if (p / "__init__.py").exists()]
+    folders = [p for name in ("qsim", "quiver") for p in (ROOT / name).iterdir() if not p.is_symlink()]
+    rooms = [p for p in folders if (p / "__init__.py").exists()]
     assert len(rooms) > 15
     for room in rooms:
         assert f"| `{room.relative_to(ROOT)}/` | {_load('map').first_sentence(room / '__init__.py')} |" in text
@@ -249,17 +250,6 @@ def test_files_named_on_the_map_exist():
         for path in re.findall(r"\b(?:qsim|quiver|tests)/[a-z_/.]*[a-z]\b(?!/?[A-Z])", page)
         if not (ROOT / path).exists()
     ]
-
-
-def test_every_page_is_in_the_navigation_or_linked_from_a_page():
-    config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-    links = {
-        (path.parent / target).resolve()
-        for path in DOCUMENTS
-        for target in re.findall(r"\]\(([^)#\s]+)", path.read_text(encoding="utf-8"))
-    }
-    for path in (ROOT / "docs").rglob("*.md"):
-        assert f": {path.relative_to(ROOT / 'docs').as_posix()}\n" in config or path in links, path
 
 
 def test_the_page_of_evidence_is_made_from_its_numbers():
@@ -280,14 +270,3 @@ def test_tests_named_as_evidence_exist():
     there = {path.name for path in (ROOT / "tests").rglob("test_*.py")}
     assert len(names) >= 10
     assert set(names) <= there
-
-
-@pytest.mark.skipif(shutil.which("mkdocs", path=str(Path(sys.executable).parent)) is None, reason="no mkdocs here")
-def test_the_site_builds_without_a_broken_link(tmp_path):
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert (tmp_path / "site" / "index.html").is_file()
-    pages = "".join(path.read_text(encoding="utf-8") for path in (tmp_path / "site").rglob("*.html"))
-    loaded = re.findall(r"<(?:script|img|link)[^>]+(?:src|href)=\"(https?://[^\"]+)", pages)
-    assert not [address for address in loaded if 'rel="canonical"' not in address], "pages load nothing from elsewhere"

@@ -1,0 +1,35 @@
+"""Builds the manual: what Sphinx needs beyond its own extensions. `make docs` builds; nothing is executed or fetched.
+
+Pages are Markdown. Comments such as `<!-- keys: [recipe] -->` are replaced by what is made from the code, and
+`<!-- page: ../scenes/README.md -->` by that page.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from manual import api, commands, keys, mathml, menu
+
+_PAGE = re.compile(r"^<!-- page: (\S+) -->$", re.MULTILINE)
+
+
+def setup(app: Any) -> dict[str, Any]:
+    """Connect the parts to Sphinx."""
+    app.connect("builder-inited", api.write_pages)
+    app.connect("autodoc-process-docstring", api.convert_docstring)
+    app.connect("source-read", _insert)
+    mathml.setup(app)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
+
+
+def moved(path: Path) -> str:
+    """Return a page beside docs/ with its links as seen from docs/."""
+    return path.read_text(encoding="utf-8").replace("](../docs/", "](")
+
+
+def _insert(app: Any, page: str, source: list[str]) -> None:
+    """Replace the comments of a page by what they name."""
+    source[0] = _PAGE.sub(lambda found: moved(Path(app.srcdir) / found[1]), source[0])
+    source[0] = menu.insert(commands.insert(keys.insert(source[0])))

@@ -1,0 +1,192 @@
+"""The manual describes every public name, option and key, in menus that reach every page. `make docs` builds it."""
+
+from __future__ import annotations
+
+import pkgutil
+import re
+import subprocess
+import sys
+import tomllib
+from collections import Counter
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+import qsim.cli.program
+import quiver.cli.program
+from qsim.cli.console import options_of
+
+pytest.importorskip("sphinx")
+pytest.importorskip("latex2mathml")
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+sys.path.append(str(DOCS))
+
+from manual import api, commands, keys, mathml, menu  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def pages() -> dict[str, str]:
+    return api.pages()
+
+
+def described(pages: dict[str, str]) -> list[str]:
+    """The full names that have descriptions."""
+    directive = re.compile(r"^\.\. (?:autoclass|autofunction|py:data):: (\S+)$", re.MULTILINE)
+    return [name for text in pages.values() for name in directive.findall(text)]
+
+
+def found(name: str) -> object:
+    module, _, own = name.rpartition(".")
+    return getattr(import_module(module), own)
+
+
+# The API reference
+
+
+def test_every_exported_name_is_described_once(pages):
+    names = described(pages)
+    assert len(set(names)) == len(names) > 900
+    known = {id(found(name)) for name in names}
+    rooms = [import_module(name) for name in ("qsim", "quiver")]
+    rooms += [
+        import_module(module.name)
+        for package in list(rooms)
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+        if module.ispkg and ".cli" not in module.name
+    ]
+    assert len(rooms) > 15
+    exported = [(room, name) for room in rooms for name in getattr(room, "__all__", [])]
+    assert len(exported) > 120
+    assert not [name for room, name in exported if id(getattr(room, name)) not in known]
+    for room, name in exported:
+        assert f":py:obj:`{name} <" in pages[room.__name__], f"{room.__name__}.{name} is not in its room's table"
+
+
+def test_names_of_modules_are_found_too(pages):
+    names = set(described(pages))
+    assert {
+        "qsim.scene.Keyframes",
+        "qsim.scene.shapes.mesh_file",
+        "quiver.data.windows.Batches",
+        "qsim.Key",
+    } <= names
+
+
+def test_a_docstring_becomes_restructured_text():
+    lines = ["W * bits of `x`:", "", "    code * 2", "", "* one, `Clip`", "  and more", "end_ **bold**"]
+    literal = ["::", "", "    code * 2", ""]
+    made = [r"W \* bits of ``x``:", "", *literal, "* one, :py:obj:`Clip`", "  and more", "", r"end\_ **bold**"]
+    assert api.restructured(lines) == made
+
+
+def test_fields_carry_the_comments_behind_them():
+    fields = api.fields_of(qsim.QIS)
+    assert list(fields) == ["quantum_efficiency", "dark_current", "read_noise", "bits", "gain", "offset", "full_well"]
+    assert fields["gain"] == "codes per electron"
+    assert api.fields_of(qsim.Sensing)["ppp"].startswith("mean photons per pixel and code")
+
+
+# Commands and keys
+
+
+@pytest.mark.parametrize("program", [qsim.cli.program, quiver.cli.program], ids=["qsim", "quiver"])
+def test_every_option_of_every_command_is_in_the_reference(program):
+    parser = program.parser()
+    page = (DOCS / f"{parser.prog}.md").read_text(encoding="utf-8")
+    text = commands.insert(page)
+    parts = {part.partition("\n")[0]: part for part in text.split("\n## ")}
+    assert set(parts) >= {f"{parser.prog} {name}" for name in options_of(parser).commands}
+    for name, own in options_of(parser).commands.items():
+        for action in options_of(own).options:
+            for option in action.option_strings:
+                where = parts[f"{parser.prog} {name}"] if option not in ("-h",) else "`-h`"
+                assert f"`{option}" in where or f"`{option}`" in (DOCS / "qsim.md").read_text(encoding="utf-8"), option
+
+
+@pytest.mark.parametrize("section", keys.SECTIONS)
+def test_every_key_has_a_meaning_and_an_example_that_its_check_accepts(section):
+    module, name = keys.SECTIONS[section]
+    checks = dict(keys.flat(getattr(import_module(module), name)))
+    rows = keys.keys(section)
+    assert {row.name for row in rows} >= set(keys.commented(import_module(module).__doc__, section))
+    assert len(rows) >= 8
+    for row in rows:
+        value = tomllib.loads(f"found = {row.example}")["found"]
+        checks[row.name if row.needed else f"{row.name}, if any"](value)
+        assert row.accepts
+        assert len(row.meaning) >= 6
+
+
+def test_what_a_check_accepts_is_in_its_words():
+    accepts = {row.name: row.accepts for row in keys.keys("[recipe]")}
+    assert accepts["shutter"] == "the open share of a frame, 0 to 1"
+    assert accepts["frames"] == "a whole number from 1 to 100000"
+
+
+# Pages
+
+
+def listed(page: str = "index") -> list[str]:
+    """The pages that the menus reach from a page."""
+    below = menu.pages((DOCS / f"{page}.md").read_text(encoding="utf-8"))
+    return [page, *(name for one in below for name in (listed(one) if (DOCS / f"{one}.md").is_file() else [one]))]
+
+
+def test_every_page_is_in_one_menu():
+    count = Counter(listed())
+    there = {path.relative_to(DOCS).with_suffix("").as_posix() for path in DOCS.rglob("*.md")}
+    assert set(count) == there
+    assert max(count.values()) == 1
+    assert len(there) > 25
+
+
+def formulas() -> list[str]:
+    texts = [path.read_text(encoding="utf-8") for path in DOCS.rglob("*.md")]
+    bare = [re.sub(r"^```.*?^```|`[^`\n]+`", "", text, flags=re.MULTILINE | re.DOTALL) for text in texts]
+    return [one or two for text in bare for one, two in re.findall(r"\$\$(.+?)\$\$|\$([^$\n]+)\$", text, re.DOTALL)]
+
+
+def test_every_formula_becomes_mathml_without_leftovers():
+    assert len(formulas()) > 30
+    for formula in formulas():
+        made = mathml.typeset(formula)
+        assert made.startswith("<math")
+        assert not re.search(r"[\\$]|negative|mathspace", re.sub(r"<annotation.*", "", made)), formula
+    assert "\\" in mathml.typeset(r"\bigl\langle a"), "such a command would be noticed"
+
+
+def test_pictures_are_small():
+    kinds = {".png", ".jpg", ".gif", ".webp", ".svg"}
+    sizes = [path.stat().st_size for path in DOCS.rglob("*.*") if path.suffix in kinds]
+    assert sum(sizes) <= 9_000_000  # the README's animation takes up to 3 MB, the manual the others
+
+
+@pytest.mark.slow
+def test_the_manual_builds_strictly_and_loads_nothing_from_elsewhere(tmp_path):
+    site = tmp_path / "site"
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-W",
+        "--keep-going",
+        "-q",
+        "-E",
+        "-d",
+        str(tmp_path / "trees"),
+        str(DOCS),
+        str(site),
+    ]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    texts = {path: path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
+    loaded = re.findall(r"<(?:script|img|link)[^>]+(?:src|href)=\"((?:https?:)?//[^\"]+)", "".join(texts.values()))
+    assert not loaded, "pages load nothing from elsewhere"
+    assert "<math" in texts[site / "physics.html"]
+    index = (site / "searchindex.js").read_text(encoding="utf-8")
+    assert "Keyframes" in index
+    assert "paralyzable" in index
+    assert 'id="qsim-sense"' in texts[site / "qsim.html"]
+    assert 'id="qsim.sensor.QIS.white"' in texts[site / "api" / "qsim.sensor.html"]
