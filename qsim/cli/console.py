@@ -318,13 +318,13 @@ def bar(label: str, unit: str = "frame", first: str = "") -> Iterator[Progress]:
     with tqdm(
         desc=label, unit=unit, delay=2, mininterval=interval, dynamic_ncols=True, file=sys.stderr, disable=silent
     ) as shown:
-        waiting = threading.Timer(2.0, lambda: shown.set_description(f"{label}: {first}"))
+        waiting = threading.Timer(2.0, lambda: shown.set_description_str(f"{label}, {first}"))
         waiting.daemon = True
 
         def update(done: int, total: int) -> None:
             if done and first:
                 waiting.cancel()
-                shown.set_description(label, refresh=False)
+                shown.set_description_str(label, refresh=False)
             shown.total = total
             shown.update(done - shown.n)
 

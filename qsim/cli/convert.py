@@ -151,9 +151,13 @@ def _pairs(args: argparse.Namespace) -> tuple[Path, str]:
 
 def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
     refuse_idle(args, f"{args.input} is read, not written for others", ["to", "lossy", "window"])
+    restored = _restored(args.input)
+    args.frame_rate = args.frame_rate or restored.get("frame_rate")
+    args.exposure = args.exposure or restored.get("exposure")
     if args.frame_rate is None:
         raise ValueError(f"{args.input}: files do not state the capture rate; add --frame-rate, as in 2000")
-    hints = Hints(args.layout, args.height, args.width, args.bits, args.transfer, args.channel, args.flip, args.columns,
+    transfer = args.transfer or ("linear" if restored else None)
+    hints = Hints(args.layout, args.height, args.width, args.bits, transfer, args.channel, args.flip, args.columns,
                   args.stretched, args.variable, args.white)  # fmt: skip
     capture = importing.Import(args.frame_rate, args.exposure, args.sensor, args.ppp, args.split)
     found = detection.recordings(args.input, args.layout)
@@ -164,7 +168,10 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
             recording = importing.read(source, hints)
             if recording.is_light:
                 if target.suffix in _SUFFIXES:
-                    raise ValueError(f"{target}: light is read into a clip, a folder; name it without {target.suffix}")
+                    raise ValueError(
+                        f"{target}: light is read into a clip, a folder; name it without {target.suffix}, or write a "
+                        "film with `qsim preview`"
+                    )
                 clip = importing.to_clip(recording, target, capture, force=args.force, progress=progress)
                 made.append(
                     (clip.path, f"{_size(clip)}, light of {recording.source}; {importing.saturation_line(clip)}")
@@ -173,6 +180,13 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
             stream = importing.to_stream(recording, target, capture, force=args.force, progress=progress)
             made.append((stream.path, f"{_size(stream)}, codes of {stream.bits} bits, {recording.source}"))
     return made
+
+
+def _restored(source: Path) -> dict[str, Any]:
+    """Return the description of restored video (`quiver restore`), which states its rates; else an empty one."""
+    beside = source.with_suffix(".json")
+    found = files.read_json(beside) if source.suffix == ".npy" and beside.is_file() else {}
+    return found if "seconds_per_frame" in found else {}
 
 
 def _size(made: Clip | Stream) -> str:

@@ -12,7 +12,8 @@ from typing import Any
 from qsim import checks, files
 from qsim.cli.console import PILOT, RESUMES, bar, command, note, output
 from qsim.cli.options import checked, part_of
-from qsim.dataset.job import Job
+from qsim.dataset.job import Job, Settings
+from qsim.dataset.recipe import Recipe
 
 
 def add_generate(sub: Any) -> None:
@@ -46,6 +47,7 @@ def _run_generate(args: argparse.Namespace) -> int:
 
     wanted = recipe.load(args.recipe)
     folder = args.output or Path("out") / wanted.name
+    note(_defaults(wanted, folder))
     # None: not given, as --cluster needs it (`_cluster`).
     count = generation.Options.workers if args.workers is None else args.workers
     limits = Limits() if args.memory is None else Limits(memory=args.memory)
@@ -66,6 +68,14 @@ def _run_generate(args: argparse.Namespace) -> int:
         lines.append("run again with --retry after removing the cause")
     output(args, {"dataset": str(folder)} | dataclasses.asdict(summary), lines)
     return 0 if summary.done == summary.jobs and not summary.shared else 1
+
+
+def _defaults(wanted: Recipe, folder: Path) -> str:
+    """Return one line: the number of clips, their folder, and the defaults that the recipe does not set."""
+    sections = [wanted.source["recipe"], *wanted.source["scenes"]]
+    settings = {"frame_rate": 2000.0, "shutter": Settings.shutter, "psnr": Settings.psnr, "seed": 0}
+    taken = [f"{key} = {value:g}" for key, value in settings.items() if not any(key in part for part in sections)]
+    return f"{wanted.name}: {len(wanted.jobs)} clips in {folder}; by default " + (", ".join(taken) or "nothing")
 
 
 def _noisy(folder: Path, jobs: list[Job]) -> list[str]:

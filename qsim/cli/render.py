@@ -14,6 +14,11 @@ from qsim.backend import BACKENDS
 from qsim.cli.console import PILOT, RESUMES, bar, command, output, refuse_idle
 from qsim.cli.options import checked
 
+LIGHT = (
+    "highest light level you will sense, photons per pixel; sets samples so that the Monte-Carlo variance stays "
+    "below 1 %% of the shot variance"
+)
+
 
 def add_render(sub: Any) -> None:
     """Add the command `render` to a program."""
@@ -50,7 +55,7 @@ def add_render(sub: Any) -> None:
         help="requested error of the radiance, in dB below white and clamped at white (default 40)",
     )
     light = checked(checks.positive)
-    parser.add_argument("--ppp", type=light, help="brightest light level that will be sensed, photons per pixel")
+    parser.add_argument("--ppp", type=light, help=LIGHT)
     parser.add_argument("--engine", choices=BACKENDS, help="engine to use (default: QSIM_ENGINE, else the fastest)")
     parser.add_argument("--force", action="store_true", help="replace an existing clip")
 
@@ -79,8 +84,13 @@ def _run_render(args: argparse.Namespace) -> int:
         chosen = choose_budget(scene, **taken)
         output(args, {"render": dataclasses.asdict(chosen)}, explain(chosen.findings))
         return 0
-    with bar(args.output.name, first=PILOT) as progress:
-        clip = render(args.scene, args.output, **taken, **size, progress=progress, force=args.force)
+    try:
+        with bar(args.output.name, first=PILOT) as progress:
+            clip = render(args.scene, args.output, **taken, **size, progress=progress, force=args.force)
+    except KeyboardInterrupt:
+        if not args.output.with_name(f"{args.output.name}.part").exists():
+            args.after_interrupt = "no frame is stored yet; run the same command again"
+        raise
     render_meta = clip.meta["render"]
     found = stated(clip.meta)
     text = f"{clip.path}: {len(clip)} frames of {args.height} x {args.width}"
@@ -90,8 +100,8 @@ def _run_render(args: argparse.Namespace) -> int:
     text += (missed := shortfall(found, args.psnr)) and f"\nerror: {missed}"
     if "fireflies_per_frame" in clip.meta:
         fireflies, pixels = sum(clip.meta["fireflies_per_frame"]), math.prod(clip.shape)
-        how = "counted before denoising" if render_meta["denoise"] else "counted and left in"
-        text += f"\nfireflies: {fireflies} of {pixels} pixels, {how}"
+        how = "before denoising" if render_meta["denoise"] else "not removed"
+        text += f"\n{fireflies} of {pixels} pixels are fireflies (Monte-Carlo outliers); {how}"
     findings = [Finding(**finding) for finding in render_meta["findings"]]
     text += "\n" + (explain(findings) if args.explain or clip.camera is None else diffraction_line(clip.camera))
     output(args, {"clip": str(clip.path)} | {k: v for k, v in clip.meta.items() if k != "checksums"}, text)

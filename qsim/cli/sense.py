@@ -84,13 +84,21 @@ def _run_sense(args: argparse.Namespace) -> int:
                 waiting = partial(note, f"{clip.path}: waiting for another process that senses this clip")
                 found, line = sense(clip, sensing, force=args.force, progress=count, on_wait=waiting)
                 before += len(clip)
-                facts = {"clip": str(clip.path), "stream": found.name, "made": bool(drawn), "light": line}
+                facts = {"clip": str(clip.path), "stream": found.name, "file": str(found.path), "made": bool(drawn)}
+                facts["light"] = line
                 made.append(facts | _light(found.meta))
     if len(levels) > 1:
         note("streams of a clip with the same --seed share their random numbers: another --seed makes them independent")
-    lines = [f"{m['light']}; {'made' if m['made'] else 'exists already'}: stream {m['stream']}" for m in made]
+    lines = [_line(m) for m in made]
     output(args, {"streams": made}, lines)
     return 0
+
+
+def _line(made: dict[str, Any]) -> str:
+    """Return what was written where: `wrote STREAM.npy: 21 codes of 3 bits, 128 x 128 pixels; light ...`."""
+    frames, height, width = made["shape"]
+    kind = f"{frames} codes of {made['bits']} bit{'s' if made['bits'] > 1 else ''}, {height} x {width} pixels"
+    return f"{'wrote' if made['made'] else 'exists already:'} {made['file']}: {kind}; {made['light']}"
 
 
 def _light(meta: dict[str, Any]) -> dict[str, Any]:

@@ -65,15 +65,11 @@ def clip_photons(
     return expected_photons(radiance, camera, clip.exposure, origin=(y, x)) * factor
 
 
-def light_line(clip: ClipFolder, level: LightLevel, electrons_per_photon: float | None = None) -> str:
+def light_line(level: LightLevel, electrons_per_photon: float) -> str:
     """Return a one-line summary of the light level.
 
-    `fan_03: mean radiance 0.0254 W/m2/sr, 3.25 PPP (factor 0.84), then 1.31 lx at 555 nm, 2.60 e-/pixel`
+    `light scaled by 0.1228 to 3.25 photons/pixel (2.6 e-, equivalent to 1.313 lx at 555 nm)`
     """
-    unit = " (relative)" if level.lux is None else " W/m2/sr"
-    text = f"{clip.name}: mean radiance {clip.mean_radiance:.4g}{unit}, {level.ppp:.4g} PPP (factor {level.factor:.4g})"
-    if level.lux is not None:
-        text += f", then {level.lux:.4g} lx at 555 nm"
-    if electrons_per_photon is not None:
-        text += f", {level.ppp * electrons_per_photon:.3g} e-/pixel"
-    return text
+    lux = "" if level.lux is None else f", equivalent to {level.lux:.4g} lx at 555 nm"
+    electrons = f"{level.ppp * electrons_per_photon:.3g} e-"
+    return f"light scaled by {level.factor:.4g} to {level.ppp:.4g} photons/pixel ({electrons}{lux})"

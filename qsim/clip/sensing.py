@@ -157,7 +157,10 @@ def sense(
     """
     draw = prepare(clip, sensing)
     meta = describe(clip, sensing, draw)
-    line = light_line(clip, draw.level, draw.planes * draw.sensor.efficiency)
+    line = light_line(draw.level, draw.planes * draw.sensor.efficiency)
+    if draw.defects is not None:
+        effects = [key for key, value in draw.defects.to_dict().items() if value and key != "device_seed"]
+        line += f"; defects: {', '.join(effects) or 'none'}"
     missed = draw.missed(clip)
     if missed is not None:
         draw = dataclasses.replace(draw, followed=missed if missed.largest > TOLERANCE else None)

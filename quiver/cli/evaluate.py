@@ -48,7 +48,7 @@ def add_evaluate(sub: Any) -> None:
         "--methods",
         type=words,
         default="naive,moment",
-        help="comma-separated; moment:3 has a window of 3; all: every classical method and the shipped weights",
+        help="comma-separated; `moment:3` uses a 3-frame window; `all` runs every method (default naive,moment)",
     )
     parser.add_argument("--split", choices=("train", "val", "test", "all"), help="split of a data set (default test)")
     parser.add_argument("--stream", help="score this stored stream of every clip, instead of sensing the clip now")

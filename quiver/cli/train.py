@@ -33,7 +33,7 @@ from quiver.device import DEVICES
 
 def add_train(sub: Any) -> None:
     parser = command(
-        sub, "train", _run_train, "Train a network on the clips of a data set; the same command resumes it.",
+        sub, "train", _run_train, "Train a network on the clips of a data set; rerun the same command to resume.",
         "quiver train out/starter -o out/mine --minutes 20\n"
         "quiver train out/starter -o out/unet --preset unet --protocol control --minutes 20\n"
         "torchrun --nproc-per-node 4 -m quiver train out/starter -o out/s --preset quiver-s --protocol published",

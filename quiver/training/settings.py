@@ -60,7 +60,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         if self.steps is None and self.minutes is None:
-            raise ValueError("a run needs an end: give --steps or --minutes")
+            raise ValueError("give a training length: --steps N or --minutes M")
         if self.threads is not None and (isinstance(self.threads, bool) or not isinstance(self.threads, int)):
             raise ValueError(f"--threads must be a whole number, got {self.threads!r}")
         for name in (

@@ -173,7 +173,7 @@ def test_a_bar_names_the_work_before_the_first_frame(capsys, monkeypatch):
 
     monkeypatch.setattr("qsim.cli.console.threading.Timer", Now)
     with console.bar("fan", first="pilot") as progress:
-        assert "fan: pilot" in capsys.readouterr().err
+        assert "fan, pilot" in capsys.readouterr().err
         progress(1, 4)
     assert started == [2.0]
     with console.bar("fan"):

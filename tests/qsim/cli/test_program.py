@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -115,7 +116,7 @@ def test_render_explains_and_counts(tmp_path: Path, capsys: pytest.CaptureFixtur
     code, out, _ = run(capsys, "render", "plain", "-o", tmp_path / "clip", *small)
     assert code == 0
     assert "Airy disk 3.4 px wide, MTF 0.19 at Nyquist (f/2.8, 550 nm, 1.1 um)" in out
-    assert "fireflies: " in out
+    assert "pixels are fireflies (Monte-Carlo outliers); " in out
     assert "bounces" not in out
     code, _, err = run(capsys, "render", "plain", *small)
     assert code == 2
@@ -129,12 +130,12 @@ def test_sense_prints_one_line_of_light(made: Path, capsys: pytest.CaptureFixtur
     clip = made / "clips" / "fan_0001"
     code, out, _ = run(capsys, "sense", clip, "--bits", 2, "--ppp", 3.25)
     assert code == 0
-    assert out.startswith("fan_0001: mean radiance 0.")
-    assert "W/m2/sr, 3.25 PPP (factor " in out
-    assert "lx at 555 nm, 2.6 e-/pixel" in out
-    assert out.count("\n") == 1
-    assert out.endswith("made: stream quiver-physical_2bit_3.25ppp\n")
-    assert "exists already: stream quiver" in run(capsys, "sense", clip, "--bits", 2, "--ppp", 3.25)[1]
+    assert re.fullmatch(
+        r"wrote \S+/fan_0001/streams/quiver-physical_2bit_3.25ppp\.npy: 3 codes of 2 bits, 8 x 10 pixels; light "
+        r"scaled by \S+ to 3.25 photons/pixel \(2.6 e-, equivalent to \S+ lx at 555 nm\)\n",
+        out,
+    )
+    assert "exists already: " in run(capsys, "sense", clip, "--bits", 2, "--ppp", 3.25)[1]
     stream = Clip.open(clip).stream("quiver-physical_2bit_3.25ppp")
     assert stream.codes().max() <= 3
     assert stream.meta["ppp_target"] == 3.25
@@ -345,3 +346,50 @@ def test_devices_are_listed_with_sources(capsys: pytest.CaptureFixture[str]):
 def test_as_a_module():
     done = subprocess.run([sys.executable, "-m", "qsim", "--version"], capture_output=True, text=True)
     assert (done.returncode, done.stdout[:5]) == (0, "qsim ")
+
+
+def test_defaults_of_a_recipe_and_applied_defects_are_printed(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = '[recipe]\nname = "mine"\nframes = 2\nheight = 8\nwidth = 10\npsnr = 20\n[[scenes]]\nfamily = "fan"\n'
+    Path("mine.toml").write_text(text + 'split = "train"\n')
+    monkeypatch.setattr(generation, "generate", lambda *_, **__: generation.Summary(1, 1, 1, {}, ()))
+    assert main(["generate", "mine.toml"]) == 0
+    assert "mine: 1 clips in out/mine; by default frame_rate = 2000, shutter = 0, seed = 0" in capsys.readouterr().err
+    clip = relative(tmp_path / "c")
+    Path("d.toml").write_text("[defects]\nprnu = 0.02\ndead = 0.1\n")
+    assert (
+        "; defects: prnu, dead"
+        in run(capsys, "sense", clip, "--sensor", "spad-320x240", "--ppp", 1, "--defects", "d.toml")[1]
+    )
+
+
+def test_restored_video_states_its_own_rates(tmp_path, capsys):
+    np.save(tmp_path / "video.npy", np.ones((3, 8, 10), np.float32))
+    description = {"seconds_per_frame": 0.1, "frame_rate": 1000.0, "exposure": 2e-4, "method": "moment"}
+    (tmp_path / "video.json").write_text(json.dumps(description))
+    code, out, _ = run(capsys, "convert", tmp_path / "video.npy", tmp_path / "clip")
+    assert code == 0
+    assert "3 frames of 8 x 10 pixels at 1000 per second, exposure 200 us" in out
+    clip = Clip.open(tmp_path / "clip")
+    assert (clip.frame_rate, clip.exposure) == (1000.0, 2e-4)
+    np.testing.assert_array_equal(clip[:], np.ones((3, 8, 10)))
+    code, _, err = run(capsys, "convert", tmp_path / "video.npy", tmp_path / "video.mp4")
+    assert code == 2
+    assert "write a film with `qsim preview`" in err
+
+
+def test_a_render_that_is_interrupted_before_its_first_frame_says_so(tmp_path, capsys, monkeypatch):
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("qsim.dataset.scene_rendering.choose_budget", interrupt)
+    err = run(capsys, "render", "fan", "-o", tmp_path / "fan")[2].strip()
+    assert err.endswith("qsim: interrupted; no frame is stored yet; run the same command again")
+
+
+def test_a_preview_of_a_damaged_clip_names_the_check(tmp_path, capsys):
+    clip = relative(tmp_path / "c")
+    (clip / "radiance" / "000001.exr").unlink()
+    code, _, err = run(capsys, "preview", clip, "--frame", 1, "-o", tmp_path / "a.png")
+    assert code == 2
+    assert "the clip is damaged, run `qsim check" in err

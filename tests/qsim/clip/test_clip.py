@@ -40,7 +40,7 @@ def test_names_files_and_records_of_a_sensor_give_the_same_codes(tmp_path: Path)
     assert clip.sense("quiver-paper", ppp=2.5).sensor == QIS(0.8, 1.6, 0.2, 3)
     same, line = sense(clip, Sensing(SENSOR, ppp=2.5))
     assert (same.name, clip.sense(SENSOR, ppp=2.5).name) == (record.name, record.name)
-    assert "2.5 PPP" in line
+    assert "to 2.5 photons/pixel" in line
 
 
 def test_records_of_other_parameters_are_other_streams(tmp_path: Path):

@@ -28,7 +28,7 @@ def test_light_levels(tmp_path: Path):
     assert same.factor == pytest.approx(1, rel=1e-12)
     with pytest.raises(ValueError, match="not both"):
         light_level(clip, ppp=1.0, lux=1.0)
-    assert "3.25 PPP" in light_line(clip, light_level(clip, ppp=3.25), 0.8)
+    assert "to 3.25 photons/pixel (2.6 e-" in light_line(light_level(clip, ppp=3.25), 0.8)
 
 
 def test_relative_radiance_needs_a_target(tmp_path: Path):
