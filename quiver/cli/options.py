@@ -25,6 +25,7 @@ NETWORKS = (
         "unet",
         "fastdvdnet",
         "student-teacher",
+        "bit2bit",
         "emvd",
         "emvd-as-published",
         "flornn",

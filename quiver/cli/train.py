@@ -39,7 +39,7 @@ def add_train(sub: Any) -> None:
         "torchrun --nproc-per-node 4 -m quiver train out/starter -o out/s --preset quiver-s --protocol published",
         resumes=True,
     )  # fmt: skip
-    parser.add_argument("data", help="data set folder")
+    parser.add_argument("data", help="data set folder; for bit2bit a stored stream, or a clip with one stream")
     parser.add_argument("-o", "--output", required=True, help="folder of the run")
     parser.add_argument("--preset", default="nano", choices=NETWORKS, help="network (default nano)")
     parser.add_argument(
@@ -86,11 +86,12 @@ def _run_train(args: argparse.Namespace) -> int:
     from quiver import threads
     from quiver.data.clips import open_clips
     from quiver.device import pick_device
-    from quiver.model.presets import build
     from quiver.training.loop import Diverged, train
     from quiver.training.run_folder import draw_curve
 
     settings = _settings(args)
+    if args.preset == "bit2bit":
+        settings = _of_stream(args, settings)
     if args.validate_every is not None and settings.steps is None:
         raise ValueError("--validate-every: counts steps of a run with --steps; a run that --minutes ends is validated "
                          "after every tenth of its time; leave it out")  # fmt: skip
@@ -106,7 +107,7 @@ def _run_train(args: argparse.Namespace) -> int:
     try:
         with _signals() as interrupted:
             state = train(
-                build(args.preset),
+                network_of(args, settings),
                 settings,
                 device=pick_device(args.device),
                 should_stop=lambda: bool(interrupted),
@@ -138,6 +139,27 @@ def _settings(args: argparse.Namespace) -> Any:
     return Settings(**defaults | {name: value for name, value in given.items() if value is not None})
 
 
+def _of_stream(args: argparse.Namespace, settings: Any) -> Any:
+    """Return the settings with the light of a stream; `ValueError` for options that act on data sets alone."""
+    from quiver.data.stream_windows import stream_at
+    from quiver.restoration.sources import refuse
+    from quiver.training.self_supervised import own_light
+
+    names = ("sensor", "ppp", "bits", "validate_every", "validation_split")
+    refuse(args, names, f"is for data sets, and {args.preset} learns from one stream")
+    return own_light(settings, stream_at(Path(args.data)))
+
+
+def network_of(args: argparse.Namespace, settings: Any) -> Any:
+    """Return the network of the preset with random weights; bit2bit for the law of its stream."""
+    from quiver.data.stream_windows import stream_at
+    from quiver.model.presets import build
+    from quiver.model.rivals.bit2bit import Bit2Bit
+    from quiver.training.self_supervised import config_for
+
+    return Bit2Bit(config_for(stream_at(Path(settings.data)))) if args.preset == "bit2bit" else build(args.preset)
+
+
 @contextlib.contextmanager
 def _signals() -> Iterator[list[int]]:
     """Collect Ctrl-C and termination instead of ending: the loop ends after its step and saves its state."""
@@ -149,10 +171,13 @@ def _signals() -> Iterator[list[int]]:
 def _summary(folder: Path, state: Any) -> tuple[dict[str, Any], str]:
     found = {"run": str(folder), "steps": state.step, "seconds": state.elapsed}
     text = f"{folder}: {state.step} steps in {state.elapsed / 60:.1f} min"
+    weights = str(folder / "best.safetensors")
     if state.history:
-        weights = str(folder / "best.safetensors")
         found |= {"best_psnr_matched": state.best, "weights": weights, "last_validation": state.history[-1]}
         text += f", best validation PSNR {state.best:.2f} dB (after the best factor): {weights}"
+    elif state.finished:
+        found |= {"weights": weights}
+        text += f": {weights}"
     return found, text
 
 

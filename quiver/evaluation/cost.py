@@ -38,7 +38,18 @@ from quiver.restoration.restorers import restorer, weights_path
 
 EXPOSURE = 5e-4  # s
 MODAL = ("nano", "quiver-s", "quiver")  # presets that have several modes
-PRESETS = (*MODAL, "unet", "fastdvdnet", "student-teacher", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")
+PRESETS = (
+    *MODAL,
+    "unet",
+    "fastdvdnet",
+    "student-teacher",
+    "bit2bit",
+    "emvd",
+    "flornn",
+    "memdeblur",
+    "rvrt",
+    "spk2imgnet",
+)
 
 
 @dataclass(frozen=True)

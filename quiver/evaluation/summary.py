@@ -17,7 +17,8 @@ from quiver.evaluation.comparison import FORMAT, Comparison, ComparisonRow, json
 from quiver.evaluation.metrics import Interval, over_scenes
 from quiver.restoration.interface import Restorer
 
-UNTRAINED = ("student-teacher", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")  # of the paper: no weights ship
+# Networks of the paper whose weights do not ship; bit2bit is trained on each stream
+UNTRAINED = ("student-teacher", "bit2bit", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")
 COLUMNS = (
     "method",
     "frames (future)",

@@ -9,6 +9,7 @@ from torch import nn
 from quiver.model.config import Config
 from quiver.model.folded import FoldedConfig, FoldedQUIVER
 from quiver.model.quiver import QUIVER
+from quiver.model.rivals.bit2bit import Bit2Bit, Bit2BitConfig
 from quiver.model.rivals.emvd import EMVD, EMVDConfig
 from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
 from quiver.model.rivals.flornn import FloRNN, FloRNNConfig
@@ -29,6 +30,7 @@ OTHERS: dict[str, Any] = {
     "unet": UNetConfig(),
     "fastdvdnet": FastDVDnetConfig(),
     "student-teacher": StudentTeacherConfig(),
+    "bit2bit": Bit2BitConfig(),
     "emvd": EMVDConfig(),
     "emvd-as-published": EMVDConfig(as_published=True),
     "flornn": FloRNNConfig(),
@@ -47,6 +49,7 @@ NETWORKS: tuple[tuple[type[nn.Module], type], ...] = (
     (UNet, UNetConfig),
     (FastDVDnet, FastDVDnetConfig),
     (StudentTeacher, StudentTeacherConfig),
+    (Bit2Bit, Bit2BitConfig),
     (EMVD, EMVDConfig),
     (FloRNN, FloRNNConfig),
     (MemDeblur, MemDeblurConfig),

@@ -41,8 +41,8 @@ def part_of(network: Any) -> Part:
     """Return the parts in which a network restores a clip."""
     ahead = network.look_ahead
     if ahead is None:
-        seen = AROUND + KEPT_OF_CLIP - 1
-        return Part(AROUND, KEPT_OF_CLIP, AROUND, seen, seen)
+        around, kept = getattr(network, "parts", (AROUND, KEPT_OF_CLIP))
+        return Part(around, kept, around, around + kept - 1, around + kept - 1)
     if hasattr(network, "frames_in"):
         before = network.frames_in - 1 - ahead
         return Part(before, KEPT, ahead, before, ahead)

@@ -28,16 +28,19 @@ from tqdm import tqdm
 
 from quiver import threads
 from quiver.data.clips import open_clips
+from quiver.data.stream_windows import StreamWindows
 from quiver.data.windows import Batches, Windows, WindowSettings
 from quiver.device import device_of_process, group_backend, is_gpu, moved
 from quiver.evaluation import metrics
 from quiver.training.optimiser import Optimiser
 from quiver.training.run_folder import Run
 from quiver.training.schedule import State, learning_rate, note_plateau, share_used, time_is_up, validation_due
+from quiver.training.self_supervised import make_stream_windows
 from quiver.training.settings import Settings, settled
 from quiver.training.system import Batch, Loss, System
 from quiver.training.systems import OURS, system_of
 
+AnyWindows = Windows | StreamWindows
 CHECKPOINT_SECONDS = 120.0
 FOREVER = 10**9  # steps of a run that only time limits
 VALIDATION_SIDE = 128  # px, of the validation windows at most
@@ -123,7 +126,7 @@ def make_windows(
     return windows, Subset(fixed, range(0, len(fixed), -(-len(fixed) // settings.validation_windows)))
 
 
-def batches(windows: Windows, settings: Settings, state: State, process: Process) -> Iterator[dict[str, Any]]:
+def batches(windows: AnyWindows, settings: Settings, state: State, process: Process) -> Iterator[dict[str, Any]]:
     """Return the batches from the current step on; workers draw the same bytes as this process."""
     last = state.step if state.finished else settings.steps or FOREVER
     numbers = Batches(settings.batch, state.step, last, process.rank, process.world)
@@ -211,7 +214,7 @@ class Trainer:
     """Training of one model: steps, validations when they are due, and checkpoints."""
 
     def __init__(
-        self, model: nn.Module, run: Run, fixed: Subset[dict[str, Any]], process: Process, system: System
+        self, model: nn.Module, run: Run, fixed: Subset[dict[str, Any]] | None, process: Process, system: System
     ) -> None:
         settings = run.settings
         self.system = system
@@ -266,7 +269,10 @@ class Trainer:
         if not self.process.any(validation_due(settings, state)) and not state.finished:
             return
         began = time.monotonic()
-        if self.board is not None:
+        if self.fixed is None:  # nothing to validate on: the last weights count as the best
+            if self.board is not None and state.finished:
+                self.run.save_weights("best", self.model, state)
+        elif self.board is not None:
             score, picture = validate(self.model, self.fixed, self.process.device, self.system)
             self.board.validation(state, score, picture)
             self._record(score)
@@ -309,12 +315,18 @@ def train(
     """
     torch.set_flush_denormal(True)  # gradients in the tails of GELU are denormal and slow down a step
     with joined(device) as process, contextlib.ExitStack() as stack:
-        asked = settings.threads
-        settings, lines = settled(settings, force=force)
-        settings = replace(settings, threads=threads.use(asked, settings.threads).number)
-        system = system_of(model)
+        asked, system = settings.threads, system_of(model)
         system.refuse(model, settings)
-        windows, fixed = make_windows(settings, system.side(model), system, system.window(model))
+        windows: AnyWindows
+        fixed: Subset[dict[str, Any]] | None = None
+        if system.of_stream:
+            windows, lines = make_stream_windows(settings), ["noise: that of the stream"]
+            earlier = None if force else threads.recorded(Path(settings.out) / "settings.json")
+            settings = replace(settings, threads=threads.use(asked, earlier).number)
+        else:
+            settings, lines = settled(settings, force=force)
+            settings = replace(settings, threads=threads.use(asked, settings.threads).number)
+            windows, fixed = make_windows(settings, system.side(model), system, system.window(model))
         run = Run(settings)
         if process.leads:
             stack.enter_context(run.open(force=force))

@@ -37,6 +37,7 @@ class System:
     multiple: int | None = None  # px that divides the side of a crop; None: the network's own `multiple`, else 1
     prepare: Prepare | None = None  # computes more inputs where samples are drawn
     still: bool = False  # samples also hold noisy copies of the centre frame
+    of_stream: bool = False  # learns from the frames of one stored stream, without truth or validation
     check: Callable[[nn.Module, Settings], None] = nothing_to_refuse  # ValueError for settings that do not fit
 
     def window(self, network: nn.Module) -> int:

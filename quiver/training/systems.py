@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from quiver.model.blocks import RADIUS
 from quiver.model.presets import build
+from quiver.model.rivals.bit2bit import Bit2Bit
 from quiver.model.rivals.emvd import EMVD
 from quiver.model.rivals.fastdvdnet import FastDVDnet
 from quiver.model.rivals.flornn import FloRNN
@@ -19,6 +20,7 @@ from quiver.model.rivals.student_teacher import StudentTeacher
 from quiver.training import rival_losses as rivals
 from quiver.training.loss import PRESETS as LOSSES
 from quiver.training.loss import training_loss
+from quiver.training.self_supervised import split_loss
 from quiver.training.settings import PROTOCOLS, Settings
 from quiver.training.system import Batch, System
 
@@ -39,6 +41,7 @@ _PORT: dict[str, Any] = {
 }
 _FASTDVDNET = {"sensor": "quiver-published", "ppp": (3.25,), "bits": (3,), "force_exposure": True, "reverse": False,
                "schedule": "plateau", "warmup": 0, "crop": 96, "batch": 64, "steps": 320_000}  # fmt: skip
+_STREAM: dict[str, Any] = {"frames": 32, "batch": 1, "learning_rate": 2e-4, "clip_norm": 1.0, "loss": "own"}
 _QUICK: dict[str, Any] = {"learning_rate": 1e-3, "drift": 3, "loss": "own"}
 
 
@@ -86,6 +89,12 @@ SYSTEMS: dict[type[nn.Module], System] = {
     StudentTeacher: System(
         *("student-teacher", rivals.student_teacher_loss, rivals.windows_restored, _protocols({}, learning_rate=3e-4)),
         still=True,
+    ),
+    Bit2Bit: System(
+        *("bit2bit", split_loss, rivals.every_frame),
+        {name: _STREAM | sizes for name, sizes in {"quick": {"crop": 64}, "published": {"crop": 256}}.items()},
+        frames=1,
+        of_stream=True,
     ),
     RVRT: System(
         *("rvrt", rivals.charbonnier_loss, rivals.centre_frame),

@@ -79,6 +79,7 @@ class Bit2Bit(nn.Module):
     """The network for grey frames."""
 
     look_ahead: ClassVar[int | None] = None  # all frames
+    parts: ClassVar[tuple[int, int]] = (PIECE // 4, PIECE // 2)  # frames around a part of a long clip, and of the part
     multiple: ClassVar[int] = 2 ** (LEVELS - 1)  # px and frames that divide the sides inside
 
     def __init__(self, config: Bit2BitConfig | None = None) -> None:

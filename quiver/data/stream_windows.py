@@ -1,0 +1,68 @@
+"""Draws training windows from one stored stream, for networks that learn from its noisy frames alone.
+
+Sample n is a function of (seed, n) alone: its place and its turn. Its noise is that of the stream.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch.utils.data import Dataset
+
+from qsim.clip.clip import Clip
+from qsim.keys import Key
+from quiver.data.codes import Codes, open_stream, stream_codes
+from quiver.data.window_noise import WindowPlace
+from quiver.data.windows import WindowSettings, as_input, turned
+
+
+def stream_at(path: Path) -> Codes:
+    """Return the codes of a stored stream, or of the only stream of a clip folder. `ValueError` for other paths."""
+    if path.is_dir():
+        clip = Clip.open(path)
+        if len(clip.streams) != 1:
+            raise ValueError(
+                f"{path}: has the streams {', '.join(clip.streams) or 'none'}; name one of their .npy files"
+            )
+        return stream_codes(clip.stream(clip.streams[0]))
+    if not path.with_suffix(".json").is_file():
+        raise FileNotFoundError(f"{path}: no stored stream, which is a .npy with its .json; see `qsim sense`")
+    return stream_codes(open_stream(path))
+
+
+class StreamWindows(Dataset[dict[str, Any]]):
+    """Windows of a stream: a `torch` data set.
+
+    An item holds codes float32 [T, 1, h, w] in [0, 1], sample (its number) and key (a text with its place).
+    `ValueError` for a stream that is shorter or smaller than a window.
+    """
+
+    def __init__(self, codes: Codes, settings: WindowSettings) -> None:
+        length, height, width = codes.shape
+        if length < settings.frames or min(height, width) < settings.crop:
+            raise ValueError(
+                f"{codes.name} is {length} x {height} x {width}; a window needs {settings.frames} frames of "
+                f"{settings.crop} x {settings.crop} px; choose a smaller --crop or fewer --frames"
+            )
+        self.codes, self.settings = codes, settings
+
+    def __len__(self) -> int:
+        """Return how many windows hold as many codes as the stream; numbers beyond are windows, too."""
+        frames, crop = self.settings.frames, self.settings.crop
+        return int(np.ceil(np.prod(self.codes.shape) / (frames * crop**2)))
+
+    def __getitem__(self, n: int) -> dict[str, Any]:
+        settings, rng = self.settings, np.random.default_rng((self.settings.seed, n))
+        length, height, width = self.codes.shape
+        start, y, x = (
+            int(rng.integers(most - size + 1))
+            for most, size in ((length, settings.frames), (height, settings.crop), (width, settings.crop))
+        )
+        turn = int(rng.integers(8)) if settings.flips else 0
+        backwards = bool(rng.integers(2)) if settings.reverse else False
+        place = WindowPlace(0, start, y, x, (0, 0), 0, turn, backwards, Key(settings.seed, n))
+        part = self.codes.read(start, start + settings.frames)[:, y : y + settings.crop, x : x + settings.crop]
+        key = f"{self.codes.name} frame {start}, (y, x) ({y}, {x}), turn {turn}"
+        return {"codes": as_input(turned(part, place), self.codes.sensor), "sample": n, "key": key}

@@ -1,0 +1,57 @@
+"""Trains bit2bit on one stored stream: the law that its codes obey, and its loss.
+
+stream -> configuration of the network; crops of its codes -> split at random into input and target -> loss
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from qsim.sensor.qis import QIS
+from qsim.sensor.spad import BinarySPAD
+from quiver.data.codes import Codes
+from quiver.data.stream_windows import StreamWindows, stream_at
+from quiver.data.windows import WindowSettings
+from quiver.model.rivals.bit2bit import Bit2BitConfig, bit2bit_loss
+from quiver.training.settings import Settings
+from quiver.training.system import Batch
+
+COUNTING = (0.9, 1.25)  # codes per electron at which codes of a QIS are photon counts, nearly
+
+
+def config_for(codes: Codes) -> Bit2BitConfig:
+    """Return the published sizes with the law of a stream: binomial for sums of planes, else that of photon counts.
+
+    `ValueError` for a QIS whose codes are no counts: a photon cannot be taken from them.
+    """
+    sensor, exposure = codes.sensor, codes.exposure
+    if isinstance(sensor, QIS) and not COUNTING[0] <= sensor.gain <= COUNTING[1]:
+        raise ValueError(
+            f"{codes.name}: its codes are {sensor.gain:.3g} per electron and no photon counts, which bit2bit needs; "
+            "give a stream of about one code per electron, or of summed planes"
+        )
+    dark = sensor.dark_rate * exposure / (sensor.efficiency * sensor.white(exposure))
+    return Bit2BitConfig(planes=sensor.levels - 1, dark=float(dark), as_published=not isinstance(sensor, BinarySPAD))
+
+
+def own_light(settings: Settings, codes: Codes) -> Settings:
+    """Return the settings with sensor, bits and light [photons/pixel] of the stream, for the weights file."""
+    light = None if codes.ppp is None else (codes.ppp,)
+    return replace(settings, sensor=codes.sensor_name or None, ppp=light, bits=(codes.sensor.bits,))
+
+
+def make_stream_windows(settings: Settings) -> StreamWindows:
+    """Return the windows of the stream that the settings name; errors as of `stream_at` and `StreamWindows`."""
+    window = WindowSettings(
+        frames=settings.frames, crop=settings.crop, flips=settings.flips, reverse=settings.reverse, seed=settings.seed
+    )
+    return StreamWindows(stream_at(Path(settings.data)), window)
+
+
+def split_loss(network: Any, batch: Batch, settings: Settings, share: float) -> Tensor:
+    """Return the loss of one random split of the codes; the split is drawn by torch's generator."""
+    return bit2bit_loss(network, (batch["codes"] * network.config.planes).round())

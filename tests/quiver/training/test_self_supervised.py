@@ -1,0 +1,151 @@
+"""bit2bit learns from the frames of one stream: its law, its windows, resuming, and the command."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from clips import write_clip
+from runs import same_weights
+
+from qsim.clip.sensing import Sensing, sense
+from qsim.sensor.qis import QIS
+from qsim.sensor.spad import BinarySPAD
+from quiver.baselines import moment
+from quiver.cli.program import main
+from quiver.data.codes import Codes, array_codes
+from quiver.data.stream_windows import StreamWindows, stream_at
+from quiver.data.windows import WindowSettings
+from quiver.model.rivals.bit2bit import Bit2Bit
+from quiver.model.weights import load
+from quiver.training import loop as training
+from quiver.training.loop import train
+from quiver.training.self_supervised import config_for
+from quiver.training.settings import Settings
+
+
+@pytest.fixture
+def stream(tmp_path: Path) -> Path:
+    """A stream of seven planes per frame, in a clip folder."""
+    clip = write_clip(tmp_path / "clip", frames=16, height=24, width=32)
+    return sense(clip, Sensing("spad-320x240", bits=3, ppp=3.0))[0].path
+
+
+def small(codes: Codes, seed: int = 0) -> Bit2Bit:
+    torch.manual_seed(seed)
+    return Bit2Bit(replace(config_for(codes), width=4))
+
+
+def settings_of(stream: Path, out: Path, **changes: object) -> Settings:
+    own = {"steps": 4, "frames": 8, "crop": 16, "batch": 2, "loss": "own", "learning_rate": 2e-3, "warmup": 1}
+    return Settings(str(stream), str(out), "bit2bit", **own | changes)
+
+
+def test_the_law_is_that_of_the_codes():
+    codes = np.zeros((4, 8, 8), np.uint8)
+    planes = array_codes(codes, BinarySPAD(0.4, 100.0, bits=3), 7e-4)
+    found = config_for(planes)
+    assert (found.as_published, found.planes) == (False, 7)
+    assert found.dark * planes.white * 0.4 == pytest.approx(100.0 * 7e-4, rel=1e-6)  # detections per code
+    counts = config_for(array_codes(codes, QIS(0.8, 1.6, 0.2, 3, gain=1.0), 5e-4))
+    assert (counts.as_published, counts.planes) == (True, 7)
+    with pytest.raises(ValueError, match=r"its codes are 0\.135 per electron and no photon counts"):
+        config_for(array_codes(codes, QIS(0.8, 1.6, 0.2, 3, gain=0.135), 5e-4))
+
+
+def test_windows_are_parts_of_the_stream(stream):
+    """Unturned ones are found in the stream where the key states; sample n repeats; turned ones hold the same codes."""
+    codes = stream_at(stream)
+    stack = codes.read(0, 16)
+    plain = WindowSettings(frames=5, crop=12, flips=False, reverse=False)
+    windows = StreamWindows(codes, plain)
+    turning = StreamWindows(codes, replace(plain, flips=True, reverse=True))
+    seen = set()
+    for n in range(8):
+        sample = windows[n]
+        values = (sample["codes"].numpy()[:, 0] * 7).round().astype(np.uint8)
+        start = int(sample["key"].partition("frame ")[2].partition(",")[0])
+        y, x = (int(v) for v in sample["key"].partition("(y, x) (")[2].partition(")")[0].split(", "))
+        np.testing.assert_array_equal(values, stack[start : start + 5, y : y + 12, x : x + 12])
+        assert torch.equal(windows[n]["codes"], sample["codes"])
+        torch.testing.assert_close(turning[n]["codes"].sum(), sample["codes"].sum())
+        seen.add((start, y, x))
+    assert len(seen) > 4
+    for size in ({"frames": 17}, {"crop": 25}):
+        with pytest.raises(ValueError, match="choose a smaller --crop or fewer --frames"):
+            StreamWindows(codes, replace(plain, **size))
+
+
+class Killed(Exception):
+    """Stands for a killed process."""
+
+
+def test_killed_and_resumed_equals_uninterrupted(stream, tmp_path, monkeypatch):
+    codes = stream_at(stream)
+    through = small(codes)
+    torch.manual_seed(5)
+    train(through, settings_of(stream, tmp_path / "a"), progress=False)
+    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
+    asked = []
+
+    def kill() -> bool:
+        asked.append(1)
+        if len(asked) == 2:
+            monkeypatch.setattr(training, "CHECKPOINT_SECONDS", math.inf)
+        if len(asked) == 3:
+            raise Killed
+        return False
+
+    begun = small(codes)
+    torch.manual_seed(5)  # splits are drawn by torch's generator, whose state is stored
+    with pytest.raises(Killed):
+        train(begun, settings_of(stream, tmp_path / "b"), should_stop=kill, progress=False)
+    resumed = small(codes, seed=9)
+    state = train(resumed, settings_of(stream, tmp_path / "b"), progress=False)
+    assert (state.step, state.finished, state.history) == (4, True, [])
+    assert same_weights(through, resumed)
+    assert same_weights(load(tmp_path / "b/best.safetensors"), resumed)
+
+
+@pytest.mark.slow
+def test_it_learns_the_light_of_its_stream(tmp_path):
+    """A scene at rest: after 150 steps nearer to the light than half of what the codes of a frame are."""
+    one = write_clip(tmp_path / "one", frames=1, height=32, width=32).radiance(0)
+    clip = write_clip(tmp_path / "clip", frames=16, height=32, width=32, radiance=np.repeat(one[None], 16, axis=0))
+    path = sense(clip, Sensing("spad-320x240", bits=3, ppp=3.0))[0].path
+    codes = stream_at(path)
+    torch.manual_seed(0)
+    network = Bit2Bit(replace(config_for(codes), width=8))
+    train(network, settings_of(path, tmp_path / "r", steps=150, crop=32, frames=16), progress=False)
+    stack = codes.read(0, 16)
+    with torch.inference_mode():
+        found = network.eval()(torch.from_numpy(stack / np.float32(7))[None, :, None])[0, :, 0].numpy() * codes.white
+    light = one * (3.0 / one.mean())
+    alone = moment.restore(stack, codes.sensor, codes.exposure, window=1)
+    error, of_codes = (np.sqrt(np.mean((video[8] - light) ** 2)) for video in (found, alone))
+    assert error < 0.5 * of_codes
+    assert found.mean() == pytest.approx(3.0, rel=0.1)
+
+
+def test_the_command_trains_on_a_clip_and_restores_it(stream, tmp_path, capsys):
+    """The clip folder, or its stream; the run is a method; options of data sets are refused."""
+    clip, run = tmp_path / "clip", tmp_path / "run"
+    small_run = ["--steps", "1", "--crop", "16", "--frames", "8", "-q"]
+    assert main(["train", str(clip), "-o", str(run), "--preset", "bit2bit", *small_run, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["weights"] == str(run / "best.safetensors")
+    assert main(["restore", str(clip), "--method", str(run), "-o", str(tmp_path / "v.npy"), "-q"]) == 0
+    assert np.load(tmp_path / "v.npy").shape == (16, 24, 32)
+    capsys.readouterr()
+    words = ["train", str(clip), "-o", str(tmp_path / "x"), "--preset", "bit2bit", *small_run]
+    for more in (["--ppp", "3"], ["--bits", "3"], ["--validation-split", "val"], ["--validate-every", "5"]):
+        assert main([*words, *more]) == 2
+        assert "is for data sets, and bit2bit learns from one stream" in capsys.readouterr().err
+    assert main(["train", str(tmp_path / "none.npy"), *words[2:]]) == 2
+    assert "no stored stream" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
