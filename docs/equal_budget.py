@@ -69,6 +69,7 @@ def main(words: list[str] | None = None) -> int:
         return 2
     if args.budget_seconds:
         budget = Budget(args.budget_seconds / 60, args.budget_seconds / 240, budget.threads, budget.crop, budget.batch)
+    args.out.mkdir(parents=True, exist_ok=True)
     try:
         for name in names:
             path = args.out / f"{name}.json"
