@@ -61,7 +61,8 @@ class Dataset:
 
     def __repr__(self) -> str:
         splits = ", ".join(f"{len(self.names(split))} {split}" for split in SPLITS)
-        recipe = self.recipe.get("recipe", {})
+        table = self.recipe.get("recipe")
+        recipe = table if isinstance(table, dict) else {}
         size = " x ".join(str(recipe.get(key, "?")) for key in ("frames", "height", "width"))
         rate = recipe.get("frame_rate", "?")
         missing = f", {len(self.missing)} not made yet" if self.missing else ""
