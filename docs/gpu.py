@@ -15,7 +15,7 @@ if __name__ == "__main__":
     if sys.version_info < (3, 11):  # noqa: UP036
         print(f"gpu.py: {sys.executable} is Python {sys.version.split()[0]}; use 3.11 or newer", file=sys.stderr)
         sys.exit(2)
-    signal.signal(signal.SIGTERM, lambda number, frame: signal.raise_signal(signal.SIGINT))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # also where SIGINT is ignored, as in the background
     sys.path[0] = str(Path(__file__).resolve().parent / "gpu")
     from pieces import main
 

@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from folder import ROOT, Wrong, opened, read, read_record, setup, write
+from job import SECTIONS
 from wheels import install
 
 CHILD = (sys.executable, str(Path(__file__).with_name("child.py")))
-SECTIONS = ("doctor", "sensor", "render", "train", "restore", "table")
+SLEEPING = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}  # as quiver.threads has it for commands
 LAST_SHARE = 0.1  # of a piece, in which nothing is started
 ENDED = ("done", "failed", "absent", "late")  # states of a record that is not made again as it is
 LISTING = 600.0  # s, limit of the list of measurements, and of the table
@@ -47,7 +48,9 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     about = "Measure what only a machine with a GPU can tell; the same command again continues."
     parser = argparse.ArgumentParser("docs/gpu.py", description=about)
     parser.add_argument("out", type=Path, help="folder of the results; the same command continues there")
-    parser.add_argument("--section", choices=SECTIONS, help="measure one section; what failed in it is tried again")
+    parser.add_argument(
+        "--section", choices=(*SECTIONS, "table"), help="measure one section; what failed in it is tried again"
+    )
     parser.add_argument("--minutes", type=_minutes, default=9.0, help="length of this piece (default 9)")
     parser.add_argument("--wheels", type=Path, help="folder of .whl files for packages that this machine lacks")
     return parser.parse_args(argv)
@@ -74,7 +77,7 @@ def planned(piece: Piece) -> dict[str, list[str]]:
     for section, names in plan.items():
         if names != ["all"]:
             (piece.out / section / "all.json").unlink(missing_ok=True)
-    return {section: plan[section] for section in SECTIONS[:-1]}
+    return {section: plan[section] for section in SECTIONS}
 
 
 def record_of(piece: Piece, section: str, name: str) -> dict[str, Any] | None:
@@ -105,12 +108,13 @@ def run_child(piece: Piece, job: dict[str, Any], result: Path, seconds: float) -
     """
     log = log_of(piece, job["section"], job["name"])
     log.parent.mkdir(exist_ok=True)
-    path = os.pathsep.join([str(piece.packages), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    given = [os.path.abspath(entry) for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry]
+    path = os.pathsep.join([str(piece.packages), str(ROOT), *given])
     before = result.stat().st_mtime_ns if result.exists() else None
     with open(log, "wb") as text:
         process = subprocess.Popen(
             piece.child, stdin=subprocess.PIPE, stdout=text, stderr=text, start_new_session=True,
-            env=os.environ | {"PYTHONPATH": path}, cwd=piece.out,
+            env=SLEEPING | os.environ | {"PYTHONPATH": path}, cwd=piece.out,
         )  # fmt: skip
         assert process.stdin is not None
         try:

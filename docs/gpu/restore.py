@@ -27,6 +27,7 @@ def learned() -> list[str]:
 
 def measure(job: Job) -> list[dict[str, Any]]:
     """Return one row: frames per second, memory, and the difference from float32 on the CPU."""
+    from quiver import threads
     from quiver.baselines import METHODS
     from quiver.device import pick_device
     from quiver.evaluation.cost import CostCase, CostSettings
@@ -38,7 +39,9 @@ def measure(job: Job) -> list[dict[str, Any]]:
     case = CostCase(source, "exact", precision)
     slow = classical or kind == "cpu"
     restored = sizes.restored_slow if slow else sizes.restored
-    settings = CostSettings(sizes.height, sizes.width, frames=restored + 10, restored=restored, device=kind)
+    settings = CostSettings(
+        sizes.height, sizes.width, frames=restored + 10, restored=restored, device=kind, threads=threads.use().number
+    )
     cost = measure_cost(case, settings)
     row = {
         "method": name,

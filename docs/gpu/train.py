@@ -176,6 +176,7 @@ def _copies(job: Job) -> list[dict[str, Any]]:
     import torch
     from torch.utils.data import DataLoader
 
+    from quiver import threads
     from quiver.data.windows import Batches
     from quiver.device import pick_device
     from quiver.model.presets import build
@@ -183,6 +184,7 @@ def _copies(job: Job) -> list[dict[str, Any]]:
     from quiver.training.settings import settled
 
     settings, _ = settled(_settings(job, COPIED, "bfloat16"))
+    threads.use()
     place = torch.device(pick_device("auto"))
     model = build(COPIED).to(place).train()
     windows, _ = make_windows(settings, int(model.multiple))
@@ -197,7 +199,7 @@ def _copies(job: Job) -> list[dict[str, Any]]:
         for batch in loader if copied else [held] * job.sizes.copied_batches:
             moved = {name: batch[name].to(place, non_blocking=not waiting) for name in ("codes", "target")}
             held.update(moved)
-            with torch.autocast(place.type, torch.bfloat16):
+            with torch.autocast(place.type, torch.bfloat16, enabled=place.type == "cuda"):
                 output = model(moved["codes"]).scale1
             torch.nn.functional.mse_loss(output.float(), output.detach().float() * 0).backward()
             model.zero_grad(set_to_none=True)
