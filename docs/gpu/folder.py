@@ -116,7 +116,7 @@ def read(path: Path) -> dict[str, Any] | None:
 def read_record(path: Path) -> dict[str, Any] | None:
     """Return the record of a measurement; None if it is missing or damaged."""
     found = read(path) or {}
-    kinds = {"state": str, "setup": dict, "minutes": (int, float), "command": str}
+    kinds: dict[str, Any] = {"state": str, "setup": dict, "minutes": (int, float), "command": str}
     return found if all(isinstance(found.get(name), kind) for name, kind in kinds.items()) else None
 
 
@@ -125,7 +125,7 @@ def write(path: Path, value: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{path.name}.tmp-{os.getpid()}")
     with open(temporary, "w", encoding="utf-8") as file:
-        json.dump(value, file, indent=1, sort_keys=True)
+        json.dump(value, file, indent=1)  # columns of rows keep their order
         file.flush()
         os.fsync(file.fileno())
     os.replace(temporary, path)

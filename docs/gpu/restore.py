@@ -35,7 +35,7 @@ def measure(job: Job) -> list[dict[str, Any]]:
 
     classical, kind, sizes = job.name in METHODS, pick_device("auto"), job.sizes
     name, _, precision = (job.name, "", "float32") if classical else job.name.rpartition("-")
-    source, weights = (name, "none needed") if classical else _weights(job.out, name)
+    source, weights = (name, "none needed") if classical else weights_of(job.out, name)
     case = CostCase(source, "exact", precision)
     slow = classical or kind == "cpu"
     restored = sizes.restored_slow if slow else sizes.restored
@@ -56,7 +56,7 @@ def measure(job: Job) -> list[dict[str, Any]]:
     return [row | ({} if classical else _error(case, kind, sizes))]
 
 
-def _weights(out: Path, network: str) -> tuple[str, str]:
+def weights_of(out: Path, network: str) -> tuple[str, str]:
     """Return what to restore with: the run of this machine, else shipped weights, else random ones."""
     from quiver.restoration.restorers import shipped_names
 

@@ -24,14 +24,9 @@ def measure(job: Job) -> list[dict[str, Any]]:
     return _engine(where, job.sizes) if kind == "engine" else _torch(where, job.sizes)
 
 
-def _row(by: str, what: str, pixels: int, seconds: float, **more: Any) -> dict[str, Any]:
-    return {
-        "by": by,
-        "what": what,
-        "Gpixel/s": pixels / seconds / 1e9,
-        "times NumPy": None,
-        "differing per million": None,
-    } | more
+def _row(by: str, what: str, gigapixels: float, **more: Any) -> dict[str, Any]:
+    empty = {"times NumPy": None, "differing per million": None}
+    return {"by": by, "what": what, "Gpixel/s": gigapixels} | empty | more
 
 
 def _engine(where: str, sizes: Sizes) -> list[dict[str, Any]]:
@@ -51,9 +46,9 @@ def _engine(where: str, sizes: Sizes) -> list[dict[str, Any]]:
     for what, model in ((THREE_BITS, "QIS 3 bits, gain 1.077"), (PACKED, "clocked SPAD, 1 bit, packed")):
         numpy, fast = by[model, "numpy"], by[model, "fast"]
         host = f"{what}, from host to host"
-        rows.append(_row("numpy", host, 1, 1e-3 / numpy.megapixels_per_second))
+        rows.append(_row("numpy", host, numpy.megapixels_per_second / 1e3))
         more = {"times NumPy": fast.times_numpy, "differing per million": fast.mismatches_per_million}
-        rows.append(_row(where, host, 1, 1e-3 / fast.megapixels_per_second, **more))
+        rows.append(_row(where, host, fast.megapixels_per_second / 1e3, **more))
     checks = {"differing per million": different, "all checks": "passed" if report.ok else "NOT passed"}
     rows.append({"by": where, "what": "all sensors, the largest difference; `qsim validate sensor`"} | checks)
     return rows + _on_device(where, sizes)
@@ -86,7 +81,7 @@ def _on_device(where: str, sizes: Sizes) -> list[dict[str, Any]]:
     for start, given in (("host", light), ("device", photons)):
         seconds = median_seconds(lambda given=given: codes_on_device(sensor, given, EXPOSURE, key=key), sizes.rounds)
         what = f"{THREE_BITS}, from {start} to a torch tensor on {codes.device.type}"
-        found.append(_row(where, what, light.size, seconds, **{"differing per million": 1e6 * different}))
+        found.append(_row(where, what, light.size / seconds / 1e9, **{"differing per million": 1e6 * different}))
     return found
 
 
@@ -115,8 +110,8 @@ def _torch(where: str, sizes: Sizes) -> list[dict[str, Any]]:
         return (bits.to(torch.uint8) * powers).sum(-1, dtype=torch.uint8)
 
     works: tuple[tuple[str, Callable[[], torch.Tensor]], ...] = ((THREE_BITS, codes), (PACKED, planes))
-    return [
-        _row(f"torch, {where}", f"{what}, on the device", rate.numel(),
-             median_seconds(work, sizes.rounds, lambda: wait(place)))
-        for what, work in works
-    ]  # fmt: skip
+    rows = []
+    for what, work in works:
+        seconds = median_seconds(work, sizes.rounds, lambda: wait(place))
+        rows.append(_row(f"torch, {where}", f"{what}, on the device", rate.numel() / seconds / 1e9))
+    return rows
