@@ -106,6 +106,20 @@ def hue_from_turns(turns: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.clip(np.abs(np.mod(position, 6.0) - 3.0) - 1.0, 0.0, 1.0)
 
 
+def error_colours(error: NDArray[np.floating], full: float) -> NDArray[np.uint8]:
+    """Return errors [..., H, W] as colour [..., H, W, 3]: white is none, red above, blue below.
+
+    Errors of `full` and above, in the same unit, have the full colour; NaN is grey.
+    """
+    if not full > 0:
+        raise ValueError(f"error_colours: the error of the full colour must be positive, got {full!r}")
+    share = np.clip(np.nan_to_num(error) / full, -1.0, 1.0)
+    above, below = np.maximum(share, 0.0), np.maximum(-share, 0.0)
+    rgb = 1.0 - np.stack([below, np.abs(share), above], axis=-1) * np.array([0.85, 0.8, 0.85])
+    rgb[np.isnan(error)] = 0.5
+    return np.rint(255.0 * rgb).astype(np.uint8)
+
+
 def flow_legend(size: int = 96) -> NDArray[np.uint8]:
     """Return the colour wheel of `flow_colours` [size, size, 3]; the rim is the largest flow."""
     y, x = np.mgrid[0:size, 0:size] * (2.0 / (size - 1)) - 1.0

@@ -12,73 +12,29 @@ from numpy.typing import NDArray
 from qsim import colour
 from qsim.clip.clamped_error import stated
 from qsim.clip.clip import Clip
-from qsim.clip.manifest import RELATIVE
 from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, MOVING, SLOWEST, largest_motion, moving_mean
 from qsim.clip.photons import clip_photons
 from qsim.clip.stream import Stream
 from qsim.report import html as page
+from qsim.report.panels import (
+    FRAMES,
+    Light,
+    chosen_frames,
+    fit,
+    legend,
+    light_name,
+    stream_panels,
+    truth_panels,
+    truth_photons,
+    truth_stack,
+)
 from qsim.sensor.defects import defect_table, fixed_pattern
 from qsim.sensor.defects.pixel_array import PixelArray
 
 if TYPE_CHECKING:
     from markupsafe import Markup
 
-FRAMES = 48  # largest number in a player
-WIDTH = 512  # columns of a panel; wider pictures are reduced by a whole factor
 _PIXELS = 4096  # largest number of a frame in the expected histogram of codes
-
-
-def chosen_frames(count: int) -> range:
-    """Return at most FRAMES frames from the start, without gaps, which would change the motion."""
-    return range(min(count, FRAMES))
-
-
-def fit(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return every n-th row and column of [T, H, W] or [T, H, W, 3], so that a panel has at most WIDTH columns."""
-    step = -(-frames.shape[2] // WIDTH)
-    return frames[:, ::step, ::step]
-
-
-def light_name(clip: Clip) -> str:
-    """Return the name of a clip's light: "truth" if rendered; an imported video has the errors of its camera."""
-    return "recorded video" if clip.meta["radiance_unit"] == RELATIVE else "truth"
-
-
-def truth_stack(clip: Clip, frames: range) -> NDArray[np.float32]:
-    """Return the sharp radiance of these frames, float32 [T, H, W], in the unit of the clip."""
-    return np.stack([clip.sharp(t) for t in frames])
-
-
-def stream_panels(stream: Stream, frames: range) -> list[page.Panel]:
-    """Return panels of the codes, and of the naive mean of up to 11 frames around each."""
-    reach = colour.AVERAGE // 2
-    first, last = max(frames.start - reach, 0), min(frames.stop + reach, len(stream))
-    codes = stream.codes(first, last)
-    bits = int(stream.meta["bits"])
-    averages = np.stack(
-        [codes[max(t - reach - first, 0) : t + reach + 1 - first].mean(axis=0) / (2**bits - 1) for t in frames]
-    )
-    shown = codes[frames.start - first : frames.stop - first]
-    shown_average = colour.tone(averages, colour.peak(averages))
-    return [
-        page.Panel(f"codes, {bits} bit ({stream.name})", fit(colour.code_levels(shown, bits))),
-        page.Panel(f"naive mean of {colour.AVERAGE} frames, white at its peak", fit(shown_average)),
-    ]
-
-
-def flow_panel(clip: Clip, frames: range) -> tuple[page.Panel, float, NDArray[np.floating]]:
-    """Return the flow as colours, the motion of the full colour [px/frame], and the lengths [px/frame], [T, H, W]."""
-    flow = np.stack([clip.flow(t) for t in frames])
-    speed = np.hypot(flow[:, 0], flow[:, 1])
-    largest = max(largest_motion(speed), 0.5)
-    panel = page.Panel(f"flow, full colour at {largest:.1f} px/frame", fit(colour.flow_colours(flow, largest)))
-    return panel, largest, speed
-
-
-def legend(largest: float) -> Markup:
-    """Return the colour wheel of the flow, whose rim is `largest` [px/frame]."""
-    words = f"direction and length of the flow: rim = {largest:.2g} px/frame, white = still, grey = unknown"
-    return page.picture(colour.flow_legend(72), words)
 
 
 def motion(clip: Clip, frames: Sequence[int]) -> tuple[float | None, float]:
@@ -87,34 +43,50 @@ def motion(clip: Clip, frames: Sequence[int]) -> tuple[float | None, float]:
     return moving_mean(speed), largest_motion(speed)
 
 
-def clip_section(clip: Clip) -> Markup:
-    """Return truth, streams and flow of a clip, its light, motion, modelled effects, and the error of its frames."""
+def clip_section(clip: Clip) -> page.Section:
+    """Return light, streams and ground truth of a clip, its motion, modelled effects, and the error of its frames."""
     frames = chosen_frames(len(clip))
     truth = truth_stack(clip, frames)
-    white = colour.peak(truth)
-    panels = [page.Panel(light_name(clip), fit(colour.tone(truth, white)))]
-    figures: list[Markup] = []
-    lines = [light_line(clip)]
-    for name in clip.streams:
-        stream = clip.stream(name)
-        lines.append(stream_line(stream))
-        if len(stream) >= len(frames):
-            panels += stream_panels(stream, frames)
-        figures.append(code_histogram(clip, stream))
-    wheel = None
+    lines = [light_line(clip), *(stream_line(clip.stream(name)) for name in clip.streams)]
+    figures = [_light_histogram(truth, clip)]
+    players = _players(clip, frames, truth)
     if clip.has_truth:
-        panel, largest, speed = flow_panel(clip, frames)
-        panels.append(panel)
-        wheel = legend(largest)
+        panels, largest, speed = truth_panels(clip, frames)
+        players += [page.player(panels, left=1), legend(largest)]
         lines.append(motion_line(clip, frames))
-        figures.insert(0, _motion_histogram(speed))
-    figures.insert(0, _light_histogram(truth, clip))
+        figures.append(_motion_histogram(speed))
+    figures += [code_histogram(clip, clip.stream(name)) for name in clip.streams]
     lines += error_lines(clip.meta)
     if clip.meta.get("error_per_frame"):
         figures.append(error_curve(clip.meta["error_per_frame"]))
-    left = 2 if len(panels) > 3 else len(panels) - 1  # the average of the first stream, else the last panel
-    parts = [page.player(panels, left=left), wheel, page.bullets(lines), modelled(clip.meta), page.grid(figures)]
-    return page.section(f"Clip {clip.name}", *parts)
+    count, height, width = clip.shape
+    story = f"{clip.name} has {count} frames of {height} × {width} pixels at {clip.frame_rate:g} frames/s."
+    parts = [*players, page.bullets(lines), modelled(clip.meta), page.grid(figures)]
+    return page.section(f"Clip {clip.name}", *parts, story=story, facts=_facts(clip, frames))
+
+
+def _players(clip: Clip, frames: range, truth: Light) -> list[Markup]:
+    """Return the light with all streams of one code per frame, and a player of each other stream."""
+    panels = [page.Panel(light_name(clip), fit(colour.tone(truth, colour.peak(truth))))]
+    others = []
+    for name in clip.streams:
+        stream = clip.stream(name)
+        if len(stream) == len(clip):
+            panels += stream_panels(stream, frames, truth_photons(clip, stream, frames))
+        else:
+            others.append(page.player(stream_panels(stream, chosen_frames(len(stream))), right=1, left=0))
+    left = 1 if len(panels) > 1 else 0
+    return [page.player(panels, left=left), *others]
+
+
+def _facts(clip: Clip, frames: range) -> list[page.Fact]:
+    """Return the headline numbers of a clip."""
+    facts = [page.Fact(" × ".join(map(str, clip.shape)), f"frames × rows × columns of {clip.name}")]
+    if clip.has_truth and (mean := motion(clip, frames)[0]) is not None:
+        facts.append(page.Fact(f"{mean:.3g} px", "per frame: mean motion of what moves"))
+    if (found := stated(clip.meta)) is not None:
+        facts.append(page.Fact(f"{found.psnr:.1f} dB", "PSNR of the rendered light itself"))
+    return facts
 
 
 def light_line(clip: Clip) -> str:
@@ -198,7 +170,7 @@ def code_histogram(clip: Clip, stream: Stream) -> Markup:
     drawn = np.bincount(stream.codes(0, count).ravel(), minlength=levels) / (count * stream.shape[1] * stream.shape[2])
     axes, save = page.axes("code", "share of pixels")
     few = levels <= 64
-    axes.bar(np.arange(levels), drawn, width=0.8 if few else 1.0, color="tab:blue", label="drawn")
+    axes.bar(np.arange(levels), drawn, width=0.8 if few else 1.0, color="tab:blue", alpha=0.6, label="drawn")
     words = f"codes of {stream.name}: drawn"
     missing = unexpected(clip, stream)
     if missing is None:
@@ -213,7 +185,7 @@ def code_histogram(clip: Clip, stream: Stream) -> Markup:
     if missing is not None:
         words += f"; no expectation is shown: {missing}"
     axes.legend()
-    return page.figure(save(), words)
+    return save(words)
 
 
 def unexpected(clip: Clip, stream: Stream) -> str | None:
@@ -258,7 +230,7 @@ def _motion_histogram(speed: NDArray[np.floating]) -> Markup:
     known = speed[np.isfinite(speed)]
     axes.hist(known, bins=48, weights=np.full(known.size, 1 / max(known.size, 1)), color="tab:blue")
     axes.set_yscale("log")
-    return page.figure(save(), "motion between successive frames, all pixels")
+    return save("motion between successive frames, all pixels")
 
 
 def _light_histogram(truth: NDArray[np.floating], clip: Clip) -> Markup:
@@ -266,7 +238,7 @@ def _light_histogram(truth: NDArray[np.floating], clip: Clip) -> Markup:
     axes, save = page.axes(f"radiance [{unit}]", "share of pixels")
     axes.hist(truth.ravel(), bins=64, weights=np.full(truth.size, 1 / truth.size), color="tab:blue")
     axes.set_yscale("log")
-    return page.figure(save(), f"light of the {light_name(clip)}, all pixels")
+    return save(f"light of the {light_name(clip)}, all pixels")
 
 
 def error_curve(errors: Sequence[float]) -> Markup:
@@ -274,4 +246,4 @@ def error_curve(errors: Sequence[float]) -> Markup:
     axes, save = page.axes("frame", "rms error of the radiance")
     axes.plot(errors, ".-")
     axes.set_ylim(0, 1.15 * max(max(errors), 1e-30))
-    return page.figure(save(), "error of every frame: noise from independent halves, blur, omitted bounces")
+    return save("error of every frame: noise from independent halves, blur, omitted bounces")

@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from math import floor, log10
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qsim.figures import figure_png, new_figure
+from qsim.figures import figure_svg, new_figure
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -29,6 +31,25 @@ class Panel:
 
     caption: str
     frames: NDArray[np.uint8]
+    score: str = ""  # behind the caption, as in "24.1 dB"
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A headline number and what it is."""
+
+    value: str
+    what: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of a page: heading and content, with a sentence and numbers for the top of the page."""
+
+    title: str
+    body: Markup
+    story: str = ""
+    facts: tuple[Fact, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -67,31 +88,59 @@ def strip(frames: NDArray[np.uint8]) -> str:
     return picture_uri(tall, quality=None if frames.shape[2] <= 256 else 88)
 
 
-def player(panels: Sequence[Panel], *, left: int = -1, milliseconds: int = 120) -> Markup:
-    """Return panels that play together, with a scrubber and a slider that reveals panel `left` over the first."""
+def player(panels: Sequence[Panel], *, left: int = -1, right: int = 0, milliseconds: int = 120) -> Markup:
+    """Return panels that play together, and a large picture in which a dragged line parts panels `left` and `right`."""
     count = len(panels[0].frames)
     for panel in panels:
         if len(panel.frames) != count:
             raise ValueError(f"panel {panel.caption!r} has {len(panel.frames)} frames, the first has {count}")
-    strips = [(panel.caption, strip(panel.frames)) for panel in panels]
-    return _parts().player(strips, count, left % len(panels), milliseconds)
+    strips = [(panel, strip(panel.frames)) for panel in panels]
+    height, width = panels[0].frames.shape[1:3]
+    return _parts().player(
+        strips, count, left % len(panels), right % len(panels), f"{width / height:.4f}", milliseconds
+    )
 
 
 def table(content: Table) -> Markup:
-    """Return a table; numbers have four digits and are aligned to the right."""
+    """Return a table; numbers have four digits, and columns of numbers are aligned to the right."""
+    rows = [[number_text(value) for value in row] for row in content.rows]
     numeric = [
-        bool(content.rows) and all(isinstance(row[i], int | float) or row[i] is None for row in content.rows)
+        bool(rows)
+        and all(
+            isinstance(row[i], int | float) or _NUMBER.match(own[i])
+            for row, own in zip(content.rows, rows, strict=True)
+        )
         for i in range(len(content.headers))
     ]
-    rows = [[number_text(value) for value in row] for row in content.rows]
     return _parts().table(content.caption, content.headers, rows, numeric, content.best)
 
 
+_NUMBER = re.compile(r"[-+−]?[\d.]+([eE][-+]?\d+)?( ± [\d.]+)?( [†%a-zµ/]+)*$|–$|n/a$|failed$|inf$")
+
+
 def number_text(value: object) -> str:
-    """Return a float with four significant digits, None as a dash, and anything else as text."""
+    """Return a float with four digits, without an exponent from 1e-4 to 1e7; None as a dash, other things as text."""
     if value is None:
         return "–"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    if value and 1e-4 <= abs(value) < 1e7:
+        return (
+            f"{value:.{max(3 - floor(log10(abs(value))), 0)}f}".rstrip("0").rstrip(".")
+            if abs(value) < 1e4
+            else f"{value:.0f}"
+        )
+    return f"{value:.4g}"
+
+
+def seconds_text(seconds: float | None) -> str | None:
+    """Return a time with three digits and its unit: 65 µs, 357 ms, 2.1 s; None stays None."""
+    if seconds is None:
+        return None
+    for factor, unit in ((1e6, "µs"), (1e3, "ms")):
+        if 0 < seconds * factor < 1000:
+            return f"{seconds * factor:.3g} {unit}"
+    return f"{seconds:.3g} s"
 
 
 def text(words: str) -> Markup:
@@ -104,19 +153,26 @@ def bullets(lines: Sequence[str]) -> Markup:
     return _parts().bullets(lines)
 
 
-def figure(png: bytes, caption: str) -> Markup:
-    """Return a PNG figure with its caption."""
-    return _parts().figure("data:image/png;base64," + base64.b64encode(png).decode(), caption)
+def stored_figure(png: bytes, caption: str) -> Markup:
+    """Return a stored PNG figure with its caption."""
+    return _parts().stored("data:image/png;base64," + base64.b64encode(png).decode(), caption)
 
 
-def axes(x_label: str, y_label: str) -> tuple[Any, Callable[[], bytes]]:
-    """Return small axes, and a function that returns their figure as PNG bytes."""
-    drawing = new_figure(6.4, 3.0)
+def axes(x_label: str, y_label: str) -> tuple[Any, Callable[[str], Markup]]:
+    """Return small axes, and a function that returns their figure with a caption, in the colours of the page."""
+    from markupsafe import Markup
+
+    drawing = new_figure(4.6, 2.7)
     own = drawing.subplots()
     own.set_xlabel(x_label)
     own.set_ylabel(y_label)
     own.grid(alpha=0.3)
-    return own, lambda: figure_png(drawing)
+
+    def save(caption: str) -> Markup:
+        opening = Markup('<svg role="img" aria-label="{}" ').format(caption)
+        return _parts().drawing(Markup(figure_svg(drawing).replace("<svg ", opening, 1)), caption)
+
+    return own, save
 
 
 def picture(pixels: NDArray[np.uint8], caption: str) -> Markup:
@@ -129,21 +185,17 @@ def grid(figures: Sequence[Markup]) -> Markup:
     return _parts().grid(figures)
 
 
-def section(title: str, *parts: Markup | None) -> Markup:
-    """Return a section with its heading; parts that are None are omitted."""
-    return _parts().section(title, parts)
-
-
-def together(sections: Sequence[Markup]) -> Markup:
-    """Return several sections as one."""
+def section(title: str, *parts: Markup | None, story: str = "", facts: Sequence[Fact] = ()) -> Section:
+    """Return a section of these parts; those that are None are omitted."""
     from markupsafe import Markup
 
-    return Markup("\n").join(sections)
+    return Section(title, Markup("\n").join(part for part in parts if part is not None), story, tuple(facts))
 
 
-def page(title: str, subtitle: str, sections: Sequence[Markup]) -> str:
-    """Return the complete page as text; it loads nothing from elsewhere."""
-    return environment().get_template("page.html").render(title=title, subtitle=subtitle, sections=sections)
+def page(title: str, story: Sequence[str], facts: Sequence[Fact], sections: Sequence[Section]) -> str:
+    """Return the complete page as text: sentences and numbers, contents, sections. It loads nothing from elsewhere."""
+    template = environment().get_template("page.html")
+    return template.render(title=title, story=story, facts=facts, sections=sections, script=script("player.js"))
 
 
 def script(name: str) -> Markup:

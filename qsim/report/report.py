@@ -5,14 +5,15 @@
     restored .json       -> restored video beside its codes and, if the clip is there, its truth and flow
     runs, scores, studies, validations -> tables and curves (table_sections.py)
 
-The page shows stored results only; nothing is recomputed. A player shows at most `clip_section.FRAMES` frames.
+The page shows stored results; from stored pictures it computes only their PSNR and error. A player shows at most
+`panels.FRAMES` frames.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,27 +21,27 @@ from qsim import colour, files
 from qsim.clip.clamped_error import stated
 from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import MOVING
-from qsim.clip.photons import clip_photons
 from qsim.clip.stream import Stream
 from qsim.dataset.checking import Restored
 from qsim.dataset.dataset import Dataset
 from qsim.files import Progress
 from qsim.report import html as page
 from qsim.report import table_sections
-from qsim.report.clip_section import (
+from qsim.report.clip_section import clip_section, motion
+from qsim.report.panels import (
     chosen_frames,
-    clip_section,
+    error_panel,
     fit,
-    flow_panel,
     legend,
     light_name,
-    motion,
+    score,
     stream_panels,
+    truth_panels,
+    truth_photons,
 )
 
-if TYPE_CHECKING:
-    from markupsafe import Markup
-
+_SENTENCES, _FACTS = 4, 8  # at most on top of a page
+_STORY = ("dataset", "training", "evaluation", "static", "restored", "study", "clip")  # the kinds in that order
 INSIDE_CLIPS = {"streams", "truth", "radiance", "sharp", "jobs", "failed", "logs", "locks", "work"}
 
 
@@ -54,10 +55,10 @@ def build_page(
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     kinds = {file: _kind(file) for file in _known_files(path)}
-    found = [(kind, file) for kind in _DRAW for file in kinds if kinds[file] == kind]
+    found = [(kind, file) for kind in _ORDER for file in kinds if kinds[file] == kind]
     total = sum(_steps(kind, file) for kind, file in found)
     done = 0
-    drawn = []
+    drawn: list[tuple[str, page.Section]] = []
 
     def step() -> None:
         nonlocal done
@@ -66,17 +67,26 @@ def build_page(
             progress(done, total)
 
     for kind, file in found:
-        drawn.append(dataset_section(file, step) if kind == "dataset" else _DRAW[kind](file))
-        if kind != "dataset":
+        if kind == "dataset":
+            drawn += [(kind, section) for section in dataset_sections(file, step)]
+        else:
+            drawn.append((kind, _DRAW[kind](file)))
             step()
     if not drawn:
         raise ValueError(f"{path}: nothing to report; expected a clip, a data set, a restored video or an evaluation")
-    words = [page.section("About this page", page.bullets(notes))] if notes else []
-    return page.page(
-        title or f"qsim report: {path.name}",
-        f"{len(drawn)} section{'s' if len(drawn) > 1 else ''} from {path}",
-        [*words, *drawn],
-    )
+    sections = [section for _, section in drawn]
+    about = [page.section("About this page", page.bullets(notes))] if notes else []
+    story, facts = _top(drawn)
+    count = f"{len(drawn)} result{'s' if len(drawn) > 1 else ''} under {path}."
+    return page.page(title or f"qsim report: {path.name}", [count, *story], facts, [*about, *sections])
+
+
+def _top(drawn: list[tuple[str, page.Section]]) -> tuple[list[str], list[page.Fact]]:
+    """Return sentences and numbers for the top of a page: of the first section of each kind, in the order of _STORY."""
+    first = dict(reversed(drawn))
+    told = [first[kind] for kind in _STORY if kind in first]
+    facts = [fact for section in told for fact in section.facts]
+    return [section.story for section in told if section.story][:_SENTENCES], facts[:_FACTS]
 
 
 def _known_files(path: Path) -> list[Path]:
@@ -119,13 +129,14 @@ def _steps(kind: str, file: Path) -> int:
     return len(Dataset.open(file.parent).names()) if kind == "dataset" else 1
 
 
-def dataset_section(path: Path, step: Callable[[], None] = lambda: None) -> Markup:
+def dataset_sections(path: Path, step: Callable[[], None] = lambda: None) -> list[page.Section]:
     """Return a table of the clips of a data set and the first clip of each split; call `step` after each clip."""
     data = Dataset.open(path.parent)
-    rows, below = [], set()
+    rows, below, splits = [], set(), []
     for name in data.names():
         clip = Clip.open(data.path / "clips" / name)
         split = data.meta["jobs"][name]["split"]
+        splits.append(split)
         frames, height, width = clip.shape
         mean, largest = motion(clip, [len(clip) // 2]) if clip.has_truth else (None, None)
         size, found = f"{frames} × {height} × {width}", stated(clip.meta)
@@ -133,42 +144,57 @@ def dataset_section(path: Path, step: Callable[[], None] = lambda: None) -> Mark
                      None if found is None else found.psnr])  # fmt: skip
         below |= set() if found is None else {found.below.split(" (")[0]}
         step()
-    unit = " or ".join(sorted(below)) or "white"
     headers = [
         "clip", "split", "frames × rows × columns", "mean radiance", "photons per pixel",
-        "motion of what moves [px/frame]", "largest", f"radiance's PSNR [dB below {unit}]",
+        "motion [px/frame]", "largest [px/frame]", "noise floor [dB]",
     ]  # fmt: skip
     missing = f"; missing: {', '.join(data.missing)}" if data.missing else ""
-    caption = f"{len(rows)} clips{missing}; motion in the middle frame, of pixels that move more than {MOVING:g} px"
-    overview = page.section(f"Data set {data.name}", page.table(page.Table(caption, headers, rows)))
+    caption = (
+        f"{len(rows)} clips{missing}; motion in the middle frame, of pixels that move more than {MOVING:g} px; noise "
+        f"floor: PSNR of the rendered light below {' or '.join(sorted(below)) or 'white'}"
+    )
+    counts = ", ".join(f"{splits.count(split)} {split}" for split in dict.fromkeys(splits))
+    story = f"Data set {data.name} has {len(rows)} clips ({counts}), each of another scene or another seed."
+    facts = [page.Fact(str(len(rows)), f"clips in {data.name}")]
+    table = page.table(page.Table(caption, headers, rows))
+    overview = page.section(f"Data set {data.name}", table, story=story, facts=facts)
     shown = [clip for split in ("test", "train", "val") for clip in data.clips(split)[:1]]
-    return page.together([overview, *(clip_section(clip) for clip in shown)])
+    return [overview, *(clip_section(clip) for clip in shown)]
 
 
-def restored_section(path: Path) -> Markup:
-    """Return restored video beside its codes and truth, all with one white."""
+def restored_section(path: Path) -> page.Section:
+    """Return restored video beside its codes and truth, all with one white, with the error of each."""
     video = Restored.open(path)
     meta, restored = video.meta, video.frames()
     frames = chosen_frames(len(restored))
     shown = np.asarray(restored[: len(frames)])
     clip, stream = _source(meta)
+    name, truth = str(meta["method"]), None
     panels: list[page.Panel] = []
-    white = colour.peak(shown)
-    if clip is not None and stream is not None and len(clip) >= len(frames):
-        photons = np.stack([clip_photons(clip, t, stream.photons_factor, sharp=True) for t in frames])
-        white = colour.peak(photons)
-        panels = [page.Panel(light_name(clip), fit(colour.tone(photons, white))), *stream_panels(stream, frames)]
-    place = len(panels)
-    panels.append(page.Panel(f"restored by {meta['method']}", fit(colour.tone(shown, white))))
-    wheel = None
-    if clip is not None and len(panels) > 1 and clip.has_truth:
-        panel, largest, _ = flow_panel(clip, frames)
-        panels.append(panel)
-        wheel = legend(largest)
-    line = (
-        f"{meta['description']}; {meta['seconds_per_frame']:.3g} s per frame; pictures are white at {white:.3g} photons"
-    )
-    return page.section(f"Restored: {path.stem}", page.text(line), page.player(panels, left=place), wheel)
+    if clip is not None and stream is not None:
+        truth = truth_photons(clip, stream, frames)
+    white = colour.peak(shown if truth is None else truth)
+    own = page.Panel(f"restored by {name}", fit(colour.tone(shown, white)), score(shown, truth))
+    wheel, lines = None, [f"{meta['description']}; {page.seconds_text(meta['seconds_per_frame'])} per frame."]
+    if clip is None or stream is None or truth is None:
+        panels = [own]
+    else:
+        light = page.Panel(light_name(clip), fit(colour.tone(truth, white)))
+        panels = [light, own, error_panel(name, shown, truth), *stream_panels(stream, frames, truth)]
+        lines.append(
+            f"PSNR of {len(frames)} frames against the {light_name(clip)}, both clamped at its white. Codes are shown "
+            "as the light at which they are the mean code."
+        )
+        if clip.has_truth:
+            motion_panels, largest, _ = truth_panels(clip, frames)
+            panels.append(motion_panels[1])
+            wheel = legend(largest)
+    lines.append(f"White of the pictures: {white:.3g} photons.")
+    found = f" at {own.score} PSNR" if own.score else ""
+    story = f"{stream.name if stream else path.stem} is restored by {name}{found}."
+    facts = [page.Fact(own.score, f"PSNR of {path.stem}")] if own.score else []
+    player = page.player(panels, left=len(panels) - 1 if len(panels) < 4 else 3, right=1 if len(panels) > 1 else 0)
+    return page.section(f"Restored: {path.stem}", player, page.bullets(lines), wheel, story=story, facts=facts)
 
 
 def _source(meta: dict[str, Any]) -> tuple[Clip | None, Stream | None]:
@@ -180,7 +206,7 @@ def _source(meta: dict[str, Any]) -> tuple[Clip | None, Stream | None]:
         return None, None
 
 
-_DRAW: dict[str, Callable[[Path], Markup]] = {
+_DRAW: dict[str, Callable[[Path], page.Section]] = {
     "restored": restored_section,  # moving pictures first
     "evaluation": table_sections.evaluation_section,
     "static": table_sections.static_section,
@@ -189,6 +215,7 @@ _DRAW: dict[str, Callable[[Path], Markup]] = {
     "bench": table_sections.bench_section,
     "validation": table_sections.validation_section,
     "reading": table_sections.reading_section,
-    "dataset": dataset_section,
     "clip": lambda path: clip_section(Clip.open(path.parent)),
 }
+
+_ORDER = ("restored", "evaluation", "static", "training", "study", "bench", "validation", "reading", "dataset", "clip")

@@ -21,19 +21,63 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
 NAIVE = "obvious_"  # begins the keys of the naive loop in stored reports
+_HEADINGS = {  # of keys whose words alone are unclear
+    "answer": "answer",
+    "bits": "bits",
+    "fps": "frames/s",
+    "ppp": "photons per pixel",
+    "lux": "faceplate lux at 555 nm",
+    "peak": "peak of the PSNR [photons]",
+    "frame_rate": "planes/s",
+    "motion_px_per_code_frame": "motion [px per 3-bit frame]",
+    "blur_error": "blur [photons rms]",
+    "blur_predicted": "blur expected [photons rms]",
+    "shot_error": "photon noise [photons rms]",
+    "quantisation_error": "quantization [photons rms]",
+    "read_error": "read noise [photons rms]",
+    "snr_db": "SNR [dB]",
+    "psnr_db": "PSNR [dB]",
+    "psnr_predicted_db": "PSNR expected [dB]",
+    "psnr_error_db": "standard error [dB]",
+    "sigmas": "difference [standard errors]",
+    "psnr_matched": "PSNR matched [dB]",
+    "psnr": "PSNR [dB]",
+    "stated_psnr": "PSNR stated [dB]",
+    "seconds_per_frame": "seconds/frame",
+    "peak_bytes": "memory [bytes]",
+    "gmac_per_frame": "GMAC/frame",
+    "cdf_error": "error of the cdf",
+    "p_value": "p of chi-square",
+}
+_SUFFIXES = (
+    ("_megabytes_per_second", " [MB/s]"),
+    ("_px_per_frame", " [px/frame]"),
+    ("_db", " [dB]"),
+    ("_fps", " [1/s]"),
+)
 
 
-def training_section(path: Path) -> Markup:
-    """Return the learning curve: PSNR of the validation clips against minutes."""
+def training_section(path: Path) -> page.Section:
+    """Return the learning curve: PSNR of the validation clips against minutes, with the weights that were kept."""
     history = files.read_json(path)["history"]
+    minutes, scores = ([entry[key] for entry in history] for key in ("elapsed", "psnr_matched"))
+    minutes = [seconds / 60 for seconds in minutes]
     axes, save = page.axes("minutes of training", "validation PSNR, matched [dB]")
-    axes.plot([entry["elapsed"] / 60 for entry in history], [entry["psnr_matched"] for entry in history], ".-")
-    last = history[-1]
-    words = f"{last['step']} steps in {last['elapsed'] / 60:.1f} minutes; last {last['psnr_matched']:.2f} dB"
-    return page.section(f"Training: {path.parent.name}", page.figure(save(), words))
+    axes.plot(minutes, scores, ".-")
+    best = max(range(len(scores)), key=lambda i: scores[i] if _is_number(scores[i]) else float("-inf"))
+    axes.plot(minutes[best], scores[best], "o", color="tab:orange", label="best, kept")
+    axes.legend()
+    name = path.parent.name
+    story = f"Training {name} reached {scores[best]:.2f} dB on the validation clips after {minutes[best]:.1f} minutes."
+    words = (
+        f"{history[-1]['step']} steps in {minutes[-1]:.1f} minutes. The weights of the best validation are kept "
+        f"({scores[best]:.2f} dB); the last one has {scores[-1]:.2f} dB."
+    )
+    facts = [page.Fact(f"{scores[best]:.2f} dB", f"best validation of {name}")]
+    return page.section(f"Training: {name}", save(words), story=story, facts=facts)
 
 
-def evaluation_section(path: Path) -> Markup:
+def evaluation_section(path: Path) -> page.Section:
     """Return the scores of methods on held-out clips: means and 95 % intervals over scenes, best matched PSNR bold."""
     found = files.read_json(path)
     rows = [
@@ -43,7 +87,7 @@ def evaluation_section(path: Path) -> Markup:
             _pm(line["scores"]["psnr"], 2) + _near(line, "psnr"),
             _pm(line["scores"]["psnr_matched"], 2) + _near(line, "psnr_matched"),
             _pm(line["scores"]["ssim_matched"], 3),
-            line["seconds_per_frame"],
+            page.seconds_text(line["seconds_per_frame"]),
             _percent(line.get("above_peak")),
             line["truth_psnr"],
         ]
@@ -56,19 +100,35 @@ def evaluation_section(path: Path) -> Markup:
         "method",
         "light",
         "PSNR [dB]",
-        "PSNR matched [dB]",
+        "matched [dB]",
         "SSIM matched",
-        "s/frame",
-        "truth above the peak",
-        "truth's own PSNR [dB]",
+        "time/frame",
+        "above peak",
+        "noise floor [dB]",
     ]
-    caption = f"mean ± half of the 95 % interval over scenes; {_definition(found)}"
+    caption = (
+        f"mean ± half of the 95 % interval over scenes; {_definition(found)}; above peak: share of the truth's pixels; "
+        "noise floor: PSNR of the rendered truth itself"
+    )
     if any(line.get("near_truth") for line in found["table"]):
-        caption += "; † within 3 dB of the truth's own PSNR in at least one clip, so its error is a large part"
-    missing = f"No weights ship of {', '.join(found['no_weights'])}." if found.get("no_weights") else ""
+        caption += "; † within 3 dB of the noise floor in at least one clip, so the error of the truth is a large part"
     table = page.table(page.Table(caption, headers, rows, frozenset(best)))
-    remarks = [page.text(remark) for remark in (*found.get("remarks", []), missing)]
-    return page.section(f"Methods compared: {path.parent.name}", table, *remarks, _speed_against_error(found))
+    remarks = [page.text(remark) for remark in found.get("remarks", [])]
+    winners = [found["table"][i] for i in sorted(best)]
+    facts = [
+        page.Fact(
+            f"{_pm(line['scores']['psnr_matched'], 1)} dB", f"best matched PSNR, {line['method']} at {line['light']}"
+        )
+        for line in winners
+    ]
+    parts = [table, *remarks, _speed_against_error(found)]
+    return page.section(f"Methods compared: {path.parent.name}", *parts, story=_winner(winners), facts=facts)
+
+
+def _winner(lines: list[dict[str, Any]]) -> str:
+    """Return a sentence with the best method of each light level."""
+    best = [f"{_pm(line['scores']['psnr_matched'], 1)} dB by {line['method']} at {line['light']}" for line in lines]
+    return f"On held-out clips the best matched PSNR is {', '.join(best)}."
 
 
 def _definition(found: dict[str, Any]) -> str:
@@ -97,7 +157,7 @@ def _pm(interval: dict[str, Any], digits: int) -> str:
     return f"{mean:.{digits}f}" + (f" ± {half:.{digits}f}" if isinstance(half, int | float) else "")
 
 
-def static_section(path: Path) -> Markup:
+def static_section(path: Path) -> page.Section:
     """Return the scores on measured photons of a static object: some frames are restored, the others the reference."""
     found = files.read_json(path)
     headers = ["method", "PSNR [dB]", "PSNR matched [dB]", "spread over splits [dB]", "with the reference's noise [dB]"]
@@ -125,17 +185,17 @@ def _speed_against_error(found: dict[str, Any]) -> Markup | None:
         ]
         axes.plot([p[0] for p in points], [p[1] for p in points], mark, label=light)
         for seconds, psnr, method in points:
-            axes.annotate(method, (seconds, psnr), textcoords="offset points", xytext=(4, 4), fontsize=7)
+            axes.annotate(method, (seconds, psnr), textcoords="offset points", xytext=(4, 4), fontsize=8)
         drawn += len(points)
     if not drawn:
         return None
     axes.set_xscale("log")
     axes.margins(0.15)  # space for the names
-    axes.legend(fontsize=7)
-    return page.figure(save(), "speed against error: up and to the left is better")
+    axes.legend(fontsize=8)
+    return save("speed against error: up and to the left is better")
 
 
-def study_section(path: Path) -> Markup:
+def study_section(path: Path) -> page.Section:
     """Return the rows of a bit-depth study, or the cells of a sweep, with their stored figures."""
     found = files.read_json(path)
     rows = found.get("rows") or found.get("cells") or []
@@ -149,23 +209,24 @@ def study_section(path: Path) -> Markup:
     pictures = [
         folder_picture for name in (path.stem, "best") if (folder_picture := path.with_name(f"{name}.png")).is_file()
     ]
-    figures = [page.figure(picture.read_bytes(), f"{path.parent.name}/{picture.name}") for picture in pictures]
-    return page.section(f"Study: {path.parent.name}", page.bullets(lines), *figures, table)
+    figures = [page.stored_figure(picture.read_bytes(), f"{path.parent.name}/{picture.name}") for picture in pictures]
+    story = next((str(text) for text in (found.get("answer"), *found.get("answers", [])) if text), "")
+    return page.section(f"Study: {path.parent.name}", page.bullets(lines), *figures, table, story=story)
 
 
-def bench_section(path: Path) -> Markup:
+def bench_section(path: Path) -> page.Section:
     """Return the cost of a restored frame beside its PSNR."""
     found = files.read_json(path)
     keys = list(dict.fromkeys(key for cost in found["costs"] for key in cost if not isinstance(cost[key], list | dict)))
     rows = [[cost.get(key) for key in keys] for cost in found["costs"]]
     setting = ", ".join(f"{key} {value}" for key, value in found["setting"].items() if value is not None)
     picture = path.with_name("bench.png")
-    figure = page.figure(picture.read_bytes(), "seconds per frame against PSNR") if picture.is_file() else None
+    figure = page.stored_figure(picture.read_bytes(), "seconds per frame against PSNR") if picture.is_file() else None
     table = page.table(page.Table(setting, [_heading(key) for key in keys], rows))
     return page.section(f"Cost of a frame: {path.parent.name}", figure, table)
 
 
-def validation_section(path: Path) -> Markup:
+def validation_section(path: Path) -> page.Section:
     """Return speed against error of sensor models or of rendering, from the JSON of `qsim validate`."""
     found = files.read_json(path)
     verdict = "everything is within its bounds" if found["ok"] else "something is OUTSIDE its bounds"
@@ -192,10 +253,10 @@ def validation_section(path: Path) -> Markup:
     table = page.table(page.Table(f"{what}: {verdict}", [_heading(key) for key in keys], rows))
     cases = [[case["name"], case["found"], "right" if case["ok"] else "wrong"] for case in found.get("cases", [])]
     hard = page.table(page.Table("hard cases", ["case", "found", ""], cases)) if cases else None
-    return page.section("Validation", page.figure(save(), "speed against error"), table, hard)
+    return page.section("Validation", save("speed against error"), table, hard)
 
 
-def reading_section(path: Path) -> Markup:
+def reading_section(path: Path) -> page.Section:
     """Return the windows read per second from a clip and from video, from the JSON of `qsim validate reading`."""
     found = files.read_json(path)
     window, clip = (" × ".join(map(str, found[key])) for key in ("window_shape", "clip_shape"))
@@ -210,7 +271,12 @@ def reading_section(path: Path) -> Markup:
 
 
 def _heading(key: str) -> str:
-    """Return a key of a file as a heading; in files, keys of the naive loop begin with NAIVE."""
+    """Return a key of a file as a heading with its unit; in files, keys of the naive loop begin with NAIVE."""
+    if key in _HEADINGS:
+        return _HEADINGS[key]
+    for suffix, unit in _SUFFIXES:
+        if key.endswith(suffix):
+            return key.removesuffix(suffix).replace("_", " ") + unit
     return key.replace(NAIVE, "naive_").replace("_", " ")
 
 

@@ -10,6 +10,7 @@ from qsim.colour import (
     depth_colours,
     depth_legend,
     depth_range,
+    error_colours,
     flow_colours,
     flow_legend,
     from_linear,
@@ -122,3 +123,16 @@ def test_transfer_curves_are_inverted_exactly(transfer: str, top: int):
     assert (linear[0], linear[-1]) == (0, pytest.approx(1))
     back = from_linear(linear, transfer, top).astype(int)
     assert np.abs(back - coded).max() <= (0 if top == 255 else 1)
+
+
+def test_error_colour_shows_sign_and_size():
+    """White is no error, red above, blue below; clipped at the full colour; grey where it is unknown."""
+    error = np.array([[0.0, 1.0, 2.0, 9.0, -1.0, -2.0, np.nan]])
+    colours = error_colours(error, 2.0)[0].astype(int)
+    assert list(colours[0]) == [255, 255, 255]
+    assert colours[1][0] == 255 > colours[1][2] > colours[2][2]
+    assert list(colours[2]) == list(colours[3])
+    assert colours[4][2] == 255 > colours[4][0] > colours[5][0]
+    assert list(colours[6]) == [128, 128, 128]
+    with pytest.raises(ValueError, match="must be positive"):
+        error_colours(error, 0.0)

@@ -39,13 +39,13 @@ def test_the_expected_codes_include_the_maps(tmp_path, name):
     photons = np.stack([clip_photons(clip, t, stream.photons_factor) for t in range(6)])
     blind = stream.sensor.pmf(photons, stream.exposure).reshape(-1, 2**stream.bits)
     assert mixture_p_value(codes, blind) < 1e-6
-    section = clip_section.clip_section(clip)
+    section = clip_section.clip_section(clip).body
     assert "exact distribution of the sensor and its map of defects" in section
     assert "; defects: " in section
     if name == "measured":
         assert "dark_map rates.npy" in section
         np.save(tmp_path / "rates.npy", rates * 2)
-        assert "rates.npy has changed since the stream was drawn" in clip_section.clip_section(clip)
+        assert "rates.npy has changed since the stream was drawn" in clip_section.clip_section(clip).body
 
 
 def test_no_expectation_is_shown_without_an_exact_one(tmp_path):
@@ -64,16 +64,6 @@ def test_no_expectation_is_shown_without_an_exact_one(tmp_path):
     assert "light is unknown" in str(clip_section.unexpected(clip, unknown))
 
 
-def test_average_is_the_mean_of_the_codes_around(folder):
-    stream = Clip.open(folder / "square").stream(Clip.open(folder / "square").streams[0])
-    codes = stream.codes(0, 5)
-    shown = clip_section.stream_panels(stream, range(5))[1].frames
-    mean = codes.mean(axis=0) / 7  # five frames: every window of eleven holds all of them
-    assert np.array_equal(shown[0], shown[4])
-    brightest = np.unravel_index(np.argmax(mean), mean.shape)
-    assert shown[2][brightest] == 255
-
-
 def test_the_section_states_light_motion_model_and_error(tmp_path):
     """Numbers of the page are those of the clip: photons, factor, lux, motion, findings, error of every frame."""
     clip = write_clip(
@@ -86,7 +76,7 @@ def test_the_section_states_light_motion_model_and_error(tmp_path):
     assert f"{clip.mean_photons:.4g} photons per pixel and exposure" in page
     assert f"3.25 photons per pixel (the clip&#39;s light × {stream.photons_factor:.4g}), equal to 1.313 lx" in page
     assert "2.6 e⁻ per pixel; 3 bit, QIS (multibit): quantum_efficiency 0.8 e-/photon" in page
-    assert "<td>bounces</td><td>2</td><td>later ones &lt;1 %</td>" in page
+    assert '<td>bounces</td><td class="number">2</td><td>later ones &lt;1 %</td>' in page
     assert "Error of a frame (noise, blur, omitted bounces): 0.01 rms in the unit of the radiance, worst 0.01" in page
     for words in ("light of the truth", "drawn, and expected from the light", "error of every frame"):
         assert words in page, words

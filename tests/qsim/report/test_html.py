@@ -5,7 +5,21 @@ import re
 import numpy as np
 import pytest
 
-from qsim.report.html import MAX_STRIP, Panel, Table, figure, number_text, page, player, section, strip, table
+from qsim.report.html import (
+    MAX_STRIP,
+    Fact,
+    Panel,
+    Table,
+    axes,
+    number_text,
+    page,
+    player,
+    seconds_text,
+    section,
+    stored_figure,
+    strip,
+    table,
+)  # fmt: skip
 
 
 def frames(t: int = 3, h: int = 5, w: int = 7) -> np.ndarray:
@@ -14,15 +28,18 @@ def frames(t: int = 3, h: int = 5, w: int = 7) -> np.ndarray:
 
 def test_page_loads_nothing_from_elsewhere():
     body = section("A scene", player([Panel("truth", frames()), Panel("codes", frames())]))
-    text = page("Title", "subtitle", [body])
+    text = page("Title", ["story"], [Fact("3 dB", "better")], [body])
     addresses = re.findall(r'(?:src|href|data-strip)="([^"]*)"', text)
-    assert addresses
-    assert all(a.startswith("data:") for a in addresses)
+    assert sum(a.startswith("data:") for a in addresses) == 2
+    assert [a for a in addresses if not a.startswith("data:")] == ["#s1"]
     assert "{{" not in text
+    assert "<strong>3 dB</strong>" in text
 
 
 def test_text_is_escaped():
-    text = page("<b>", "&", [section("<i>", table(Table("c", ["<x>"], [["a<b"]])))])
+    text = page("<b>", ["&<u>"], [], [section("<i>", table(Table("c", ["<x>"], [["a<b"]])))])
+    assert "&amp;&lt;u&gt;" in text
+    assert "&lt;i&gt;</h2>" in text
     assert "<b>" not in text.replace("<body>", "")
     assert "a&lt;b" in text
 
@@ -57,5 +74,51 @@ def test_numbers_are_aligned_and_none_is_a_dash():
     assert number_text(3) == "3"
 
 
-def test_figure_embeds_its_bytes():
-    assert "data:image/png;base64,aGk=" in figure(b"hi", "caption")
+def test_columns_of_formatted_numbers_are_aligned_too():
+    text = table(
+        Table("t", ["PSNR", "time", "light"], [["20.12 ± 0.50 †", "65 µs", "3.25 PPP"], ["failed", "–", "26 PPP"]])
+    )
+    assert text.count('class="number"') == 2 * 3
+    assert "<td>26 PPP</td>" in text
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(6.502e-5, "6.502e-05"), (0.00065, "0.00065"), (0.35681, "0.3568"), (12.0, "12"), (1428.57, "1429"),
+     (123456.7, "123457"), (0.0, "0")],
+)  # fmt: skip
+def test_numbers_have_four_digits(value, shown):
+    assert number_text(value) == shown
+
+
+@pytest.mark.parametrize(
+    ("seconds", "shown"), [(6.502e-5, "65 µs"), (0.3568, "357 ms"), (2.1, "2.1 s"), (0.0, "0 s"), (None, None)]
+)
+def test_times_have_units(seconds, shown):
+    assert seconds_text(seconds) == shown
+
+
+def test_a_stored_figure_embeds_its_bytes():
+    assert "data:image/png;base64,aGk=" in stored_figure(b"hi", "caption")
+
+
+def test_figures_follow_the_colours_of_the_page():
+    """No black or white is left in the SVG, its text is text, and a caption cannot break out of it."""
+    drawing, save = axes("<x>", "y")
+    drawing.plot([1, 2], [3, 4])
+    drawing.set_xscale("log")
+    text = save('a "caption" <b>')
+    assert text.startswith("<figure><svg role=")
+    assert "currentColor" in text
+    assert "var(--mark)" in text
+    assert not re.search(r"#000000|#ffffff|<metadata|<\?xml|<g id=", text)
+    assert "&lt;x&gt;</text>" in text
+    assert "<b>" not in text
+    assert 'aria-label="a &#34;caption&#34; &lt;b&gt;"' in text
+
+
+def test_a_player_states_scores_and_its_shape():
+    text = player([Panel("truth", frames()), Panel("codes", frames(), "12.1 dB")], left=1)
+    assert "<b>12.1 dB</b>" in text
+    assert "--ratio: 1.4000" in text
+    assert text.index('<option value="1" selected>') < text.index('<option value="0" selected>')

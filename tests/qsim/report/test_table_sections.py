@@ -14,9 +14,52 @@ def test_an_evaluation_defines_its_scores(folder):
     line = found["table"][0] | {"above_peak": 0.0961, "truth_psnr": 21.0, "near_truth": ["psnr_matched"]}
     path.write_text(json.dumps(found | {"table": [line]}))
     page = report.build_page(folder, title="All")
-    for words in ("behind the clamp", "9.6 %", "20.00 ± 1.00 †", "within 3 dB of the truth", "&lt;nano&gt; was never"):
+    for words in (
+        "behind the clamp",
+        "9.6 %",
+        "20.00 ± 1.00 †",
+        "within 3 dB of the noise floor",
+        "&lt;nano&gt; was never",
+    ):
         assert words in page, words
     assert "of the earlier definition" not in page
+
+
+def test_the_top_of_a_page_tells_the_best_method_and_the_kept_weights(tmp_path):
+    """The best of each light level, and the best validation, not the last."""
+
+    def line(method: str, light: str, psnr: float) -> dict:
+        interval = {"mean": psnr, "half_width": 0.5, "scenes": 3}
+        scores = dict.fromkeys(("psnr", "psnr_matched", "ssim_matched"), interval)
+        return {"method": method, "light": light, "seconds_per_frame": 6.5e-5, "truth_psnr": 38.0, "scores": scores}
+
+    lines = [line("a", "3 PPP", 20.0), line("b", "3 PPP", 22.0), line("a", "9 PPP", 25.0), line("b", "9 PPP", 24.0)]
+    evaluation = {"format": "quiver-evaluation-2", "peak": "white", "table": lines, "no_weights": ["RVRT"]}
+    (tmp_path / "evaluation.json").write_text(json.dumps(evaluation))
+    entries = [
+        {"step": i, "elapsed": 60.0 * i, "psnr_matched": psnr} for i, psnr in ((1, 20.0), (2, 22.76), (3, 22.26))
+    ]
+    (tmp_path / "history.json").write_text(json.dumps({"history": entries}))
+    page = report.build_page(tmp_path)
+    top = page.split("</header>")[0]
+    assert "best matched PSNR is 22.0 ± 0.5 dB by b at 3 PPP, 25.0 ± 0.5 dB by a at 9 PPP." in top
+    assert "reached 22.76 dB on the validation clips after 2.0 minutes" in top
+    assert "<strong>22.76 dB</strong>" in top
+    assert "are kept (22.76 dB); the last one has 22.26 dB" in page
+    assert '<td class="number">65 µs</td>' in page
+    assert page.count("class=best") == 2
+    assert "RVRT" not in page
+
+
+def test_headings_have_units(tmp_path):
+    row = {"model": "planes", "bits": 3, "blur_error": 0.5, "loss_of_prediction_db": 0.25, "new_key": 1}
+    (tmp_path / "tradeoff.json").write_text(
+        json.dumps({"answer": "3 bits are best.", "rows": [row], "structure_function": []})
+    )
+    page = report.build_page(tmp_path)
+    for heading in ("blur [photons rms]", "loss of prediction [dB]", "new key"):
+        assert f">{heading}</th>" in page, heading
+    assert "3 bits are best." in page.split("</header>")[0]
 
 
 def test_studies_costs_and_validations_have_their_sections(tmp_path):
