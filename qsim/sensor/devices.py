@@ -62,11 +62,13 @@ def quiver_published(ppp: float, bits: int = 3, exposure: float = 5e-4) -> QIS:
 
 
 def quiver_physical(ppp: float, bits: int = 3) -> QIS:
-    """Return our default: dark current per second as in the paper's text, and the program's gain.
+    """Return our default: dark current per second as in the paper's text, and the program's gain, but at most 1.
 
-    The gain is 0.5 (2^b - 1) / PPP.
+    The gain is min(0.5 (2^b - 1) / PPP, 1) codes per electron. A larger one leaves codes unused: at 0.5 PPP and 3 bits
+    the program's rule makes 7 codes per electron, and frames hold little but 0 and 7.
     """
-    return QIS(_QUIVER_QE, _QUIVER_DARK, _QUIVER_READ_NOISE, bits, gain=_gain("quiver-physical", ppp, bits))
+    gain = min(_gain("quiver-physical", ppp, bits), 1.0)
+    return QIS(_QUIVER_QE, _QUIVER_DARK, _QUIVER_READ_NOISE, bits, gain=gain)
 
 
 def _gain(name: str, ppp: float, bits: int) -> float:
@@ -93,6 +95,7 @@ _QUIVER_SOURCES = {
     "read_noise": "0.2 e- rms; same paper (also its figure 1)",
 }
 _RULE = "0.5 (2^bits - 1) / PPP; the rule behind the default of the authors' program, 1.0769 at 3.25 PPP and 3 bits"
+_PHYSICAL_RULE = "min(0.5 (2^bits - 1) / PPP, 1); the same rule, with at most one code per electron; our choice"
 
 
 def _need(name: str, ppp: float | None) -> float:
@@ -107,10 +110,10 @@ DEVICES: Mapping[str, Device] = MappingProxyType(
         for device in (
             Device(
                 "quiver-physical",
-                "QUIVER's sensor with the text's dark current and the program's gain rule (default)",
+                "QUIVER's sensor with the text's dark current and the program's gain, at most 1 (default)",
                 3,
                 lambda ppp, bits, exposure: quiver_physical(_need("quiver-physical", ppp), bits),
-                {**_QUIVER_SOURCES, "dark_current": "1.6 e-/s; same paper, text", "gain": _RULE},
+                {**_QUIVER_SOURCES, "dark_current": "1.6 e-/s; same paper, text", "gain": _PHYSICAL_RULE},
                 follows_light=True,
             ),
             Device(

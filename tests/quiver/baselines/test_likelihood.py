@@ -5,6 +5,7 @@ import pytest
 
 from qsim.keys import Key
 from qsim.sensor.devices import quiver_paper, quiver_physical
+from qsim.sensor.qis import QIS
 from quiver.baselines import likelihood
 
 EXPOSURE = 5e-4
@@ -17,7 +18,7 @@ def flat(sensor, photons, frames, shape=(40, 50)):
 def test_single_codes_worked_by_hand():
     """The most likely light for each single 3-bit code; the last one is the cap."""
     codes = np.arange(8, dtype=np.uint8).reshape(1, 2, 4)
-    restored = likelihood.restore(codes, quiver_physical(3.25), EXPOSURE, window=1)
+    restored = likelihood.restore(codes, QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25), EXPOSURE, window=1)
     expected = [0, 1.237, 2.467, 3.677, 4.852, 5.979, 7.055, 10.326]
     np.testing.assert_allclose(restored.ravel(), expected, atol=6e-4)
 

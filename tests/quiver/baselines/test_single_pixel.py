@@ -91,7 +91,7 @@ def test_the_light_a_gain_is_made_for_is_recovered(ppp):
 
 
 def test_caps_and_dark_level_worked_by_hand():
-    table = quiver_physical(3.25).response(EXPOSURE)
+    table = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25).response(EXPOSURE)
     np.testing.assert_allclose([table.cap(n) for n in (1, 3, 5, 11)], [10.326, 12.873, 13.969, 15.584], atol=6e-4)
     np.testing.assert_allclose(table.mean[0], 0.010941, atol=1e-6)
     np.testing.assert_allclose(table.invert(2.696241, 100), 3.25, rtol=1e-5)
@@ -100,7 +100,7 @@ def test_caps_and_dark_level_worked_by_hand():
 @pytest.mark.parametrize(("factor", "bias"), [(0.5, -0.041), (1, -0.037), (2, -0.096), (4, -0.389)])
 def test_the_naive_mean_is_as_biased_as_clipping_makes_it(factor, bias):
     """Expectation over one code, worked by hand for 3.25 photons per pixel."""
-    sensor, photons = quiver_physical(3.25), 3.25 * factor
+    sensor, photons = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25), 3.25 * factor
     estimate = naive_mean.restore(np.arange(8, dtype=np.uint8).reshape(1, 1, 8), sensor, EXPOSURE, window=1)[0, 0]
     unclamped = np.where(estimate > 0, estimate, -naive_mean.dark_codes(sensor, EXPOSURE) * sensor.white(EXPOSURE) / 7)
     pmf = np.exp(sensor.log_pmf(np.array([photons]), EXPOSURE))[0]

@@ -12,7 +12,7 @@ from quiver.baselines import moment, transform_denoise
 from quiver.baselines.vst import stabiliser, sum_pmf
 
 EXPOSURE = 5e-4
-SENSOR = quiver_physical(3.25)
+SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
 PHOTONS = np.array([0.3, 1, 2, 3.25, 5, 8])
 
 

@@ -32,7 +32,7 @@ def test_sensed_codes_and_truth(make_clip: ClipMaker):
     whole = codes.read(0, 14)
     np.testing.assert_array_equal(np.concatenate([codes.read(t, t + 1) for t in range(14)]), whole)
     assert truth(clip, factor, 0, 14).mean() == pytest.approx(3.25, rel=1e-6)
-    assert codes.white == pytest.approx(8.125)
+    assert codes.white == pytest.approx(8.75)
     assert (sensed(clip, Illumination(), seed=3)[0].read(0, 1) != whole[:1]).any()
 
 

@@ -37,11 +37,11 @@ def test_a_sample_is_what_the_docs_say(make_clip: ClipMaker):
     crop, times = (place.y, place.x, 16, 16), range(place.start, place.start + 11)
     sharp = np.stack([clip_photons(clip, t, factor, crop, sharp=True) for t in times])
     exposed = np.stack([clip_photons(clip, t, factor, crop) for t in times])
-    np.testing.assert_allclose(sample["target"][:, 0], sharp / 8.125, rtol=1e-6)
+    np.testing.assert_allclose(sample["target"][:, 0], sharp / 8.75, rtol=1e-6)
     codes = sensor.sample(exposed, clip.exposure, key=place.key, engine="reference")
     np.testing.assert_array_equal(sample["codes"][:, 0], (codes / np.float32(7)).astype(np.float32))
     assert sample["codes"].shape == sample["target"].shape == (11, 1, 16, 16)
-    assert sample["white"] == pytest.approx(8.125)
+    assert sample["white"] == pytest.approx(8.75)
     assert sharp.mean() == pytest.approx(1.1 * exposed.mean(), rel=1e-3)
 
 
@@ -53,7 +53,7 @@ def test_codes_have_the_mean_of_their_photons(make_clip: ClipMaker):
     codes = sample["codes"].numpy() * 7
     level = np.array([3.25])
     assert_mean(codes, sensor.mean(level, 5e-4)[0], sensor.variance(level, 5e-4)[0])
-    np.testing.assert_allclose(sample["target"], 3.25 / 8.125, rtol=1e-3)
+    np.testing.assert_allclose(sample["target"], 3.25 / 8.75, rtol=1e-3)
     frames = codes[:, 0]
     assert all((frames[a] != frames[b]).any() for a in range(11) for b in range(a))
 

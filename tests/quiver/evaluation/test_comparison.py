@@ -186,11 +186,12 @@ def test_another_peak_moves_scores_by_its_ratio(make_clip: ClipMaker):
 
 
 def test_the_published_protocol_keeps_its_white(make_clip: ClipMaker):
-    """Peak = white of the sensor as published; with the default gain that is 2.5 times the light."""
+    """Peak = white of the sensor as published; the gain that its program derives from the light gives 2.5 times it."""
     clip = make_clip()
     paper = Comparison(str(clip.path), None, (Illumination("quiver-paper"),), published=True)
     assert evaluate(paper, [restorer("moment")])[0].peak == pytest.approx(7 / 0.8)
-    assert evaluate(replace(paper, lights=(Illumination(),)), [restorer("moment")])[0].peak == pytest.approx(2.5 * 3.25)
+    published = replace(paper, lights=(Illumination("quiver-published"),))
+    assert evaluate(published, [restorer("moment")])[0].peak == pytest.approx(2.5 * 3.25)
     assert evaluate(replace(paper, peak=3.0), [restorer("moment")])[0].peak == 3.0
     assert "the sensor's white, as published" in summary.peak_name(paper)
 

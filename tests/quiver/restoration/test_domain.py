@@ -29,9 +29,9 @@ def test_the_nearest_cell_is_the_nearest_in_log_light():
     for _ in range(300):
         lights = np.exp(rng.uniform(-2, 5, rng.integers(1, 7)))
         bits = [int(b) for b in rng.integers(1, 4, len(lights))]
-        cells = tuple(cell(float(p), 1.0, bits=b) for p, b in zip(lights, bits, strict=True))
+        cells = tuple(cell(float(p), 1.0, bits=b, sensor="quiver-published") for p, b in zip(lights, bits, strict=True))
         ppp, own = float(np.exp(rng.uniform(-2.5, 5.5))), int(rng.integers(1, 4))
-        place = domain.place_of(devices.load("quiver-physical", ppp=ppp, bits=own), 5e-4, ppp)
+        place = domain.place_of(devices.load("quiver-published", ppp=ppp, bits=own), 5e-4, ppp)
         same = [c.ppp for c in cells if c.place.bits == own]
         found = Domain(cells, {}).nearest(place)
         if not same or not min(same) / domain.NEAR <= ppp <= max(same) * domain.NEAR:
@@ -111,8 +111,8 @@ def test_the_shipped_weights_know_their_domain():
     page = (Path(__file__).parents[3] / "docs/results/domain.md").read_text(encoding="utf-8")
     assert "\n".join(domain.table(scope.domain)) in page
     assert domain_remarks.remark("nano", scope, stream()) is None
-    assert "nano is worse than qbp-bm3d on quiver-physical, 3 bit, 0.5 PPP" in str(
-        domain_remarks.remark("nano", scope, stream(ppp=0.5))
+    assert "nano is worse than qbp on quiver-physical, 3 bit, 26 PPP" in str(
+        domain_remarks.remark("nano", scope, stream(ppp=26))
     )
     assert "is worse than" in str(domain_remarks.remark("nano", scope, stream(bits=1)))
     assert "never measured near" in str(domain_remarks.remark("nano", scope, stream(bits=4)))

@@ -62,19 +62,19 @@ def test_the_other_options_change_the_answer(inputs, tmp_path):
         return np.load(path)
 
     for kind, words, options in (
-        ("clip", ["--ppp", 3], ["ppp", "sensor", "bits", "seed"]),
-        ("array", ["--ppp", 3], ["ppp"]),
+        ("clip", ["--ppp", 6], ["ppp", "sensor", "bits", "seed"]),
+        ("array", ["--ppp", 6], ["ppp"]),
         ("planes", ["--width", 7, "--sensor", "spad-320x240"], ["planes"]),
     ):
         base = video(kind, *words)
         for option in options:
             other = video(kind, *words, f"--{option}", VALUES[option])
             assert other.shape != base.shape or not np.array_equal(other, base), (kind, option)
-    base = video("array", "--ppp", 3, "--method", "moment")
+    base = video("array", "--ppp", 6, "--method", "moment")
     for words in (
-        ["--ppp", 3, "--bits", 4],
+        ["--ppp", 6, "--bits", 4],
         ["--sensor", "quiver-paper"],
-        ["--ppp", 3, "--sensor", "quiver-published"],
+        ["--ppp", 6, "--sensor", "quiver-published"],
     ):
         assert not np.array_equal(video("array", *words, "--method", "moment"), base), words
 
@@ -132,7 +132,7 @@ def test_one_line_says_what_was_assumed(inputs, tmp_path, capsys):
     said = lines[0]
     for part in (
         "quiver-physical, 3 bit, 3.25 photons",
-        "white = 8.125",
+        "white = 8.75",
         "4 frames",
         "method nano",
         "weights ",
