@@ -16,9 +16,16 @@ __all__ = ["Clip", "has_sharp", "known", "mean_light", "open_clips", "peak_of", 
 
 
 def open_clips(path: Path | str, split: str | None = None) -> list[Clip]:
-    """Return the finished clips of a data set folder, all or of one split; or the one clip of a clip folder."""
+    """Return the finished clips of a data set, all or of one split; the one clip of a clip folder; or those of a folder
+    of clips, each of which states its split.
+    """
     path = Path(path)
-    return [Clip.open(path)] if (path / "clip.json").exists() else Dataset.open(path).clips(split)
+    if (path / "clip.json").exists():
+        return [Clip.open(path)]
+    made = sorted(found.parent for found in path.glob("*/clip.json"))
+    if not made or (path / "dataset.json").exists():
+        return Dataset.open(path).clips(split)
+    return [clip for clip in map(Clip.open, made) if split in (None, clip.meta.get("split"))]
 
 
 def has_sharp(clip: Clip) -> bool:

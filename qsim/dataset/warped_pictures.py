@@ -1,0 +1,283 @@
+"""Makes clips of warped pictures: photographs and shapes cut from them that slide, turn and zoom before one another.
+
+    python -m qsim.dataset.warped_pictures PICTURES -o out/photos --licence FILE --clips 300 --split train
+
+    pictures -> layers (a background, bodies of random outline) -> relative radiance, exact flow, one clip per number
+
+They cost a thousandth of a rendered clip, and have no light, shading or blur of their own. Pictures become linear light
+and are shrunk to half of their size at least, which removes most of their noise. Every clip draws its largest motion
+from 0 to `motion` px/frame; its layers translate, sway, rotate and zoom up to that. A pixel is the mean of 3 x 3
+bilinear samples; flow follows from the motion in closed form. Clip n is a function of the pictures, `seed` and n. An
+existing clip is kept, so the same command resumes. The folder holds one clip folder per number, and the licence.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+from scipy import ndimage
+
+from qsim import checks, files
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import RELATIVE
+from qsim.clip.writer import ClipWriter
+from qsim.scene.image_files import read_grey
+from qsim.scene.textures import noise, pictures_in
+
+FINE = 2  # texels of a layer per pixel, at zoom 1
+SAMPLES = 3  # per pixel along each side
+STILL = 0.15  # share of clips in which nothing moves
+FASTEST_GROWTH = 0.05  # of the zoom, per frame
+SMOOTH = 0.25  # share of bodies with a smooth tone instead of a picture
+
+
+@dataclass(frozen=True)
+class Path2D:
+    """A motion in the picture in closed form; lengths in pixels, times in frames from the middle of the clip."""
+
+    place: tuple[float, float]  # y, x at the middle
+    speed: tuple[float, float]  # px/frame
+    sway: tuple[float, float]  # px
+    frequency: float  # of the sway, rad/frame
+    phase: float
+    angle: float
+    spin: float  # rad/frame
+    growth: float  # of the zoom, per frame: zoom = exp(growth time)
+
+    def matrix(self, time: float) -> Array:
+        """Return the map [3, 3] of homogeneous (y, x, 1) from layer to picture at a time."""
+        wave = np.sin(self.frequency * time + self.phase) - np.sin(self.phase)
+        y, x = (p + v * time + a * wave for p, v, a in zip(self.place, self.speed, self.sway, strict=True))
+        turn, zoom = self.angle + self.spin * time, np.exp(self.growth * time)
+        c, s = zoom * np.cos(turn), zoom * np.sin(turn)
+        return np.array([[c, -s, y], [s, c, x], [0, 0, 1]])
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """A picture with its cover, both around the layer's origin, and its motion."""
+
+    light: Array  # [h, w], FINE texels per pixel
+    cover: Array | None  # [h, w] in 0..1; None: everywhere
+    path: Path2D
+
+    def sampled(self, points: Array, time: float) -> tuple[Array, Array]:
+        """Return light and cover at picture points (y, x) [2, n] at a time."""
+        inverse = np.linalg.inv(self.path.matrix(time))
+        at = FINE * (inverse[:2, :2] @ points + inverse[:2, 2:])
+        at += np.array([[n / 2 - 0.5] for n in self.light.shape])
+        light = ndimage.map_coordinates(self.light, at, order=1, mode="mirror")
+        if self.cover is None:
+            return light, np.ones_like(light)
+        return light, ndimage.map_coordinates(self.cover, at, order=1, mode="constant")
+
+
+def layers(pictures: Sequence[Array], size: tuple[int, int], motion: float, rng: np.random.Generator) -> list[Layer]:
+    """Return a background and zero to four bodies before it.
+
+    `pictures` are linear light [h, w]; `size` is that of the clip [px], `motion` its largest speed [px/frame].
+    """
+    largest = 0.0 if rng.random() < STILL else motion * rng.random()
+    side = max(size)
+    found = [Layer(_cut(pictures, 2 * side, rng), None, _path(size, largest, side, rng))]
+    for _ in range(int(rng.integers(0, 5))):
+        across = int(side * rng.uniform(0.15, 0.7))
+        light = _tone(across, rng) if rng.random() < SMOOTH else _cut(pictures, across, rng)
+        own = largest * rng.choice([0.0, 0.5, 1.0], p=[0.2, 0.3, 0.5])
+        found.append(Layer(light, _outline(light.shape, rng), _path(size, own, across / 2, rng)))
+    return found
+
+
+def frame(parts: Sequence[Layer], size: tuple[int, int], time: float) -> tuple[Array, Array, Array]:
+    """Return light [H, W], flow to one frame later [2, H, W] (x, y) [px], and where the point is seen there [H, W]."""
+    height, width = size
+    steps = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
+    y, x = np.mgrid[:height, :width].astype(float)
+    total = np.zeros((height, width))
+    for dy in steps:
+        for dx in steps:
+            total += _seen(parts, np.stack([y.ravel() + dy, x.ravel() + dx]), time)[0].reshape(size)
+    points = np.stack([y.ravel(), x.ravel()])
+    top, moved = _seen(parts, points, time)[1], points.copy()
+    for i, layer in enumerate(parts):
+        step = layer.path.matrix(time + 1) @ np.linalg.inv(layer.path.matrix(time))
+        own = top == i
+        moved[:, own] = step[:2, :2] @ points[:, own] + step[:2, 2:]
+    inside = (moved >= 0).all(0) & (moved[0] <= height - 1) & (moved[1] <= width - 1)
+    valid = inside & (_seen(parts, moved, time + 1)[1] == top)
+    flow = (moved - points)[::-1].reshape(2, *size)
+    return total / SAMPLES**2, flow.astype(np.float32), valid.reshape(size)
+
+
+def _seen(parts: Sequence[Layer], points: Array, time: float) -> tuple[Array, Array]:
+    """Return the light and the uppermost layer that covers more than half, at points (y, x) [2, n]."""
+    light, top = np.zeros(points.shape[1]), np.zeros(points.shape[1], int)
+    for i, layer in enumerate(parts):
+        own, cover = layer.sampled(points, time)
+        light += cover * (own - light)
+        top[cover > 0.5] = i
+    return light, top
+
+
+def _path(size: tuple[int, int], largest: float, radius: float, rng: np.random.Generator) -> Path2D:
+    """Return a random motion of at most about `largest` px/frame for points up to `radius` px from its centre."""
+    shares = rng.dirichlet((3.0, 1.0, 0.7, 0.7)) * largest  # of translation, sway, rotation and zoom
+    angle, frequency = rng.uniform(0, 2 * np.pi), rng.uniform(0.2, 0.6)
+    side, sway = rng.uniform(0, 2 * np.pi), shares[1] / frequency
+    return Path2D(
+        place=(float(rng.uniform(0, size[0])), float(rng.uniform(0, size[1]))),
+        speed=(float(shares[0] * np.sin(angle)), float(shares[0] * np.cos(angle))),
+        sway=(float(sway * np.sin(side)), float(sway * np.cos(side))),
+        frequency=float(frequency),
+        phase=float(rng.uniform(0, 2 * np.pi)),
+        angle=float(rng.uniform(0, 2 * np.pi)),
+        spin=float(shares[2] / radius * rng.choice([-1, 1])),
+        growth=float(min(shares[3] / radius, FASTEST_GROWTH) * rng.choice([-1, 1])),
+    )
+
+
+def _cut(pictures: Sequence[Array], across: int, rng: np.random.Generator) -> Array:
+    """Return a square of `across` px from a random picture, in a random exposure.
+
+    In half of the cases it is the one of most texture among six: large parts of photographs are out of focus.
+    """
+    found = [_square(pictures, across, rng) for _ in range(6 if rng.random() < 0.5 else 1)]
+    part = max(found, key=lambda cut: float(np.abs(np.diff(cut, axis=0)).mean() / (cut.mean() + 0.01)))
+    part = np.rot90(part, int(rng.integers(4)))
+    part = part if rng.random() < 0.5 else part[:, ::-1]
+    return np.ascontiguousarray(part) * np.exp(rng.normal(0, 0.5)) + 0.02 * rng.random()
+
+
+def _square(pictures: Sequence[Array], across: int, rng: np.random.Generator) -> Array:
+    """Return a random square of `across` px, or as much as there is, of a random picture."""
+    picture = pictures[int(rng.integers(len(pictures)))]
+    side = min(FINE * across, *picture.shape)
+    y, x = (int(rng.integers(n - side + 1)) for n in picture.shape)
+    return picture[y : y + side, x : x + side]
+
+
+def _tone(across: int, rng: np.random.Generator) -> Array:
+    """Return a smooth tone with a slight slope, [n, n] texels."""
+    y, x = (np.mgrid[: FINE * across, : FINE * across] + 0.5) / (FINE * across) - 0.5
+    slope = rng.normal(0, 0.3, 2)
+    return np.exp(rng.uniform(np.log(0.02), np.log(0.9)) + slope[0] * y + slope[1] * x)
+
+
+def _outline(shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+    """Return the cover [h, w] of a body: a wavy disk, a bar, or blobs; 0 at its border, with edges one texel soft."""
+    height, width = shape
+    y, x = (np.mgrid[:height, :width] + 0.5) / np.array([height, width])[:, None, None] * 2 - 1
+    match rng.integers(4):
+        case 0:
+            angle = np.arctan2(y, x)
+            waves = sum(rng.normal(0, 0.1) * np.cos(k * angle + rng.uniform(0, 2 * np.pi)) for k in range(2, 8))
+            inside = 0.7 * (1 + waves) - np.hypot(y, x)
+        case 1:
+            inside = np.minimum(0.95 - np.abs(x), rng.uniform(0.04, 0.4) - np.abs(y))
+        case 2:
+            inside = np.minimum(0.9 - np.abs(x), 0.9 - np.abs(y))
+        case _:
+            blobs = noise(rng, (height, width), 2.0)
+            inside = np.minimum(blobs - np.quantile(blobs, rng.uniform(0.3, 0.7)), 0.95 - np.maximum(abs(x), abs(y)))
+    return np.clip(inside * height / 2 + 0.5, 0, 1)
+
+
+def read_pictures(paths: Sequence[Path], smallest: int) -> list[Array]:
+    """Return pictures as linear light [h, w], shrunk to half or less; `ValueError` for one smaller than `smallest`."""
+    found = []
+    for path in paths:
+        light = read_grey(path)
+        shrink = max(2, min(light.shape) // 1200)
+        height, width = (n // shrink * shrink for n in light.shape)
+        light = light[:height, :width].reshape(height // shrink, shrink, width // shrink, shrink).mean((1, 3))
+        if min(light.shape) < smallest:
+            raise ValueError(
+                f"{path}: {width} x {height} px, half of which is less than {smallest} px; leave this picture out, or "
+                "choose smaller clips"
+            )
+        found.append(light.astype(np.float64))
+    return found
+
+
+def write_clip(path: Path, parts: Sequence[Layer], size: tuple[int, int], meta: dict[str, Any]) -> Clip:
+    """Write one clip of `meta["shape"][0]` frames; an interrupted one resumes."""
+    frames = meta["shape"][0]
+    with ClipWriter(path, meta) as writer:
+        for t in range(frames):
+            if not writer.has(t):
+                light, flow, valid = frame(parts, size, t - (frames - 1) / 2)
+                writer.add(t, light.astype(np.float32), truth={"flow": flow, "valid": valid})
+    return Clip.open(path)
+
+
+def make(folder: Path, pictures: Path, licence: Path, args: argparse.Namespace) -> int:
+    """Write the missing clips below `folder`, and return their number."""
+    size = (args.height, args.width)
+    paths = pictures_in(pictures)
+    lights = read_pictures(paths, max(size))
+    if not licence.is_file():
+        raise FileNotFoundError(f"{licence}: no such file; name the file that states the licence of the pictures")
+    folder.mkdir(parents=True, exist_ok=True)
+    files.write_bytes(folder / "LICENCE.txt", licence.read_bytes())
+    digests = [f"texture {files.sha256(path)}" for path in paths]
+    made = 0
+    for n in range(args.first, args.first + args.clips):
+        path = folder / f"warped_{n:05d}"
+        if path.exists():
+            Clip.open(path)  # raises: another thing of this name
+            continue
+        rng = np.random.default_rng([args.seed, n])
+        meta = {
+            "shape": [args.frames, *size],
+            "frame_rate": 2000.0,
+            "exposure": 1 / 2000.0,
+            "radiance_unit": RELATIVE,
+            "camera": None,
+            "split": args.split,
+            "assets": digests,
+            "source": {"format": "warped pictures", "seed": args.seed, "number": n, "motion": args.motion},
+        }
+        write_clip(path, layers(lights, size, args.motion, rng), size, meta)
+        made += 1
+    return made
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the program; return its exit code."""
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
+    parser.add_argument("pictures", type=Path, help="folder of pictures (.jpg, .png, .tif), sRGB")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the clips")
+    parser.add_argument("--licence", type=Path, required=True, help="file with the pictures' licence; it is copied")
+    parser.add_argument("--clips", type=int, default=300, help="number of clips (default 300)")
+    parser.add_argument("--first", type=int, default=0, help="number of the first clip (default 0)")
+    parser.add_argument("--frames", type=int, default=16, help="per clip (default 16)")
+    parser.add_argument("--height", type=int, default=112, help="pixels (default 112)")
+    parser.add_argument("--width", type=int, default=112, help="pixels (default 112)")
+    parser.add_argument("--motion", type=float, default=16.0, help="largest motion, px/frame (default 16)")
+    parser.add_argument("--split", choices=checks.SPLITS, default="train", help="stored in the clips (default train)")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
+    args = parser.parse_args(words)
+    try:
+        for name in ("clips", "frames", "height", "width"):
+            checks.whole(getattr(args, name))
+        for name in ("seed", "first"):
+            checks.seed(getattr(args, name))
+        if not 0 <= args.motion <= 100:
+            raise ValueError(f"--motion: expected 0 to 100 px/frame, got {args.motion!r}")
+        made = make(args.output, args.pictures, args.licence, args)
+    except (ValueError, OSError) as error:
+        print(f"warped_pictures: {files.wording(error)}", file=sys.stderr)
+        return 2
+    print(f"{args.output}: {made} clips made, {args.clips - made} were there")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""Warped pictures: light and flow follow from the motion, and repeats give the same bytes and keep what is there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import ndimage
+
+from qsim.clip.clip import Clip
+from qsim.dataset import warped_pictures
+from qsim.dataset.warped_pictures import Layer, Path2D, frame, layers
+from quiver.data.clips import open_clips
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """Two coloured pictures and a licence."""
+    folder, rng = tmp_path / "pictures", np.random.default_rng(0)
+    folder.mkdir()
+    for name in ("a.png", "b.jpg"):
+        soft = ndimage.gaussian_filter(rng.random((150, 170, 3)), (3, 3, 0))
+        Image.fromarray(np.uint8(255 * (soft - soft.min()) / np.ptp(soft))).save(folder / name)
+    (tmp_path / "licence.txt").write_text("CC0")
+    return folder
+
+
+def run(pictures: Path, out: Path, *words: object) -> int:
+    licence = pictures.parent / "licence.txt"
+    size = ["--frames", 5, "--height", 24, "--width", 30]
+    return warped_pictures.main([str(w) for w in (pictures, "-o", out, "--licence", licence, *size, *words)])
+
+
+def test_flow_leads_to_the_same_light():
+    """Random smooth layers and motions up to 8 px/frame: light moves along the flow, where it stays in view."""
+    rng = np.random.default_rng(1)
+    soft = [ndimage.gaussian_filter(rng.random((300, 300)), 8, mode="wrap") * 3 for _ in range(2)]
+    inside = 0
+    for _ in range(8):
+        parts, time = layers(soft, (60, 70), 8.0, rng), float(rng.uniform(-4, 4))
+        now, flow, valid = frame(parts, (60, 70), time)
+        later = frame(parts, (60, 70), time + 1)[0]
+        y, x = np.mgrid[:60, :70]
+        there = ndimage.map_coordinates(later, [y + flow[1], x + flow[0]], order=1, mode="nearest")
+        off = np.abs(there - now)[valid]
+        assert np.median(off) < 0.01 * now.mean()  # pixels at edges of bodies mix two layers
+        assert np.percentile(off, 75) < 0.05 * now.mean()
+        inside += int(valid.sum())
+    assert inside > 8 * 60 * 70 / 3
+
+
+def test_a_layer_that_slides_moves_by_its_speed():
+    light = np.random.default_rng(2).random((80, 80))
+    still = Path2D((20.0, 20.0), (1.25, -3.5), (0.0, 0.0), 0.3, 0.0, 0.0, 0.0, 0.0)
+    flow = frame([Layer(light, None, still)], (16, 18), 0.5)[1]
+    np.testing.assert_allclose(flow[0], -3.5, atol=1e-5)
+    np.testing.assert_allclose(flow[1], 1.25, atol=1e-5)
+
+
+def test_the_largest_motion_is_kept_and_some_clips_are_still():
+    """Two hundred draws at 16 px/frame: no pixel moves twice that far, some clips rest, half move 3 px or more."""
+    rng, flat = np.random.default_rng(3), [np.ones((64, 64))]
+    largest = []
+    for _ in range(200):
+        flow = frame(layers(flat, (30, 30), 16.0, rng), (30, 30), float(rng.uniform(-8, 8)))[1]
+        largest.append(float(np.hypot(*flow).max()))
+    assert max(largest) < 32
+    assert 10 <= sum(value < 1e-6 for value in largest) <= 60  # 15 % +- 5 sigma
+    assert np.median(largest) > 3
+
+
+def test_a_repeat_gives_the_same_bytes_and_keeps_what_is_there(pictures, tmp_path, capsys):
+    assert run(pictures, tmp_path / "once", "--clips", 3) == 0
+    assert run(pictures, tmp_path / "again", "--clips", 2) == 0
+    assert run(pictures, tmp_path / "again", "--clips", 3, "--split", "val") == 0
+    assert capsys.readouterr().out.endswith("1 clips made, 2 were there\n")
+    for n in range(3):
+        once, again = (Clip.open(tmp_path / name / f"warped_{n:05d}") for name in ("once", "again"))
+        assert once.meta["checksums"] == again.meta["checksums"]
+        assert once.shape == (5, 24, 30)
+        assert once.verify() == []
+    assert (tmp_path / "once/LICENCE.txt").read_text() == "CC0"
+    assert [clip.name for clip in open_clips(tmp_path / "again", "train")] == ["warped_00000", "warped_00001"]
+    assert [clip.name for clip in open_clips(tmp_path / "again", "val")] == ["warped_00002"]
+    assert len(open_clips(tmp_path / "again")) == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--height", 200], "half of which is less than 200 px"),
+        (["--motion", -1], "expected 0 to 100 px/frame"),
+        (["--clips", 0], "expected a whole number"),
+        (["--licence", "none.txt"], "none.txt: no such file; name the file that states the licence"),
+    ],
+)
+def test_a_mistake_is_one_line(pictures, tmp_path, capsys, words, named):
+    assert run(pictures, tmp_path / "out", *words) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert named in said
+    assert not list(tmp_path.glob("out/*"))
