@@ -35,6 +35,7 @@ NETWORKS = (
     ),
     *("rvrt", "spk2imgnet", "spk2imgnet-as-published"),
 )
+LEVELS = 16  # of a range of light in training: from 0.3 to 100 photons they are a factor 1.47 apart
 PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see quiver/training/settings.py
 
 
@@ -47,6 +48,22 @@ def add_light(parser: argparse.ArgumentParser, several: bool) -> None:
     parser.add_argument("--bits", type=whole, help="bits per code (default 3)")
 
 
+def light_levels(text: str) -> tuple[float, ...]:
+    """Return light levels [photons] of a list, in which LOW..HIGH stands for LEVELS of them at equal ratios.
+
+    Levels, not a continuum: the sensor follows the light, and each one has a table of its law.
+    """
+    import numpy as np
+
+    found: list[float] = []
+    for part in text.split(","):
+        ends = numbers(part.replace("..", ","))
+        if ".." in part and not (len(ends) == 2 and ends[0] < ends[1]):
+            raise argparse.ArgumentTypeError(f"expected LOW..HIGH with LOW below HIGH, got {part!r}")
+        found += [float(f"{level:.3g}") for level in np.geomspace(*ends, LEVELS)] if ".." in part else ends
+    return tuple(found)
+
+
 def add_noise(parser: argparse.ArgumentParser) -> None:
     """Add --sensor, --ppp and --bits of training; values that are not given come from the streams of the data set."""
     parser.add_argument(
@@ -55,7 +72,10 @@ def add_noise(parser: argparse.ArgumentParser) -> None:
         help="names of `qsim doctor --devices` or .toml files, comma-separated (default: the data set's streams')",
     )
     parser.add_argument(
-        "--ppp", type=numbers, help="mean photons per pixel and exposure; several: 1,10 (default: the streams')"
+        "--ppp",
+        type=light_levels,
+        help=f"mean photons per pixel and exposure; several: 1,10, or {LEVELS} in a range: 0.3..100 (default: the "
+        "streams')",
     )
     parser.add_argument("--bits", type=whole_numbers, help="bits per code; several: 1,3 (default: the streams')")
 

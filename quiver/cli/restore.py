@@ -43,6 +43,9 @@ def add_restore(sub: Any) -> None:
     parser.add_argument("--width", type=count, help="bare array: packed binary planes of this many pixels per row")
     parser.add_argument("--planes", type=count, help="packed planes: 2^b - 1 are summed to one code (default 1)")
     parser.add_argument("--frame-rate", type=positive, help="bare array: codes per second (default 2000)")
+    parser.add_argument(
+        "--defects", type=Path, help="map of defective pixels, .npy [H, W], true where hot or dead: they are filled"
+    )
     add_running(parser)
     add_strict(parser)
     parser.add_argument("--force", action="store_true", help="replace an existing result")

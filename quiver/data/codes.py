@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from qsim.clip.stream import Stream
 from qsim.files import read_json, sha256, to_json
 from qsim.keys import Key, hash_name
 from qsim.sensor.sensor import Sensor
+from quiver.data import defects
 from quiver.data.code_table import draw_codes
 from quiver.data.illumination import Illumination
 
@@ -33,6 +34,7 @@ __all__ = [
     "Stream",
     "array_codes",
     "array_digest",
+    "filled",
     "open_stream",
     "sensed",
     "stored",
@@ -41,6 +43,7 @@ __all__ = [
 ]
 
 DIGEST_BYTES = 1 << 24  # of an array, hashed at a time
+LIGHT_FRAMES = 11  # spread over a stream, from which its light is estimated where it is not stated
 WINDOW_STAGE = 1000  # of the random keys of published test windows, + frame; 0 is `qsim sense`
 
 
@@ -58,11 +61,54 @@ class Codes:
     digest: Callable[[], str] = str  # SHA-256 of the codes, computed on request; empty: not known
     sensor_name: str = ""  # of a device or a file; empty: the sensor's model
     ppp: float | None = None  # mean photons per pixel and code; None: not known
+    defective: Array | None = field(default=None, compare=False)  # bool [H, W]; pixels that `read` fills from others
 
     @property
     def white(self) -> float:
         """Return the photons at which restored video has the value 1."""
         return self.sensor.white(self.exposure)
+
+
+def filled(codes: Codes, bad: Array | None) -> Codes:
+    """Return the codes of a stream with its defective pixels, bool [H, W], filled (defects.py); the same without any.
+
+    `ValueError` for a map of another size, and for one without a good pixel.
+    """
+    if bad is None or not bad.any():
+        return codes
+    if bad.shape != codes.shape[1:]:
+        raise ValueError(
+            f"{codes.name}: the map of defective pixels has {' x '.join(map(str, bad.shape))} pixels, the frames "
+            f"{codes.shape[1]} x {codes.shape[2]}; give the map of this sensor, cut to these frames"
+        )
+    filler = defects.Filler(bad if codes.defective is None else bad | codes.defective)
+
+    def read(start: int, stop: int) -> Array:
+        return filler.fill(codes.read(start, stop), start)
+
+    def digest() -> str:
+        before = codes.digest()
+        return before and hashlib.sha256(before.encode() + np.packbits(filler.bad).tobytes()).hexdigest()
+
+    return replace(codes, read=read, digest=digest, defective=filler.bad)
+
+
+def light_of(codes: Codes) -> float:
+    """Return the mean photons per pixel and code of a stream: as stated, else estimated from LIGHT_FRAMES frames.
+
+    The estimate is the moment inverse of each pixel's mean code; where codes do not determine the light, the mean code
+    in units of white. Saturated pixels make it too low: no code tells how bright they are.
+    """
+    if codes.ppp is not None and codes.ppp > 0:
+        return float(codes.ppp)
+    length = codes.shape[0]
+    taken = np.unique(np.linspace(0, length - 1, min(LIGHT_FRAMES, length)).round().astype(int))
+    mean = np.mean([codes.read(int(t), int(t) + 1)[0] for t in taken], axis=0)
+    try:
+        found = float(codes.sensor.response(codes.exposure).invert(mean, len(taken)).mean())
+    except ValueError:
+        found = float(mean.mean()) / (codes.sensor.levels - 1) * codes.white
+    return max(found, 1e-9 * codes.white)
 
 
 def array_digest(array: Array) -> str:
@@ -99,7 +145,7 @@ def array_codes(codes: Array, sensor: Sensor, exposure: float, name: str = "code
 def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float]:
     """Return the codes of a clip under a light level, and the light factor: the codes that `qsim sense` would store.
 
-    Codes are drawn when they are read.
+    Codes are drawn when they are read; dead and hot pixels of the sensor's defects are filled.
     """
     sensing, draw = light.sensing(seed), light.draw(clip, seed)
 
@@ -121,13 +167,13 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
         sensor_name=light.sensor,
         ppp=draw.level.ppp,
     )
-    return codes, draw.level.factor
+    return filled(codes, defects.of_draw(draw, clip.exposure, (clip.shape[1], clip.shape[2]))), draw.level.factor
 
 
 def stream_codes(stream: Stream) -> Codes:
-    """Return the codes of a stored stream."""
+    """Return the codes of a stored stream; its dead and hot pixels, where it states them, are filled."""
     meta = stream.meta
-    return Codes(
+    codes = Codes(
         stream.name,
         stream.shape,
         stream.sensor,
@@ -139,6 +185,7 @@ def stream_codes(stream: Stream) -> Codes:
         str(meta.get("sensor_name") or ""),
         meta.get("ppp"),
     )
+    return filled(codes, defects.of_stream(stream))
 
 
 def open_stream(path: Path) -> Stream:

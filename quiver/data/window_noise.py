@@ -22,6 +22,7 @@ from qsim.keys import Key
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.sensor import Sensor
 from quiver.data.code_table import draw_codes
+from quiver.data.defects import Filler, defective
 from quiver.data.noise import Noise, stored_defects
 
 NEGLIGIBLE = 1e-6  # chance of an afterpulse chain that is as long as the frames before a window
@@ -57,6 +58,15 @@ def check_windows(noise: Noise, clip: Clip) -> None:
                 f"{noise.sensor}: carry_dead_time and afterpulse of counting pixels reach from exposure to exposure, "
                 "which training windows cannot follow; give --sensor with a file without them"
             )
+
+
+def window_filler(noise: Noise, draw: Draw, clip: Clip, place: WindowPlace, side: int) -> Filler | None:
+    """Return what fills the dead and hot pixels of a window [side, side], not turned; None without any."""
+    assert noise.defects is not None
+    size = (clip.shape[1], clip.shape[2])
+    bad = defective(stored_defects(noise.defects), draw.sensor, clip.exposure, draw.level.ppp, size)
+    crop = None if bad is None else bad[place.y : place.y + side, place.x : place.x + side]
+    return None if crop is None or not crop.any() else Filler(crop)
 
 
 def window_codes(

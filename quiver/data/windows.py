@@ -5,7 +5,7 @@
 Sample n is a function of (seed, n) alone: its clip, place, turn, light level and every bit of its noise. So 0, 1 or 8
 workers give the same bytes, and a killed run resumes with the next sample. Sample n + e * len(windows) is sample n of
 epoch e, with new noise. Dr.Jit, which does not survive a fork, is not used. Sensor, light and defects are those of the
-clips' streams unless the settings name others (noise.py).
+clips' streams unless the settings name others (noise.py). Dead and hot pixels are filled as before restoration.
 
     loader = DataLoader(windows("out/starter", split="train", crop=64), batch_size=8, shuffle=True)
 """
@@ -34,7 +34,7 @@ from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
 from quiver.data.mixture import Mixture, choose
 from quiver.data.noise import Noise
-from quiver.data.window_noise import WindowPlace, check_windows, window_codes
+from quiver.data.window_noise import WindowPlace, check_windows, window_codes, window_filler
 
 # Computes inputs of a network from the codes of a window: name -> tensor, each the same shape for all windows. It runs
 # where samples are drawn, in worker processes too, and gets no gradients; it is a function of a module, not a lambda.
@@ -167,6 +167,8 @@ class Windows(Dataset[dict[str, Any]]):
                 codes = draw_codes(draw.sensor, photons * scale, clip.exposure, place.key)
             else:
                 drawn = window_codes(noise, draw, clip, place, self.settings.frames, self.settings.crop, scale)
+                filler = window_filler(noise, draw, clip, place, self.settings.crop)
+                drawn = drawn if filler is None else filler.fill(drawn, 0)
                 codes = turned(drawn, replace(place, backwards=False))  # in the order of exposure already
         except ValueError as error:
             raise ValueError(f"{clip.path}: window from frame {place.start}: {error}") from None

@@ -10,7 +10,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from quiver.data.clips import Clip
-from quiver.data.codes import Codes, LazyArray, Sensor, Stream, array_codes, open_stream, sensed, stream_codes
+from quiver.data.codes import Codes, LazyArray, Sensor, Stream, array_codes, filled, open_stream, sensed, stream_codes
 from quiver.data.illumination import Illumination
 from quiver.restoration.domain_remarks import refuse_outside, remarks
 from quiver.restoration.interface import DEFAULT_METHOD, RestoreOptions
@@ -30,6 +30,7 @@ def restore(
     device: str | None = None,
     mode: str | None = None,
     strict: bool = False,
+    defects: Array | None = None,
 ) -> Array:
     """Return restored video, float32 [T, H, W], in photons per pixel and exposure (expected, before quantum
     efficiency).
@@ -38,12 +39,15 @@ def restore(
     path of either; integer codes [T, H, W], for which `sensor` and `exposure` [s] must be given. `method` is a
     classical method (naive, moment, likelihood, transform-denoise, qbp, qbp-bm3d), shipped weights (default nano), a
     .safetensors file or a folder of `quiver train`. `device` (auto, cpu, cuda) and `mode` (exact, streaming, windows)
-    are for networks. A network outside of what it was measured for warns; with `strict` it is a `ValueError`.
+    are for networks. `defects` [H, W] is true at hot and dead pixels, which are filled from their neighbours, as are
+    those that a stream's description states. A network outside of what it was measured for warns; with `strict` it is
+    a `ValueError`.
     `ValueError` or `FileNotFoundError` where the arguments do not fit together.
 
         video = quiver.restore(stream)
     """
-    codes = _codes(np.asarray(source) if isinstance(source, LazyArray) else source, sensor, exposure, ppp)
+    source = np.asarray(source) if isinstance(source, LazyArray) else source
+    codes = filled(_codes(source, sensor, exposure, ppp), None if defects is None else np.asarray(defects, bool))
     chosen = restorer(method, RestoreOptions(device=device or "auto", mode=mode or "exact"))
     refuse_idle({"device": device, "mode": mode}, [chosen])
     found = remarks([chosen], codes)

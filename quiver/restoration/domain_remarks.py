@@ -5,25 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from quiver.baselines import METHODS
-from quiver.data.codes import Codes
+from quiver.data.codes import Codes, light_of
 from quiver.data.illumination import Illumination
 from quiver.restoration.domain import NEAR, OperatingPoint, Scope, place_of
 from quiver.restoration.interface import Restorer
-
-LIGHT_FRAMES = 11  # from which the light of a stream is estimated where it is not known
-
-
-def light_of(codes: Codes) -> float:
-    """Return the photons per pixel and code of a stream: stored, or estimated by the moment inverse or the mean."""
-    if codes.ppp is not None and codes.ppp > 0:
-        return float(codes.ppp)
-    some = codes.read(0, min(LIGHT_FRAMES, codes.shape[0]))
-    try:
-        found = float(METHODS["moment"].restore(some, codes.sensor, codes.exposure).mean())
-    except ValueError:  # its codes do not determine the light
-        found = float(METHODS["naive"].restore(some, codes.sensor, codes.exposure).mean())
-    return max(found, 1e-9 * codes.white)
 
 
 def remark(name: str, scope: Scope, codes: Codes) -> str | None:

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quiver.data.clips import Clip, open_clips
-from quiver.data.codes import Codes, open_stream, sensed, stream_codes
-from quiver.data.illumination import Illumination, follows_light
+from quiver.data.codes import Codes, filled, light_of, open_stream, sensed, stream_codes
+from quiver.data.defects import defective, read_map
+from quiver.data.illumination import Illumination, follows_light, read_sensor
 from quiver.data.photon_cubes import cube_codes
 
 if TYPE_CHECKING:
@@ -44,7 +45,15 @@ def refuse_idle(asked: Mapping[str, Any], methods: Sequence[Restorer]) -> None:
 
 
 def codes_to_restore(args: argparse.Namespace) -> Codes:
-    """Return the codes of `quiver restore`: a stored stream, a clip that is sensed now, or a bare array."""
+    """Return the codes of `quiver restore`: a stored stream, a clip that is sensed now, or a bare array.
+
+    Pixels that the map `--defects` or the sensor's file marks are filled (quiver/data/defects.py).
+    """
+    codes = _found(args)
+    return codes if args.defects is None else filled(codes, read_map(args.defects))
+
+
+def _found(args: argparse.Namespace) -> Codes:
     path: Path = args.source
     if path.is_dir():
         return _of_clip(path, args)
@@ -88,7 +97,9 @@ def _of_array(path: Path, args: argparse.Namespace) -> Codes:
     light = Illumination(sensor, args.ppp, args.bits if args.width is not None else _bits(args))
     if args.output.resolve() == path.resolve():
         raise ValueError(f"{path}: would be replaced by what is made from it; name another with -o")
-    return cube_codes(path, light, args.frame_rate or FRAME_RATE, planes=args.planes, width=args.width)
+    codes = cube_codes(path, light, args.frame_rate or FRAME_RATE, planes=args.planes, width=args.width)
+    found = read_sensor(sensor)[1] if sensor.endswith(".toml") else None
+    return filled(codes, defective(found, codes.sensor, codes.exposure, light_of(codes), codes.shape[1:]))
 
 
 def _sensor(args: argparse.Namespace) -> str:
@@ -104,7 +115,10 @@ def assumed(codes: Codes, method: Restorer) -> str:
     """Return one line with everything that a restoration assumes."""
     length, height, width = codes.shape
     sensor = codes.sensor_name or type(codes.sensor).__name__
-    light = "" if codes.ppp is None else f", {codes.ppp:.4g} photons/pixel"
+    stated = codes.ppp is not None and codes.ppp > 0
+    light = f", {light_of(codes):.4g} photons/pixel" + ("" if stated else " (estimated from the codes)")
+    bad = 0 if codes.defective is None else int(codes.defective.sum())
+    light += f", {bad} of {height * width} pixels defective and filled from their neighbours" if bad else ""
     return (
         f"{codes.name}: {length} frames of {height} x {width}, {codes.frame_rate:g} codes/s; "
         f"sensor {sensor}, {codes.sensor.bits} bit{light}, white = {codes.white:.4g} photons; "

@@ -177,7 +177,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("train", "--steps"): of_training("--steps", "3"),
     ("train", "--minutes"): of_training("--minutes", "1e-7"),
     ("train", "--sensor"): of_training(
-        "--sensor", "quiver-paper", Refused(TRAIN, "--sensor carries.toml", "training windows cannot follow")
+        "--sensor", "quiver-published", Refused(TRAIN, "--sensor carries.toml", "training windows cannot follow")
     ),
     ("train", "--ppp"): of_training("--ppp", "9"),
     ("train", "--bits"): of_training(
@@ -221,7 +221,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Refused(CLIP, "--stream p1", "p1"),
     ],
     ("restore", "--sensor"): [
-        Acts(CLIP, "--sensor quiver-paper"),
+        Acts(CLIP, "--sensor quiver-published"),
         Acts(f"{BARE} --bits 1", "--sensor spad-320x240"),
         Acts(CUBE, "--sensor spad512s"),
         Refused(STREAM, "--sensor quiver-paper", "is a stored stream"),
@@ -245,6 +245,13 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Refused(BARE, "--seed 1", "holds codes already"),
         Refused(CUBE, "--seed 1", "holds codes already"),
         Refused(STREAM, "--seed 1", "is a stored stream"),
+    ],
+    ("restore", "--defects"): [
+        Acts(CLIP, "--defects bad.npy"),
+        Acts(BARE, "--defects bad.npy"),
+        Acts(STREAM, "--defects bad.npy"),
+        Refused(CUBE, "--defects small.npy", "the frames 16 x 24"),
+        Refused(BARE, "--defects codes.npy", "a map of defective pixels is"),
     ],
     ("restore", "--width"): [
         Acts(CUBE, "--width 20"),
@@ -307,8 +314,8 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ),
     ("evaluate", "--sensor"): of_clips(
         "--sensor",
-        "quiver-paper",
-        Acts(SCORE, "--sensor quiver-paper", scores),
+        "quiver-published",
+        Acts(SCORE, "--sensor quiver-published", scores),
         Refused(STORED, "--sensor quiver-paper", "is stored"),
     ),
     ("evaluate", "--ppp"): of_clips(
@@ -387,7 +394,9 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Acts(CELLS.replace("clip", "data"), "--split val", cells),
         Refused(CELLS, "--split val", "only clip folders are given"),
     ),
-    ("domain", "--sensor"): of_measuring("--sensor", "quiver-paper", Acts(CELLS, "--sensor quiver-paper", cells)),
+    ("domain", "--sensor"): of_measuring(
+        "--sensor", "quiver-published", Acts(CELLS, "--sensor quiver-published", cells)
+    ),
     ("domain", "--bits"): of_measuring("--bits", "1", Acts(CELLS, "--bits 1,3", cells)),
     ("domain", "--ppp"): of_measuring("--ppp", "9", Acts(CELLS, "--ppp 3.25,9", cells)),
     ("domain", "--methods"): of_measuring(
@@ -419,7 +428,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("ablate", "--steps"): [Acts(ABLATE, "--steps 2", tensors)],
     ("ablate", "--minutes"): [Acts(f"{ABLATE} --steps 2", "--minutes 1e-7", tensors)],
     ("ablate", "--sensor"): [
-        Acts(ABLATE, "--sensor quiver-paper", tensors),
+        Acts(ABLATE, "--sensor quiver-published", tensors),
         Refused(f"{ABLATE} -q", "--sensor carries.toml", "training windows cannot follow"),
     ],
     ("ablate", "--ppp"): [Acts(ABLATE, "--ppp 9", tensors)],
@@ -538,6 +547,8 @@ def work(scale: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_clip(folder / "short", frames=5, height=16, width=24)
     write_clip(folder / "large", frames=11, height=88, width=88)
     np.save(folder / "codes.npy", rng.integers(0, 2, (12, 16, 24)).astype(np.uint8))
+    np.save(folder / "bad.npy", rng.random((16, 24)) < 0.1)
+    np.save(folder / "small.npy", np.ones((8, 8), bool))
     np.save(folder / "cube.npy", rng.integers(0, 256, (12, 16, 3)).astype(np.uint8))
     np.save(folder / "counts.npy", rng.poisson(1.0, (14, 16, 16)))
     np.save(folder / "more.npy", rng.poisson(2.0, (14, 16, 16)))

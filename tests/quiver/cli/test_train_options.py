@@ -52,9 +52,10 @@ def trained(data: Path, out: Path, *words: str) -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize(
     "words",
     [
-        ["--sensor", "quiver-paper"],
-        ["--sensor", "quiver-physical,quiver-paper"],
+        ["--sensor", "quiver-published"],
+        ["--sensor", "quiver-physical,quiver-published"],
         ["--ppp", "1,10"],
+        ["--ppp", "0.3..100"],
         ["--bits", "1"],
         ["--bits", "1,3"],
         *(

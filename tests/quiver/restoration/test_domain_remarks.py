@@ -14,7 +14,7 @@ from qsim.sensor import devices
 from qsim.sensor.qis import QIS
 from quiver.baselines import METHODS
 from quiver.data.clips import open_clips
-from quiver.data.codes import array_codes
+from quiver.data.codes import array_codes, light_of
 from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise
 from quiver.model.weights import metadata_of
@@ -31,7 +31,8 @@ def test_inside_nothing_is_said_and_outside_the_better_method():
         "nano is worse than qbp-bm3d on quiver-physical, 3 bit, 1.2 PPP: qbp-bm3d 20.0 dB, network 15.0 dB "
         "at quiver-physical, 3 bit, 1 PPP"
     )
-    for far in (stream(ppp=0.5), stream(ppp=100.0), stream(bits=1), stream("quiver-paper", 1.0), stream("spad512s", 1)):
+    others = (stream(bits=1), stream("quiver-published", 1.0), stream("spad512s", 1))
+    for far in (stream(ppp=0.5), stream(ppp=100.0), *others):
         said = domain_remarks.remark("nano", scope, far)
         assert said is not None
         assert "was never measured near" in said
@@ -42,8 +43,8 @@ def test_light_that_is_not_told_is_estimated():
     """From 12 x 256 codes at 3.25 PPP the mean is known to about 1 %, which decides the nearest cell."""
     told, untold = stream(), stream(told=False)
     assert untold.ppp is None
-    assert domain_remarks.light_of(told) == 3.25
-    assert domain_remarks.light_of(untold) == pytest.approx(3.25, rel=0.1)
+    assert light_of(told) == 3.25
+    assert light_of(untold) == pytest.approx(3.25, rel=0.1)
     assert domain_remarks.remark("nano", Scope(MEASURED), untold) is None
     assert "is worse than" in str(domain_remarks.remark("nano", Scope(MEASURED), stream(ppp=26.0, told=False)))
 
@@ -151,4 +152,4 @@ def test_a_sensor_whose_codes_tell_no_light_still_has_a_remark():
     codes = array_codes(np.zeros((3, 8, 8), np.uint8), sensor, 5e-4)
     with pytest.raises(ValueError, match="does not"):
         METHODS["moment"].restore(codes.read(0, 3), sensor, 5e-4)
-    assert domain_remarks.light_of(codes) > 0
+    assert light_of(codes) > 0

@@ -1,0 +1,106 @@
+"""Fills the codes of hot and dead pixels from their neighbours, before any method sees them.
+
+    map of defective pixels [H, W] -> Filler;   codes [T, H, W] --Filler.fill--> codes that every method reads
+
+A defective pixel takes the mean of the codes of its eight nearest good pixels in the same frame, weighted by the
+inverse square of their distance, and rounded up or down by chance, so that its expectation is this mean: rounding to
+the nearest code would shift the light of few-bit codes. The chance is keyed by frame and pixel: repeats are equal.
+Other frames are not used: what moves is elsewhere in them, and every method merges frames itself.
+
+The map is given, or known: a stream drawn with a table [defects] states its dead and hot pixels. It is not guessed from
+the codes: a hot pixel looks like a small bright thing at rest, and at 13 % hot pixels they touch one another.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import files, keys
+from qsim.clip.simulation import Draw
+from qsim.clip.stream import Stream
+from qsim.keys import Key
+from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.defects.defect_table import from_dict as read_defects
+from qsim.sensor.defects.pixel_array import PixelArray
+from qsim.sensor.sensor import Sensor
+
+NEIGHBOURS = 8  # good pixels that a defective one is filled from
+STAGE = 4  # of the random keys
+HOT = 0.1  # dark detections over those of the mean light, from which on a pixel counts as hot
+
+
+class Filler:
+    """Fills the defective pixels of one map."""
+
+    def __init__(self, bad: Array) -> None:
+        """Find the neighbours of every defective pixel of a map, bool [H, W]. `ValueError` if no pixel is good."""
+        from scipy.spatial import cKDTree
+
+        if bad.all():
+            raise ValueError(f"all {bad.size} pixels are marked as defective; the map is true at defective pixels")
+        self.bad = bad
+        good = np.argwhere(~bad)
+        count = min(NEIGHBOURS, len(good))
+        distance, index = cKDTree(good).query(np.argwhere(bad), k=range(1, count + 1))
+        self.sources = np.ravel_multi_index(tuple(good.T), bad.shape)[index]  # [n, k]
+        self.weights = distance**-2.0 / (distance**-2.0).sum(1, keepdims=True)  # [n, k]
+
+    def fill(self, codes: Array, first: int) -> Array:
+        """Return codes [T, H, W] with the defective pixels filled; frames are numbered from `first`."""
+        flat = codes.reshape(len(codes), -1)
+        means = np.einsum("tnk,nk->tn", flat[:, self.sources].astype(float), self.weights)
+        chance = keys.uniform(keys.words(Key(0, 0, first, STAGE), codes.shape))[:, self.bad]
+        filled = codes.copy()
+        filled[:, self.bad] = np.floor(means + chance).astype(codes.dtype)
+        return filled
+
+
+def defective(
+    defects: Defects | None, sensor: Sensor, exposure: float, light: float, shape: tuple[int, int]
+) -> Array | None:
+    """Return the dead and the hot pixels, bool [H, W], of a sensor with defects; None without any.
+
+    A pixel is hot if its dark detections per exposure [s] exceed HOT times those of the mean light [photons]. Of a
+    clocked sum, `sensor` and `exposure` are those of the sum.
+    """
+    if defects is None:
+        return None
+    array = PixelArray.of(defects, sensor, *shape)
+    bad = np.zeros(shape, bool) if array.maps.dead is None else np.array(array.maps.dead)
+    if array.maps.dark is not None:
+        bad |= array.maps.dark * array.sensor.dark_rate * exposure > HOT * light * array.sensor.efficiency
+    return bad if bad.any() else None
+
+
+def of_draw(draw: Draw, exposure: float, shape: tuple[int, int]) -> Array | None:
+    """Return the defective pixels of a clip that is sensed now."""
+    return defective(draw.defects, draw.sensor, exposure * draw.planes, draw.level.ppp * draw.planes, shape)
+
+
+def of_stream(stream: Stream) -> Array | None:
+    """Return the defective pixels that the description of a stream states; a warning where a map is missing."""
+    table, ppp = stream.meta.get("defects"), stream.meta.get("ppp")
+    if table is None or ppp is None:
+        return None
+    try:
+        return defective(
+            read_defects(table), stream.sensor, stream.exposure, float(ppp), (stream.shape[1], stream.shape[2])
+        )
+    except (OSError, ValueError) as error:
+        warnings.warn(f"{stream.path}: its hot and dead pixels are not filled: {files.wording(error)}", stacklevel=2)
+        return None
+
+
+def read_map(path: Path) -> Array:
+    """Return a map of defective pixels, bool [H, W], from a .npy of booleans or of 0 and 1. `ValueError` otherwise."""
+    array = files.load_array(path)
+    if array.ndim != 2 or not array.size or array.dtype.kind not in "bui" or not np.isin(array, (0, 1)).all():
+        raise ValueError(
+            f"{path}: a map of defective pixels is [H, W] of booleans, or of 0 and 1, and this is {array.dtype} "
+            f"{list(array.shape)}; compare measured dark counts with a limit first"
+        )
+    return np.asarray(array, bool)

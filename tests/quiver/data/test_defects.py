@@ -1,0 +1,130 @@
+"""Defective pixels are filled from their good neighbours alone, without bias, and before every method."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from clips import ClipMaker
+from sensor_files import QIS, SPAD, sensor_file
+from stats import assert_mean
+
+from qsim.clip.sensing import Sensing, sense
+from qsim.keys import Key
+from qsim.sensor.spad import BinarySPAD
+from quiver.baselines import METHODS
+from quiver.data.codes import array_codes, filled, light_of, sensed, stream_codes
+from quiver.data.defects import Filler, read_map
+from quiver.data.illumination import Illumination
+from quiver.data.windows import Windows, WindowSettings
+from quiver.restoration.restorers import restorer
+
+SENSOR, EXPOSURE = BinarySPAD(0.5, 0.0, 3), 1e-3
+
+
+def test_masked_codes_are_never_read_and_good_ones_stay():
+    """Random maps of 0.1 to 99 % of random sizes: any codes below the map give the same filled codes."""
+    rng = np.random.default_rng(1)
+    for _ in range(60):
+        shape = tuple(int(n) for n in rng.integers(1, (5, 30, 30)))
+        bad = rng.random(shape[1:]) < 10 ** rng.uniform(-3, 0)
+        if bad.all():
+            continue
+        codes = rng.integers(0, 8, shape, dtype=np.uint8)
+        other = np.where(bad, rng.integers(0, 8, shape), codes).astype(np.uint8)
+        once, again = (Filler(bad).fill(c, 3) for c in (codes, other))
+        np.testing.assert_array_equal(once, again)
+        np.testing.assert_array_equal(once[:, ~bad], codes[:, ~bad])
+        assert once.dtype == np.uint8
+
+
+@pytest.mark.parametrize("bits", [1, 3, 7])
+def test_the_fill_has_the_mean_of_its_neighbours(bits):
+    """Flat fields at low and high light: the mean code of filled pixels is that of good ones, at any bits."""
+    rng = np.random.default_rng(bits)
+    for light in rng.uniform(0.02, 0.98, 4):
+        bad = rng.random((40, 40)) < 0.13
+        codes = rng.binomial(2**bits - 1, light, (60, 40, 40)).astype(np.uint8)
+        mean, variance = light * (2**bits - 1), light * (1 - light) * (2**bits - 1)
+        # A filled code varies no more than a good one and the rounding; neighbours share some of their sources
+        assert_mean(Filler(bad).fill(codes, 0)[:, bad].astype(float), mean, 8 * (variance + 0.25), checks=12)
+
+
+def test_a_slope_goes_on_through_a_single_pixel():
+    """The eight neighbours of a pixel lie around it: a linear slope keeps its value there."""
+    slope = np.broadcast_to(np.arange(9, dtype=np.uint8) * 3, (5, 9, 9))
+    bad = np.zeros((9, 9), bool)
+    bad[4, 4] = True
+    np.testing.assert_array_equal(Filler(bad).fill(slope, 0), slope)
+
+
+def test_frames_are_filled_alike_in_any_blocks():
+    rng = np.random.default_rng(2)
+    codes = array_codes(rng.integers(0, 8, (7, 8, 10), dtype=np.uint8), SENSOR, EXPOSURE)
+    made = filled(codes, rng.random((8, 10)) < 0.2)
+    whole = made.read(0, 7)
+    np.testing.assert_array_equal(np.concatenate([made.read(0, 3), made.read(3, 4), made.read(4, 7)]), whole)
+    assert made.digest() != codes.digest()
+    assert filled(codes, np.zeros((8, 10), bool)) is codes
+
+
+@pytest.mark.parametrize("frames", [1, 2, 11])
+@pytest.mark.parametrize("name", sorted(METHODS))
+def test_no_method_sees_a_defective_pixel(name, frames):
+    """Any codes below the map, one frame or several: the same video, without a NaN."""
+    rng = np.random.default_rng(3)
+    codes = SENSOR.sample(np.full((frames, 20, 19), 4.0), EXPOSURE, key=Key(1, 1), engine="reference")
+    bad = rng.random((20, 19)) < 0.13
+    hot = np.where(bad, SENSOR.levels - 1, codes).astype(codes.dtype)
+    videos = [restorer(name).restore(filled(array_codes(c, SENSOR, EXPOSURE), bad)) for c in (codes, hot)]
+    np.testing.assert_array_equal(*videos)
+    assert np.isfinite(videos[0]).all()
+
+
+def test_a_stream_states_its_dead_and_hot_pixels(make_clip: ClipMaker, tmp_path):
+    """Sensed now or stored: dead pixels and those whose dark detections exceed a tenth of the light's are filled."""
+    table = "dead = 0.05\ndark = { spread = 0.1, hot_share = 0.1, hot_from = 1000.0, hot_to = 4000.0, tail = 0.67 }\n"
+    clip = make_clip(frames=4, height=30, width=31)
+    path = sensor_file(tmp_path, SPAD + table, bits=3)
+    now, _ = sensed(clip, Illumination(path, 3.25, 3))
+    stored = stream_codes(sense(clip, Sensing(path, 3, ppp=3.25))[0])
+    share = now.defective.mean()
+    assert 0.08 < share < 0.22
+    np.testing.assert_array_equal(stored.defective, now.defective)
+    np.testing.assert_array_equal(stored.read(0, 4), now.read(0, 4))
+    assert now.read(0, 4)[:, now.defective].mean() == pytest.approx(now.read(0, 4)[:, ~now.defective].mean(), rel=0.1)
+    healthy = sensor_file(tmp_path, QIS + "prnu = 0.05\n", bits=3, name="healthy.toml")
+    assert sensed(clip, Illumination(healthy, 3.25, 3))[0].defective is None
+
+
+def test_a_training_window_is_filled_too(make_clip: ClipMaker, tmp_path):
+    """Four in ten pixels are dead, and code 0 is as rare as without dead pixels."""
+    clip = make_clip(frames=12, height=40, width=40)
+    shares = []
+    for dead in (0.4, 0.0):
+        path = sensor_file(tmp_path, QIS + f"prnu = 0.01\ndead = {dead}\n", bits=3, name=f"dead{dead}.toml")
+        windows = Windows([clip], WindowSettings(lights=(Illumination(path, 4.0, 3),), crop=32))
+        shares.append(float((windows[0]["codes"] == 0).float().mean()))
+    assert shares[0] < shares[1] + 0.02
+
+
+def test_a_wrong_map_is_refused(tmp_path):
+    codes = array_codes(np.zeros((2, 6, 7), np.uint8), SENSOR, EXPOSURE)
+    with pytest.raises(ValueError, match="has 7 x 6 pixels, the frames 6 x 7"):
+        filled(codes, np.ones((7, 6), bool))
+    with pytest.raises(ValueError, match="all 42 pixels are marked"):
+        filled(codes, np.ones((6, 7), bool))
+    for wrong in (np.zeros((2, 6, 7), bool), np.full((6, 7), 0.5), np.full((6, 7), 2)):
+        np.save(tmp_path / "map.npy", wrong)
+        with pytest.raises(ValueError, match="a map of defective pixels is"):
+            read_map(tmp_path / "map.npy")
+    np.save(tmp_path / "map.npy", np.eye(6, 7, dtype=np.uint8))
+    np.testing.assert_array_equal(read_map(tmp_path / "map.npy"), np.eye(6, 7) > 0)
+
+
+def test_light_is_estimated_where_no_code_is_saturated():
+    """Random sensors, frames and light below white: 3 % of the light, and that of the spread frames."""
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        light, frames = float(rng.uniform(0.5, 4.0)), int(rng.integers(1, 30))
+        stack = SENSOR.sample(np.full((frames, 60, 60), light), EXPOSURE, key=Key(2, frames), engine="reference")
+        assert light_of(array_codes(stack, SENSOR, EXPOSURE)) == pytest.approx(light, rel=0.06)
