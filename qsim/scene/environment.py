@@ -18,6 +18,7 @@ from qsim.colour import luminance
 from qsim.scene.image_files import read_hdr
 from qsim.scene.lights import EnvironmentImage, SunSky
 
+RINGING = 0.05  # of an environment's mean; free maps of 1024 x 512 px hold -0.03
 SKY_ROWS = 128  # of both halves; the sky is smooth, and the sun is a separate disk
 
 # CIE S 011/E:2003, standard general sky, type 12 "CIE standard clear sky, low luminance turbidity".
@@ -59,11 +60,16 @@ def sky_map(light: SunSky, rows: int = SKY_ROWS) -> Array:
 
 
 def environment_map(light: EnvironmentImage) -> Array:
-    """Return the picture in W m^-2 sr^-1, float32 [H, W]; `ValueError` or `FileNotFoundError` with the file's name."""
+    """Return the picture in W m^-2 sr^-1, float32 [H, W]; `ValueError` or `FileNotFoundError` with the file's name.
+
+    Slightly negative radiance, down to -RINGING times the mean, is an artefact of compressed files and becomes 0.
+    """
     picture = read_hdr(Path(light.image)) if isinstance(light.image, str) else np.asarray(light.image, np.float32)
     if picture.ndim == 3:
         picture = luminance(picture[..., :3])
-    if picture.ndim != 2 or picture.size == 0 or not np.isfinite(picture).all() or picture.min() < 0:
-        where = light.image if isinstance(light.image, str) else "EnvironmentImage.image"
+    where = light.image if isinstance(light.image, str) else "EnvironmentImage.image"
+    if picture.ndim != 2 or picture.size == 0 or not np.isfinite(picture).all():
         raise ValueError(f"{where}: expected finite radiance [H, W] of at least 0, found shape {picture.shape}")
-    return (picture * light.scale).astype(np.float32)
+    if picture.min() < -RINGING * abs(picture.mean()):
+        raise ValueError(f"{where}: expected finite radiance [H, W] of at least 0, found {picture.min():.3g}")
+    return (np.maximum(picture, 0) * light.scale).astype(np.float32)
