@@ -60,7 +60,7 @@ def light_levels(text: str) -> tuple[float, ...]:
         ends = numbers(part.replace("..", ","))
         if ".." in part and not (len(ends) == 2 and ends[0] < ends[1]):
             raise argparse.ArgumentTypeError(f"expected LOW..HIGH with LOW below HIGH, got {part!r}")
-        found += [float(f"{level:.3g}") for level in np.geomspace(*ends, LEVELS)] if ".." in part else ends
+        found += [float(f"{level:.3g}") for level in np.geomspace(ends[0], ends[1], LEVELS)] if ".." in part else ends
     return tuple(found)
 
 

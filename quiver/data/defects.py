@@ -46,7 +46,7 @@ class Filler:
         good = np.argwhere(~bad)
         count = min(NEIGHBOURS, len(good))
         distance, index = cKDTree(good).query(np.argwhere(bad), k=range(1, count + 1))
-        self.sources = np.ravel_multi_index(tuple(good.T), bad.shape)[index]  # [n, k]
+        self.sources: Array = np.flatnonzero(~bad)[index]  # [n, k]
         self.weights = distance**-2.0 / (distance**-2.0).sum(1, keepdims=True)  # [n, k]
 
     def fill(self, codes: Array, first: int) -> Array:
