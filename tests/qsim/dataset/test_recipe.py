@@ -252,6 +252,19 @@ def test_no_mesh_or_texture_of_a_test_scene_is_in_training(path: Path):
     assert found["test"].isdisjoint(found["train"] | found["val"])
 
 
+@pytest.mark.slow
+def test_the_clips_that_test_restorers_show_nothing_of_their_training():
+    """By content: no picture and no photograph of restorer_test.toml is in restorer.toml or restorer_val.toml."""
+    found = []
+    for name in ("restorer_test", "restorer_val", "restorer"):
+        jobs = {job.scene: job for job in recipe.load(Path(__file__).parents[3] / "scenes" / f"{name}.toml").jobs}
+        scenes = [job_runner.load_scene(job) for job in jobs.values()]
+        shown = {asset for s in scenes for asset in (*provenance.assets(s.to_dict()), *provenance.photographs(s))}
+        found.append({asset for asset in shown if not asset.startswith("mesh")})
+    assert found[0]
+    assert found[0].isdisjoint(found[1] | found[2])
+
+
 def calls(action: Callable[[], object]) -> int:
     """Return the number of function calls, ours and built in, of an action."""
     count = 0
