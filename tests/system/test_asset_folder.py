@@ -6,7 +6,7 @@ from PIL import Image
 
 from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
-from scenes import asset_folder
+from qsim.scenes import asset_folder
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -24,7 +24,7 @@ ROOMS: dict[str, set[str]] = {
     "qsim.scene": {"qsim", "qsim.optics"},
     "qsim.clip": {"qsim", "qsim.optics", "qsim.sensor"},
     "qsim.rendering": {"qsim", "qsim.optics", "qsim.scene", "qsim.clip"},
-    "qsim.formats": {"qsim", "qsim.optics", "qsim.sensor", "qsim.clip"},
+    "qsim.formats": {"qsim", "qsim.optics", "qsim.sensor", "qsim.clip", "qsim.scene"},
     "qsim.scenes": {"qsim", "qsim.optics", "qsim.scene", "qsim.rendering"},
     "qsim.dataset": {"qsim", "qsim.optics", "qsim.sensor", "qsim.scene", "qsim.clip", "qsim.rendering", "qsim.scenes"},
     "qsim.calibration": {"qsim", "qsim.sensor", "qsim.clip", "qsim.formats"},

@@ -10,8 +10,8 @@ from PIL import Image
 from scipy import ndimage
 
 from qsim.clip.clip import Clip
-from qsim.dataset import warped_pictures
-from qsim.dataset.warped_pictures import Layer, Path2D, frame, layers
+from qsim.formats import warped_pictures
+from qsim.formats.warped_pictures import Layer, Path2D, frame, layers
 from quiver.data.clips import open_clips
 
 

@@ -1,6 +1,6 @@
 """Makes clips of warped pictures: photographs and shapes cut from them that slide, turn and zoom before one another.
 
-    python -m qsim.dataset.warped_pictures PICTURES -o out/photos --licence FILE --clips 300 --split train
+    python -m qsim.formats.warped_pictures PICTURES -o out/photos --licence FILE --clips 300 --split train
 
     pictures -> layers (a background, bodies of random outline) -> relative radiance, exact flow, one clip per number
 
