@@ -4,7 +4,7 @@
 
     pictures -> layers (a background, bodies of random outline) -> relative radiance, exact flow, one clip per number
 
-They cost a thousandth of a rendered clip, and have no light, shading or blur of their own. Pictures become linear light
+They cost a thousandth of a rendered clip, and have no shading and no blur. Pictures become linear light
 and are shrunk to half of their size at least, which removes most of their noise. Every clip draws its largest motion
 from 0 to `motion` px/frame; its layers translate, sway, rotate and zoom up to that. A pixel is the mean of 3 x 3
 bilinear samples; flow follows from the motion in closed form. Clip n is a function of the pictures, `seed` and n. An
