@@ -117,7 +117,7 @@ def clip_bytes(network: Any) -> int:
     part = part_of(network)
     first, more = CLIP_BYTES[type(network).__name__]
     share = network.config.width / type(network.config)().width
-    return 500 + int(1.5 * share * (first + more * (part.before + part.kept + part.after)))
+    return 500 + int(1.5 * (share * first + more * (part.before + part.kept + part.after)))
 
 
 def frame_bytes(model: nn.Module, mode: str) -> int:
