@@ -319,7 +319,7 @@ def curves(networks: list[dict[str, Any]], path: Path) -> None:
     for i, row in enumerate(networks):
         minutes = [entry["elapsed"] / 60 for entry in row["curve"]]
         values = [entry["psnr_matched"] for entry in row["curve"]]
-        axes.plot(minutes, values, ".-", color=f"C{i % 10}", ls=("-", "--")[i // 10 % 2], label=row["name"])
+        axes.plot(minutes, values, marker=".", color=f"C{i % 10}", ls=("-", "--")[i // 10 % 2], label=row["name"])
     axes.set_xlabel("minutes of training")
     axes.set_ylabel("validation PSNR after the best factor [dB]")
     if networks:

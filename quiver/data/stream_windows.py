@@ -5,6 +5,7 @@ Sample n is a function of (seed, n) alone: its place and its turn. Its noise is 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,36 @@ from torch.utils.data import Dataset
 
 from qsim.clip.clip import Clip
 from qsim.keys import Key
+from qsim.sensor.qis import QIS
+from qsim.sensor.spad import BinarySPAD
 from quiver.data.codes import Codes, open_stream, stream_codes
 from quiver.data.window_noise import WindowPlace
 from quiver.data.windows import WindowSettings, as_input, turned
+
+COUNTING = (0.9, 1.25)  # codes per electron at which codes of a QIS are photon counts, nearly
+
+
+@dataclass(frozen=True)
+class Law:
+    """How photons make the codes of a stream, as far as single photons can be taken from them."""
+
+    planes: bool  # a code is the sum of binary planes; else a count of photons
+    dark: float  # what comes without light, in units of white
+
+
+def law_of(codes: Codes) -> Law:
+    """Return the law of a stream: sums of planes of a clocked SPAD array, else photon counts.
+
+    `ValueError` for a QIS whose codes are no counts: a photon cannot be taken from them.
+    """
+    sensor, exposure = codes.sensor, codes.exposure
+    if isinstance(sensor, QIS) and not COUNTING[0] <= sensor.gain <= COUNTING[1]:
+        raise ValueError(
+            f"{codes.name}: its codes are {sensor.gain:.3g} per electron and no photon counts, which bit2bit needs; "
+            "give a stream of about one code per electron, or of summed planes"
+        )
+    dark = sensor.dark_rate * exposure / (sensor.efficiency * sensor.white(exposure))
+    return Law(isinstance(sensor, BinarySPAD), float(dark))
 
 
 def stream_at(path: Path) -> Codes:

@@ -11,31 +11,18 @@ from typing import Any
 
 from torch import Tensor
 
-from qsim.sensor.qis import QIS
-from qsim.sensor.spad import BinarySPAD
 from quiver.data.codes import Codes
-from quiver.data.stream_windows import StreamWindows, stream_at
+from quiver.data.stream_windows import StreamWindows, law_of, stream_at
 from quiver.data.windows import WindowSettings
 from quiver.model.rivals.bit2bit import Bit2BitConfig, bit2bit_loss
 from quiver.training.settings import Settings
 from quiver.training.system import Batch
 
-COUNTING = (0.9, 1.25)  # codes per electron at which codes of a QIS are photon counts, nearly
-
 
 def config_for(codes: Codes) -> Bit2BitConfig:
-    """Return the published sizes with the law of a stream: binomial for sums of planes, else that of photon counts.
-
-    `ValueError` for a QIS whose codes are no counts: a photon cannot be taken from them.
-    """
-    sensor, exposure = codes.sensor, codes.exposure
-    if isinstance(sensor, QIS) and not COUNTING[0] <= sensor.gain <= COUNTING[1]:
-        raise ValueError(
-            f"{codes.name}: its codes are {sensor.gain:.3g} per electron and no photon counts, which bit2bit needs; "
-            "give a stream of about one code per electron, or of summed planes"
-        )
-    dark = sensor.dark_rate * exposure / (sensor.efficiency * sensor.white(exposure))
-    return Bit2BitConfig(planes=sensor.levels - 1, dark=float(dark), as_published=not isinstance(sensor, BinarySPAD))
+    """Return the published sizes with the law of a stream; `ValueError` for a QIS whose codes are no counts."""
+    law = law_of(codes)
+    return Bit2BitConfig(planes=codes.sensor.levels - 1, dark=law.dark, as_published=not law.planes)
 
 
 def own_light(settings: Settings, codes: Codes) -> Settings:
