@@ -1,17 +1,19 @@
-"""Makes small networks of all rivals for tests: float64, evaluation mode, every stage contributes."""
+"""Makes small networks of all rivals and of the U-Net for tests: float64, evaluation mode, every stage contributes."""
 
 import importlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from golden import fill_by_rule
 from torch import nn
 
+from quiver.model.presets import NETWORKS
 from quiver.model.rivals.bit2bit import Bit2Bit, Bit2BitConfig
 from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
 from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
+from quiver.model.unet import UNet, UNetConfig
 
 N = TypeVar("N", bound=nn.Module)
 GOLDEN = [importlib.import_module(path.stem) for path in sorted(Path(__file__).parent.glob("golden_*.py"))]
@@ -30,10 +32,16 @@ def lively(network: N) -> N:
     return network.double().eval()
 
 
+def assembled(config: Any) -> nn.Module:
+    """Return the network of a configuration of any kind."""
+    return next(network(config) for network, kind in NETWORKS if kind is type(config))
+
+
 SMALL: dict[str, Callable[[], nn.Module]] = {
     **{module.__name__.removeprefix("golden_"): module.small for module in GOLDEN if hasattr(module, "small")},
     "bit2bit": lambda: lively(Bit2Bit(Bit2BitConfig(width=4))),
     "bit2bit_as_published": lambda: lively(Bit2Bit(Bit2BitConfig(width=4, as_published=True))),
     "student_teacher": lambda: lively(StudentTeacher(StudentTeacherConfig(width=3, blocks=1))),
+    "unet": lambda: lively(UNet(UNetConfig(2))),
     "fastdvdnet": lambda: lively(FastDVDnet(FastDVDnetConfig(width=4))),
 }

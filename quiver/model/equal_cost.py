@@ -1,0 +1,48 @@
+"""Holds the sizes at which all networks cost alike: about a million multiply-accumulates per pixel and frame.
+
+Each is its published design with other widths. Counted by `quiver.evaluation.macs.macs_per_pixel`: one more frame of a
+long clip, whose ends do not count.
+"""
+
+from typing import Any
+
+from quiver.model.folded import FoldedConfig
+from quiver.model.rivals.bit2bit import Bit2BitConfig
+from quiver.model.rivals.emvd import EMVDConfig
+from quiver.model.rivals.fastdvdnet import FastDVDnetConfig
+from quiver.model.rivals.flornn import FloRNNConfig
+from quiver.model.rivals.memdeblur import MemDeblurConfig
+from quiver.model.rivals.rvrt import RVRTConfig
+from quiver.model.rivals.spk2imgnet import Spk2ImgNetConfig
+from quiver.model.rivals.student_teacher import StudentTeacherConfig
+from quiver.model.unet import UNetConfig
+
+EQUAL_COST: dict[str, Any] = {
+    "emvd": EMVDConfig(width=336),
+    "flornn": FloRNNConfig(width=38, flow_channels=(16, 32, 16, 8)),  # the published flow network alone costs 0.6 M
+    "memdeblur": MemDeblurConfig(width=112),
+    "rvrt": RVRTConfig(width=168, flow_levels=4),  # six levels pad a training crop to 132 px
+    "spk2imgnet": Spk2ImgNetConfig(width=24),
+    "student-teacher": StudentTeacherConfig(width=56),  # of the student, which restores
+    "bit2bit": Bit2BitConfig(width=40),  # every frame lies in two pieces
+    "fastdvdnet": FastDVDnetConfig(width=57),
+    "unet": UNetConfig(width=90),
+    # Published width 16 costs 2.5 M. Here is QUIVER without additions: no folding, initial estimate or temperature.
+    "quiver-s": FoldedConfig(
+        channels=12,
+        deformable_groups=12,
+        deformable_kernel=3,
+        denoiser_growth=24,
+        denoiser_passes=5,
+        flow_channels=(16, 32, 16, 8),
+        flow_kernel=7,
+        flow_levels=4,
+        cell_blocks=11,
+        attention_width=None,
+        attention_temperature=None,
+        fold=1,
+        estimate_width=0,
+        largest_velocity=0.0,
+        lecun=False,
+    ),
+}

@@ -1,0 +1,71 @@
+"""Tests the counter of multiply-accumulates against hand counts, and the networks that are to cost alike."""
+
+import pytest
+from rivals import assembled
+from torch import Tensor, nn
+
+from quiver.evaluation.macs import macs, macs_per_pixel
+from quiver.model.equal_cost import EQUAL_COST
+from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
+from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
+
+
+class Layers(nn.Module):
+    """One layer of each kind that the networks have, on every frame."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.enter = nn.Conv2d(1, 6, 3, padding=1)  # 54 per pixel
+        self.grouped = nn.Conv2d(6, 8, 3, stride=2, padding=1, groups=2)  # 8 * 3 * 9 = 216 per pixel of half size
+        self.linear = nn.Linear(8, 5)  # 40
+        self.up = nn.ConvTranspose2d(8, 3, 2, stride=2)  # 8 * 3 * 4 = 96
+        self.volume = nn.Conv3d(3, 2, 3, padding=1)  # 162 per pixel of full size
+
+    def forward(self, frames: Tensor) -> Tensor:
+        x = self.grouped(self.enter(frames.flatten(0, 1)))
+        self.linear(x.movedim(1, -1))
+        flat = x.flatten(2)
+        flat @ flat.mT  # 8 * 8 per pixel of half size
+        return self.volume(self.up(x).movedim(0, 1))
+
+
+def test_layers_cost_what_they_cost_by_hand():
+    quarter = 216 + 40 + 96 + 64
+    assert macs(Layers(), 3, 8, 12) == 3 * 8 * 12 * (54 + 162) + 3 * 4 * 6 * quarter
+    assert macs_per_pixel(Layers(), (2, 4), 8) == 54 + 162 + quarter / 4
+
+
+def test_a_network_costs_what_its_layers_cost():
+    """By hand from the tables of layers: of a block of FastDVDnet, and of a student."""
+    w, each = 4, 3
+    full = 9 * (3 * 2 * each + 3 * each * w + w * w + w)
+    half = 9 * (w * 2 * w + 2 * (2 * w) ** 2 + 2 * (2 * w) ** 2 + 2 * w * 4 * w)
+    quarter = 9 * (2 * w * 4 * w + 4 * (4 * w) ** 2 + 4 * w * 8 * w)
+    network = FastDVDnet(FastDVDnetConfig(width=w)).eval()
+    assert macs_per_pixel(network, (2, 4), 16) == 2 * (full + half / 4 + quarter / 16)
+    w = 3
+    full = 9 * (2 * (11 * w + 2 * w * w) + 3 * w * w + 2 * w * w + w)
+    half = 9 * (2 * (w * w + 2 * w * w) + 2 * w * w + 2 * w * w + w * 4 * w)
+    student = StudentTeacher(StudentTeacherConfig(width=w, blocks=1)).eval()
+    assert macs_per_pixel(student, (1, 2), 8) == full + half / 4
+
+
+def test_published_sizes_cost_what_is_published():
+    """GMAC per frame at 256 x 256 of the specification; only convolutions, so pixels of any size cost alike."""
+    pixels = 256**2
+    assert macs_per_pixel(FastDVDnet().eval(), (1, 2), 16) * pixels == pytest.approx(20.6e9, rel=0.003)
+    assert macs_per_pixel(StudentTeacher().eval(), (1, 2), 16) * pixels == pytest.approx(85.4e9, rel=0.001)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EQUAL_COST)
+def test_networks_of_equal_cost_cost_a_million(name):
+    network = assembled(EQUAL_COST[name]).eval()
+    frames = (32, 64) if name == "bit2bit" else (12, 22)
+    found = macs_per_pixel(network, frames, 128 if name == "rvrt" else 64)
+    assert 0.9e6 < found < 1.1e6
+
+
+def test_every_compared_network_has_a_size_of_equal_cost():
+    wanted = {"emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet", "student-teacher", "bit2bit", "fastdvdnet", "unet"}
+    assert set(EQUAL_COST) == {*wanted, "quiver-s"}
