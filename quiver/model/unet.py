@@ -1,19 +1,22 @@
 """Defines a U-Net over the stacked frames of a window: the control for every learned method.
 
-The eleven frames are channels of one image. The network has no part for motion, time or noise.
+The eleven frames are channels of one image. The network has no part for motion, time or noise. Its outside is that of
+the compared networks (quiver/model/rivals/). Look-ahead: 5 frames; beyond the ends of a clip, time runs backwards.
 """
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from qsim.structure import make
-from quiver.model.blocks import WINDOW, Output, check_input, conv, join
+from quiver.model.blocks import RADIUS, WINDOW, check_input, conv, join
 from quiver.model.config import whole_number
+from quiver.model.rivals.edges import check_frames, pad_space, reflected
 
 
 @dataclass(frozen=True)
@@ -63,21 +66,34 @@ class SmallUNet(nn.Module):
 
 
 class UNet(nn.Module):
-    """The control; it is called like QUIVER, and its output has scale 1 only."""
+    """The control for grey frames."""
 
-    multiple = SmallUNet.MULTIPLE
-    reach = SmallUNet.REACH  # px: a pixel depends on no input farther away
+    look_ahead: ClassVar[int] = RADIUS  # frames
+    frames_in: ClassVar[int] = WINDOW  # of a window; the middle one is restored
+    multiple: ClassVar[int] = SmallUNet.MULTIPLE  # px that divide height and width inside
+    reach: ClassVar[int] = SmallUNet.REACH  # px: a pixel depends on no input farther away
 
     def __init__(self, config: UNetConfig | None = None) -> None:
         super().__init__()
         self.config = config or UNetConfig()
         self.body = SmallUNet(WINDOW, self.config.width)
 
-    def forward(self, x: Tensor) -> Output:
-        """[B, T, 1, H, W] with T >= 11 -> Output of the frames 5 .. T-6; ValueError as in QUIVER."""
-        check_input(x, self.multiple)
-        windows = [self.body(x[:, t : t + WINDOW, 0]) for t in range(x.shape[1] - WINDOW + 1)]
-        return Output(None, torch.stack(windows, dim=1), None, None)
+    def forward(self, frames: Tensor) -> Tensor:
+        """[B, T, 1, H, W] of codes/(2^b - 1) -> restored [B, T, 1, H, W]; ValueError for another shape."""
+        check_frames(frames)
+        count = frames.shape[1]
+        order = reflected(-RADIUS, count + 2 * RADIUS, count)
+        restored = self.windows(pad_space(frames, self.multiple)[:, order])
+        return restored[..., : frames.shape[-2], : frames.shape[-1]]
+
+    def windows(self, frames: Tensor) -> Tensor:
+        """[B, T, 1, H, W], T >= 11, H and W multiples of 4 -> restored frames 5 ... T-6 [B, T-10, 1, H, W].
+
+        ValueError for fewer frames or other sides.
+        """
+        check_input(frames, self.multiple)
+        starts = range(frames.shape[1] - WINDOW + 1)
+        return torch.stack([self.body(frames[:, t : t + WINDOW, 0]) for t in starts], dim=1)
 
 
 def _relu_chain(widths: Sequence[int]) -> list[nn.Module]:

@@ -60,14 +60,15 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int, mode: str
     whole = Pieces(cut_tiles(height, width, height * width, 0))
     if height * width <= pixels:
         return whole
+    reach = getattr(model, "reach", None)
+    if reach is not None:
+        return Pieces(cut_tiles(height, width, pixels, reach, int(model.multiple)))  # type: ignore[arg-type]
     if takes_clips(model):  # recurrent, or aligned along any motion: no overlap makes tiles exact
         needed = bytes_per_pixel(model, mode) * height * width
         return Pieces(cut_tiles(height, width, pixels, BLENDED, STEP, blend=True), None, False, needed)
     multiple = int(model.multiple)  # type: ignore[arg-type]
     if not isinstance(model, QUIVER):
-        reach = getattr(model, "reach", None)
-        blend = reach is None
-        return Pieces(cut_tiles(height, width, pixels, reach or BLENDED, multiple, blend=blend), exact=not blend)
+        return Pieces(cut_tiles(height, width, pixels, BLENDED, multiple, blend=True), exact=False)
     padded = [side + -side % multiple for side in (height, width)]
     needed = bytes_per_pixel(model, mode) * height * width
     if isinstance(model, FoldedQUIVER) and model.estimate is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -17,6 +18,7 @@ from quiver.model.rivals.memdeblur import MemDeblur
 from quiver.model.rivals.rvrt import RVRT
 from quiver.model.rivals.spk2imgnet import Spk2ImgNet
 from quiver.model.rivals.student_teacher import StudentTeacher
+from quiver.model.unet import UNet
 from quiver.training import rival_losses as rivals
 from quiver.training.loss import PRESETS as LOSSES
 from quiver.training.loss import training_loss
@@ -51,7 +53,7 @@ def _protocols(published: dict[str, Any], **quick: Any) -> dict[str, dict[str, A
     return {"quick": _QUICK | common | quick, "published": _PORT | published}
 
 
-# ---- Networks whose output is an `Output`
+# ---- Networks with the outside of QUIVER, and the control
 
 
 def quiver_loss(network: nn.Module, batch: Batch, settings: Settings, share: float) -> Tensor:
@@ -66,9 +68,16 @@ def quiver_restored(network: nn.Module, batch: Batch) -> tuple[Tensor, int]:
     return network(batch["codes"]).scale1, RADIUS
 
 
+def unet_loss(network: nn.Module, batch: Batch, settings: Settings, share: float) -> Tensor:
+    """Return the loss of loss.py that the settings name, of the frames whose window lies in that of the batch."""
+    restored, first = rivals.windows_restored(network, batch)
+    return training_loss(restored, batch["target"], LOSSES[settings.loss], first=first)
+
+
 OURS = System("quiver", quiver_loss, quiver_restored, PROTOCOLS, losses=tuple(LOSSES))
 
 SYSTEMS: dict[type[nn.Module], System] = {
+    UNet: replace(OURS, name="unet", loss=unet_loss, restored=rivals.windows_restored),
     EMVD: System(
         "emvd", rivals.emvd_loss, rivals.last_frame, _protocols({"clip_norm": 5.0}, clip_norm=5.0)
     ),

@@ -66,7 +66,7 @@ def test_wrong_names_and_settings_say_what_is_right():
     ],
 )
 def test_inputs_that_do_not_fit_are_refused(shape, message):
-    for refusing in (assemble(SMALL), QUIVER(16), UNet(UNetConfig(2))):
+    for refusing in (assemble(SMALL), QUIVER(16), UNet(UNetConfig(2)).windows):
         with pytest.raises(ValueError, match=message):
             refusing(torch.zeros(shape))
 

@@ -27,6 +27,7 @@ from quiver.training import loop as training
 from quiver.training.loop import Diverged, make_windows, train
 from quiver.training.schedule import State
 from quiver.training.settings import settled
+from quiver.training.systems import system_of
 
 ROOT = Path(__file__).parents[3]
 
@@ -99,7 +100,8 @@ def test_it_learns(tiny_dataset, tmp_path):
     """Forty steps at a high rate halve the root mean squared error of the untrained network, on held-out clips."""
     quick = settings(tiny_dataset, tmp_path / "r", steps=40, learning_rate=1e-2, loss="l1")
     state = train(small_network(), quick, progress=False)
-    before, _ = training.validate(small_network(), make_windows(quick, 4)[1], torch.device("cpu"))
+    network = small_network()
+    before, _ = training.validate(network, make_windows(quick, 4)[1], torch.device("cpu"), system_of(network))
     assert state.history[-1]["psnr"] > before.psnr + 6
 
 

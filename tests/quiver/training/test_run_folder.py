@@ -141,7 +141,7 @@ def trained(folder: Path) -> tuple[Run, dict[str, Any]]:
         pass
     model = UNet(UNetConfig(1))
     optimiser = Optimiser(model, "muon", 1e-3, (0.9, 0.99))
-    model(torch.rand(1, 11, 1, 8, 8)).scale1.sum().backward()
+    model(torch.rand(1, 11, 1, 8, 8)).sum().backward()
     optimiser.step(1e-3)
     entry = {"step": 1, "elapsed": 1.0, "loss": 0.5, "psnr": 20.0, "psnr_matched": 21.0}
     run.save(run.checkpoint, model, optimiser, State(step=1, elapsed=1.0, best=21.0, history=[entry]))
@@ -152,7 +152,7 @@ def resumed(run: Run) -> State:
     model = UNet(UNetConfig(1))
     optimiser = Optimiser(model, "muon", 1e-3, (0.9, 0.99))
     state = run.load(model, optimiser, torch.device("cpu"))
-    model(torch.rand(1, 11, 1, 8, 8)).scale1.sum().backward()
+    model(torch.rand(1, 11, 1, 8, 8)).sum().backward()
     optimiser.step(1e-3)  # the loaded state is usable
     return state
 

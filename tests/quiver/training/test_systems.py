@@ -181,7 +181,7 @@ def test_every_preset_has_a_system_and_a_quick_protocol():
     for name in NETWORKS:
         system = system_named(name)
         assert set(protocol(system, "quick")) <= known
-        assert (system is OURS) == (name in ("unet", *PRESETS))
+        assert (system is OURS) == (name in PRESETS)
     assert {kind for kind, _ in KINDS} >= set(SYSTEMS)
     with pytest.raises(ValueError, match="--protocol paper: emvd has quick and published"):
         protocol(system_named("emvd"), "paper")
@@ -190,7 +190,7 @@ def test_every_preset_has_a_system_and_a_quick_protocol():
 @pytest.mark.parametrize(
     ("name", "changes", "message"),
     [
-        ("unet", {"frames": 10}, "--frames must be at least 11, the window of quiver, got 10"),
+        ("unet", {"frames": 10}, "--frames must be at least 11, the window of unet, got 10"),
         ("rvrt", {"frames": 11}, "--frames must be at least 12, the window of rvrt, got 11"),
         ("spk2imgnet", {"frames": 9}, "at least 10"),
         ("emvd", {"crop": 36}, "--crop 36: this network needs a multiple of 8"),
