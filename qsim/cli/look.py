@@ -116,7 +116,8 @@ def _show(args: argparse.Namespace, source: Any, views: list[Any], frames: range
                 print(preview.cursor_up(text) if coloured else "")
         if view.legend is not None:
             print(draw(preview.fit_terminal(view.legend, 24, 12)))
-        print(f"frame {frames[-1]} of {source.name}, {view.declared}")
+        stretched = "" if coloured else ", contrast stretched"
+        print(f"frame {frames[-1]} of {source.name}, {view.declared}{stretched}")
     return 0
 
 

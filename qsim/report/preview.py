@@ -129,6 +129,7 @@ def _write_gif(path: Path, frames: Iterator[Picture], fps: float) -> None:
 # Terminals
 
 HALF = "▀"  # upper half block: the foreground is the upper pixel, the background the lower one
+NEARLY_EQUAL = 16  # grey levels of 255, within which a picture is noise around one level
 SHADES = " .:-=+*#%@"  # dark to light, for outputs without colour
 
 
@@ -160,9 +161,14 @@ def _lower(picture: NDArray[np.uint8]) -> list[NDArray[np.uint8] | None]:
 
 
 def shades(picture: NDArray[np.uint8]) -> str:
-    """Return every second row of a picture [H, W, 3] in ten shades of text; characters are twice as high as wide."""
+    """Return every second row of a picture [H, W, 3] in ten shades of text; characters are twice as high as wide.
+
+    The shades run from the 1st to the 99th percentile of the picture's grey levels, unless these are nearly equal.
+    """
     grey = luminance(picture[::2])
-    steps = np.minimum((grey / 256 * len(SHADES)).astype(int), len(SHADES) - 1)
+    low, high = np.percentile(grey, [1, 99])
+    low, high = (low, high) if high - low > NEARLY_EQUAL else (0.0, 255.0)
+    steps = np.clip((grey - low) / (high - low) * len(SHADES), 0, len(SHADES) - 1).astype(int)
     return "\n".join("".join(SHADES[i] for i in row) for row in steps)
 
 

@@ -71,6 +71,14 @@ def test_half_blocks_carry_both_pixels():
     assert "\x1b[49m" in lines[1], "an odd last row has nothing below"
 
 
+def test_shades_of_a_dim_picture_have_full_contrast_and_a_flat_one_its_level():
+    dim = np.repeat(np.linspace(100, 140, 50)[None, :, None], 3, axis=2).astype(np.uint8)
+    text = preview.shades(dim)
+    assert (text[0], text[-1], len(set(text))) == (preview.SHADES[0], preview.SHADES[-1], len(preview.SHADES))
+    assert preview.shades(np.full((2, 4, 3), 255, np.uint8)) == "@@@@"
+    assert preview.shades(np.zeros((2, 4, 3), np.uint8)) == "    "
+
+
 def test_shades_go_from_dark_to_light():
     ramp = np.repeat(np.linspace(0, 255, 10).astype(np.uint8)[None, :, None], 3, axis=2)
     assert preview.shades(ramp) == preview.SHADES
