@@ -318,7 +318,12 @@ def bar(label: str, unit: str = "frame", first: str = "") -> Iterator[Progress]:
     with tqdm(
         desc=label, unit=unit, delay=2, mininterval=interval, dynamic_ncols=True, file=sys.stderr, disable=silent
     ) as shown:
-        waiting = threading.Timer(2.0, lambda: shown.set_description_str(f"{label}, {first}"))
+
+        def begin() -> None:
+            shown.last_print_t = time.time()  # it is shown, so its line must end
+            shown.set_description_str(f"{label}, {first}")
+
+        waiting = threading.Timer(2.0, begin)
         waiting.daemon = True
 
         def update(done: int, total: int) -> None:
@@ -332,5 +337,8 @@ def bar(label: str, unit: str = "frame", first: str = "") -> Iterator[Progress]:
             waiting.start()
         try:
             yield update
+        except BaseException:
+            shown.leave = False  # the reason of the failure is the last line
+            raise
         finally:
             waiting.cancel()

@@ -47,7 +47,6 @@ def _run_generate(args: argparse.Namespace) -> int:
 
     wanted = recipe.load(args.recipe)
     folder = args.output or Path("out") / wanted.name
-    note(_defaults(wanted, folder))
     # None: not given, as --cluster needs it (`_cluster`).
     count = generation.Options.workers if args.workers is None else args.workers
     limits = Limits() if args.memory is None else Limits(memory=args.memory)
@@ -59,7 +58,7 @@ def _run_generate(args: argparse.Namespace) -> int:
     chosen = generation.shard(wanted.jobs, args.shard)
     with bar(wanted.name, first=PILOT) as progress, generation.watching(folder, chosen, progress):
         summary = generation.generate(wanted, folder, options, run=_cluster(args))
-    lines = [f"{folder}: {summary.done} of {summary.jobs} clips done, {summary.made} made now"]
+    lines = [f"{folder}: {summary.done} of {summary.jobs} clips done, {summary.made} made now{_defaults(wanted)}"]
     lines += [f"repaired {problem}" for problem in summary.repaired]
     lines += [f"FAILED {name}: {why}" for name, why in sorted(summary.failed.items())]
     lines += [f"SHARED {problem}" for problem in summary.shared]
@@ -70,12 +69,12 @@ def _run_generate(args: argparse.Namespace) -> int:
     return 0 if summary.done == summary.jobs and not summary.shared else 1
 
 
-def _defaults(wanted: Recipe, folder: Path) -> str:
-    """Return one line: the number of clips, their folder, and the defaults that the recipe does not set."""
+def _defaults(wanted: Recipe) -> str:
+    """Return the defaults that a recipe does not set: `; by default frame_rate = 2000, shutter = 0`."""
     sections = [wanted.source["recipe"], *wanted.source["scenes"]]
     settings = {"frame_rate": 2000.0, "shutter": Settings.shutter, "psnr": Settings.psnr, "seed": 0}
     taken = [f"{key} = {value:g}" for key, value in settings.items() if not any(key in part for part in sections)]
-    return f"{wanted.name}: {len(wanted.jobs)} clips in {folder}; by default " + (", ".join(taken) or "nothing")
+    return f"; by default {', '.join(taken)}" if taken else ""
 
 
 def _noisy(folder: Path, jobs: list[Job]) -> list[str]:

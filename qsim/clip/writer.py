@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import importlib.metadata
 import json
@@ -36,19 +37,9 @@ class ClipWriter:
     """
 
     def __init__(self, path: str | os.PathLike[str], meta: dict[str, Any], *, force: bool = False) -> None:
-        self.path = Path(path)
         self.force = force
-        self.name = check_name(self.path.name)
-        if self.path.is_symlink():  # the link stays; the clip is written where it points to
-            self.path = self.path.resolve()
-        if self.path.exists() and not force:
-            raise FileExistsError(f"{self.path}: exists; name another with -o, or use --force to replace it")
-        if self.path.exists() and not (self.path / "clip.json").is_file():
-            raise FileExistsError(
-                f"{self.path}: exists and is not a clip, which is all that --force replaces; name another with -o"
-            )
-        if self.path.exists():
-            files.check_ours(self.path, OURS)
+        self.name = check_name(Path(path).name)
+        self.path = target_of(path, force)
         self.meta = json.loads(files.to_json({"format_version": FORMAT_VERSION, "name": self.name} | meta))
         check_new(self.path, self.meta)
         self.part = self.path.with_name(self.path.name + ".part")
@@ -249,6 +240,29 @@ class ClipWriter:
             exr.read_half(self.part / "radiance" / f"{t:06d}.exr", height, width)[::step, ::step] for t in range(frames)
         ]
         return bright_end(np.stack(samples))
+
+
+def target_of(path: str | os.PathLike[str], force: bool) -> Path:
+    """Return the folder that a clip of this path is written to: a symbolic link stays, and its target is written.
+
+    `FileExistsError` for a folder that may not be replaced, `NotADirectoryError` for a path below a file.
+    """
+    found = Path(path)
+    check_name(found.name)
+    if found.is_symlink():
+        found = found.resolve()
+    if found.exists() and not force:
+        raise FileExistsError(f"{found}: exists; name another with -o, or use --force to replace it")
+    if found.exists() and not (found / "clip.json").is_file():
+        raise FileExistsError(
+            f"{found}: exists and is not a clip, which is all that --force replaces; name another with -o"
+        )
+    if found.exists():
+        files.check_ours(found, OURS)
+    above = next(parent for parent in found.absolute().parents if parent.exists())
+    if not above.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(found))
+    return found
 
 
 def _truth_channels(truth: dict[str, Array]) -> dict[str, Array]:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from qsim.clip.clip import Clip
+from qsim.clip.writer import target_of
 from qsim.dataset import scene_files
 from qsim.files import NAME, Progress
 from qsim.rendering.budget import Budget
@@ -54,6 +55,8 @@ def render(
     """
     if path is None and force:
         raise ValueError("force= replaces the clip of a folder, and no path is given; leave it out")
+    if path is not None:
+        target_of(path, force)  # before the pilot
     loaded, read = load_scene(scene, height, width, seed, speed)
     if budget is None:
         budget = choose_budget(

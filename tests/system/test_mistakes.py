@@ -145,7 +145,7 @@ MISTAKES = [
         "is not a 2-bit code (0..3); give the right --bits",
     ),
     ("qsim convert light.npy x --frame-rate 9 --columns 99", "--columns 99: the frames have 10 columns"),
-    ("qsim convert lit x.webm", "x.webm: name the kind of output with --to: cube, exr, mp4, png, zarr"),
+    ("qsim convert lit x.webm", "x.webm: name the kind of output with --to: cube, exr, mp4, pairs, png, zarr"),
     # Looking and studying
     (
         "qsim report empty -o x.html",

@@ -354,7 +354,8 @@ def test_defaults_of_a_recipe_and_applied_defects_are_printed(tmp_path, capsys, 
     Path("mine.toml").write_text(text + 'split = "train"\n')
     monkeypatch.setattr(generation, "generate", lambda *_, **__: generation.Summary(1, 1, 1, {}, ()))
     assert main(["generate", "mine.toml"]) == 0
-    assert "mine: 1 clips in out/mine; by default frame_rate = 2000, shutter = 0, seed = 0" in capsys.readouterr().err
+    words = "out/mine: 1 of 1 clips done, 1 made now; by default frame_rate = 2000, shutter = 0, seed = 0\n"
+    assert capsys.readouterr().out == words
     clip = relative(tmp_path / "c")
     Path("d.toml").write_text("[defects]\nprnu = 0.02\ndead = 0.1\n")
     assert (
