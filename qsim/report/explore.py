@@ -71,7 +71,7 @@ def explore_page(clip: Clip) -> str:
     """Return the page of a clip as HTML; it loads nothing from elsewhere. `ValueError` for a black clip."""
     stored = stored_light(clip)
     frames, height, width = stored.steps.shape
-    mean, largest = motion(clip, range(frames)) if clip.has_truth else (None, None)
+    mean = motion(clip, range(frames))[0] if clip.has_truth else None
     data = {
         "frames": frames,
         "height": height,
@@ -81,8 +81,8 @@ def explore_page(clip: Clip) -> str:
         "steps": _STEPS,
         "exposure": clip.exposure,
         "frameRate": clip.frame_rate,
+        "shutter": float(clip.meta.get("shutter", min(clip.exposure * clip.frame_rate, 1.0))),  # share of a frame
         "motion": mean,
-        "largestMotion": largest,
         "devices": named_sensors(clip.exposure),
     }
     template = environment().get_template("explore.html")

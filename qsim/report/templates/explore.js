@@ -133,7 +133,7 @@ function frame(x, y, xTicks, yTicks, xLabel, yLabel) {
     parts.push(element("line", { class: "grid", x1: 50, x2: 475, y1: y(value), y2: y(value) }));
     parts.push(element("text", { x: 45, y: y(value) + 4, "text-anchor": "end" }, text));
   }
-  for (const [value, text] of xTicks) parts.push(element("text", { x: x(value), y: 226, "text-anchor": "middle" }, text));
+  for (const [value, text] of xTicks) parts.push(element("text", { x: x(value), y: 226, "text-anchor": x(value) > 465 ? "end" : "middle" }, text));
   parts.push(element("line", { class: "axis", x1: 50, x2: 475, y1: 210, y2: 210 }));
   parts.push(element("text", { x: 475, y: 245, "text-anchor": "end" }, xLabel));
   parts.push(element("text", { x: 4, y: 12 }, yLabel));
@@ -164,7 +164,7 @@ function drawSnr(response, photons, mean, here) {
     element("rect", { class: "range", x: left, width: Math.max(right - left, 1), y: 20, height: 190 }),
     ...frame(x, y, xTicks, yTicks, "photons per code", "SNR [dB]"),
     element("path", { class: "ideal", d: line([[low, 10 * Math.log10(low)], [high, 10 * Math.log10(high)]]) }),
-    element("path", { class: "snr", d: line(response.map(r => [r.photons, decibel(r.snr)]).filter(p => p[1] > -24)) }),
+    element("path", { class: "snr", d: line(response.map(r => [r.photons, decibel(r.snr)]).filter(p => p[1] > -21)) }),
     element("circle", { class: "point", cx: x(mean), cy: y(here), r: 5 }));
   at("snr").setAttribute("aria-label", `signal-to-noise ratio against light; ${here.toFixed(1)} dB at the mean light`);
 }
@@ -199,8 +199,8 @@ function showPictures(first, photons, codes, light) {
 }
 
 function showNumbers(own, counts, expected, mean, here) {
-  const top = counts.length - 1, open = Math.min(data.exposure * data.frameRate, 1);
-  const moved = data.motion === null ? null : data.motion * (state.frames - 1 + open);
+  const top = counts.length - 1;
+  const moved = data.motion === null ? null : data.motion * (state.frames - 1 + data.shutter);
   at("photons").textContent = short(mean);
   at("events").textContent = short(meanEvents(own, mean));
   at("event-name").textContent = own.model === "QIS" ? "electrons" : "avalanches";

@@ -89,6 +89,12 @@ def test_a_long_clip_shows_its_first_frames_and_says_so(tmp_path):
     assert held(page)["frames"] == explore.FRAMES
     assert f"The first {explore.FRAMES} of {explore.FRAMES + 3} frames" in page
     assert held(page)["motion"] is None, "without flow the blur is unknown"
+    assert held(page)["shutter"] == 1.0
+
+
+def test_an_instant_has_no_blur(tmp_path):
+    """Frames rendered without a shutter do not blur; the light of an exposure of a full frame time does."""
+    assert held(explore.explore_page(write_clip(tmp_path / "sharp", frames=2, shutter=0.0)))["shutter"] == 0.0
 
 
 def test_the_page_loads_nothing_and_escapes_the_name(clip):

@@ -137,6 +137,9 @@ def test_a_phone_sees_picture_and_scrubber_together(written, tab, dark):
             f"(b => [b.top, b.bottom])(document.querySelector('{selector}').getBoundingClientRect())"
         )
         assert -1 <= top < bottom <= 845, selector
+    wide = "[...document.querySelectorAll('.scroll')].filter(t => t.scrollWidth > t.clientWidth)"
+    assert tab.value(f"{wide}.every(t => t.tabIndex === 0)"), "tables that scroll can be reached by the keyboard"
+    assert tab.value("[...document.querySelectorAll('figcaption')].every(c => c.scrollWidth <= 390)")
     tab.value("document.querySelector('.panels').lastElementChild.scrollIntoView({ block: 'end' })")
     bottom = tab.value("document.querySelector('input.frame').getBoundingClientRect().bottom")
     assert 0 < bottom <= 845, "the scrubber stays below the panels that it moves"
