@@ -44,10 +44,11 @@ def names(sizes: Sizes) -> list[str]:
 
 
 def networks() -> list[str]:
-    """Return the networks of the project that are trained here: that of the paper first, then ours."""
-    from quiver.model.presets import PRESETS
+    """Return the networks that are trained here: those of the paper and ours, not the compared ones (rivals/)."""
+    from quiver.model.presets import OTHERS, PRESETS
 
-    return sorted(PRESETS, key=lambda name: (name != COPIED, name in PUBLISHED, name))
+    ours = [name for name, config in OTHERS.items() if ".rivals." not in type(config).__module__]
+    return sorted([*PRESETS, *ours], key=lambda name: (name != COPIED, name in PUBLISHED, name))
 
 
 def measure(job: Job) -> list[dict[str, Any]]:

@@ -441,10 +441,10 @@ def test_without_a_package_the_true_measurements_name_it(tmp_path, hidden, secti
 
 
 TINY = {
-    "height": 32, "width": 64, "sensor_pixels": 1 << 16, "rounds": 1, "families": ["fan"], "frames": 1, "psnr": 20.0,
+    "height": 16, "width": 32, "sensor_pixels": 1 << 16, "rounds": 1, "families": ["fan"], "frames": 1, "psnr": 20.0,
     "check_height": 16, "check_width": 24, "reference_samples": 256, "train_families": ["fan"], "train_psnr": 20.0,
     "train_seeds": 1, "train_frames": 12, "train_height": 32, "train_width": 32, "crop": 32, "batch": 1, "steps": 2,
-    "copied_batches": 2, "restored": 2, "restored_slow": 2, "compared_side": 32,
+    "copied_batches": 2, "restored": 2, "restored_slow": 2, "compared_side": 16,
 }  # fmt: skip
 
 
@@ -502,7 +502,7 @@ def _sensor(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
 def _render(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
     assert {row["engine"] for row in rows["engines-fan"]} >= {"llvm", "scalar"}
     assert all(row["equal"] == "yes" for row in rows["engines-fan"])
-    assert rows["frame-llvm-fan"][0]["size"] == "32 x 64"
+    assert rows["frame-llvm-fan"][0]["size"] == "16 x 32"
     assert rows["validate-llvm-fan"][0]["asked [dB]"] == 40
 
 
