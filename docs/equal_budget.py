@@ -92,7 +92,7 @@ def main(words: list[str] | None = None) -> int:
 def options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, help="data set with splits train, val and test")
-    left_out = ("bit2bit",)  # it is trained on the stream that it restores
+    left_out = ("bit2bit", "bit2bit-1m")  # trained on the stream that they restore
     names = ["classical", *(n for n in NETWORKS if n not in left_out and not n.endswith("-as-published"))]
     parser.add_argument("--rows", default=",".join(names), help="comma-separated (default all)")
     parser.add_argument(
@@ -203,7 +203,7 @@ def train(name: str, rate: str, minutes: float, folder: Path, data: Path, budget
         "quiver-s": ["control", "--loss", "published"],
     }
     quiver(
-        *("train", data, "-o", folder, "--preset", name, "--protocol", *own.get(name, ["quick"])),
+        *("train", data, "-o", folder, "--preset", name, "--protocol", *own.get(name.removesuffix("-1m"), ["quick"])),
         *("--minutes", minutes, "--learning-rate", rate, "--crop", budget.crop, "--batch", budget.batch),
         *("--sensor", "quiver-physical", "--ppp", LIGHTS[0], "--bits", 3, "-q"),
         budget=budget,

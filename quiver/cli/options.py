@@ -19,21 +19,12 @@ from quiver.device import DEVICES
 from quiver.restoration.interface import MODES
 
 QUIVERS = ("nano", "quiver-s", "quiver")  # see quiver/model/presets.py
+_COMPARED = ("unet", "fastdvdnet", "student-teacher", "bit2bit", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")
 NETWORKS = (
     *QUIVERS,
-    *(
-        "unet",
-        "fastdvdnet",
-        "student-teacher",
-        "bit2bit",
-        "emvd",
-        "emvd-as-published",
-        "flornn",
-        "flornn-as-published",
-        "memdeblur",
-        "memdeblur-as-published",
-    ),
-    *("rvrt", "spk2imgnet", "spk2imgnet-as-published"),
+    *_COMPARED,
+    *(f"{name}-as-published" for name in ("emvd", "flornn", "memdeblur", "spk2imgnet")),
+    *(f"{name}-1m" for name in ("quiver-s", *_COMPARED)),
 )
 LEVELS = 16  # of a range of light in training: from 0.3 to 100 photons they are a factor 1.47 apart
 PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see quiver/training/settings.py

@@ -90,7 +90,7 @@ def _run_train(args: argparse.Namespace) -> int:
     from quiver.training.run_folder import draw_curve
 
     settings = _settings(args)
-    if args.preset == "bit2bit":
+    if args.preset.startswith("bit2bit"):
         settings = _of_stream(args, settings)
     if args.validate_every is not None and settings.steps is None:
         raise ValueError("--validate-every: counts steps of a run with --steps; a run that --minutes ends is validated "
@@ -157,7 +157,10 @@ def network_of(args: argparse.Namespace, settings: Any) -> Any:
     from quiver.model.rivals.bit2bit import Bit2Bit
     from quiver.training.self_supervised import config_for
 
-    return Bit2Bit(config_for(stream_at(Path(settings.data)))) if args.preset == "bit2bit" else build(args.preset)
+    network = build(args.preset)
+    if isinstance(network, Bit2Bit):
+        return Bit2Bit(config_for(stream_at(Path(settings.data)), network.config))
+    return network
 
 
 @contextlib.contextmanager

@@ -37,19 +37,9 @@ from quiver.restoration.networks import network_restorer, wrap_network
 from quiver.restoration.restorers import restorer, weights_path
 
 EXPOSURE = 5e-4  # s
-MODAL = ("nano", "quiver-s", "quiver")  # presets that have several modes
-PRESETS = (
-    *MODAL,
-    "unet",
-    "fastdvdnet",
-    "student-teacher",
-    "bit2bit",
-    "emvd",
-    "flornn",
-    "memdeblur",
-    "rvrt",
-    "spk2imgnet",
-)
+MODAL = ("nano", "quiver-s", "quiver", "quiver-s-1m")  # presets that have several modes
+_COMPARED = ("unet", "fastdvdnet", "student-teacher", "bit2bit", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")
+PRESETS = (*MODAL, *_COMPARED, *(f"{name}-1m" for name in _COMPARED))
 
 
 @dataclass(frozen=True)

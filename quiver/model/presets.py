@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from quiver.model.config import Config
+from quiver.model.equal_cost import EQUAL_COST
 from quiver.model.folded import FoldedConfig, FoldedQUIVER
 from quiver.model.quiver import QUIVER
 from quiver.model.rivals.bit2bit import Bit2Bit, Bit2BitConfig
@@ -40,6 +41,7 @@ OTHERS: dict[str, Any] = {
     "rvrt": RVRTConfig(),
     "spk2imgnet": Spk2ImgNetConfig(),
     "spk2imgnet-as-published": Spk2ImgNetConfig(as_published=True),
+    **{f"{name}-1m": config for name, config in EQUAL_COST.items()},  # a million multiply-adds per pixel and frame
 }
 
 # Each network with its configuration. The name of the class stands in weights files.

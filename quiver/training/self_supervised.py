@@ -19,10 +19,14 @@ from quiver.training.settings import Settings
 from quiver.training.system import Batch
 
 
-def config_for(codes: Codes) -> Bit2BitConfig:
-    """Return the published sizes with the law of a stream; `ValueError` for a QIS whose codes are no counts."""
+def config_for(codes: Codes, sizes: Bit2BitConfig | None = None) -> Bit2BitConfig:
+    """Return a configuration, by default the published one, with the law of a stream.
+
+    `ValueError` for a QIS whose codes are no counts.
+    """
     law = law_of(codes)
-    return Bit2BitConfig(planes=codes.sensor.levels - 1, dark=law.dark, as_published=not law.planes)
+    top = codes.sensor.levels - 1
+    return replace(sizes or Bit2BitConfig(), planes=top, dark=law.dark, as_published=not law.planes)
 
 
 def own_light(settings: Settings, codes: Codes) -> Settings:

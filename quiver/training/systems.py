@@ -44,7 +44,7 @@ _PORT: dict[str, Any] = {
 _FASTDVDNET = {"sensor": "quiver-published", "ppp": (3.25,), "bits": (3,), "force_exposure": True, "reverse": False,
                "schedule": "plateau", "warmup": 0, "crop": 96, "batch": 64, "steps": 320_000}  # fmt: skip
 _STREAM: dict[str, Any] = {"frames": 32, "batch": 1, "learning_rate": 2e-4, "clip_norm": 1.0, "loss": "own"}
-_QUICK: dict[str, Any] = {"learning_rate": 1e-3, "drift": 3, "loss": "own"}
+_QUICK: dict[str, Any] = {"learning_rate": 1e-3, "loss": "own"}
 
 
 def _protocols(published: dict[str, Any], **quick: Any) -> dict[str, dict[str, Any]]:
