@@ -135,7 +135,7 @@ def test_missing_things_are_named(capsys, tmp_path, tiny_dataset, clip):
     )
     assert "no such file" in mistake(capsys, "evaluate", "--static", gone)
     assert "give a data set" in mistake(capsys, "evaluate")
-    assert "--steps or --minutes" in mistake(capsys, "train", tiny_dataset, "-o", tmp_path / "r")
+    assert "--steps N or --minutes M" in mistake(capsys, "train", tiny_dataset, "-o", tmp_path / "r")
     assert "choose one of its streams" in mistake(
         capsys, "restore", clip, "-o", tmp_path / "v.npy", "--method", "moment"
     )
