@@ -132,12 +132,13 @@ def _steps(kind: str, file: Path) -> int:
 def dataset_sections(path: Path, step: Callable[[], None] = lambda: None) -> list[page.Section]:
     """Return a table of the clips of a data set and the first clip of each split; call `step` after each clip."""
     data = Dataset.open(path.parent)
-    rows, below, splits = [], set(), []
+    rows, below, splits, total = [], set(), [], 0
     for name in data.names():
         clip = Clip.open(data.path / "clips" / name)
         split = data.meta["jobs"][name]["split"]
         splits.append(split)
         frames, height, width = clip.shape
+        total += frames
         mean, largest = motion(clip, [len(clip) // 2]) if clip.has_truth else (None, None)
         size, found = f"{frames} × {height} × {width}", stated(clip.meta)
         rows.append([name, split, size, clip.mean_radiance, clip.meta.get("mean_photons"), mean, largest,
@@ -154,8 +155,8 @@ def dataset_sections(path: Path, step: Callable[[], None] = lambda: None) -> lis
         f"floor: PSNR of the rendered light below {' or '.join(sorted(below)) or 'white'}"
     )
     counts = ", ".join(f"{splits.count(split)} {split}" for split in dict.fromkeys(splits))
-    story = f"Data set {data.name} has {len(rows)} clips ({counts}), each of another scene or another seed."
-    facts = [page.Fact(str(len(rows)), f"clips in {data.name}")]
+    story = f"Data set {data.name} has {len(rows)} clips ({counts}) with {total} frames in all."
+    facts = [page.Fact(str(len(rows)), f"clips in {data.name}"), page.Fact(str(total), "frames in all")]
     table = page.table(page.Table(caption, headers, rows))
     overview = page.section(f"Data set {data.name}", table, story=story, facts=facts)
     shown = [clip for split in ("test", "train", "val") for clip in data.clips(split)[:1]]
