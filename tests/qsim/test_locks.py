@@ -1,5 +1,7 @@
-"""Tests locks whose file is deleted."""
+"""Tests locks whose file is deleted, and a system that has none."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 from qsim import locks
@@ -17,3 +19,10 @@ def test_a_lock_whose_file_is_deleted_is_taken_on_the_new_one(tmp_path: Path):
     assert third.acquire()
     third.delete()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_system_without_posix_locks_is_named():
+    code = "import sys; sys.modules['fcntl'] = None; import qsim.locks"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert found.returncode == 1
+    assert "ImportError: qsim runs on Linux and macOS: it locks files by fcntl" in found.stderr
