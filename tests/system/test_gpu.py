@@ -530,10 +530,12 @@ def _restore(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
     networks = {name.rpartition("-")[0] for name in set(rows) - set(METHODS)}
     assert set(METHODS) <= set(rows)
     assert {"quiver-s", "quiver", "nano", "unet"} <= networks
-    for name in networks:
-        exact, low = (rows[f"{name}-{precision}"][0]["largest [% of white]"] for precision in ("float32", "bfloat16"))
+    largest = {name: found[0].get("largest [% of white]") for name, found in rows.items()}
+    errors = {name: (largest[f"{name}-float32"], largest[f"{name}-bfloat16"]) for name in networks}
+    for name, (exact, low) in errors.items():
         assert exact < 1e-3, name  # where torch computes on the CPU, it is the same computation
-        assert low > exact, name
+        assert low >= exact, name  # equal where random weights add nothing to the frame
+    assert errors["quiver-s"][1] > 1e-3
 
 
 CHECKS = {"doctor": _doctor, "sensor": _sensor, "render": _render, "train": _train, "restore": _restore}
