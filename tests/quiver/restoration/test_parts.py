@@ -116,7 +116,7 @@ def test_it_looks_ahead_as_far_as_it_says(name, tmp_path):
     np.testing.assert_array_equal(method.restore(changed, 8, 10), method.restore(codes, 8, 10))
 
 
-@pytest.mark.parametrize("name", CLIPS)
+@pytest.mark.parametrize("name", [name for name in CLIPS if not hasattr(tiny(name), "reach")])  # others: exact
 def test_a_frame_beyond_the_memory_is_cut_with_a_word(name):
     network, codes = tiny(name).eval(), random_codes(2, 96, 130)
     whole = restored(network, codes, RestoreOptions(memory=10**12))

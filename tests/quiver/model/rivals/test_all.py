@@ -1,4 +1,4 @@
-"""What every rival promises: any size, one frame, finite numbers and gradients, separate clips, look-ahead.
+"""What every compared network promises: any size, finite numbers, separate clips, look-ahead, half precision.
 
 The networks come from tests/support/rivals.py.
 """
@@ -8,6 +8,8 @@ import torch
 from golden import draw
 from rivals import SMALL
 from torch import nn
+
+from quiver.model.rivals.edges import reflected
 
 
 @pytest.fixture(scope="module", params=SMALL)
@@ -57,10 +59,30 @@ def test_a_frame_uses_the_declared_future(network):
     assert differences[6] > 0
 
 
+def test_ends_of_time_are_reflections(network):
+    """A network of windows gives the same for a clip that was reflected by hand."""
+    if not hasattr(network, "windows"):
+        return
+    frames, before = draw(1, 4, 1, 16, 8), network.frames_in - 1 - network.look_ahead
+    order = reflected(-before, 4 + network.frames_in - 1, 4)
+    with torch.no_grad():
+        assert torch.equal(network(frames), network.windows(frames[:, order]))
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_half_precision_is_close(name):
+    network, frames = SMALL[name]().float(), draw(1, 3, 1, 24, 32, dtype=torch.float32)
+    with torch.no_grad():
+        exact = network(frames)
+        with torch.autocast("cpu", torch.bfloat16):
+            close = network(frames)
+    assert 0 < float((close.float() - exact).square().mean().sqrt() / exact.std()) < 0.05
+
+
 @pytest.mark.parametrize(
     "frames", [torch.zeros(3, 1, 8, 8), torch.zeros(1, 3, 2, 8, 8), torch.zeros(1, 0, 1, 8, 8),
                torch.zeros(1, 3, 1, 8, 8, dtype=torch.uint8)]
 )  # fmt: skip
 def test_other_shapes_and_integers_are_refused(network, frames):
-    with pytest.raises(ValueError, match=r"frames must be floating-point numbers \[B, T, 1, H, W\]"):
+    with pytest.raises(ValueError, match=r"^frames must be floating-point numbers \[B, T, 1, H, W\], got .*; give .*$"):
         network(frames)
