@@ -64,6 +64,12 @@ def _qbp_published(*given: Any, **settings: Any) -> Array:
     return qbp.restore(*given, settings=qbp.AS_PUBLISHED, **settings)
 
 
+def _path_merge(*given: Any, **settings: Any) -> Array:
+    from quiver.baselines import path_merge
+
+    return path_merge.restore(*given, **settings)
+
+
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
@@ -79,6 +85,7 @@ METHODS: dict[str, Method] = {
             "align, Wiener merge, stabilise, BM3D, exact unbiased inverse",
             1800,
         ),
+        Method("path-merge", _path_merge, 11, "merge along smooth paths, exact inverse response", 500),
         Method(
             "transform-denoise-published",
             _transform_denoise_published,

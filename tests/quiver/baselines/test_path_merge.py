@@ -1,0 +1,169 @@
+"""Merging along paths: weights against a plain reference, counts against the noise, ends of time, odd sizes."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter, shift
+from stats import assert_mean
+
+from qsim.keys import Key
+from qsim.sensor.qis import QIS
+from qsim.sensor.spad import BinarySPAD
+from quiver.baselines import path_merge as pm
+from quiver.baselines.information_domain import FLOOR, information_domain
+
+EXPOSURE = 5e-4
+SENSOR = QIS(0.8, 1.6, 0.2, 3)
+
+
+def merged(codes, t, sensor=SENSOR, window=11):
+    domain = information_domain(sensor, EXPOSURE)
+    return next(pm.stream(lambda i: codes[i], len(codes), domain, window, range(t, t + 1)))
+
+
+def plain_agreement(difference, variance):
+    """agreement() in loops over cells of 2 x 2 pixels."""
+    cells = difference.reshape(difference.shape[0] // 2, 2, -1, 2).mean((1, 3))
+
+    def box(x):
+        grown = np.pad(x, 1, mode="edge")
+        return np.array([[grown[y : y + 3, z : z + 3].mean() for z in range(x.shape[1])] for y in range(x.shape[0])])
+
+    statistic = box(box(cells) ** 2 * 36 / variance)
+    return 1 / (1 + np.maximum(statistic - pm.TOLERANCE, 0) / pm.SOFTNESS)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_weights_are_those_of_a_plain_program(seed):
+    rng = np.random.default_rng(seed)
+    height, width = (2 * int(n) for n in rng.integers(1, 9, 2))
+    first = -int(rng.integers(0, 6))
+    offsets = list(range(first, int(rng.integers(max(0, first + 1), 6)) + 1))
+    domain = information_domain(SENSOR, EXPOSURE)
+    moved = rng.integers(0, 8, (len(offsets), height, width)).astype(np.float32)
+    inside = (rng.random(moved.shape) < 0.8).astype(np.float32)
+    inside[offsets.index(0)] = 1
+    found = pm.weights(torch.from_numpy(moved), torch.from_numpy(inside), offsets, domain).numpy()
+
+    def half(x):
+        return x.reshape(height // 2, 2, width // 2, 2).mean((1, 3))
+
+    mean = half((moved * inside).sum(0) / inside.sum(0))
+    grown = np.pad(mean, 1, mode="edge")
+    local = [[grown[y : y + 3, x : x + 3].mean() for x in range(mean.shape[1])] for y in range(mean.shape[0])]
+    variance = np.maximum(np.interp(local, domain.mean_code, domain.variance), FLOOR)
+
+    def enlarged(cells):
+        image = torch.from_numpy(cells)[None, None]
+        return torch.nn.functional.interpolate(image, scale_factor=2, mode="bilinear")[0, 0].numpy()
+
+    expected = np.zeros(moved.shape)
+    at = {k: i for i, k in enumerate(offsets)}
+    expected[at[0]] = 1
+    for k in {-1, 1} & at.keys():
+        expected[at[k]] = inside[at[k]] * enlarged(plain_agreement(moved[at[k]] - moved[at[0]], 2 * variance))
+    near = [at[k] for k in (-1, 0, 1) if k in at]
+    total = expected[near].sum(0)
+    base = (expected[near] * moved[near]).sum(0) / total
+    for side in (-1, 1):
+        for pair in ((2, 3), (4, 5)):
+            group = [at[side * k] for k in pair if side * k in at]
+            if group:
+                count = np.maximum(inside[group].sum(0), 1)
+                mean = (moved[group] * inside[group]).sum(0) / count
+                weight = enlarged(plain_agreement(mean - base, (half(1 / count) + half(1 / total)) * variance))
+                expected[group] = weight * inside[group]
+    assert found == pytest.approx(expected, abs=1e-4)
+
+
+def still(sensor, photons, frames, side=48, seed=0):
+    return sensor.sample(np.full((frames, side, side), photons), EXPOSURE, key=Key(seed, seed), engine="reference")
+
+
+@pytest.mark.parametrize(("sensor", "photons"), [(SENSOR, 0.5), (SENSOR, 3.25), (BinarySPAD(1.0, 0.0, 1), 0.7)])
+def test_flat_light_keeps_its_mean_and_nearly_all_frames(sensor, photons):
+    codes = still(sensor, photons, 11, side=64)
+    found = merged(codes, 5, sensor)
+    variance = float(sensor.variance(np.array(photons), EXPOSURE))
+    # pixels of one frame are shared by their neighbours' interpolation: 4 of them count as one at most
+    sample = found.mean_code[8:-8, 8:-8][::4, ::4]
+    assert_mean(sample, float(sensor.mean(np.array(photons), EXPOSURE)), variance)
+    assert found.count.mean() > 9
+    assert found.frames == 11
+
+
+@pytest.mark.parametrize("speed", [1.5, 6.0, 14.0])
+def test_a_moving_texture_is_merged_sharp(speed):
+    """The merged frame has less error than three frames could have, where a mean without motion has far more."""
+    rng = np.random.default_rng(2)
+    texture = 12 * np.exp(1.2 * gaussian_filter(rng.normal(size=(160, 400)), 2) / 0.14 / 2)
+    frames = np.stack(
+        [np.clip(texture[32:-32, 150 - round(speed * k) : 246 - round(speed * k)], 0, 60) for k in range(-5, 6)]
+    )
+    sensor = QIS(0.8, 1.6, 0.2, 5, gain=0.5)
+    codes = sensor.sample(frames, EXPOSURE, key=Key(1, 1), engine="reference")
+    truth = sensor.mean(frames[5], EXPOSURE)
+    found = merged(codes, 5, sensor)
+    noise = float(sensor.variance(frames[5], EXPOSURE).mean())
+    inner = (slice(16, -16), slice(16, -16))
+    assert ((found.mean_code - truth)[inner] ** 2).mean() < noise / 3
+    assert ((found.still - truth)[inner] ** 2).mean() > 2 * noise
+
+
+def test_a_frame_of_another_scene_has_little_weight():
+    codes = still(SENSOR, 1.0, 11)
+    codes[6:] = still(SENSOR, 5.0, 5, seed=1)
+    found = merged(codes, 5)
+    assert found.mean_code.mean() == pytest.approx(float(SENSOR.mean(np.array(1.0), EXPOSURE)), rel=0.2)
+    assert found.count.mean() < 8
+
+
+@pytest.mark.parametrize("shape", [(1, 8, 10), (2, 10, 7), (3, 1, 1), (5, 9, 33), (12, 8, 10)])
+def test_any_size_and_any_number_of_frames(shape):
+    rng = np.random.default_rng(0)
+    codes = rng.integers(0, 8, shape).astype(np.uint8)
+    restored = pm.restore(codes, SENSOR, EXPOSURE)
+    assert restored.shape == shape
+    assert restored.dtype == np.float32
+    assert np.isfinite(restored).all()
+    if shape[0] == 1:
+        assert restored[0] == pytest.approx(SENSOR.response(EXPOSURE).invert(codes[0], 11), rel=1e-6)
+
+
+def test_frames_restored_alone_are_those_of_the_stream():
+    codes = np.random.default_rng(1).integers(0, 8, (9, 16, 24)).astype(np.uint8)
+    everything = pm.restore(codes, SENSOR, EXPOSURE, window=5)
+    assert np.array_equal(pm.restore(codes, SENSOR, EXPOSURE, window=5, frames=range(3, 6)), everything[3:6])
+
+
+def test_a_stream_reads_each_frame_once_and_no_further_than_its_delay():
+    codes = np.random.default_rng(1).integers(0, 8, (9, 16, 16)).astype(np.uint8)
+    read = []
+    domain = information_domain(SENSOR, EXPOSURE)
+    stream = pm.stream(lambda i: read.append(i) or codes[i], 9, domain, 5, range(9))
+    for t, _ in enumerate(stream):
+        assert read == list(range(min(t + 3, 9)))
+
+
+def test_threads_change_nothing():
+    codes = np.random.default_rng(4).integers(0, 8, (5, 24, 32)).astype(np.uint8)
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            found.append(merged(codes, 2))
+    finally:
+        torch.set_num_threads(before)
+    assert found[1].mean_code == pytest.approx(found[0].mean_code, abs=1e-5)
+    assert found[1].count == pytest.approx(found[0].count, abs=1e-4)
+
+
+def test_a_shift_of_the_scene_by_a_pixel_shifts_the_answer():
+    rng = np.random.default_rng(7)
+    light = 3 * np.exp(gaussian_filter(rng.normal(size=(72, 88)), 2) * 4)
+    frames = np.stack([shift(light, (0, 1.5 * k), order=1, mode="nearest") for k in range(-5, 6)])
+    codes = SENSOR.sample(np.clip(frames, 0, None), EXPOSURE, key=Key(3, 3), engine="reference")
+    one, other = merged(codes[:, :-8, :-8], 5), merged(codes[:, 1:-7, 1:-7], 5)
+    apart = (one.mean_code[1:, 1:] - other.mean_code[:-1, :-1])[16:-16, 16:-16]
+    error = (one.mean_code - SENSOR.mean(np.clip(frames[5], 0, None), EXPOSURE)[:-8, :-8])[16:-16, 16:-16]
+    assert np.sqrt((apart**2).mean()) < 0.35 * np.sqrt((error**2).mean())
