@@ -9,6 +9,7 @@ from torch import nn
 from quiver.model.config import Config
 from quiver.model.equal_cost import EQUAL_COST
 from quiver.model.folded import FoldedConfig, FoldedQUIVER
+from quiver.model.mergenet import MergeNet, MergeNetConfig
 from quiver.model.quiver import QUIVER
 from quiver.model.rivals.bit2bit import Bit2Bit, Bit2BitConfig
 from quiver.model.rivals.emvd import EMVD, EMVDConfig
@@ -28,6 +29,7 @@ PRESETS: dict[str, Config] = {
 
 # The controls and the compared networks: mended, with the sensor's noise or factor, and as their ports have them.
 OTHERS: dict[str, Any] = {
+    "mergenet": MergeNetConfig(),
     "unet": UNetConfig(),
     "fastdvdnet": FastDVDnetConfig(),
     "student-teacher": StudentTeacherConfig(),
@@ -48,6 +50,7 @@ OTHERS: dict[str, Any] = {
 NETWORKS: tuple[tuple[type[nn.Module], type], ...] = (
     (QUIVER, Config),
     (FoldedQUIVER, FoldedConfig),
+    (MergeNet, MergeNetConfig),
     (UNet, UNetConfig),
     (FastDVDnet, FastDVDnetConfig),
     (StudentTeacher, StudentTeacherConfig),

@@ -65,13 +65,17 @@ def wrap_network(
 ) -> Restorer:
     """Return a network as a method; the checksum is that of its weights file."""
     from quiver.model.blocks import RADIUS, WINDOW
+    from quiver.model.mergenet import MergeNet
     from quiver.model.quiver import QUIVER
+    from quiver.restoration.merging import fill_merged
 
     mode = options.mode if isinstance(model, QUIVER) else "windows"  # other networks have one way to share work
     model.to(pick_device(options.device)).eval()
     run: RestoreNetwork = fill_network
     window, look_ahead, together = WINDOW, RADIUS, 1
-    if takes_clips(model):
+    if isinstance(model, MergeNet):
+        run = fill_merged
+    elif takes_clips(model):
         part = part_of(model)
         run, window, look_ahead, together = fill_parts, part.past + 1 + part.future, part.future, part.kept
         description = f"{description}; look-ahead {look_ahead} frames"

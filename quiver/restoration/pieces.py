@@ -29,6 +29,7 @@ STARTING = 60_000_000  # bytes that torch takes for its kernels at first use
 TILING = 30_000_000  # bytes that tiles of several shapes take beyond those of the largest; 26 MB measured
 ESTIMATE_BYTES = 1_200  # per pixel of an initial estimate of width 32; 930 measured
 STEP = 16  # px: tiles of the compared networks begin at multiples of it
+MERGED_BYTES = 1_500  # per pixel that merging and MergeNet take
 COUNTS = 0.1  # weight from which the result of a tile is compared with its neighbours
 
 
@@ -87,10 +88,13 @@ def bytes_per_pixel(model: nn.Module, mode: str) -> int:
     measured.
     """
     from quiver.model.folded import FoldedQUIVER
+    from quiver.model.mergenet import MergeNet
     from quiver.model.quiver import QUIVER
 
     if type(model).__name__ in CLIP_BYTES:
         return clip_bytes(model)
+    if isinstance(model, MergeNet):
+        return MERGED_BYTES * max(24, model.config.width) // 24
     if not isinstance(model, QUIVER):
         return 4_000
     held = 2 if mode == "windows" else 1  # windows of eleven frames at once

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from quiver.model.blocks import RADIUS
+from quiver.model.mergenet import MergeNet
 from quiver.model.presets import build
 from quiver.model.rivals.bit2bit import Bit2Bit
 from quiver.model.rivals.emvd import EMVD
@@ -19,6 +20,7 @@ from quiver.model.rivals.rvrt import RVRT
 from quiver.model.rivals.spk2imgnet import Spk2ImgNet
 from quiver.model.rivals.student_teacher import StudentTeacher
 from quiver.model.unet import UNet
+from quiver.training import merge_training as merging
 from quiver.training import rival_losses as rivals
 from quiver.training.loss import PRESETS as LOSSES
 from quiver.training.loss import training_loss
@@ -77,6 +79,9 @@ def unet_loss(network: nn.Module, batch: Batch, settings: Settings, share: float
 OURS = System("quiver", quiver_loss, quiver_restored, PROTOCOLS, losses=tuple(LOSSES))
 
 SYSTEMS: dict[type[nn.Module], System] = {
+    MergeNet: System(
+        *("mergenet", merging.loss, merging.restored, merging.PROTOCOLS), multiple=8, prepare=merging.prepare
+    ),
     UNet: replace(OURS, name="unet", loss=unet_loss, restored=rivals.windows_restored),
     EMVD: System(
         "emvd", rivals.emvd_loss, rivals.last_frame, _protocols({"clip_norm": 5.0}, clip_norm=5.0)

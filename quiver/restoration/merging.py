@@ -1,0 +1,76 @@
+"""Restores streams by MergeNet: merges frames along their paths, corrects them by the network, returns to photons.
+
+    codes -> path_merge.stream -> merge_inputs -> MergeNet -> phi + deviation x correction -> photons
+
+The stated delay is half a window: five frames. A frame is read, pooled and merged in one pass, tile by tile where the
+memory does not hold it; tiles are blended, since paths reach far.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.files import Progress
+from quiver.data.codes import Codes
+from quiver.restoration.interface import RestoreOptions
+from quiver.restoration.pieces import Disagreement, cut_pieces, warn_of_cut
+
+BLOCK_PIXELS = 1 << 22  # codes read at a time: 4 MB
+
+
+def fill_merged(
+    network: Any, codes: Codes, out: Array, first: int, options: RestoreOptions, progress: Progress | None
+) -> None:
+    """Restore tile by tile and frame by frame; `out` [t, H, W] must be zero and collects the weighted tiles.
+
+    Where a cut changes the answer (pieces.py), a warning states by how much neighbouring tiles differ.
+    """
+    from quiver.baselines.information_domain import information_domain
+    from quiver.baselines.path_merge import stream
+    from quiver.model.blocks import WINDOW
+
+    length, height, width = codes.shape
+    domain = information_domain(codes.sensor, codes.exposure)
+    pieces = cut_pieces(network, height, width, options.memory, options.mode)
+    step = max(1, BLOCK_PIXELS // (height * width))
+    apart, done = Disagreement.nothing(height, width), 0
+
+    @lru_cache(maxsize=2)
+    def block(i: int) -> Array:
+        return codes.read(i * step, min((i + 1) * step, length))
+
+    for tile in pieces.tiles:
+        rows, columns = tile.weight.shape
+        part = (slice(tile.y, tile.y + rows), slice(tile.x, tile.x + columns))
+
+        def frame(t: int, part: tuple[slice, slice] = part) -> Array:
+            return block(t // step)[(t % step, *part)]
+
+        for t, merged in enumerate(stream(frame, length, domain, WINDOW, range(first, first + len(out)))):
+            restored = corrected(network, merged, domain, options)[:rows, :columns]
+            out[(t, *part)] += tile.weight * restored
+            if t == 0 and not pieces.exact:
+                apart.add(tile, restored / np.float32(codes.white))
+            done += 1
+            if progress is not None:
+                progress(done, len(out) * len(pieces.tiles))
+    warn_of_cut(codes, options, pieces, apart)
+
+
+def corrected(network: Any, merged: Any, domain: Any, options: RestoreOptions) -> Array:
+    """Return photons, float32 [H, W], of a merged frame after the network's correction."""
+    import torch
+
+    from quiver.restoration.merge_inputs import merge_inputs
+
+    inputs = merge_inputs(merged, domain)
+    device = next(network.parameters()).device
+    low = options.precision == "bfloat16"
+    with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=low):
+        correction = network(inputs.channels[None].to(device))[0, 0].float().cpu()
+    restored: Array = domain.inverse((inputs.phi + inputs.deviation * correction).numpy())
+    return restored

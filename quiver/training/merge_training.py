@@ -1,0 +1,80 @@
+"""States how MergeNet is trained: inputs made where windows are drawn, and a loss that counts every light in decibels.
+
+    codes -> merged frame -> channels, phi, deviation, table phi -> light;  loss = mean over windows of log(MSE)
+
+The error is that of a score: light over the peak, clamped. Its logarithm gives a dim window the same weight as a bright
+one; otherwise the dimmest would own the gradient. Above the peak the clamp keeps a small slope.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from quiver.data.codes import Codes
+from quiver.restoration.merge_inputs import middle_inputs
+from quiver.training.settings import Settings
+from quiver.training.system import Batch
+
+NODES = 1024  # of the table from phi to light, evenly spaced in phi
+FLOOR = 2e-6  # added to a mean squared error: 57 dB
+ABOVE = 0.05  # slope of light above the peak
+
+PROTOCOLS: Mapping[str, Mapping[str, Any]] = {
+    "quick": {
+        "sensor": "quiver-physical",
+        "ppp": (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 100.0),
+        "bits": (1, 2, 3, 5, 7),
+        "learning_rate": 1.5e-3,
+        "crop": 96,
+        "batch": 6,
+        "clip_norm": 1.0,
+        "loss": "own",
+    }
+}
+
+
+def prepare(codes: Codes) -> dict[str, Tensor]:
+    """Return the inputs of the middle frame of a window, and the table from phi to light over white."""
+    inputs, domain = middle_inputs(codes)
+    top = float(domain.phi[-1])
+    table = np.interp(np.linspace(0, top, NODES), domain.phi, domain.photons) / codes.white
+    return {
+        "channels": inputs.channels,
+        "phi": inputs.phi,
+        "deviation": inputs.deviation,
+        "top": torch.tensor(top, dtype=torch.float32),
+        "table": torch.from_numpy(table.astype(np.float32)),
+    }
+
+
+def light_of(phi: Tensor, top: Tensor, table: Tensor) -> Tensor:
+    """Return light over white [B, h, w] of phi [B, h, w], from tables [B, NODES] over phi from 0 to `top` [B]."""
+    last = table.shape[1] - 1
+    place = (phi / top[:, None, None]).clamp(0, 1) * last
+    left = place.detach().floor().long().clamp(0, last - 1)
+    low, high = (table.gather(1, (left + step).flatten(1)).view_as(phi) for step in (0, 1))
+    return low + (high - low) * (place - left)
+
+
+def restored(network: nn.Module, batch: Batch) -> tuple[Tensor, int]:
+    """Return the middle frame of a window [B, 1, 1, h, w] in units of white, and its place."""
+    correction = network(batch["channels"])[:, 0].float()
+    light = light_of(batch["phi"] + batch["deviation"] * correction, batch["top"], batch["table"])
+    return light[:, None, None], batch["codes"].shape[1] // 2
+
+
+def loss(network: nn.Module, batch: Batch, settings: Settings, share: float) -> Tensor:
+    """Return the mean over windows of log(mean squared error of light over the peak, clamped)."""
+    light, middle = restored(network, batch)
+    unit = (batch["white"] / batch["peak"]).to(light.dtype)[:, None, None]
+    error = _shown(light[:, 0, 0] * unit) - _shown(batch["target"][:, middle, 0] * unit)
+    return (error.square().mean((1, 2)) + FLOOR).log().mean()
+
+
+def _shown(light: Tensor) -> Tensor:
+    return torch.where(light > 1, 1 + ABOVE * (light - 1), light)

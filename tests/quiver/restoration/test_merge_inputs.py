@@ -1,0 +1,58 @@
+"""Inputs of MergeNet: noise of one unit for every sensor, and a map that falls where codes tell nothing."""
+
+import numpy as np
+import pytest
+
+from qsim.keys import Key
+from qsim.sensor.qis import QIS
+from qsim.sensor.spad import BinarySPAD
+from quiver.baselines.information_domain import information_domain
+from quiver.baselines.path_merge import Merged, stream
+from quiver.restoration.merge_inputs import CHANNELS, UNIT, merge_inputs
+
+EXPOSURE = 5e-4
+
+
+def mean_of(codes):
+    """A merged frame whose three means are that of all codes [T, H, W], without motion."""
+    count = np.full(codes.shape[1:], len(codes), np.float32)
+    mean = codes.mean(0, dtype=np.float32)
+    return Merged(mean, count, mean, count, mean, len(codes))
+
+
+@pytest.mark.parametrize(
+    ("sensor", "photons"),
+    [
+        (QIS(0.8, 1.6, 0.2, 3), 2.0),
+        (QIS(0.8, 1.6, 0.2, 1), 0.6),
+        (QIS(0.8, 1.6, 0.2, 7, gain=0.6), 60.0),
+        (BinarySPAD(0.5, 25.0, 3), 4.0),
+    ],
+)
+def test_noise_is_one_unit_whatever_the_sensor(sensor, photons):
+    codes = sensor.sample(np.full((11, 96, 96), photons), EXPOSURE, key=Key(0, 1), engine="reference")
+    inputs = merge_inputs(mean_of(codes), information_domain(sensor, EXPOSURE))
+    noise = float(inputs.channels[0].std()) * UNIT
+    assert noise == pytest.approx(1, abs=0.15)  # 11 codes: the delta method errs by 0.85 to 1.15
+    assert not inputs.channels[1:3].any()
+
+
+def test_the_map_of_knowledge_falls_where_codes_tell_nothing():
+    sensor = QIS(0.8, 1.6, 0.2, 1, gain=0.5 / 26)
+    light = np.repeat([6.0, 31.0], 48)[None, :] * np.ones((48, 1))
+    codes = sensor.sample(np.broadcast_to(light, (11, 48, 96)), EXPOSURE, key=Key(0, 1), engine="reference")
+    known = merge_inputs(mean_of(codes), information_domain(sensor, EXPOSURE)).channels[4]
+    assert float(known[:, :32].mean()) < float(known[:, 64:].mean()) - 0.5
+
+
+@pytest.mark.parametrize("level", ["dark", "saturated"])
+@pytest.mark.parametrize("bits", [1, 3, 7])
+def test_extreme_codes_give_finite_inputs(level, bits):
+    sensor = QIS(0.8, 0.0, 0.2, bits)
+    codes = np.full((4, 8, 16), 0 if level == "dark" else sensor.levels - 1, np.uint8)
+    domain = information_domain(sensor, EXPOSURE)
+    merged = next(stream(lambda t: codes[t], 4, domain, 11, range(1)))
+    inputs = merge_inputs(merged, domain)
+    assert inputs.channels.shape == (CHANNELS, 8, 16)
+    assert np.isfinite(inputs.channels.numpy()).all()
+    assert np.isfinite(domain.inverse(inputs.phi.numpy())).all()

@@ -1,0 +1,60 @@
+"""Restoring by MergeNet: the path from codes to photons, any size, tiles within memory, ranges of frames."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from qsim.sensor.qis import QIS
+from quiver.baselines import path_merge
+from quiver.data.codes import array_codes
+from quiver.model.mergenet import MergeNet, MergeNetConfig
+from quiver.restoration.interface import RestoreOptions
+from quiver.restoration.networks import wrap_network
+
+SENSOR, EXPOSURE = QIS(0.8, 1.6, 0.2, 3), 5e-4
+
+
+def method(memory=10**9, trained=True):
+    torch.manual_seed(0)
+    network = MergeNet(MergeNetConfig(4))
+    if trained:
+        torch.nn.init.normal_(network.leave.weight, std=0.05)
+    return wrap_network(network, "mergenet", "", RestoreOptions(memory=memory, device="cpu"))
+
+
+def stream(shape, seed=0):
+    codes = np.random.default_rng(seed).integers(0, 6, shape).astype(np.uint8)
+    return array_codes(codes, SENSOR, EXPOSURE), codes
+
+
+def test_without_a_correction_it_is_the_merge():
+    codes, array = stream((4, 16, 24))
+    expected = path_merge.restore(array, SENSOR, EXPOSURE)
+    assert method(trained=False).restore(codes) == pytest.approx(expected, rel=2e-2, abs=2e-3)  # tables of phi, caps
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 10, 7), (3, 17, 9)])
+def test_any_size_and_any_number_of_frames(shape):
+    restored = method().restore(stream(shape)[0])
+    assert restored.shape == shape
+    assert np.isfinite(restored).all()
+    assert restored.min() >= 0
+
+
+def test_frames_restored_alone_are_those_of_the_stream():
+    codes, _ = stream((8, 16, 16))
+    restorer = method()
+    assert restorer.look_ahead == 5
+    assert np.array_equal(restorer.restore(codes, 2, 4), restorer.restore(codes)[2:4])
+
+
+def test_little_memory_cuts_tiles_and_says_so():
+    codes, _ = stream((2, 16, 264))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        whole = method().restore(codes, 0, 1)
+    with pytest.warns(UserWarning, match="cut into 2 tiles"):
+        cut = method(memory=1_500 * 16 * 180).restore(codes, 0, 1)
+    assert np.sqrt(np.mean((cut - whole) ** 2)) < 0.4 * whole.std()  # codes of pure noise have arbitrary paths
