@@ -29,7 +29,7 @@ def test_every_level_and_depth_is_mixed():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"steps": None}, "give --steps or --minutes"),
+        ({"steps": None}, "give a training length: --steps N or --minutes M"),
         ({"steps": 0}, "--steps must be above 0"),
         ({"learning_rate": math.nan}, "--learning-rate must be above 0, got nan"),
         ({"loss": "l3"}, "no loss is called 'l3'; known are published, paper, l1"),
