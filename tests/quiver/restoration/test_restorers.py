@@ -23,7 +23,7 @@ from quiver.restoration import restored_file
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 from quiver.restoration.restored_file import restore_to_file
-from quiver.restoration.restorers import method_names, restorer, restorers, weights_path
+from quiver.restoration.restorers import method_names, restorer, restorers, shipped_names, weights_path
 
 DEFAULTS = RestoreOptions()
 
@@ -65,9 +65,13 @@ def test_the_shipped_weights_are_useful_at_once(make_clip: ClipMaker):
         return metrics.score(restorer(name).restore(codes) / codes.white, target).psnr_matched
 
     assert psnr("nano") > max(psnr(f"moment:{window}") for window in (1, 3, 5, 7, 9, 11)) + 4
-    assert weights_path("nano").stat().st_size < 5e6
-    card = weights_path("nano").with_suffix(".md").read_text()
-    assert f"{sum(p.numel() for p in build('nano').parameters()):,} parameters" in card
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_shipped_weights_are_small_and_have_a_card(name):
+    assert weights_path(name).stat().st_size < 5e6
+    card = weights_path(name).with_suffix(".md").read_text()
+    assert f"{sum(p.numel() for p in build(name).parameters()):,} parameters" in card
 
 
 def test_weights_are_found_by_file_folder_and_name(tmp_path):
