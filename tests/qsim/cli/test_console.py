@@ -46,7 +46,7 @@ def test_bash_completes_commands_options_choices_and_files(capsys, tmp_path):
     assert complete(script, "qsim", "validate", "s", cwd=tmp_path) == ["sensor"]
     assert complete(script, "qsim", "check", "read", cwd=tmp_path) == ["reading.txt"]
     script = completion(capsys, "quiver", "bash")
-    assert complete(script, "quiver", "train", "--preset", "quiver-", cwd=tmp_path) == ["quiver-s"]
+    assert complete(script, "quiver", "train", "--preset", "quiver-", cwd=tmp_path) == ["quiver-s", "quiver-s-1m"]
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
