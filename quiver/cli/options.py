@@ -22,6 +22,7 @@ QUIVERS = ("nano", "quiver-s", "quiver")  # see quiver/model/presets.py
 _COMPARED = ("unet", "fastdvdnet", "student-teacher", "bit2bit", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")
 NETWORKS = (
     *QUIVERS,
+    "mergenet",
     *_COMPARED,
     *(f"{name}-as-published" for name in ("emvd", "flornn", "memdeblur", "spk2imgnet")),
     *(f"{name}-1m" for name in ("quiver-s", *_COMPARED)),

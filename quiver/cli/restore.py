@@ -35,7 +35,8 @@ def add_restore(sub: Any) -> None:
     parser.add_argument(
         "--method",
         default=DEFAULT_METHOD,
-        help=f"classical method, shipped weights, weights file or run folder (default {DEFAULT_METHOD})",
+        help="classical method, shipped weights, weights file or run folder; auto: mergenet, or the classical method "
+        f"that was measured to be better at this sensor, depth and light (default {DEFAULT_METHOD})",
     )
     parser.add_argument("--stream", help="stream of a clip to restore (default: the only one)")
     add_light(parser, several=False)
@@ -53,8 +54,8 @@ def add_restore(sub: Any) -> None:
 
 def _run_restore(args: argparse.Namespace) -> int:
     from quiver import threads
+    from quiver.restoration.automatic import chosen
     from quiver.restoration.restored_file import restore_to_file
-    from quiver.restoration.restorers import restorer
     from quiver.restoration.sources import assumed, codes_to_restore, refuse_idle
 
     target: Path = args.output
@@ -65,10 +66,12 @@ def _run_restore(args: argparse.Namespace) -> int:
         if path.exists() and not args.force:
             raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
     threads.check(args.threads)
-    method = restorer(args.method, running_options(args))
+    method, why = chosen(args.method, codes, running_options(args))
     refuse_idle(vars(args), [method])
     check_domain(args, [method], [codes])
     used = use_threads(args, threads.recorded(target.with_name(f"{target.name}.part.json")))
+    if why is not None:
+        note(why)
     target.parent.mkdir(parents=True, exist_ok=True)
     lines, started = [assumed(codes, method)], time.monotonic()
     with bar(method.name) as progress:

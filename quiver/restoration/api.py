@@ -12,9 +12,9 @@ from numpy import ndarray as Array
 from quiver.data.clips import Clip
 from quiver.data.codes import Codes, LazyArray, Sensor, Stream, array_codes, filled, open_stream, sensed, stream_codes
 from quiver.data.illumination import Illumination
+from quiver.restoration.automatic import chosen
 from quiver.restoration.domain_remarks import refuse_outside, remarks
 from quiver.restoration.interface import DEFAULT_METHOD, RestoreOptions
-from quiver.restoration.restorers import restorer
 from quiver.restoration.sources import refuse_idle
 
 Source = Stream | Clip | str | os.PathLike[str] | Array
@@ -37,25 +37,25 @@ def restore(
 
     `source` is one of these: a `Stream`; a `Clip` (its only stream; with `ppp` the default sensor senses it now); the
     path of either; integer codes [T, H, W], for which `sensor` and `exposure` [s] must be given. `method` is a
-    classical method (naive, moment, likelihood, transform-denoise, qbp, qbp-bm3d), shipped weights (default nano), a
+    classical method (naive, moment, likelihood, transform-denoise, qbp, qbp-bm3d), shipped weights (mergenet, nano), a
     .safetensors file or a folder of `quiver train`. `device` (auto, cpu, cuda) and `mode` (exact, streaming, windows)
-    are for networks. `defects` [H, W] is true at hot and dead pixels, which are filled from their neighbours, as are
-    those that a stream's description states. A network outside of what it was measured for warns; with `strict` it is
-    a `ValueError`.
+    are for networks. `auto` takes mergenet, or a classical method where that was measured to be better. `defects`
+    [H, W] is true at hot and dead pixels, which are filled from their neighbours, as are those that a stream's
+    description states. A network outside of what it was measured for warns; with `strict` it is a `ValueError`.
     `ValueError` or `FileNotFoundError` where the arguments do not fit together.
 
         video = quiver.restore(stream)
     """
     source = np.asarray(source) if isinstance(source, LazyArray) else source
     codes = filled(_codes(source, sensor, exposure, ppp), None if defects is None else np.asarray(defects, bool))
-    chosen = restorer(method, RestoreOptions(device=device or "auto", mode=mode or "exact"))
-    refuse_idle({"device": device, "mode": mode}, [chosen])
-    found = remarks([chosen], codes)
+    runner, _ = chosen(method, codes, RestoreOptions(device=device or "auto", mode=mode or "exact"))
+    refuse_idle({"device": device, "mode": mode}, [runner])
+    found = remarks([runner], codes)
     if strict:
-        refuse_outside([chosen], found)
+        refuse_outside([runner], found)
     for text in found:
         warnings.warn(text, stacklevel=2)
-    return chosen.restore(codes)
+    return runner.restore(codes)
 
 
 def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: float | None) -> Codes:

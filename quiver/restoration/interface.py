@@ -12,7 +12,7 @@ from qsim.files import Progress
 from quiver.data.codes import Codes
 from quiver.restoration.domain import Scope
 
-DEFAULT_METHOD = "nano"  # of `quiver restore` and `quiver.restore`
+DEFAULT_METHOD = "auto"  # of `quiver restore` and `quiver.restore`: see automatic.py
 DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory beside the weights
 MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/model/schedules.py
 

@@ -125,16 +125,16 @@ def test_measured_counts_refuse_what_is_of_clips(inputs, capsys, words, named):
     assert named in said
 
 
-def test_one_line_says_what_was_assumed(inputs, tmp_path, capsys):
+def test_two_lines_say_what_was_chosen_and_assumed(inputs, tmp_path, capsys):
     assert main(["restore", str(inputs["clip"]), "-o", str(tmp_path / "r.npy")]) == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if "warning:" not in line]  # of the weights' domain
-    assert len(lines) == 1
-    said = lines[0]
+    chosen, said = lines
+    assert chosen.startswith("auto: mergenet; measured at quiver-physical, 3 bit, 3.25 PPP")
     for part in (
         "quiver-physical, 3 bit, 3.25 photons",
         "white = 8.75",
         "4 frames",
-        "method nano",
+        "method mergenet",
         "weights ",
         "exact",
     ):

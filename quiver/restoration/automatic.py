@@ -1,0 +1,31 @@
+"""Chooses the method of a stream: MergeNet, or a classical method where that was measured to be better.
+
+    sensor, bits, light -> nearest measured cell in the weights file (domain.py) -> method, and one line that says why
+
+The cells are averages over clips of several speeds. Motion is not measured in a stream, so it does not decide.
+"""
+
+from __future__ import annotations
+
+from quiver.data.codes import Codes
+from quiver.restoration.domain import place_of
+from quiver.restoration.domain_remarks import light_of
+from quiver.restoration.interface import RestoreOptions, Restorer
+from quiver.restoration.restorers import restorer
+
+AUTO = "auto"
+NETWORK = "mergenet"
+
+
+def chosen(name: str, codes: Codes, options: RestoreOptions | None = None) -> tuple[Restorer, str | None]:
+    """Return the method of this name for a stream; for `auto` the chosen one, and a line that says why."""
+    if name != AUTO:
+        return restorer(name, options), None
+    network = restorer(NETWORK, options)
+    ppp = light_of(codes)
+    domain = None if network.scope is None else network.scope.domain
+    cell = None if domain is None else domain.nearest(place_of(codes.sensor, codes.exposure, ppp))
+    if cell is None:
+        return network, f"auto: {NETWORK}; nothing was measured near {codes.sensor.bits} bit, {ppp:.3g} PPP"
+    best = NETWORK if cell.wins else cell.classical
+    return (network if cell.wins else restorer(best, options)), f"auto: {best}; measured at {cell.name}: {cell.scores}"

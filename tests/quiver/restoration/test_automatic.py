@@ -1,0 +1,64 @@
+"""The method `auto`: what was measured to be better at a stream's sensor, depth and light, and a line that says why."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from qsim.sensor.devices import quiver_physical
+from quiver.data.codes import array_codes
+from quiver.restoration import automatic
+from quiver.restoration.domain import Cell, Domain, Scope, place_of
+from quiver.restoration.restorers import restorer
+
+EXPOSURE = 5e-4
+
+
+def stream(ppp, bits=3):
+    codes = np.zeros((2, 8, 8), np.uint8)
+    return replace(array_codes(codes, quiver_physical(ppp, bits), EXPOSURE), ppp=ppp)
+
+
+@pytest.fixture
+def measured(monkeypatch):
+    """Two cells: the network wins at 3.25 PPP and loses at 26."""
+    cells = tuple(
+        Cell("quiver-physical", ppp, place_of(quiver_physical(ppp), EXPOSURE, ppp), network, "qbp", 25.0)
+        for ppp, network in ((3.25, 26.0), (26.0, 24.0))
+    )
+
+    def found(name, options=None):
+        method = restorer(name, options)
+        return replace(method, scope=Scope(Domain(cells, {}), ())) if name == "mergenet" else method
+
+    monkeypatch.setattr(automatic, "restorer", found)
+
+
+@pytest.mark.parametrize(
+    ("ppp", "bits", "name", "said"),
+    [
+        (
+            3.25,
+            3,
+            "mergenet",
+            "auto: mergenet; measured at quiver-physical, 3 bit, 3.25 PPP: qbp 25.0 dB, network 26.0",
+        ),
+        (26.0, 3, "qbp", "auto: qbp; measured at quiver-physical, 3 bit, 26 PPP: qbp 25.0 dB, network 24.0 dB"),
+        (26.0, 5, "mergenet", "auto: mergenet; nothing was measured near 5 bit, 26 PPP"),
+    ],
+)
+def test_the_better_method_is_chosen_and_named(measured, ppp, bits, name, said):
+    method, line = automatic.chosen("auto", stream(ppp, bits))
+    assert method.name == name
+    assert line.startswith(said)
+
+
+def test_a_named_method_is_taken_without_a_word():
+    method, line = automatic.chosen("moment:3", stream(3.25))
+    assert (method.name, line) == ("moment:3", None)
+
+
+def test_shipped_weights_state_what_was_measured():
+    method, line = automatic.chosen("auto", stream(0.5))
+    assert method.name == "qbp-bm3d"  # measured 17.61 dB, mergenet 17.52
+    assert "measured at" in line
