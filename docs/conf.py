@@ -22,8 +22,8 @@ extensions = [
     "sphinx_design",
     "manual",
 ]
-source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-exclude_patterns = ["manual", "results/*.json"]
+source_suffix = {".md": "markdown", ".rst": "restructuredtext", ".py": "markdown"}  # .py: the examples
+exclude_patterns = ["*.py", "gpu/*", "manual/*", "results/*.json", "examples/results/*.json"]
 suppress_warnings = ["ref.python"]  # some classes share a name, as Clip
 
 myst_enable_extensions = ["attrs_inline", "colon_fence", "deflist", "dollarmath"]

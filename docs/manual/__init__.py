@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from manual import api, commands, keys, mathml, menu
+from manual import api, commands, examples, keys, mathml, menu
 
 _PAGE = re.compile(r"^<!-- page: (\S+) -->$", re.MULTILINE)
 
@@ -20,6 +20,7 @@ def setup(app: Any) -> dict[str, Any]:
     app.connect("builder-inited", api.write_pages)
     app.connect("autodoc-process-docstring", api.convert_docstring)
     app.connect("source-read", _insert)
+    app.connect("build-finished", examples.write_downloads)
     mathml.setup(app)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
@@ -30,6 +31,8 @@ def moved(path: Path) -> str:
 
 
 def _insert(app: Any, page: str, source: list[str]) -> None:
-    """Replace the comments of a page by what they name."""
+    """Replace the comments of a page by what they name; an example becomes its page."""
+    if page.startswith("examples/"):
+        source[0] = examples.page(page.removeprefix("examples/"))
     source[0] = _PAGE.sub(lambda found: moved(Path(app.srcdir) / found[1]), source[0])
     source[0] = menu.insert(commands.insert(keys.insert(source[0])))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 
-from manual import api
+from manual import api, examples
 
 _LIST = re.compile(r"^<!-- menu -->\n\n((?:- \[.*\n(?:  .*\n)*)+)", re.MULTILINE)
 _ROOMS = re.compile(r"^<!-- rooms -->$", re.MULTILINE)
@@ -27,11 +27,17 @@ def pages(text: str) -> list[str]:
 
 def _cards(items: list[tuple[str, str, str]]) -> str:
     cards = [
-        f":::{{grid-item-card}} {title}\n:link: {page}\n:link-type: doc\n\n{' '.join(what.split())}\n:::"
+        f":::{{grid-item-card}} {title}\n{_picture(page)}:link: {page}\n:link-type: doc\n\n{' '.join(what.split())}"
         for title, page, what in items
     ]
-    grid = "\n\n".join(["::::{grid} 1 1 2 2", ":gutter: 3", *cards, "::::"]).replace("2 2\n\n:gutter", "2 2\n:gutter")
+    grid = "\n\n".join(["::::{grid} 1 2 2 2\n:gutter: 3", *(f"{card}\n:::" for card in cards), "::::"])
     return f"{grid}\n\n{_toctree([page for _, page, _ in items])}"
+
+
+def _picture(page: str) -> str:
+    """Return the option for the last picture of an example, above its card; an empty text for other pages."""
+    pictures = [name for cell in examples.outputs(page.removeprefix("examples/")) for name in cell.pictures]
+    return f":img-top: examples/results/{pictures[-1]}\n" if pictures else ""
 
 
 def _toctree(pages: list[str]) -> str:

@@ -136,7 +136,8 @@ def listed(page: str = "index") -> list[str]:
 
 def test_every_page_is_in_one_menu():
     count = Counter(listed())
-    there = {path.relative_to(DOCS).with_suffix("").as_posix() for path in DOCS.rglob("*.md")}
+    paths = [*DOCS.rglob("*.md"), *(DOCS / "examples").glob("*.py")]
+    there = {path.relative_to(DOCS).with_suffix("").as_posix() for path in paths}
     assert set(count) == there
     assert max(count.values()) == 1
     assert len(there) > 25
