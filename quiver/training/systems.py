@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from quiver.model.blocks import RADIUS
+from quiver.model.blocks import RADIUS, Output
 from quiver.model.mergenet import MergeNet
 from quiver.model.presets import build
 from quiver.model.rivals.bit2bit import Bit2Bit
@@ -73,7 +73,8 @@ def quiver_restored(network: nn.Module, batch: Batch) -> tuple[Tensor, int]:
 def unet_loss(network: nn.Module, batch: Batch, settings: Settings, share: float) -> Tensor:
     """Return the loss of loss.py that the settings name, of the frames whose window lies in that of the batch."""
     restored, first = rivals.windows_restored(network, batch)
-    return training_loss(restored, batch["target"], LOSSES[settings.loss], first=first)
+    output = Output(None, restored, None, None)  # scale 1 has its weight in the loss
+    return training_loss(output, batch["target"], LOSSES[settings.loss], first=first)
 
 
 OURS = System("quiver", quiver_loss, quiver_restored, PROTOCOLS, losses=tuple(LOSSES))
