@@ -260,16 +260,17 @@ def test_samples_hold_noisy_copies_of_the_centre_frame(tiny_dataset):
 def test_a_network_is_trained_on_prepared_inputs(tiny_dataset, tmp_path, monkeypatch):
     """The loop hands what `prepare` returns to the loss and to the validation."""
     seen: list[float] = []
+    base = system_of(tiny("unet"))
 
     def loss(network, batch, run, share):
         seen.append(float(batch["known"][0, 2]))
-        return OURS.loss(network, batch, run, share)
+        return base.loss(network, batch, run, share)
 
     def restored(network, batch):
         assert batch["mean"].shape[0] == 1
-        return OURS.restored(network, batch)
+        return base.restored(network, batch)
 
-    mine = replace(OURS, loss=loss, restored=restored, prepare=moments)
+    mine = replace(base, loss=loss, restored=restored, prepare=moments)
     monkeypatch.setattr(training, "system_of", lambda network: mine)
     train(tiny("unet"), settings(tiny_dataset, tmp_path / "r", steps=2), progress=False)
     assert seen == pytest.approx([3.25, 3.25])
