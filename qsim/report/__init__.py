@@ -1,4 +1,4 @@
-"""Shows stored results as pages and previews; nothing is recomputed."""
+"""Shows clips, streams and stored results as pages and previews."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Reads codes and training windows from qsim's files; the only door to qsim's physics and data."""
+"""Reads codes and training windows from qsim's files."""
 
 from typing import TYPE_CHECKING
 
