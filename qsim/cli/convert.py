@@ -13,7 +13,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.recipe import SPLITS
-from qsim.formats import detection, exporting, importing, pairs
+from qsim.formats import challenge, detection, exporting, importing, pairs
 from qsim.formats.recording import TRANSFERS, Hints
 
 _SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr", ".h5": "pairs"}
@@ -29,6 +29,7 @@ def add_convert(sub: Any) -> None:
         "qsim convert capture.bin out/capture --layout swissspad2-half --frame-rate 96800\n"
         "qsim convert out/starter out/starter_mp4 --to mp4\n"
         "qsim convert out/starter out/starter.h5 --to pairs\n"
+        "qsim convert out/challenge out/cubes --to challenge\n"
         "qsim convert out/fan/streams/spad.json out/fan_cube.npy",
     )  # fmt: skip
     parser.add_argument("input", type=Path, help="a file, a folder, a clip, a stream (its .npy or .json), a data set")
@@ -62,9 +63,15 @@ def add_convert(sub: Any) -> None:
     writing.add_argument(
         "--to",
         choices=sorted([*exporting.EXPORTS, "pairs"]),
-        help="kind of the output (default: from the suffix of its name); pairs: codes, truth and flow in one .h5",
+        help="kind of the output (default: from the suffix of its name); pairs: codes, truth and flow in one .h5; "
+        "challenge: cubes of colour planes with their truth",
     )
-    writing.add_argument("--window", type=count, help=f"pairs: codes in each window (default {pairs.WINDOW})")
+    writing.add_argument(
+        "--window",
+        type=count,
+        help=f"pairs: codes in each window (default {pairs.WINDOW}); challenge: planes in each cube (default "
+        f"{challenge.PLANES})",
+    )
     writing.add_argument(
         "--lossy", action="store_true", help="write mp4 with FFmpeg's default settings, which lose noise"
     )
@@ -101,7 +108,7 @@ def _refuse_what_cannot_act(args: argparse.Namespace, kind: str, light: bool) ->
         refuse_idle(args, where, ["transfer"])
     if kind != "mp4":
         refuse_idle(args, where, ["lossy"])
-    if kind != "pairs":
+    if kind not in ("pairs", "challenge"):
         refuse_idle(args, where, ["window"])
 
 
@@ -114,7 +121,8 @@ def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
         known = ", ".join(sorted([*exporting.EXPORTS, "pairs"]))
         raise ValueError(f"{args.output}: name the kind of output with --to: {known}")
     _refuse_what_cannot_act(args, kind, args.input.suffix != ".json")
-    wanted = exporting.Export(kind, args.transfer or "gamma 2.2", args.white, not args.lossy)
+    planes = args.window or challenge.PLANES
+    wanted = exporting.Export(kind, args.transfer or "gamma 2.2", args.white, not args.lossy, planes=planes)
     if args.white is not None and (kind not in ("mp4", "png") or args.input.suffix == ".json"):
         raise ValueError("--white: acts on light written as mp4 or png; leave it out")
     if kind == "pairs":
@@ -125,6 +133,8 @@ def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
     suffix = {"cube": ".npy", "mp4": ".mp4", "zarr": ".zarr"}.get(kind, "")
     made = []
     clips = Dataset.open(args.input).clips()
+    for clip in clips:
+        exporting.check(clip, wanted)
     with bar("converting", "clip") as progress:
         for n, clip in enumerate(clips, 1):
             split = clip.meta.get("split")  # it becomes a folder, and the name a file

@@ -1,4 +1,4 @@
-"""Writes clips and streams for other programs: photon cube, mp4, PNG, EXR or zarr, with a .json beside it."""
+"""Writes clips and streams for other programs: photon cube, mp4, PNG, EXR, zarr, challenge, with a .json beside it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream, orientation
 from qsim.colour import code_levels, peak
 from qsim.files import VERSION
-from qsim.formats import array_files, images, video
+from qsim.formats import array_files, challenge, images, video
 
 BLOCK = 16  # frames read at a time
 
@@ -25,11 +25,12 @@ BLOCK = 16  # frames read at a time
 class Export:
     """The format of an export."""
 
-    kind: str  # cube, mp4, png, exr, zarr
+    kind: str  # cube, mp4, png, exr, zarr, challenge
     transfer: str = "gamma 2.2"  # of pictures of light
     white: float | None = None  # light that becomes full scale; None: the 99.9th percentile
     lossless: bool = True  # of mp4
     playback: float = 30.0  # frames per second of an mp4; its .json has the capture rate
+    planes: int = challenge.PLANES  # of a cube of the challenge
 
 
 def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = False) -> Path:
@@ -39,6 +40,7 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
     """
     if wanted.kind not in EXPORTS:
         raise ValueError(f"{path}: unknown kind {wanted.kind!r}; there are {', '.join(EXPORTS)}")
+    check(source, wanted)
     if (path.exists() or path.is_symlink()) and not force:
         raise FileExistsError(f"{path}: exists; name another, or use --force to replace it")
     meta = _export_meta(source, wanted)
@@ -68,6 +70,14 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
     return path
 
 
+def check(source: Clip | Stream, wanted: Export) -> None:
+    """Raise `ValueError` if the challenge cannot hold this source; other kinds check theirs when they write."""
+    if wanted.kind == "challenge":
+        if not isinstance(source, Clip):
+            raise ValueError(f"{source.path}: is one stream, the challenge has three colours; name the clip's folder")
+        challenge.bands_of(source, wanted.planes)
+
+
 def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = False) -> tuple[Path, str]:
     """Export; return the path and one line: kind, frames, size, rates, white."""
     made = export(source, path, wanted, force=force)
@@ -84,11 +94,13 @@ def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool 
     if isinstance(source, Clip):
         about += "; not written: codes, flow, depth (--to pairs writes codes, truth and flow)"
     rate = float(source.meta["frame_rate"])
+    if wanted.kind == "challenge":
+        return made, f"challenge, {challenge.line(meta)}"
     return made, f"{wanted.kind}, {frames} frames of {height} x {width} pixels at {rate:g} per second{shown}, {about}"
 
 
 _MARK = {"software": {"qsim": VERSION}}  # in every description of an export: this program wrote it
-_NAMES = r"meta\.json|[0-9]{6,}\.(png|exr)|zarr\.json|frames/zarr\.json|frames/c/[0-9]+/[0-9]+/[0-9]+"
+_NAMES = r"meta\.json|[0-9]{6,}\.(png|exr|npy)|zarr\.json|frames/zarr\.json|frames/c/[0-9]+/[0-9]+/[0-9]+"
 
 
 def _check_ours(place: Path, description: Path, single: bool) -> None:
@@ -146,12 +158,17 @@ def _zarr(source: Clip | Stream, path: Path, _wanted: Export, meta: dict[str, An
     array_files.write_zarr(path, blocks, source.shape, attributes | {"qsim": meta})
 
 
+def _challenge(source: Any, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+    meta |= challenge.write(source, path, wanted.planes)
+
+
 EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
     "cube": _cube,
     "mp4": _mp4,
     "png": _png,
     "exr": _exr,
     "zarr": _zarr,
+    "challenge": _challenge,
 }
 
 
@@ -163,7 +180,8 @@ def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
     found |= {"format_version": 1, "bit_order": "msb", "software": {"qsim": VERSION}}
     found["orientation"] = orientation(meta)
     if isinstance(source, Clip):
-        found["transfer"] = "linear" if wanted.kind in ("exr", "zarr") else wanted.transfer
+        written = {"exr": "linear", "zarr": "linear", "challenge": "srgb"}
+        found["transfer"] = written.get(wanted.kind, wanted.transfer)
         if wanted.kind in ("mp4", "png"):
             found["white"] = wanted.white if wanted.white is not None else _white(source)
     elif wanted.kind == "mp4":

@@ -255,6 +255,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ],
     ("convert", "--window"): [
         Acts("convert clip e.h5", "--window 2", stdout),
+        Acts("convert bands e --to challenge --window 3", "--window 2"),
         Refused("convert clip e --to png", "--window 2", "--window"),
         Refused(CODES, "--window 2", "--window"),
     ],
@@ -434,6 +435,9 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_clip(folder / "fast", frames=16, height=16, width=24, frame_rate=20000.0, exposure=5e-5, flow=flow)
     write_clip(folder / "wide", frames=16, height=64, width=96, frame_rate=20000.0, exposure=5e-5)
     write_clip(folder / "relative", frames=3, height=16, width=24, relative=True)
+    bands = write_clip(folder / "bands", frames=6, height=5, width=9)
+    for seed, name in enumerate(("red", "green", "blue")):
+        bands.sense("spad512s", ppp=0.4, bits=1, seed=seed, name=name)
     np.save(folder / "codes.npy", rng.integers(0, 4, (3, 16, 24)).astype(np.uint8))
     np.save(folder / "light.npy", rng.integers(0, 60000, (3, 16, 24)).astype(np.uint16))
     np.save(folder / "cube.npy", rng.integers(0, 256, (3, 16, 2)).astype(np.uint8))
