@@ -27,11 +27,22 @@ def add_restore(sub: Any) -> None:
         "quiver restore out/starter/clips/fan_0003 -o out/fan.npy\n"
         "quiver restore out/fan/streams/quiver-physical_3bit_3.25ppp.npy -o out/fan.npy --method out/mine\n"
         "quiver restore out/fan --ppp 3.25 -o out/fan.npy --method moment\n"
-        "quiver restore cube.npy --width 320 --planes 7 --sensor spad-320x240 --frame-rate 1428 -o out/cube.npy",
+        "quiver restore cube.npy --width 320 --planes 7 --sensor spad-320x240 --frame-rate 1428 -o out/cube.npy\n"
+        "quiver restore out/cubes/test -o out/submission.zip --planes 7",
         resumes=True,
     )  # fmt: skip
-    parser.add_argument("source", type=Path, help="stream (.npy with its .json), clip folder, or bare .npy array")
-    parser.add_argument("-o", "--output", type=Path, required=True, help=".npy to write; a .json appears beside it")
+    parser.add_argument(
+        "source",
+        type=Path,
+        help="stream (.npy with its .json), clip folder, bare .npy array, or (with -o OUT.zip) cubes of the challenge",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        help=".npy to write, or .zip: the pictures of a submission to the challenge; a .json appears beside it",
+    )
     parser.add_argument(
         "--method",
         default=DEFAULT_METHOD,
@@ -42,7 +53,9 @@ def add_restore(sub: Any) -> None:
     add_light(parser, several=False)
     parser.add_argument("--seed", type=int, help="seed of the noise, if a clip is sensed now (default 0)")
     parser.add_argument("--width", type=count, help="bare array: packed binary planes of this many pixels per row")
-    parser.add_argument("--planes", type=count, help="packed planes: 2^b - 1 are summed to one code (default 1)")
+    parser.add_argument(
+        "--planes", type=count, help="packed planes and cubes: 2^b - 1 are summed to one code (default 1)"
+    )
     parser.add_argument("--frame-rate", type=positive, help="bare array: codes per second (default 2000)")
     parser.add_argument(
         "--defects", type=Path, help="map of defective pixels, .npy [H, W], true where hot or dead: they are filled"
@@ -59,6 +72,8 @@ def _run_restore(args: argparse.Namespace) -> int:
     from quiver.restoration.sources import assumed, codes_to_restore, refuse_idle
 
     target: Path = args.output
+    if target.suffix == ".zip":
+        return _restore_cubes(args)
     if target.suffix != ".npy":
         raise ValueError(f"{target}: restored video is written as .npy; name a .npy file")
     codes = codes_to_restore(args)
@@ -90,5 +105,38 @@ def _run_restore(args: argparse.Namespace) -> int:
         {"restored": str(target)} | meta,
         f"{target}: {length} frames of {height} x {width} by {method.name}, "
         f"{meta['seconds_per_frame']:.3g} s per frame; photons, white = {codes.white:.4g}",
+    )
+    return 0
+
+
+def _restore_cubes(args: argparse.Namespace) -> int:
+    """Restore cubes of the Single Photon Challenge into the zip of a submission."""
+    from quiver.data.challenge import band_codes, cubes
+    from quiver.restoration.automatic import chosen
+    from quiver.restoration.sources import assumed, refuse, refuse_idle
+    from quiver.restoration.submission import check_target, restore_cubes
+
+    target: Path = args.output
+    idle = ("stream", "sensor", "ppp", "bits", "seed", "width", "frame_rate", "defects")
+    refuse(args, idle, f"{target} is a submission, whose layout states it")
+    check_target(target, args.force)
+    found, planes = cubes(args.source), args.planes or 1
+    first = band_codes(found[0], 1, planes)
+    method, why = chosen(args.method, first, running_options(args))
+    refuse_idle(vars(args), [method])
+    check_domain(args, [method], [first])
+    use_threads(args)
+    for text in (why, assumed(first, method)):
+        if text is not None:
+            note(text)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with bar(method.name) as progress:
+        meta = restore_cubes(found, method, planes, target, progress, force=args.force)
+    score = "no truth beside them" if meta["psnr"] is None else f"PSNR {meta['psnr']:.2f} dB"
+    output(
+        args,
+        {"submission": str(target)} | meta,
+        f"{target}: {len(found)} pictures by {method.name}, {planes} planes per code, {score}, "
+        f"{meta['seconds_per_picture']:.3g} s per picture",
     )
     return 0

@@ -65,14 +65,9 @@ def _summed(path: Path, cube: Array, light: Illumination, frame_rate: float, pla
         )
     if len(cube) < planes:
         raise ValueError(f"{path}: {len(cube)} planes are fewer than the {planes} of one code")
-    together = max(1, PLANE_PIXELS // (cube.shape[1] * width))  # planes unpacked at a time
 
     def code(t: int) -> Array:
-        total = np.zeros((cube.shape[1], width), np.uint16)  # at most 65535
-        for start in range(t * planes, (t + 1) * planes, together):
-            part = cube[start : min(start + together, (t + 1) * planes)]
-            total += np.unpackbits(part, axis=2, count=width).sum(axis=0, dtype=np.uint16)
-        return total.astype(np.uint8 if bits <= 8 else np.uint16)
+        return sum_planes(cube, width, t * planes, (t + 1) * planes, bits)
 
     return Codes(
         name=path.name,
@@ -83,3 +78,13 @@ def _summed(path: Path, cube: Array, light: Illumination, frame_rate: float, pla
         read=lambda start, stop: np.stack([code(t) for t in range(start, stop)]),
         source=str(path),
     )
+
+
+def sum_planes(cube: Array, width: int, start: int, stop: int, bits: int) -> Array:
+    """Return the sum [H, W] of packed planes start ... stop - 1 of uint8 [T, H, ceil(W/8)], as codes of `bits` bits."""
+    together = max(1, PLANE_PIXELS // (cube.shape[1] * width))  # planes unpacked at a time
+    total = np.zeros((cube.shape[1], width), np.uint16)  # at most 65535
+    for first in range(start, stop, together):
+        part = cube[first : min(first + together, stop)]
+        total += np.unpackbits(part, axis=2, count=width).sum(axis=0, dtype=np.uint16)
+    return total.astype(np.uint8 if bits <= 8 else np.uint16)

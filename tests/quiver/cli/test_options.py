@@ -98,6 +98,7 @@ STREAM = "restore two/streams/p3.npy -o r.npy --method moment"
 CLIP = "restore clip --ppp 3 -o r.npy --method moment"
 BARE = "restore codes.npy --sensor quiver-paper -o r.npy --method moment"
 GAIN = "restore codes.npy --ppp 3 -o r.npy --method moment"  # of a sensor whose gain follows the light
+ZIP = "restore cubes -o r.zip --method moment"
 CUBE = "restore cube.npy --width 24 --sensor spad-320x240 -o r.npy --method moment"
 NET = "restore clip --ppp 3 -o r.npy --method small.safetensors -q"
 UNET = "restore clip --ppp 3 -o r.npy --method unet.safetensors"
@@ -212,15 +213,21 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Refused(TRAIN.replace("-o run", "-o clip"), "--force", "removes only what this command made"),
     ],
     # restore
-    ("restore", "--output"): [Acts(CLIP, "-o s.npy", names), Refused(CLIP, "-o r.mp4", "written as .npy")],
+    ("restore", "--output"): [
+        Acts(CLIP, "-o s.npy", names),
+        Acts(ZIP, "-o s.zip", names),
+        Refused(CLIP, "-o r.mp4", "written as .npy"),
+    ],
     ("restore", "--method"): [Acts(CLIP, "--method naive"), Acts(CLIP, "--method small.safetensors")],
     ("restore", "--stream"): [
+        Refused(ZIP, "--stream p1", "whose layout states it"),
         Acts("restore two --stream p3 -o r.npy --method moment", "--stream p1"),
         Refused(STREAM, "--stream p1", "names a stream of a clip"),
         Refused(BARE, "--stream p1", "names a stream of a clip"),
         Refused(CLIP, "--stream p1", "p1"),
     ],
     ("restore", "--sensor"): [
+        Refused(ZIP, "--sensor quiver-paper", "whose layout states it"),
         Acts(CLIP, "--sensor quiver-published"),
         Acts(f"{BARE} --bits 1", "--sensor spad-320x240"),
         Acts(CUBE, "--sensor spad512s"),
@@ -228,6 +235,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Refused("restore one -o r.npy --method moment", "--sensor quiver-paper", "is a stored stream"),
     ],
     ("restore", "--ppp"): [
+        Refused(ZIP, "--ppp 9", "whose layout states it"),
         Acts(CLIP, "--ppp 9"),
         Acts("restore one -o r.npy --method moment", "--ppp 3.25"),
         Acts(GAIN, "--ppp 9"),
@@ -235,18 +243,21 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Refused(STREAM, "--ppp 9", "is a stored stream"),
     ],
     ("restore", "--bits"): [
+        Refused(ZIP, "--bits 1", "whose layout states it"),
         Acts(CLIP, "--bits 1"),
         Acts(BARE, "--bits 4"),
         Refused(STREAM, "--bits 1", "is a stored stream"),
         Refused(CUBE, "--bits 2", "planes are 1-bit codes"),
     ],
     ("restore", "--seed"): [
+        Refused(ZIP, "--seed 1", "whose layout states it"),
         Acts(CLIP, "--seed 1"),
         Refused(BARE, "--seed 1", "holds codes already"),
         Refused(CUBE, "--seed 1", "holds codes already"),
         Refused(STREAM, "--seed 1", "is a stored stream"),
     ],
     ("restore", "--defects"): [
+        Refused(ZIP, "--defects bad.npy", "whose layout states it"),
         Acts(CLIP, "--defects bad.npy"),
         Acts(BARE, "--defects bad.npy"),
         Acts(STREAM, "--defects bad.npy"),
@@ -254,17 +265,20 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Refused(BARE, "--defects codes.npy", "a map of defective pixels is"),
     ],
     ("restore", "--width"): [
+        Refused(ZIP, "--width 24", "whose layout states it"),
         Acts(CUBE, "--width 20"),
         Refused(CLIP, "--width 24", "describes a bare array"),
         Refused(STREAM, "--width 24", "is a stored stream"),
     ],
     ("restore", "--planes"): [
         Acts(CUBE, "--planes 3"),
+        Acts(ZIP, "--planes 3"),
         Refused(BARE, "--planes 3", "give their width"),
         Refused(CLIP, "--planes 3", "describes a bare array"),
         Refused(STREAM, "--planes 3", "is a stored stream"),
     ],
     ("restore", "--frame-rate"): [
+        Refused(ZIP, "--frame-rate 20", "whose layout states it"),
         Acts(CUBE.replace("spad-320x240", "spad.toml"), "--frame-rate 300"),
         Acts(BARE.replace("quiver-paper", "spad.toml"), "--frame-rate 300"),
         Refused(CLIP, "--frame-rate 20", "describes a bare array"),
@@ -292,7 +306,10 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Refused(NET.replace("small", "measured").replace("--ppp 3", "--ppp 26"), "--strict", "is worse than"),
         Refused(CLIP, "--strict", "acts on networks"),
     ],
-    ("restore", "--force"): [Acts(f"{CLIP} --seed 1", "--force", codes=(0, 2), before=CLIP)],
+    ("restore", "--force"): [
+        Acts(f"{CLIP} --seed 1", "--force", codes=(0, 2), before=CLIP),
+        Acts(f"{ZIP} --planes 3", "--force", codes=(0, 2), before=ZIP),
+    ],
     # evaluate
     ("evaluate", "--output"): of_clips("-o", "t", Acts(SCORE, "-o other/table", names)),
     ("evaluate", "--methods"): [
@@ -550,6 +567,8 @@ def work(scale: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.save(folder / "bad.npy", rng.random((16, 24)) < 0.1)
     np.save(folder / "small.npy", np.ones((8, 8), bool))
     np.save(folder / "cube.npy", rng.integers(0, 256, (12, 16, 3)).astype(np.uint8))
+    (folder / "cubes/fan").mkdir(parents=True)
+    np.save(folder / "cubes/fan/000000.npy", rng.integers(0, 256, (6, 5, 2, 3)).astype(np.uint8))
     np.save(folder / "counts.npy", rng.poisson(1.0, (14, 16, 16)))
     np.save(folder / "more.npy", rng.poisson(2.0, (14, 16, 16)))
     (folder / "spad.toml").write_text('[sensor]\nmodel = "BinarySPAD"\nbits = 1\npde = 0.5\ndark_count_rate = 100.0\n')

@@ -1,0 +1,54 @@
+"""Gives the colours of cubes of the Single Photon Challenge as codes, summed so that the last code ends with the cube.
+
+    cube uint8 [T, H, ceil(W/8), 3]  ->  for each colour codes [T // planes, H, W]
+
+The truth belongs to the last plane, so planes that fill no code are left out at the start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.formats.challenge import COLOURS, DETECTIONS, Cube, cubes, picture
+from qsim.sensor.spad import BinarySPAD
+from quiver.data.codes import Codes
+from quiver.data.photon_cubes import plane_bits, sum_planes
+
+__all__ = ["COLOURS", "Cube", "band_codes", "cubes", "light_of_band", "picture"]
+
+RATE = 2000.0  # planes per second: the benchmark states none, and nothing depends on it without dark counts
+
+
+def band_codes(cube: Cube, colour: int, planes: int) -> Codes:
+    """Return one colour (0, 1, 2) of a cube as codes that sum `planes` = 2^b - 1 planes each, of an ideal clocked SPAD.
+
+    `ValueError` for another number of planes, or more than the cube has.
+    """
+    bits = plane_bits(planes)
+    frames, height, width = cube.shape
+    if frames < planes:
+        raise ValueError(f"{cube.path}: {frames} planes are fewer than the {planes} of one code; give fewer --planes")
+    skipped = frames % planes
+    packed = cube.packed[..., colour]
+
+    def read(start: int, stop: int) -> Array:
+        ends = (skipped + t * planes for t in range(start, stop))
+        return np.stack([sum_planes(packed, width, first, first + planes, bits) for first in ends])
+
+    return Codes(
+        name=f"{cube.name} {COLOURS[colour]}",
+        shape=(frames // planes, height, width),
+        sensor=BinarySPAD(pde=1.0, dark_count_rate=0.0, bits=bits),
+        exposure=planes / RATE,
+        frame_rate=RATE / planes,
+        read=read,
+        source=f"{cube.path}, {COLOURS[colour]}",
+    )
+
+
+def light_of_band(photons: Sequence[Array], planes: int) -> Array:
+    """Return linear light [H, W, 3], 1 at white, of the restored photons [H, W] per code of the three colours."""
+    return np.stack(photons, axis=-1) / (planes * DETECTIONS)
