@@ -22,7 +22,8 @@ from torch import Tensor
 
 SCALES = (8, 4, 2)  # px of the full frame per cell, along one side
 SPEED = 18.0  # px/frame, the fastest that is tried; refinement goes slightly beyond
-STEP = 0.25  # cells of scale 8 per frame, between the velocities that are tried
+PARTS = 4  # velocities that are tried per cell of scale 8 and frame
+STEP = 1 / PARTS  # cells of scale 8 per frame, between them
 FAR = 4  # frames from the reference that vote in the search
 OUTSIDE = 0.25  # relative cost of a path that leads out of all frames; of half of them, where it is still allowed, half
 PREFERENCE = 0.05  # deviations of the noise per cell and frame: slower paths win among equals
@@ -145,27 +146,41 @@ def _add_differences(
     """Add |frame moved by every velocity - reference| to sums [2 most + 1, 2 most + 1, h, w], and 1 to `inside`, where
     the moved place lies in the frame.
     """
-    height, width = reference.shape
-    versions: dict[tuple[float, float], Tensor] = {}
-    grown = functional.pad(frame[None, None], (0, 1, 0, 1), mode="replicate")[0, 0]
-    for v in range(2 * most + 1):
-        y, part_y = divmod(offset * (v - most) * STEP, 1)
-        rows = slice(max(0, -int(y)), min(height, height - int(y)))
+    (height, width), count, far = reference.shape, 2 * most + 1, abs(offset) * most
+    fine, start = _in_steps(frame, far)
+    line = fine.shape[1]
+    columns = torch.zeros(count, 1, width)
+    for u in range(count):
+        columns[u, :, _kept(offset * (u - most), width)] = 1
+    for v in range(count):
+        down = offset * (v - most)
+        rows = _kept(down, height)
         if rows.start >= rows.stop:
             continue
-        for u in range(2 * most + 1):
-            x, part_x = divmod(offset * (u - most) * STEP, 1)
-            columns = slice(max(0, -int(x)), min(width, width - int(x)))
-            if columns.start >= columns.stop:
-                continue
-            if (part_y, part_x) not in versions:
-                lines = torch.lerp(grown[:-1], grown[1:], part_y)
-                versions[part_y, part_x] = torch.lerp(lines[:, :-1], lines[:, 1:], part_x)
-            moved = versions[part_y, part_x][
-                rows.start + int(y) : rows.stop + int(y), columns.start + int(x) : columns.stop + int(x)
-            ]
-            differences[v, u, rows, columns] += (moved - reference[rows, columns]).abs_()
-            inside[v, u, rows, columns] += 1
+        corner = (start + rows.start * PARTS + down) * line + start - far
+        places = (count, rows.stop - rows.start, width), (abs(offset), PARTS * line, PARTS), corner
+        moved = fine.as_strided(*places)  # by -far ... far steps to the right
+        moved = moved if offset > 0 else moved.flip(0)
+        differences[v, :, rows] += (moved - reference[rows]).abs_().mul_(columns)
+        inside[v, :, rows] += columns
+
+
+def _in_steps(frame: Tensor, far: int) -> tuple[Tensor, int]:
+    """Return a frame [h, w] at every step of STEP cells, at least `far` steps beyond its border, and the place of its
+    first cell on either axis. Between cells it is linear; beyond the border the last cell repeats.
+    """
+    beyond = -(-far // PARTS)
+    grown = functional.pad(frame[None, None], (beyond, beyond + 1) * 2, mode="replicate")[0, 0]
+    parts = [part * STEP for part in range(PARTS)]
+    lines = torch.stack([torch.lerp(grown[:-1], grown[1:], part) for part in parts], 1).flatten(0, 1)
+    fine = torch.stack([torch.lerp(lines[:, :-1], lines[:, 1:], part) for part in parts], 2).flatten(1)
+    return fine, beyond * PARTS
+
+
+def _kept(move: int, length: int) -> slice:
+    """Return the cells that lie in a frame of `length` cells after a move by so many steps."""
+    cells = move // PARTS
+    return slice(max(0, -cells), max(0, min(length, length - cells)))
 
 
 def _between(cost: Tensor, best: Tensor, step: int, place: Tensor, count: int) -> Tensor:
