@@ -51,7 +51,7 @@ class InformationDomain:
         return np.interp(phi, self.phi, self.photons).astype(np.float32)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def information_domain(sensor: Sensor, exposure: float) -> InformationDomain:
     """Return the tables of a sensor for codes of `exposure` seconds; made once per sensor.
 

@@ -22,7 +22,7 @@ from qsim.sensor.sensor import Sensor
 
 CELLS = 1024  # along each side of the table
 U_SHIFT = 22  # 2^32 / CELLS words fall into one cell
-TABLE_BITS = 5  # wider codes change within too many cells
+TABLE_BITS = 7  # wider codes change within too many cells
 MARGIN = 1e-12  # relative; wider than the rounding of sqrt and product
 
 
@@ -69,7 +69,7 @@ class CodeTable:
         return codes
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)  # 1 MB each
 def _code_table(sensor: Sensor, exposure: float) -> CodeTable | None:
     """Return the table of a sensor; None for a sensor that a table cannot hold."""
     if sensor.bits > TABLE_BITS:

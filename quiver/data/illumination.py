@@ -59,7 +59,7 @@ def read_sensor(source: str | Mapping[str, Any], bits: int | None = None) -> tup
     return devices.from_dict(source), None
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def _device(light: Illumination, exposure: float) -> Sensor:
     return devices.load(light.sensor, ppp=light.ppp, bits=light.bits, exposure=exposure)
 

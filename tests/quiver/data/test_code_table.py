@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from stats import assert_histogram
@@ -19,6 +21,8 @@ SENSORS = (
     QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25),
     QIS(0.8, 3200.0, 0.0, 2),
     QIS(0.8, 1.6, 2.0, 5, gain=0.3, full_well=20.0),
+    QIS(0.8, 1.6, 0.2, 6, gain=0.3),
+    QIS(0.8, 1.6, 0.2, 7, gain=0.635),
     BinarySPAD(0.4, 100.0, bits=1),
     CountingSPAD(0.5, 25.0, 5e-5, 3),
 )
@@ -36,10 +40,9 @@ def test_table_draws_are_the_reference_draws(sensor: Sensor):
 
 def test_sums_of_planes_have_the_exact_distribution():
     """A clocked SPAD draws plane by plane; its table draws the sum: the same binomial law."""
-    sensor = BinarySPAD(1.0, 0.0, bits=3)
-    for level in (0.5, 4.9, 20.0):
+    for sensor, level in itertools.product((BinarySPAD(1.0, 0.0, bits=bits) for bits in (3, 7)), (0.5, 4.9, 20.0)):
         codes = draw_codes(sensor, np.full((5, 80, 100), level), EXPOSURE, Key(1, int(level)))
-        assert_histogram(codes, np.exp(sensor.log_pmf(np.array([level]), EXPOSURE)[0]), checks=3)
+        assert_histogram(codes, np.exp(sensor.log_pmf(np.array([level]), EXPOSURE)[0]), checks=6)
 
 
 def test_the_table_decides_most_pixels_itself():
