@@ -14,6 +14,7 @@ from typing import Any
 
 from qsim.cli.console import note, output
 from qsim.cli.options import count, nonnegative, positive
+from qsim.files import sha256
 from quiver.cli.options import (
     NETWORKS,
     PROTOCOLS,
@@ -39,7 +40,11 @@ def add_train(sub: Any) -> None:
         "torchrun --nproc-per-node 4 -m quiver train out/starter -o out/s --preset quiver-s --protocol published",
         resumes=True,
     )  # fmt: skip
-    parser.add_argument("data", help="data set folder; for bit2bit a stored stream, or a clip with one stream")
+    parser.add_argument(
+        "data",
+        nargs="+",
+        help="data set folder, or several, whose clips count alike; for bit2bit a stored stream, or a clip with one",
+    )
     parser.add_argument("-o", "--output", required=True, help="folder of the run")
     parser.add_argument("--preset", default="nano", choices=NETWORKS, help="network (default nano)")
     parser.add_argument(
@@ -48,6 +53,7 @@ def add_train(sub: Any) -> None:
         choices=PROTOCOLS,
         help="bundle of defaults (default quick); compared networks have quick and published",
     )
+    parser.add_argument("--start", help="weights to start from: a name that ships, a weights file or a run folder")
     parser.add_argument("--steps", type=count, help="optimiser steps")
     parser.add_argument("--minutes", type=positive, help="wall-clock limit; the learning rate follows it")
     add_noise(parser)
@@ -86,9 +92,13 @@ def _run_train(args: argparse.Namespace) -> int:
     from quiver import threads
     from quiver.data.clips import open_clips
     from quiver.device import pick_device
+    from quiver.restoration.restorers import weights_path
     from quiver.training.loop import Diverged, train
     from quiver.training.run_folder import draw_curve
 
+    first = None if args.start is None else weights_path(args.start)
+    args.start = None if first is None else sha256(first)
+    args.data = args.data[0] if len(args.data) == 1 else tuple(args.data)
     settings = _settings(args)
     if args.preset.startswith("bit2bit"):
         settings = _of_stream(args, settings)
@@ -97,8 +107,8 @@ def _run_train(args: argparse.Namespace) -> int:
                          "after every tenth of its time; leave it out")  # fmt: skip
     if args.validation_split is not None and not open_clips(settings.data, args.validation_split):
         raise ValueError(
-            f"--validation-split {args.validation_split}: {settings.data} has no clip in that split; leave it out, and "
-            "without clips in `val` training clips serve"
+            f"--validation-split {args.validation_split}: {', '.join(settings.folders)} has no clip in that split; "
+            "leave it out, and without clips in `val` training clips serve"
         )
     folder, leads = Path(settings.out), os.environ.get("RANK", "0") == "0"
     earlier = None if args.force else threads.recorded(folder / "settings.json")
@@ -107,7 +117,7 @@ def _run_train(args: argparse.Namespace) -> int:
     try:
         with _signals() as interrupted:
             state = train(
-                network_of(args, settings),
+                network_of(args, settings, first),
                 settings,
                 device=pick_device(args.device),
                 should_stop=lambda: bool(interrupted),
@@ -147,20 +157,31 @@ def _of_stream(args: argparse.Namespace, settings: Any) -> Any:
 
     names = ("sensor", "ppp", "bits", "validate_every", "validation_split")
     refuse(args, names, f"is for data sets, and {args.preset} learns from one stream")
-    return own_light(settings, stream_at(Path(args.data)))
+    if len(settings.folders) > 1:
+        raise ValueError(f"{', '.join(settings.folders)}: {args.preset} learns from one stream; give one")
+    return own_light(settings, stream_at(Path(settings.folders[0])))
 
 
-def network_of(args: argparse.Namespace, settings: Any) -> Any:
-    """Return the network of the preset with random weights; bit2bit for the law of its stream."""
+def network_of(args: argparse.Namespace, settings: Any, first: Path | None = None) -> Any:
+    """Return the network of the preset with random weights, or those of the file `first`; bit2bit for the law of its
+    stream. `ValueError` for weights of another network.
+    """
     from quiver.data.stream_windows import stream_at
+    from quiver.model import weights
     from quiver.model.presets import build
     from quiver.model.rivals.bit2bit import Bit2Bit
     from quiver.training.self_supervised import config_for
 
     network = build(args.preset)
     if isinstance(network, Bit2Bit):
-        return Bit2Bit(config_for(stream_at(Path(settings.data)), network.config))
-    return network
+        network = Bit2Bit(config_for(stream_at(Path(settings.folders[0])), network.config))
+    if first is None:
+        return network
+    loaded = weights.load(first)
+    if type(loaded) is not type(network) or loaded.config != network.config:
+        raise ValueError(f"--start {first}: weights of {type(loaded).__name__} with another configuration than the "
+                         f"preset {args.preset}; name the preset that they were trained with")  # fmt: skip
+    return loaded.train()
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,12 @@ from qsim.optics.radiometry import WHITE_PER_MEAN
 __all__ = ["Clip", "has_sharp", "known", "mean_light", "open_clips", "peak_of", "truth"]
 
 
-def open_clips(path: Path | str, split: str | None = None) -> list[Clip]:
-    """Return the finished clips of a data set, all or of one split; the one clip of a clip folder; or those of a folder
-    of clips, each of which states its split.
+def open_clips(path: Path | str | Iterable[Path | str], split: str | None = None) -> list[Clip]:
+    """Return the finished clips of a data set, all or of one split; the one clip of a clip folder; those of a folder
+    of clips, each of which states its split; or those of several folders, one after another.
     """
+    if not isinstance(path, Path | str):
+        return [clip for folder in path for clip in open_clips(folder, split)]
     path = Path(path)
     if (path / "clip.json").exists():
         return [Clip.open(path)]

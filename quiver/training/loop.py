@@ -115,10 +115,10 @@ def make_windows(
         seed=settings.seed,
     )
     training, split = open_clips(settings.data, "train"), settings.validation_split
-    windows = Windows(training, window, prepare=system.prepare)
-    validation = open_clips(settings.data, split)
+    windows, validation = Windows(training, window, prepare=system.prepare), open_clips(settings.data, split)
     if not validation:
-        warnings.warn(f"{settings.data}: no clip in split '{split}'; validating on training clips", stacklevel=2)
+        names = ", ".join(settings.folders)
+        warnings.warn(f"{names}: no clip in split '{split}'; validating on training clips", stacklevel=2)
         validation = training
     side = min(VALIDATION_SIDE, *(min(clip.shape[1:]) for clip in validation)) // multiple * multiple
     middle = replace(window, drift=0, frames=frames or system.frames, crop=max(side, multiple), ceiling=math.inf)

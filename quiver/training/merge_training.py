@@ -26,8 +26,8 @@ ABOVE = 0.05  # slope of light above the peak
 
 PROTOCOLS: Mapping[str, Mapping[str, Any]] = {
     "quick": {
-        "sensor": "quiver-physical",
-        "ppp": (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 100.0),
+        "sensor": ("quiver-physical", "spad-320x240"),  # of a SPAD, 2^bits - 1 planes are summed
+        "ppp": tuple(float(f"{level:.3g}") for level in np.geomspace(0.3, 100, 16)),
         "bits": (1, 2, 3, 5, 7),
         "learning_rate": 1.5e-3,
         "crop": 96,

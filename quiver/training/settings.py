@@ -25,9 +25,10 @@ PRECISIONS = ("auto", "float32", "bfloat16")
 class Settings:
     """All that a run depends on; stored beside its results."""
 
-    data: str  # data set folder
+    data: str | tuple[str, ...]  # data set folder, or several
     out: str  # folder of the run
     network: str = "nano"  # name of the model, for the record
+    start: str | None = None  # SHA-256 of the weights file that the run starts from; None: random weights
     steps: int | None = None  # of the optimiser; with `minutes` too, the limit that is reached first ends the run
     minutes: float | None = None  # wall-clock limit, validation included
     sensor: str | tuple[str, ...] | None = None  # as given; None: those of the data set's streams
@@ -85,6 +86,11 @@ class Settings:
         for name, known in known_names.items():
             if getattr(self, name) not in known:
                 raise ValueError(f"no {name} is called {getattr(self, name)!r}; known are {', '.join(known)}")
+
+    @property
+    def folders(self) -> tuple[str, ...]:
+        """Return the data set folders."""
+        return (self.data,) if isinstance(self.data, str) else self.data
 
     @property
     def sensors(self) -> tuple[str, ...] | None:
@@ -169,7 +175,8 @@ def _recorded(found: Mapping[str, Any]) -> tuple[Noise, ...]:
 def portable(settings: Settings) -> dict[str, Any]:
     """Return settings for a weights file: names without folders; sensor, ppp and bits are those of the noise."""
     found = settings.to_dict()
-    found |= {name: Path(found[name]).name for name in ("data", "out")}
+    folders = [Path(folder).name for folder in settings.folders]
+    found |= {"data": folders[0] if len(folders) == 1 else folders, "out": Path(settings.out).name}
     for noise in found["noise"] or ():
         noise["sensor"] = Path(noise["sensor"]).name
         for value in (noise["defects"] or {}).values():

@@ -23,9 +23,10 @@ from quiver.training.settings import Settings
 from quiver.training.systems import system_of
 
 
-def settings(data: Path, out: Path, **changes: object) -> Settings:
+def settings(data: Path | tuple[Path, ...], out: Path, **changes: object) -> Settings:
     defaults = {"steps": 6, "crop": 16, "batch": 2, "validate_every": 4, "warmup": 2, "validation_windows": 2}
-    return Settings(str(data), str(out), **defaults | changes)
+    folders = tuple(map(str, data)) if isinstance(data, tuple) else str(data)
+    return Settings(folders, str(out), **defaults | changes)
 
 
 def small_network(seed: int = 0) -> UNet:

@@ -175,6 +175,9 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("train", "--output"): [Acts(TRAIN, "-o other", names), Refused(TRAIN, "-o clip", "is not a training run")],
     ("train", "--preset"): of_training("--preset", "nano"),
     ("train", "--protocol"): of_training("--protocol", "spad-sum"),
+    ("train", "--start"): of_training(
+        "--start", "trained", Refused(TRAIN, "--start small.safetensors", "the preset unet")
+    ),
     ("train", "--steps"): of_training("--steps", "3"),
     ("train", "--minutes"): of_training("--minutes", "1e-7"),
     ("train", "--sensor"): of_training(

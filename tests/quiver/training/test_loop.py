@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import os
 import socket
@@ -168,6 +169,19 @@ def test_a_crop_must_fit_the_network(tiny_dataset, tmp_path):
     with pytest.raises(ValueError, match="--crop 18: this network needs a multiple of 4"):
         train(small_network(), settings(tiny_dataset, tmp_path / "r", crop=18), progress=False)
     assert not (tmp_path / "r").exists()
+
+
+def test_several_folders_train_and_validate_on_all_their_clips(tmp_path):
+    one = write_dataset(tmp_path / "one", {"train": 2, "val": 1})
+    two = write_dataset(tmp_path / "two", {"train": 3, "test": 1})
+    train(small_network(), settings((one, two), tmp_path / "r", steps=1), progress=False)
+    assert json.loads((tmp_path / "r/settings.json").read_text())["data"] == [str(one), str(two)]
+    windows, fixed = make_windows(settings((one, two), tmp_path), 4)
+    assert [Path(clip.path).parts[-3:-1] for clip in windows.clips].count(("one", "clips")) == 2, windows.clips
+    assert len(windows.clips) == 5
+    assert len(fixed.dataset.clips) == 1
+    with pytest.raises(FileExistsError, match="holds a run with data"):
+        train(small_network(), settings(one, tmp_path / "r", steps=1), progress=False)
 
 
 def test_without_validation_clips_the_training_clips_serve(tmp_path):
