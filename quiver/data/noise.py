@@ -1,4 +1,8 @@
-"""Describes the noise of training windows: a sensor with its defects at a light level, as a stream stores it."""
+"""Describes the noise of training windows: a sensor with its defects at a light level, as a stream stores it.
+
+For networks that take the noise of codes as an input, `noise_table` gives their variance at every mean, from the
+exact law of the sensor. One table serves training windows and restored streams alike.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,9 @@ from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
+from numpy import ndarray as Array
+
 from qsim.clip.clip import Clip
 from qsim.clip.sensing import Sensing, assemble
 from qsim.clip.simulation import Draw
@@ -16,6 +23,8 @@ from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.defect_table import from_dict as read_defects
 from qsim.sensor.sensor import Sensor
 from quiver.data.illumination import Illumination, read_sensor
+
+NODES = 4097  # of a table; between nodes the variance is read along straight lines
 
 
 @dataclass(frozen=True)
@@ -149,3 +158,18 @@ def stored_defects(text: str) -> Defects:
 def short_name(sensor: str) -> str:
     """Return the name of a device, or of a file without folder and suffix."""
     return sensor.rpartition("/")[2].removesuffix(".toml")
+
+
+@lru_cache(maxsize=64)
+def noise_table(sensor: Sensor, exposure: float) -> Array:
+    """Return the variance of one code over 2^b - 1 at equal steps of its mean over 2^b - 1, float32 [NODES].
+
+    Codes of `exposure` seconds. Below the mean of a dark pixel the variance is that of a dark pixel, and above the
+    largest mean that of the brightest light. The array is shared and read-only. `ValueError` for a sensor whose mean
+    code does not rise with light.
+    """
+    response, top = sensor.response(exposure), sensor.levels - 1
+    steps = np.linspace(0, top, NODES)
+    table = (np.interp(steps, response.mean, response.variance) / top**2).astype(np.float32)
+    table.setflags(write=False)
+    return table

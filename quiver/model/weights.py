@@ -7,7 +7,7 @@ import json
 import pickle
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,8 @@ EARLIER: dict[str, object] = {
     "lecun": False,
 }
 RENAMED = {"baseline": "estimate_width", "sweep": "largest_velocity"}  # earlier field: field of FoldedConfig
+# Earlier fields: the noise of the sensor is now an input of these networks.
+NO_FIELDS = {"EMVD": ("variance",), "FloRNN": ("variance",), "FastDVDnet": ("variance",)}
 RENAMED_PARTS = {"baseline": "estimate", "hourglass": "body"}  # earlier part of a network: part today
 
 
@@ -142,8 +144,13 @@ def _build(kind: str, values: dict[str, object]) -> nn.Module:
         return assemble(_config_of(values))
     for network, config in NETWORKS:
         if kind == network.__name__:
-            return network(config.from_dict(values))  # type: ignore[attr-defined]
+            return network(config.from_dict(without(values, NO_FIELDS.get(kind, ()))))  # type: ignore[attr-defined]
     raise ValueError(f"no network is called {kind[:60]!r}")
+
+
+def without(values: dict[str, object], names: Sequence[str]) -> dict[str, object]:
+    """Return values without some; anything but a table is returned unchanged."""
+    return {name: value for name, value in values.items() if name not in names} if isinstance(values, dict) else values
 
 
 def _config_of(values: dict[str, object]) -> Config:

@@ -15,6 +15,7 @@ from numpy import ndarray as Array
 from qsim.files import Progress
 from quiver.baselines.sliding_window import reflect
 from quiver.data.codes import Codes
+from quiver.data.noise import noise_table
 from quiver.device import moved, pick_device
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.parts import part_of, takes_clips
@@ -140,7 +141,7 @@ def fill_parts(
     length, height, width = codes.shape
     part, last, done = part_of(network), first + len(out), 0
     pieces = cut_pieces(network, height, width, options.memory, options.mode)
-    apart = Disagreement.nothing(height, width)
+    apart, known = Disagreement.nothing(height, width), known_of(network, codes)
     for start in range(first - first % part.kept, last, part.kept):
         end = min(length, start + part.kept + part.after)
         begin = max(0, min(start - part.before, end - 1 - part.after))  # the last frames are reflected at the end
@@ -151,7 +152,7 @@ def fill_parts(
             place = (slice(tile.y, tile.y + rows), slice(tile.x, tile.x + columns))
             seen = torch.from_numpy(frames[(slice(None), *place)])[None, :, None].to(device)
             with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
-                result = network(seen)[0, wanted.start - begin : wanted.stop - begin, 0]
+                result = network(seen, **known)[0, wanted.start - begin : wanted.stop - begin, 0]
             restored = result.float().cpu().numpy()
             out[(slice(wanted.start - first, wanted.stop - first), *place)] += (
                 tile.weight * restored * np.float32(codes.white)
@@ -162,6 +163,18 @@ def fill_parts(
             if progress is not None:
                 progress(done, len(out) * len(pieces.tiles))
     warn_of_cut(codes, options, pieces, apart)
+
+
+def known_of(network: Any, codes: Codes) -> dict[str, Tensor]:
+    """Return the inputs of a network beside the frames: the noise table of the stream's sensor, if it takes one.
+
+    `ValueError` for a sensor whose mean code does not rise with light.
+    """
+    import torch
+
+    if not getattr(network, "takes_variance", False):
+        return {}
+    return {"variance": torch.tensor(noise_table(codes.sensor, codes.exposure))}
 
 
 def padded_frames(codes: Codes, part: tuple[slice, slice], first: int, count: int) -> Iterator[Tensor]:

@@ -12,8 +12,11 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
+from quiver.data.codes import Codes
+from quiver.data.noise import noise_table
 from quiver.model.blocks import RADIUS, WINDOW, resize
 from quiver.model.deformable import warp
+from quiver.model.rivals.noise import table_of
 from quiver.model.rivals.spk2imgnet import BEFORE, CONVERTER, GROUPS
 from quiver.model.rivals.student_teacher import distillation_loss
 from quiver.training.settings import Settings
@@ -40,18 +43,26 @@ def centre_frame(network: nn.Module, batch: Batch) -> tuple[Tensor, int]:
     return network(batch["codes"])[:, BEFORE : BEFORE + 1], BEFORE
 
 
-def last_frame(network: nn.Module, batch: Batch) -> tuple[Tensor, int]:
-    """Return the last frame of a window [B, 1, 1, h, w], and its place."""
-    restored = network(batch["codes"])
-    return restored[:, -1:], restored.shape[1] - 1
-
-
 def windows_restored(network: Any, batch: Batch) -> tuple[Tensor, int]:
     """Return the frames whose window lies in that of the batch [B, n, 1, h, w], and the place of the first."""
     return network.windows(batch["codes"]), network.frames_in - 1 - network.look_ahead
 
 
+# Networks that take the noise of the sensor
+
+
+def noise_inputs(codes: Codes) -> dict[str, Tensor]:
+    """Return the noise table of a window's sensor [n], as `variance`."""
+    return {"variance": torch.tensor(noise_table(codes.sensor, codes.exposure))}
+
+
 # EMVD
+
+
+def emvd_restored(network: nn.Module, batch: Batch) -> tuple[Tensor, int]:
+    """Return the last frame of a window [B, 1, 1, h, w], and its place."""
+    restored = network(batch["codes"], batch.get("variance"))
+    return restored[:, -1:], restored.shape[1] - 1
 
 
 def emvd_loss(network: Any, batch: Batch, settings: Settings, share: float) -> Tensor:
@@ -59,9 +70,9 @@ def emvd_loss(network: Any, batch: Batch, settings: Settings, share: float) -> T
 
     The published program multiplies the wavelet taps without transposing; as published, so do we.
     """
-    state, restored = None, []
+    table, state, restored = table_of(batch.get("variance"), batch["codes"]), None, []
     for image in network.packed(batch["codes"]).unbind(1):
-        output, state = network.step(state, image)
+        output, state = network.step(state, image, table)
         restored.append(output)
     error = (torch.stack(restored, dim=1).float() - network.packed(batch["target"])).abs().mean()
     colour, back = (mix.net1.weight.flatten(1) for mix in (network.ct, network.cti))
@@ -87,7 +98,7 @@ def flornn_loss(network: Any, batch: Batch, settings: Settings, share: float) ->
     codes, target = batch["codes"], batch["target"]
     flows = network.flows(codes)
     images = codes.expand(-1, -1, network.config.image_channels, -1, -1)
-    restored = network.restore(images, network.noise(codes), flows).float()
+    restored = network.restore(images, network.noise(codes, batch.get("variance")), flows).float()
     first = 1 if network.config.as_published else 0
     wanted = target[:, first : restored.shape[1]]
     squares = HALF * (restored[:, first:] - wanted).square().sum() / len(codes)
@@ -104,7 +115,7 @@ def flornn_restored(network: Any, batch: Batch) -> tuple[Tensor, int]:
     """Return the last frame of a window that needs no reflected frame [B, 1, 1, h, w], and its place."""
     codes = batch["codes"]
     images = codes.expand(-1, -1, network.config.image_channels, -1, -1)
-    restored = network.restore(images, network.noise(codes), network.flows(codes))
+    restored = network.restore(images, network.noise(codes, batch.get("variance")), network.flows(codes))
     return restored[:, -1:].mean(dim=2, keepdim=True), restored.shape[1] - 1
 
 
@@ -168,9 +179,14 @@ def student_teacher_loss(network: Any, batch: Batch, settings: Settings, share: 
 # FastDVDnet
 
 
+def fastdvdnet_restored(network: Any, batch: Batch) -> tuple[Tensor, int]:
+    """Return the frames whose window lies in that of the batch [B, T-4, 1, h, w], and 2."""
+    return network.windows(batch["codes"], batch.get("variance")), network.look_ahead
+
+
 def fastdvdnet_loss(network: Any, batch: Batch, settings: Settings, share: float) -> Tensor:
     """Return the squared error of the restored frames, summed, over twice their number."""
-    restored, first = windows_restored(network, batch)
+    restored, first = fastdvdnet_restored(network, batch)
     wanted = batch["target"][:, first : first + restored.shape[1]]
     squares = (restored.float() - wanted).square().sum()
     return HALF * squares / (restored.shape[0] * restored.shape[1])

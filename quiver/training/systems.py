@@ -85,10 +85,12 @@ SYSTEMS: dict[type[nn.Module], System] = {
     ),
     UNet: replace(OURS, name="unet", loss=unet_loss, restored=rivals.windows_restored),
     EMVD: System(
-        "emvd", rivals.emvd_loss, rivals.last_frame, _protocols({"clip_norm": 5.0}, clip_norm=5.0)
+        *("emvd", rivals.emvd_loss, rivals.emvd_restored, _protocols({"clip_norm": 5.0}, clip_norm=5.0)),
+        prepare=rivals.noise_inputs,
     ),
     FloRNN: System(
         *("flornn", rivals.flornn_loss, rivals.flornn_restored, _protocols({}, learning_rate=3e-4)),
+        prepare=rivals.noise_inputs,
         check=rivals.check_flornn,
     ),
     MemDeblur: System(
@@ -97,9 +99,10 @@ SYSTEMS: dict[type[nn.Module], System] = {
         check=rivals.check_memdeblur,
     ),
     FastDVDnet: System(
-        *("fastdvdnet", rivals.fastdvdnet_loss, rivals.windows_restored),
+        *("fastdvdnet", rivals.fastdvdnet_loss, rivals.fastdvdnet_restored),
         _protocols(_FASTDVDNET | {"learning_rate": 1e-3, "frames": 5}),
         multiple=4,
+        prepare=rivals.noise_inputs,
     ),
     StudentTeacher: System(
         *("student-teacher", rivals.student_teacher_loss, rivals.windows_restored, _protocols({}, learning_rate=3e-4)),

@@ -9,6 +9,7 @@ from golden import Recorder, fill_by_rule
 from torch import Tensor
 
 from quiver.model.rivals.emvd import EMVD, EMVDConfig
+from quiver.model.rivals.noise import table_of
 from quiver.model.rivals.published_names import load_published
 
 INPUTS = ("codes", "noise_ab")
@@ -43,9 +44,9 @@ def built(config: EMVDConfig, weights: Mapping[str, Tensor]) -> EMVD:
 def run(network: EMVD, codes: np.ndarray) -> tuple[Tensor, Tensor]:
     """Codes [B, T, 1, H, W] -> outputs and states [B, T, 4, H, W]."""
     images = network.packed(torch.from_numpy(np.asarray(codes, np.float64) / 7))
-    state, outputs, states = None, [], []
+    table, state, outputs, states = table_of(None, images), None, [], []
     for image in images.unbind(1):
-        output, state = network.step(state, image)
+        output, state = network.step(state, image, table)
         outputs.append(output)
         states.append(state)
     return torch.stack(outputs, dim=1), torch.stack(states, dim=1)

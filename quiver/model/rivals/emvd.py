@@ -8,8 +8,8 @@ Look-ahead: none. The first frame is its own past; the end of a clip needs nothi
 
 Our reading: the four output channels share one target, so their mean is the restored frame. The published port tells
 the network the noise of a 12-bit camera, about a thousandth of the true one. To find it, it clips the low-pass bands at
-1, though they carry gains of 4, 8 and 16. Both are mended here, and a slip in one colour coefficient; `as_published`
-brings them back.
+1, though they carry gains of 4, 8 and 16. Here the noise is that of the sensor's table (noise.py), and the bands are
+not clipped; a slip in one colour coefficient is mended too. `as_published` brings all three back.
 """
 
 from dataclasses import asdict, dataclass
@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from qsim.structure import make
 from quiver.model.config import flag, whole_number
 from quiver.model.rivals.edges import check_frames, pad_space
-from quiver.model.rivals.noise import VARIANCE, numbers, variance_at, variance_table
+from quiver.model.rivals.noise import numbers, table_of, variance_at
 
 IMAGE = 4  # channels of an image
 BANDS = 4  # blocks of a wavelet transform, each with the channels of an image
@@ -31,11 +31,10 @@ SCALES = 3
 
 @dataclass(frozen=True)
 class EMVDConfig:
-    """Configuration of EMVD; the defaults are the published sizes with the sensor's noise."""
+    """Configuration of EMVD; the defaults are the published sizes, and the noise that the sensor has."""
 
     width: int = 16  # hidden channels of the small networks
     space_to_depth: bool = False  # ours: 2 x 2 pixels make four channels at half the size, instead of four copies
-    variance: tuple[float, ...] = VARIANCE  # of codes/(2^b - 1), at equal steps of their mean from 0 to 1
     as_published: bool = False  # the port's noise and colour coefficient
     published_noise: tuple[float, ...] = (1 / 3855, 1 / 3855**2)  # slope and offset, if as_published
 
@@ -44,9 +43,7 @@ class EMVDConfig:
         whole_number("EMVDConfig.width", self.width, 1, 1024)
         for name in ("space_to_depth", "as_published"):
             flag(f"EMVDConfig.{name}", getattr(self, name))
-        variance = variance_table("EMVDConfig.variance", self.variance)
         published = numbers("EMVDConfig.published_noise", self.published_noise, 2, 2)
-        object.__setattr__(self, "variance", variance)
         object.__setattr__(self, "published_noise", published)
 
     def to_dict(self) -> dict[str, object]:
@@ -79,18 +76,22 @@ class EMVD(nn.Module):
         super().__init__()
         self.config = config = config or EMVDConfig()
         self.multiple = 2**SCALES * (2 if config.space_to_depth else 1)  # px that divide height and width inside
+        self.takes_variance = not config.as_published
         colour = _colour(0.2764 if config.as_published else 0.2784)
         self.ct, self.cti = Colour(colour), Colour(colour.T)
         self.ft, self.fti = Analysis(), Synthesis()
         self.vd, self.md1, self.md0 = (Scale(config, scale) for scale in (2, 1, 0))
         self.refine = SmallNet(2 * BANDS * IMAGE + 1, config.width, 1, sigmoid=True)
 
-    def forward(self, frames: Tensor) -> Tensor:
-        """[B, T, 1, H, W] of codes/(2^b - 1) -> restored [B, T, 1, H, W]; ValueError for another shape."""
+    def forward(self, frames: Tensor, variance: Tensor | None = None) -> Tensor:
+        """[B, T, 1, H, W] of codes/(2^b - 1) -> restored [B, T, 1, H, W]; ValueError for another shape.
+
+        `variance` is the sensor's table, [n] or one per clip [B, n]; None: that of noise.VARIANCE.
+        """
         check_frames(frames)
-        state, restored = None, []
+        table, state, restored = table_of(variance, frames), None, []
         for image in self.packed(pad_space(frames, self.multiple)).unbind(1):
-            output, state = self.step(state, image)
+            output, state = self.step(state, image, table)
             restored.append(output)
         return self.unpacked(torch.stack(restored, dim=1))[..., : frames.shape[-2], : frames.shape[-1]]
 
@@ -106,15 +107,15 @@ class EMVD(nn.Module):
             return F.pixel_shuffle(images, 2)
         return images.mean(dim=2, keepdim=True)
 
-    def step(self, state: Tensor | None, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Image [N, 4, h, w] -> (restored image, next state); the state before the first frame is None.
+    def step(self, state: Tensor | None, image: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
+        """Image [N, 4, h, w], noise table [N, n] -> (restored image, next state); the first state is None.
 
         Height and width must be multiples of 8. The next state is the fused image, not the restored one.
         """
         old, new = (self.bands(image if x is None else x) for x in (state, image))
         gamma, up = None, None
         for scale, module in zip((2, 1, 0), (self.vd, self.md1, self.md0), strict=True):
-            result = module(old[scale], new[scale], gamma, up)
+            result = module(old[scale], new[scale], table, gamma, up)
             gamma = result.gamma
             if scale:
                 up = self.fti(result.denoised)
@@ -143,10 +144,10 @@ class Scale(nn.Module):
         self.fusion = SmallNet(IMAGE + 1 + coarser, config.width, 1, sigmoid=True)
         self.denoise = SmallNet(bands + IMAGE + 1 + IMAGE * coarser, config.width, bands)
 
-    def forward(self, old: Tensor, new: Tensor, gamma: Tensor | None, up: Tensor | None) -> Fused:
+    def forward(self, old: Tensor, new: Tensor, table: Tensor, gamma: Tensor | None, up: Tensor | None) -> Fused:
         """Bands of state and new frame [N, 16, h, w], coarser gamma [N, 1, h/2, w/2], its image `up` [N, 4, h, w]."""
         old_low, new_low = old[:, :IMAGE], new[:, :IMAGE]
-        old_noise, new_noise = self.noise(old_low), self.noise(new_low)
+        old_noise, new_noise = self.noise(old_low, table), self.noise(new_low, table)
         coarser = [] if gamma is None else [gamma.repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)]
         gamma = self.fusion(torch.cat([(new_low - old_low).abs(), *coarser, new_noise], dim=1))
         fused = torch.lerp(old, new, gamma)
@@ -159,20 +160,18 @@ class NoiseMap(nn.Module):
     """The variance of the low-pass band of one scale, from its own brightness."""
 
     def __init__(self, config: EMVDConfig, scale: int) -> None:
-        """Keep the sensor's law, or the published constants."""
+        """Keep the factors of the band, or the published constants."""
         super().__init__()
         self.as_published, (self.slope, self.offset) = config.as_published, config.published_noise
         self.gain = 4.0 * 2**scale  # of the low-pass band: two by colour, two by every transform
         self.correlation = 1.0 if config.space_to_depth else 4.0  # copies add up to a larger variance
-        self.register_buffer("variance", torch.tensor(config.variance), persistent=False)
-        self.variance: Tensor
 
-    def forward(self, low: Tensor) -> Tensor:
-        """Low-pass band [N, 4, h, w] -> variance [N, 1, h, w]."""
+    def forward(self, low: Tensor, table: Tensor) -> Tensor:
+        """Low-pass band [N, 4, h, w], noise table [N, n] -> variance [N, 1, h, w]."""
         brightness = low[:, :1]
         if self.as_published:
             return brightness.clamp(0, 1) * self.slope + self.offset
-        return self.correlation * variance_at(brightness / self.gain, self.variance.to(low.dtype))
+        return (self.correlation * variance_at(brightness / self.gain, table)).to(low.dtype)
 
 
 class SmallNet(nn.Module):

@@ -22,26 +22,24 @@ from torch import Tensor, nn
 from qsim.structure import make
 from quiver.model.config import flag, whole_number
 from quiver.model.rivals.edges import check_frames, pad_space, reflected
-from quiver.model.rivals.noise import VARIANCE, deviation_map, variance_table
+from quiver.model.rivals.noise import deviation_map, table_of
 
 TRIPLE = 3  # frames of a U-Net
 
 
 @dataclass(frozen=True)
 class FastDVDnetConfig:
-    """Configuration of FastDVDnet; the defaults are the published sizes with the sensor's noise."""
+    """Configuration of FastDVDnet; the defaults are the published sizes, with noise maps of the sensor."""
 
     width: int = 32  # channels at full size; twice and four times as many at half and at a quarter
     noise_map: bool = True  # False: the network sees the frames alone
     batch_norm: bool = True  # False: no normalisation
-    variance: tuple[float, ...] = VARIANCE  # of codes/(2^b - 1), at equal steps of their mean from 0 to 1
 
     def __post_init__(self) -> None:
         """Raise `ValueError` for a value out of range."""
         whole_number("FastDVDnetConfig.width", self.width, 2, 1024)
         for name in ("noise_map", "batch_norm"):
             flag(f"FastDVDnetConfig.{name}", getattr(self, name))
-        object.__setattr__(self, "variance", variance_table("FastDVDnetConfig.variance", self.variance))
 
     def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON."""
@@ -68,20 +66,22 @@ class FastDVDnet(nn.Module):
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-        self.register_buffer("variance", torch.tensor(config.variance), persistent=False)
-        self.variance: Tensor
+        self.takes_variance = config.noise_map
 
-    def forward(self, frames: Tensor) -> Tensor:
-        """[B, T, 1, H, W] of codes/(2^b - 1) -> restored [B, T, 1, H, W]; ValueError for another shape."""
+    def forward(self, frames: Tensor, variance: Tensor | None = None) -> Tensor:
+        """[B, T, 1, H, W] of codes/(2^b - 1) -> restored [B, T, 1, H, W]; ValueError for another shape.
+
+        `variance` is the sensor's table, [n] or one per clip [B, n]; None: that of noise.VARIANCE.
+        """
         check_frames(frames)
         count = frames.shape[1]
         order = reflected(-self.look_ahead, count + 2 * self.look_ahead, count)
-        restored = self.windows(pad_space(frames, self.multiple)[:, order])
+        restored = self.windows(pad_space(frames, self.multiple)[:, order], variance)
         return restored[..., : frames.shape[-2], : frames.shape[-1]]
 
-    def windows(self, frames: Tensor) -> Tensor:
+    def windows(self, frames: Tensor, variance: Tensor | None = None) -> Tensor:
         """[B, T, 1, H, W], T >= 5, H and W multiples of 4 -> restored frames 2 ... T-3 [B, T-4, 1, H, W]."""
-        maps = deviation_map(frames, self.variance).unbind(1) if self.config.noise_map else None
+        maps = deviation_map(frames, table_of(variance, frames)).unbind(1) if self.config.noise_map else None
         images, restored = frames.unbind(1), []
         denoised: deque[Tensor] = deque(maxlen=TRIPLE)
         for t in range(1, len(images) - 1):

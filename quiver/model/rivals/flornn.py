@@ -36,7 +36,7 @@ from quiver.model.config import flag, real_number, whole_number
 from quiver.model.deformable import warp
 from quiver.model.ops.splatting import average_splat
 from quiver.model.rivals.edges import check_frames, pad_space, reflected
-from quiver.model.rivals.noise import VARIANCE, deviation_map, variance_table
+from quiver.model.rivals.noise import deviation_map, table_of
 
 LEAST_SIDE = 10  # px
 VALID = 0.9999  # least part of a warped pixel that must come from inside
@@ -44,7 +44,7 @@ VALID = 0.9999  # least part of a warped pixel that must come from inside
 
 @dataclass(frozen=True)
 class FloRNNConfig:
-    """Configuration of FloRNN; the defaults are the published sizes with the sensor's noise and a flow network."""
+    """Configuration of FloRNN; the defaults are the published sizes, with a flow network and the sensor's noise."""
 
     width: int = 64  # channels of a state
     blocks: int = 15  # residual blocks of each recurrent net
@@ -54,7 +54,6 @@ class FloRNNConfig:
     flow_channels: tuple[int, ...] = (32, 64, 32, 16)  # of the flow network; none: the flow must be given
     flow_kernel: int = 7
     flow_levels: int = 4
-    variance: tuple[float, ...] = VARIANCE  # of codes/(2^b - 1), at equal steps of their mean from 0 to 1
     as_published: bool = False  # noise map zero
 
     def __post_init__(self) -> None:
@@ -71,7 +70,6 @@ class FloRNNConfig:
         for channels in self.flow_channels:
             whole_number("FloRNNConfig.flow_channels", channels, 1, 1024)
         object.__setattr__(self, "flow_channels", tuple(self.flow_channels))
-        object.__setattr__(self, "variance", variance_table("FloRNNConfig.variance", self.variance))
         flag("FloRNNConfig.as_published", self.as_published)
 
     def to_dict(self) -> dict[str, object]:
@@ -110,13 +108,13 @@ class FloRNN(nn.Module):
         self.flow = (
             FlowNetwork(config.flow_channels, config.flow_kernel, config.flow_levels) if config.flow_channels else None
         )
-        self.register_buffer("variance", torch.tensor(config.variance), persistent=False)
-        self.variance: Tensor
+        self.takes_variance = not config.as_published
 
-    def forward(self, frames: Tensor, flows: Flows | None = None) -> Tensor:
+    def forward(self, frames: Tensor, flows: Flows | None = None, variance: Tensor | None = None) -> Tensor:
         """[B, T, 1, H, W] of codes/(2^b - 1) -> restored [B, T, 1, H, W]; ValueError for another shape.
 
-        `flows` (default: estimated) has T-1 flows forward and T-1 backward at [H, W].
+        `flows` (default: estimated) has T-1 flows forward and T-1 backward at [H, W]. `variance` is the sensor's table,
+        [n] or one per clip [B, n]; None: that of noise.VARIANCE.
         """
         check_frames(frames)
         batch, count, _, height, width = frames.shape
@@ -131,7 +129,8 @@ class FloRNN(nn.Module):
             flows = Flows(*(pad_space(flow, 1, LEAST_SIDE) for flow in flows)) if count > 1 else self.flows(frames)
         order = reflected(0, count + self.look_ahead, count)
         images = frames.expand(-1, -1, self.config.image_channels, -1, -1)
-        restored = self.restore(images[:, order], self.noise(frames)[:, order], reflected_flows(flows, self.look_ahead))
+        noise = self.noise(frames, variance)[:, order]
+        restored = self.restore(images[:, order], noise, reflected_flows(flows, self.look_ahead))
         return restored.mean(dim=2, keepdim=True)[..., :height, :width]
 
     def flows(self, frames: Tensor) -> Flows:
@@ -152,11 +151,11 @@ class FloRNN(nn.Module):
             parts.append(self.flow(torch.cat([a, b]), torch.cat([b, a]))[0].unflatten(0, (2, len(a))))
         return Flows(*(flow.unflatten(0, (batch, count - 1)) for flow in torch.cat(parts, dim=1)))
 
-    def noise(self, frames: Tensor) -> Tensor:
+    def noise(self, frames: Tensor, variance: Tensor | None = None) -> Tensor:
         """Frames [B, T, 1, H, W] -> noise maps of the same shape: the deviation of each pixel, or 0 if as published."""
         if self.config.as_published:
             return torch.zeros_like(frames)
-        return deviation_map(frames, self.variance)
+        return deviation_map(frames, table_of(variance, frames))
 
     def restore(self, images: Tensor, noise: Tensor, flows: Flows) -> Tensor:
         """Images [B, N, C, H, W] and noise maps [B, N, 1, H, W] -> restored images 0 ... N-k-1 [B, N-k, C, H, W].

@@ -21,6 +21,7 @@ from quiver.model.config import Config
 from quiver.model.folded import FoldedConfig, FoldedQUIVER
 from quiver.model.presets import PRESETS
 from quiver.model.quiver import QUIVER
+from quiver.model.rivals.emvd import EMVD, EMVDConfig
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import EARLIER, RENAMED, RENAMED_PARTS, load, save
 from quiver.restoration.restorers import weights_path
@@ -73,7 +74,7 @@ def earlier(network: nn.Module, config: dict[str, object], path: Path) -> None:
     old = {new: name for name, new in RENAMED_PARTS.items()}
     parts = ((name.partition("."), value) for name, value in network.state_dict().items())
     tensors = {old.get(part, part) + dot + rest: value.contiguous() for (part, dot, rest), value in parts}
-    kind = "UNet" if isinstance(network, UNet) else "QUIVER"
+    kind = "QUIVER" if isinstance(network, QUIVER) else type(network).__name__
     save_file(tensors, path, {"format": "quiver-1", "network": kind, "config": json.dumps(config)})
 
 
@@ -98,6 +99,14 @@ def test_weights_of_earlier_versions_are_read(tmp_path: Path, network):
     assert back.config == network.config
     for name, value in network.state_dict().items():
         assert torch.equal(back.state_dict()[name], value), name
+
+
+def test_a_noise_table_of_an_earlier_version_is_left_out(tmp_path: Path):
+    network = EMVD(EMVDConfig(width=2))
+    earlier(network, network.config.to_dict() | {"variance": [0.0, 0.1]}, tmp_path / "w.safetensors")
+    back = load(tmp_path / "w.safetensors")
+    assert isinstance(back, EMVD)
+    assert back.config == network.config
 
 
 def test_the_shipped_weights_are_those_of_the_preset():

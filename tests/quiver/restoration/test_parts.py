@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -17,8 +18,10 @@ from random_codes import random_codes
 from runs import TINY, tiny
 from torch import Tensor, nn
 
+from qsim.sensor.qis import QIS
 from quiver.cli.program import main
 from quiver.data.codes import Codes
+from quiver.data.noise import noise_table
 from quiver.model.presets import OTHERS, build
 from quiver.model.rivals.edges import reflected
 from quiver.model.weights import save
@@ -65,9 +68,13 @@ def restored(network: nn.Module, codes: Codes, options: RestoreOptions | None = 
 
 def complete(network: nn.Module, codes: Codes) -> Array:
     """The network's own result for the complete clip, in photons."""
-    frames = torch.from_numpy(codes.read(0, codes.shape[0]) / np.float32(7))[None, :, None]
+    top = np.float32(codes.sensor.levels - 1)
+    frames = torch.from_numpy(codes.read(0, codes.shape[0]) / top)[None, :, None]
+    known = {}
+    if getattr(network, "takes_variance", False):
+        known["variance"] = torch.tensor(noise_table(codes.sensor, codes.exposure))
     with torch.inference_mode():
-        return network.eval()(frames)[0, :, 0].numpy() * np.float32(codes.white)
+        return network.eval()(frames, **known)[0, :, 0].numpy() * np.float32(codes.white)
 
 
 @pytest.mark.parametrize("frames", [1, 3, 16, 17, 50])
@@ -100,6 +107,19 @@ def test_every_frame_of_any_size_is_restored(name, shape):
     found = restored(network, codes)
     assert np.isfinite(found).all()
     np.testing.assert_allclose(found, complete(network, codes), rtol=1e-3, atol=1e-4 * codes.white)
+
+
+@pytest.mark.parametrize("name", ["emvd", "flornn", "fastdvdnet"])
+def test_the_noise_of_the_stream_is_that_of_its_sensor(name):
+    """The same codes over the top code, of a sensor with five bits and of one with three: other noise, as stated."""
+    network, three = tiny(name).eval(), random_codes(2, 12, 16)
+    five = replace(three, sensor=QIS(0.8, 1.6, 2.0, 5, gain=0.3), read=lambda a, b: three.read(a, b) * 31 // 7)
+    found, wanted = restored(network, five), complete(network, five)
+    np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-4 * five.white)
+    network.takes_variance = False
+    assert np.abs(restored(network, five) - wanted).max() > 1e-3 * five.white
+    with pytest.raises(ValueError, match="does not rise with light"):
+        restored(tiny(name), replace(three, sensor=QIS(0.8, 1e9, 0.2, 3)))
 
 
 @pytest.mark.parametrize("name", CLIPS)

@@ -15,6 +15,7 @@ from torch import Tensor
 from quiver.cli.options import NETWORKS, QUIVERS
 from quiver.data.clips import open_clips
 from quiver.data.codes import Codes
+from quiver.data.noise import noise_table
 from quiver.data.windows import Windows, WindowSettings
 from quiver.model.presets import NETWORKS as KINDS
 from quiver.model.presets import OTHERS, PRESETS, build
@@ -148,6 +149,24 @@ def test_memdeblur_centres_its_targets():
     network.scales = lambda images: [images[..., ::k, ::k] for k in (4, 2, 1)]  # type: ignore[assignment,method-assign]
     found = system_of(network).loss(network, {"codes": codes, "target": codes}, Settings("d", "o", steps=1), 1.0)
     assert float(found) == pytest.approx(3e-3, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["emvd", "flornn", "fastdvdnet"])
+def test_windows_bring_the_noise_of_their_sensor(tiny_dataset, tmp_path, name):
+    """Windows of two bit depths in one batch: each has its own table, and the loss and the scored frame follow it."""
+    network = tiny(name)
+    run = settled(tiny_settings(network, tiny_dataset, tmp_path / "r", crop=32, bits=(1, 5), ppp=(3.25,)))[0]
+    system = system_of(network)
+    windows, _ = training.make_windows(run, 8, system, system.window(network))
+    lights = [windows.place(n).light for n in range(20)]
+    batch = torch.utils.data.default_collate([windows[lights.index(0)], windows[lights.index(1)]])
+    clip = windows.clips[0]
+    tables = [noise_table(noise.draw(clip).sensor, clip.exposure) for noise in windows.noise.noises]
+    assert np.array_equal(batch["variance"], tables)
+    other = batch | {"variance": batch["variance"].flip(0)}
+    with torch.no_grad():
+        assert float(system.loss(network, batch, run, 1.0)) != float(system.loss(network, other, run, 1.0))
+        assert not torch.equal(system.restored(network, batch)[0], system.restored(network, other)[0])
 
 
 # ---- Settings

@@ -3,10 +3,12 @@
 The networks come from tests/support/rivals.py.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
 from golden import draw
-from rivals import SMALL
+from rivals import SMALL, assembled
 from torch import nn
 
 from quiver.model.rivals.edges import reflected
@@ -77,6 +79,29 @@ def test_half_precision_is_close(name):
         with torch.autocast("cpu", torch.bfloat16):
             close = network(frames)
     assert 0 < float((close.float() - exact).square().mean().sqrt() / exact.std()) < 0.05
+
+
+TAKE_NOISE = ("emvd", "flornn", "fastdvdnet")
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_the_noise_of_a_sensor_reaches_the_networks_that_take_it(name):
+    """Two tables give two results, a table for each clip that of the clip alone; as published there is none."""
+    network = SMALL[name]()
+    assert getattr(network, "takes_variance", False) == (name in TAKE_NOISE)
+    if name not in TAKE_NOISE:
+        return
+    frames, tables = draw(2, 4, 1, 16, 16), torch.stack([torch.full((9,), 0.02), torch.linspace(0, 0.3, 9)]).double()
+    with torch.no_grad():
+        together, first, second = (network(frames, variance=table) for table in (tables, tables[0], tables[1]))
+    assert (first - second).abs().max() > 1e-3 * first.std()
+    assert (together - torch.stack([first[0], second[1]])).abs().max() < 1e-12
+    blind = assembled(
+        replace(network.config, **{"noise_map": False} if name == "fastdvdnet" else {"as_published": True})
+    )
+    assert not blind.takes_variance
+    with torch.no_grad():
+        assert torch.equal(*(blind.double().eval()(frames, variance=table) for table in tables))
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from golden import DATA, arrays_of, draw, errors, fill_by_rule, golden_files, we
 from qsim import QIS
 from quiver.model.rivals import emvd
 from quiver.model.rivals.emvd import EMVD, EMVDConfig, NoiseMap
-from quiver.model.rivals.noise import VARIANCE
+from quiver.model.rivals.noise import VARIANCE, table_of
 
 TABLE = DATA / "emvd_state_dict.tsv"
 
@@ -63,7 +63,7 @@ MISTAKES = {  # what is written, what is written wrongly; each exactly once in t
     "no absolute value": ("(new_low - old_low).abs()", "(new_low - old_low)"),
     "order of noise and gamma": ("*coarser, new_noise]", "new_noise, *coarser]"),
     "order of the denoiser": ("[fused, *images, new_low, variance]", "[fused, new_low, *images, variance]"),
-    "noise of the state": ("self.noise(old_low), self.noise(new_low)", "self.noise(old_low), self.noise(old_low)"),
+    "noise of the state": ("self.noise(new_low, table)", "self.noise(old_low, table)"),
     "not clipped": ("brightness.clamp(0, 1) * self.slope", "brightness * self.slope"),
     "gamma the other way": ("fused = torch.lerp(old, new, gamma)", "fused = torch.lerp(new, old, gamma)"),
     "gamma not squared": ("+ gamma**2 * new_noise", "+ gamma * new_noise"),
@@ -105,7 +105,7 @@ def test_the_transforms_begin_as_inverses():
         assert (network.cti(network.ct(image)) - image).abs().max() < limit
 
 
-def test_the_default_noise_is_that_of_the_sensor():
+def test_the_noise_without_a_table_is_that_of_the_papers_sensor():
     sensor, exposure = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25), 1 / 2000
     photons = np.geomspace(1e-3, 40, 1000)
     mean, variance = sensor.mean(photons, exposure) / 7, sensor.variance(photons, exposure) / 49
@@ -118,14 +118,14 @@ def test_the_default_noise_is_that_of_the_sensor():
 def test_the_noise_map_is_the_variance_of_the_band(space_to_depth, scale):
     """Binomial codes of seven draws: variance m(1 - m)/7. Tolerance: five sigma of a variance from n samples."""
     steps = np.linspace(0, 1, 201)
-    config = EMVDConfig(space_to_depth=space_to_depth, variance=tuple(steps * (1 - steps) / 7))
+    config, table = EMVDConfig(space_to_depth=space_to_depth), torch.from_numpy(steps * (1 - steps) / 7)[None]
     network, generator = EMVD(config).double(), torch.Generator().manual_seed(0)
     m = 0.3
     codes = (torch.rand(7, 1, 1, 1, 512, 512, generator=generator) < m).double().mean(dim=0)
     with torch.no_grad():
         low = network.bands(network.packed(codes)[:, 0])[scale][:, :4]
         level = torch.full((1, 4, 1, 1), m * 4 * 2**scale, dtype=torch.float64)
-        stated = float(NoiseMap(config, scale)(level))
+        stated = float(NoiseMap(config, scale)(level, table))
     assert float(low[:, 0].mean()) == pytest.approx(m * 4 * 2**scale, rel=0.01)
     assert float(low[:, 0].var()) == pytest.approx(stated, rel=5 * (2 / low[:, 0].numel()) ** 0.5)
 
@@ -134,9 +134,9 @@ def test_streaming_equals_the_clip():
     network = golden_emvd.small()
     frames = draw(1, 4, 1, 16, 24)
     with torch.no_grad():
-        whole, state = network(frames), None
+        whole, state, table = network(frames), None, table_of(None, frames)
         for t, image in enumerate(network.packed(frames).unbind(1)):
-            output, state = network.step(state, image)
+            output, state = network.step(state, image, table)
             assert torch.equal(network.unpacked(output[:, None])[:, 0], whole[:, t])
 
 
@@ -177,7 +177,6 @@ def test_a_configuration_survives_json():
     ("field", "value", "message"),
     [
         ("width", 0, "EMVDConfig.width must be a whole number from 1"),
-        ("variance", (0.1,), "EMVDConfig.variance must be 2 to 4096 numbers"),
         ("published_noise", (0.1, -1.0), "EMVDConfig.published_noise must be a number from 0"),
         ("as_published", 1, "EMVDConfig.as_published must be true or false"),
     ],

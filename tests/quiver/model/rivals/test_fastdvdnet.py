@@ -10,7 +10,7 @@ from rivals import lively
 from torch import Tensor
 
 from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
-from quiver.model.rivals.noise import deviation_map
+from quiver.model.rivals.noise import deviation_map, table_of
 
 
 def small(**settings: object) -> FastDVDnet:
@@ -44,7 +44,7 @@ def described(state: dict[str, Tensor], name: str, images: list[Tensor], maps: l
 def test_a_window_equals_the_description():
     network, frames = small(), draw(2, 5, 1, 12, 20)
     state, images = network.state_dict(), list(frames.unbind(1))
-    maps = list(deviation_map(frames, network.variance).unbind(1))
+    maps = list(deviation_map(frames, table_of(None, frames)).unbind(1))
     with torch.no_grad():
         once = [described(state, "first", images[i : i + 3], maps[i : i + 3]) for i in range(3)]
         wanted = described(state, "second", once, maps[1:4])
@@ -88,16 +88,6 @@ def test_start_values_are_those_of_he():
     assert float(weight.std()) == pytest.approx((2 / (128 * 9)) ** 0.5, rel=5 * (2 * weight.numel()) ** -0.5)
 
 
-def test_the_table_of_the_sensor_reaches_the_result():
-    frames, flat = draw(1, 5, 1, 8, 8), (0.02, 0.02)
-    networks = {table: small(variance=table) for table in (FastDVDnetConfig().variance, flat)}
-    blind = [small(variance=table, noise_map=False) for table in networks]
-    with torch.no_grad():
-        published, other = (network(frames) for network in networks.values())
-        assert (published - other).abs().max() > 1e-3
-        assert torch.equal(blind[0](frames), blind[1](frames))
-
-
 def test_a_window_is_learnt():
     torch.manual_seed(0)
     network, truth = FastDVDnet(FastDVDnetConfig(width=4)), draw(1, 1, 1, 2, 2, dtype=torch.float32)
@@ -115,7 +105,7 @@ def test_a_window_is_learnt():
 
 
 def test_a_configuration_survives_json():
-    config = FastDVDnetConfig(width=24, batch_norm=False, noise_map=False, variance=(0.0, 0.1))
+    config = FastDVDnetConfig(width=24, batch_norm=False, noise_map=False)
     assert FastDVDnetConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
@@ -125,7 +115,6 @@ def test_a_configuration_survives_json():
         ("width", 1, "FastDVDnetConfig.width must be a whole number from 2"),
         ("noise_map", 1, "FastDVDnetConfig.noise_map must be true or false"),
         ("batch_norm", None, "FastDVDnetConfig.batch_norm must be true or false"),
-        ("variance", (0.1,), "FastDVDnetConfig.variance must be 2 to 4096 numbers"),
     ],
 )
 def test_configurations_out_of_range_are_refused(field, value, message):
