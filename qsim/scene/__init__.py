@@ -7,6 +7,7 @@ from qsim.files import lazy_names
 if TYPE_CHECKING:
     from qsim.optics.camera import Camera
     from qsim.scene.deformation import Flag, Ripple
+    from qsim.scene.flicker import Flicker, Mains, PulseWidth, RectifiedSine
     from qsim.scene.lights import AreaLamp, Constant, EnvironmentImage, Light, PointLight, SunSky
     from qsim.scene.materials import (
         Bump,
@@ -49,9 +50,11 @@ __all__ = [
     "Diffuse",
     "EnvironmentImage",
     "Flag",
+    "Flicker",
     "Glow",
     "Keyframes",
     "Light",
+    "Mains",
     "Material",
     "Mesh",
     "MitsubaFile",
@@ -61,6 +64,8 @@ __all__ = [
     "Part",
     "Pendulum",
     "PointLight",
+    "PulseWidth",
+    "RectifiedSine",
     "Relief",
     "Ripple",
     "RoughPlastic",
@@ -91,9 +96,11 @@ __getattr__ = lazy_names(
         "Diffuse": "materials",
         "EnvironmentImage": "lights",
         "Flag": "deformation",
+        "Flicker": "flicker",
         "Glow": "materials",
         "Keyframes": "motion",
         "Light": "lights",
+        "Mains": "flicker",
         "Material": "materials",
         "Mesh": "scene",
         "MitsubaFile": "scene",
@@ -103,6 +110,8 @@ __getattr__ = lazy_names(
         "Part": "scene",
         "Pendulum": "motion",
         "PointLight": "lights",
+        "PulseWidth": "flicker",
+        "RectifiedSine": "flicker",
         "Relief": "materials",
         "Ripple": "deformation",
         "RoughPlastic": "materials",

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from qsim.optics.camera import Pose, Vector
+from qsim.scene.flicker import Flicker, check_flicker
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,9 +16,11 @@ class Constant:
     """Surroundings with the same radiance in every direction."""
 
     radiance: float  # W m^-2 sr^-1
+    flicker: Flicker | None = None  # None: steady
 
     def __post_init__(self) -> None:
         check_light(self, "radiance")
+        check_flicker(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +51,11 @@ class AreaLamp:
     height: float  # m
     radiance: float  # W m^-2 sr^-1
     motion: Pose | None = None  # in world axes: pose(t) is applied after the placement
+    flicker: Flicker | None = None  # None: steady
 
     def __post_init__(self) -> None:
         check_light(self, "radiance")
+        check_flicker(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +65,11 @@ class PointLight:
     position: Vector  # m
     intensity: float  # W sr^-1
     motion: Pose | None = None
+    flicker: Flicker | None = None  # None: steady
 
     def __post_init__(self) -> None:
         check_light(self, "intensity")
+        check_flicker(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +82,10 @@ class EnvironmentImage:
     image: np.ndarray | str
     scale: float = 1.0  # radiance per unit of the picture, W m^-2 sr^-1
     rotation: float = 0.0  # rad about +y
+    flicker: Flicker | None = None  # None: steady
+
+    def __post_init__(self) -> None:
+        check_flicker(self)
 
 
 Light = Constant | SunSky | AreaLamp | PointLight | EnvironmentImage

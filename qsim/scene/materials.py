@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from qsim.checks import require_finite
+from qsim.scene.flicker import Flicker, check_flicker
 from qsim.scene.image_files import read_grey
 from qsim.scene.lights import check_light
 
@@ -106,9 +107,11 @@ class Glow:
     """A surface whose outer side emits the same radiance in all directions; it reflects nothing."""
 
     radiance: float  # W m^-2 sr^-1
+    flicker: Flicker | None = None  # None: steady
 
     def __post_init__(self) -> None:
         check_light(self, "radiance")
+        check_flicker(self)
 
 
 Material = Diffuse | RoughPlastic | Conductor | Dielectric | Glow

@@ -21,6 +21,7 @@ import numpy as np
 
 from qsim.checks import require_finite
 from qsim.optics.camera import Camera, Pose
+from qsim.scene.flicker import Flicker
 from qsim.scene.lights import ENVIRONMENTS, Light, strength
 from qsim.scene.materials import Diffuse, Glow, Material
 
@@ -163,6 +164,13 @@ class Scene:
         return any(strength(light) > 0 for light in self.lights) or any(
             isinstance(body.material, Glow) and body.material.radiance > 0 for body in self.bodies
         )
+
+    @functools.cached_property
+    def flickers(self) -> dict[str, Flicker]:
+        """The flicker of each light that has one: `light0` by its place in `lights`, `body3` for a glowing body."""
+        lights = {f"light{i}": getattr(light, "flicker", None) for i, light in enumerate(self.lights)}
+        glowing = {f"body{i}": getattr(body.material, "flicker", None) for i, body in enumerate(self.bodies)}
+        return {name: flicker for name, flicker in (lights | glowing).items() if flicker is not None}
 
     def resized(self, height: int, width: int) -> Scene:
         """Return the same scene with another number of pixels."""
