@@ -189,6 +189,16 @@ CAMERA: Table = {
     "vignetting, if any": FLAG,
     "aperture_blur, if any": FLAG,
 }
+
+
+def _flickers(value: Any) -> bool:
+    """Return whether a JSON value describes the flicker of a light, with its strength in each frame."""
+    if not (isinstance(value, dict) and is_text(value.get("kind")) and is_number(value.get("frequency"))):
+        return False
+    strengths = value.get("strength")
+    return list_of(is_light)(strengths) and bool(strengths)
+
+
 _FRAME = r"(?:radiance|sharp|truth|saturated)/[0-9]{6,}\.exr"
 CLIP: Table = {
     "shape": SHAPE,
@@ -203,6 +213,9 @@ CLIP: Table = {
     "origin, if any": expected("[y, x] in pixels", list_of(is_count, 2)),
     "mean_photons, if any": LIGHT,
     "shutter, if any": LIGHT,
+    "flicker, if any": expected(
+        "the kind and the strengths from 0 of each light", mapping_of(r"[a-z]+[0-9]+", _flickers)
+    ),
     "clipped_pixels, if any": COUNT,
     "saturated_pixels, if any": COUNT,
     "saturation, if any": {"white or null": LIGHT, "assumed": FLAG},

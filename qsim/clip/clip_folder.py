@@ -104,6 +104,14 @@ class ClipFolder:
             raise ValueError(f"{self.path}: its radiance is relative and has no photons; give a target in PPP")
         return float(value)
 
+    @property
+    def strengths(self) -> dict[str, Array]:
+        """The mean strength of each flickering light over the exposure of each frame, float64 [T]; 1 is its mean.
+
+        `light0` is the first light of the scene, `body3` the glowing body of index 3. Empty without flicker.
+        """
+        return {name: np.array(found["strength"]) for name, found in self.meta.get("flicker", {}).items()}
+
     @cached_property
     def camera(self) -> Camera | None:
         """The camera without its motion; None for relative radiance."""

@@ -89,6 +89,21 @@ def instants(middle: float, exposure: float, count: int) -> list[float]:
     return [middle + float(part) * exposure for part in (np.arange(count) + 0.5) / count - 0.5]
 
 
+def light_windows(instants: Sequence[float], exposure: float) -> list[tuple[float, float]]:
+    """Return, for each instant, start and stop [s] of the part of the exposure whose mean light it stands for.
+
+    `instants` are those of `instants`. The parts cover the exposure evenly, so the mean light is exact at any count.
+    Three instants share a part where the count allows it: every third one then sees the light of all, and `blur_left`
+    compares motion only.
+    """
+    each = 3 if len(instants) % 3 == 0 else 1
+    start, count = (instants[0] + instants[-1] - exposure) / 2, len(instants) // each
+    return [
+        (start + exposure * (i // each) / count, start + exposure * (i // each + 1) / count)
+        for i in range(len(instants))
+    ]
+
+
 def blur_left(means: Array, count: int) -> float:
     """Return the rms error of the mean of `count` instants (3, 6, 9 ...), W m^-2 sr^-1.
 

@@ -50,6 +50,12 @@ def render_clip(
         "seed": seed,
         "render": asdict(renderer.budget) | {"engine": renderer.engine.backend, "variant": renderer.engine.variant},
     }
+    if scene.flickers:
+        strengths = renderer.strengths(frames)
+        meta["flicker"] = {
+            name: {**asdict(flicker), "kind": type(flicker).__name__, "strength": strengths[name].tolist()}
+            for name, flicker in scene.flickers.items()
+        }
     with ClipWriter(path, meta | (extra or {}), force=force) as writer:
         for t in range(frames):
             if not writer.has(t):

@@ -52,6 +52,10 @@ class Noise:
         errors = [Errors.of_halves(halves, white) for halves in pilots]
         return cls(_falling([e.at_white for e in errors]), _falling([e.plain for e in errors]))
 
+    def times(self, factor: float) -> Noise:
+        """Return the noise times a factor."""
+        return Noise(*(tuple(factor * error for error in errors) for errors in (self.at_white, self.plain)))
+
     def at(self, samples: float, instants: int = 1) -> Errors:
         """Return the errors of the mean of `instants` instants with `samples` samples each."""
         return Errors(*(_error(errors, samples) / math.sqrt(instants) for errors in (self.at_white, self.plain)))
@@ -103,7 +107,7 @@ def choose_budget(
             pilot.extent, contrast, lambda k: allowed.fraction(pilot.changes(k, bounces, allowed.white))
         )
     share = math.sqrt(1 - min(allowed.fraction(left_out), SHARE) ** 2 - min(blurred, SHARE) ** 2)
-    noise = Noise.of(halves, allowed.white)
+    noise = Noise.of(halves, allowed.white).times(pilot.unevenness(instants))
     samples, about_samples = fewest_samples(noise, instants, allowed, share)
     fewer, about_denoiser = None, Finding("denoiser", "off", "not requested")
     if denoise is not False:
@@ -113,7 +117,7 @@ def choose_budget(
     if fewer is not None:
         samples = fewer
         about_samples = Finding("samples", f"{samples} per pixel, denoised", f"without: {about_samples.chosen}")
-    lens = _left_out(scene.camera, pilot.truths())
+    lens = (*_flicker(pilot.renderer.strengths(frames)), *_left_out(scene.camera, pilot.truths()))
     pixels = scene.camera.height * scene.camera.width
     noisy = noise.at(samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
     about_light, about_motion = _light(dimmed, noisy, fewer is not None), moving(pilot.extent, shutter)
@@ -282,6 +286,12 @@ def _error(errors: tuple[float, ...], samples: float) -> float:
     if samples > COUNTS[-1]:
         power = min(max(power, 0.5), 0.75)
     return float(errors[i + 1] * (samples / COUNTS[i + 1]) ** -power)
+
+
+def _flicker(strengths: dict[str, Array]) -> tuple[Finding, ...]:
+    """Return a finding for lights that flicker: their strengths [frames] over the exposures of the clip."""
+    sizes = [f"{name} {found.min():.3g} to {found.max():.3g} of its mean" for name, found in strengths.items()]
+    return (Finding("flicker", "exact mean over each exposure", ", ".join(sizes)),) if sizes else ()
 
 
 def _left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, ...]:

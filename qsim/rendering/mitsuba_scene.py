@@ -1,6 +1,7 @@
 """Converts a `Scene` to a Mitsuba scene once, and updates only the parameters that move.
 
     Scene -> mi.Scene (loaded once) + `place(t)`, which moves bodies, lamps and points to their poses at time t
+                                    + `light(start, stop)`, which sets flickering lights to their mean strength
 
 The motion of a body decides its form in Mitsuba. A resting mesh lies in world coordinates. A large rigid body is an
 instance whose `to_world` changes; the acceleration structure of its mesh stays. The vertices of small, deforming or
@@ -27,6 +28,7 @@ LARGE = 20_000  # triangles from which a rigid body becomes an instance
 # rays find them anyway, and sampling them takes samples from the sun or the lamp. test_mitsuba_scene.py requires 1.25
 # times less error than with 1; docs/log.md has the measurement.
 SMOOTH_WEIGHT = 1 / 1024
+EMISSION = ("emitter.radiance.value", "radiance.value", "intensity.value", "scale")  # lamp or glow, even, point, image
 SUN_DISTANCE = 1000.0  # in units of the scene's reach from the camera: parallax of the sun under 1 mrad
 
 
@@ -46,6 +48,7 @@ class Stage:
         self._placed: dict[str, bytes] = {}
         self._normals: dict[str, Array] = {}  # of smooth bodies that moved; replace those of Mitsuba
         self._rest_normals: dict[str, Array] = {}
+        self._steady = {name: self._emission(name) for name in scene.flickers}
 
     def place(self, t: float) -> None:
         """Move everything to time t [s]; parameters equal to those of the last call are not set again."""
@@ -66,6 +69,20 @@ class Stage:
                 self._parameters[key] = normals.ravel()
             self._normals.clear()
             self._parameters.update()
+
+    def light(self, start: float, stop: float) -> None:
+        """Set every flickering light to its mean strength over the times from `start` to `stop` [s]."""
+        for name, flicker in self.scene.flickers.items():
+            key, steady = self._steady[name]
+            strength = flicker.mean(np.array(start), np.array(stop))
+            self._set(key, strength, lambda steady=steady, by=float(strength): self._opaque(steady * by))
+        self._parameters.update()
+
+    def _emission(self, name: str) -> tuple[str, Any]:
+        """Return the parameter that scales a light, and its value without flicker."""
+        key = next(key for suffix in EMISSION if (key := f"{name}.{suffix}") in self._parameters)
+        value = self._parameters[key]
+        return key, type(value)(value)
 
     def shape_numbers(self) -> dict[str, int]:
         """Return shape id -> body number; lamps follow the bodies; the sun's disk is -1 (surroundings)."""

@@ -2,8 +2,8 @@
 
 Rays alone measure motion and bodies, in every frame or in MOST_LOOKS of them. Light is rendered in a few frames: the
 first, the middle and the last, those with bodies that these do not show, and, with an open shutter, those with the
-fastest motion. Two independent half-renders separate Monte Carlo noise from signal. Equal frames use equal paths at
-every depth.
+fastest motion. Under lights that flicker, frames of every strength take the place of the first three. Two independent
+half-renders separate Monte Carlo noise from signal. Equal frames use equal paths at every depth.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy import ndarray as Array
 from qsim.clip.clamped_error import Errors
 from qsim.clip.motion_statistics import largest_motion
 from qsim.optics.camera import Camera, Pose
-from qsim.rendering.budget import Allowed, Budget, Finding, grid_samples, instants
+from qsim.rendering.budget import Allowed, Budget, Finding, grid_samples, instants, light_windows
 from qsim.rendering.denoiser import AROUND, DENOISE_COST, available, cleaned_mean
 from qsim.rendering.renderer import Renderer
 from qsim.scene import Scene, Still
@@ -26,6 +26,7 @@ from qsim.scene import Scene, Still
 COUNTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
 PIXELS = 3000  # of the frame that a pilot renders, about
 MOST_MORE = 3  # frames added for hidden bodies, and as many for fast motion
+STRENGTHS = 6  # frames in which flickering light is rendered
 WINDOW = 96  # px, side of the windows in which the denoiser is tested, one in the middle of each quarter of the frame
 MOST_LOOKS = 256  # frames of a clip in which motion and bodies are measured
 STAGE = 18  # of the random keys
@@ -40,7 +41,7 @@ class Pilot:
 
     renderer: Renderer
     extent: Array  # motion [frames, H, W] in px per exposure, or per frame time if the shutter is 0
-    middle: int  # index of the middle frame
+    middle: int  # the frame in which the denoiser is tried: the middle one, or the brightest under flicker
     times: tuple[int, ...]  # frames in which light is rendered
 
     @classmethod
@@ -50,7 +51,7 @@ class Pilot:
         renderer = Renderer(scene, frame_rate=frame_rate, shutter=shutter, seed=seed, budget=Budget(), thinned=thinned)
         looks = np.unique(np.linspace(0, frames - 1, min(frames, MOST_LOOKS)).round().astype(int)).tolist()
         extent, bodies = (np.stack(each) for each in zip(*map(renderer.motion_extent, looks), strict=True))
-        times = {0, frames // 2, frames - 1}
+        middle, times = _lit(renderer, frames)
         known = set(np.unique([renderer.motion_extent(t)[1] for t in times]).tolist())
         for _ in range(MOST_MORE):
             hidden = ~np.isin(bodies, list(known))
@@ -62,7 +63,7 @@ class Pilot:
         if shutter > 0:
             times.add(looks[int(np.argmax([largest_motion(frame) for frame in extent]))])
             times |= _fastest(scene, {t: renderer.time(t) for t in {*looks, *times}}, times)
-        return cls(renderer, extent, frames // 2, tuple(sorted(times)))
+        return cls(renderer, extent, middle, tuple(sorted(times)))
 
     def halves(self, samples: int, bounces: int) -> Array:
         """Return two independent estimates of the sharp radiance, float64 [2, times, H, W], W m^-2 sr^-1."""
@@ -99,8 +100,34 @@ class Pilot:
         """Return `count` instants [s] of the exposure of frame t."""
         return instants(self.renderer.time(t), self.renderer.shutter / self.renderer.frame_rate, count)
 
+    def unevenness(self, count: int) -> float:
+        """Return how much more noise the mean of `count` instants has than under steady light: 1 without flicker.
+
+        The root of mean square over mean of their strengths, of the light that varies most.
+        """
+        renderer, most = self.renderer, 1.0
+        windows = [np.transpose(light_windows(self.exposed(t, count), renderer.exposure)) for t in self.times]
+        for flicker in renderer.scene.flickers.values():
+            strengths = np.stack([flicker.mean(start, stop) for start, stop in windows])
+            means = float(np.mean(strengths.mean(axis=1) ** 2))
+            most = max(most, math.sqrt(float(np.mean(strengths**2)) / means) if means > 0 else 1.0)
+        return most
+
     def _drawn(self, t: int, instant: float, budget: Budget) -> Array:
         return self.renderer.halves([instant], budget, self.renderer.key(t, STAGE))
+
+
+def _lit(renderer: Renderer, frames: int) -> tuple[int, set[int]]:
+    """Return the frame for the denoiser, and those in which light is rendered at least.
+
+    Under flicker they are STRENGTHS frames whose strengths are spread as those of the clip: first, middle and last may
+    all be dark. The strength of a frame is the sum over the lights.
+    """
+    if not renderer.scene.flickers:
+        return frames // 2, {0, frames // 2, frames - 1}
+    strengths = np.sum(list(renderer.strengths(frames).values()), axis=0)
+    places = (np.arange(STRENGTHS) + 0.5) / STRENGTHS * frames
+    return int(np.argmax(strengths)), set(np.argsort(strengths, kind="stable")[places.astype(int)].tolist())
 
 
 def rests(scene: Scene) -> bool:

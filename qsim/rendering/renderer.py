@@ -3,9 +3,11 @@
     Scene + frame rate + shutter + budget -> Frame(radiance, sharp, flow, flow_back, valid, depth, body_id, error)
 
 Frame t is exposed around t / frame_rate: the mean of K instants, spread evenly over shutter / frame_rate seconds
-(Mitsuba's wheels have no motion blur). Every pixel integrates its own area (box filter). Samples come in two
-independent halves A and B: radiance is their mean, and its noise the rms of (A - B) / 2. The stated error also contains
-blur and omitted bounces. The sampler's seeds are words of qsim.keys: frames can be rendered alone and in any order.
+(Mitsuba's wheels have no motion blur). Lights that flicker have their exact mean strength over the exposure, also where
+the shutter is 0 and in the sharp frame: motion is frozen there, light is not. Every pixel integrates its own area (box
+filter). Samples come in two independent halves A and B: radiance is their mean, and its noise the rms of (A - B) / 2.
+The stated error also contains blur and omitted bounces. The sampler's seeds are words of qsim.keys: frames can be
+rendered alone and in any order.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from qsim.clip.clamped_error import Errors, frame_errors, rms, white_in
 from qsim.keys import Key, hash_name, words
 from qsim.optics.radiometry import Crop, check_crop
 from qsim.rendering import ground_truth
-from qsim.rendering.budget import Budget, blur_left, grid_samples, instants
+from qsim.rendering.budget import Budget, blur_left, grid_samples, instants, light_windows
 from qsim.rendering.denoiser import cleaned_mean
 from qsim.rendering.engine import activate, select
 from qsim.rendering.mitsuba_scene import Stage, film_pass
@@ -102,6 +104,16 @@ class Renderer:
         """Return the mid-exposure time of frame t [s]."""
         return t / self.frame_rate
 
+    @property
+    def exposure(self) -> float:
+        """The time in which a frame collects light [s]: a frame time if the shutter is 0."""
+        return (self.shutter or 1.0) / self.frame_rate
+
+    def strengths(self, frames: int) -> dict[str, Array]:
+        """Return the mean strength of each flickering light (`Scene.flickers`) in frames 0 ... frames - 1, [frames]."""
+        middle, half = np.arange(frames) / self.frame_rate, self.exposure / 2
+        return {name: flicker.mean(middle - half, middle + half) for name, flicker in self.scene.flickers.items()}
+
     def frame(self, t: int, *, with_truth: bool = True) -> Frame:
         """Render frame t: arrays of the window's height and width [H, W]."""
         activate(self.engine)
@@ -129,14 +141,20 @@ class Renderer:
         return self.means(instants, budget, key)[0]
 
     def means(self, instants: list[float], budget: Budget, key: Key) -> Array:
-        """Return `halves` of all instants, of every third one, and of the middle one, float64 [3, 2, H, W]."""
+        """Return `halves` of all instants, of every third one, and of the middle one, float64 [3, 2, H, W].
+
+        The instants [s] are the middles of equal parts of an exposure; lights have their mean over `light_windows`.
+        """
         n, samples = len(instants), budget.grid(len(instants))
         parts = self.parts(2 * samples)
         seeds = words(key, (2, n * len(parts))).reshape(2, n, len(parts))
         sums = np.zeros((3, 2, math.prod(self.shape)))
+        windows = light_windows(instants, self.exposure)
         for i, instant in enumerate(instants):
             drawn = np.empty_like(sums[0])
             self.stage.place(instant)
+            if self.scene.flickers:
+                self.stage.light(*windows[i])
             pose = self.scene.camera.pose(instant)
             if self.engine.backend == "scalar":
                 integrator = self._integrator(budget.bounces)
@@ -151,6 +169,8 @@ class Renderer:
                 sums[1] += drawn * 3 / n
             if i == n // 2:
                 sums[2] = drawn
+        if self.scene.flickers and n > 3:  # the middle one has the light of its part: as if it had that of all
+            sums[2] = sums[2] * (sums[0].mean() / sums[2].mean()) if sums[2].any() else sums[1]
         return sums.reshape(3, 2, *self.shape)
 
     def parts(self, samples: int) -> list[range]:
@@ -307,7 +327,7 @@ class Renderer:
 
         With the shutter at 0, it is the motion per frame time at the speed of that instant.
         """
-        now, exposure = self.time(t), (self.shutter or 1.0) / self.frame_rate
+        now, exposure = self.time(t), self.exposure
         rays = pixel_rays(self.scene.camera, self.crop, self.thinned)
         self.stage.place(now)
         hits = self._caster.cast(self.scene.camera.pose(now), rays)

@@ -55,6 +55,9 @@ def clip_section(clip: Clip) -> page.Section:
         players += [page.player(panels, left=1), legend(largest)]
         lines.append(motion_line(clip, frames))
         figures.append(_motion_histogram(speed))
+    if clip.strengths:
+        lines.append(flicker_line(clip))
+        figures.append(_strengths(clip))
     figures += [code_histogram(clip, clip.stream(name)) for name in clip.streams]
     lines += error_lines(clip.meta)
     if clip.meta.get("error_per_frame"):
@@ -98,6 +101,16 @@ def light_line(clip: Clip) -> str:
         f"{frames} frames of {height} × {width} at {clip.frame_rate:g} fps, exposure {clip.exposure * 1e6:.4g} µs, "
         f"mean radiance {clip.mean_radiance:.4g} {unit}{photons}"
     )
+
+
+def flicker_line(clip: Clip) -> str:
+    """Return the lights that flicker, and their strengths in the frames of a clip, as one line."""
+    each = []
+    for name, found in clip.strengths.items():
+        own = clip.meta["flicker"][name]
+        what = f"{own['kind']}, {own['frequency']:g} Hz"
+        each.append(f"{name} ({what}) {found.min():.3g} to {found.max():.3g} of its mean")
+    return f"Flicker, exact means over the exposures: {'; '.join(each)}"
 
 
 def stream_line(stream: Stream) -> str:
@@ -239,6 +252,14 @@ def _light_histogram(truth: NDArray[np.floating], clip: Clip) -> Markup:
     axes.hist(truth.ravel(), bins=64, weights=np.full(truth.size, 1 / truth.size), color="tab:blue")
     axes.set_yscale("log")
     return save(f"light of the {light_name(clip)}, all pixels")
+
+
+def _strengths(clip: Clip) -> Markup:
+    axes, save = page.axes("frame", "strength, 1 is the mean of the light")
+    for name, found in clip.strengths.items():
+        axes.plot(found, ".-", label=name)
+    axes.legend()
+    return save("strength of the lights that flicker, mean over the exposure of every frame")
 
 
 def error_curve(errors: Sequence[float]) -> Markup:
