@@ -7,6 +7,7 @@ import numpy as np
 from qsim.scene import (
     AreaLamp,
     Body,
+    Camera,
     Conductor,
     Constant,
     Diffuse,
@@ -29,6 +30,13 @@ TABLE = -0.09  # m
 def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
     """Return bodies on a table, half of them turning, and two that pass at 2 to 4 m/s at speed 1."""
     rng = np.random.default_rng([seed, 12])
+    bodies, view = still_life(rng, speed)
+    lights = (Constant(between(rng, 0.001, 0.003)), swinging(rng, speed))
+    return Scene("lamp", seed, view, lights, tuple(bodies), speed)
+
+
+def still_life(rng: np.random.Generator, speed: float) -> tuple[list[Body], Camera]:
+    """Return bodies on a table before a wall, two that pass above it, and a camera that looks at them."""
     bodies = [
         common.floor(Diffuse(common.backdrop(rng, 0.1, 0.7)), 1.8, y=TABLE, z=-0.3),
         common.wall(Diffuse(common.backdrop(rng, 0.1, 0.7)), 2.0, 1.0, z=-0.45),
@@ -47,8 +55,7 @@ def scene(seed: int = 0, *, speed: float = 1.0) -> Scene:
         turn = Spin(common.direction(rng), speed * between(rng, 15, 40), any_angle(rng))
         bodies.append(Body(f"flyer {i}", tumble.shape(rng), finish(rng), flight @ turn))
     view = common.camera((between(rng, -0.15, 0.15), between(rng, 0.08, 0.2), 0.65), (0, -0.02, 0), 0.5)
-    lights = (Constant(between(rng, 0.001, 0.003)), swinging(rng, speed))
-    return Scene("lamp", seed, view, lights, tuple(bodies), speed)
+    return bodies, view
 
 
 def swinging(rng: np.random.Generator, speed: float) -> AreaLamp:
