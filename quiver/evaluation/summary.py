@@ -17,8 +17,6 @@ from quiver.evaluation.comparison import FORMAT, Comparison, ComparisonRow, json
 from quiver.evaluation.metrics import Interval, over_scenes
 from quiver.restoration.interface import Restorer
 
-# Networks of the paper whose weights do not ship; bit2bit is trained on each stream
-UNTRAINED = ("student-teacher", "bit2bit", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")
 COLUMNS = (
     "method",
     "frames (future)",
@@ -32,7 +30,7 @@ COLUMNS = (
     "s/frame",
     "memory",
     "above peak",
-    "truth's own PSNR",
+    "noise floor",
 )
 MEMORY = (
     "Memory: the largest increase while one clip was restored. Memory that an earlier method left free is not counted; "
@@ -118,7 +116,7 @@ def _interval(found: Interval, digits: int) -> str:
 def markdown(
     comparison: Comparison, methods: Sequence[Restorer], rows: Sequence[ComparisonRow], remarks: Sequence[str] = ()
 ) -> str:
-    """Return the complete evaluation as Markdown: means, caveats, failures, scores per scene, networks without weights.
+    """Return the complete evaluation as Markdown: means, caveats, failures and scores per scene.
 
     `remarks` are lines about networks outside of what they were measured for.
     """
@@ -138,18 +136,14 @@ def markdown(
         + "Matched = after the one factor "
         + ("per window" if comparison.published else "per clip")
         + " that is best behind this clamp; by frames = its mean over all frames of all clips alike; above peak = "
-        "share of the truth's pixels; n/a = the clamp hides the complete error, or no window of SSIM fits.",
+        "share of the truth's pixels; noise floor = PSNR of the ground truth itself; n/a = the clamp hides the "
+        "complete error, or no window of SSIM fits.",
         "",
     ]
     lines = summarise(rows)
     text += markdown_table([_cells(line, by_name[line.method]) for line in lines], COLUMNS)
     text += ["", *_caveats(lines, rows), *[f"{remark}\n" for remark in remarks]]
-    text += [
-        MEMORY,
-        "",
-        f"No weights ship of {', '.join(UNTRAINED)}: train them with `quiver train --preset NAME`.",
-        "",
-    ]
+    text += [MEMORY, ""]
     failures = [f"- {line.method}, {line.light}, {reason}" for line in lines for reason in line.failures]
     text += ["## Failures", "", *failures, ""] if failures else []
     return "\n".join([*text, *_by_motion(lines), *_per_scene(rows)]) + "\n"
@@ -190,8 +184,8 @@ def _caveats(lines: Sequence[SummaryLine], rows: Sequence[ComparisonRow]) -> lis
     text = [metrics.above_peak_warning(what, share) + "\n" for share, what in over.values()]
     if any(line.near_truth for line in lines):
         text.append(
-            f"† In one clip or more within {metrics.NEAR_TRUTH:g} dB of the truth's own PSNR: the error of the truth "
-            "is a large part of this score.\n"
+            f"† In one clip or more within {metrics.NEAR_TRUTH:g} dB of the noise floor of the ground truth: the "
+            "error of the truth is a large part of this score.\n"
         )
     return text
 
@@ -242,7 +236,6 @@ def as_dict(
                 {"name": m.name, "frames": m.window, "future": m.look_ahead, "learned": m.learned, "is": m.description}
                 for m in methods
             ],
-            "no_weights": list(UNTRAINED),
             "table": [asdict(line) for line in summarise(rows)],
             "rows": [row.to_dict() for row in rows],
         }

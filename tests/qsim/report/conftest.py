@@ -52,7 +52,7 @@ def folder(tmp_path_factory):
     interval = {"mean": 20.0, "half_width": 1.0, "scenes": 2}
     line = {"method": "<moment>", "light": "3.25 PPP", "seconds_per_frame": 0.1, "truth_psnr": None}
     line["scores"] = {"psnr": interval, "psnr_matched": interval, "ssim_matched": interval | {"half_width": None}}
-    evaluation = {"format": "quiver-evaluation-1", "table": [line], "no_weights": ["RVRT"]}
+    evaluation = {"format": "quiver-evaluation-1", "table": [line]}
     (top / "evaluation.json").write_text(json.dumps(evaluation))
     (top / "unknown.json").write_text("[1, 2]")
     return top

@@ -34,7 +34,7 @@ def test_the_top_of_a_page_tells_the_best_method_and_the_kept_weights(tmp_path):
         return {"method": method, "light": light, "seconds_per_frame": 6.5e-5, "truth_psnr": 38.0, "scores": scores}
 
     lines = [line("a", "3 PPP", 20.0), line("b", "3 PPP", 22.0), line("a", "9 PPP", 25.0), line("b", "9 PPP", 24.0)]
-    evaluation = {"format": "quiver-evaluation-2", "peak": "white", "table": lines, "no_weights": ["RVRT"]}
+    evaluation = {"format": "quiver-evaluation-2", "peak": "white", "table": lines}
     (tmp_path / "evaluation.json").write_text(json.dumps(evaluation))
     entries = [
         {"step": i, "elapsed": 60.0 * i, "psnr_matched": psnr} for i, psnr in ((1, 20.0), (2, 22.76), (3, 22.26))
