@@ -125,10 +125,13 @@ def add_report(sub: Any) -> None:
     """Add the command `report` to a program."""
     parser = command(
         sub, "report", _run_report, "Write one self-contained page of clips, data sets, runs, restored video, scores.",
-        "qsim report out/fan\nqsim report out/demo -o out/demo/index.html --title 'My run'",
+        "qsim report out/fan\nqsim report out/fan out/fan.npy -o fan.html\n"
+        "qsim report out/demo -o out/demo/index.html --title 'My run'",
     )  # fmt: skip
-    parser.add_argument("path", type=Path, help="clip, data set, or a folder that contains some")
-    parser.add_argument("-o", "--output", type=Path, help=".html file to write (default: NAME.html here)")
+    parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help="clips, data sets, or folders of some")
+    parser.add_argument(
+        "-o", "--output", type=Path, help=".html file to write (default: NAME.html here; report.html for several paths)"
+    )
     parser.add_argument("--title", help="title of the page")
     parser.add_argument("--note", action="append", default=[], help="a line for the top of the page; may be repeated")
     parser.add_argument("--force", action="store_true", help="replace an existing page")
@@ -137,9 +140,10 @@ def add_report(sub: Any) -> None:
 def _run_report(args: argparse.Namespace) -> int:
     from qsim.report import report
 
-    target = _page_target(args, f"{args.path.resolve().stem or 'report'}.html")
+    only = args.paths[0].resolve().stem if len(args.paths) == 1 else ""
+    target = _page_target(args, f"{only or 'report'}.html")
     with bar("drawing", "thing") as progress:
-        page = report.build_page(args.path, title=args.title, notes=args.note, progress=progress)
+        page = report.build_page(*args.paths, title=args.title, notes=args.note, progress=progress)
     return _write_page(args, target, page)
 
 

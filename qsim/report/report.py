@@ -1,4 +1,4 @@
-"""Builds one self-contained HTML page for the clips, data sets, runs, restored video and scores under a path.
+"""Builds one self-contained HTML page for the clips, data sets, runs, restored video and scores under paths.
 
     clip.json            -> truth, codes, naive mean and flow as moving pictures; light, motion, error (clip_section.py)
     dataset.json         -> a table of the clips, and one clip of each split
@@ -46,16 +46,15 @@ INSIDE_CLIPS = {"streams", "truth", "radiance", "sharp", "jobs", "failed", "logs
 
 
 def build_page(
-    path: Path, *, title: str | None = None, notes: list[str] | None = None, progress: Progress | None = None
+    *paths: Path, title: str | None = None, notes: list[str] | None = None, progress: Progress | None = None
 ) -> str:
-    """Return the page for `path` as HTML, with `notes` on top; raise `ValueError` if nothing under it is known.
+    """Return the page for these paths as HTML, with `notes` on top; raise `ValueError` if one has nothing known.
 
-    `progress(done, total)` is called after each result; each clip of a data set counts as one.
+    A result that lies under several of the paths is shown once. `progress(done, total)` is called after each result;
+    each clip of a data set counts as one.
     """
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file or folder")
-    kinds = {file: _kind(file) for file in _known_files(path)}
-    found = [(kind, file) for kind in _ORDER for file in kinds if kinds[file] == kind]
+    kinds = {file.resolve(): (file, kind) for path in paths for file, kind in _results(path)}
+    found = [(kind, file) for wanted in _ORDER for file, kind in kinds.values() if kind == wanted]
     total = sum(_steps(kind, file) for kind, file in found)
     done = 0
     drawn: list[tuple[str, page.Section]] = []
@@ -72,13 +71,12 @@ def build_page(
         else:
             drawn.append((kind, _DRAW[kind](file)))
             step()
-    if not drawn:
-        raise ValueError(f"{path}: nothing to report; expected a clip, a data set, a restored video or an evaluation")
     sections = [section for _, section in drawn]
     about = [page.section("About this page", page.bullets(notes))] if notes else []
     story, facts = _top(drawn)
-    count = f"{len(drawn)} result{'s' if len(drawn) > 1 else ''} under {path}."
-    return page.page(title or f"qsim report: {path.name}", [count, *story], facts, [*about, *sections])
+    count = f"{len(drawn)} result{'s' if len(drawn) > 1 else ''} under {', '.join(map(str, paths))}."
+    title = title or f"qsim report: {', '.join(path.name for path in paths)}"
+    return page.page(title, [count, *story], facts, [*about, *sections])
 
 
 def _top(drawn: list[tuple[str, page.Section]]) -> tuple[list[str], list[page.Fact]]:
@@ -89,10 +87,24 @@ def _top(drawn: list[tuple[str, page.Section]]) -> tuple[list[str], list[page.Fa
     return [section.story for section in told if section.story][:_SENTENCES], facts[:_FACTS]
 
 
+def _results(path: Path) -> list[tuple[Path, str]]:
+    """Return the description and the kind of every result at or below `path`; `ValueError` if there is none."""
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    found = [(file, kind) for file in _known_files(path) if (kind := _kind(file)) is not None]
+    if not found:
+        raise ValueError(f"{path}: nothing to report; expected a clip, a data set, a restored video or an evaluation")
+    return found
+
+
 def _known_files(path: Path) -> list[Path]:
-    """Return the JSON files at or below `path`, without those inside clips and the clips of a data set."""
+    """Return the JSON files at or below `path`, without those inside clips and the clips of a data set.
+
+    An array is described by the JSON file beside it.
+    """
     if path.is_file():
-        return [path]
+        sidecar = path.with_suffix(".json")
+        return [sidecar if sidecar.is_file() else path]
     candidates = [p for p in sorted(path.rglob("*.json")) if not INSIDE_CLIPS & set(p.relative_to(path).parts[:-1])]
     sets = [p.parent / "clips" for p in candidates if p.name == "dataset.json"]
     return [p for p in candidates if not any(folder in p.parents for folder in sets)]
@@ -164,7 +176,10 @@ def dataset_sections(path: Path, step: Callable[[], None] = lambda: None) -> lis
 
 
 def restored_section(path: Path) -> page.Section:
-    """Return restored video beside its codes and truth, all with one white, with the error of each."""
+    """Return restored video beside its codes and truth, all with one white, with the error of each.
+
+    Flow, depth, bodies and hidden points of the clip lie over its light.
+    """
     video = Restored.open(path)
     meta, restored = video.meta, video.frames()
     frames = chosen_frames(len(restored))
@@ -187,8 +202,8 @@ def restored_section(path: Path) -> page.Section:
             "as the light at which they are the mean code."
         )
         if clip.has_truth:
-            motion_panels, largest, _ = truth_panels(clip, frames)
-            panels.append(motion_panels[1])
+            overlays, largest, _ = truth_panels(clip, frames)
+            panels += overlays[1:]  # the first is the light again
             wheel = legend(largest)
     lines.append(f"White of the pictures: {white:.3g} photons.")
     found = f" at {own.score} PSNR" if own.score else ""

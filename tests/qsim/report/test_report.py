@@ -3,11 +3,15 @@
 import json
 import re
 
+import numpy as np
 import pytest
 from browser import browser, needs_chromium
 from clips import write_dataset
 
 from qsim.cli.program import main
+from qsim.clip.clip import Clip
+from qsim.clip.manifest import RELATIVE
+from qsim.clip.writer import ClipWriter
 from qsim.report import report
 
 
@@ -30,6 +34,47 @@ def test_page_shows_everything_and_loads_nothing(folder):
 
 def test_one_clip_alone(folder):
     assert report.build_page(folder / "square").count("<h2>") == 1
+
+
+def test_ground_truth_lies_over_restored_video(tmp_path):
+    """Flow, depth, bodies and hidden points: of each kind that the clip has, a panel beside the restored video."""
+    light = np.full((3, 8, 10), 0.5, np.float32)
+    half = np.arange(10) < 5
+    truth = {
+        "flow": np.ones((2, 8, 10), np.float32),
+        "flow_back": -np.ones((2, 8, 10), np.float32),
+        "depth": np.broadcast_to(np.where(half, 1.0, 2.0), (8, 10)).astype(np.float32),
+        "body_id": np.broadcast_to(half, (8, 10)).astype(np.int32),
+        "valid": np.broadcast_to(half, (8, 10)),
+    }
+    meta = {"shape": [3, 8, 10], "frame_rate": 2000.0, "exposure": 5e-4, "radiance_unit": RELATIVE}
+    with ClipWriter(tmp_path / "c", meta) as writer:
+        for t in range(3):
+            writer.add(t, light[t], truth=truth, error=0.01)
+    stream = Clip.open(tmp_path / "c").sense(ppp=3.25, bits=3)
+    about = {"format": "quiver-restored-1", "method": "moment", "description": "moment inverse"}
+    about |= {"seconds_per_frame": 0.1, "source": str(stream.path)}
+    np.save(tmp_path / "v.npy", light)
+    (tmp_path / "v.json").write_text(json.dumps(about))
+    body = report.restored_section(tmp_path / "v.json").body
+    for words in ("restored by moment", "flow, full colour", "depth, 1 m", "bodies, one colour", "red: hidden"):
+        assert words in body, words
+
+
+def test_several_paths_are_one_page_without_repetition(folder, tmp_path, capsys, monkeypatch):
+    clip, video = folder / "square", folder / "video.npy"
+    assert report.build_page(clip, video, clip).count("<h2>") == 2
+    assert report.build_page(folder, clip).count("<h2>") == report.build_page(folder).count("<h2>")
+    with pytest.raises(ValueError, match="empty: nothing to report"):
+        report.build_page(clip, _made(tmp_path / "empty"))
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", str(clip), str(video)]) == 0
+    assert "report.html: " in capsys.readouterr().out
+
+
+def _made(path):
+    path.mkdir()
+    return path
 
 
 def test_command_writes_and_does_not_overwrite(folder, tmp_path, capsys):
