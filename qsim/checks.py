@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+ROW_ORDERS = ("down", "up", "right", "left")  # rows from the top or the bottom, columns from the left or the right
 SPLITS = ("train", "val", "test")
 MAX_PIXELS = 1 << 26  # of one frame: 8192 x 8192
 
@@ -114,6 +115,12 @@ def psnr(value: Any) -> float:
     if not 10 <= number <= 80:
         raise ValueError(f"expected the wanted error in dB, 10 to 80, got {value!r}; 40.0 is 1 % of the peak")
     return number
+
+
+def row_order(value: Any) -> str:
+    if value not in ROW_ORDERS:
+        raise ValueError(f"expected the order in which rows are read, {', '.join(ROW_ORDERS)}, got {shown(value)}")
+    return str(value)
 
 
 def split(value: Any) -> str:

@@ -261,6 +261,7 @@ STREAM: Table = {
     "orientation, if any": TEXT,
     "source, if any": OBJECT,
     "defects, if any": OBJECT,
+    "rows, if any": {"delay": POSITIVE, "order": TEXT},
     "drawn_by, if any": TEXT,
     "dead_time_effects, if any": OBJECT,
 }

@@ -48,12 +48,19 @@ def add_sense(sub: Any) -> None:
         help="counting SPAD: clip frames per exposure, so that light may change within it",
     )
     parser.add_argument(
+        "--row-delay", type=checked(checks.positive), help="seconds from one row to the next (default: all at once)"
+    )
+    parser.add_argument(
+        "--row-order", choices=checks.ROW_ORDERS, help="rows from the top (down, the default), columns from the left..."
+    )
+    parser.add_argument(
         "--replay", metavar="CLIP:FRAME", help="draw one frame again and compare it with the stored one"
     )
     parser.add_argument("--force", action="store_true", help="replace a stream of the same name")
 
 
 def _run_sense(args: argparse.Namespace) -> int:
+    from qsim.clip.rows import Rows
     from qsim.clip.sensing import Sensing, sense
 
     if args.ppp and args.lux:
@@ -61,9 +68,10 @@ def _run_sense(args: argparse.Namespace) -> int:
     levels = [{"ppp": ppp} for ppp in args.ppp or []] + [{"lux": lux} for lux in args.lux or []] or [{}]
     if args.name and len(levels) > 1:
         raise ValueError(f"--name {args.name}: one name for {len(levels)} light levels; leave it out")
+    rows = Rows.of(args.row_delay, args.row_order)
     wanted = [
         Sensing(args.sensor or "quiver-physical", args.bits, seed=args.seed, name=args.name, group=args.group,
-                       diffraction=args.diffraction, defects=args.defects, slices=args.slices, **level)
+                       diffraction=args.diffraction, defects=args.defects, slices=args.slices, rows=rows, **level)
         for level in levels
     ]  # fmt: skip
     clips = [clip for path in args.paths for clip in _clips(path)]
@@ -109,7 +117,8 @@ def _light(meta: dict[str, Any]) -> dict[str, Any]:
 def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
     from qsim.clip.sensing import replay
 
-    refuse_idle(args, "--replay draws what is stored", ["group", "diffraction", "defects", "force"])
+    unused = ["group", "diffraction", "defects", "row_delay", "row_order", "force"]
+    refuse_idle(args, "--replay draws what is stored", unused)
     if args.slices != 1:
         raise ValueError("--replay draws what is stored: --slices changes nothing here; leave it out")
     name, _, number = args.replay.rpartition(":")

@@ -15,6 +15,7 @@ from qsim import colour, files
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
 from qsim.clip.manifest import RELATIVE
+from qsim.clip.rows import Rows
 from qsim.clip.sensing import Sensing, sense
 from qsim.clip.stream import Stream
 from qsim.files import Progress
@@ -60,6 +61,7 @@ class Clip(ClipFolder):
         diffraction: bool = False,
         defects: str | Defects | None = None,
         slices: int = 1,
+        rows: Rows | None = None,
         force: bool = False,
         progress: Progress | None = None,
     ) -> Stream:
@@ -71,7 +73,7 @@ class Clip(ClipFolder):
         `ValueError` for settings that do not fit the clip; `FileExistsError` where `name` is taken by others.
         """
         chosen = sensor if isinstance(sensor, Sensor) else os.fspath(sensor)
-        wanted = Sensing(chosen, bits, ppp, lux, seed, name, group, diffraction, defects, slices)
+        wanted = Sensing(chosen, bits, ppp, lux, seed, name, group, diffraction, defects, slices, rows=rows)
         return self.stream(sense(self, wanted, force=force, progress=progress)[0].name)
 
     @property

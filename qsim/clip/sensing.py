@@ -17,6 +17,7 @@ from numpy import ndarray as Array
 from qsim import files, keys, locks
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.photons import light_level, light_line
+from qsim.clip.rows import Rows
 from qsim.clip.simulation import Draw, plane_of, stored
 from qsim.clip.stream import Stream, orientation, write_packed, writing
 from qsim.files import Progress, check_name
@@ -44,6 +45,7 @@ class Sensing:
     diffraction: bool = False  # blur by the lens's Airy pattern
     defects: str | Defects | None = None  # .toml with a table [defects]; None: that of the sensor's file, if it has one
     slices: int = 1  # clip frames in one exposure of a counting SPAD, for light that changes within it
+    rows: Rows | None = None  # rows or columns at their own time; None: all at once
 
     @property
     def stream_name(self) -> str:
@@ -90,6 +92,8 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
     if not 1 <= planes <= len(clip):
         what = f"one code of {planes} planes" if sensing.group else f"one exposure of {planes} slices"
         raise ValueError(f"{clip.name}: {len(clip)} frames are too few for {what}")
+    if sensing.rows is not None:
+        _check_rows(sensing.rows, clip, planes, 1 if sensing.group else planes)
     target = None if sensing.ppp is None else sensing.ppp / planes
     level = light_level(clip, ppp=target, lux=sensing.lux)
     sensor = own or devices.load(
@@ -99,7 +103,18 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
         sensor = PixelArray.of(found, sensor, *clip.shape[1:]).sensor
     _check_planes(sensor, sensing, clip)
     key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
-    return Draw(sensor, plane_of(sensor, planes), level, key, planes, sensing.diffraction, found)
+    return Draw(sensor, plane_of(sensor, planes), level, key, planes, sensing.diffraction, found, rows=sensing.rows)
+
+
+def _check_rows(rows: Rows, clip: ClipFolder, planes: int, period: int) -> None:
+    """Raise `ValueError` if rows cannot be read at their times: codes of `planes`, planes of `period` clip frames."""
+    _, height, width = clip.shape
+    if clip.exposure < 0.999 / clip.frame_rate:
+        raise ValueError(f"{clip.name}: rows at their own time need a clip whose shutter is open all the time")
+    rows.check(height, width, clip.frame_rate, period, clip.name)
+    needed = planes + rows.reach(height, width, clip.frame_rate)
+    if len(clip) < needed:
+        raise ValueError(f"{clip.name}: {len(clip)} frames are too few for one code, whose last row needs {needed}")
 
 
 def _check_planes(sensor: Sensor, sensing: Sensing, clip: ClipFolder) -> None:
@@ -115,12 +130,12 @@ def _check_planes(sensor: Sensor, sensing: Sensing, clip: ClipFolder) -> None:
 
 def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> dict[str, Any]:
     """Return the json of the stream of a draw, without the fields of the written file (checksums, versions)."""
-    frames, height, width = clip.shape
+    _, height, width = clip.shape
     named = {} if isinstance(sensing.sensor, Sensor) else {"sensor_name": sensing.sensor}
     return (
         named
         | {
-            "shape": [frames // draw.planes, height, width],
+            "shape": [draw.count(clip), height, width],
             "ppp_target": sensing.ppp,
             "lux_target": sensing.lux,
             "ppp": draw.level.ppp * draw.planes,
@@ -139,6 +154,7 @@ def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> dict[str, Any]:
             "drawn_by": draw.law,
         }
         | ({} if draw.defects is None else {"defects": draw.defects.to_dict()})
+        | ({} if draw.rows is None else {"rows": draw.rows.to_dict()})
     )
 
 
@@ -158,6 +174,8 @@ def sense(
     draw = prepare(clip, sensing)
     meta = describe(clip, sensing, draw)
     line = light_line(draw.level, draw.planes * draw.sensor.efficiency)
+    if draw.rows is not None:
+        line += f"; {draw.rows}"
     if draw.defects is not None:
         effects = [key for key, value in draw.defects.to_dict().items() if value and key != "device_seed"]
         line += f"; defects: {', '.join(effects) or 'none'}"
@@ -188,7 +206,7 @@ def _kept(clip: ClipFolder, sensing: Sensing, draw: Draw, meta: dict[str, Any]) 
         return None
     if (
         all(old.meta.get(key, value if key == "drawn_by" else None) == value for key, value in meta.items())
-        and old.meta.get("defects") == meta.get("defects")
+        and all(old.meta.get(key) == meta.get(key) for key in ("defects", "rows"))
         and old.meta["sensor"] == draw.sensor.to_dict()
     ):
         return old

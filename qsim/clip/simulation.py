@@ -17,10 +17,11 @@ from numpy import ndarray as Array
 
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.photons import clip_photons
+from qsim.clip.rows import Rows
 from qsim.clip.stream import Stream
 from qsim.files import Progress
 from qsim.keys import Key
-from qsim.optics.radiometry import LightLevel
+from qsim.optics.radiometry import Crop, LightLevel
 from qsim.sensor import packing
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table, event_simulation
@@ -48,6 +49,7 @@ class Draw:
     defects: Defects | None = None
     followed: Effects | None = None  # counting pixels: the error of the closed form, if photons are followed instead
     engine: str = "auto"
+    rows: Rows | None = None  # rows or columns at their own time; None: all at once
 
     @property
     def law(self) -> str:
@@ -70,10 +72,25 @@ class Draw:
         return "planes" if few or self.sums or disturbed or isinstance(self.sensor, PlaneByPlane) else "process"
 
     def light(self, clip: ClipFolder, start: int, stop: int) -> Array:
-        """Return expected photons [stop - start, H, W] of clip frames, per clip frame."""
-        return np.stack(
-            [clip_photons(clip, t, self.level.factor, diffraction=self.diffraction) for t in range(start, stop)]
-        )
+        """Return expected photons [stop - start, H, W] of clip frames, per clip frame, each row at its time."""
+        whole = (0, 0, *clip.shape[1:])
+        return np.stack([self._delayed(clip, t, whole) for t in range(start, stop)])
+
+    def incident(self, clip: ClipFolder, t: int, crop: Crop | None = None) -> Array:
+        """Return the expected photons [h, w] of clip frame t in a crop = (y, x, height, width) [px]."""
+        return clip_photons(clip, t, self.level.factor, crop, diffraction=self.diffraction)
+
+    def _delayed(self, clip: ClipFolder, t: int, crop: Crop) -> Array:
+        """Return the same, with every row at its own time."""
+        if self.rows is None:
+            return self.incident(clip, t, None if crop == (0, 0, *clip.shape[1:]) else crop)
+        shifts = self.rows.shifts(*clip.shape[1:], clip.frame_rate)
+        return self.rows.delayed(lambda frame, part: self.incident(clip, frame, part), t, crop, shifts)
+
+    def count(self, clip: ClipFolder) -> int:
+        """Return the number of codes in a clip: its frames over those of a code; late rows need the frames after it."""
+        more = 0 if self.rows is None else self.rows.reach(*clip.shape[1:], clip.frame_rate)
+        return (len(clip) - more) // self.planes
 
     def frames(self, clip: ClipFolder, start: int, stop: int) -> Array:
         """Return codes [stop - start, H, W] of stream frames start ... stop - 1.
@@ -165,11 +182,7 @@ class Draw:
         def read(frame: int, row: int, rows: int) -> Array:
             crop = (row, 0, rows, clip.shape[2])
             first = frame * self.planes
-            each = (
-                clip_photons(clip, t, self.level.factor, crop, diffraction=self.diffraction)
-                for t in range(first, first + self.planes)
-            )
-            return np.stack(list(each))
+            return np.stack([self._delayed(clip, t, crop) for t in range(first, first + self.planes)])
 
         return read
 
@@ -181,7 +194,7 @@ class Draw:
         if self.planes == 1 and not (memory.carry or memory.afterpulse):
             return None
         array = PixelArray.of(self.defects or Defects(), self.plane, *clip.shape[1:])
-        shape = (len(clip) // self.planes, *clip.shape[1:])
+        shape = (self.count(clip), *clip.shape[1:])
         return event_simulation.clip_effects(
             array, self._slices(clip), shape, self._exposure(clip), self.planes / clip.frame_rate
         )
@@ -218,7 +231,8 @@ def stored(stream: Stream) -> Draw:
     found = defect_table.from_dict(meta["defects"], where) if "defects" in meta else None
     followed = event_simulation.Effects(**meta["dead_time_effects"]) if law == "events" else None
     diffraction = bool(meta.get("diffraction", False))
-    return Draw(sensor, plane_of(sensor, planes), level, key, planes, diffraction, found, followed)
+    plane = plane_of(sensor, planes)
+    return Draw(sensor, plane, level, key, planes, diffraction, found, followed, rows=stream.rows)
 
 
 def plane_of(sensor: Sensor, planes: int) -> Sensor:

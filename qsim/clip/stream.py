@@ -24,6 +24,7 @@ from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
 from qsim.clip.lazy_array import LazyArray
 from qsim.clip.photons import clip_photons
+from qsim.clip.rows import Rows, from_dict
 from qsim.files import VERSION, Progress
 from qsim.optics.radiometry import Crop, check_crop
 from qsim.sensor import packing
@@ -106,30 +107,49 @@ class Stream:
             raise FileNotFoundError(f"{self.path}: does not lie in the folder of a clip, so its light is not known")
         return replace(ClipFolder.open(folder), keeps=self.keeps)
 
-    def truth(self, start: int = 0, stop: int | None = None) -> Array:
+    def truth(self, start: int = 0, stop: int | None = None, *, at: str = "row") -> Array:
         """Return the photons that a perfect restorer would find, float64 [stop - start, H, W].
 
         They are expected photons per pixel and exposure at mid-exposure, without blur. A code of several clip frames
-        has the light of its middle one times their number. `ValueError` for frames that do not exist,
-        `FileNotFoundError` for a stream without a clip.
+        has the light of its middle one times their number. Where rows have their own time, each is that of the clip
+        frame nearest to its mid-exposure; `at="frame"` takes all from the middle of the frame, undistorted by motion.
+        `ValueError` for frames that do not exist, `FileNotFoundError` for a stream without a clip.
         """
+        if at not in ("row", "frame"):
+            raise ValueError(f"{self.path}: truth at the time of each row or of the middle of the frame, got {at!r}")
         frames = self._existing(start, len(self) if stop is None else stop)
         factor = self.photons_factor * self._planes
-        return np.stack([clip_photons(self.clip, self._middle(t), factor, sharp=True) for t in frames])
+
+        def sharp(frame: int, crop: Crop | None = None) -> Array:
+            return clip_photons(self.clip, frame, factor, crop, sharp=True)
+
+        return np.stack([self._at_mid_exposure(sharp, t, at) for t in frames])
 
     def known(self) -> Array | None:
         """Return bool [T, H, W], False where a saturated camera cut off the light of `truth`; None if all is known."""
         if not self.clip.meta.get("saturated_pixels"):
             return None
-        return ~np.stack([self.clip.saturated(self._middle(t)) for t in range(len(self))])
+        return ~np.stack([self._at_mid_exposure(self.clip.saturated, t) for t in range(len(self))])
 
     @property
     def _planes(self) -> int:
         return int(self.meta.get("planes_per_code") or 1)
 
-    def _middle(self, t: int) -> int:
-        """Return the clip frame in the middle of code t."""
-        return t * self._planes + self._planes // 2
+    @cached_property
+    def rows(self) -> Rows | None:
+        """The delay of rows or columns; None: all are read at once."""
+        where = f"{self.path.with_suffix('.json')}: rows"
+        return from_dict(self.meta["rows"], where) if "rows" in self.meta else None
+
+    def _at_mid_exposure(self, read: Callable[..., Array], t: int, at: str = "row") -> Array:
+        """Return `read(clip frame, crop)` [H, W] in the middle of code t: of each row's exposure, or of all of them."""
+        if self.rows is None:
+            return read(t * self._planes + self._planes // 2)
+        middle = t * self._planes + (self._planes - 1) / 2
+        shifts = self.rows.shifts(*self.shape[1:], self.clip.frame_rate)
+        if at == "frame":
+            return read(math.floor(middle + shifts.mean() + 0.5))
+        return self.rows.picked(read, middle, (0, 0, *self.shape[1:]), shifts)
 
     def _existing(self, start: int, stop: int) -> range:
         """Return frames start ... stop - 1; `ValueError` if they do not all exist."""

@@ -61,7 +61,7 @@ class Job:
         described = dataclasses.asdict(self) | {"family": Path(self.family).stem}
         described["streams"] = [stream | {"sensor": Path(stream["sensor"]).name} for stream in described["streams"]]
         for stream in described["streams"]:  # options that are off stay out: data sets of earlier versions resume
-            for key, off in (("defects", None), ("slices", 1)):
+            for key, off in (("defects", None), ("slices", 1), ("rows", None)):
                 if stream[key] == off:
                     del stream[key]
         own = [

@@ -29,6 +29,8 @@
     name = "dim"               # of the stream; default: made from sensor, bits and light
     group = true               # a code sums 2^bits - 1 clip frames as binary planes; default false
     diffraction = true         # blur by the lens's Airy pattern; default false
+    row_delay = 2e-6           # seconds from one row, or column, to the next; default: all at once
+    row_order = "down"         # order of rows: down, the default, or up; of columns: right or left
 
 A (family, seed) belongs to one split at every speed, and a family of the test split to no other split.
 """
@@ -41,6 +43,7 @@ from typing import Any
 
 from qsim import checks
 from qsim.checks import MAX_PIXELS
+from qsim.clip.rows import Rows
 from qsim.clip.sensing import Sensing
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe_toml import Section, Text
@@ -142,6 +145,10 @@ def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
                 "families that training never sees: move its scenes"
             )
         for sensing in job.streams:
+            if sensing.rows is not None:
+                with section.naming():
+                    at = job.settings
+                    sensing.rows.check(at.height, at.width, at.frame_rate, sensing.slices, sensing.stream_name)
             if sensing.group and job.settings.frames < 2 ** (sensing.bits or 1) - 1:
                 raise ValueError(
                     f"{section.where()}: {job.settings.frames} frames are too few for {sensing.stream_name}, whose "
@@ -170,10 +177,8 @@ def _jobs(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[
             f"{MAX_PIXELS} pixels are rendered"
         )
     stem = Path(family).stem
-    try:
+    with section.naming("family", "clips are named after the scene: "):
         check_name(f"{stem}_{seeds[0]:04d}")
-    except ValueError as error:
-        raise ValueError(f"{section.where('family')}: clips are named after the scene: {error}") from None
     if len(stem) > MAX_STEM:
         raise ValueError(
             f"{section.where('family')}: clips are named after the scene, whose name has {len(stem)} characters; "
@@ -244,6 +249,8 @@ def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
     bits, name = given.get("bits", [None]), given.get("name")
     group, diffraction = given.get("group", False), given.get("diffraction", False)
     sensor = _sensor(section, given["sensor"], bits, group)
+    with section.naming("row_order"):
+        rows = Rows.of(given.get("row_delay"), given.get("row_order"))
     if name is not None and len(bits) * len(levels) > 1:
         raise ValueError(
             f"{section.where('name')}: one name for {len(bits) * len(levels)} streams; give one bits and one light "
@@ -259,15 +266,14 @@ def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
             name=name,
             group=group,
             diffraction=diffraction,
+            rows=rows,
         )
         for b in bits
         for level in levels
     ]
     for sensing in found:
-        try:
+        with section.naming("sensor", "streams are named after the sensor: "):
             stream = sensing.stream_name
-        except ValueError as error:
-            raise ValueError(f"{section.where('sensor')}: streams are named after the sensor: {error}") from None
         if stream in taken:
             raise ValueError(f"{section.where()}: two [[streams]] are called '{stream}'; give one of them a name")
         taken.add(stream)
@@ -301,10 +307,8 @@ def _sensor(section: Section, sensor: str, bits: list[int | None], group: bool) 
     if sensor.endswith(".toml"):
         sensor = str((section.text.path.parent / sensor).resolve())
     for depth in bits:
-        try:
+        with section.naming("sensor"):
             found = devices.load(sensor, ppp=3.25, bits=depth, exposure=5e-4)
-        except (ValueError, OSError) as error:
-            raise ValueError(f"{section.where('sensor')}: {error}") from None
         if group and not (depth and isinstance(found, BinarySPAD)):
             what = f"this is a {type(found).__name__}" if depth else "the bits of a code are needed, as in bits = 3"
             raise ValueError(f"{section.where('group')}: group sums planes of a clocked SPAD; {what}")
@@ -337,13 +341,10 @@ SCENES: Table = {
     **{f"{key}, if any": check for key, check in _SETTINGS.items()},
 }  # fmt: skip
 STREAMS: Table = {
-    "sensor": checks.text,
-    "bits, if any": checks.list_of(checks.bits),
-    "ppp, if any": checks.list_of(checks.light),
-    "lux, if any": checks.list_of(checks.light),
+    "sensor": checks.text, "bits, if any": checks.list_of(checks.bits),
+    "ppp, if any": checks.list_of(checks.light), "lux, if any": checks.list_of(checks.light),
     "absolute, if any": checks.flag,
-    "seed, if any": checks.seed,
-    "name, if any": _name,
-    "group, if any": checks.flag,
-    "diffraction, if any": checks.flag,
-}
+    "seed, if any": checks.seed, "name, if any": _name,
+    "group, if any": checks.flag, "diffraction, if any": checks.flag,
+    "row_delay, if any": checks.positive, "row_order, if any": checks.row_order,
+}  # fmt: skip

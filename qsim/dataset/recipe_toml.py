@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -70,6 +72,14 @@ class Section:
     def where(self, key: str | None = None) -> str:
         """Return `FILE:LINE` of a key, or of the section's head."""
         return self.text.where(self.name, self.i, key)
+
+    @contextlib.contextmanager
+    def naming(self, key: str | None = None, words: str = "") -> Iterator[None]:
+        """Put `FILE:LINE: ` of a key, or of the section's head, and some words before an error's message."""
+        try:
+            yield
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{self.where(key)}: {words}{error}") from None
 
     def values(self, table: Table) -> dict[str, Any]:
         """Return the values as their checks return them; `ValueError` with the line of the wrong key."""

@@ -47,9 +47,10 @@ class Window:
         return self.stream.truth(self.first, self.first + self.frames).astype(np.float32)
 
     def flow(self) -> Array:
-        """Return the flow, float32 [T, 2, H, W]; NaN where hidden, without ground truth, and between sums of frames."""
+        """Return the flow, float32 [T, 2, H, W]; NaN where hidden or unknown, for sums of frames and rolling rows."""
         found = np.full((self.frames, 2, *self.clip.shape[1:]), np.nan, np.float32)
-        if self.clip.has_truth and (self.stream.meta.get("planes_per_code") or 1) == 1:
+        single = (self.stream.meta.get("planes_per_code") or 1) == 1 and self.stream.rows is None
+        if self.clip.has_truth and single:
             for n, t in enumerate(range(self.first, self.first + self.frames)):
                 if t + 1 < len(self.clip):
                     found[n] = np.where(self.clip.valid(t), self.clip.flow(t), np.nan)

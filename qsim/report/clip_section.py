@@ -120,7 +120,13 @@ def stream_line(stream: Stream) -> str:
     light = "" if ppp is None else f": {ppp:.4g} photons per pixel (the clip's light × {stream.photons_factor:.4g})"
     light += "" if lux is None else f", equal to {lux:.4g} lx at 555 nm"
     light += "" if ppp is None else f", {ppp * stream.sensor.efficiency:.3g} e⁻ per pixel"
-    return f"Stream {stream.name}{light}; {stream.bits} bit, {stream.sensor}{defects_words(stream)}"
+    return f"Stream {stream.name}{light}; {stream.bits} bit, {stream.sensor}{rows_words(stream)}{defects_words(stream)}"
+
+
+def rows_words(stream: Stream) -> str:
+    """Return "; each row 2e-06 s later, down", or "" where all are read at once."""
+    rows = stream.rows
+    return "" if rows is None else f"; {rows}"
 
 
 def defects_words(stream: Stream) -> str:
@@ -206,6 +212,8 @@ def unexpected(clip: Clip, stream: Stream) -> str | None:
     own = stream.meta.get("defects", {})
     if 2**stream.bits > 64:
         return "more than 64 codes"
+    if stream.rows is not None:
+        return "every row sees its own part of two frames of the clip"
     if int(stream.meta.get("planes_per_code", 1)) > 1 or len(stream) != len(clip):
         return "a code sums planes of several frames of the clip"
     if stream.meta["ppp_factor"] is None:

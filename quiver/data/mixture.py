@@ -43,7 +43,8 @@ def choose(
     asked = bool(sensors or ppp or bits)
     streams = _streams(clips)
     if sensors and ppp and bits:  # the streams decide nothing
-        streams = [stream for stream in streams if (stream.meta.get("planes_per_code") or 1) == 1]
+        single = [stream for stream in streams if (stream.meta.get("planes_per_code") or 1) == 1]
+        streams = [stream for stream in single if stream.rows is None]
     found = _sorted(streams)
     if not asked:
         default = "" if found else "the default; the data set has no streams"

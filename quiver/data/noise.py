@@ -62,6 +62,11 @@ class Noise(Illumination):
                 f"{where}: a code takes {planes} clip frames, a training window one for each; give --sensor, --bits "
                 "and --ppp"
             )
+        if stream.rows is not None:
+            raise ValueError(
+                f"{where}: its rows have their own time, those of a training window have one; give --sensor, --bits "
+                "and --ppp"
+            )
         name = str(meta.get("sensor_name") or stream.sensor.to_dict()["model"])
         named = "sensor_name" in meta and not name.endswith(".toml")
         ppp, lux = meta.get("ppp_target"), meta.get("lux_target")

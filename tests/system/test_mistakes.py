@@ -88,6 +88,13 @@ MISTAKES = [
     ("qsim sense video --lux 3", "has no lux; give a target in photons per pixel, as in --ppp 3.25"),
     ("qsim sense black --ppp 3", "black: mean of photons is 0, no factor reaches 3 PPP; is the light on?"),
     # Sensors and streams
+    ("qsim sense lit --ppp 3 --row-delay 0", "--row-delay: expected a number above 0, got 0"),
+    ("qsim sense lit --ppp 3 --row-delay 1e-3", "longer than a frame or plane of 0.0005 s; the largest delay is"),
+    ("qsim sense lit --ppp 3 --row-order up", "row order up: orders rows that have their own time; give the row delay"),
+    (
+        "qsim sense lit --ppp 3 --row-delay 1e-6 --row-order upp",
+        "unknown argument --row-order 'upp' (did you mean 'up'?)",
+    ),
     ("qsim sense lit --ppp 3 --bits 0", "--bits: expected 1 to 16 bits per code, got 0"),
     ("qsim sense lit --ppp 3 --bits 17", "--bits: expected 1 to 16 bits per code, got 17"),
     ("qsim sense lit --ppp 3 --sensor quiver-fysical", "did you mean 'quiver-physical'?"),

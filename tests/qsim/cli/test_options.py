@@ -147,11 +147,27 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Acts("sense clip --sensor counter.toml --name n", "--slices 2"),
         Refused("sense clip", "--slices 2", "slices"),
     ],
+    ("sense", "--row-delay"): [
+        Acts("sense clip --ppp 3 --name n", "--row-delay 1e-6"),
+        Refused("sense clip", "--row-delay 1", "longer than a frame"),
+    ],
+    ("sense", "--row-order"): [
+        Acts("sense clip --ppp 3 --name n --row-delay 1e-6", "--row-order left"),
+        Refused("sense clip", "--row-order up", "row delay"),
+    ],
     ("sense", "--replay"): [
         Acts("sense clip --ppp 3.25 --bits 3 --name s", "--replay clip:1", stdout),
+        Refused("sense clip --replay clip:1", "--row-order up", "row delay"),
         *(
             Refused("sense clip --replay clip:1", option, option.split()[0])
-            for option in ("--group", "--diffraction", "--defects bad.toml", "--slices 2", "--force")
+            for option in (
+                "--group",
+                "--diffraction",
+                "--defects bad.toml",
+                "--slices 2",
+                "--row-delay 1e-6",
+                "--force",
+            )
         ),
         *(
             Refused("sense clip --replay clip:1", option, "no stream")

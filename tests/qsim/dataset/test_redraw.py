@@ -12,6 +12,7 @@ from scipy.special import gammaln
 from qsim import files
 from qsim.cli import program
 from qsim.clip.clip import Clip
+from qsim.clip.rows import Rows
 from qsim.clip.sensing import Sensing, prepare, replay, sense, write_stream
 from qsim.clip.simulation import stored
 from qsim.clip.stream import Stream
@@ -42,6 +43,8 @@ KINDS = {
     "counting": (COUNTING.format(bits=3), {"ppp": 3.0}, "closed form"),
     "counting, followed": (COUNTING.format(bits=3) + "[defects]\ncarry_dead_time = true\n", {"ppp": 3.0}, "events"),
     "counting, slices": (COUNTING.format(bits=3), {"ppp": 3.0, "slices": 3}, "events"),
+    "counting, rows": (COUNTING.format(bits=3), {"ppp": 3.0, "slices": 2, "rows": Rows(9e-5, "up")}, "events"),
+    "planes, columns": (BINARY.format(bits=1) + DISTURBED, {"ppp": 0.7, "rows": Rows(3e-5, "left")}, "planes"),
 }
 
 

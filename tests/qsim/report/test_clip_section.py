@@ -10,6 +10,7 @@ from stats import mixture_p_value
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
+from qsim.clip.rows import Rows
 from qsim.clip.sensing import Sensing, sense
 from qsim.report import clip_section, report
 
@@ -60,6 +61,9 @@ def test_no_expectation_is_shown_without_an_exact_one(tmp_path):
         assert f"defects: {cause} 0.05" in clip_section.stream_line(stream)
     grouped, _ = sense(clip, Sensing("spad-320x240", bits=2, ppp=2.0, name="grouped", group=True))
     assert "sums planes" in str(clip_section.unexpected(clip, grouped))
+    rolling, _ = sense(clip, Sensing("quiver-physical", ppp=2.0, name="rolling", rows=Rows(2e-6)))
+    assert "its own part of two frames" in str(clip_section.unexpected(clip, rolling))
+    assert "; each row 2e-06 s later, down" in clip_section.stream_line(rolling)
     unknown = replace(stream, meta=stream.meta | {"ppp_factor": None, "defects": {}})
     assert "light is unknown" in str(clip_section.unexpected(clip, unknown))
 
