@@ -129,6 +129,12 @@ def split(value: Any) -> str:
     return str(value)
 
 
+def bands(value: Any) -> str:
+    if value != "rgb":
+        raise ValueError(f'expected "rgb", red, green and blue (leave bands out for one band), got {value!r}')
+    return str(value)
+
+
 def list_of(check: Callable[[Any], Any]) -> Callable[[Any], list[Any]]:
     """Return a check that takes one value or a list of different values, and returns a list."""
 
@@ -152,6 +158,12 @@ def require_finite(name: str, values: np.ndarray) -> None:
     if len(bad):
         index = tuple(int(i) for i in bad[0])
         raise ValueError(f"{name}: {values[index]} at index {index}; every value must be finite")
+
+
+def check_video(path: Path, shape: tuple[int, ...]) -> tuple[int, int, int]:
+    """Return (T, H, W) of frames [T, H, W], or [T, 3, H, W] in colour; errors as of `check_shape`."""
+    in_colour = len(shape) == 4 and shape[1] == 3
+    return check_shape(path, (shape[0], *shape[2:]) if in_colour else shape)
 
 
 def check_shape(path: Path, shape: tuple[int, ...]) -> tuple[int, int, int]:

@@ -219,6 +219,9 @@ DEVICES: Mapping[str, Device] = MappingProxyType(
 )
 
 
+TABLES = ("sensor", "sources", "defects", "colour")  # of a file; defect_table.py and colour_filter.py read the last two
+
+
 def load(
     name: str | Path | Sensor, *, ppp: float | None = None, bits: int | None = None, exposure: float = 5e-4
 ) -> Sensor:
@@ -251,8 +254,8 @@ def from_toml(path: str | Path) -> Sensor:
     path = Path(path)
     tables = files.read_toml(path, "sensor file")
     for key in tables:
-        if key not in ("sensor", "sources", "defects"):  # [defects] is read by defect_table.py
-            raise ValueError(f"{path}: unknown table [{key}]{suggest(key, ('sensor', 'sources', 'defects'))}")
+        if key not in TABLES:
+            raise ValueError(f"{path}: unknown table [{key}]{suggest(key, TABLES)}")
     if not isinstance(tables.get("sensor"), dict):
         raise ValueError(f"{path}: a table [sensor] with model, bits and the model's fields is missing")
     sensor = from_dict(tables["sensor"], where=f"{path}: [sensor]")
