@@ -78,6 +78,12 @@ def tone(linear: NDArray[np.floating], peak: float) -> NDArray[np.uint8]:
     return np.rint(255.0 * scaled ** (1 / GAMMA)).astype(np.uint8)
 
 
+def tone_picture(linear: NDArray[np.floating], peak: float, *, colours: bool) -> NDArray[np.uint8]:
+    """Return `tone` of grey light [..., H, W], or of bands [..., 3, H, W] as red, green and blue [..., H, W, 3]."""
+    levels = tone(linear, peak)
+    return np.moveaxis(levels, -3, -1) if colours else levels
+
+
 def code_levels(codes: NDArray[np.integer], bits: int) -> NDArray[np.uint8]:
     """Return codes 0 ... 2^bits - 1 as grey levels 0 ... 255, linearly."""
     return np.rint(255.0 * codes / (2**bits - 1)).astype(np.uint8)

@@ -158,6 +158,14 @@ def is_name(value: Any) -> bool:
     return isinstance(value, str) and NAME.fullmatch(value) is not None
 
 
+def is_bands(value: Any) -> bool:
+    return list_of(is_positive, 3)(value)
+
+
+def is_video_shape(value: Any) -> bool:
+    return list_of(is_whole)(value) and (len(value) == 3 or (len(value) == 4 and value[1] == 3))
+
+
 TEXT = expected("a text", is_text)
 FLAG = expected("true or false", lambda value: isinstance(value, bool))
 NAMED = expected("a name of letters, digits, '.', '_' and '-'", is_name)
@@ -210,6 +218,7 @@ CLIP: Table = {
     "name, if any": NAMED,
     "split, if any": SPLIT,
     "camera, if any": CAMERA,
+    "bands, if any": expected("three wavelengths in m", is_bands),
     "origin, if any": expected("[y, x] in pixels", list_of(is_count, 2)),
     "mean_photons, if any": LIGHT,
     "shutter, if any": LIGHT,
@@ -262,6 +271,7 @@ STREAM: Table = {
     "source, if any": OBJECT,
     "defects, if any": OBJECT,
     "rows, if any": {"delay": POSITIVE, "order": TEXT},
+    "colour, if any": OBJECT,
     "drawn_by, if any": TEXT,
     "dead_time_effects, if any": OBJECT,
 }
@@ -279,7 +289,8 @@ RESTORED: Table = {
     "seconds_per_frame": LIGHT,
     "unit, if any": TEXT,
     "white, if any": POSITIVE,
-    "shape, if any": SHAPE,
+    "shape, if any": expected("[frames, height, width] or [frames, 3, height, width]", is_video_shape),
+    "colour, if any": OBJECT,
     "frame_rate, if any": POSITIVE,
     "exposure, if any": POSITIVE,
     "sensor, if any": {"model": TEXT},

@@ -54,6 +54,7 @@ def add_render(sub: Any) -> None:
         default=40.0,
         help="requested error of the radiance, in dB below white and clamped at white (default 40)",
     )
+    parser.add_argument("--bands", choices=["rgb"], help="rgb: in colour, three bands (default: one band)")
     light = checked(checks.positive)
     parser.add_argument("--ppp", type=light, help=LIGHT)
     parser.add_argument("--engine", choices=BACKENDS, help="engine to use (default: QSIM_ENGINE, else the fastest)")
@@ -78,7 +79,7 @@ def _run_render(args: argparse.Namespace) -> int:
         os.environ["QSIM_ENGINE"] = args.engine
         backend.choose()
     taken = {name: getattr(args, name) for name in ("frames", "seed", "frame_rate", "shutter", "psnr", "ppp")}
-    size = {name: getattr(args, name) for name in ("height", "width", "speed")}
+    size = {name: getattr(args, name) for name in ("height", "width", "speed", "bands")}
     if args.output is None:
         scene, _ = load_scene(args.scene, **size, seed=args.seed)
         chosen = choose_budget(scene, **taken)

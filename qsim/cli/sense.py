@@ -42,6 +42,11 @@ def add_sense(sub: Any) -> None:
         "that is carried over (default: that of the sensor's own .toml file)",
     )
     parser.add_argument(
+        "--colour",
+        metavar="MASK",
+        help="colour filters: rggb, quad, rgbw, red, green, blue, or a .toml with a table [colour]",
+    )
+    parser.add_argument(
         "--slices",
         type=int,
         default=1,
@@ -71,7 +76,8 @@ def _run_sense(args: argparse.Namespace) -> int:
     rows = Rows.of(args.row_delay, args.row_order)
     wanted = [
         Sensing(args.sensor or "quiver-physical", args.bits, seed=args.seed, name=args.name, group=args.group,
-                       diffraction=args.diffraction, defects=args.defects, slices=args.slices, rows=rows, **level)
+                diffraction=args.diffraction, defects=args.defects, slices=args.slices, rows=rows,
+                colour=args.colour, **level)
         for level in levels
     ]  # fmt: skip
     clips = [clip for path in args.paths for clip in _clips(path)]
@@ -129,7 +135,9 @@ def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
         raise ValueError(f"--replay {args.replay}: no clip {name} among {', '.join(clip.name for clip in clips)}")
     clip = chosen[0]
     known = clip.streams
-    named = args.sensor or args.bits or args.ppp or args.lux or args.seed  # each is part of a stream's name
+    named = (
+        args.sensor or args.bits or args.ppp or args.lux or args.seed or args.colour
+    )  # each is part of a stream's name
     stored = clip.stream(known[0] if len(known) == 1 and not args.name and not named else sensing.stream_name)
     drawn, kept = replay(clip, stored, int(number))
     differ = int((drawn != kept).sum())

@@ -11,7 +11,8 @@ import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from qsim import colour, files
+from qsim import colour as pictures
+from qsim import files
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
 from qsim.clip.manifest import RELATIVE
@@ -19,6 +20,7 @@ from qsim.clip.rows import Rows
 from qsim.clip.sensing import Sensing, sense
 from qsim.clip.stream import Stream
 from qsim.files import Progress
+from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.sensor import Sensor
 
@@ -31,6 +33,7 @@ class Clip(ClipFolder):
         frames, height, width = self.shape
         unit = "(relative)" if self.meta["radiance_unit"] == RELATIVE else "W/m2/sr"
         streams = ", ".join(self.streams) or "none"
+        unit += "" if self.bands is None else " in each of 3 bands"
         return (
             f"<Clip {self.name}: {frames} frames of {height} x {width} px at {self.frame_rate:g} fps, exposure "
             f"{self.exposure * 1e6:.4g} us, mean radiance {self.mean_radiance:.4g} {unit}, streams: {streams}>"
@@ -39,7 +42,7 @@ class Clip(ClipFolder):
     def _repr_html_(self) -> str:
         """Return the middle frame and the facts of `repr`, for notebooks."""
         middle = self.radiance(len(self) // 2)
-        return card(repr(self), colour.tone(middle, colour.peak(middle)))
+        return card(repr(self), pictures.tone_picture(middle, pictures.peak(middle), colours=self.bands is not None))
 
     def show(self, start: int = 0, stop: int | None = None, fps: float = 12.0) -> Film:
         """Return the radiance of frames start ... stop - 1 (at most 100 by default) as a film that notebooks show.
@@ -62,6 +65,7 @@ class Clip(ClipFolder):
         defects: str | Defects | None = None,
         slices: int = 1,
         rows: Rows | None = None,
+        colour: str | ColourFilter | None = None,
         force: bool = False,
         progress: Progress | None = None,
     ) -> Stream:
@@ -69,11 +73,12 @@ class Clip(ClipFolder):
 
         `sensor` is a record such as `QIS(...)`, a name of `qsim doctor --devices`, or a .toml file. `ppp` is the mean
         of photons per pixel and code over the clip, `lux` [lx] the light at 555 nm instead; with neither, the clip's
-        own light is used. `Sensing` describes the other settings. A stream of equal settings is not drawn again.
-        `ValueError` for settings that do not fit the clip; `FileExistsError` where `name` is taken by others.
+        own light is used. A colour clip needs colour filters, as in `colour="rggb"`. `Sensing` describes the other
+        settings. A stream of equal settings is not drawn again. `ValueError` for settings that do not fit the clip;
+        `FileExistsError` where `name` is taken by others.
         """
         chosen = sensor if isinstance(sensor, Sensor) else os.fspath(sensor)
-        wanted = Sensing(chosen, bits, ppp, lux, seed, name, group, diffraction, defects, slices, rows=rows)
+        wanted = Sensing(chosen, bits, ppp, lux, seed, name, group, diffraction, defects, slices, rows, colour)
         return self.stream(sense(self, wanted, force=force, progress=progress)[0].name)
 
     @property

@@ -1,7 +1,7 @@
 """Reads the frames of clip folders: radiance, sharp frames and ground truth.
 
     clip.json            shape, rates, units, camera, scene, render choices, errors, checksums; written last
-    radiance/000000.exr  Y, half, uncompressed: mean over the exposure
+    radiance/000000.exr  Y, or B G R of a colour clip, half, uncompressed: mean over the exposure
     sharp/000000.exr     the same at mid-exposure, only if it differs
     truth/000000.exr     u v bu bv valid Z id: flow to the next and the previous frame, validity, depth, body; zipped
     saturated/000000.exr 1 where the camera of an imported video was saturated, only for frames with such pixels; zipped
@@ -51,11 +51,14 @@ class ClipFolder:
         return int(self.meta["shape"][0])
 
     def __getitem__(self, index: Any) -> Array:
-        """Return radiance as an array [T, H, W] would: `clip[3]` is float32 [H, W], `clip[2:5]` is [3, H, W]."""
+        """Return radiance as an array [T, H, W] would: `clip[3]` is float32 [H, W], `clip[2:5]` is [3, H, W].
+
+        A colour clip is an array [T, 3, H, W].
+        """
         return self._frames[index]
 
     def __iter__(self) -> Iterator[Array]:
-        """Yield the radiance of each frame, float32 [H, W]."""
+        """Yield the radiance of each frame, float32 [H, W] or [3, H, W]."""
         return iter(self._frames)
 
     @property
@@ -63,7 +66,9 @@ class ClipFolder:
         def read(start: int, stop: int, crop: Crop | None) -> Array:
             return np.stack([self.radiance(t, crop) for t in range(start, stop)])
 
-        return LazyArray(self.shape, np.dtype(np.float32), read)
+        frames, height, width = self.shape
+        shape = self.shape if self.bands is None else (frames, 3, height, width)
+        return LazyArray(shape, np.dtype(np.float32), read)
 
     @property
     def name(self) -> str:
@@ -74,6 +79,12 @@ class ClipFolder:
         """(frames, height, width)."""
         frames, height, width = self.meta["shape"]
         return frames, height, width
+
+    @property
+    def bands(self) -> tuple[float, float, float] | None:
+        """Wavelengths [m] of the bands R, G, B of a colour clip; None: one band, at the camera's wavelength."""
+        found = self.meta.get("bands")
+        return None if found is None else (float(found[0]), float(found[1]), float(found[2]))
 
     @property
     def frame_rate(self) -> float:
@@ -93,12 +104,15 @@ class ClipFolder:
 
     @property
     def mean_radiance(self) -> float:
-        """Mean over all frames and pixels, in `meta["radiance_unit"]`."""
+        """Mean over all frames, pixels and bands, in `meta["radiance_unit"]`."""
         return float(self.meta["mean_radiance"])
 
     @property
     def mean_photons(self) -> float:
-        """Mean expected photons per pixel and exposure, without a light factor; `ValueError` for relative radiance."""
+        """Mean expected photons per pixel and exposure, without a light factor; `ValueError` for relative radiance.
+
+        Of a colour clip it is the mean over the bands: the photons of one band.
+        """
         value = self.meta.get("mean_photons")
         if value is None:
             raise ValueError(f"{self.path}: its radiance is relative and has no photons; give a target in PPP")
@@ -117,8 +131,16 @@ class ClipFolder:
         """The camera without its motion; None for relative radiance."""
         return camera_of(self.meta, self.path / "clip.json")
 
+    def require_one_band(self, what: str) -> None:
+        """Raise `ValueError` for a colour clip; `what` needs a clip of one band."""
+        if self.bands is not None:
+            raise ValueError(f"{self.path}: holds three bands, and {what} takes one; render the scene without bands")
+
     def radiance(self, t: int, crop: Crop | None = None) -> Array:
-        """Return the mean radiance over the exposure of frame t, float32 [h, w]; crop = (y, x, height, width) [px]."""
+        """Return the mean radiance over the exposure of frame t, float32 [h, w]; crop = (y, x, height, width) [px].
+
+        Of a colour clip it is [3, h, w], the bands R, G, B; so is `sharp`.
+        """
         return self._half("radiance", t, crop)
 
     def sharp(self, t: int, crop: Crop | None = None) -> Array:
@@ -163,14 +185,14 @@ class ClipFolder:
         return "truth/000000.exr" in self.meta["checksums"]
 
     def _half(self, folder: str, t: int, crop: Crop | None) -> Array:
-        """Return an image of frame t in a folder, float32 [h, w]."""
+        """Return an image of frame t in a folder, float32 [h, w] or [3, h, w]."""
         self._check_frame(t)
         _, height, width = self.shape
         if crop is not None:
             check_crop(crop, height, width, str(self.path))
         path = self.path / folder / f"{t:06d}.exr"
         try:
-            return exr.read_half(path, height, width, crop)
+            return exr.read_half(path, height, width, crop, colour=self.bands is not None)
         except FileNotFoundError:
             raise FileNotFoundError(
                 f"{path}: no such file; the clip is damaged, run `qsim check {self.path}`"

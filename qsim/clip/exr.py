@@ -48,20 +48,23 @@ def encode(channels: dict[str, Array], *, compress: bool = False) -> bytes:
 
 
 def to_half(image: Array) -> tuple[Array, int]:
-    """Return a half-precision copy of an image [H, W], and the number of pixels clipped to the largest half, 65504."""
+    """Return a half-precision copy of an image [..., H, W], and the values clipped to the largest half, 65504."""
     clipped = int(np.count_nonzero(image > HALF_MAX))
     return np.minimum(image, HALF_MAX).astype("<f2"), clipped
 
 
-def read_half(path: Path, height: int, width: int, crop: Crop | None = None) -> Array:
-    """Return float32 [h, w] of an uncompressed one-channel half image; only rows of the crop (y, x, h, w) are read.
+def read_half(path: Path, height: int, width: int, crop: Crop | None = None, *, colour: bool = False) -> Array:
+    """Return float32 [h, w] of an uncompressed half image of channel Y; only rows of the crop (y, x, h, w) are read.
+
+    With `colour` the channels are R, G, B and the result is [3, h, w].
 
     `ValueError` if the file has another size or layout: it is truncated, or was written by another program.
     """
     y, x, rows, columns = crop if crop is not None else (0, 0, height, width)
-    header = _half_header(height, width)
+    header = _half_header(height, width, colour)
+    channels = 3 if colour else 1
     start = len(header) + 8 * height
-    stride = 8 + 2 * width
+    stride = 8 + 2 * width * channels
     descriptor = os.open(path, os.O_RDONLY)
     try:
         size = os.fstat(descriptor).st_size
@@ -76,8 +79,9 @@ def read_half(path: Path, height: int, width: int, crop: Crop | None = None) -> 
     table = np.frombuffer(raw, dtype=np.uint8).reshape(rows, stride)
     if int.from_bytes(raw[:4], "little") != y:
         raise ValueError(f"{path}: row {y} is not at its place; the file is damaged, run `qsim check`")
-    pixels = table[:, 8 + 2 * x : 8 + 2 * (x + columns)]
-    return np.ascontiguousarray(pixels).view("<f2").astype(np.float32)
+    places = [8 + 2 * (width * channel + x) for channel in reversed(range(channels))]  # B, G, R follow each other
+    planes = [np.ascontiguousarray(table[:, at : at + 2 * columns]).view("<f2").astype(np.float32) for at in places]
+    return np.stack(planes) if colour else planes[0]
 
 
 def read(path: Path, size: tuple[int, int] | None = None) -> dict[str, Array]:
@@ -138,8 +142,8 @@ def _header(types: dict[str, np.dtype], height: int, width: int, compress: bool)
 
 
 @functools.lru_cache(maxsize=16)
-def _half_header(height: int, width: int) -> bytes:
-    return _header({"Y": np.dtype("<f2")}, height, width, compress=False)
+def _half_header(height: int, width: int, colour: bool) -> bytes:
+    return _header(dict.fromkeys("BGR" if colour else "Y", np.dtype("<f2")), height, width, compress=False)
 
 
 def _zip(raw: bytes) -> bytes:

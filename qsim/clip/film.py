@@ -18,7 +18,10 @@ NARROWEST = 256  # px, at which pictures are shown
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """Frames as pictures, uint8 [T, H, W]; a notebook shows them as an animation if this is the last line of a cell."""
+    """Frames as pictures, uint8 [T, H, W] or [T, H, W, 3].
+
+    A notebook shows them as an animation if this is the last line of a cell.
+    """
 
     pictures: Array
     caption: str
@@ -26,8 +29,9 @@ class Film:
 
     @classmethod
     def of(cls, name: str, frames: LazyArray, start: int, stop: int | None, fps: float) -> Film:
-        """Return frames [T, H, W] start ... stop - 1 with the tone curve of every picture; white is their own peak.
+        """Return frames start ... stop - 1 of [T, H, W] or [T, 3, H, W] with the tone curve of every picture.
 
+        White is their own peak.
         `ValueError` for frames that do not exist, and for a speed outside of 0 to 50 frames per second.
         """
         last = min(len(frames), start + MOST_FRAMES) if stop is None else stop
@@ -38,7 +42,7 @@ class Film:
         values = frames[start:last]
         white = colour.peak(values)
         caption = f"{name}, frames {start}..{last - 1} of {len(frames)}, white = {white:.4g}"
-        return cls(colour.tone(values, white), caption, fps)
+        return cls(colour.tone_picture(values, white, colours=values.ndim == 4), caption, fps)
 
     def __repr__(self) -> str:
         return f"<Film of {self.caption}; shown by notebooks, `qsim preview` writes files>"
@@ -48,12 +52,12 @@ class Film:
 
 
 def card(text: str, picture: Array) -> str:
-    """Return a picture, uint8 [H, W], with a text below as HTML."""
+    """Return a picture, uint8 [H, W] or [H, W, 3], with a text below as HTML."""
     return figure(picture[None], text.strip("<>"))
 
 
 def figure(pictures: Array, caption: str, fps: float = 12.0) -> str:
-    """Return pictures, uint8 [T, H, W], as an HTML figure: one as PNG, several as an animated GIF without loss."""
+    """Return pictures, uint8 [T, H, W] or [T, H, W, 3], as an HTML figure: a PNG, or a GIF without loss."""
     from PIL import Image
 
     images = [Image.fromarray(picture) for picture in pictures]
@@ -62,7 +66,7 @@ def figure(pictures: Array, caption: str, fps: float = 12.0) -> str:
     images[0].save(buffer, kind, **(animated if len(images) > 1 else {}))
     source = f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"
     text = html.escape(caption)
-    width = max(NARROWEST, pictures.shape[-1])
+    width = max(NARROWEST, pictures.shape[2])
     style = f"width:{width}px;max-width:100%;image-rendering:pixelated"
     return (
         f'<figure style="margin:0"><img src="{source}" alt="{text}" style="{style}">'

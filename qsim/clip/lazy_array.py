@@ -1,4 +1,4 @@
-"""Defines `LazyArray`, frames [T, H, W] on disk that are used as an array and read when they are."""
+"""Defines `LazyArray`, frames [T, H, W] or [T, 3, H, W] on disk that are used as an array and read when they are."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class LazyArray(NDArrayOperatorsMixin):
     """
 
     def __init__(
-        self, shape: tuple[int, int, int], dtype: np.dtype[Any], read: Callable[[int, int, Crop | None], Array]
+        self, shape: tuple[int, ...], dtype: np.dtype[Any], read: Callable[[int, int, Crop | None], Array]
     ) -> None:
         self.shape, self.dtype, self.ndim, self._read = shape, dtype, len(shape), read
 

@@ -80,3 +80,5 @@ def check_new(path: Path, meta: dict[str, Any]) -> None:
         )
     if (meta.get("camera") is None) != (meta["radiance_unit"] == RELATIVE):
         raise ValueError(f"{path}: a clip in {PHYSICAL} needs a camera, and a relative one has none")
+    if not structure.is_bands(meta.get("bands", [1.0, 1.0, 1.0])):
+        raise ValueError(f"{path}: bands must be three wavelengths in m, got {meta['bands']!r}; leave them out for one")

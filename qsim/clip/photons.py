@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clip_folder import ClipFolder
 from qsim.optics.diffraction import diffract
-from qsim.optics.radiometry import Crop, LightLevel, expected_photons, photons_per_lux, ppp_factor
+from qsim.optics.radiometry import Crop, LightLevel, band_photons, expected_photons, photons_per_lux, ppp_factor
 
 
 def light_level(clip: ClipFolder, *, ppp: float | None = None, lux: float | None = None) -> LightLevel:
@@ -45,12 +47,13 @@ def clip_photons(
 ) -> Array:
     """Return expected photons float64 [h, w] of frame t, or of its sharp instant, times a factor.
 
-    `crop` = (y, x, height, width) [px]; `diffraction` blurs by the lens's Airy pattern.
+    Of a colour clip they are [3, h, w], the photons of each band. `crop` = (y, x, height, width) [px]; `diffraction`
+    blurs by the lens's Airy pattern.
     """
     if diffraction and crop is not None:
         whole = clip_photons(clip, t, factor, sharp=sharp, diffraction=True)
         y, x, height, width = crop
-        return whole[y : y + height, x : x + width]
+        return whole[..., y : y + height, x : x + width]
     radiance = clip.sharp(t, crop) if sharp else clip.radiance(t, crop)
     camera = clip.camera
     if camera is None:
@@ -60,6 +63,11 @@ def clip_photons(
     y, x = clip.origin
     if crop is not None:
         y, x = y + crop[0], x + crop[1]
+    if clip.bands is not None:
+        if diffraction:
+            cameras = [replace(camera, wavelength=wavelength) for wavelength in clip.bands]
+            radiance = np.stack([diffract(*each) for each in zip(radiance, cameras, strict=True)])
+        return band_photons(radiance, camera, clip.exposure, clip.bands, origin=(y, x)) * factor
     if diffraction:
         radiance = diffract(radiance, camera)
     return expected_photons(radiance, camera, clip.exposure, origin=(y, x)) * factor

@@ -21,7 +21,8 @@ from qsim.clip.rows import Rows
 from qsim.clip.simulation import Draw, plane_of, stored
 from qsim.clip.stream import Stream, orientation, write_packed, writing
 from qsim.files import Progress, check_name
-from qsim.sensor import devices, packing
+from qsim.sensor import colour_filter, devices, packing
+from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
 from qsim.sensor.defects.defect_table import Defects
@@ -46,6 +47,7 @@ class Sensing:
     defects: str | Defects | None = None  # .toml with a table [defects]; None: that of the sensor's file, if it has one
     slices: int = 1  # clip frames in one exposure of a counting SPAD, for light that changes within it
     rows: Rows | None = None  # rows or columns at their own time; None: all at once
+    colour: str | ColourFilter | None = None  # rggb, quad, rgbw or .toml with a table [colour]; None: as for defects
 
     @property
     def stream_name(self) -> str:
@@ -58,6 +60,10 @@ class Sensing:
         bits = "" if self.depth is None else f"_{self.depth}bit"
         seed = f"_seed{self.seed}" if self.seed else ""
         sensor = Path(self.sensor_name).name.removesuffix(".toml")
+        if isinstance(self.colour, str):
+            sensor += f"-{Path(self.colour).name.removesuffix('.toml')}"
+        elif self.colour is not None:
+            sensor += f"-{files.sha256(files.to_json(self.colour.to_dict()))[:8]}"
         if isinstance(self.sensor, Sensor):
             sensor += f"-{files.sha256(files.to_json(self.sensor.to_dict()))[:8]}"
         return check_name(f"{sensor}{bits}_{light}{seed}")
@@ -76,12 +82,32 @@ class Sensing:
 def prepare(clip: ClipFolder, sensing: Sensing) -> Draw:
     """Return the draw of a clip with these settings; `ValueError` if they do not fit the clip."""
 
-    source = sensing.defects or (sensing.sensor_name if sensing.sensor_name.endswith(".toml") else None)
+    own = sensing.sensor_name if sensing.sensor_name.endswith(".toml") else None
+    source = sensing.defects or own
     return assemble(clip, sensing, defect_table.from_toml(source) if isinstance(source, str) else source)
+
+
+def filters_of(clip: ClipFolder, sensing: Sensing) -> ColourFilter | None:
+    """Return the colour filter array of a sensor that sees this clip, from the clip's first pixel on; None without one.
+
+    `ValueError` for a colour clip and a sensor without filters, and for the reverse.
+    """
+    found: ColourFilter | None = None
+    if sensing.colour is not None:
+        found = colour_filter.load(sensing.colour) if isinstance(sensing.colour, str) else sensing.colour
+    elif sensing.sensor_name.endswith(".toml"):
+        found = colour_filter.from_toml(sensing.sensor_name)
+    if (found is None) == (clip.bands is None):
+        return None if found is None else found.shifted(*clip.origin)
+    if found is None:
+        cure = "give some, as in --colour rggb, or a table [colour] in the sensor's file"
+        raise ValueError(f"{clip.name}: has three bands and {sensing.sensor_name} no colour filters; {cure}")
+    raise ValueError(f"{clip.name}: has one band, and the sensor has colour filters; render it with --bands rgb")
 
 
 def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sensor | None = None) -> Draw:
     """Return the draw of a clip as `prepare`, with given defects and, if given, the sensor `own`."""
+    filters = filters_of(clip, sensing)
     planes = sensing.slices
     if sensing.group:
         if sensing.depth is None:
@@ -103,7 +129,9 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
         sensor = PixelArray.of(found, sensor, *clip.shape[1:]).sensor
     _check_planes(sensor, sensing, clip)
     key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
-    return Draw(sensor, plane_of(sensor, planes), level, key, planes, sensing.diffraction, found, rows=sensing.rows)
+    plane = plane_of(sensor, planes)
+    rows = sensing.rows
+    return Draw(sensor, plane, level, key, planes, sensing.diffraction, found, rows=rows, colour=filters)
 
 
 def _check_rows(rows: Rows, clip: ClipFolder, planes: int, period: int) -> None:
@@ -155,6 +183,7 @@ def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> dict[str, Any]:
         }
         | ({} if draw.defects is None else {"defects": draw.defects.to_dict()})
         | ({} if draw.rows is None else {"rows": draw.rows.to_dict()})
+        | ({} if draw.colour is None else {"colour": draw.colour.to_dict()})
     )
 
 
@@ -173,7 +202,11 @@ def sense(
     """
     draw = prepare(clip, sensing)
     meta = describe(clip, sensing, draw)
-    line = light_line(draw.level, draw.planes * draw.sensor.efficiency)
+    efficiency = draw.sensor.efficiency
+    line = light_line(draw.level, draw.planes * efficiency)
+    if draw.colour is not None:
+        line = light_line(draw.level, draw.planes * draw.colour.mean_efficiency(efficiency))
+        line += f"; {_colours(draw.colour, efficiency)}"
     if draw.rows is not None:
         line += f"; {draw.rows}"
     if draw.defects is not None:
@@ -197,6 +230,17 @@ def sense(
         return _write(clip, sensing.stream_name, blocks, draw.sensor, meta), line
 
 
+def _colours(filters: ColourFilter, efficiency: float) -> str:
+    """Return mask and efficiencies as text: `mask RG GB, efficiency R 0.45, G 0.6, B 0.5`."""
+    each = []
+    for colour in dict.fromkeys("".join(filters.mask)):
+        values = filters.efficiency_of(colour, efficiency)
+        own = [value for value in values if value]
+        each.append(f"{colour} {own[0]:g}" if len(own) == 1 else f"{colour} {'/'.join(f'{v:g}' for v in values)}")
+    rows = filters.mask if len(filters.mask) <= 8 else (f"of {filters.tile[0]} x {filters.tile[1]} pixels",)
+    return f"mask {' '.join(rows)}, efficiency {', '.join(each)}"
+
+
 def _kept(clip: ClipFolder, sensing: Sensing, draw: Draw, meta: dict[str, Any]) -> Stream | None:
     """Return the stored stream if its settings are these, None if there is none; `FileExistsError` for others."""
     json_path = clip.path / "streams" / f"{sensing.stream_name}.json"
@@ -206,7 +250,7 @@ def _kept(clip: ClipFolder, sensing: Sensing, draw: Draw, meta: dict[str, Any]) 
         return None
     if (
         all(old.meta.get(key, value if key == "drawn_by" else None) == value for key, value in meta.items())
-        and all(old.meta.get(key) == meta.get(key) for key in ("defects", "rows"))
+        and all(old.meta.get(key) == meta.get(key) for key in ("defects", "rows", "colour"))
         and old.meta["sensor"] == draw.sensor.to_dict()
     ):
         return old

@@ -23,6 +23,7 @@ from qsim.files import Progress
 from qsim.keys import Key
 from qsim.optics.radiometry import Crop, LightLevel
 from qsim.sensor import packing
+from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table, event_simulation
 from qsim.sensor.defects.defect_table import Defects
@@ -50,6 +51,7 @@ class Draw:
     followed: Effects | None = None  # counting pixels: the error of the closed form, if photons are followed instead
     engine: str = "auto"
     rows: Rows | None = None  # rows or columns at their own time; None: all at once
+    colour: ColourFilter | None = None  # from the first pixel of the clip; None: the clip has one band
 
     @property
     def law(self) -> str:
@@ -77,8 +79,11 @@ class Draw:
         return np.stack([self._delayed(clip, t, whole) for t in range(start, stop)])
 
     def incident(self, clip: ClipFolder, t: int, crop: Crop | None = None) -> Array:
-        """Return the expected photons [h, w] of clip frame t in a crop = (y, x, height, width) [px]."""
-        return clip_photons(clip, t, self.level.factor, crop, diffraction=self.diffraction)
+        """Return the expected photons [h, w] of clip frame t in a crop = (y, x, height, width) [px], behind filters."""
+        photons = clip_photons(clip, t, self.level.factor, crop, diffraction=self.diffraction)
+        if self.colour is None:
+            return photons
+        return self.colour.mosaic(photons, self.sensor.efficiency, (0, 0) if crop is None else crop[:2])
 
     def _delayed(self, clip: ClipFolder, t: int, crop: Crop) -> Array:
         """Return the same, with every row at its own time."""
@@ -231,8 +236,9 @@ def stored(stream: Stream) -> Draw:
     found = defect_table.from_dict(meta["defects"], where) if "defects" in meta else None
     followed = event_simulation.Effects(**meta["dead_time_effects"]) if law == "events" else None
     diffraction = bool(meta.get("diffraction", False))
-    plane = plane_of(sensor, planes)
-    return Draw(sensor, plane, level, key, planes, diffraction, found, followed, rows=stream.rows)
+    plane, filters = plane_of(sensor, planes), stream.colour_filter
+    late = stream.rows
+    return Draw(sensor, plane, level, key, planes, diffraction, found, followed, rows=late, colour=filters)
 
 
 def plane_of(sensor: Sensor, planes: int) -> Sensor:

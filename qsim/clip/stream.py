@@ -30,6 +30,7 @@ from qsim.optics.radiometry import Crop, check_crop
 from qsim.sensor import packing
 
 if TYPE_CHECKING:
+    from qsim.sensor.colour_filter import ColourFilter
     from qsim.sensor.sensor import Sensor
 
 FORMAT_VERSION = 1
@@ -100,6 +101,14 @@ class Stream:
         return LazyArray(self.shape, np.dtype(packing.code_dtype(self.bits)), self._read)
 
     @cached_property
+    def colour_filter(self) -> ColourFilter | None:
+        """The colour filter array over the pixels, from the first one on; None: all pixels see one band."""
+        from qsim.sensor import colour_filter
+
+        where = f"{self.path.with_suffix('.json')}: colour"
+        return colour_filter.from_dict(self.meta["colour"], where) if "colour" in self.meta else None
+
+    @cached_property
     def clip(self) -> ClipFolder:
         """The clip that these codes were sensed from; `FileNotFoundError` if they do not lie in its folder."""
         folder = self.path.absolute().parents[1]
@@ -110,6 +119,7 @@ class Stream:
     def truth(self, start: int = 0, stop: int | None = None, *, at: str = "row") -> Array:
         """Return the photons that a perfect restorer would find, float64 [stop - start, H, W].
 
+        Those of a colour clip are [stop - start, 3, H, W], the photons of each band.
         They are expected photons per pixel and exposure at mid-exposure, without blur. A code of several clip frames
         has the light of its middle one times their number. Where rows have their own time, each is that of the clip
         frame nearest to its mid-exposure; `at="frame"` takes all from the middle of the frame, undistorted by motion.

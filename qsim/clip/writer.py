@@ -98,6 +98,8 @@ class ClipWriter:
         are pairs (white, rms error of radiance and truth clamped there), from which clip.json gets the error at its
         own white. `fireflies` counts the pixels with implausible samples.
 
+        Images of a clip with `bands` are [3, H, W].
+
         `saturated` [H, W] is True where the camera was saturated: the radiance there is a lower bound. It is stored if
         any pixel is saturated, together with pixels above the largest half, and counted in clip.json.
 
@@ -136,7 +138,12 @@ class ClipWriter:
             entry["fireflies"] = int(fireflies)
         if self._camera is not None:
             origin = tuple(self.meta.get("origin", (0, 0)))
-            photons = radiometry.expected_photons(stored, self._camera, self.meta["exposure"], origin=origin)
+            bands, exposure = self.meta.get("bands"), self.meta["exposure"]
+            photons = (
+                radiometry.expected_photons(stored, self._camera, exposure, origin=origin)
+                if bands is None
+                else radiometry.band_photons(stored, self._camera, exposure, bands, origin=origin)
+            )
             entry["mean_photons"] = float(photons.mean())
         self._frames[t] = entry
         self._complete = False
@@ -183,17 +190,19 @@ class ClipWriter:
     def _encode(self, t: int, folder: str, image: Array, contents: dict[str, bytes]) -> tuple[Array, int]:
         """Add the image [H, W] of frame t as EXR to `contents`; return it in half precision, and its clipped pixels."""
         _, height, width = self.meta["shape"]
-        if image.shape != (height, width):
-            raise ValueError(f"{self.path}: {folder} of frame {t} is {image.shape}, expected {(height, width)}")
+        expected = (height, width) if self.meta.get("bands") is None else (3, height, width)
+        if image.shape != expected:
+            raise ValueError(f"{self.path}: {folder} of frame {t} is {image.shape}, expected {expected}")
         bad = ~(np.isfinite(image) & (image >= 0))
         if bad.any():
-            y, x = (int(i) for i in np.argwhere(bad)[0])
+            y, x = (int(i) for i in np.argwhere(bad)[0][-2:])
             raise ValueError(
-                f"{self.path}: {folder} of frame {t} is {float(image[y, x])!r} at (y, x) = ({y}, {x}); "
+                f"{self.path}: {folder} of frame {t} is {float(image[bad][0])!r} at (y, x) = ({y}, {x}); "
                 "radiance must be finite and not negative"
             )
         half, clipped = exr.to_half(image)
-        contents[f"{folder}/{t:06d}.exr"] = exr.encode({"Y": half})
+        channels = {"Y": half} if half.ndim == 2 else dict(zip("RGB", half, strict=True))
+        contents[f"{folder}/{t:06d}.exr"] = exr.encode(channels)
         return half, clipped
 
     def _finish(self) -> None:
@@ -236,9 +245,9 @@ class ClipWriter:
         """Return the 99.9th percentile of the radiance, over at most 4 million evenly spaced samples."""
         frames, height, width = self.meta["shape"]
         step = max(1, math.isqrt(frames * height * width // 4_000_000))
-        samples = [
-            exr.read_half(self.part / "radiance" / f"{t:06d}.exr", height, width)[::step, ::step] for t in range(frames)
-        ]
+        colour = self.meta.get("bands") is not None
+        paths = [self.part / "radiance" / f"{t:06d}.exr" for t in range(frames)]
+        samples = [exr.read_half(path, height, width, colour=colour)[..., ::step, ::step] for path in paths]
         return bright_end(np.stack(samples))
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from numpy import ndarray as Array
 
 from qsim import files, structure
-from qsim.checks import check_shape
+from qsim.checks import check_video
 from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream
 from qsim.dataset.dataset import Dataset
@@ -57,7 +57,7 @@ def check(path: Path, progress: Progress | None = None) -> Verdict:
 
 @dataclass(frozen=True)
 class Restored:
-    """Restored video: NAME.npy, float32 photons [T, H, W], and NAME.json."""
+    """Restored video: NAME.npy, float32 photons [T, H, W] or [T, 3, H, W], and NAME.json."""
 
     path: Path  # NAME.npy
     meta: dict[str, Any]  # NAME.json
@@ -72,9 +72,9 @@ class Restored:
         return Restored(description.with_suffix(".npy"), meta)
 
     def frames(self) -> Array:
-        """Return the video, float32 photons [T, H, W], as a memory map; `ValueError` if it differs from its .json."""
+        """Return the video, float32 photons, as a memory map; `ValueError` if it differs from its .json."""
         array = load_array(self.path)
-        check_shape(self.path, array.shape)
+        check_video(self.path, array.shape)
         if array.dtype.kind != "f" or self.meta.get("shape", list(array.shape)) != list(array.shape):
             raise ValueError(f"{self.path}: {array.dtype} {list(array.shape)} is not what its .json describes")
         return array

@@ -23,6 +23,7 @@ class Settings:
     frame_rate: float  # Hz
     shutter: float = 0.0  # open share of a frame, 0..1
     psnr: float = 40.0  # wanted error of the radiance, dB below white
+    bands: str | None = None  # "rgb": in colour
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,10 @@ class Job:
         """
         described = dataclasses.asdict(self) | {"family": Path(self.family).stem}
         described["streams"] = [stream | {"sensor": Path(stream["sensor"]).name} for stream in described["streams"]]
+        if self.settings.bands is None:
+            del described["settings"]["bands"]
         for stream in described["streams"]:  # options that are off stay out: data sets of earlier versions resume
-            for key, off in (("defects", None), ("slices", 1), ("rows", None)):
+            for key, off in (("defects", None), ("slices", 1), ("rows", None), ("colour", None)):
                 if stream[key] == off:
                     del stream[key]
         own = [

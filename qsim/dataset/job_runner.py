@@ -74,9 +74,10 @@ def load_scene(job: Job) -> Scene:
 def load_traced(job: Job) -> tuple[Scene, dict[str, str]]:
     """Return the job's scene at its size, and the SHA-256 of each file of the user that it read."""
     from qsim.dataset import scene_files
+    from qsim.dataset.scene_rendering import in_bands
 
     scene, read = scene_files.load(job.family, seed=job.scene_seed, speed=job.speed)
-    return scene.resized(job.settings.height, job.settings.width), read
+    return in_bands(scene.resized(job.settings.height, job.settings.width), job.settings.bands), read
 
 
 def render_seed(job: Job) -> int:

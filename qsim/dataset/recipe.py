@@ -9,6 +9,7 @@
     frame_rate = 2000.0        # frames per second of the scene's time; default 2000
     shutter = 0.0              # open share of a frame; 0, the default: a sharp instant with the light of a full frame
     psnr = 40.0                # wanted error of the radiance, dB below white, clamped there; default 40
+    bands = "rgb"              # colour: bands R, G and B; default: one band
 
     [[scenes]]                 # one clip per family, seed and speed
     family = "fan"             # a family of scenes/; or a .py file, .xml file or folder beside the recipe ("./things")
@@ -17,7 +18,7 @@
     first = 0                  # first seed of a count; default 0
     speed = [1.0, 2.0]         # factor on all motions, a number or a list; default 1
     split = "train"            # train, the default, val or test
-    # frames, height, width, frame_rate, shutter, psnr: as above, for these scenes only
+    # frames, height, width, frame_rate, shutter, psnr, bands: as above, for these scenes only
 
     [[streams]]                # optional; one stream per bits and light level, in every clip
     sensor = "quiver-physical" # a name of `qsim doctor --devices`, or a .toml file beside the recipe
@@ -31,6 +32,7 @@
     diffraction = true         # blur by the lens's Airy pattern; default false
     row_delay = 2e-6           # seconds from one row, or column, to the next; default: all at once
     row_order = "down"         # order of rows: down, the default, or up; of columns: right or left
+    colour = "rggb"            # colour filters: rggb, quad, rgbw or a .toml with [colour]; default: the sensor's
 
 A (family, seed) belongs to one split at every speed, and a family of the test split to no other split.
 """
@@ -113,17 +115,17 @@ def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
     jobs: list[tuple[Job, Section]] = []
     for section in document.sections("scenes"):
         jobs += [(job, section) for job in _jobs(section, defaults, seed, tuple(streams))]
-    if not jobs:
-        raise ValueError(f"{path}: no [[scenes]], nothing to render")
-    _check_jobs(jobs)
+    _check_jobs(jobs, path)
     return Recipe(name, tuple(job for job, _ in jobs), document.table)
 
 
-def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
-    """`ValueError` for a clip that is listed twice, a split that shares a scene, or too few frames for a sum.
+def _check_jobs(jobs: list[tuple[Job, Section]], path: Path) -> None:
+    """`ValueError` without jobs, for a clip listed twice, a split that shares a scene, or too few frames for a sum.
 
     A scene may be in one split only, and a family of the test split in no other split.
     """
+    if not jobs:
+        raise ValueError(f"{path}: no [[scenes]], nothing to render")
     seen: set[str] = set()
     split_of: dict[str, str] = {}
     tested = {job.stem for job, _ in jobs if job.split == "test"}
@@ -140,23 +142,17 @@ def _check_jobs(jobs: list[tuple[Job, Section]]) -> None:
                 + (cure if same else "splits are by scene, at any speed: give one of them other seeds")
             )
         if job.split != "test" and job.stem in tested:
-            raise ValueError(
-                f"{section.where()}: family {job.stem} is in the splits '{job.split}' and 'test'; the test split holds "
-                "families that training never sees: move its scenes"
-            )
+            where = f"{section.where()}: family {job.stem} is in the splits '{job.split}' and 'test'"
+            raise ValueError(f"{where}; the test split holds families that training never sees: move its scenes")
         for sensing in job.streams:
             if sensing.rows is not None:
                 with section.naming():
                     at = job.settings
                     sensing.rows.check(at.height, at.width, at.frame_rate, sensing.slices, sensing.stream_name)
             if sensing.group and job.settings.frames < 2 ** (sensing.bits or 1) - 1:
-                raise ValueError(
-                    f"{section.where()}: {job.settings.frames} frames are too few for {sensing.stream_name}, whose "
-                    f"codes sum {2 ** (sensing.bits or 1) - 1} of them; render more frames, or use fewer bits"
-                )
-
-
-# ---- [[scenes]]
+                few = f"{job.settings.frames} frames are too few for {sensing.stream_name}, whose codes sum"
+                cure = f"{2 ** (sensing.bits or 1) - 1} of them; render more frames, or use fewer bits"
+                raise ValueError(f"{section.where()}: {few} {cure}")
 
 
 def _jobs(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[Sensing, ...]) -> list[Job]:
@@ -166,24 +162,19 @@ def _jobs(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[
     seeds = _seeds(section, given)
     speeds = given.get("speed", [1.0])
     if family.endswith(".xml") and speeds != [1.0]:
-        raise ValueError(
-            f"{section.where('speed')}: an .xml scene has no motion, so speed changes nothing; leave it out"
-        )
+        why = "an .xml scene has no motion, so speed changes nothing; leave it out"
+        raise ValueError(f"{section.where('speed')}: {why}")
     split = given.get("split", "train")
     settings = Settings(**(defaults | _settings(given)))
     if settings.height * settings.width > MAX_PIXELS:
-        raise ValueError(
-            f"{section.where()}: frames of {settings.height} x {settings.width} pixels; at most "
-            f"{MAX_PIXELS} pixels are rendered"
-        )
+        size = f"frames of {settings.height} x {settings.width} pixels"
+        raise ValueError(f"{section.where()}: {size}; at most {MAX_PIXELS} pixels are rendered")
     stem = Path(family).stem
     with section.naming("family", "clips are named after the scene: "):
         check_name(f"{stem}_{seeds[0]:04d}")
     if len(stem) > MAX_STEM:
-        raise ValueError(
-            f"{section.where('family')}: clips are named after the scene, whose name has {len(stem)} characters; "
-            f"at most {MAX_STEM}"
-        )
+        long = f"whose name has {len(stem)} characters; at most {MAX_STEM}"
+        raise ValueError(f"{section.where('family')}: clips are named after the scene, {long}")
     return [
         Job(
             name=f"{stem}_{s:04d}" + ("" if speed == 1 else f"_x{speed:g}"),
@@ -217,20 +208,16 @@ def _family(section: Section, family: str) -> str:
     from qsim.scenes import FAMILIES
 
     if family not in FAMILIES:
-        known = ", ".join(sorted(FAMILIES))
-        raise ValueError(
-            f"{section.where('family')}: unknown family {family!r}{checks.suggest(family, FAMILIES)}; "
-            f"there are: {known}"
-        )
+        meant = f"{family!r}{checks.suggest(family, FAMILIES)}; there are: {', '.join(sorted(FAMILIES))}"
+        raise ValueError(f"{section.where('family')}: unknown family {meant}")
     return family
 
 
 def _seeds(section: Section, given: dict[str, Any]) -> list[int]:
     """Return the seeds of a section, listed or counted."""
     if "seeds" in given:
-        for key in ("count", "first"):
-            if key in given:
-                raise ValueError(f"{section.where(key)}: give either seeds or count, not both")
+        if other := next((key for key in ("count", "first") if key in given), None):
+            raise ValueError(f"{section.where(other)}: give either seeds or count, not both")
         return list(given["seeds"])
     first, count = given.get("first", 0), given.get("count", 1)
     if first + count > 2**31:
@@ -239,33 +226,29 @@ def _seeds(section: Section, given: dict[str, Any]) -> list[int]:
     return list(range(first, first + count))
 
 
-# ---- [[streams]]
-
-
 def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
     """Return one stream per bits and light level, and add their names to `taken`; `ValueError` for a taken name."""
     given = section.values(STREAMS)
     unit, levels = _light(section, given)
     bits, name = given.get("bits", [None]), given.get("name")
-    group, diffraction = given.get("group", False), given.get("diffraction", False)
-    sensor = _sensor(section, given["sensor"], bits, group)
+    sensor = _sensor(section, given["sensor"], bits, given.get("group", False))
+    colour = _colour(section, given.get("colour"))
     with section.naming("row_order"):
         rows = Rows.of(given.get("row_delay"), given.get("row_order"))
-    if name is not None and len(bits) * len(levels) > 1:
-        raise ValueError(
-            f"{section.where('name')}: one name for {len(bits) * len(levels)} streams; give one bits and one light "
-            "level, or leave the name out"
-        )
+    if name is not None and (count := len(bits) * len(levels)) > 1:
+        cure = "give one bits and one light level, or leave the name out"
+        raise ValueError(f"{section.where('name')}: one name for {count} streams; {cure}")
     found = [
         Sensing(
             sensor,
             bits=b,
+            name=name,
+            colour=colour,
             ppp=level if unit == "ppp" else None,
             lux=level if unit == "lux" else None,
             seed=given.get("seed", seed),
-            name=name,
-            group=group,
-            diffraction=diffraction,
+            group=given.get("group", False),
+            diffraction=given.get("diffraction", False),
             rows=rows,
         )
         for b in bits
@@ -284,10 +267,8 @@ def _light(section: Section, given: dict[str, Any]) -> tuple[str, list[float | N
     """Return ("ppp" | "lux" | "absolute", levels); absolute light has the one level None."""
     units = [key for key in ("ppp", "lux", "absolute") if key in given]
     if len(units) != 1:
-        raise ValueError(
-            f"{section.where()}: give one light level, ppp = ..., lux = ... or absolute = true; "
-            f"{' and '.join(units) or 'none'} given"
-        )
+        wanted = "give one light level, ppp = ..., lux = ... or absolute = true"
+        raise ValueError(f"{section.where()}: {wanted}; {' and '.join(units) or 'none'} given")
     unit = units[0]
     if unit != "absolute":
         return unit, given[unit]
@@ -315,6 +296,18 @@ def _sensor(section: Section, sensor: str, bits: list[int | None], group: bool) 
     return sensor
 
 
+def _colour(section: Section, colour: str | None) -> str | None:
+    """Return the name or absolute file of colour filters; `ValueError` if they cannot be read."""
+    from qsim.sensor import colour_filter
+
+    if colour is None:
+        return None
+    found = str((section.text.path.parent / colour).resolve()) if colour.endswith(".toml") else colour
+    with section.naming("colour"):
+        colour_filter.load(found)
+    return found
+
+
 def _name(value: Any) -> str:
     """Return a text that can name a file."""
     return check_name(checks.text(value))
@@ -328,6 +321,7 @@ def _kept(value: Any) -> Any:
 _SETTINGS: dict[str, Check] = {
     "frames": checks.whole, "height": checks.whole, "width": checks.whole,
     "frame_rate": checks.frame_rate, "shutter": checks.shutter, "psnr": checks.psnr,
+    "bands": checks.bands,
 }  # fmt: skip
 HEAD: Table = {
     "name": _name,
@@ -347,4 +341,5 @@ STREAMS: Table = {
     "seed, if any": checks.seed, "name, if any": _name,
     "group, if any": checks.flag, "diffraction, if any": checks.flag,
     "row_delay, if any": checks.positive, "row_order, if any": checks.row_order,
+    "colour, if any": checks.text,
 }  # fmt: skip

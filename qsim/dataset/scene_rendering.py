@@ -9,6 +9,7 @@ import weakref
 from dataclasses import replace
 from pathlib import Path
 
+from qsim import checks
 from qsim.clip.clip import Clip
 from qsim.clip.writer import target_of
 from qsim.dataset import scene_files
@@ -17,6 +18,7 @@ from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.fidelity import choose_budget
 from qsim.scene import Scene
+from qsim.scenes.colours import coloured
 
 FRAMES = 21
 SIDE = 128  # px, height and width of a family or a file unless others are given
@@ -35,6 +37,7 @@ def render(
     shutter: float = 0.0,
     psnr: float = 40.0,
     ppp: float | None = None,
+    bands: str | None = None,
     budget: Budget | None = None,
     progress: Progress | None = None,
     force: bool = False,
@@ -46,6 +49,7 @@ def render(
     is that of the scene and of its samples; `speed` is a factor on all motions (default 1). `frame_rate` is in frames
     per second, `shutter` the open fraction of a frame, 0 for sharp frames. `psnr` [dB] is the requested error, `ppp`
     the brightest light that will be sensed [photons/pixel] (`choose_budget`); a `budget` decides both instead.
+    `bands="rgb"` gives a scene of one band colours (scenes/colours.py) and renders red, green and blue.
 
     `path` is the folder of the clip; an equal call resumes an interrupted one. Without it, the clip lies in a temporary
     folder that is deleted after the last use of the clip and its streams. `progress(done, frames)` is called after each
@@ -57,7 +61,7 @@ def render(
         raise ValueError("force= replaces the clip of a folder, and no path is given; leave it out")
     if path is not None:
         target_of(path, force)  # before the pilot
-    loaded, read = load_scene(scene, height, width, seed, speed)
+    loaded, read = load_scene(scene, height, width, seed, speed, bands)
     if budget is None:
         budget = choose_budget(
             loaded, frame_rate=frame_rate, shutter=shutter, frames=frames, psnr=psnr, ppp=ppp, seed=seed
@@ -80,15 +84,25 @@ def render(
 
 
 def load_scene(
-    scene: Scene | str | os.PathLike[str], height: int | None, width: int | None, seed: int, speed: float | None
+    scene: Scene | str | os.PathLike[str],
+    height: int | None,
+    width: int | None,
+    seed: int,
+    speed: float | None,
+    bands: str | None = None,
 ) -> tuple[Scene, dict[str, str]]:
     """Return a scene in its size, and the SHA-256 of each file that it reads; arguments and errors as of `render`."""
     if isinstance(scene, Scene):
         if speed is not None:
             raise ValueError(f"scene {scene.name}: a Scene has its motions already; leave speed= out")
-        return scene.resized(height or scene.camera.height, width or scene.camera.width), {}
+        return in_bands(scene.resized(height or scene.camera.height, width or scene.camera.width), bands), {}
     loaded, read = scene_files.load(os.fspath(scene), seed, 1.0 if speed is None else speed)
-    return loaded.resized(SIDE if height is None else height, SIDE if width is None else width), read
+    return in_bands(loaded.resized(SIDE if height is None else height, SIDE if width is None else width), bands), read
+
+
+def in_bands(scene: Scene, bands: str | None) -> Scene:
+    """Return a scene as it is, or for "rgb" in colour. `ValueError` for other bands, and for a scene with bands."""
+    return scene if bands is None else coloured(scene) if checks.bands(bands) else scene
 
 
 class TemporaryFolder:

@@ -179,7 +179,10 @@ def read_picture(path: Path, size: tuple[int, int]) -> Array:
 
 def _light(band: Stream, t: int) -> Array:
     """Return the sharp light of plane t in units of white, float64 [H, W]; dark counts do not enter."""
-    return band.truth(t, t + 1)[0] * (band.sensor.efficiency / DETECTIONS)
+    light = band.truth(t, t + 1)[0]
+    if band.colour_filter is not None:
+        light = band.colour_filter.mosaic(light, band.sensor.efficiency)
+    return light * (band.sensor.efficiency / DETECTIONS)
 
 
 def _write_cube(path: Path, bands: Sequence[Stream], first: int, planes: int) -> None:

@@ -87,7 +87,7 @@ def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool 
     if isinstance(source, Stream):
         about = f"codes of {source.bits} bits" + (", stretched to 0..255" if meta.get("stretched") else "")
     elif "white" in meta:
-        bits = 16 if wanted.kind == "png" else 8
+        bits = _depth(source, wanted)
         about = f"light in {bits} bits by {meta['transfer']}, white {meta['white']:.4g} {source.meta['radiance_unit']}"
     else:
         about = f"linear light in {source.meta['radiance_unit']}"
@@ -132,6 +132,8 @@ def _mp4(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]
         raise ValueError(
             f"{source.path}: a video holds 8 bits per pixel, this stream has {source.bits}; use png or zarr"
         )
+    if isinstance(source, Clip) and wanted.lossless:
+        source.require_one_band("lossless mp4")
     video.write_video(path, _grey(source, wanted, meta), wanted.playback, lossless=wanted.lossless)
 
 
@@ -150,6 +152,8 @@ def _exr(source: Clip | Stream, path: Path, _wanted: Export, _meta: dict[str, An
 
 
 def _zarr(source: Clip | Stream, path: Path, _wanted: Export, meta: dict[str, Any]) -> None:
+    if isinstance(source, Clip):
+        source.require_one_band("zarr")
     frames, height, width = source.shape
     rate = float(meta["frame_rate"])
     # quanta-spad-sim calls the length of the whole recording T_exp.
@@ -175,7 +179,7 @@ EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
 def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
     meta = source.meta
     keys = ("shape", "frame_rate", "exposure", "radiance_unit", "scene", "split", "bits", "code_model", "sensor",
-            "seed", "ppp_target", "ppp_factor", "width", "planes_per_code", "rows")  # fmt: skip
+            "seed", "ppp_target", "ppp_factor", "width", "planes_per_code", "rows", "bands", "colour")  # fmt: skip
     found = {key: meta[key] for key in keys if key in meta}
     found |= {"format_version": 1, "bit_order": "msb", "software": {"qsim": VERSION}}
     found["orientation"] = orientation(meta)
@@ -192,16 +196,22 @@ def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
 def _grey(source: Clip | Stream, wanted: Export, meta: dict[str, Any]) -> Iterator[Array]:
     if isinstance(source, Clip):
         for block in _light_blocks(source):
-            yield from images.grey(block, meta["white"], wanted.transfer, 16 if wanted.kind == "png" else 8)
+            levels = images.grey(block, meta["white"], wanted.transfer, _depth(source, wanted))
+            yield from levels if source.bands is None else np.ascontiguousarray(np.moveaxis(levels, -3, -1))
     else:
         for block in _code_blocks(source):
             yield from code_levels(block, source.bits)
 
 
+def _depth(clip: Clip, wanted: Export) -> int:
+    """Return the bits of a pixel and band: PNG holds 16 of grey, and 8 of each colour."""
+    return 16 if wanted.kind == "png" and clip.bands is None else 8
+
+
 def _white(clip: Clip) -> float:
     """Return the peak of up to 64 frames of a clip, of every second row and column, in its unit."""
     step = max(1, len(clip) // 32)
-    samples = np.stack([clip.radiance(t)[::2, ::2] for t in range(0, len(clip), step)])
+    samples = np.stack([clip.radiance(t)[..., ::2, ::2] for t in range(0, len(clip), step)])
     return peak(samples)
 
 

@@ -129,9 +129,11 @@ def write_png(folder: Path, images: Iterator[Array]) -> None:
 
 
 def write_exr(folder: Path, images: Iterator[Array]) -> None:
-    """Write one float32 EXR per image, with the channel Y, compressed without loss."""
+    """Write one float32 EXR per image, compressed without loss: channel Y of [H, W], or R, G, B of [3, H, W]."""
     for t, image in enumerate(images):
-        files.write_bytes(folder / f"{t:06d}.exr", exr.encode({"Y": image.astype("<f4")}, compress=True))
+        channels = {"Y": image} if image.ndim == 2 else dict(zip("RGB", image, strict=True))
+        single = {name: values.astype("<f4") for name, values in channels.items()}
+        files.write_bytes(folder / f"{t:06d}.exr", exr.encode(single, compress=True))
 
 
 def grey(light: Array, white: float, transfer: str, bits: int = 8) -> Array:

@@ -71,6 +71,7 @@ def windows(splits: Mapping[str, Sequence[Clip]], frames: int) -> dict[str, list
     found: dict[str, list[Window]] = {}
     for split, clips in splits.items():
         for clip in clips:
+            clip.require_one_band("a file of pairs")
             for stream in map(clip.stream, clip.streams):
                 for first in range(0, len(stream) - frames + 1, frames):
                     found.setdefault(split, []).append(Window(clip, stream, first, frames))

@@ -7,16 +7,27 @@ from qsim.files import lazy_names
 if TYPE_CHECKING:
     from qsim.optics.camera import Camera
     from qsim.optics.diffraction import diffract
-    from qsim.optics.radiometry import WHITE_PER_MEAN, LightLevel, expected_photons, photons_per_lux
+    from qsim.optics.radiometry import RGB, WHITE_PER_MEAN, LightLevel, band_photons, expected_photons, photons_per_lux
 
-__all__ = ["WHITE_PER_MEAN", "Camera", "LightLevel", "diffract", "expected_photons", "photons_per_lux"]
+__all__ = [
+    "RGB",
+    "WHITE_PER_MEAN",
+    "Camera",
+    "LightLevel",
+    "band_photons",
+    "diffract",
+    "expected_photons",
+    "photons_per_lux",
+]
 
 __getattr__ = lazy_names(
     __name__,
     {
         "Camera": "camera",
         "LightLevel": "radiometry",
+        "RGB": "radiometry",
         "WHITE_PER_MEAN": "radiometry",
+        "band_photons": "radiometry",
         "diffract": "diffraction",
         "expected_photons": "radiometry",
         "photons_per_lux": "radiometry",

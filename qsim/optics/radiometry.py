@@ -11,7 +11,8 @@ aberrations, stray light, and the working f-number of close objects.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy import ndarray as Array
@@ -22,6 +23,7 @@ PLANCK = 6.62607015e-34  # J s, exact (SI)
 LIGHT_SPEED = 299792458.0  # m s^-1, exact (SI)
 LUMINOUS_EFFICACY = 683.0  # lm W^-1 at 540 THz, exact (SI); K_m at 555 nm
 LUX_WAVELENGTH = 555e-9  # m, where V(lambda) = 1: every lux of this module is light of this wavelength
+RGB = (610e-9, 540e-9, 460e-9)  # m, of the bands R, G and B of colour clips unless a scene states others
 WHITE_PER_MEAN = 2.5  # white of a clip or stream over its mean light: the peak of scores and of requested errors
 
 Crop = tuple[int, int, int, int]  # y, x, height, width
@@ -79,6 +81,18 @@ def expected_photons(
             centre_y, centre_x = camera.height / 2 - origin[0], camera.width / 2 - origin[1]
         cosines = off_axis_cosines(height, width, centre_y, centre_x, camera.focal_length / camera.pixel_pitch)
     return to_photons(to_irradiance(radiance, camera, cosines), camera, exposure)
+
+
+def band_photons(
+    radiance: Array, camera: Camera, exposure: float, bands: Sequence[float], *, origin: tuple[int, int] | None = None
+) -> Array:
+    """Return expected photons per pixel, exposure and band, float64 [..., 3, H, W]; arguments as of `expected_photons`.
+
+    `radiance` [..., 3, H, W] holds the power of each band, whose light has one wavelength of `bands` [m].
+    """
+    cameras = [replace(camera, wavelength=wavelength) for wavelength in bands]
+    each = [expected_photons(radiance[..., i, :, :], c, exposure, origin=origin) for i, c in enumerate(cameras)]
+    return np.stack(each, axis=-3)
 
 
 @functools.lru_cache(maxsize=16)

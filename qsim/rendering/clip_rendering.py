@@ -56,6 +56,8 @@ def render_clip(
             name: {**asdict(flicker), "kind": type(flicker).__name__, "strength": strengths[name].tolist()}
             for name, flicker in scene.flickers.items()
         }
+    if scene.bands is not None:
+        meta["bands"] = list(scene.bands)
     with ClipWriter(path, meta | (extra or {}), force=force) as writer:
         for t in range(frames):
             if not writer.has(t):

@@ -41,19 +41,25 @@ def available() -> bool:
 
 
 def denoised(noisy: Array, albedo: Array, normal: Array) -> Array:
-    """Return a grey picture [H, W] without its pixel noise, float32; albedo and normals are treated as free of noise.
+    """Return a picture [H, W] or [3, H, W] without its pixel noise, float32.
 
-    Albedo is [H, W] in 0..1, `normal` is [H, W, 3].
+    Albedo has the shape of the picture, in 0..1, `normal` is [H, W, 3]; both are treated as free of noise.
     `ValueError` if the denoiser is not installed.
     """
     if not available():
         raise ValueError("denoising requires Open Image Denoise, which is missing: pip install pyoidn")
     import pyoidn
 
-    colour = np.repeat(noisy[..., None].astype(np.float32), 3, axis=2)
-    grey = np.repeat(np.clip(albedo, 0, 1)[..., None].astype(np.float32), 3, axis=2)
-    cleaned = pyoidn.denoise(colour, albedo=grey, normal=normal.astype(np.float32), hdr=True, clean_aux=True)
-    return np.maximum(cleaned[..., 0], 0)
+    colour, matt = _three(noisy), _three(np.clip(albedo, 0, 1))
+    cleaned = pyoidn.denoise(colour, albedo=matt, normal=normal.astype(np.float32), hdr=True, clean_aux=True)
+    return np.maximum(cleaned[..., 0] if noisy.ndim == 2 else np.moveaxis(cleaned, -1, 0), 0)
+
+
+def _three(picture: Array) -> Array:
+    """Return a picture [H, W] or [3, H, W] as colours, float32 [H, W, 3]."""
+    if picture.ndim == 2:
+        return np.repeat(picture[..., None].astype(np.float32), 3, axis=2)
+    return np.ascontiguousarray(np.moveaxis(picture, 0, -1), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +84,7 @@ class Mixture:
 
 
 def cleaned_mean(halves: Array, albedo: Array, normal: Array, white: float) -> Mixture:
-    """Return the mean of two independent halves [2, H, W], denoised where that lowers the error.
+    """Return the mean of two independent halves, [2, H, W] or [2, 3, H, W], denoised where that lowers the error.
 
     Its mean is that of the raw halves, unless the shift exceeds KEPT times its error at white.
     """
@@ -102,7 +108,11 @@ def mixture(halves: Array, cleaned: Array) -> Mixture:
 
     z, y = halves[0] - halves[1], cleaned[0] - cleaned[1]
     gain, apart = z * (z - y) / 4, (cleaned.mean(axis=0) - halves.mean(axis=0)) ** 2
-    share = np.clip(uniform_filter(gain, AROUND) / np.maximum(uniform_filter(apart, AROUND), 1e-300), 0, 1)
+    share = np.clip(
+        uniform_filter(gain, AROUND, axes=(-2, -1)) / np.maximum(uniform_filter(apart, AROUND, axes=(-2, -1)), 1e-300),
+        0,
+        1,
+    )
     mixed = share * cleaned + (1 - share) * halves
     squares = z**2 / 4 - 2 * share * gain + share**2 * apart
     return Mixture(share, mixed.mean(axis=0), mixed.min(axis=0), squares, z**2 / 4)

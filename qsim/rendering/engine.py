@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
-from qsim.backend import Engine, choose, limit_threads
+from qsim.backend import INSTALL_HINT, Engine, choose, limit_threads
 
 
 def select(prefer: str | None = None) -> Engine:
@@ -18,6 +19,13 @@ def select(prefer: str | None = None) -> Engine:
     engine = choose(prefer)
     activate(engine)
     return engine
+
+
+def in_colour(engine: Engine) -> Engine:
+    """Return the same engine with Mitsuba's variant of three bands; `ValueError` for the scalar engine."""
+    if engine.backend == "scalar":
+        raise ValueError(f"the scalar engine renders one band only ({engine.reason}); {INSTALL_HINT}")
+    return replace(engine, variant=engine.variant.replace("_mono", "_rgb"))
 
 
 def activate(engine: Engine) -> None:

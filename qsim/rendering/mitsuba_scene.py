@@ -21,6 +21,7 @@ from qsim.rendering import mitsuba_xml
 from qsim.rendering.engine import errors_only, opaque
 from qsim.rendering.mitsuba_mesh import NORMALS, POSITIONS, mesh_shape, vertex_normals
 from qsim.scene import Body, Part, Scene, lights, materials
+from qsim.scene.bands import Colour, largest, numbers
 from qsim.scene.environment import environment_map, sky_map, sun_direction, sun_radiance
 
 LARGE = 20_000  # triangles from which a rigid body becomes an instance
@@ -223,8 +224,8 @@ def _scene_dict(mi: Any, scene: Scene, smooth_weight: float) -> dict[str, Any]:
 def _mesh(mi: Any, body: Body, name: str, vertices: Array) -> Any:
     properties = mi.Properties()
     if isinstance(body.material, materials.Glow):
-        properties["emitter"] = mi.load_dict({"type": "area", "radiance": _grey(mi, body.material.radiance)})
-        properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": _grey(mi, 0.0)})
+        properties["emitter"] = mi.load_dict({"type": "area", "radiance": _value(mi, body.material.radiance)})
+        properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": _value(mi, 0.0)})
     else:
         properties["bsdf"] = mi.load_dict(_bsdf(mi, body.material))
     return mesh_shape(mi, body.mesh, name, vertices, properties)
@@ -233,21 +234,21 @@ def _mesh(mi: Any, body: Body, name: str, vertices: Array) -> Any:
 def _light(mi: Any, scene: Scene, light: lights.Light, name: str, smooth_weight: float) -> dict[str, Any]:
     match light:
         case lights.Constant(radiance):
-            return {name: {"type": "constant", "radiance": _grey(mi, radiance), "sampling_weight": smooth_weight}}
+            return {name: {"type": "constant", "radiance": _value(mi, radiance), "sampling_weight": smooth_weight}}
         case lights.SunSky():
             sky = {"type": "envmap", "bitmap": _rgb_bitmap(mi, sky_map(light)), "sampling_weight": smooth_weight}
-            return {name: sky} | ({"sun": _sun(mi, scene, light)} if light.sun_irradiance > 0 else {})
+            return {name: sky} | ({"sun": _sun(mi, scene, light)} if largest(light.sun_irradiance) > 0 else {})
         case lights.EnvironmentImage(rotation=rotation):
             turn = mi.ScalarTransform4f().rotate([0, 1, 0], math.degrees(rotation))
-            bitmap = _rgb_bitmap(mi, environment_map(light))
+            bitmap = _rgb_bitmap(mi, environment_map(light, colours=scene.bands is not None))
             return {name: {"type": "envmap", "bitmap": bitmap, "to_world": turn}}
         case lights.AreaLamp(radiance=radiance):
             place = mi.ScalarTransform4f(lamp_pose(light).tolist())
-            black = {"type": "diffuse", "reflectance": _grey(mi, 0.0)}
-            emitter = {"type": "area", "radiance": _grey(mi, radiance)}
+            black = {"type": "diffuse", "reflectance": _value(mi, 0.0)}
+            emitter = {"type": "area", "radiance": _value(mi, radiance)}
             return {name: {"type": "rectangle", "to_world": place, "bsdf": black, "emitter": emitter}}
         case lights.PointLight(position, intensity):
-            return {name: {"type": "point", "position": list(position), "intensity": _grey(mi, intensity)}}
+            return {name: {"type": "point", "position": list(position), "intensity": _value(mi, intensity)}}
     raise ValueError(f"{light!r} is not one of the lights of qsim.scene")
 
 
@@ -262,7 +263,7 @@ def _sun(mi: Any, scene: Scene, light: lights.SunSky) -> dict[str, Any]:
     up = [0, 1, 0] if abs(towards[1]) < 0.99 else [1, 0, 0]
     place = mi.ScalarTransform4f().look_at(origin=origin, target=centre.tolist(), up=up)
     place = place @ mi.ScalarTransform4f().scale(distance * math.tan(light.sun_radius))
-    emitter = {"type": "area", "radiance": _grey(mi, sun_radiance(light))}
+    emitter = {"type": "area", "radiance": _value(mi, sun_radiance(light))}
     return {"type": "disk", "to_world": place, "emitter": emitter}
 
 
@@ -274,7 +275,7 @@ def _bsdf(mi: Any, material: materials.Material) -> dict[str, Any]:
             inner = {"type": "roughplastic", "diffuse_reflectance": _reflectance(mi, reflectance), "alpha": roughness}
             inner |= {"int_ior": ior, "distribution": "ggx", "nonlinear": True}
         case materials.Conductor(eta, k, roughness, relief):
-            inner = {"type": "conductor", "eta": _grey(mi, eta), "k": _grey(mi, k)}
+            inner = {"type": "conductor", "eta": _value(mi, eta), "k": _value(mi, k)}
             if roughness > 0:
                 inner |= {"type": "roughconductor", "alpha": roughness, "distribution": "ggx"}
         case materials.Dielectric(ior, roughness, thin):
@@ -285,26 +286,31 @@ def _bsdf(mi: Any, material: materials.Material) -> dict[str, Any]:
             raise ValueError(f"{material!r} is not one of the materials of qsim.scene")
     match relief:
         case materials.Bump(texture, height):
-            inner = {"type": "bumpmap", "relief": _texture(mi, texture), "scale": height, "inner": inner}
+            inner = {
+                "type": "bumpmap",
+                "relief": _texture(mi, texture, texture.pixels()[..., None]),
+                "scale": height,
+                "inner": inner,
+            }
         case materials.NormalMap(image, repeat):
             picture = _bitmap(mi, np.asarray(image, np.float32), repeat)
             inner = {"type": "normalmap", "normalmap": picture, "inner": inner}
     return {"type": "twosided", "inner": inner}
 
 
-def _reflectance(mi: Any, value: float | materials.Texture) -> Any:
+def _reflectance(mi: Any, value: float | Colour | materials.Texture) -> Any:
     if isinstance(value, materials.Texture):
-        pixels = value.pixels()
+        pixels = value.colours() if mi.variant().endswith("_ad_rgb") else value.pixels()[..., None]
         if pixels.min() < 0 or pixels.max() > 1:
             raise ValueError(f"Texture of a reflectance: 0..1 expected, found {pixels.min()}..{pixels.max()}")
-        return _texture(mi, value)
-    if not 0 <= value <= 1:
+        return _texture(mi, value, pixels)
+    if not 0 <= min(numbers(value), default=-1) <= max(numbers(value)) <= 1:
         raise ValueError(f"reflectance: 0..1 expected, got {value!r}")
-    return _grey(mi, value)
+    return _value(mi, value)
 
 
-def _texture(mi: Any, texture: materials.Texture) -> dict[str, Any]:
-    return _bitmap(mi, texture.pixels()[..., None], texture.repeat, "nearest" if texture.nearest else "bilinear")
+def _texture(mi: Any, texture: materials.Texture, pixels: Array) -> dict[str, Any]:
+    return _bitmap(mi, pixels, texture.repeat, "nearest" if texture.nearest else "bilinear")
 
 
 def _bitmap(mi: Any, pixels: Array, repeat: tuple[float, float], kind: str = "bilinear") -> dict[str, Any]:
@@ -314,12 +320,15 @@ def _bitmap(mi: Any, pixels: Array, repeat: tuple[float, float], kind: str = "bi
     return {"type": "bitmap", "data": data, "raw": True, "filter_type": kind, "to_uv": scale}
 
 
-def _rgb_bitmap(mi: Any, grey: Array) -> Any:
-    return mi.Bitmap(np.repeat(grey[..., None], 3, axis=2))
+def _rgb_bitmap(mi: Any, picture: Array) -> Any:
+    """Return Mitsuba's bitmap of a picture [H, W] or [H, W, 3]."""
+    return mi.Bitmap(np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture)
 
 
-def _grey(mi: Any, value: float) -> Any:
-    """Return a value equal for all colours: the RGB variant then computes the same as the mono variant."""
+def _value(mi: Any, value: float | Colour) -> Any:
+    """Return a colour, or a value equal for all bands: the RGB variant then computes the same as the mono variant."""
+    if isinstance(value, tuple):
+        return {"type": "rgb", "value": list(value)}
     if mi.variant().startswith("scalar_rgb"):
         return {"type": "rgb", "value": [value] * 3} if 0 <= value <= 1 else {"type": "spectrum", "value": float(value)}
     return float(value)

@@ -8,6 +8,7 @@ the shutter is 0 and in the sharp frame: motion is frozen there, light is not. E
 filter). Samples come in two independent halves A and B: radiance is their mean, and its noise the rms of (A - B) / 2.
 The stated error also contains blur and omitted bounces. The sampler's seeds are words of qsim.keys: frames can be
 rendered alone and in any order.
+Mitsuba's RGB variant renders scenes of three bands: their images are [3, H, W].
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from qsim.optics.radiometry import Crop, check_crop
 from qsim.rendering import ground_truth
 from qsim.rendering.budget import Budget, blur_left, grid_samples, instants, light_windows
 from qsim.rendering.denoiser import cleaned_mean
-from qsim.rendering.engine import activate, select
+from qsim.rendering.engine import activate, in_colour, select
 from qsim.rendering.mitsuba_scene import Stage, film_pass
 from qsim.rendering.ray_casting import RayCaster, pixel_rays
 from qsim.scene import Scene
@@ -43,11 +44,11 @@ FIREFLY = 10.0  # a pixel counts as a firefly where halves differ by this many r
 class Frame:
     """One exposure with its error and ground truth."""
 
-    radiance: Array  # float32 [H, W], W m^-2 sr^-1, mean over the exposure
+    radiance: Array  # float32 [H, W], or [3, H, W] of a colour scene, W m^-2 sr^-1, mean over the exposure
     error: float  # rms error of `radiance`, W m^-2 sr^-1: noise and blur as measured, and the budget's `left_out`
     errors_at: tuple[tuple[float, float], ...]  # (white, the same clamped there), rising; empty without light
     fireflies: int  # pixels whose halves differ by more than FIREFLY rms, or are not finite (and made 0)
-    sharp: Array | None = None  # float32 [H, W], the instant at mid-exposure, only for an open shutter
+    sharp: Array | None = None  # as radiance, the instant at mid-exposure, only for an open shutter
     flow: Array | None = None  # float32 [2, H, W], px, mid-exposure of t to that of t + 1
     flow_back: Array | None = None  # float32 [2, H, W], px, mid-exposure of t to that of t - 1
     valid: Array | None = None  # bool [H, W], the point is seen in frame t + 1
@@ -89,7 +90,8 @@ class Renderer:
         self.budget = budget or Budget()
         self.crop, self.thinned = _checked_crop(scene, crop), thinned
         self.shape = -(-self.crop[2] // thinned), -(-self.crop[3] // thinned)
-        self.engine = engine or select()
+        self.engine = (engine or select()) if scene.bands is None else in_colour(engine or select())
+        self._film = (*(() if scene.bands is None else (3,)), math.prod(self.shape))
         activate(self.engine)
         import mitsuba as mi
 
@@ -129,6 +131,7 @@ class Renderer:
         """Return a renderer of the same loaded scene for every pixel of another crop."""
         other = copy.copy(self)
         other.crop, other.thinned, other.shape = _checked_crop(self.scene, crop), 1, crop[2:]
+        other._film = (*self._film[:-1], math.prod(other.shape))
         return other
 
     def instants(self, t: int) -> list[float]:
@@ -137,7 +140,10 @@ class Renderer:
         return instants(self.time(t), self.shutter / self.frame_rate, count)
 
     def halves(self, instants: list[float], budget: Budget, key: Key) -> Array:
-        """Return independent estimates A, B of the mean radiance over the instants [s], float64 [2, H, W]."""
+        """Return independent estimates A, B of the mean radiance over the instants [s], float64 [2, H, W].
+
+        Those of a colour scene are [2, 3, H, W]; so are the radiances of all other functions here.
+        """
         return self.means(instants, budget, key)[0]
 
     def means(self, instants: list[float], budget: Budget, key: Key) -> Array:
@@ -148,7 +154,7 @@ class Renderer:
         n, samples = len(instants), budget.grid(len(instants))
         parts = self.parts(2 * samples)
         seeds = words(key, (2, n * len(parts))).reshape(2, n, len(parts))
-        sums = np.zeros((3, 2, math.prod(self.shape)))
+        sums = np.zeros((3, 2, *self._film))
         windows = light_windows(instants, self.exposure)
         for i, instant in enumerate(instants):
             drawn = np.empty_like(sums[0])
@@ -163,7 +169,7 @@ class Renderer:
                 drawn[:] = np.reshape(thin, drawn.shape)
             else:
                 for part, seed in zip(parts, seeds[0, i], strict=True):
-                    drawn[:, part.start : part.stop] = self._pass(pose, int(seed), samples, budget.bounces, part)
+                    drawn[..., part.start : part.stop] = self._pass(pose, int(seed), samples, budget.bounces, part)
             sums[0] += drawn / n
             if i % 3 == 1:
                 sums[1] += drawn * 3 / n
@@ -171,7 +177,7 @@ class Renderer:
                 sums[2] = drawn
         if self.scene.flickers and n > 3:  # the middle one has the light of its part: as if it had that of all
             sums[2] = sums[2] * (sums[0].mean() / sums[2].mean()) if sums[2].any() else sums[1]
-        return sums.reshape(3, 2, *self.shape)
+        return sums.reshape(*sums.shape[:-1], *self.shape)
 
     def parts(self, samples: int) -> list[range]:
         """Return the window's pixels, row by row, in ranges of at most about MAX_SAMPLES_IN_FLIGHT samples.
@@ -210,7 +216,7 @@ class Renderer:
         return radiance.astype(np.float32), whole, frame_errors(error_at, white), fireflies
 
     def surfaces(self, instants: list[float], key: Key) -> tuple[Array, Array]:
-        """Return albedo [H, W] (1 for mirrors and misses) and normals [H, W, 3] of first surfaces, for the denoiser."""
+        """Return albedo [H, W] or [3, H, W] (1 for mirrors and misses) and normals [H, W, 3], for the denoiser."""
         if self.engine.backend == "scalar":
             raise ValueError("the scalar engine cannot denoise; leave Budget.denoise off or install LLVM")
         import drjit as dr
@@ -219,7 +225,8 @@ class Renderer:
         samples = grid_samples(max(2, SURFACE_SAMPLES // len(instants)))
         parts = self.parts(samples)
         seeds = words(key, (len(instants), len(parts)), redraw=1)
-        sums = np.zeros((4, math.prod(self.shape)))
+        colours = 1 if self.scene.bands is None else 3
+        sums = np.zeros((colours + 3, math.prod(self.shape)))
         for instant, row in zip(instants, seeds, strict=True):
             self.stage.place(instant)
             for part, seed in zip(parts, row, strict=True):
@@ -229,17 +236,18 @@ class Renderer:
                 bsdf = found.bsdf(ray)
                 seen = found.is_valid()
                 matt = seen & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
-                albedo = dr.select(matt, bsdf.eval_diffuse_reflectance(found)[0], 1)
+                reflectance = bsdf.eval_diffuse_reflectance(found)
+                albedo = [dr.select(matt, reflectance[i], 1) for i in range(colours)]
                 normal = dr.select(seen, found.sh_frame.n, 0)
-                values = (albedo, normal.x, normal.y, normal.z)
+                values = (*albedo, normal.x, normal.y, normal.z)
                 dr.eval(*values)  # together: separate sums would each trace the rays again
                 means = [np.array(dr.block_sum(value, samples)) / samples for value in values]
                 sums[:, part.start : part.stop] += means
-        albedo, *normals = sums.reshape(4, *self.shape) / len(instants)
-        return albedo, np.stack(normals, axis=-1)
+        means_of = sums.reshape(-1, *self.shape) / len(instants)
+        return means_of[0] if colours == 1 else means_of[:3], np.stack(list(means_of[colours:]), axis=-1)
 
     def _pass(self, pose: Array, seed: int, samples: int, bounces: int, part: range) -> Array:
-        """Return two independent estimates of the radiance of these pixels, float64 [2, N], `samples` per pixel each.
+        """Return two independent estimates of these pixels' radiance, float64 [2, (3,) N], `samples` per pixel each.
 
         One launch computes both: a launch costs as much as several samples of a small frame.
         """
@@ -249,8 +257,10 @@ class Renderer:
         sampler, position = self._film_positions(seed, samples, part, 2)
         ray = self._camera_ray(pose, position, sampler)
         radiance, _, _ = integrator.sample(self.stage.loaded, sampler, ray)
-        mean = dr.block_sum(radiance[0], samples) / samples
-        return np.array(mean, np.float64).reshape(2, len(part))
+        means = [dr.block_sum(radiance[band], samples) / samples for band in range(len(radiance))]
+        dr.eval(*means)  # together: each alone would trace the rays again
+        found = np.array([np.array(mean, np.float64).reshape(2, len(part)) for mean in means])
+        return found[0] if self.scene.bands is None else found.swapaxes(0, 1)
 
     def _film_positions(self, seed: int, samples: int, part: range, times: int = 1) -> tuple[Any, Any]:
         """Return a seeded sampler and film positions [px], uniform in each pixel; its samples are neighbours in memory.

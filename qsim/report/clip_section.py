@@ -24,6 +24,7 @@ from qsim.report.panels import (
     legend,
     light_name,
     stream_panels,
+    toned,
     truth_panels,
     truth_photons,
     truth_stack,
@@ -34,6 +35,7 @@ from qsim.sensor.defects.pixel_array import PixelArray
 if TYPE_CHECKING:
     from markupsafe import Markup
 
+BANDS = ("tab:red", "tab:green", "tab:blue")  # curves of the bands R, G and B
 _PIXELS = 4096  # largest number of a frame in the expected histogram of codes
 
 
@@ -70,7 +72,7 @@ def clip_section(clip: Clip) -> page.Section:
 
 def _players(clip: Clip, frames: range, truth: Light) -> list[Markup]:
     """Return the light with all streams of one code per frame, and a player of each other stream."""
-    panels = [page.Panel(light_name(clip), fit(colour.tone(truth, colour.peak(truth))))]
+    panels = [page.Panel(light_name(clip), fit(toned(truth, colour.peak(truth))))]
     others = []
     for name in clip.streams:
         stream = clip.stream(name)
@@ -99,7 +101,7 @@ def light_line(clip: Clip) -> str:
     photons = "" if clip.camera is None else f", {clip.mean_photons:.4g} photons per pixel and exposure"
     return (
         f"{frames} frames of {height} × {width} at {clip.frame_rate:g} fps, exposure {clip.exposure * 1e6:.4g} µs, "
-        f"mean radiance {clip.mean_radiance:.4g} {unit}{photons}"
+        f"mean radiance {clip.mean_radiance:.4g} {unit}{photons}{in_bands(clip)}"
     )
 
 
@@ -113,6 +115,14 @@ def flicker_line(clip: Clip) -> str:
     return f"Flicker, exact means over the exposures: {'; '.join(each)}"
 
 
+def in_bands(clip: Clip) -> str:
+    """Return ", in each of the bands R 610, G 540, B 460 nm" of a colour clip, else ""."""
+    if clip.bands is None:
+        return ""
+    named = (f"{name} {wavelength * 1e9:g}" for name, wavelength in zip("RGB", clip.bands, strict=True))
+    return f", mean of the bands {', '.join(named)} nm"
+
+
 def stream_line(stream: Stream) -> str:
     """Return sensor and light level of a stream as one line."""
     meta = stream.meta
@@ -120,7 +130,9 @@ def stream_line(stream: Stream) -> str:
     light = "" if ppp is None else f": {ppp:.4g} photons per pixel (the clip's light × {stream.photons_factor:.4g})"
     light += "" if lux is None else f", equal to {lux:.4g} lx at 555 nm"
     light += "" if ppp is None else f", {ppp * stream.sensor.efficiency:.3g} e⁻ per pixel"
-    return f"Stream {stream.name}{light}; {stream.bits} bit, {stream.sensor}{rows_words(stream)}{defects_words(stream)}"
+    filters = "" if stream.colour_filter is None else f"; colour filters {' '.join(stream.colour_filter.mask)}"
+    words = f"{filters}{rows_words(stream)}{defects_words(stream)}"
+    return f"Stream {stream.name}{light}; {stream.bits} bit, {stream.sensor}{words}"
 
 
 def rows_words(stream: Stream) -> str:
@@ -234,7 +246,10 @@ def expected_codes(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64
     height, width = clip.shape[1:]
     step = max(1, int(np.sqrt(height * width / _PIXELS)))
     blurred = bool(stream.meta.get("diffraction", False))
-    light = [clip_photons(clip, int(t), stream.photons_factor, diffraction=blurred)[::step, ::step] for t in chosen]
+    light = [clip_photons(clip, int(t), stream.photons_factor, diffraction=blurred) for t in chosen]
+    if stream.colour_filter is not None:
+        light = [stream.colour_filter.mosaic(each, stream.sensor.efficiency) for each in light]
+    light = [each[::step, ::step] for each in light]
     sensor, maps = stream.sensor, fixed_pattern.PERFECT
     if "defects" in stream.meta:
         found = defect_table.from_dict(stream.meta["defects"], f"{stream.name}: defects")
@@ -257,9 +272,13 @@ def _motion_histogram(speed: NDArray[np.floating]) -> Markup:
 def _light_histogram(truth: NDArray[np.floating], clip: Clip) -> Markup:
     unit = "relative" if clip.camera is None else "W m⁻² sr⁻¹"
     axes, save = page.axes(f"radiance [{unit}]", "share of pixels")
-    axes.hist(truth.ravel(), bins=64, weights=np.full(truth.size, 1 / truth.size), color="tab:blue")
+    bands = [truth] if clip.bands is None else list(np.moveaxis(truth, 1, 0))
+    for values, paint in zip(bands, ["tab:blue"] if clip.bands is None else BANDS, strict=True):
+        weights = np.full(values.size, 1 / values.size)
+        shown = {"color": paint} if clip.bands is None else {"color": paint, "histtype": "step"}
+        axes.hist(values.ravel(), bins=64, weights=weights, **shown)
     axes.set_yscale("log")
-    return save(f"light of the {light_name(clip)}, all pixels")
+    return save(f"light of the {light_name(clip)}, all pixels" + ("" if clip.bands is None else ", each band"))
 
 
 def _strengths(clip: Clip) -> Markup:

@@ -51,6 +51,7 @@ class StoredLight:
 
 def stored_light(clip: Clip) -> StoredLight:
     """Return the light of the first frames of a clip; `ValueError` for a black clip."""
+    clip.require_one_band("the page of sliders")
     factor = light_level(clip, ppp=1.0).factor
     _, height, width = clip.shape
     step = ceil(sqrt(height * width / PIXELS))

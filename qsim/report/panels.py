@@ -19,6 +19,7 @@ from qsim.clip.motion_statistics import largest_motion
 from qsim.clip.photons import clip_photons
 from qsim.clip.stream import Stream
 from qsim.report import html as page
+from qsim.sensor.demosaicing import demosaic
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -28,7 +29,7 @@ WIDTH = 512  # columns of a panel; wider pictures are reduced by a whole factor
 _BITS = 8  # of codes that are shown as light; deeper ones are shown as they are
 _GOLDEN = 0.6180339887  # turns between the hues of successive bodies
 
-Light = NDArray[np.floating]  # [T, H, W] photons
+Light = NDArray[np.floating]  # [T, H, W] photons; of colour clips [T, 3, H, W]
 
 
 def chosen_frames(count: int) -> range:
@@ -42,13 +43,18 @@ def fit(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return frames[:, ::step, ::step]
 
 
+def toned(light: Light, white: float) -> NDArray[np.uint8]:
+    """Return light as pictures on the tone curve of all panels: [T, H, W], or [T, H, W, 3] of [T, 3, H, W]."""
+    return colour.tone_picture(light, white, colours=light.ndim == 4)
+
+
 def light_name(clip: Clip) -> str:
     """Return the name of a clip's light: "truth" if rendered; an imported video has the errors of its camera."""
     return "recorded video" if clip.meta["radiance_unit"] == RELATIVE else "truth"
 
 
 def truth_stack(clip: Clip, frames: range) -> NDArray[np.float32]:
-    """Return the sharp radiance of these frames, float32 [T, H, W], in the unit of the clip."""
+    """Return the sharp radiance of these frames, float32 [T, H, W] or [T, 3, H, W], in the unit of the clip."""
     return np.stack([clip.sharp(t) for t in frames])
 
 
@@ -86,12 +92,17 @@ def stream_panels(stream: Stream, frames: range, truth: Light | None = None) -> 
             page.Panel(names[0], fit(shown_codes)),
             page.Panel(names[1], fit(colour.tone(averages, colour.peak(averages)))),
         ]
-    light, average = one(shown), many(averages)
-    white = colour.peak(average if truth is None else truth)
+    light, average, filters = one(shown), many(averages), stream.colour_filter
+    mosaic, picture = truth, average
+    if filters is not None:
+        names = names[0], f"{names[1]}, demosaiced"
+        picture = demosaic(average, filters, stream.sensor.efficiency)
+        mosaic = None if truth is None else filters.mosaic(truth, stream.sensor.efficiency)
+    white = colour.peak(picture if truth is None else truth)
     brightest = float(one(np.array([2.0**stream.bits - 1]))[0])
     return [
-        page.Panel(names[0], fit(colour.tone(light, min(white, brightest))), score(light, truth)),
-        page.Panel(names[1], fit(colour.tone(average, white)), score(average, truth)),
+        page.Panel(names[0], fit(colour.tone(light, min(white, brightest))), score(light, mosaic)),
+        page.Panel(names[1], fit(toned(picture, white)), score(picture, truth)),
     ]
 
 
@@ -114,7 +125,8 @@ def error_panel(name: str, light: Light, truth: Light) -> page.Panel:
     """Return light - truth as colours: red is too bright, blue too dark, full colour at a fifth of white."""
     full = white_in(truth) / 5
     caption = f"error of {name}: red too bright, blue too dark, full colour at {full:.3g} photons"
-    return page.Panel(caption, fit(colour.error_colours(light - truth, full)))
+    error = light - truth
+    return page.Panel(caption, fit(colour.error_colours(error if error.ndim == 3 else error.mean(axis=1), full)))
 
 
 def truth_panels(clip: Clip, frames: range) -> tuple[list[page.Panel], float, Light]:
@@ -122,11 +134,12 @@ def truth_panels(clip: Clip, frames: range) -> tuple[list[page.Panel], float, Li
 
     Also the motion of the full colour [px/frame], and the lengths of all motions [px/frame], [T, H, W].
     """
-    grey = colour.tone(truth := truth_stack(clip, frames), colour.peak(truth))
+    truth = truth_stack(clip, frames)
+    grey = colour.tone(truth if clip.bands is None else truth.mean(axis=1), white := colour.peak(truth))
     flow = np.stack([clip.flow(t) for t in frames])
     speed = np.hypot(flow[:, 0], flow[:, 1])
     largest = max(largest_motion(speed), 0.5)
-    panels = [page.Panel(light_name(clip), fit(grey))]
+    panels = [page.Panel(light_name(clip), fit(toned(truth, white)))]
     panels.append(
         page.Panel(f"flow, full colour at {largest:.1f} px/frame", fit(_over(grey, colour.flow_colours(flow, largest))))
     )

@@ -36,6 +36,7 @@ from qsim.report.panels import (
     light_name,
     score,
     stream_panels,
+    toned,
     truth_panels,
     truth_photons,
 )
@@ -190,12 +191,12 @@ def restored_section(path: Path) -> page.Section:
     if clip is not None and stream is not None:
         truth = truth_photons(clip, stream, frames)
     white = colour.peak(shown if truth is None else truth)
-    own = page.Panel(f"restored by {name}", fit(colour.tone(shown, white)), score(shown, truth))
+    own = page.Panel(f"restored by {name}", fit(toned(shown, white)), score(shown, truth))
     wheel, lines = None, [f"{meta['description']}; {page.seconds_text(meta['seconds_per_frame'])} per frame."]
     if clip is None or stream is None or truth is None:
         panels = [own]
     else:
-        light = page.Panel(light_name(clip), fit(colour.tone(truth, white)))
+        light = page.Panel(light_name(clip), fit(toned(truth, white)))
         panels = [light, own, error_panel(name, shown, truth), *stream_panels(stream, frames, truth)]
         lines.append(
             f"PSNR of {len(frames)} frames against the {light_name(clip)}, both clamped at its white. Codes are shown "

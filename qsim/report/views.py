@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsim import colour, files
-from qsim.checks import check_shape
+from qsim.checks import check_shape, check_video
 from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import largest_motion
 from qsim.clip.stream import Stream
 from qsim.files import load_array
 from qsim.formats.recording import checked_codes
 from qsim.sensor import packing
+from qsim.sensor.demosaicing import demosaic
 
 Picture = NDArray[np.uint8]  # [H, W, 3]
 SAMPLES = 16  # frames on which the scales of a clip are measured
@@ -100,14 +101,16 @@ def _stream_source(stream: Stream) -> Source:
     def read(start: int, stop: int) -> NDArray[Any]:
         return stream.codes(start, stop)
 
-    views = _code_views(stream.name, stream.bits, len(stream), read)
+    filters, own = stream.colour_filter, stream.sensor.efficiency
+    bands = None if filters is None else lambda mosaic: demosaic(mosaic, filters, own)
+    views = _code_views(stream.name, stream.bits, len(stream), read, bands)
     return Source(stream.name, len(stream), float(stream.meta["frame_rate"]), views)
 
 
 def _array_source(path: Path, bits: int | None, width: int | None, described: dict[str, Any]) -> Source:
     array = load_array(path)
     array = array[None] if array.ndim == 2 else array
-    length = check_shape(path, array.shape)[0]
+    length = (check_shape if described.get("colour") is None else check_video)(path, array.shape)[0]
     rate = described.get("frame_rate")
     if array.dtype.kind == "f":
         _refuse(path, "an array of values, not of codes", bits=bits, width=width)
@@ -156,26 +159,39 @@ def _grey(levels: NDArray[np.uint8]) -> Picture:
 def _light_view(kind: str, title: str, unit: str, length: int, read: Callable[[int], NDArray[Any]]) -> View:
     white = colour.peak(np.stack([read(t) for t in _samples(length)]))
     declared = f"{title}: white = {white:.4g} {unit}, curve {CURVE}"
-    return View(kind, declared, lambda t: _grey(colour.tone(read(t), white)), None, {"white": white})
+    return View(kind, declared, lambda t: _toned(read(t), white), None, {"white": white})
 
 
-def _code_views(name: str, bits: int, length: int, read: Callable[[int, int], NDArray[Any]]) -> dict[str, View]:
+def _toned(light: NDArray[Any], white: float) -> Picture:
+    """Return light, [H, W] or the bands [3, H, W], as a picture."""
+    return _grey(colour.tone(light, white)) if light.ndim == 2 else colour.tone_picture(light, white, colours=True)
+
+
+def _code_views(
+    name: str,
+    bits: int,
+    length: int,
+    read: Callable[[int, int], NDArray[Any]],
+    bands: Callable[[NDArray[Any]], NDArray[Any]] | None = None,
+) -> dict[str, View]:
+    """Return the views of codes; `bands` makes the mean of a mosaic [H, W] a picture of three bands [3, H, W]."""
     top = 2**bits - 1
     reach = colour.AVERAGE // 2
 
     def average(t: int) -> NDArray[np.float64]:
         mean: NDArray[np.float64] = read(max(t - reach, 0), min(t + reach + 1, length)).mean(axis=0) / top
-        return mean
+        return mean if bands is None else bands(mean)
 
     def code(t: int) -> Picture:
         return _grey(colour.code_levels(read(t, t + 1)[0], bits))
 
     white = colour.peak(np.stack([average(t) for t in _samples(length)]))
     shown = f"codes of {name}: 0 black, {top} white, no curve"
-    mean = f"naive mean of {colour.AVERAGE} frames: white = {white * top:.4g} codes, curve {CURVE}"
+    after = "" if bands is None else ", demosaiced"
+    mean = f"naive mean of {colour.AVERAGE} frames{after}: white = {white * top:.4g} codes, curve {CURVE}"
     return {
         "codes": View("codes", shown, code, None, {"bits": bits}),
-        "average": View("average", mean, lambda t: _grey(colour.tone(average(t), white)), None, {"white": white}),
+        "average": View("average", mean, lambda t: _toned(average(t), white), None, {"white": white}),
     }
 
 

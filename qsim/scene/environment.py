@@ -15,6 +15,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.colour import luminance
+from qsim.scene.bands import Colour, three
 from qsim.scene.image_files import read_hdr
 from qsim.scene.lights import EnvironmentImage, SunSky
 
@@ -33,13 +34,19 @@ def sun_direction(light: SunSky) -> Array:
     )
 
 
-def sun_radiance(light: SunSky) -> float:
-    """Return the radiance of the disk [W m^-2 sr^-1]: irradiance / (pi sin^2 radius)."""
-    return light.sun_irradiance / (math.pi * math.sin(light.sun_radius) ** 2)
+def sun_radiance(light: SunSky) -> float | Colour:
+    """Return the disk's radiance [W m^-2 sr^-1], a colour if the sun has one: irradiance / (pi sin^2 radius)."""
+    area = math.pi * math.sin(light.sun_radius) ** 2
+    if isinstance(light.sun_irradiance, tuple):
+        red, green, blue = light.sun_irradiance
+        return red / area, green / area, blue / area
+    return light.sun_irradiance / area
 
 
 def sky_map(light: SunSky, rows: int = SKY_ROWS) -> Array:
     """Return radiance of sky (above) and ground (below) without the sun's disk: float32 [rows, 2 rows], rows even.
+
+    It is [rows, 2 rows, 3] if sun or sky has a colour.
 
     Relative sky radiance = phi(Z) f(chi), phi(Z) = 1 + a exp(b / cos Z), f(chi) = 1 + c (exp(d chi) - exp(d pi/2))
     + e cos^2 chi, with zenith distance Z and angle chi from the sun, scaled to the requested irradiance.
@@ -54,21 +61,31 @@ def sky_map(light: SunSky, rows: int = SKY_ROWS) -> Array:
     above = up > 0
     solid_angle = np.sin(zenith) * (np.pi / rows) ** 2
     irradiance = float(np.sum((sky * up * solid_angle)[above]))
-    sunlit = light.sun_irradiance * max(math.sin(light.elevation), 0.0)
-    ground = light.ground_reflectance * (sunlit + light.sky_irradiance) / np.pi
-    return np.where(above, sky * light.sky_irradiance / irradiance, ground).astype(np.float32)
+
+    def seen(sun: float, blue: float) -> Array:
+        """Return the map of one band from the irradiance of sun and sky."""
+        sunlit = sun * max(math.sin(light.elevation), 0.0)
+        ground = light.ground_reflectance * (sunlit + blue) / np.pi
+        return np.where(above, sky * blue / irradiance, ground).astype(np.float32)
+
+    sun, blue = light.sun_irradiance, light.sky_irradiance
+    if isinstance(sun, tuple) or isinstance(blue, tuple):
+        return np.stack([seen(*each) for each in zip(three(sun), three(blue), strict=True)], axis=-1)
+    return seen(sun, blue)
 
 
-def environment_map(light: EnvironmentImage) -> Array:
+def environment_map(light: EnvironmentImage, *, colours: bool = False) -> Array:
     """Return the picture in W m^-2 sr^-1, float32 [H, W]; `ValueError` or `FileNotFoundError` with the file's name.
+
+    With `colours` a picture in colour stays one, [H, W, 3].
 
     Slightly negative radiance, down to -RINGING times the mean, is an artefact of compressed files and becomes 0.
     """
     picture = read_hdr(Path(light.image)) if isinstance(light.image, str) else np.asarray(light.image, np.float32)
     if picture.ndim == 3:
-        picture = luminance(picture[..., :3])
+        picture = picture[..., :3] if colours and picture.shape[2] >= 3 else luminance(picture[..., :3])
     where = light.image if isinstance(light.image, str) else "EnvironmentImage.image"
-    if picture.ndim != 2 or picture.size == 0 or not np.isfinite(picture).all():
+    if picture.ndim not in (2, 3) or picture.size == 0 or not np.isfinite(picture).all():
         raise ValueError(f"{where}: expected finite radiance [H, W] of at least 0, found shape {picture.shape}")
     if picture.min() < -RINGING * abs(picture.mean()):
         raise ValueError(f"{where}: expected finite radiance [H, W] of at least 0, found {picture.min():.3g}")

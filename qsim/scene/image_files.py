@@ -12,6 +12,15 @@ from qsim.colour import luminance, to_linear
 
 def read_grey(path: Path) -> np.ndarray:
     """Return an image file as linear luminance, float32 [H, W]; `FileNotFoundError` or `ValueError`."""
+    return luminance(_linear(path).astype(np.float64)).astype(np.float32)
+
+
+def read_colour(path: Path) -> np.ndarray:
+    """Return an image file as linear colours R, G, B, float32 [H, W, 3]; `FileNotFoundError` or `ValueError`."""
+    return _linear(path).astype(np.float32)
+
+
+def _linear(path: Path) -> np.ndarray:
     from PIL import Image
 
     if not path.is_file():
@@ -21,7 +30,7 @@ def read_grey(path: Path) -> np.ndarray:
             colour = np.asarray(opened.convert("RGB"), np.float32) / 255
     except OSError as error:
         raise ValueError(f"texture {path}: not a readable image ({error})") from error
-    return luminance(to_linear(colour, "srgb", 1.0).astype(np.float64)).astype(np.float32)
+    return to_linear(colour, "srgb", 1.0)
 
 
 def read_hdr(path: Path) -> Array:

@@ -1,4 +1,4 @@
-"""Lights and environments, as frozen records."""
+"""Lights and environments, as frozen records. A radiance, an intensity or an irradiance is a number or a colour."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from qsim.optics.camera import Pose, Vector
+from qsim.scene.bands import Colour, largest, numbers
 from qsim.scene.flicker import Flicker, check_flicker
 
 
@@ -15,7 +16,7 @@ from qsim.scene.flicker import Flicker, check_flicker
 class Constant:
     """Surroundings with the same radiance in every direction."""
 
-    radiance: float  # W m^-2 sr^-1
+    radiance: float | Colour  # W m^-2 sr^-1
     flicker: Flicker | None = None  # None: steady
 
     def __post_init__(self) -> None:
@@ -32,8 +33,8 @@ class SunSky:
 
     elevation: float = 0.8  # rad above the horizon
     azimuth: float = 0.6  # rad
-    sun_irradiance: float = 1.0  # W m^-2 on a plane facing the sun
-    sky_irradiance: float = 0.25  # W m^-2 on the ground, sky alone
+    sun_irradiance: float | Colour = 1.0  # W m^-2 on a plane facing the sun
+    sky_irradiance: float | Colour = 0.25  # W m^-2 on the ground, sky alone
     ground_reflectance: float = 0.2  # 0..1
     sun_radius: float = 4.65e-3  # rad; the real sun's mean angular radius
 
@@ -49,7 +50,7 @@ class AreaLamp:
     target: Vector  # m
     width: float  # m
     height: float  # m
-    radiance: float  # W m^-2 sr^-1
+    radiance: float | Colour  # W m^-2 sr^-1
     motion: Pose | None = None  # in world axes: pose(t) is applied after the placement
     flicker: Flicker | None = None  # None: steady
 
@@ -63,7 +64,7 @@ class PointLight:
     """An isotropic point light: irradiance at distance r is intensity / r^2."""
 
     position: Vector  # m
-    intensity: float  # W sr^-1
+    intensity: float | Colour  # W sr^-1
     motion: Pose | None = None
     flicker: Flicker | None = None  # None: steady
 
@@ -74,7 +75,9 @@ class PointLight:
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentImage:
-    """An equirectangular picture of radiance around the scene: array [H, W] or a file (.hdr, .exr), zenith on top.
+    """An equirectangular picture of radiance around the scene, zenith on top: array [H, W] or [H, W, 3], or .hdr, .exr.
+
+    A scene of one band takes the luminance of colours.
 
     The first and last column meet at azimuth `rotation` + pi; the middle column is azimuth `rotation` (0 is +z).
     """
@@ -96,11 +99,11 @@ def strength(light: Light) -> float:
     """Return a measure of a light's power that is 0 only if it emits nothing."""
     match light:
         case Constant(radiance) | AreaLamp(radiance=radiance):
-            return radiance
+            return largest(radiance)
         case SunSky(sun_irradiance=sun, sky_irradiance=sky):
-            return sun + sky
+            return largest(sun) + largest(sky)
         case PointLight(intensity=intensity):
-            return intensity
+            return largest(intensity)
         case EnvironmentImage(image, scale):
             return scale * (1.0 if isinstance(image, str) else float(np.max(image)))
     raise ValueError(f"{light!r} is not one of the lights of qsim.scene")
@@ -109,5 +112,5 @@ def strength(light: Light) -> float:
 def check_light(light: Any, *names: str) -> None:
     for name in names:
         found = getattr(light, name)
-        if not (isinstance(found, int | float | np.number) and np.isfinite(found) and found >= 0):
+        if min(numbers(found), default=-1) < 0:
             raise ValueError(f"{type(light).__name__}.{name}: a finite number from 0 up is expected, got {found!r}")

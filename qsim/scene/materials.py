@@ -1,4 +1,4 @@
-"""Surfaces: materials with textures and relief, as frozen records."""
+"""Surfaces: materials with textures and relief, as frozen records. A reflectance is a number, a colour or a texture."""
 
 from __future__ import annotations
 
@@ -8,16 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from qsim.checks import require_finite
+from qsim.scene.bands import Colour, numbers
 from qsim.scene.flicker import Flicker, check_flicker
-from qsim.scene.image_files import read_grey
+from qsim.scene.image_files import read_colour, read_grey
 from qsim.scene.lights import check_light
 
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """A picture on a surface: an array [H, W] of linear values, or an image file (sRGB, grey or colour)."""
+    """A picture on a surface: an array of linear values, or an image file (sRGB, grey or colour).
 
-    image: np.ndarray | str  # float [H, W] linear, or a path; a path's colours become linear luminance (Rec. 709)
+    In a scene of one band, the colours of a file become linear luminance (Rec. 709), and arrays are [H, W].
+    """
+
+    image: np.ndarray | str  # float [H, W] linear, in scenes of three bands also [H, W, 3]; or a path
     repeat: tuple[float, float] = (1.0, 1.0)  # repetitions of the picture in u, v = 0..1
     nearest: bool = False  # nearest texel instead of bilinear
     source: str | None = None  # name of the photograph that the picture shows; data sets record it
@@ -33,6 +37,18 @@ class Texture:
         if pixels.ndim != 2 or pixels.size == 0:
             raise ValueError(f"{where}: expected a picture [H, W], got shape {pixels.shape}")
         require_finite(where, pixels)
+        return pixels
+
+    def colours(self) -> np.ndarray:
+        """Return linear values of the bands, float32 [H, W, 3], equal in a grey picture; errors as of `pixels`."""
+        if isinstance(self.image, str | Path):
+            return read_colour(Path(self.image))
+        pixels = np.asarray(self.image, np.float32)
+        if pixels.ndim != 3:
+            return np.repeat(self.pixels()[..., None], 3, axis=2)
+        if pixels.shape[2] != 3 or pixels.size == 0:
+            raise ValueError(f"Texture.image: expected a picture [H, W] or [H, W, 3], got shape {pixels.shape}")
+        require_finite("Texture.image", pixels)
         return pixels
 
 
@@ -59,7 +75,7 @@ Relief = Bump | NormalMap | None
 class Diffuse:
     """A two-sided Lambertian surface."""
 
-    reflectance: float | Texture = 0.5  # 0..1
+    reflectance: float | Colour | Texture = 0.5  # 0..1
     relief: Relief = None
 
     def __post_init__(self) -> None:
@@ -70,7 +86,7 @@ class Diffuse:
 class RoughPlastic:
     """A diffuse base under a rough dielectric coat (GGX)."""
 
-    reflectance: float | Texture = 0.5  # of the base, 0..1
+    reflectance: float | Colour | Texture = 0.5  # of the base, 0..1
     roughness: float = 0.1  # GGX alpha
     ior: float = 1.49
     relief: Relief = None
@@ -87,8 +103,8 @@ class Conductor:
     (rounded handbook values at 550 nm).
     """
 
-    eta: float = 0.96
-    k: float = 6.70
+    eta: float | Colour = 0.96
+    k: float | Colour = 6.70
     roughness: float = 0.1  # GGX alpha
     relief: Relief = None
 
@@ -106,7 +122,7 @@ class Dielectric:
 class Glow:
     """A surface whose outer side emits the same radiance in all directions; it reflects nothing."""
 
-    radiance: float  # W m^-2 sr^-1
+    radiance: float | Colour  # W m^-2 sr^-1
     flicker: Flicker | None = None  # None: steady
 
     def __post_init__(self) -> None:
@@ -119,5 +135,6 @@ Material = Diffuse | RoughPlastic | Conductor | Dielectric | Glow
 
 def _check_reflectance(material: Diffuse | RoughPlastic) -> None:
     found, kind = material.reflectance, type(material).__name__
-    if not isinstance(found, Texture) and not (isinstance(found, int | float | np.number) and 0 <= found <= 1):
+    values = list(numbers(found))
+    if not isinstance(found, Texture) and not (values and min(values) >= 0 and max(values) <= 1):
         raise ValueError(f"{kind}.reflectance: a number from 0 to 1 or a Texture is expected, got {found!r}")

@@ -5,7 +5,8 @@
 Lengths are metres, angles radians, y points up. Bodies are described in their own coordinates; `motion.pose(t)` (4x4,
 body to world) places them at time t [s]. The camera looks from `origin` to `target`; its optional motion acts in the
 camera's own axes (x right, y down, z forward): a spin about y is a pan, a translation along z a dolly. Radiance belongs
-to one band around `Camera.wavelength`. Left out: polarisation, spectra, participating media, lens aberrations.
+to one band around `Camera.wavelength`, or to the three `bands` of a colour scene. Left out: polarisation, spectra,
+participating media, lens aberrations.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 
 from qsim.checks import require_finite
 from qsim.optics.camera import Camera, Pose
+from qsim.scene.bands import Bands, check_bands, has_colour, largest
 from qsim.scene.flicker import Flicker
 from qsim.scene.lights import ENVIRONMENTS, Light, strength
 from qsim.scene.materials import Diffuse, Glow, Material
@@ -121,12 +123,19 @@ class Scene:
     speed: float = 1.0  # the factor that the family applied to its motions
     file: MitsubaFile | None = None  # instead of lights and bodies; see `qsim.read_mitsuba`
     parts: tuple[Part, ...] = ()  # the file's shapes, in its order
+    bands: Bands | None = None  # m, wavelengths of R, G and B; None: one band, at the camera's wavelength
 
     def __post_init__(self) -> None:
         for name in ("lights", "bodies"):
             if not isinstance(getattr(self, name), list | tuple):
                 kind = type(getattr(self, name)).__name__
                 raise ValueError(f"Scene.{name}: a tuple is expected, got a {kind}; one alone is ({kind}(...),)")
+        check_bands(self.bands, f"scene {self.name}")
+        coloured = [
+            type(each).__name__ for each in (*self.lights, *(b.material for b in self.bodies)) if has_colour(each)
+        ]
+        if self.bands is None and coloured:
+            raise ValueError(f"scene {self.name}: a {coloured[0]} has a colour; give the scene bands=qsim.RGB")
         environments = [light for light in self.lights if isinstance(light, ENVIRONMENTS)]
         if len(environments) > 1:
             kinds = " and ".join(type(light).__name__ for light in environments)
@@ -162,7 +171,7 @@ class Scene:
         if self.file is not None:
             return True  # checked when the file was read
         return any(strength(light) > 0 for light in self.lights) or any(
-            isinstance(body.material, Glow) and body.material.radiance > 0 for body in self.bodies
+            isinstance(body.material, Glow) and largest(body.material.radiance) > 0 for body in self.bodies
         )
 
     @functools.cached_property

@@ -16,6 +16,7 @@ from qsim.dataset.generation import Options, generate
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe import Recipe
 from qsim.optics.camera import Camera
+from qsim.optics.radiometry import RGB
 
 ClipMaker = Callable[..., Clip]
 
@@ -50,18 +51,25 @@ def write_clip(
 ) -> Clip:
     stack = sliding_pattern(frames, height, width, seed) if radiance is None else radiance
     described = {
-        "shape": list(stack.shape),
+        "shape": [len(stack), *stack.shape[-2:]],
         "frame_rate": 2000.0,
         "exposure": 5e-4,
         "radiance_unit": RELATIVE if relative else PHYSICAL,
-        "camera": None if relative else asdict(Camera(8e-3, 2.8, 1.1e-6, *stack.shape[1:])),
+        "camera": None if relative else asdict(Camera(8e-3, 2.8, 1.1e-6, *stack.shape[-2:])),
         "scene": {"family": "sliding", "seed": seed},
     }
     with ClipWriter(path, described | meta) as writer:
         for t, frame in enumerate(stack):
-            truth = None if flow is None else {"flow": flow, "flow_back": -flow, "valid": np.ones(frame.shape, bool)}
+            seen = np.ones(stack.shape[-2:], bool)
+            truth = None if flow is None else {"flow": flow, "flow_back": -flow, "valid": seen}
             writer.add(t, frame, sharp=frame * 1.1 if sharp else None, truth=truth, error=error)
     return Clip.open(path)
+
+
+def colour_clip(path: Path, frames: int = 3, height: int = 7, width: int = 9, **meta: object) -> Clip:
+    """A clip of three bands whose patterns differ, of odd size unless others are given."""
+    bands = [sliding_pattern(frames, height, width, seed) * light for seed, light in ((1, 0.6), (2, 1.0), (3, 1.7))]
+    return write_clip(path, radiance=np.stack(bands, axis=1), bands=list(RGB), **meta)
 
 
 def write_dataset(path: Path, splits: dict[str, int], **options: object) -> Path:

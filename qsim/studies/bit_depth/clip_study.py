@@ -93,6 +93,7 @@ class Exposed:
 
 def check_clip(clip: Clip, settings: StudySettings) -> None:
     """Raise `ValueError` if the clip is too slow or too short for the settings."""
+    clip.require_one_band("a study of bit depth")
     if clip.frame_rate < SLOWEST:
         raise ValueError(
             f"{clip.path}: {clip.frame_rate:g} fps; this study needs a clip of at least {SLOWEST:g} fps, as in "

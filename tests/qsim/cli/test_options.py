@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from clips import write_clip
+from clips import colour_clip, write_clip
 from option_rows import (
     Acts,
     Refused,
@@ -107,6 +107,10 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("render", "--width"): [Acts(f"{RENDER} -o r", "--width 12", slow=True)],
     ("render", "--frame-rate"): [Acts(f"{RENDER} -o r", "--frame-rate 240", slow=True)],
     ("render", "--shutter"): [Acts(f"{RENDER} -o r", "--shutter 1", names, slow=True)],
+    ("render", "--bands"): [
+        Acts(f"{RENDER} -o r", "--bands rgb", slow=True),
+        Refused(RENDER, "--bands grey", "--bands"),
+    ],
     ("render", "--psnr"): [Acts(f"{RENDER} -o r", "--psnr 34", slow=True), Refused(RENDER, "--psnr 5", "psnr")],
     ("render", "--ppp"): [Acts(f"{RENDER} -o r", "--ppp 3000", slow=True)],
     ("render", "--engine"): [Acts(f"{RENDER} -o r", "--engine scalar", slow=True)],
@@ -142,6 +146,10 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("sense", "--defects"): [
         Acts("sense clip --name n", "--defects bad.toml"),
         Refused("sense clip", "--defects no.toml", "no.toml"),
+    ],
+    ("sense", "--colour"): [
+        Acts("sense coloured", "--colour rggb", codes=(0, 2)),
+        Refused("sense clip", "--colour rggb", "colour filters"),
     ],
     ("sense", "--slices"): [
         Acts("sense clip --sensor counter.toml --name n", "--slices 2"),
@@ -454,6 +462,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     bands = write_clip(folder / "bands", frames=6, height=5, width=9)
     for seed, name in enumerate(("red", "green", "blue")):
         bands.sense("spad512s", ppp=0.4, bits=1, seed=seed, name=name)
+    colour_clip(folder / "coloured")
     np.save(folder / "codes.npy", rng.integers(0, 4, (3, 16, 24)).astype(np.uint8))
     np.save(folder / "light.npy", rng.integers(0, 60000, (3, 16, 24)).astype(np.uint16))
     np.save(folder / "cube.npy", rng.integers(0, 256, (3, 16, 2)).astype(np.uint8))

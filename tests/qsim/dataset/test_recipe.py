@@ -91,6 +91,7 @@ MISTAKES = [
     ("width = 10", "width = -10", 5, r"width: expected a whole number"),
     ("width = 10", "width = 10\nshutter = 50", 6, r"open share of a frame, 0 to 1, got 50"),
     ("width = 10", "width = 10\npsnr = 0.01", 6, r"wanted error in dB"),
+    ("width = 10", 'width = 10\nbands = "cmyk"', 6, r'expected "rgb", red, green and blue'),
     ('name = "tiny"', 'name = "../tiny"', 2, r"letters, digits"),
     ('"fan"', '"fann"', 9, r"unknown family 'fann' \(did you mean 'fan'\?\)"),
     ("seeds = [0, 2]", "seeds = [0, 0]", 10, r"seeds: 0 is listed twice"),
@@ -181,7 +182,9 @@ def test_training_never_sees_a_family_of_the_test_split():
 
 
 def test_files_that_are_no_recipes(tmp_path: Path):
-    with pytest.raises(FileNotFoundError, match=r"no such recipe; give a \.toml file, or one of bitdepth, demo, "):
+    with pytest.raises(
+        FileNotFoundError, match=r"no such recipe; give a \.toml file, or one of bitdepth, challenge, colour, demo, "
+    ):
         recipe.load(tmp_path / "none.toml")
     path = tmp_path / "binary.toml"
     path.write_bytes(b"\xff\xfe\x00")

@@ -1,0 +1,130 @@
+"""Tests streams behind colour filters: stored codes and descriptions, replay, redrawing, crops, groups, refusals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from clips import colour_clip, write_clip
+
+from qsim.cli import main
+from qsim.clip.clip import Clip
+from qsim.clip.photons import clip_photons
+from qsim.clip.sensing import Sensing, prepare, replay
+from qsim.clip.simulation import stored
+from qsim.dataset.redraw import redraw
+from qsim.keys import Key, hash_name
+from qsim.sensor.colour_filter import ColourFilter
+from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.qis import QIS
+
+SENSOR = """
+[sensor]
+model = "QIS"
+quantum_efficiency = 0.8
+dark_current = 5.0
+read_noise = 0.2
+bits = 3
+[colour]
+mask = ["RG", "WB"]
+efficiency.R = 0.5
+efficiency.G = [0.1, 0.6, 0.1]
+efficiency.B = 0.4
+efficiency.W = [0.7, 0.7, 0.6]
+"""
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text(SENSOR)
+    return tmp_path
+
+
+def test_a_stream_is_one_mosaic_that_can_be_drawn_again(place):
+    clip = colour_clip(place / "c")
+    stream = clip.sense("mine.toml", ppp=4.0)
+    assert stream.shape == clip.shape == (3, 7, 9)
+    light = 4.0 / clip.mean_photons
+    expected = stream.colour_filter.mosaic(np.stack([clip_photons(clip, t, light) for t in range(3)]), 0.8)
+    drawn = stream.sensor.sample(expected, clip.exposure, key=Key(0, hash_name("c")), engine="reference")
+    np.testing.assert_array_equal(stream.codes(), drawn)
+    for one, kept in (replay(clip, stream, t) for t in range(3)):
+        np.testing.assert_array_equal(one, kept)
+    assert [found.line() for found in redraw(place / "c")] == [None]
+    assert stream.truth().shape == (3, 3, 7, 9)
+    assert stream.truth().mean() == pytest.approx(4.0, rel=1e-3)
+    assert clip.sense("mine.toml", ppp=4.0).meta == stream.meta, "kept, not drawn again"
+
+
+def test_crops_keep_the_phase_of_the_mask(place):
+    """A clip that is a window of the frame sees the filters, and the lens, of its place."""
+    whole = colour_clip(place / "c", frames=1, height=9, width=11)
+    meta = {"camera": whole.meta["camera"], "origin": [3, 2]}
+    window = write_clip(place / "w", radiance=whole.radiance(0)[None, :, 3:8, 2:9], bands=whole.meta["bands"], **meta)
+    wanted = Sensing("mine.toml")
+    one, other = prepare(whole, wanted), prepare(window, wanted)
+    np.testing.assert_allclose(other.light(window, 0, 1), one.light(whole, 0, 1)[:, 3:8, 2:9], rtol=1e-12)
+    np.testing.assert_array_equal(one.incident(whole, 0, (3, 2, 5, 7)), one.light(whole, 0, 1)[0, 3:8, 2:9])
+    assert window.sense("mine.toml").colour_filter.mask == ("WB", "RG")
+
+
+def test_slices_and_defects_see_the_filtered_light(place):
+    clip = colour_clip(place / "c", frames=4, shutter=1.0)
+    counting = CountingSPAD(0.5, 200.0, 1e-5, 4)
+    stream = clip.sense(counting, ppp=3.0, slices=2, colour="rggb")
+    again = replace(stored(stream), engine="reference").frames(clip, 0, 2)
+    np.testing.assert_array_equal(stream.codes(), again)
+    (place / "bad.toml").write_text("[defects]\ndevice_seed = 3\ndead = 0.2\nprnu = 0.1\n")
+    bad = clip.sense("mine.toml", ppp=3.0, defects="bad.toml", name="bad")
+    np.testing.assert_array_equal(bad.codes(), replace(stored(bad), engine="reference").frames(clip, 0, 4))
+    planes = clip.sense("spad-320x240", ppp=2.0, bits=2, group=True, colour="quad")
+    assert planes.shape == (1, 7, 9)
+    np.testing.assert_array_equal(planes.codes(), stored(planes).frames(clip, 0, 1))
+
+
+def test_light_behind_a_filter_is_that_of_its_band(place):
+    """An ideal counter of many frames at rest: the mean code of each pixel is the photons of its band."""
+    still = np.repeat(np.random.default_rng(0).uniform(0.2, 2, (1, 3, 7, 9)), 150, axis=0)
+    clip = write_clip(place / "c", radiance=still.astype(np.float32), bands=[6.1e-7, 5.4e-7, 4.6e-7])
+    stream = clip.sense(QIS(1.0, 0.0, 0.0, 8), ppp=5.0, colour=ColourFilter(("RG", "GB")))
+    truth, mean = stream.truth(0, 1)[0], stream.codes().mean(axis=0)
+    own = np.array([[truth["RGB".index("RGGB"[2 * (y % 2) + x % 2]), y, x] for x in range(9)] for y in range(7)])
+    assert (np.abs(mean - own) < 5 * np.sqrt(own / 150)).all()
+
+
+REFUSED = [
+    ("sense c --ppp 3", "has three bands and quiver-physical no colour filters"),
+    ("sense g --ppp 3 --colour rggb", "has one band, and the sensor has colour filters"),
+    ("sense g --ppp 3 --sensor mine.toml", "has one band, and the sensor has colour filters"),
+    ("sense c --ppp 3 --colour rgbb", "unknown colour filter array 'rgbb'"),
+    ("sense c --ppp 3 --colour torn.toml", "does not tile"),
+    ("sense c --ppp 3 --colour blind.toml", "colour B of the mask has none"),
+]
+
+
+@pytest.mark.parametrize(("line", "why"), REFUSED)
+def test_mistakes_take_one_line(place, capsys, line, why):
+    colour_clip(place / "c")
+    write_clip(place / "g", frames=3, height=7, width=9)
+    (place / "torn.toml").write_text('[colour]\nmask = ["RG", "GBB"]\n')
+    (place / "blind.toml").write_text('[colour]\nmask = "rggb"\nefficiency.R = 0.5\nefficiency.G = 0.5\n')
+    assert main(line.split()) == 2
+    error = capsys.readouterr().err.strip()
+    assert why in error
+    assert len(error.splitlines()) == 1
+    assert not Clip.open(place / "c").streams
+    assert not Clip.open(place / "g").streams
+
+
+def test_a_recipe_names_its_filters(place):
+    from qsim.dataset import recipe
+
+    head = '[recipe]\nname = "t"\nframes = 2\nheight = 8\nwidth = 9\nbands = "rgb"\n[[scenes]]\nfamily = "fan"\n'
+    found = recipe.parse(head + '[[streams]]\nsensor = "quiver-physical"\nppp = 3\nbits = 3\ncolour = "quad"\n')
+    (job,) = found.jobs
+    assert job.settings.bands == "rgb"
+    assert job.streams[0].stream_name == "quiver-physical-quad_3bit_3ppp"
+    grey = recipe.parse(head.replace('bands = "rgb"\n', ""))
+    assert grey.jobs[0].digest != recipe.parse(head).jobs[0].digest
+    with pytest.raises(ValueError, match=r"recipe\.toml:12: unknown colour filter array 'x'"):
+        recipe.parse(head + '[[streams]]\nsensor = "quiver-physical"\nppp = 3\ncolour = "x"\n')
