@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from qsim.dataset.scene_rendering import render
     from qsim.keys import Key
     from qsim.optics.camera import Camera
-    from qsim.optics.radiometry import RGB, expected_photons
+    from qsim.optics.radiometry import expected_photons
     from qsim.rendering.budget import Budget
     from qsim.rendering.clip_rendering import render_clip
     from qsim.rendering.fidelity import choose_budget
@@ -49,7 +49,6 @@ _HOMES = {
     "Dataset": "dataset.dataset",
     "Key": "keys",
     "QIS": "sensor.qis",
-    "RGB": "optics.radiometry",
     "Renderer": "rendering.renderer",
     "Scene": "scene.scene",
     "Sensing": "clip.sensing",
@@ -71,7 +70,6 @@ _HOMES = {
 
 __all__ = [
     "QIS",
-    "RGB",
     "BinarySPAD",
     "Budget",
     "Camera",

@@ -23,7 +23,7 @@ BRIGHTEST = 0.95  # of any reflectance
 
 
 def coloured(scene: Scene) -> Scene:
-    """Return a scene in colours that follow from its name and seed, for the bands `qsim.RGB`.
+    """Return a scene in colours that follow from its name and seed, for the bands `qsim.optics.RGB`.
 
     Bodies that share a material share its colours. Metals, glass and the shapes of a Mitsuba file keep their own.
     `ValueError` for a scene that states its bands already.

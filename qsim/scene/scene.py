@@ -135,7 +135,7 @@ class Scene:
             type(each).__name__ for each in (*self.lights, *(b.material for b in self.bodies)) if has_colour(each)
         ]
         if self.bands is None and coloured:
-            raise ValueError(f"scene {self.name}: a {coloured[0]} has a colour; give the scene bands=qsim.RGB")
+            raise ValueError(f"scene {self.name}: a {coloured[0]} has a colour; give the scene bands=qsim.optics.RGB")
         environments = [light for light in self.lights if isinstance(light, ENVIRONMENTS)]
         if len(environments) > 1:
             kinds = " and ".join(type(light).__name__ for light in environments)

@@ -100,10 +100,11 @@ def _run_restore(args: argparse.Namespace) -> int:
     for line in lines:
         note(line)
     length, height, width = codes.shape
+    size = f"{height} x {width}" + ("" if codes.colour is None else " in R, G, B")
     output(
         args,
         {"restored": str(target)} | meta,
-        f"{target}: {length} frames of {height} x {width} by {method.name}, "
+        f"{target}: {length} frames of {size} by {method.name}, "
         f"{meta['seconds_per_frame']:.3g} s per frame; photons, white = {codes.white:.4g}",
     )
     return 0

@@ -22,6 +22,8 @@ from qsim.clip.sensing import describe
 from qsim.clip.stream import Stream
 from qsim.files import read_json, sha256, to_json
 from qsim.keys import Key, hash_name
+from qsim.sensor.colour_filter import ColourFilter
+from qsim.sensor.demosaicing import demosaic
 from qsim.sensor.sensor import Sensor
 from quiver.data import defects
 from quiver.data.code_table import draw_codes
@@ -62,11 +64,22 @@ class Codes:
     sensor_name: str = ""  # of a device or a file; empty: the sensor's model
     ppp: float | None = None  # mean photons per pixel and code; None: not known
     defective: Array | None = field(default=None, compare=False)  # bool [H, W]; pixels that `read` fills from others
+    colour: ColourFilter | None = None  # over the pixels, from the first one on; None: all see one band
 
     @property
     def white(self) -> float:
         """Return the photons at which restored video has the value 1."""
         return self.sensor.white(self.exposure)
+
+    @property
+    def video_shape(self) -> tuple[int, ...]:
+        """Return the shape of the restored video: [T, H, W], or [T, 3, H, W] behind colour filters."""
+        return self.shape if self.colour is None else (self.shape[0], 3, *self.shape[1:])
+
+    def demosaiced(self, light: Array) -> Array:
+        """Return the photons of R, G and B [3, H, W] of the light [H, W] behind the stream's colour filters."""
+        assert self.colour is not None
+        return demosaic(light, self.colour, self.sensor.efficiency)
 
 
 def filled(codes: Codes, bad: Array | None) -> Codes:
@@ -81,16 +94,24 @@ def filled(codes: Codes, bad: Array | None) -> Codes:
             f"{codes.name}: the map of defective pixels has {' x '.join(map(str, bad.shape))} pixels, the frames "
             f"{codes.shape[1]} x {codes.shape[2]}; give the map of this sensor, cut to these frames"
         )
-    filler = defects.Filler(bad if codes.defective is None else bad | codes.defective)
+    marked = bad if codes.defective is None else bad | codes.defective
+    rows, columns = (1, 1) if codes.colour is None else codes.colour.tile  # neighbours of one colour fill a pixel
+    fillers = {(i, j): defects.Filler(marked[i::rows, j::columns]) for i in range(rows) for j in range(columns)}
 
     def read(start: int, stop: int) -> Array:
-        return filler.fill(codes.read(start, stop), start)
+        part = codes.read(start, stop)
+        if codes.colour is None:
+            return fillers[0, 0].fill(part, start)
+        part = part.copy()
+        for (i, j), filler in fillers.items():
+            part[:, i::rows, j::columns] = filler.fill(part[:, i::rows, j::columns], start)
+        return part
 
     def digest() -> str:
         before = codes.digest()
-        return before and hashlib.sha256(before.encode() + np.packbits(filler.bad).tobytes()).hexdigest()
+        return before and hashlib.sha256(before.encode() + np.packbits(marked).tobytes()).hexdigest()
 
-    return replace(codes, read=read, digest=digest, defective=filler.bad)
+    return replace(codes, read=read, digest=digest, defective=marked)
 
 
 def light_of(codes: Codes) -> float:
@@ -166,6 +187,7 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
         digest=lambda: sha256(to_json({"clip_meta": clip.meta} | describe(clip, sensing, draw))),
         sensor_name=light.sensor,
         ppp=draw.level.ppp,
+        colour=draw.colour,
     )
     return filled(codes, defects.of_draw(draw, clip.exposure, (clip.shape[1], clip.shape[2]))), draw.level.factor
 
@@ -184,6 +206,7 @@ def stream_codes(stream: Stream) -> Codes:
         lambda: array_digest(stream.packed),
         str(meta.get("sensor_name") or ""),
         meta.get("ppp"),
+        colour=stream.colour_filter,
     )
     return filled(codes, defects.of_stream(stream))
 
@@ -214,6 +237,7 @@ def windows_sensed(clip: Clip, light: Illumination, seed: int, centres: range) -
     """
     if light.ppp is None:
         raise ValueError("the published protocol forces the exposure of every window; give --ppp")
+    clip.require_one_band("the published protocol")
     sensor = light.device(clip.exposure)
     for t in centres:
         photons = np.stack([clip_photons(clip, i) for i in range(t - 5, t + 6)])

@@ -271,6 +271,7 @@ def check_clips(clips: Sequence[Clip], settings: WindowSettings) -> None:
     if not clips:
         raise ValueError("no complete clip to draw windows from; check the split, or finish `qsim generate`")
     for clip in clips:
+        clip.require_one_band("training")
         length, height, width = clip.shape
         if length < settings.frames or min(height, width) < settings.crop:
             raise ValueError(

@@ -39,9 +39,10 @@ def speeds(clip: Clip, frames: range) -> Array | None:
 
 def by_motion(matched: Array, target: Array, speed: Array) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Return pixels and summed squared error (clamped, in units of the peak) of every bin of EDGES; all arrays [T, H,
-    W].
+    W]. The error of videos in colour, [T, 3, H, W], is the mean over their bands.
     """
     squares = (np.clip(matched, 0, 1) - np.clip(target, 0, 1)) ** 2
+    squares = squares.mean(axis=1) if squares.ndim == 4 else squares
     known = np.isfinite(speed)
     bins = np.digitize(speed[known], EDGES[1:-1])
     count = np.bincount(bins, minlength=len(EDGES) - 1)
@@ -83,7 +84,7 @@ def crop_file(out: Path, light: str, clip: str, method: str) -> Path:
 
 
 def save_crop(path: Path, picture: Array) -> None:
-    """Store a float16 picture [h, w] in units of the peak, limited to 2: a sheet shows white there."""
+    """Store a float16 picture, [h, w] or [3, h, w], in units of the peak, limited to 2: a sheet shows white there."""
     path.parent.mkdir(exist_ok=True)
     with replacing(path) as file:
         np.save(file, np.minimum(picture, 2).astype(np.float16))
@@ -107,6 +108,7 @@ def sheet(out: Path, light: str, clips: Sequence[str], methods: Sequence[str], t
             path = crop_file(out, light, clip, column)
             if path.exists():
                 picture = np.clip(load_array(path).astype(np.float32), 0, 1) ** (1 / 2.2)
+                picture = picture if picture.ndim == 2 else np.moveaxis(picture, 0, -1)
                 axes.imshow(picture, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
             if clip == rows[0]:
                 axes.set_title(column, fontsize=8)

@@ -141,14 +141,16 @@ def truth_psnr(clip: Clip, factor: float, peak: float, frames: range) -> float |
 
 
 def score_video(video: Array, stream: Stream, *, peak: float | None = None) -> metrics.Score:
-    """Return the score of restored video [T, H, W] in photons against the truth of its stream.
+    """Return the score of restored video, [T, H, W] or [T, 3, H, W], in photons against the truth of its stream.
 
     `peak` [photons per pixel] is the light that the decibels refer to: 2.5 times the mean light of the stream by
     default, as in `quiver evaluate`. Pixels whose light is not known do not count. `ValueError` for another shape,
     `FileNotFoundError` for a stream without a clip.
     """
-    if np.shape(video) != stream.shape:
-        raise ValueError(f"video has shape {list(np.shape(video))}, stream {list(stream.shape)}; they must be equal")
+    frames, height, width = stream.shape
+    expected = stream.shape if stream.colour_filter is None else (frames, 3, height, width)
+    if np.shape(video) != expected:
+        raise ValueError(f"video has shape {list(np.shape(video))}, expected {list(expected)} as of the stream's light")
     target = stream.truth()
     white = peak_of(float(stream.meta.get("ppp") or target.mean()), peak)
     return metrics.score(np.asarray(video) / np.float32(white), target / white, valid=stream.known())
@@ -224,7 +226,7 @@ def keep_crops(
     """
     middle = len(frames) // 2
     part = breakdown.place(clip, frames[middle])
-    pictures = {name: stack[middle][part] for name, stack in stacks.items()}
+    pictures = {name: stack[middle][..., *part] for name, stack in stacks.items()}
     pictures["codes"] = codes.read(frames[middle], frames[middle] + 1)[0][part] / (codes.sensor.levels - 1)
     for name, picture in pictures.items():
         breakdown.save_crop(breakdown.crop_file(out, row.light, row.clip, name), picture)

@@ -1,6 +1,6 @@
 """Scores a restored clip against the truth: PSNR, a brightness factor per clip, SSIM, intervals over scenes.
 
-    restored x, target x  [T, H, W], in units of the peak (photons / peak)  ->  numbers
+    restored x, target x  [T, H, W] or [T, 3, H, W], in units of the peak (photons / peak)  ->  numbers
 
 The peak is 2.5 times the mean light (`data.clips.peak_of`), for every sensor and depth. Output and target are clamped
 to [0, 1] and PSNR = 10 log10(1 / MSE) of complete frames, without a border. Few-bit input does not determine the
@@ -46,14 +46,17 @@ class Score:
 
 
 def _stack(name: str, image: np.ndarray) -> np.ndarray:
-    """Return float64 [T, H, W]. `ValueError` with the first index of NaN or Inf, and for empty or misshaped input."""
+    """Return float64 [T, H, W] or [T, 3, H, W]. `ValueError` with the first index of NaN or Inf, or the shape."""
     stack = np.asarray(image, dtype=np.float64)
     stack = stack[None] if stack.ndim == 2 else stack
-    if stack.ndim != 3 or stack.size == 0:
-        raise ValueError(f"{name}: expected [T, H, W] with at least one pixel, got shape {np.shape(image)}")
+    if stack.ndim not in (3, 4) or stack.size == 0:
+        raise ValueError(
+            f"{name}: expected [T, H, W] or [T, 3, H, W] with at least one pixel, got shape {np.shape(image)}"
+        )
     if not np.isfinite(stack).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(stack))[0])
-        raise ValueError(f"{name} is {stack[index]} at (t, y, x) = {index}; scores need finite values")
+        axes = "t, y, x" if stack.ndim == 3 else "t, band, y, x"
+        raise ValueError(f"{name} is {stack[index]} at ({axes}) = {index}; scores need finite values")
     return stack
 
 
@@ -182,7 +185,7 @@ def ssim(output: np.ndarray, target: np.ndarray, valid: np.ndarray | None = None
     """
     one, two = (np.clip(image, 0, 1) for image in _pair(output, target))
     keep = _kept(valid, two)
-    if min(one.shape[1:]) < SSIM_WINDOW:
+    if min(one.shape[-2:]) < SSIM_WINDOW:
         return np.full(len(one), nan)
     return np.array(
         [_ssim_frame(a, b, None if keep is None else keep[t]) for t, (a, b) in enumerate(zip(one, two, strict=True))]
@@ -195,7 +198,8 @@ def _ssim_frame(output: np.ndarray, target: np.ndarray, keep: np.ndarray | None)
     from skimage.metrics import structural_similarity
 
     if keep is None:
-        return float(structural_similarity(output, target, win_size=SSIM_WINDOW, data_range=1.0))
+        axis = None if output.ndim == 2 else 0  # the mean over bands
+        return float(structural_similarity(output, target, win_size=SSIM_WINDOW, data_range=1.0, channel_axis=axis))
     index = structural_similarity(output, target, win_size=SSIM_WINDOW, data_range=1.0, full=True)[1]
     edge = SSIM_WINDOW // 2
     inner = (slice(edge, -edge), slice(edge, -edge))
@@ -223,7 +227,8 @@ def score(
         scales = np.array(each)
     else:
         scales = np.full(len(one), best_scale(one, two, keep))
-    matched = psnr(one * scales[:, None, None], two, keep)
+    scaled = one * scales.reshape(-1, *(1,) * (one.ndim - 1))
+    matched = psnr(scaled, two, keep)
     if per_frame_scale:
         worse = ~(matched >= raw)
     else:
@@ -231,12 +236,13 @@ def score(
         better = not np.isnan(matched[scored]).any() and _mean(matched[scored]) >= _mean(raw)
         worse = np.full(len(one), not better)
     scales, matched = np.where(worse, 1.0, scales), np.where(worse | np.isnan(raw), raw, matched)
+    scaled = one * scales.reshape(-1, *(1,) * (one.ndim - 1))
     hidden = np.isnan(raw)
     return Score(
         psnr=_mean(raw),
         psnr_matched=_mean(matched),
         ssim=_mean(np.where(hidden, nan, ssim(one, two, keep))),
-        ssim_matched=_mean(np.where(hidden, nan, ssim(one * scales[:, None, None], two, keep))),
+        ssim_matched=_mean(np.where(hidden, nan, ssim(scaled, two, keep))),
         scale=float(scales.mean()),
         scale_spread=float(scales.std()),
         frames=int(np.count_nonzero(~hidden)),

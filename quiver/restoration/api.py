@@ -33,7 +33,7 @@ def restore(
     defects: Array | None = None,
 ) -> Array:
     """Return restored video, float32 [T, H, W], in photons per pixel and exposure (expected, before quantum
-    efficiency).
+    efficiency). Of a stream behind colour filters it is [T, 3, H, W]: the photons of R, G and B.
 
     `source` is one of these: a `Stream`; a `Clip` (its only stream; with `ppp` the default sensor senses it now); the
     path of either; integer codes [T, H, W], for which `sensor` and `exposure` [s] must be given. `method` is a

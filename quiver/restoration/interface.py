@@ -11,6 +11,7 @@ from numpy import ndarray as Array
 from qsim.files import Progress
 from quiver.data.codes import Codes
 from quiver.restoration.domain import Scope
+from quiver.restoration.mosaics import fill_mosaic
 
 DEFAULT_METHOD = "auto"  # of `quiver restore` and `quiver.restore`: see automatic.py
 DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory beside the weights
@@ -59,8 +60,18 @@ class Restorer:
     scope: Scope | None = None  # of a network: the streams that it was measured for or trained on; None: not known
 
     def restore(self, codes: Codes, first: int = 0, last: int | None = None, progress: Progress | None = None) -> Array:
-        """Return photons, float32 [last - first, H, W], of frames first ... last - 1; of all frames by default."""
-        length, height, width = codes.shape
-        out = np.zeros(((length if last is None else last) - first, height, width), np.float32)
-        self.fill(codes, out, first, progress)
+        """Return photons, float32 [last - first, H, W], of frames first ... last - 1; of all frames by default.
+
+        Behind colour filters they are [last - first, 3, H, W], the photons of R, G and B.
+        """
+        length, *size = codes.video_shape
+        out = np.zeros(((length if last is None else last) - first, *size), np.float32)
+        self.into(codes, out, first, progress)
         return out
+
+    def into(self, codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
+        """Write what `restore` returns of frames `first` ... into `out`, zeros of that shape."""
+        if codes.colour is None:
+            self.fill(codes, out, first, progress)
+        else:
+            fill_mosaic(self.fill, codes, out, first, progress)

@@ -1,6 +1,6 @@
 """Writes restored video to a file, block by block: resumable, complete or absent, by one writer at a time.
 
-    PATH.npy.part, PATH.npy.part.json  ->  PATH.npy (float32 photons [T, H, W]) and PATH.json
+    PATH.npy.part, PATH.npy.part.json  ->  PATH.npy (float32 photons [T, H, W]; in colour [T, 3, H, W]) and PATH.json
     PATH.npy.lock                          held while a process writes
 
 The disk space is reserved before the work begins. So a full disk is an error at the start, not a fault in the memory
@@ -28,6 +28,7 @@ FORMAT = "quiver-restored-1"
 BLOCK_FRAMES = 256  # restored between two entries of the journal
 WHAT_CHANGED = {  # key of the description -> its name in the message that a restoration starts again
     "codes_sha256": "the codes",
+    "colour": "the colour filters",
     "method": "the method",
     "description": "the method",
     "identity": "the method's settings or weights",
@@ -68,16 +69,18 @@ def restore_to_file(
             "quiver": VERSION,
             "method": method.name,
             "description": method.description,
-            "identity": dict(method.identity) | {"cut": method.cut(*codes.shape[1:])},
+            "identity": dict(method.identity) | {"cut": method.cut(*_at_a_time(codes))},
             "unit": "photons",
             "white": codes.white,
-            "shape": list(codes.shape),
+            "shape": list(codes.video_shape),
             "frame_rate": codes.frame_rate,
             "exposure": codes.exposure,
             "sensor": codes.sensor.to_dict(),
             "source": codes.source,
             "codes_sha256": codes.digest(),
         }
+        if codes.colour is not None:
+            meta["colour"] = codes.colour.to_dict() | {"bands": "R, G, B", "by": "places of the mask, then demosaicing"}
         try:
             seconds = _fill_file(codes, method, part, journal, meta, progress, note, threads)
             meta |= {"seconds_per_frame": seconds / codes.shape[0], "threads": threads, "sha256": sha256(part)}
@@ -148,13 +151,13 @@ def _fill_file(
         note(f"{part}: holds an interrupted restoration, but {why}; starting again")
     if not done:
         journal.unlink(missing_ok=True)
-        _reserve(part, codes.shape)
+        _reserve(part, codes.video_shape)
     out = np.lib.format.open_memmap(part, mode="r+")
     for first in range(done, length, BLOCK_FRAMES if method.seamless else length):
         block = out[first : first + BLOCK_FRAMES if method.seamless else length]
         block[:] = 0  # an interrupted block may be partly written
         started = time.perf_counter()
-        method.fill(codes, block, first, _shifted(progress, first, length, len(block)))
+        method.into(codes, block, first, _shifted(progress, first, length, len(block)))
         check_finite(block, method.name, first)
         out.flush()
         seconds += time.perf_counter() - started
@@ -164,8 +167,14 @@ def _fill_file(
     return seconds
 
 
-def _reserve(part: Path, shape: tuple[int, int, int]) -> None:
-    """Create a .npy of float32 [T, H, W] and reserve its disk space. `OSError` if there is not enough."""
+def _at_a_time(codes: Codes) -> tuple[int, int]:
+    """Return height and width of what a method restores at a time: the frame, or one place of a mask."""
+    rows, columns = (1, 1) if codes.colour is None else codes.colour.tile
+    return -(-codes.shape[1] // rows), -(-codes.shape[2] // columns)
+
+
+def _reserve(part: Path, shape: tuple[int, ...]) -> None:
+    """Create a .npy of float32 of this shape and reserve its disk space. `OSError` if there is not enough."""
     with open(part, "wb") as file:
         header = {"descr": np.lib.format.dtype_to_descr(np.dtype(np.float32)), "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)

@@ -118,6 +118,9 @@ def assumed(codes: Codes, method: Restorer) -> str:
     stated = codes.ppp is not None and codes.ppp > 0
     light = f", {light_of(codes):.4g} photons/pixel" + ("" if stated else " (estimated from the codes)")
     bad = 0 if codes.defective is None else int(codes.defective.sum())
+    if codes.colour is not None:
+        rows, columns = codes.colour.tile
+        light += f", each of {rows} x {columns} places of the colour filters alone, then demosaiced"
     light += f", {bad} of {height * width} pixels defective and filled from their neighbours" if bad else ""
     return (
         f"{codes.name}: {length} frames of {height} x {width}, {codes.frame_rate:g} codes/s; "

@@ -114,7 +114,7 @@ def test_a_budget_is_chosen_and_a_clip_states_its_bands(tmp_path):
 
 
 def test_mistakes_are_named():
-    with pytest.raises(ValueError, match=r"a Constant has a colour; give the scene bands=qsim\.RGB"):
+    with pytest.raises(ValueError, match=r"a Constant has a colour; give the scene bands=qsim\.optics\.RGB"):
         Scene("s", 0, CAMERA, (Constant((1.0, 1.0, 1.0)),), ())
     with pytest.raises(ValueError, match="bands are three wavelengths in m"):
         Scene("s", 0, CAMERA, (Constant(1.0),), (), bands=(610, 540, 460))

@@ -1,0 +1,67 @@
+"""Restores mosaics: each place of the colour filter array's tile alone, by any method; then the bands by demosaicing.
+
+    codes [T, H, W] --places of the tile--> codes [T, h, w] --method--> light [T, H, W] --demosaicing--> [T, 3, H, W]
+
+Pixels of one place see one colour, so their codes are a small stream of one band: a method needs to know no colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.files import Progress
+from quiver.data.codes import Codes
+
+
+def places(codes: Codes) -> Iterator[tuple[tuple[int, int], Codes]]:
+    """Yield row and column of each place of the tile, and the codes [T, h, w] of its pixels as a stream of one band.
+
+    `ValueError` for frames smaller than the tile.
+    """
+    assert codes.colour is not None
+    length, height, width = codes.shape
+    rows, columns = codes.colour.tile
+    if height < rows or width < columns:
+        raise ValueError(
+            f"{codes.name}: frames of {height} x {width} px are smaller than the mask's {rows} x {columns}"
+        )
+    seen = codes.colour.weights(codes.sensor.efficiency).sum(axis=0)
+    for i, j in np.ndindex(rows, columns):
+
+        def read(start: int, stop: int, i: int = i, j: int = j) -> Array:
+            return np.ascontiguousarray(codes.read(start, stop)[:, i::rows, j::columns])
+
+        shape = (length, len(range(i, height, rows)), len(range(j, width, columns)))
+        ppp = None if codes.ppp is None else codes.ppp * float(seen[i, j])
+        name = f"{codes.name}, {codes.colour.mask[i][j]}"
+        yield (i, j), replace(codes, name=name, shape=shape, read=read, ppp=ppp, colour=None, defective=None)
+
+
+def fill_mosaic(
+    fill: Callable[[Codes, Array, int, Progress | None], None],
+    codes: Codes,
+    out: Array,
+    first: int,
+    progress: Progress | None,
+) -> None:
+    """Write the photons of R, G and B of frames `first` ... into out [t, 3, H, W]; `fill` restores one band."""
+    assert codes.colour is not None
+    rows, columns = codes.colour.tile
+    light = np.zeros((len(out), *codes.shape[1:]), np.float32)
+    for n, ((i, j), place) in enumerate(places(codes)):
+        own = np.zeros((len(out), *place.shape[1:]), np.float32)
+        fill(place, own, first, _share(progress, n, rows * columns, len(out)))
+        light[:, i::rows, j::columns] = own
+    for t, frame in enumerate(light):
+        out[t] = codes.demosaiced(frame)
+
+
+def _share(progress: Progress | None, n: int, places: int, frames: int) -> Progress | None:
+    """Return the progress of place n as that of all, in frames."""
+    if progress is None:
+        return None
+    return lambda done, total: progress((n * total + done) * frames // (places * total), frames)
