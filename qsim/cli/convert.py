@@ -188,7 +188,7 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
                 )
                 continue
             stream = importing.to_stream(recording, target, capture, force=args.force, progress=progress)
-            made.append((stream.path, f"{_size(stream)}, codes of {stream.bits} bits, {recording.source}"))
+            made.append((stream.path, f"{_size(stream)}, {stream.bits}-bit codes, {recording.source}"))
     return made
 
 

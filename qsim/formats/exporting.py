@@ -85,7 +85,7 @@ def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool 
     meta, (frames, height, width) = files.read_json(side), source.shape
     shown = f", played at {wanted.playback:g}" if wanted.kind == "mp4" else ""
     if isinstance(source, Stream):
-        about = f"codes of {source.bits} bits" + (", stretched to 0..255" if meta.get("stretched") else "")
+        about = f"{source.bits}-bit codes" + (", stretched to 0..255" if meta.get("stretched") else "")
     elif "white" in meta:
         bits = _depth(source, wanted)
         about = f"light in {bits} bits by {meta['transfer']}, white {meta['white']:.4g} {source.meta['radiance_unit']}"

@@ -46,21 +46,34 @@ def study_figure(found: Study) -> bytes:
 
 
 def sweep_figure(found: Sweep) -> bytes:
-    """Return the best bit depth over speed and light as PNG: large numbers are simulated, small ones the law's."""
+    """Return the best bit depth over speed and light as PNG: simulated, and the law's where that is another one.
+
+    A hatched cell is an edge: the best depth is the deepest or the least deep that was tried.
+    """
+    from matplotlib.patches import Rectangle
+
     drawing = new_figure(11, 4.2)
-    bits = [row.bits for line in found.studies for one in line for row in one.rows]
-    for axes, model in zip(drawing.subplots(1, 2), MODELS, strict=True):
+    bits = sorted({row.bits for line in found.studies for one in line for row in one.rows})
+    panels, colours = list(drawing.subplots(1, 2)), {"cmap": "viridis", "vmin": bits[0] - 0.5, "vmax": bits[-1] + 0.5}
+    for axes, model in zip(panels, MODELS, strict=True):
         table = np.array([[s.best(model).bits for s in row] for row in found.studies])
-        axes.imshow(table, origin="lower", aspect="auto", cmap="viridis", vmin=min(bits), vmax=max(bits))
+        drawn = axes.imshow(table, origin="lower", aspect="auto", **colours)
         for (i, j), best in np.ndenumerate(table):
-            near = "white" if best < (min(bits) + max(bits)) / 2 else "black"
-            axes.text(j, i, marked(found.studies[i][j], model), ha="center", va="bottom", color=near, fontsize=12)
-            axes.text(j, i, f"law {found.predicted[model][i, j]}", ha="center", va="top", color=near, fontsize=7)
-        axes.set_xticks(range(len(found.ppps)), [f"{p:g}" for p in found.ppps])
+            shown, near = marked(found.studies[i][j], model), "white" if best <= np.mean(bits) else "black"
+            if shown != str(best):
+                axes.add_patch(
+                    Rectangle((j - 0.5, i - 0.5), 1, 1, fill=False, hatch="///", edgecolor="0.5", linewidth=0)
+                )
+            words = shown.replace(">= ", "≥ ").replace("<= ", "≤ ")
+            axes.text(j, i, words, ha="center", va="center", color=near, fontsize=12)
+            if (law := int(found.predicted[model][i, j])) != best:
+                axes.text(j, i - 0.3, f"law: {law}", ha="center", va="center", color=near, fontsize=7)
+        axes.set_xticks(range(len(found.ppps)), [f"{p:.2g}" for p in found.ppps])
         axes.set_yticks(range(len(found.speeds)), [_speed_label(found, i) for i in range(len(found.speeds))])
         axes.set_xlabel("photons per pixel and plane")
         axes.set_ylabel(f"speed (px per {CODE_BITS}-bit frame)")
         axes.set_title(f"best bits, {model}")
+    drawing.colorbar(drawn, ax=panels, ticks=bits, label="bits; hatched: at the edge of what was tried")
     return figure_png(drawing)
 
 
