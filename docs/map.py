@@ -6,7 +6,6 @@ python docs/map.py
 from __future__ import annotations
 
 import ast
-import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -39,15 +38,5 @@ def page(text: str) -> str:
     return text.partition(MARK)[0] + MARK + "\n" + files()
 
 
-def readme(text: str) -> str:
-    """The README with the charters of the rooms in its table."""
-
-    def row(found: re.Match[str]) -> str:
-        return f"| `{found[1]}/` | {first_sentence(ROOT / found[1] / '__init__.py')} |"
-
-    return re.sub(r"^\| `((?:qsim|quiver)/\w+)/` \| .* \|$", row, text, flags=re.MULTILINE)
-
-
 if __name__ == "__main__":
-    (ROOT / "README.md").write_text(readme((ROOT / "README.md").read_text(encoding="utf-8")), encoding="utf-8")
     PAGE.write_text(page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")

@@ -231,13 +231,8 @@ def test_the_map_lists_every_file():
     )
 
 
-def test_the_readme_names_every_room_with_its_charter():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    folders = [p for name in ("qsim", "quiver") for p in (ROOT / name).iterdir() if not p.is_symlink()]
-    rooms = [p for p in folders if (p / "__init__.py").exists()]
-    assert len(rooms) > 15
-    for room in rooms:
-        assert f"| `{room.relative_to(ROOT)}/` | {_load('map').first_sentence(room / '__init__.py')} |" in text
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 150
 
 
 def test_files_named_on_the_map_exist():
