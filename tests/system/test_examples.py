@@ -15,14 +15,16 @@ sys.path.append(str(ROOT / "docs"))
 from manual import examples  # noqa: E402
 
 EXAMPLES = sorted(examples.FOLDER.glob("*.py"))
+SLOW = ("on_a_cluster", "pytorch", "restoring", "training")  # 5 to 25 s of processor time; the others up to 3 s
 
 
 def test_there_are_examples():
     assert len(EXAMPLES) >= 12
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", [pytest.param(p, marks=pytest.mark.slow if p.stem in SLOW else ()) for p in EXAMPLES], ids=lambda p: p.stem
+)
 def test_an_example_runs_at_small_sizes(path, tmp_path, monkeypatch):
     import matplotlib
     import matplotlib.pyplot as plt
