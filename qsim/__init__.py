@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from qsim.sensor.qis import QIS
     from qsim.sensor.sensor import Sensor
     from qsim.sensor.spad import BinarySPAD
+    from qsim.sensor.spike import SpikeCamera
 
 __version__ = VERSION
 
@@ -53,6 +54,7 @@ _HOMES = {
     "Scene": "scene.scene",
     "Sensing": "clip.sensing",
     "Sensor": "sensor.sensor",
+    "SpikeCamera": "sensor.spike",
     "Stream": "clip.stream",
     "read_mitsuba": "rendering.mitsuba_xml",
     "calibrate_qis": "calibration.qis",
@@ -82,6 +84,7 @@ __all__ = [
     "Scene",
     "Sensing",
     "Sensor",
+    "SpikeCamera",
     "Stream",
     "calibrate_qis",
     "calibrate_spad",

@@ -50,7 +50,7 @@ def add_sense(sub: Any) -> None:
         "--slices",
         type=int,
         default=1,
-        help="counting SPAD: clip frames per exposure, so that light may change within it",
+        help="counting SPAD or QIS: clip frames per exposure, so that light may change within it (motion blur)",
     )
     parser.add_argument(
         "--row-delay", type=checked(checks.positive), help="seconds from one row to the next (default: all at once)"

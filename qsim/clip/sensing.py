@@ -28,8 +28,10 @@ from qsim.sensor.defects import defect_table
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.event_simulation import TOLERANCE
 from qsim.sensor.defects.pixel_array import PixelArray
+from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
+from qsim.sensor.spike import SpikeCamera
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Sensing:
     group: bool = False  # a code sums 2^bits - 1 binary planes, each its own clip frame
     diffraction: bool = False  # blur by the lens's Airy pattern
     defects: str | Defects | None = None  # .toml with a table [defects]; None: that of the sensor's file, if it has one
-    slices: int = 1  # clip frames in one exposure of a counting SPAD, for light that changes within it
+    slices: int = 1  # clip frames in one exposure of a counting SPAD or a QIS, for light that changes within it
     rows: Rows | None = None  # rows or columns at their own time; None: all at once
     colour: str | ColourFilter | None = None  # rggb, quad, rgbw or .toml with a table [colour]; None: as for defects
 
@@ -113,7 +115,7 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
         if sensing.depth is None:
             raise ValueError(f"{clip.name}: summing planes needs the bits of a code, as in --bits 3")
         if sensing.slices != 1:
-            raise ValueError(f"{clip.name}: --group sums planes, --slices are of counting pixels; give one of them")
+            raise ValueError(f"{clip.name}: --group sums planes, --slices are of one exposure; give one of them")
         planes = 2**sensing.depth - 1
     if not 1 <= planes <= len(clip):
         what = f"one code of {planes} planes" if sensing.group else f"one exposure of {planes} slices"
@@ -125,6 +127,8 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
     sensor = own or devices.load(
         sensing.sensor, ppp=level.ppp * planes, bits=sensing.bits, exposure=clip.exposure * planes
     )
+    if found is not None and isinstance(sensor, SpikeCamera):
+        raise ValueError(f"{sensing.sensor_name}: defects of spike cameras are not modelled; leave [defects] out")
     if found is not None:  # a measured dark map replaces the dark rate of the sensor
         sensor = PixelArray.of(found, sensor, *clip.shape[1:]).sensor
     _check_planes(sensor, sensing, clip)
@@ -150,8 +154,10 @@ def _check_planes(sensor: Sensor, sensing: Sensing, clip: ClipFolder) -> None:
     kind = type(sensor).__name__
     if sensing.group and not isinstance(sensor, BinarySPAD):
         raise ValueError(f"{sensing.sensor_name}: only a clocked SPAD (BinarySPAD) sums planes, this is a {kind}")
-    if sensing.slices > 1 and not isinstance(sensor, CountingSPAD):
-        raise ValueError(f"{sensing.sensor_name}: slices of an exposure are for a CountingSPAD, this is a {kind}")
+    if sensing.slices > 1 and not isinstance(sensor, CountingSPAD | QIS):
+        raise ValueError(
+            f"{sensing.sensor_name}: slices of an exposure are for a CountingSPAD or a QIS, this is a {kind}"
+        )
     if sensing.slices > 1 and clip.exposure < 0.999 / clip.frame_rate:
         raise ValueError(f"{clip.name}: slices of one exposure need a clip whose shutter is open all the time")
 

@@ -3,7 +3,7 @@
     Draw --packed--> packed codes of a stream      --frames--> codes of some frames, for replay
 
 A code takes one clip frame or several: binary planes that are summed (clocked pixels), or slices of one exposure in
-which the light changes (counting pixels).
+which the light changes (counting pixels, and a QIS that is read once, which blurs motion).
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD, PlaneByPlane
+from qsim.sensor.spike import SpikeCamera
 
-LAWS = ("table", "process", "planes", "closed form", "events")  # of `Draw.law`
+LAWS = ("table", "process", "planes", "closed form", "events", "spikes")  # of `Draw.law`
 _BLOCK_PIXELS = 1 << 22  # photons held in memory at a time while sensing: 32 MiB of float64
 
 
@@ -58,8 +59,11 @@ class Draw:
         """How codes are drawn from random numbers, `drawn_by` of a stream; another law draws other codes.
 
         "table": one number against the cdf. "process": step by step, or the sum of all planes at once. "planes": one by
-        one. "closed form" and "events": counting pixels, by their cdf and photon by photon.
+        one. "closed form" and "events": counting pixels, by their cdf and photon by photon. "spikes": spike cameras,
+        plane after plane.
         """
+        if isinstance(self.sensor, SpikeCamera):
+            return "spikes"
         if self.followed is not None:
             return "events"
         few = self.sensor.bits <= 8
@@ -105,7 +109,7 @@ class Draw:
         array = self._array(clip)
         if self.followed is not None:
             return self._follow(clip, stop)[start:]
-        first = 0 if array is not None and array.memory else start
+        first = 0 if self.remembers or (array is not None and array.memory) else start
         blocks = self.blocks(clip, first, stop, stop - first if first == start else 1)
         return np.concatenate([block for n, block in enumerate(blocks, first) if n >= start])
 
@@ -117,6 +121,9 @@ class Draw:
         places = [(t * self.planes, min(t + step, stop) * self.planes) for t in range(start, stop, step)]
         light = (self._exposed(self.light(clip, *place)) for place in places)
         array = self._array(clip)
+        if isinstance(self.plane, SpikeCamera):
+            yield from self.plane.spikes(light, clip.exposure, self.key.at(start))
+            return
         if array is not None:
             drawn: Iterator[Array] = array.blocks(
                 light, self._exposure(clip), self.key.at(self._number(start)), engine=self.engine
@@ -132,7 +139,7 @@ class Draw:
     def packed(self, clip: ClipFolder, frames: int, progress: Progress | None = None) -> Iterator[Array]:
         """Yield all codes of a stream, packed row by row, some frames at a time: uint8 [t, H, ceil(W bits / 8)]."""
         step = max(1, _BLOCK_PIXELS // (clip.shape[1] * clip.shape[2] * self.planes))
-        if self.followed is not None or self.defects is not None or self.planes > 1:
+        if self.followed is not None or self.defects is not None or self.planes > 1 or self.remembers:
             blocks: Iterator[Array] = (
                 packing.pack(block, self.sensor.bits) for block in self.blocks(clip, 0, frames, step)
             )
@@ -149,6 +156,11 @@ class Draw:
             done += len(block)
             if progress is not None:
                 progress(done, frames)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether a pixel's planes are drawn in order, from the first: the charge of a spike camera."""
+        return isinstance(self.plane, SpikeCamera)
 
     @property
     def sums(self) -> bool:

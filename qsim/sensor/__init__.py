@@ -13,8 +13,20 @@ if TYPE_CHECKING:
     from qsim.sensor.qis import QIS
     from qsim.sensor.sensor import Sensor
     from qsim.sensor.spad import BinarySPAD
+    from qsim.sensor.spike import SpikeCamera
 
-__all__ = ["QIS", "BinarySPAD", "CountingSPAD", "PixelArray", "Response", "Sensor", "load", "pack", "unpack"]
+__all__ = [
+    "QIS",
+    "BinarySPAD",
+    "CountingSPAD",
+    "PixelArray",
+    "Response",
+    "Sensor",
+    "SpikeCamera",
+    "load",
+    "pack",
+    "unpack",
+]
 
 __getattr__ = lazy_names(
     __name__,
@@ -25,6 +37,7 @@ __getattr__ = lazy_names(
         "QIS": "qis",
         "Response": "estimation",
         "Sensor": "sensor",
+        "SpikeCamera": "spike",
         "load": "devices",
         "pack": "packing",
         "unpack": "packing",

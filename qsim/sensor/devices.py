@@ -8,11 +8,12 @@ photons" means that light is to be given as photons that this sensor detects. A 
 
     # my_sensor.toml: the fields and units of the sensor classes, nothing else
     [sensor]
-    model = "QIS"                # QIS, BinarySPAD or CountingSPAD
+    model = "QIS"                # QIS, BinarySPAD, CountingSPAD or SpikeCamera
     quantum_efficiency = 0.8     # electrons per photon
     dark_current = 1.6           # e-/s
     read_noise = 0.2             # e- rms
     bits = 3
+    # full_well = 10000          # e-; a QIS with iso = 400 in place of gain fills its code by a quarter of it
     [sources]                    # optional: one sentence per field
     read_noise = "photon transfer of 2026-05-03, 25 C"
     [defects]                    # optional: hot and dead pixels, PRNU, afterpulses, crosstalk ...: see defect_table.py
@@ -32,10 +33,11 @@ from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
+from qsim.sensor.spike import SpikeCamera
 from qsim.structure import make
 
 MODELS: Mapping[str, type[Sensor]] = MappingProxyType(
-    {"QIS": QIS, "BinarySPAD": BinarySPAD, "CountingSPAD": CountingSPAD}
+    {"QIS": QIS, "BinarySPAD": BinarySPAD, "CountingSPAD": CountingSPAD, "SpikeCamera": SpikeCamera}
 )
 
 _QUIVER_QE = 0.8  # e- per photon; Chennuri et al., "Quanta Video Restoration", ECCV 2024, simulation settings
@@ -258,12 +260,39 @@ def from_toml(path: str | Path) -> Sensor:
             raise ValueError(f"{path}: unknown table [{key}]{suggest(key, TABLES)}")
     if not isinstance(tables.get("sensor"), dict):
         raise ValueError(f"{path}: a table [sensor] with model, bits and the model's fields is missing")
-    sensor = from_dict(tables["sensor"], where=f"{path}: [sensor]")
+    sensor = from_dict(_with_gain(tables["sensor"], f"{path}: [sensor]"), where=f"{path}: [sensor]")
     known = [field.name for field in fields(sensor)]  # type: ignore[arg-type]  # every model is a dataclass
+    known += ["iso"] if "iso" in tables["sensor"] else []
     for key in tables.get("sources", {}):
         if key not in known:
             raise ValueError(f"{path}: unknown key {key!r} in [sources]{suggest(key, known)}")
     return sensor
+
+
+def _with_gain(settings: dict[str, object], where: str) -> dict[str, object]:
+    """Return a table [sensor] whose `iso`, if it has one, becomes its gain: at ISO 100 the full well fills the code.
+
+    gain = iso / 100 (2^bits - 1 - offset) / full_well, in codes per electron.
+    """
+    if "iso" not in settings:
+        return settings
+    numbers = {}
+    for key in ("iso", "full_well", "bits", "offset"):
+        value = settings.get(key, 0.0)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(f"{where}: {key} is a number, got {value!r}")
+        numbers[key] = float(value)
+    if settings.get("model") != "QIS" or "gain" in settings:
+        raise ValueError(
+            f'{where}: iso states the gain of a QIS; leave one of iso and gain out, and give model = "QIS"'
+        )
+    room = 2 ** min(numbers["bits"], 64) - 1 - numbers["offset"]
+    if not (0 < numbers["full_well"] < 1e30 and 0 < numbers["iso"] < 1e30 and room > 0):
+        raise ValueError(
+            f"{where}: iso needs a full_well above 0 and codes above the offset; at ISO 100 they are equal"
+        )
+    gain = numbers["iso"] / 100 * room / numbers["full_well"]
+    return {key: value for key, value in settings.items() if key != "iso"} | {"gain": gain}
 
 
 def from_dict(settings: Mapping[str, object], where: str = "sensor") -> Sensor:

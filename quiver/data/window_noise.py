@@ -51,6 +51,8 @@ def _pixel_array(defects: str, sensor: Sensor, shape: tuple[int, int]) -> PixelA
 def check_windows(noise: Noise, clip: Clip) -> None:
     """Raise `ValueError` if windows of this clip cannot be drawn one by one with this noise."""
     draw = noise.draw(clip)
+    if draw.remembers:
+        raise ValueError(f"{noise.sensor}: training windows cannot follow the charge of a spike camera; give --sensor")
     if noise.defects is not None:
         array = _pixel_array(noise.defects, draw.plane, clip.shape[1:])
         if array.follows_photons:

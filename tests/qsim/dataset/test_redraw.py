@@ -29,6 +29,14 @@ QUANTA = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 1.6\
 MAPS = "[defects]\ndevice_seed = 4\nprnu = 0.2\ndead = 0.1\n"
 DISTURBED = "[defects]\nafterpulse = 0.1\ncrosstalk = 0.05\n"
 
+SPIKES = """[sensor]
+model = "SpikeCamera"
+quantum_efficiency = 0.6
+dark_current = 10.0
+threshold = 12
+subtracts = {subtracts}
+"""
+
 # Name -> (sensor file, other settings, its `drawn_by`)
 KINDS = {
     "QIS": (QUANTA.format(bits=3), {"ppp": 3.25}, "table"),
@@ -42,6 +50,10 @@ KINDS = {
     "many planes": (BINARY.format(bits=10), {"ppp": 300.0}, "process"),
     "counting": (COUNTING.format(bits=3), {"ppp": 3.0}, "closed form"),
     "counting, followed": (COUNTING.format(bits=3) + "[defects]\ncarry_dead_time = true\n", {"ppp": 3.0}, "events"),
+    "QIS, slices": (QUANTA.format(bits=3), {"ppp": 3.0, "slices": 3}, "table"),
+    "QIS of ten bits, slices": (QUANTA.format(bits=10), {"ppp": 400.0, "slices": 2}, "process"),
+    "spikes": (SPIKES.format(subtracts="true"), {"ppp": 9.0}, "spikes"),
+    "spikes, reset to zero": (SPIKES.format(subtracts="false"), {"ppp": 9.0, "seed": 3}, "spikes"),
     "counting, slices": (COUNTING.format(bits=3), {"ppp": 3.0, "slices": 3}, "events"),
     "counting, rows": (COUNTING.format(bits=3), {"ppp": 3.0, "slices": 2, "rows": Rows(9e-5, "up")}, "events"),
     "planes, columns": (BINARY.format(bits=1) + DISTURBED, {"ppp": 0.7, "rows": Rows(3e-5, "left")}, "planes"),
@@ -112,7 +124,7 @@ def test_a_law_of_a_later_version_is_refused(clip, tmp_path):
     old = stored_again(clip, stream, stream.codes(), drawn_by="magic")
     (found,) = redraw.redraw(old.path)
     assert found.why == "drawn by 'magic'; this version has " + (
-        "table, process, planes, closed form, events: use the version that drew it"
+        "table, process, planes, closed form, events, spikes: use the version that drew it"
     )
 
 

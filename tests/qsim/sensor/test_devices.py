@@ -167,3 +167,54 @@ def test_other_mistakes_say_what_to_do(tmp_path):
     path.write_text("[sensor]\n" + "".join(f"{key} = {value}\n" for key, value in GOOD.items()))
     with pytest.raises(ValueError, match="the file has bits = 1, the request 3"):
         load(path, bits=3)
+
+
+CAMERA = """[sensor]
+model = "QIS"
+quantum_efficiency = 0.6
+dark_current = 100.0
+read_noise = 5.0
+full_well = {well}
+bits = {bits}
+offset = {offset}
+iso = {iso}
+[sources]
+iso = "chosen"
+"""
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14])
+@pytest.mark.parametrize("iso", [100, 200, 3200.0])
+@pytest.mark.parametrize("offset", [0.0, 16.5])
+def test_iso_is_a_gain_at_which_a_share_of_the_full_well_fills_the_code(tmp_path, bits, iso, offset):
+    (tmp_path / "c.toml").write_text(CAMERA.format(well=8000.0, bits=bits, offset=offset, iso=iso))
+    sensor = load(tmp_path / "c.toml")
+    electrons = np.array([8000.0 * 100 / iso])
+    assert sensor.gain * electrons[0] + offset == pytest.approx(2**bits - 1)
+    assert int(sensor.codes_of(electrons)[0]) == 2**bits - 1
+    assert from_dict(sensor.to_dict()) == sensor
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("iso = 100", "iso = 0", "iso needs a full_well above 0"),
+        ("iso = 100", "iso = -1", "iso needs a full_well above 0"),
+        ("iso = 100", "iso = inf", "iso needs a full_well above 0"),
+        ("iso = 100", "iso = nan", "iso needs a full_well above 0"),
+        ("iso = 100", 'iso = "high"', "iso is a number, got 'high'"),
+        ("iso = 100", "iso = true", "iso is a number, got True"),
+        ("iso = 100", "iso = 100\ngain = 1.0", "leave one of iso and gain out"),
+        ('"QIS"', '"SpikeCamera"', "iso states the gain of a QIS"),
+        ("full_well = 8000.0\n", "", "iso needs a full_well above 0"),
+        ("offset = 0.0", "offset = 5000.0", "codes above the offset"),
+        ("bits = 12", "bits = 99999999999", "bits"),
+    ],
+)
+def test_an_iso_that_states_no_gain_is_refused(tmp_path, old, new, message):
+    text = CAMERA.format(well=8000.0, bits=12, offset=0.0, iso=100)
+    assert old in text
+    (tmp_path / "c.toml").write_text(text.replace(old, new))
+    with pytest.raises(ValueError, match=message) as caught:
+        load(tmp_path / "c.toml")
+    assert "\n" not in str(caught.value)
