@@ -1,4 +1,4 @@
-"""Writes clips and streams for other programs: photon cube, mp4, PNG, EXR, zarr, challenge, with a .json beside it."""
+"""Writes clips and streams for other programs: cubes, mp4, PNG, EXR, zarr, spike .dat, with a .json beside it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream, orientation
 from qsim.colour import code_levels, peak
 from qsim.files import VERSION
-from qsim.formats import array_files, challenge, images, video
+from qsim.formats import array_files, challenge, images, raw_cameras, video
 
 BLOCK = 16  # frames read at a time
 
@@ -25,7 +25,7 @@ BLOCK = 16  # frames read at a time
 class Export:
     """The format of an export."""
 
-    kind: str  # cube, mp4, png, exr, zarr, challenge
+    kind: str  # cube, mp4, png, exr, zarr, challenge, spike
     transfer: str = "gamma 2.2"  # of pictures of light
     white: float | None = None  # light that becomes full scale; None: the 99.9th percentile
     lossless: bool = True  # of mp4
@@ -45,7 +45,7 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
         raise FileExistsError(f"{path}: exists; name another, or use --force to replace it")
     meta = _export_meta(source, wanted)
     path.parent.mkdir(parents=True, exist_ok=True)
-    single = wanted.kind in ("cube", "mp4")
+    single = wanted.kind in ("cube", "mp4", "spike")
     side, part = path.with_name(path.name + ".json"), path.with_name(path.name + ".part")
     for place in [path, *([side] if single else [part])]:
         _check_ours(place, side if single else place / "meta.json", single)
@@ -166,6 +166,14 @@ def _challenge(source: Any, path: Path, wanted: Export, meta: dict[str, Any]) ->
     meta |= challenge.write(source, path, wanted.planes)
 
 
+def _spike(source: Clip | Stream, path: Path, _wanted: Export, meta: dict[str, Any]) -> None:
+    if isinstance(source, Clip) or source.bits != 1:
+        what = "this is light" if isinstance(source, Clip) else f"this stream has {source.bits}"
+        raise ValueError(f"{source.path}: a spike file holds one bit per pixel, {what}; name a stream of one bit")
+    raw_cameras.write_spike(path, _code_blocks(source), source.shape)
+    meta |= {"bit_order": "lsb", "orientation": "upside down"}
+
+
 EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
     "cube": _cube,
     "mp4": _mp4,
@@ -173,6 +181,7 @@ EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
     "exr": _exr,
     "zarr": _zarr,
     "challenge": _challenge,
+    "spike": _spike,
 }
 
 

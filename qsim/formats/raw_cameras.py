@@ -1,4 +1,4 @@
-"""Reads raw files of photon counting cameras: binary planes as streams of bits.
+"""Reads raw files of photon counting and spike cameras, binary planes as streams of bits, and writes those of spikes.
 
 Each reader takes a path and the user's hints and returns a `Recording` of codes. The order of bits, rows and halves is
 not in these files; it is stated in the reader's docstring and in `meta`.
@@ -7,12 +7,14 @@ not in these files; it is stated in the reader's docstring and in `meta`.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim import files
 from qsim.checks import check_shape
 from qsim.formats.recording import Hints, Recording, check_size
 
@@ -70,7 +72,11 @@ def read_spad512s(path: Path, _hints: Hints) -> Recording:
 def read_spike(path: Path, hints: Hints) -> Recording:
     """Spike camera: one bit stream, least significant bit first, frames upside down; size by hints or config.yaml."""
     height, width = hints.height, hints.width
-    config = path.parent / "config.yaml"
+    config, ours = path.parent / "config.yaml", path.with_name(f"{path.name}.json")
+    if height is None and width is None and ours.is_file():  # written by `write_spike`
+        shape = files.read_json(ours).get("shape")
+        if isinstance(shape, list) and len(shape) == 3 and all(type(n) is int for n in shape):
+            _, height, width = shape
     if height is None and width is None and config.is_file():
         found = dict(re.findall(r"^\s*(spike_h|spike_w)\s*:\s*(\d{1,9})\b", config.read_text("utf-8", "replace"), re.M))
         height, width = int(found.get("spike_h", 0)) or None, int(found.get("spike_w", 0)) or None
@@ -88,6 +94,16 @@ def read_spike(path: Path, hints: Hints) -> Recording:
     # On published streams this bit order gives the smoother frames; flipped, they agree with their ground truth.
     meta = {"bit_order": "lsb", "orientation": "stored upside down, turned upright"}
     return _raw([path], [count], frame, (height, width), decode, "spike camera", meta)
+
+
+def write_spike(path: Path, blocks: Iterator[Array], shape: tuple[int, int, int]) -> None:
+    """Write binary planes [t, H, W] as `read_spike` reads them; `ValueError` if a plane does not fill whole bytes."""
+    _, height, width = shape
+    if height * width % 8:
+        raise ValueError(f"{path}: spike frames fill whole bytes, {height} x {width} pixels do not; export a cube")
+    with files.replacing(path) as file:
+        for block in blocks:
+            file.write(np.packbits(block[:, ::-1].reshape(len(block), -1), axis=1, bitorder="little").tobytes())
 
 
 def roughness(planes: Array) -> float:

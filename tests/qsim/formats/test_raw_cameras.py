@@ -1,5 +1,6 @@
 """Tests raw files of cameras: golden bytes, round trips, sizes that are not full frames."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings import everything, one, random_planes
 
-from qsim.formats import importing
+from qsim.formats import importing, raw_cameras
 from qsim.formats.recording import Hints
 
 
@@ -76,6 +77,31 @@ def test_spike_size_from_the_side_file(tmp_path: Path):
     np.testing.assert_array_equal(everything(tmp_path / "a.dat"), expected)
     with pytest.raises(ValueError, match="12 bytes are not a whole number"):
         importing.read(tmp_path / "a.dat", Hints(height=5, width=8))
+
+
+@settings(max_examples=30, deadline=None)
+@given(frames=st.integers(1, 5), height=st.integers(1, 12), width=st.integers(1, 12), seed=st.integers(0, 99))
+def test_spikes_are_written_as_others_write_them(
+    tmp_path_factory: pytest.TempPathFactory, frames: int, height: int, width: int, seed: int
+):
+    """The bytes are those of the reference encoder of these tests; frames that fill no whole bytes are refused."""
+    path = tmp_path_factory.mktemp("s") / "a.dat"
+    planes = random_planes(frames, height, width, seed=seed)
+    blocks = [part for part in (planes[:2], planes[2:]) if len(part)]
+    if height * width % 8:
+        with pytest.raises(ValueError, match=rf"spike frames fill whole bytes, {height} x {width} pixels do not"):
+            raw_cameras.write_spike(path, iter(blocks), planes.shape)
+        assert not path.exists()
+        return
+    raw_cameras.write_spike(path, iter(blocks), planes.shape)
+    assert path.read_bytes() == raw_planes.spike(planes)
+    path.with_name("a.dat.json").write_text(json.dumps({"shape": [frames, height, width]}))
+    np.testing.assert_array_equal(everything(path), planes)
+    for shape in ([1, 2], [frames, height, "8"], [frames, height * 8, -1], None, [frames, 0, width]):
+        path.with_name("a.dat.json").write_text(json.dumps({"shape": shape}))
+        with pytest.raises(ValueError, match=r"a\.dat") as caught:
+            importing.read(path)
+        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
