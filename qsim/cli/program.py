@@ -12,6 +12,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from qsim.cli.calibrate import add_calibrate
+from qsim.cli.compare import add_compare
 from qsim.cli.completion import add_completion, families, recipes, sensors
 from qsim.cli.console import OPTIONAL, Parser, command, output, run
 from qsim.cli.convert import add_convert
@@ -48,6 +49,7 @@ def parser() -> Parser:
         add_report,
         add_explore,
         add_tradeoff,
+        add_compare,
         add_calibrate,
         add_validate,
         add_demo,

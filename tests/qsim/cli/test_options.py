@@ -52,6 +52,7 @@ WORDS = {  # a line that each parser takes
     "report": "report clip",
     "explore": "explore clip",
     "tradeoff": "tradeoff --table",
+    "compare": "compare clip",
     "calibrate": QIS,
     "validate": "validate reading",
     "completion": "completion bash",
@@ -153,7 +154,8 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ],
     ("sense", "--slices"): [
         Acts("sense clip --sensor counter.toml --name n", "--slices 2"),
-        Refused("sense clip", "--slices 2", "slices"),
+        Acts("sense clip --name n", "--slices 2"),
+        Refused("sense clip --sensor spad-320x240", "--slices 2", "slices"),
     ],
     ("sense", "--row-delay"): [
         Acts("sense clip --ppp 3 --name n", "--row-delay 1e-6"),
@@ -209,6 +211,12 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("plan", "--machines"): [Acts("plan t.toml --json", "--machines 4", numbers("machines"), slow=True)],
     ("plan", "--frames"): [Refused("plan t.toml", "--frames 1", "frames")],
     ("check", "--redraw"): [Acts("check clip", "--redraw", stdout)],
+    # compare
+    ("compare", "--streams"): [
+        Acts("compare clip", "--streams s", stdout),
+        Refused("compare clip", "--streams x", "x"),
+    ],
+    ("compare", "--span"): [Acts("compare clip", "--span 1e-3", stdout), Refused("compare clip", "--span 9", "span")],
     # convert
     ("convert", "--layout"): [Acts(CODES.replace("--layout codes", ""), "--layout codes", exit_code, codes=(0, 2))],
     ("convert", "--frame-rate"): [

@@ -1,0 +1,109 @@
+"""Compares readouts of the same light: the streams of one clip, each averaged over the same span of time.
+
+    codes within the span -> mean code -> exact inverse response -> photons per clip frame, against the sharp truth
+
+A stream of short codes averages many of them, one of long codes few, and all see the same motion. Light is compared in
+the clip's own unit, so streams at other light levels are compared, too. A first row states the error of the light
+itself: the mean of the span without noise, which is what blur leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.clip.clip import Clip
+from qsim.clip.photons import clip_photons
+from qsim.clip.stream import Stream
+from qsim.colour import psnr
+from qsim.optics.radiometry import WHITE_PER_MEAN
+from qsim.sensor.estimation import Response
+
+_POINTS = 1024  # of a response: interpolation errs by less than 2e-5 of the full scale, and 12 bits take seconds
+
+
+@dataclass(frozen=True)
+class ReadoutRow:
+    """One stream of a comparison, or the light itself."""
+
+    stream: str  # empty: the light without noise
+    model: str  # of its sensor
+    bits: int | None
+    codes: int  # averaged for one estimate
+    seconds: float  # that these codes take
+    ppp: float | None  # photons per pixel in these codes
+    psnr_db: float  # against the sharp light, below 2.5 x the mean light of the clip
+    megabytes_per_second: float | None
+
+
+@dataclass(frozen=True)
+class Readouts:
+    """The rows of one clip."""
+
+    clip: str
+    span: float  # s, as asked
+    instants: tuple[int, ...]  # clip frames that were compared
+    rows: tuple[ReadoutRow, ...]
+
+
+def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) -> Readouts:
+    """Return the comparison of streams (by default all) over `span` [s], by default the longest code of them.
+
+    `ValueError` for a clip without streams, and for a span that is shorter than a clip frame or longer than the clip.
+    """
+    streams = [clip.stream(name) for name in names or clip.streams]
+    if not streams:
+        raise ValueError(f"{clip.path}: has no streams to compare; make some with `qsim sense`")
+    frame = 1 / clip.frame_rate
+    seconds = max(frame * _frames_per_code(stream) for stream in streams) if span is None else span
+    window = round(seconds / frame)
+    if not 1 <= window <= len(clip):
+        raise ValueError(
+            f"{clip.path}: a span of {seconds:.4g} s; the clip has {len(clip)} frames of {frame:.4g} s: give a span "
+            "between"
+        )
+    centres = tuple(range(window // 2, len(clip) - window + window // 2 + 1, window))
+    truth = np.stack([clip_photons(clip, t, sharp=True) for t in centres])
+    peak = WHITE_PER_MEAN * float(np.mean([clip_photons(clip, t).mean() for t in range(len(clip))]))
+
+    def score(found: Array) -> float:
+        return psnr(peak, float(np.sqrt(np.mean((found - truth) ** 2))))
+
+    blurred = np.stack([_light(clip, t - window // 2, window) for t in centres])
+    rows = [ReadoutRow("", "light", None, window, window * frame, None, score(blurred), None)]
+    for stream in streams:
+        codes = max(1, round(window / _frames_per_code(stream)))
+        response = stream.sensor.response(stream.exposure, _POINTS)
+        found = np.stack([_estimate(stream, response, t, codes) for t in centres])
+        rows.append(_row(stream, codes, codes * _frames_per_code(stream) * frame, score(found)))
+    return Readouts(clip.name, seconds, centres, tuple(rows))
+
+
+def _frames_per_code(stream: Stream) -> int:
+    return int(stream.meta.get("planes_per_code") or 1)
+
+
+def _light(clip: Clip, first: int, window: int) -> Array:
+    """Return the mean photons [H, W] of clip frames first ... first + window - 1."""
+    return np.mean([clip_photons(clip, t) for t in range(first, first + window)], axis=0)
+
+
+def _estimate(stream: Stream, response: Response, centre: int, codes: int) -> Array:
+    """Return photons per clip frame, float64 [H, W], from the codes around a clip frame, at the clip's own light."""
+    per_code = _frames_per_code(stream)
+    first = round((centre + 0.5) / per_code - codes / 2)
+    first = min(max(first, 0), len(stream) - codes)
+    mean = stream.codes(first, first + codes).mean(axis=0)
+    return np.asarray(response.invert(mean, codes) / (per_code * stream.photons_factor))
+
+
+def _row(stream: Stream, codes: int, seconds: float, score: float) -> ReadoutRow:
+    height, width = stream.shape[1:]
+    rate = stream.bits * height * width * float(stream.meta["frame_rate"]) / 8e6
+    ppp = stream.meta.get("ppp")
+    model = type(stream.sensor).__name__
+    light = None if ppp is None else float(ppp) * codes
+    return ReadoutRow(stream.name, model, stream.bits, codes, seconds, light, score, rate)

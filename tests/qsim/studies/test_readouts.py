@@ -1,0 +1,91 @@
+"""Comparing readouts: the same light, the same span, any number of clip frames per code."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from clips import write_clip
+
+from qsim.cli.program import main
+from qsim.clip.photons import clip_photons
+from qsim.sensor.qis import QIS
+from qsim.sensor.spike import SpikeCamera
+from qsim.studies.readouts import compare
+
+EXACT = QIS(quantum_efficiency=1.0, dark_current=0.0, read_noise=0.0, bits=9)
+SPIKE = SpikeCamera(quantum_efficiency=1.0, dark_current=0.0, threshold=100)
+
+
+def test_the_light_of_a_span_is_its_mean_and_a_sensor_without_noise_finds_it(tmp_path):
+    """An ideal counter errs by the light of its span and by shot noise, at one frame per code and at four."""
+    clip = write_clip(tmp_path / "c", frames=12, height=7, width=9)
+    clip.sense(EXACT, ppp=150.0, name="each")
+    clip.sense(EXACT, ppp=150.0, slices=4, name="four")
+    found = compare(clip)
+    assert found.span == pytest.approx(4 / clip.frame_rate)
+    assert found.instants == (2, 6, 10)
+    light, each, four = found.rows
+    assert (each.codes, four.codes, light.codes) == (4, 1, 4)
+    truth = np.stack([clip_photons(clip, t, sharp=True) for t in found.instants])
+    mean = np.stack([np.mean([clip_photons(clip, t + d) for d in (-2, -1, 0, 1)], axis=0) for t in found.instants])
+    peak = 2.5 * clip.mean_photons
+    assert light.psnr_db == pytest.approx(20 * np.log10(peak / np.sqrt(np.mean((mean - truth) ** 2))))
+    blur = np.mean((mean - truth) ** 2)
+    for row in (each, four):
+        error = peak**2 / 10 ** (row.psnr_db / 10)
+        shot = clip.mean_photons**2 / row.ppp  # at the mean light
+        assert abs(error / (blur + shot) - 1) < 6 * np.sqrt(2 / truth.size) + 0.1
+    assert (each.ppp, four.ppp) == (pytest.approx(600.0), pytest.approx(150.0))
+    assert each.megabytes_per_second == pytest.approx(9 * 7 * 9 * 2000 / 8e6)
+
+
+@pytest.mark.parametrize("span", [1, 2, 5, 6, 11])
+def test_noise_falls_with_the_span_of_a_static_scene(tmp_path, span: int):
+    """Shot noise of a static scene: the mean square error of an ideal counter is light / frames, within six sigma."""
+    still = np.broadcast_to(np.linspace(0.5, 1.5, 13 * 17).reshape(13, 17), (22, 13, 17))
+    clip = write_clip(tmp_path / "c", radiance=still)
+    clip.sense(EXACT, ppp=50.0, name="each")
+    found = compare(clip, ["each"], span / clip.frame_rate)
+    n = len(found.instants) * 13 * 17
+    assert len(found.instants) == 22 // span
+    error = (2.5 * 50) ** 2 / 10 ** (found.rows[1].psnr_db / 10)
+    assert abs(error * span / 50 - 1) < 6 * np.sqrt(2.2 / n)
+    assert found.rows[0].psnr_db > 200, "the light of a static scene has no error but rounding"
+
+
+def test_spikes_come_near_the_light_they_count(tmp_path):
+    """A static scene over all planes: a count of spikes errs by one spike at most, plus shot noise."""
+    still = np.broadcast_to(np.linspace(0.5, 1.5, 11 * 7).reshape(11, 7), (60, 11, 7))
+    clip = write_clip(tmp_path / "c", radiance=still)
+    clip.sense(SPIKE, ppp=30.0, name="spike")
+    (_, row) = compare(clip, span=60 / clip.frame_rate).rows
+    error = (2.5 * 30) ** 2 / 10 ** (row.psnr_db / 10)  # photons^2 per plane
+    rounding = (SPIKE.threshold / 60) ** 2 / 6  # two uniform ends of a count
+    expected = rounding + 30 / 60
+    assert abs(error / expected - 1) < 6 * np.sqrt(2.5 / 77)
+
+
+def test_the_command_prints_a_table_and_refuses_what_cannot_be(tmp_path, capsys):
+    clip = write_clip(tmp_path / "c", frames=6, height=5, width=8)
+    assert main(["compare", str(clip.path)]) == 2
+    assert "has no streams to compare" in capsys.readouterr().err
+    clip.sense(SPIKE, ppp=30.0, name="spike")
+    clip.sense(EXACT, ppp=90.0, slices=3, name="slow")
+    assert main(["compare", str(clip.path), "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [(row["stream"], row["codes"]) for row in rows] == [("", 3), ("slow", 1), ("spike", 3)]
+    assert main(["compare", str(clip.path), "--streams", "spike", "--span", "1e-3"]) == 0
+    table = capsys.readouterr().out
+    assert "c: 3 instants, 1 ms each, against the sharp light" in table
+    assert "slow" not in table
+    for words, message in [
+        (["--span", "1"], "the clip has 6 frames of 0.0005 s: give a span between"),
+        (["--span", "1e-9"], "a span of 1e-09 s"),
+        (["--streams", "slwo"], "no stream 'slwo'"),
+    ]:
+        assert main(["compare", str(clip.path), *words]) == 2
+        said = capsys.readouterr().err
+        assert message in said
+        assert said.count("\n") == 1
