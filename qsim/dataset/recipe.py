@@ -29,6 +29,7 @@
     seed = 1                   # of the noise; default: that of [recipe]
     name = "dim"               # of the stream; default: made from sensor, bits and light
     group = true               # a code sums 2^bits - 1 clip frames as binary planes; default false
+    slices = 16                # clip frames in one exposure of a QIS or a counting SPAD; default 1
     diffraction = true         # blur by the lens's Airy pattern; default false
     row_delay = 2e-6           # seconds from one row, or column, to the next; default: all at once
     row_order = "down"         # order of rows: down, the default, or up; of columns: right or left
@@ -149,9 +150,10 @@ def _check_jobs(jobs: list[tuple[Job, Section]], path: Path) -> None:
                 with section.naming():
                     at = job.settings
                     sensing.rows.check(at.height, at.width, at.frame_rate, sensing.slices, sensing.stream_name)
-            if sensing.group and job.settings.frames < 2 ** (sensing.bits or 1) - 1:
+            taken = 2 ** (sensing.bits or 1) - 1 if sensing.group else sensing.slices
+            if job.settings.frames < taken:
                 few = f"{job.settings.frames} frames are too few for {sensing.stream_name}, whose codes sum"
-                cure = f"{2 ** (sensing.bits or 1) - 1} of them; render more frames, or use fewer bits"
+                cure = f"{taken} of them; render more frames, or use fewer bits or slices"
                 raise ValueError(f"{section.where()}: {few} {cure}")
 
 
@@ -229,9 +231,9 @@ def _seeds(section: Section, given: dict[str, Any]) -> list[int]:
 def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
     """Return one stream per bits and light level, and add their names to `taken`; `ValueError` for a taken name."""
     given = section.values(STREAMS)
-    unit, levels = _light(section, given)
+    levels = _light(section, given)
     bits, name = given.get("bits", [None]), given.get("name")
-    sensor = _sensor(section, given["sensor"], bits, given.get("group", False))
+    sensor = _sensor(section, given["sensor"], bits, given.get("group", False), given.get("slices", 1))
     colour = _colour(section, given.get("colour"))
     with section.naming("row_order"):
         rows = Rows.of(given.get("row_delay"), given.get("row_order"))
@@ -244,15 +246,15 @@ def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
             bits=b,
             name=name,
             colour=colour,
-            ppp=level if unit == "ppp" else None,
-            lux=level if unit == "lux" else None,
             seed=given.get("seed", seed),
             group=given.get("group", False),
             diffraction=given.get("diffraction", False),
+            slices=given.get("slices", 1),
             rows=rows,
+            **light,
         )
         for b in bits
-        for level in levels
+        for light in levels
     ]
     for sensing in found:
         with section.naming("sensor", "streams are named after the sensor: "):
@@ -263,27 +265,23 @@ def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
     return found
 
 
-def _light(section: Section, given: dict[str, Any]) -> tuple[str, list[float | None]]:
-    """Return ("ppp" | "lux" | "absolute", levels); absolute light has the one level None."""
+def _light(section: Section, given: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the fields of `Sensing` that state each light level; absolute light has none."""
     units = [key for key in ("ppp", "lux", "absolute") if key in given]
     if len(units) != 1:
         wanted = "give one light level, ppp = ..., lux = ... or absolute = true"
         raise ValueError(f"{section.where()}: {wanted}; {' and '.join(units) or 'none'} given")
     unit = units[0]
     if unit != "absolute":
-        return unit, given[unit]
+        return [{unit: level} for level in given[unit]]
     if not given["absolute"]:
         raise ValueError(f"{section.where('absolute')}: absolute can only be true; or give a ppp")
-    return unit, [None]
+    return [{}]
 
 
-def _sensor(section: Section, sensor: str, bits: list[int | None], group: bool) -> str:
-    """Return the sensor's name or absolute file.
-
-    `ValueError` if it does not exist with all these bits, or if its planes cannot be summed and `group` asks for it.
-    """
-    from qsim.sensor import devices
-    from qsim.sensor.spad import BinarySPAD
+def _sensor(section: Section, sensor: str, bits: list[int | None], group: bool, slices: int) -> str:
+    """Return the sensor's name or absolute file; `ValueError` if it lacks these bits, or cannot be read as asked."""
+    from qsim.sensor import QIS, BinarySPAD, CountingSPAD, devices
 
     if sensor.endswith(".toml"):
         sensor = str((section.text.path.parent / sensor).resolve())
@@ -293,6 +291,9 @@ def _sensor(section: Section, sensor: str, bits: list[int | None], group: bool) 
         if group and not (depth and isinstance(found, BinarySPAD)):
             what = f"this is a {type(found).__name__}" if depth else "the bits of a code are needed, as in bits = 3"
             raise ValueError(f"{section.where('group')}: group sums planes of a clocked SPAD; {what}")
+        if slices > 1 and (group or not isinstance(found, QIS | CountingSPAD)):
+            what = "group sums planes instead" if group else f"this is a {type(found).__name__}"
+            raise ValueError(f"{section.where('slices')}: slices are of one exposure of a QIS or CountingSPAD; {what}")
     return sensor
 
 
@@ -339,7 +340,7 @@ STREAMS: Table = {
     "ppp, if any": checks.list_of(checks.light), "lux, if any": checks.list_of(checks.light),
     "absolute, if any": checks.flag,
     "seed, if any": checks.seed, "name, if any": _name,
-    "group, if any": checks.flag, "diffraction, if any": checks.flag,
+    "group, if any": checks.flag, "slices, if any": checks.whole, "diffraction, if any": checks.flag,
     "row_delay, if any": checks.positive, "row_order, if any": checks.row_order,
     "colour, if any": checks.text,
 }  # fmt: skip

@@ -111,6 +111,14 @@ MISTAKES = [
     ("qsim sense none --ppp 3", "none: no such clip"),
     ("qsim sense text.txt --ppp 3", "text.txt: not a clip folder (it has no clip.json)"),
     ("qsim sense data --replay fan_0000", "--replay fan_0000: expected CLIP:FRAME, as in fan_0003:7"),
+    ("qsim sense lit --ppp 3 --sensor spad512s --slices 2", "slices of an exposure are for a CountingSPAD or a QIS"),
+    (
+        "qsim sense lit --ppp 3 --sensor spike.sensor.toml",
+        "SpikeCamera.threshold is a whole number of electrons, 1 ...",
+    ),
+    ("qsim sense lit --ppp 3 --sensor iso.sensor.toml", "iso needs a full_well above 0 and codes above the offset"),
+    ("qsim convert lit x.dat", "lit: a spike file holds one bit per pixel, this is light; name a stream of one bit"),
+    ("qsim compare lit --span 1", "has no streams to compare; make some with `qsim sense`"),
     # What is in the way
     ("qsim render fan -o text.txt --force", "text.txt: exists and is not a clip, which is all that --force replaces"),
     ("qsim render fan -o data --force", "data: exists and is not a clip, which is all that --force replaces"),
@@ -253,6 +261,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "percent.toml": sensor.replace("0.8", "80"),
         "key.sensor.toml": sensor.replace("efficiency", "efficency"),
         "noise.sensor.toml": sensor.replace("0.2", "-0.2"),
+        "iso.sensor.toml": f"{sensor}iso = 100\n",
+        "spike.sensor.toml": '[sensor]\nmodel = "SpikeCamera"\nquantum_efficiency = 0.6\ndark_current = 0.0\n'
+        "threshold = 0\n",
     }
     changes = {
         "key": ("frames = 3", "frmaes = 3"),
