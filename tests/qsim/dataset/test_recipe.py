@@ -116,7 +116,7 @@ MISTAKES = [
     ("ppp = [0.5, 3.25]", "ppp = 1\ngroup = true", 24, r"group sums planes of a clocked SPAD; this is a QIS"),
     ("ppp = [0.5, 3.25]", "ppp = 1\nslices = 4", 8, r"3 frames are too few for .*, whose codes sum 4 of them"),
     ("ppp = [0.5, 3.25]", "ppp = 1\nslices = 0", 24, r"slices: expected a whole number from 1 to 100000, got 0"),
-    ('"quiver-physical"', '"spad512s"\nslices = 2', 22, r"slices are of one exposure of a QIS or a CountingSPAD; this"),
+    ('"quiver-physical"', '"spad512s"\nslices = 2', 22, r"slices are of one exposure of a QIS or CountingSPAD; this"),
     ('"quiver-physical"\nbits = [1, 3]', '"spad512s"\ngroup = true', 22, r"the bits of a code are needed"),
     ('"quiver-physical"', '"spad512s"\ngroup = true', 8, r"3 frames are too few for spad512s_3bit_0\.5ppp, .* sum 7"),
     ('split = "test"', f'split = "test"\n{AGAIN}"fan"', 18, r"the clip fan_0000 is listed twice"),
