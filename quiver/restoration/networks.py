@@ -152,7 +152,7 @@ def fill_parts(
             place = (slice(tile.y, tile.y + rows), slice(tile.x, tile.x + columns))
             seen = torch.from_numpy(frames[(slice(None), *place)])[None, :, None].to(device)
             with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
-                result = network(seen, **known)[0, wanted.start - begin : wanted.stop - begin, 0]
+                result = restored_frames(network, seen, wanted.start - begin, wanted.stop - begin, **known)[0, :, 0]
             restored = result.float().cpu().numpy()
             out[(slice(wanted.start - first, wanted.stop - first), *place)] += (
                 tile.weight * restored * np.float32(codes.white)
@@ -163,6 +163,16 @@ def fill_parts(
             if progress is not None:
                 progress(done, len(out) * len(pieces.tiles))
     warn_of_cut(codes, options, pieces, apart)
+
+
+def restored_frames(network: Any, frames: Tensor, first: int, last: int, **known: Tensor) -> Tensor:
+    """Clip [1, T, 1, h, w] -> restored frames first ... last - 1; networks of windows compute these alone."""
+    from quiver.model.rivals.edges import restored_range
+
+    if hasattr(network, "windows"):
+        return restored_range(network, frames, first, last, **known)
+    restored: Tensor = network(frames, **known)
+    return restored[:, first:last]
 
 
 def known_of(network: Any, codes: Codes) -> dict[str, Tensor]:

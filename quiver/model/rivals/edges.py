@@ -1,5 +1,7 @@
 """Checks frames, and extends them beyond their edges: in space by repetition, in time by reflection."""
 
+from typing import Any
+
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -27,3 +29,16 @@ def reflected(first: int, count: int, length: int) -> list[int]:
     period = max(2 * (length - 1), 1)
     folded = (t % period for t in range(first, first + count))
     return [min(t, period - t) if length > 1 else 0 for t in folded]
+
+
+def restored_range(network: Any, frames: Tensor, first: int, last: int, **known: Tensor) -> Tensor:
+    """Clip [B, T, 1, H, W] -> restored frames first ... last - 1 of it [B, last - first, 1, H, W].
+
+    For networks that restore one frame of a window: only the windows of these frames are computed. `known` are further
+    inputs of its `windows`. ValueError for another shape.
+    """
+    check_frames(frames)
+    before, count = network.frames_in - 1 - network.look_ahead, last - first + network.frames_in - 1
+    order = reflected(first - before, count, frames.shape[1])
+    restored: Tensor = network.windows(pad_space(frames[:, order], network.multiple), **known)
+    return restored[..., : frames.shape[-2], : frames.shape[-1]]

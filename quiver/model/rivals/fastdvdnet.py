@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from qsim.structure import make
 from quiver.model.config import flag, whole_number
-from quiver.model.rivals.edges import check_frames, pad_space, reflected
+from quiver.model.rivals.edges import restored_range
 from quiver.model.rivals.noise import deviation_map, table_of
 
 TRIPLE = 3  # frames of a U-Net
@@ -73,11 +73,8 @@ class FastDVDnet(nn.Module):
 
         `variance` is the sensor's table, [n] or one per clip [B, n]; None: that of noise.VARIANCE.
         """
-        check_frames(frames)
-        count = frames.shape[1]
-        order = reflected(-self.look_ahead, count + 2 * self.look_ahead, count)
-        restored = self.windows(pad_space(frames, self.multiple)[:, order], variance)
-        return restored[..., : frames.shape[-2], : frames.shape[-1]]
+        known = {} if variance is None else {"variance": variance}
+        return restored_range(self, frames, 0, frames.shape[1], **known)
 
     def windows(self, frames: Tensor, variance: Tensor | None = None) -> Tensor:
         """[B, T, 1, H, W], T >= 5, H and W multiples of 4 -> restored frames 2 ... T-3 [B, T-4, 1, H, W]."""

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from qsim.structure import make
 from quiver.model.config import flag, whole_number
 from quiver.model.deformable import deform_conv2d
-from quiver.model.rivals.edges import check_frames, pad_space, reflected
+from quiver.model.rivals.edges import restored_range
 
 GROUPS = 5  # of frames, two frames apart
 BEFORE = 5  # frames of a window before the restored one
@@ -33,7 +33,6 @@ MIDDLE = 2  # the group to which the others are aligned
 BRANCHES = 4  # light estimates
 DEFORMABLE_GROUPS = 8
 CONVERTER = 0.6  # what the network gives for a target of 1
-MULTIPLE = 4  # px that divide height and width inside
 
 
 @dataclass(frozen=True)
@@ -79,6 +78,7 @@ class Extracted(NamedTuple):
 class Spk2ImgNet(nn.Module):
     """Spk2ImgNet: a window of ten or eleven frames gives one restored frame."""
 
+    multiple: ClassVar[int] = 4  # px that divide height and width inside
     unused: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: Spk2ImgNetConfig | None = None) -> None:
@@ -98,11 +98,7 @@ class Spk2ImgNet(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """[B, T, 1, H, W] of codes/(2^b - 1) -> restored [B, T, 1, H, W]; ValueError for another shape."""
-        check_frames(frames)
-        count = frames.shape[1]
-        order = reflected(-BEFORE, count + self.frames_in - 1, count)
-        restored = self.windows(pad_space(frames, MULTIPLE)[:, order])
-        return restored[..., : frames.shape[-2], : frames.shape[-1]]
+        return restored_range(self, frames, 0, frames.shape[1])
 
     def windows(self, frames: Tensor) -> Tensor:
         """[B, T, 1, H, W], T >= frames_in, H and W multiples of 4 -> restored frames [B, T - frames_in + 1, 1, H, W].

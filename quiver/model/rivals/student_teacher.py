@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from qsim.structure import make
 from quiver.model.blocks import RADIUS, WINDOW, conv
 from quiver.model.config import flag, whole_number
-from quiver.model.rivals.edges import check_frames, pad_space, reflected
+from quiver.model.rivals.edges import restored_range
 
 LEAST_VARIANCE = 1e-6  # of a channel of features, so that constant ones have a slope
 
@@ -85,11 +85,7 @@ class StudentTeacher(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """[B, T, 1, H, W] of codes/(2^b - 1) -> restored [B, T, 1, H, W]; ValueError for another shape."""
-        check_frames(frames)
-        count = frames.shape[1]
-        order = reflected(-RADIUS, count + 2 * RADIUS, count)
-        restored = self.windows(pad_space(frames, self.multiple)[:, order])
-        return restored[..., : frames.shape[-2], : frames.shape[-1]]
+        return restored_range(self, frames, 0, frames.shape[1])
 
     def windows(self, frames: Tensor) -> Tensor:
         """[B, T, 1, H, W], T >= 11, H and W even -> restored frames 5 ... T-6 [B, T-10, 1, H, W]."""

@@ -99,6 +99,21 @@ def test_a_range_of_frames_is_that_of_the_complete_stream():
                 np.testing.assert_array_equal(restored(network, codes, None, first, last), whole[first:last])
 
 
+@pytest.mark.parametrize("name", [name for name in CLIPS if hasattr(tiny(name), "windows")])
+def test_only_the_windows_of_wanted_frames_are_computed(name, monkeypatch):
+    """Frames 14 ... 18 lie in two parts; each is computed once, and as in the complete clip, bit for bit."""
+    network, codes, computed = tiny(name).eval(), random_codes(20, 9, 14), []
+    whole, windows = restored(network, codes), network.windows
+
+    def counted(frames: Tensor, **known: Tensor) -> Tensor:
+        computed.append(frames.shape[1] - network.frames_in + 1)
+        return windows(frames, **known)
+
+    monkeypatch.setattr(network, "windows", counted)
+    np.testing.assert_array_equal(restored(network, codes, None, 14, 19), whole[14:19])
+    assert computed == [2, 3]
+
+
 @pytest.mark.parametrize("name", CLIPS)
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 3, 5), (3, 10, 7)])
 def test_every_frame_of_any_size_is_restored(name, shape):
