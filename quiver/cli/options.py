@@ -16,16 +16,15 @@ from qsim.cli.console import note
 from qsim.cli.options import count, memory_size, numbers, positive, whole_numbers, words
 from qsim.files import check_ours
 from quiver.device import DEVICES
-from quiver.restoration.interface import MODES
+from quiver.restoration.interface import COMPARED, MODES
 
 QUIVERS = ("nano", "quiver-s", "quiver")  # see quiver/model/presets.py
-_COMPARED = ("unet", "fastdvdnet", "student-teacher", "bit2bit", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")
 NETWORKS = (
     *QUIVERS,
     "mergenet",
-    *_COMPARED,
+    *COMPARED,
     *(f"{name}-as-published" for name in ("emvd", "flornn", "memdeblur", "spk2imgnet")),
-    *(f"{name}-1m" for name in ("quiver-s", *_COMPARED)),
+    *(f"{name}-1m" for name in ("quiver-s", "mergenet", *COMPARED)),
 )
 LEVELS = 16  # of a range of light in training: from 0.3 to 100 photons they are a factor 1.47 apart
 PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see quiver/training/settings.py

@@ -32,14 +32,13 @@ from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
 from quiver.device import PeakMemory, pick_device
 from quiver.evaluation import metrics
-from quiver.restoration.interface import MODES, RestoreOptions, Restorer
+from quiver.restoration.interface import COMPARED, MODES, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer, wrap_network
 from quiver.restoration.restorers import restorer, weights_path
 
 EXPOSURE = 5e-4  # s
 MODAL = ("nano", "quiver-s", "quiver", "quiver-s-1m")  # presets that have several modes
-_COMPARED = ("unet", "fastdvdnet", "student-teacher", "bit2bit", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")
-PRESETS = (*MODAL, *_COMPARED, *(f"{name}-1m" for name in _COMPARED))
+PRESETS = (*MODAL, *COMPARED, *(f"{name}-1m" for name in ("mergenet", *COMPARED)))
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,45 @@
 """Counts the multiply-accumulates of networks, per pixel and frame: the measure of cost in tables at equal cost.
 
 Counted are convolutions, linear layers and matrix products, as torch counts them; sampling and arithmetic on single
-pixels are not.
+pixels are not. The count of a design is that of one more frame of a long clip. What restoring a stream in parts adds,
+the frames around each part, depends on the program (quiver/restoration/parts.py); `quiver bench` counts it.
 """
+
+import contextlib
+from typing import Any
 
 import torch
 from torch import nn
+from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode
 
-FRAMES = (32, 64)  # of two clips; bit2bit restores pieces of 32 frames, others repeat themselves after 10 at most
-SIDE = 64  # px
+from quiver.model.mergenet import MergeNet
+from quiver.model.presets import made
+from quiver.model.rivals.bit2bit import Bit2BitConfig
+
+FRAMES = (12, 22)  # of two clips; networks repeat themselves after 10 frames at most
+LONG = (32, 64)  # of bit2bit, which restores pieces of 32 frames
+SIDE = 128  # px
+
+
+def design_macs(config: Any) -> float:
+    """Return those of the network of a configuration, per pixel of one more frame of a long clip of 128 x 128 px.
+
+    Nothing is computed: tensors have a shape and no values. A plane sweep, which looks at values, is the exception.
+    """
+    fake = contextlib.nullcontext() if getattr(config, "largest_velocity", 0) else FakeTensorMode()
+    with fake:
+        return macs_per_pixel(made(config).eval(), LONG if isinstance(config, Bit2BitConfig) else FRAMES)
 
 
 def macs(network: nn.Module, frames: int, height: int, width: int) -> int:
-    """Return the multiply-accumulates with which a network restores a black clip [1, frames, 1, height, width]."""
+    """Return the multiply-accumulates with which a network restores a black clip [1, frames, 1, height, width].
+
+    MergeNet gets as many merged frames.
+    """
+    merged = (frames, network.config.inputs, height, width) if isinstance(network, MergeNet) else None
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        network(torch.zeros(1, frames, 1, height, width))
+        network(torch.zeros(merged or (1, frames, 1, height, width)))
     return int(counter.get_total_flops()) // 2
 
 

@@ -1,12 +1,13 @@
 """Holds the sizes at which all networks cost alike: about a million multiply-accumulates per pixel and frame.
 
-Each is its published design with other widths. Counted by `quiver.evaluation.macs.macs_per_pixel`: one more frame of a
+Each is its published design with other widths. Counted by `quiver.evaluation.macs.design_macs`: one more frame of a
 long clip, whose ends do not count.
 """
 
 from typing import Any
 
 from quiver.model.folded import FoldedConfig
+from quiver.model.mergenet import MergeNetConfig
 from quiver.model.rivals.bit2bit import Bit2BitConfig
 from quiver.model.rivals.emvd import EMVDConfig
 from quiver.model.rivals.fastdvdnet import FastDVDnetConfig
@@ -18,6 +19,7 @@ from quiver.model.rivals.student_teacher import StudentTeacherConfig
 from quiver.model.unet import UNetConfig
 
 EQUAL_COST: dict[str, Any] = {
+    "mergenet": MergeNetConfig(width=110),  # 0.99 M; merging, before it, has no convolutions
     "emvd": EMVDConfig(width=336),  # 0.99 M
     "flornn": FloRNNConfig(
         width=38, flow_channels=(16, 32, 16, 8)

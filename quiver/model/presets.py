@@ -105,8 +105,12 @@ def parameter_count(config: Config) -> int:
 
 def build(name: str) -> nn.Module:
     """Return a network by its name, with random weights; ValueError for other names."""
-    config = (PRESETS | OTHERS).get(name)
-    for network, kind in NETWORKS:
-        if type(config) is kind:
-            return network(config)
-    raise ValueError(f"no network is called {name!r}; known: {', '.join(PRESETS | OTHERS)}")
+    known = PRESETS | OTHERS
+    if name not in known:
+        raise ValueError(f"no network is called {name!r}; known: {', '.join(known)}")
+    return made(known[name])
+
+
+def made(config: Any) -> nn.Module:
+    """Return the network of a configuration of any kind, with random weights."""
+    return next(network(config) for network, kind in NETWORKS if kind is type(config))

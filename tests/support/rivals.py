@@ -3,13 +3,12 @@
 import importlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from golden import fill_by_rule
 from torch import nn
 
-from quiver.model.presets import NETWORKS
 from quiver.model.rivals.bit2bit import Bit2Bit, Bit2BitConfig
 from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
 from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
@@ -30,11 +29,6 @@ def lively(network: N) -> N:
             module.running_mean.uniform_(-0.2, 0.2, generator=generator)
             module.running_var.uniform_(0.5, 1.5, generator=generator)
     return network.double().eval()
-
-
-def assembled(config: Any) -> nn.Module:
-    """Return the network of a configuration of any kind."""
-    return next(network(config) for network, kind in NETWORKS if kind is type(config))
 
 
 SMALL: dict[str, Callable[[], nn.Module]] = {

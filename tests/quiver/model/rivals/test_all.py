@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 from golden import draw
-from rivals import SMALL, assembled
+from rivals import SMALL
 from torch import nn
 
 from quiver.model.rivals.edges import reflected
@@ -96,9 +96,7 @@ def test_the_noise_of_a_sensor_reaches_the_networks_that_take_it(name):
         together, first, second = (network(frames, variance=table) for table in (tables, tables[0], tables[1]))
     assert (first - second).abs().max() > 1e-3 * first.std()
     assert (together - torch.stack([first[0], second[1]])).abs().max() < 1e-12
-    blind = assembled(
-        replace(network.config, **{"noise_map": False} if name == "fastdvdnet" else {"as_published": True})
-    )
+    blind = made(replace(network.config, **{"noise_map": False} if name == "fastdvdnet" else {"as_published": True}))
     assert not blind.takes_variance
     with torch.no_grad():
         assert torch.equal(*(blind.double().eval()(frames, variance=table) for table in tables))
