@@ -11,6 +11,7 @@ from golden import draw
 from rivals import SMALL
 from torch import nn
 
+from quiver.model.presets import made
 from quiver.model.rivals.edges import reflected
 
 
