@@ -5,8 +5,9 @@
     SCENE/000000.png  8-bit sRGB [H, W, 3]: the sharp light x of the last plane; that of test scenes is not published
     SCENE/meta.json   width before packing, planes, seeds and sensors; the benchmark has no such file
 
-A plane of light x, 1 at white, fires with the probability 1 - exp(-DETECTIONS x). The three colours are three sensed
-bands: streams of one clip that are called red, green and blue, each with its own noise.
+A plane of light x, 1 at white, fires with the probability 1 - exp(-DETECTIONS x). The three colours are the streams
+red, green and blue of one clip, each with its own noise: in a colour clip each behind its filter, in a clip of one band
+three draws of the same light.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from qsim.clip.stream import Stream
 from qsim.colour import from_linear
 from qsim.files import decoding_errors, load_array
 from qsim.sensor import packing
+from qsim.sensor.colour_filter import MASKS
 from qsim.sensor.spad import BinarySPAD
 
 PLANES, SIDE = 1024, 800  # of a cube of the benchmark
@@ -78,6 +80,11 @@ def bands_of(clip: Clip, planes: int) -> list[Stream]:
                 f"{band.path}: {band.bits}-bit codes {list(band.shape)} of a {kind}; the challenge has planes of one "
                 "bit of a clocked SPAD, as in --sensor spad512s --bits 1"
             )
+    for band, name in zip(bands, COLOURS, strict=True):
+        filters = band.colour_filter
+        if filters is not None and filters.mask != MASKS[name]:
+            found = ", ".join(filters.mask)
+            raise ValueError(f"{band.path}: its filters are {found}, not {name}; sense it with --colour {name}")
     seeds = [band.meta.get("seed") for band in bands]
     for n, seed in enumerate(seeds):
         if seed is not None and seed in seeds[:n]:

@@ -52,8 +52,9 @@ class Readouts:
 def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) -> Readouts:
     """Return the comparison of streams (by default all) over `span` [s], by default the longest code of them.
 
-    `ValueError` for a clip without streams, and for a span that is shorter than a clip frame or longer than the clip.
+    `ValueError` for a clip of three bands or without streams, and for a span below a clip frame or above the clip.
     """
+    clip.require_one_band("a comparison of readouts")
     streams = [clip.stream(name) for name in names or clip.streams]
     if not streams:
         raise ValueError(f"{clip.path}: has no streams to compare; make some with `qsim sense`")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clips import write_clip
+from clips import colour_clip, write_clip
 from hostile import VALUES, one_line
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,6 +17,7 @@ from stats import assert_share
 
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
+from qsim.clip.photons import clip_photons
 from qsim.formats import challenge, exporting
 from qsim.formats.exporting import Export
 from qsim.sensor.spad import BinarySPAD
@@ -88,6 +89,24 @@ def test_truth_is_the_sharp_light_of_the_last_plane(tmp_path):
             assert np.abs(truth[..., colour] - 255 * srgb).max() <= 0.5 + 1e-6
     assert 0 < np.mean(above) < 1
     assert meta["clipped"] == pytest.approx(np.mean(above))
+
+
+def test_a_colour_clip_is_sensed_behind_one_filter_at_a_time(tmp_path, capsys):
+    """The red picture is that of the red photons, and so on; a mosaic is refused with its mask."""
+    clip = colour_clip(tmp_path / "c", frames=4)
+    for seed, name in enumerate(challenge.COLOURS):
+        clip.sense(SENSOR, ppp=0.3, seed=seed, name=name, colour=name)
+    exporting.export(clip, tmp_path / "out", Export("challenge", planes=4))
+    (cube,) = challenge.cubes(tmp_path / "out")
+    truth = cube.truth()
+    assert truth is not None
+    light = 2 * SENSOR.pde * clip_photons(clip, 3, clip.stream("red").photons_factor, sharp=True)
+    for band, name in enumerate(challenge.COLOURS):
+        np.testing.assert_array_equal(truth[..., band], challenge.picture(light)[band])
+        np.testing.assert_array_equal(cube.planes(0, 4)[..., band], clip.stream(name).codes())
+    clip.sense(SENSOR, ppp=0.3, seed=1, name="green", colour="rggb", force=True)
+    assert main(["convert", str(clip.path), str(tmp_path / "x"), "--to", "challenge", "--window", "4"]) == 2
+    assert "its filters are RG, GB, not green; sense it with --colour green" in capsys.readouterr().err
 
 
 def test_planes_fire_by_the_law_of_the_layout(tmp_path):

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from clips import write_clip
+from clips import colour_clip, write_clip
 
 from qsim.cli.program import main
 from qsim.clip.photons import clip_photons
@@ -71,6 +71,8 @@ def test_the_command_prints_a_table_and_refuses_what_cannot_be(tmp_path, capsys)
     clip = write_clip(tmp_path / "c", frames=6, height=5, width=8)
     assert main(["compare", str(clip.path)]) == 2
     assert "has no streams to compare" in capsys.readouterr().err
+    assert main(["compare", str(colour_clip(tmp_path / "rgb").path)]) == 2
+    assert "holds three bands, and a comparison of readouts takes one" in capsys.readouterr().err
     clip.sense(SPIKE, ppp=30.0, name="spike")
     clip.sense(EXACT, ppp=90.0, slices=3, name="slow")
     assert main(["compare", str(clip.path), "--json"]) == 0
