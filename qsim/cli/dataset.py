@@ -62,7 +62,7 @@ def _run_generate(args: argparse.Namespace) -> int:
     lines += [f"repaired {problem}" for problem in summary.repaired]
     lines += [f"FAILED {name}: {why}" for name, why in sorted(summary.failed.items())]
     lines += [f"SHARED {problem}" for problem in summary.shared]
-    lines += [f"NOISY {line}" for line in _noisy(folder, chosen)]
+    lines += _noisy(folder, chosen)
     if summary.failed:
         lines.append("run again with --retry after removing the cause")
     output(args, {"dataset": str(folder)} | dataclasses.asdict(summary), lines)
@@ -85,7 +85,7 @@ def _noisy(folder: Path, jobs: list[Job]) -> list[str]:
     described = {job.name: folder / "clips" / job.name / "clip.json" for job in jobs}
     found = {name: stated(files.read_json(path)) for name, path in described.items() if path.is_file()}
     missed = {job.name: shortfall(found.get(job.name), job.settings.psnr) for job in jobs}
-    return [f"{name}: {why}" for name, why in missed.items() if why]
+    return [f"{name} reached {why}" for name, why in missed.items() if why]
 
 
 def _cluster(args: argparse.Namespace) -> Any:
