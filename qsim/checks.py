@@ -117,6 +117,21 @@ def psnr(value: Any) -> float:
     return number
 
 
+def share(value: Any) -> float:
+    number = real(value)
+    if not 1e-6 <= number <= 1:
+        raise ValueError(f"expected a share of a full exposure, above 0 (from 1e-6) to 1, got {shown(value)}")
+    return number
+
+
+def shares(value: Any) -> tuple[float, ...]:
+    """Return a schedule of exposures, one share or a list of up to 256."""
+    found = tuple(share(item) for item in (value if isinstance(value, list | tuple) else [value]))
+    if not 1 <= len(found) <= 256:
+        raise ValueError(f"expected 1 to 256 shares of a full exposure, got {len(found)}")
+    return found
+
+
 def row_order(value: Any) -> str:
     if value not in ROW_ORDERS:
         raise ValueError(f"expected the order in which rows are read, {', '.join(ROW_ORDERS)}, got {shown(value)}")

@@ -272,6 +272,10 @@ STREAM: Table = {
     "defects, if any": OBJECT,
     "rows, if any": {"delay": POSITIVE, "order": TEXT},
     "colour, if any": OBJECT,
+    "exposures, if any": expected(
+        "shares from 1e-6 to 1",
+        lambda value: list_of(lambda v: is_number(v) and 1e-6 <= v <= 1)(value) and bool(value),
+    ),
     "drawn_by, if any": TEXT,
     "dead_time_effects, if any": OBJECT,
 }

@@ -59,6 +59,11 @@ def add_sense(sub: Any) -> None:
         "--row-order", choices=checks.ROW_ORDERS, help="rows from the top (down, the default), columns from the left..."
     )
     parser.add_argument(
+        "--exposures",
+        type=numbers,
+        help="shares of a code's time with light, in turn, as in 1,0.25,0.0625; light levels are of full exposures",
+    )
+    parser.add_argument(
         "--replay", metavar="CLIP:FRAME", help="draw one frame again and compare it with the stored one"
     )
     parser.add_argument("--force", action="store_true", help="replace a stream of the same name")
@@ -77,7 +82,7 @@ def _run_sense(args: argparse.Namespace) -> int:
     wanted = [
         Sensing(args.sensor or "quiver-physical", args.bits, seed=args.seed, name=args.name, group=args.group,
                 diffraction=args.diffraction, defects=args.defects, slices=args.slices, rows=rows,
-                colour=args.colour, **level)
+                colour=args.colour, exposures=args.exposures, **level)
         for level in levels
     ]  # fmt: skip
     clips = [clip for path in args.paths for clip in _clips(path)]
@@ -123,7 +128,7 @@ def _light(meta: dict[str, Any]) -> dict[str, Any]:
 def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
     from qsim.clip.sensing import replay
 
-    unused = ["group", "diffraction", "defects", "row_delay", "row_order", "force"]
+    unused = ["group", "diffraction", "defects", "row_delay", "row_order", "exposures", "force"]
     refuse_idle(args, "--replay draws what is stored", unused)
     if args.slices != 1:
         raise ValueError("--replay draws what is stored: --slices changes nothing here; leave it out")

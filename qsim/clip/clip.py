@@ -66,6 +66,7 @@ class Clip(ClipFolder):
         slices: int = 1,
         rows: Rows | None = None,
         colour: str | ColourFilter | None = None,
+        exposures: tuple[float, ...] | None = None,
         force: bool = False,
         progress: Progress | None = None,
     ) -> Stream:
@@ -78,7 +79,8 @@ class Clip(ClipFolder):
         `FileExistsError` where `name` is taken by others.
         """
         chosen = sensor if isinstance(sensor, Sensor) else os.fspath(sensor)
-        wanted = Sensing(chosen, bits, ppp, lux, seed, name, group, diffraction, defects, slices, rows, colour)
+        light = (chosen, bits, ppp, lux, seed, name)
+        wanted = Sensing(*light, group, diffraction, defects, slices, rows, colour, exposures)
         return self.stream(sense(self, wanted, force=force, progress=progress)[0].name)
 
     @property

@@ -14,7 +14,8 @@ from typing import Any
 
 from numpy import ndarray as Array
 
-from qsim import files, keys, locks
+from qsim import checks, files, keys, locks
+from qsim.clip import gates
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.photons import light_level, light_line
 from qsim.clip.rows import Rows
@@ -50,6 +51,7 @@ class Sensing:
     slices: int = 1  # clip frames in one exposure of a counting SPAD or a QIS, for light that changes within it
     rows: Rows | None = None  # rows or columns at their own time; None: all at once
     colour: str | ColourFilter | None = None  # rggb, quad, rgbw or .toml with a table [colour]; None: as for defects
+    exposures: tuple[float, ...] | None = None  # shares of a code's time, in turn; None: all of it
 
     @property
     def stream_name(self) -> str:
@@ -134,8 +136,24 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
     _check_planes(sensor, sensing, clip)
     key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
     plane = plane_of(sensor, planes)
-    rows = sensing.rows
-    return Draw(sensor, plane, level, key, planes, sensing.diffraction, found, rows=rows, colour=filters)
+    shares = None if sensing.exposures is None else _checked_exposures(sensing, sensor, found)
+    draw = Draw(sensor, plane, level, key, planes, sensing.diffraction, found, rows=sensing.rows, colour=filters)
+    return dataclasses.replace(draw, shares=shares)
+
+
+def _checked_exposures(sensing: Sensing, sensor: Sensor, found: Defects | None) -> tuple[float, ...]:
+    """Return the schedule of exposures; `ValueError` if it is none, or if pixels remember the exposure before."""
+    try:
+        shares = checks.shares(sensing.exposures)
+    except ValueError as error:
+        raise ValueError(f"exposures: {error}") from None
+    remembers = found is not None and (found.afterpulse or found.carry_dead_time)
+    if isinstance(sensor, SpikeCamera):
+        raise ValueError(f"exposures: {sensing.sensor_name} integrates without a pause; leave them out")
+    if remembers or (sensing.slices > 1 and isinstance(sensor, CountingSPAD)):
+        what = "afterpulses and carried dead time" if remembers else "slices of a counting pixel"
+        raise ValueError(f"exposures: {what} need codes of equal exposure; leave one of them out")
+    return shares
 
 
 def _check_rows(rows: Rows, clip: ClipFolder, planes: int, period: int) -> None:
@@ -190,6 +208,7 @@ def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> dict[str, Any]:
         | ({} if draw.defects is None else {"defects": draw.defects.to_dict()})
         | ({} if draw.rows is None else {"rows": draw.rows.to_dict()})
         | ({} if draw.colour is None else {"colour": draw.colour.to_dict()})
+        | ({} if draw.shares is None else {"exposures": list(draw.shares)})
     )
 
 
@@ -215,6 +234,8 @@ def sense(
         line += f"; {_colours(draw.colour, efficiency)}"
     if draw.rows is not None:
         line += f"; {draw.rows}"
+    if draw.shares is not None:
+        line += f"; {gates.words(draw.shares)}"
     if draw.defects is not None:
         effects = [key for key, value in draw.defects.to_dict().items() if value and key != "device_seed"]
         line += f"; defects: {', '.join(effects) or 'none'}"
@@ -256,7 +277,7 @@ def _kept(clip: ClipFolder, sensing: Sensing, draw: Draw, meta: dict[str, Any]) 
         return None
     if (
         all(old.meta.get(key, value if key == "drawn_by" else None) == value for key, value in meta.items())
-        and all(old.meta.get(key) == meta.get(key) for key in ("defects", "rows", "colour"))
+        and all(old.meta.get(key) == meta.get(key) for key in ("defects", "rows", "colour", "exposures"))
         and old.meta["sensor"] == draw.sensor.to_dict()
     ):
         return old

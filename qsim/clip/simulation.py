@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.clip import gates
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.photons import clip_photons
 from qsim.clip.rows import Rows
@@ -53,6 +54,7 @@ class Draw:
     engine: str = "auto"
     rows: Rows | None = None  # rows or columns at their own time; None: all at once
     colour: ColourFilter | None = None  # from the first pixel of the clip; None: the clip has one band
+    shares: tuple[float, ...] | None = None  # exposures of codes in turn, over a full one; None: all are full
 
     @property
     def law(self) -> str:
@@ -118,6 +120,11 @@ class Draw:
         if self.followed is not None:
             yield self._follow(clip, stop)[start:]
             return
+        if self.shares is not None:
+            array = self._array(clip)
+            for t in range(start, stop, step):
+                yield np.concatenate([self._gated(clip, n, array) for n in range(t, min(t + step, stop))])
+            return
         places = [(t * self.planes, min(t + step, stop) * self.planes) for t in range(start, stop, step)]
         light = (self._exposed(self.light(clip, *place)) for place in places)
         array = self._array(clip)
@@ -139,7 +146,8 @@ class Draw:
     def packed(self, clip: ClipFolder, frames: int, progress: Progress | None = None) -> Iterator[Array]:
         """Yield all codes of a stream, packed row by row, some frames at a time: uint8 [t, H, ceil(W bits / 8)]."""
         step = max(1, _BLOCK_PIXELS // (clip.shape[1] * clip.shape[2] * self.planes))
-        if self.followed is not None or self.defects is not None or self.planes > 1 or self.remembers:
+        apart = self.remembers or self.shares is not None
+        if self.followed is not None or self.defects is not None or self.planes > 1 or apart:
             blocks: Iterator[Array] = (
                 packing.pack(block, self.sensor.bits) for block in self.blocks(clip, 0, frames, step)
             )
@@ -156,6 +164,16 @@ class Draw:
             done += len(block)
             if progress is not None:
                 progress(done, frames)
+
+    def _gated(self, clip: ClipFolder, t: int, array: PixelArray | None) -> Array:
+        """Return the code [1, H, W] of stream frame t, whose exposure is its share of a full one."""
+        assert self.shares is not None
+        share = gates.share_of(self.shares, t)
+        part = np.full(self.planes, share) if self.sums else gates.weights(share, self.planes)
+        light = self.light(clip, t * self.planes, (t + 1) * self.planes) * part[:, None, None]
+        sample = self.plane.sample if array is None else array.sample
+        key, exposure = self.key.at(self._number(t)), share * self._exposure(clip)
+        return self._summed(sample(self._exposed(light), exposure, key=key, engine=self.engine))
 
     @property
     def remembers(self) -> bool:
@@ -248,9 +266,9 @@ def stored(stream: Stream) -> Draw:
     found = defect_table.from_dict(meta["defects"], where) if "defects" in meta else None
     followed = event_simulation.Effects(**meta["dead_time_effects"]) if law == "events" else None
     diffraction = bool(meta.get("diffraction", False))
-    plane, filters = plane_of(sensor, planes), stream.colour_filter
-    late = stream.rows
-    return Draw(sensor, plane, level, key, planes, diffraction, found, followed, rows=late, colour=filters)
+    plane = plane_of(sensor, planes)
+    draw = Draw(sensor, plane, level, key, planes, diffraction, found, followed, colour=stream.colour_filter)
+    return dataclasses.replace(draw, rows=stream.rows, shares=stream.shares)
 
 
 def plane_of(sensor: Sensor, planes: int) -> Sensor:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import colour, files, locks, structure
+from qsim.clip import gates
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.film import Film, card
 from qsim.clip.lazy_array import LazyArray
@@ -183,8 +184,18 @@ class Stream:
 
     @property
     def exposure(self) -> float:
-        """Seconds of light in one code; for a sum of planes, of all its planes."""
+        """Seconds of light in one code: in all its planes if it sums some, in a full one under a schedule."""
         return float(self.meta["exposure"])
+
+    @property
+    def shares(self) -> tuple[float, ...] | None:
+        """The exposures of codes in turn, over a full one; None: all are full."""
+        return tuple(self.meta["exposures"]) if "exposures" in self.meta else None
+
+    @property
+    def exposures(self) -> Array:
+        """Seconds of light in each code, float64 [T]."""
+        return np.array([gates.share_of(self.shares or (1.0,), t) for t in range(len(self))]) * self.exposure
 
     @property
     def photons_factor(self) -> float:

@@ -64,7 +64,13 @@ class Job:
         if self.settings.bands is None:
             del described["settings"]["bands"]
         for stream in described["streams"]:  # options that are off stay out: data sets of earlier versions resume
-            for key, off in (("defects", None), ("slices", 1), ("rows", None), ("colour", None)):
+            for key, off in (
+                ("defects", None),
+                ("slices", 1),
+                ("rows", None),
+                ("colour", None),
+                ("exposures", None),
+            ):
                 if stream[key] == off:
                     del stream[key]
         own = [

@@ -32,6 +32,7 @@
     slices = 16                # clip frames in one exposure of a QIS or a counting SPAD; default 1
     diffraction = true         # blur by the lens's Airy pattern; default false
     row_delay = 2e-6           # seconds from one row, or column, to the next; default: all at once
+    exposures = [1.0, 0.25]    # shares of a code's time with light, in turn; default: all of it
     row_order = "down"         # order of rows: down, the default, or up; of columns: right or left
     colour = "rggb"            # colour filters: rggb, quad, rgbw or a .toml with [colour]; default: the sensor's
 
@@ -251,6 +252,7 @@ def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
             diffraction=given.get("diffraction", False),
             slices=given.get("slices", 1),
             rows=rows,
+            exposures=given.get("exposures"),
             **light,
         )
         for b in bits
@@ -342,5 +344,5 @@ STREAMS: Table = {
     "seed, if any": checks.seed, "name, if any": _name,
     "group, if any": checks.flag, "slices, if any": checks.whole, "diffraction, if any": checks.flag,
     "row_delay, if any": checks.positive, "row_order, if any": checks.row_order,
-    "colour, if any": checks.text,
+    "colour, if any": checks.text, "exposures, if any": checks.shares,
 }  # fmt: skip

@@ -73,6 +73,11 @@ def windows(splits: Mapping[str, Sequence[Clip]], frames: int) -> dict[str, list
         for clip in clips:
             clip.require_one_band("a file of pairs")
             for stream in map(clip.stream, clip.streams):
+                if stream.shares is not None:
+                    raise ValueError(
+                        f"{stream.path}: its codes have different exposures, those of a window have one; use "
+                        "another stream"
+                    )
                 for first in range(0, len(stream) - frames + 1, frames):
                     found.setdefault(split, []).append(Window(clip, stream, first, frames))
     if not found:

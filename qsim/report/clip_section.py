@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qsim import colour
+from qsim.clip import gates
 from qsim.clip.clamped_error import stated
 from qsim.clip.clip import Clip
 from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, MOVING, SLOWEST, largest_motion, moving_mean
@@ -131,14 +132,15 @@ def stream_line(stream: Stream) -> str:
     light += "" if lux is None else f", equal to {lux:.4g} lx at 555 nm"
     light += "" if ppp is None else f", {ppp * stream.sensor.efficiency:.3g} e⁻ per pixel"
     filters = "" if stream.colour_filter is None else f"; colour filters {' '.join(stream.colour_filter.mask)}"
-    words = f"{filters}{rows_words(stream)}{defects_words(stream)}"
+    words = f"{filters}{timing_words(stream)}{defects_words(stream)}"
     return f"Stream {stream.name}{light}; {stream.bits} bit, {stream.sensor}{words}"
 
 
-def rows_words(stream: Stream) -> str:
-    """Return "; each row 2e-06 s later, down", or "" where all are read at once."""
+def timing_words(stream: Stream) -> str:
+    """Return "; each row 2e-06 s later, down", and a schedule of exposures; "" where all are read at once and alike."""
     rows = stream.rows
-    return "" if rows is None else f"; {rows}"
+    timing = "" if rows is None else f"; {rows}"
+    return timing + ("" if stream.shares is None else f"; {gates.words(stream.shares)}")
 
 
 def defects_words(stream: Stream) -> str:
@@ -226,6 +228,8 @@ def unexpected(clip: Clip, stream: Stream) -> str | None:
         return "more than 64 codes"
     if stream.rows is not None:
         return "every row sees its own part of two frames of the clip"
+    if stream.shares is not None:
+        return "its codes have different exposures"
     if int(stream.meta.get("planes_per_code", 1)) > 1 or len(stream) != len(clip):
         return "a code sums planes of several frames of the clip"
     if stream.meta["ppp_factor"] is None:

@@ -109,9 +109,9 @@ def stream_panels(stream: Stream, frames: range, truth: Light | None = None) -> 
 def _inverse(stream: Stream, samples: int) -> Callable[[NDArray[np.number]], Light] | None:
     """Return a function, means of this many codes [...] -> light [photons].
 
-    None for a sensor of more than _BITS bits, or whose mean code does not rise.
+    None for a sensor of more than _BITS bits or whose mean code does not rise, and for codes of different exposures.
     """
-    if stream.bits > _BITS:
+    if stream.bits > _BITS or stream.shares is not None:
         return None
     try:
         response = stream.sensor.response(stream.exposure)

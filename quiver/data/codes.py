@@ -63,6 +63,7 @@ class Codes:
     digest: Callable[[], str] = str  # SHA-256 of the codes, computed on request; empty: not known
     sensor_name: str = ""  # of a device or a file; empty: the sensor's model
     ppp: float | None = None  # mean photons per pixel and code; None: not known
+    shares: tuple[float, ...] | None = None  # exposures of codes in turn, over `exposure`; None: all are full
     defective: Array | None = field(default=None, compare=False)  # bool [H, W]; pixels that `read` fills from others
     colour: ColourFilter | None = None  # over the pixels, from the first one on; None: all see one band
 
@@ -206,6 +207,7 @@ def stream_codes(stream: Stream) -> Codes:
         lambda: array_digest(stream.packed),
         str(meta.get("sensor_name") or ""),
         meta.get("ppp"),
+        stream.shares,
         colour=stream.colour_filter,
     )
     return filled(codes, defects.of_stream(stream))

@@ -44,7 +44,7 @@ def choose(
     streams = _streams(clips)
     if sensors and ppp and bits:  # the streams decide nothing
         single = [stream for stream in streams if (stream.meta.get("planes_per_code") or 1) == 1]
-        streams = [stream for stream in single if stream.rows is None]
+        streams = [stream for stream in single if stream.rows is stream.shares is None]
     found = _sorted(streams)
     if not asked:
         default = "" if found else "the default; the data set has no streams"

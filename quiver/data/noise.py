@@ -67,6 +67,11 @@ class Noise(Illumination):
                 f"{where}: its rows have their own time, those of a training window have one; give --sensor, --bits "
                 "and --ppp"
             )
+        if stream.shares is not None:
+            raise ValueError(
+                f"{where}: its codes have different exposures, those of a training window have one; give --sensor, "
+                "--bits and --ppp"
+            )
         name = str(meta.get("sensor_name") or stream.sensor.to_dict()["model"])
         named = "sensor_name" in meta and not name.endswith(".toml")
         ppp, lux = meta.get("ppp_target"), meta.get("lux_target")

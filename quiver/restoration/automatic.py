@@ -21,6 +21,8 @@ def chosen(name: str, codes: Codes, options: RestoreOptions | None = None) -> tu
     """Return the method of this name for a stream; for `auto` the chosen one, and a line that says why."""
     if name != AUTO:
         return restorer(name, options), None
+    if codes.shares is not None:
+        return restorer("likelihood", options), "auto: likelihood; the codes have different exposures"
     network = restorer(NETWORK, options)
     ppp = light_of(codes)
     domain = None if network.scope is None else network.scope.domain

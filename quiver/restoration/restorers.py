@@ -11,17 +11,19 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from numpy import ndarray as Array
 
 from qsim.checks import suggest
 from qsim.files import Progress
-from quiver.baselines import METHODS
+from quiver.baselines import METHODS, exposures
 from quiver.baselines.sliding_window import look_ahead
 from quiver.data.codes import Codes
-from quiver.restoration.interface import RestoreOptions, Restorer
+from quiver.restoration.interface import RestoreInto, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"  # weights that ship with the package
@@ -38,7 +40,8 @@ def restorer(name: str, options: RestoreOptions | None = None) -> Restorer:
     options = options or RestoreOptions()
     base, _, window = name.partition(":")
     if base not in METHODS:
-        return network_restorer(weights_path(name), options)
+        network = network_restorer(weights_path(name), options)
+        return replace(network, fill=partial(_fill_equal_exposures, network.fill, name))
     method = METHODS[base]
     if window and not (window.isdecimal() and int(window) > 0):
         raise ValueError(f"method {name!r}: the window after the colon is a number of frames, as in {base}:5")
@@ -52,10 +55,25 @@ def restorer(name: str, options: RestoreOptions | None = None) -> Restorer:
             warnings.warn(
                 f"{name} takes about {taken / 1e6:.0f} MB for a frame of {size}, above --memory", stacklevel=2
             )
-        fill_classical(run, frames, codes, out, first, options.memory - taken, progress)
+        free = options.memory - taken
+        if codes.shares is None:
+            fill_classical(run, frames, codes, out, first, free, progress)
+            return
+        bracketed = partial(exposures.restore, method=base, window=frames)
+        fill_classical(bracketed, frames, codes, out, first, free, progress)
 
     identity = {"method": base, "window": frames}
     return Restorer(name, frames, look_ahead(frames), False, method.description, fill, identity=identity)
+
+
+def _fill_equal_exposures(
+    fill: RestoreInto, name: str, codes: Codes, out: Array, first: int, progress: Progress | None
+) -> None:
+    """Run a network on codes of equal exposure; `ValueError` for others."""
+    if codes.shares is not None:
+        known = ", ".join(exposures.METHODS)
+        raise ValueError(f"method {name!r}: takes equal exposures only; use {known} for {codes.name}")
+    fill(codes, out, first, progress)
 
 
 def shipped_names() -> list[str]:
@@ -127,6 +145,7 @@ def fill_classical(
         before, after = max(0, start - window), min(length, stop + window)
         wanted = range(start - before, stop - before)
         read = codes.read(before, after)
-        out[start - first : stop - first] = restore(read, codes.sensor, codes.exposure, frames=wanted)
+        taken = [] if codes.shares is None else [np.resize(codes.shares, after)[before:]]
+        out[start - first : stop - first] = restore(read, codes.sensor, codes.exposure, *taken, frames=wanted)
         if progress is not None:
             progress(stop - first, len(out))

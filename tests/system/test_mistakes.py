@@ -91,6 +91,11 @@ MISTAKES = [
     ("qsim sense video --lux 3", "has no lux; give a target in photons per pixel, as in --ppp 3.25"),
     ("qsim sense black --ppp 3", "black: mean of photons is 0, no factor reaches 3 PPP; is the light on?"),
     # Sensors and streams
+    ("qsim sense lit --ppp 3 --exposures 1,0", "--exposures: expected a number above 0, got '0'"),
+    (
+        "qsim sense lit --ppp 3 --exposures 1,1.5",
+        "exposures: expected a share of a full exposure, above 0",
+    ),
     ("qsim sense lit --ppp 3 --row-delay 0", "--row-delay: expected a number above 0, got 0"),
     ("qsim sense lit --ppp 3 --row-delay 1e-3", "longer than a frame or plane of 0.0005 s; the largest delay is"),
     ("qsim sense lit --ppp 3 --row-order up", "row order up: orders rows that have their own time; give the row delay"),

@@ -165,6 +165,10 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Acts("sense clip --ppp 3 --name n --row-delay 1e-6", "--row-order left"),
         Refused("sense clip", "--row-order up", "row delay"),
     ],
+    ("sense", "--exposures"): [
+        Acts("sense clip --ppp 3 --name n", "--exposures 1,0.25"),
+        Refused("sense clip", "--exposures 1,2", "share of a full exposure"),
+    ],
     ("sense", "--replay"): [
         Acts("sense clip --ppp 3.25 --bits 3 --name s", "--replay clip:1", stdout),
         Refused("sense clip --replay clip:1", "--row-order up", "row delay"),
@@ -176,6 +180,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
                 "--defects bad.toml",
                 "--slices 2",
                 "--row-delay 1e-6",
+                "--exposures 1,0.5",
                 "--force",
             )
         ),

@@ -186,7 +186,7 @@ def test_training_never_sees_a_family_of_the_test_split():
 
 def test_files_that_are_no_recipes(tmp_path: Path):
     with pytest.raises(
-        FileNotFoundError, match=r"no such recipe; give a \.toml file, or one of bitdepth, challenge, colour, demo, "
+        FileNotFoundError, match=r"no such recipe; give a \.toml file, or one of bitdepth, bracketing, challenge, "
     ):
         recipe.load(tmp_path / "none.toml")
     path = tmp_path / "binary.toml"

@@ -64,6 +64,9 @@ def test_no_expectation_is_shown_without_an_exact_one(tmp_path):
     rolling, _ = sense(clip, Sensing("quiver-physical", ppp=2.0, name="rolling", rows=Rows(2e-6)))
     assert "its own part of two frames" in str(clip_section.unexpected(clip, rolling))
     assert "; each row 2e-06 s later, down" in clip_section.stream_line(rolling)
+    bracketed, _ = sense(clip, Sensing("quiver-physical", ppp=2.0, name="bracketed", exposures=(1.0, 0.5)))
+    assert "different exposures" in str(clip_section.unexpected(clip, bracketed))
+    assert "; exposures of 1, 0.5 of a code's time in turn" in clip_section.stream_line(bracketed)
     unknown = replace(stream, meta=stream.meta | {"ppp_factor": None, "defects": {}})
     assert "light is unknown" in str(clip_section.unexpected(clip, unknown))
 

@@ -1,0 +1,137 @@
+"""Restores streams whose codes have different exposures: three methods that know the exposure of every code.
+
+    naive       sum of (codes - dark) over the codes below saturation / sum of their exposures
+    moment      the light at which the expected sum of all codes of a window is the one that was read
+    likelihood  the light that makes all codes of a window most likely
+
+Light is that of a full exposure. Where all codes are saturated, the answer ends where the shortest exposure resolves
+nothing more. Saturated codes of long exposures tell `moment` and `likelihood` that the light is at least that bright;
+`naive` leaves them out. Sources: textbook; weighting by exposure as for merging bracketed photographs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.sensor.sensor import Sensor
+from quiver.baselines.naive_mean import dark_codes
+from quiver.baselines.sliding_window import check_codes, check_window, in_units, window_frames
+
+GRID = 1024  # levels of light; a parabola through the best three errs by less than 1e-3 of the light
+DARKEST = 1e-5  # of the brightest light: the first level above darkness
+CHUNK = 1 << 22  # likelihoods held at a time
+
+Estimate = Callable[[Array, Array, Sensor, float], Array]  # codes [window, N], their shares, ... -> photons [N]
+
+
+def restore(
+    codes: Array,
+    sensor: Sensor,
+    exposure: float,
+    shares: Array,
+    *,
+    method: str = "likelihood",
+    window: int = 11,
+    photons_per_unit: float = 1.0,
+    frames: range | None = None,
+) -> Array:
+    """Restore codes [T, H, W] with exposures `shares` [T] of `exposure` [s]: float32 [T, H, W], of full exposures.
+
+    `window` frames around each are used. `ValueError` for codes that the sensor cannot produce, an empty window, and a
+    method without exposures.
+    """
+    check_codes(codes, sensor)
+    check_window(window)
+    if method not in METHODS:
+        raise ValueError(f"method {method!r}: takes equal exposures only; use {', '.join(METHODS)} for this stream")
+    frames = range(len(codes)) if frames is None else frames
+    restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
+    for i, frame in enumerate(frames):
+        taken = window_frames(frame, window, len(codes))
+        seen = codes[taken].reshape(window, -1)
+        restored[i] = METHODS[method](seen, shares[taken], sensor, exposure).reshape(codes.shape[1:])
+    return in_units(restored, photons_per_unit)
+
+
+def naive(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> Array:
+    """Return photons [N] of codes [window, N]: the mean of the codes below saturation, weighted by their exposures."""
+    top, step = sensor.levels - 1, sensor.white(exposure) / (sensor.levels - 1)
+    dark = np.array([dark_codes(sensor, exposure * share) for share in shares])
+    open_ = codes < top
+    open_[np.argmin(shares)] |= ~open_.any(axis=0)  # all saturated: the shortest exposure alone
+    signal = np.where(open_, codes - dark[:, None], 0.0).sum(axis=0)
+    return np.maximum(signal, 0) * step / (shares[:, None] * open_).sum(axis=0)
+
+
+def moment(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> Array:
+    """Return photons [N] of codes [window, N]: the light whose expected sum is theirs, through the exact responses."""
+    light = np.append(0.0, levels(tuple(np.unique(shares)), sensor, exposure))
+    expected = np.zeros(len(light))
+    for share, times in zip(*np.unique(shares, return_counts=True), strict=True):
+        expected += times * _mean(tuple(np.unique(shares)), share, sensor, exposure)
+    rising = np.concatenate([[True], expected[1:] > np.maximum.accumulate(expected)[:-1]])
+    total = np.minimum(codes.sum(axis=0, dtype=np.int64), expected[-1] - 0.5)
+    return np.interp(total, expected[rising], light[rising])
+
+
+def likelihood(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> Array:
+    """Return the most likely photons [N] of codes [window, N]; saturated codes count as what they are."""
+    distinct, kinds = np.unique(shares, return_inverse=True)
+    light = levels(tuple(distinct), sensor, exposure)
+    tables = [_log_pmf(tuple(distinct), share, sensor, exposure) for share in distinct]
+    bins = np.zeros((codes.shape[1], len(distinct), sensor.levels), np.int32)
+    for code, kind in zip(codes, kinds, strict=True):
+        bins[np.arange(codes.shape[1]), kind, code] += 1
+    outcomes, where = np.unique(bins.reshape(len(bins), -1), axis=0, return_inverse=True)
+    table = np.concatenate(tables, axis=1)  # [GRID, kinds x levels]
+    found = np.empty(len(outcomes))
+    step = max(1, CHUNK // len(light))
+    for start in range(0, len(outcomes), step):
+        found[start : start + step] = _peak(outcomes[start : start + step] @ table.T, light)
+    saturated = (codes == sensor.levels - 1).all(axis=0)
+    top = np.full((len(shares), 1), sensor.levels - 1)
+    bright = moment(top, shares, sensor, exposure)[0]
+    return np.where(saturated, bright, np.minimum(found[where.ravel()], bright))
+
+
+METHODS: dict[str, Estimate] = {"naive": naive, "moment": moment, "likelihood": likelihood}
+
+
+@lru_cache(maxsize=8)
+def levels(shares: tuple[float, ...], sensor: Sensor, exposure: float) -> Array:
+    """Return the levels of light [GRID] of full exposures on which estimates are looked for, evenly spaced in log.
+
+    They end where the response of the shortest exposure ends, or that of the longest where responses fall again.
+    """
+    ends = [sensor.response(exposure * share).photons[-1] / share for share in shares]
+    end = min(ends) if np.isfinite(sensor.brightest(exposure)) else max(ends)
+    return np.geomspace(DARKEST * end, end, GRID)
+
+
+@lru_cache(maxsize=32)
+def _mean(shares: tuple[float, ...], share: float, sensor: Sensor, exposure: float) -> Array:
+    """Return the mean code of one of these exposures in the dark and at `levels`, [1 + GRID]."""
+    return sensor.mean(np.append(0.0, levels(shares, sensor, exposure)) * share, exposure * share)
+
+
+@lru_cache(maxsize=32)
+def _log_pmf(shares: tuple[float, ...], share: float, sensor: Sensor, exposure: float) -> Array:
+    """Return the logarithm of the probability of each code of one of these exposures, [GRID, levels]."""
+    return np.maximum(sensor.log_pmf(levels(shares, sensor, exposure) * share, exposure * share), -1e6)
+
+
+def _peak(table: Array, light: Array) -> Array:
+    """Return the light of the largest value of each row of a table [N, GRID], by a parabola in log light."""
+    best = table.argmax(axis=1)
+    inner = np.clip(best, 1, len(light) - 2)
+    rows = np.arange(len(table))
+    before, middle, after = (table[rows, inner + step] for step in (-1, 0, 1))
+    bend = before - 2 * middle + after
+    shift = np.where(bend < 0, (before - after) / (2 * np.where(bend < 0, bend, -1.0)), 0.0)
+    shift = np.where(best == inner, np.clip(shift, -1, 1), 0.0)
+    spacing = np.log(light[1] / light[0])
+    return np.where(best == 0, 0.0, np.exp(np.log(light[best]) + shift * spacing))

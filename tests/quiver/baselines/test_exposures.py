@@ -1,0 +1,108 @@
+"""Restoring codes of different exposures: the laws of the estimates, light beyond white, equal exposures, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from qsim.keys import Key
+from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.qis import QIS
+from qsim.sensor.spad import BinarySPAD
+from quiver.baselines import exposures, likelihood, moment
+
+EXPOSURE = 5e-4
+SENSORS = {
+    "QIS": QIS(0.8, 200.0, 0.2, 3),
+    "plane": BinarySPAD(0.5, 300.0, bits=1),
+    "counting": CountingSPAD(pde=0.5, dark_count_rate=300.0, dead_time=2e-6, bits=5),
+}
+SCHEDULE = np.array([1.0, 0.25, 0.0625])
+
+
+def drawn(sensor, light: np.ndarray, shares: np.ndarray, seed: int) -> np.ndarray:
+    """Codes [T, 1, N] of light [N] at full exposure."""
+    frames = [
+        sensor.sample(light[None] * share, EXPOSURE * share, key=Key(seed=seed, clip=1, frame=t))
+        for t, share in enumerate(shares)
+    ]
+    return np.stack(frames)
+
+
+@pytest.mark.parametrize("kind", SENSORS)
+def test_the_likelihood_is_the_maximum_of_the_exact_one(kind):
+    """Random light over five decades and random windows: no light is likelier than the estimate, but for the grid."""
+    sensor, rng = SENSORS[kind], np.random.default_rng(5)
+    shares = rng.choice(SCHEDULE, 7)
+    light = 10 ** rng.uniform(-1.5, 3, 60)
+    codes = drawn(sensor, light, shares, 1)
+    found = exposures.likelihood(codes[:, 0], shares, sensor, EXPOSURE)
+    end = exposures.levels(tuple(np.unique(shares)), sensor, EXPOSURE)[-1]
+
+    def value(photons: np.ndarray) -> np.ndarray:
+        places = np.arange(60)
+        each = [sensor.log_pmf(photons * s, EXPOSURE * s)[places, c] for s, c in zip(shares, codes[:, 0], strict=True)]
+        return np.sum(each, axis=0)
+
+    open_ = ~(codes[:, 0] == sensor.levels - 1).all(axis=0) & (found < 0.99 * end)
+    assert open_.sum() > 20
+    for factor in (0.5, 0.9, 0.97, 1.03, 1.1, 2.0):
+        assert (value(found * factor + (found == 0) * 1e-2) <= value(found) + 1e-3)[open_].all(), factor
+
+
+@pytest.mark.parametrize("kind", SENSORS)
+def test_equal_exposures_give_the_answers_of_the_usual_methods(kind):
+    sensor, rng = SENSORS[kind], np.random.default_rng(6)
+    light = rng.uniform(0, 0.7, 200) * sensor.white(EXPOSURE)
+    shares = np.ones(5)
+    codes = drawn(sensor, light, shares, 2)
+    for method, usual in (("likelihood", likelihood.restore), ("moment", moment.restore)):
+        found = exposures.restore(codes, sensor, EXPOSURE, shares, method=method, window=5)
+        expected = usual(codes, sensor, EXPOSURE, window=5)
+        inner = expected < 0.8 * expected.max()
+        np.testing.assert_allclose(found[inner], expected[inner], rtol=2e-3, atol=1e-3 * sensor.white(EXPOSURE))
+
+
+@pytest.mark.parametrize("kind", SENSORS)
+@pytest.mark.parametrize("method", ["moment", "likelihood"])
+def test_a_bracket_sees_light_beyond_white(kind, method):
+    """At 8 times white, full exposures are all saturated; 30 brackets find the light, and dim light too."""
+    sensor, count = SENSORS[kind], 400
+    shares = np.resize(SCHEDULE, 90)
+    for level in (0.3, 8.0):
+        light = np.full(count, level * sensor.white(EXPOSURE))
+        codes = drawn(sensor, light, shares, 3)
+        found = exposures.restore(codes, sensor, EXPOSURE, shares, method=method, window=90, frames=range(45, 46))
+        spread = 6 * found.std() / np.sqrt(count)  # and a bias of second order in the noise
+        assert abs(found.mean() - light[0]) < spread + found.var() / light[0]
+        assert found.std() < 0.4 * light[0]
+
+
+def test_the_naive_mean_leaves_saturated_codes_out():
+    """Light beyond white comes from short exposures, of which the darker codes stay: 15 % low at 6 times white."""
+    sensor, shares = SENSORS["QIS"], np.resize(SCHEDULE, 30)
+    light = np.full(400, 6 * sensor.white(EXPOSURE))
+    codes = drawn(sensor, light, shares, 4)
+    found = exposures.restore(codes, sensor, EXPOSURE, shares, method="naive", window=30, frames=range(15, 16))
+    assert found.mean() == pytest.approx(light[0], rel=0.2)
+    step = sensor.white(EXPOSURE) / 7  # photons per code; of three codes the first is saturated
+    dark = sensor.dark_rate * EXPOSURE / (sensor.efficiency * step)
+    expected = (3 + 1 - dark * 0.3125) * step / 0.3125
+    one = exposures.naive(np.array([[7], [3], [1]]), SCHEDULE, sensor, EXPOSURE)
+    assert one[0] == pytest.approx(expected)
+
+
+def test_all_saturated_and_all_dark_pixels_have_finite_answers():
+    for sensor in SENSORS.values():
+        for code in (0, sensor.levels - 1):
+            codes = np.full((6, 2, 3), code, np.uint8)
+            for method in exposures.METHODS:
+                found = exposures.restore(codes, sensor, EXPOSURE, np.resize(SCHEDULE, 6), method=method)
+                assert np.isfinite(found).all()
+                assert (found >= 2 * sensor.white(EXPOSURE)).all() if code else (found <= 0.5).all()
+
+
+def test_a_method_without_exposures_is_refused():
+    codes = np.zeros((3, 2, 2), np.uint8)
+    with pytest.raises(ValueError, match="method 'qbp': takes equal exposures only; use naive, moment, likelihood"):
+        exposures.restore(codes, SENSORS["QIS"], EXPOSURE, np.ones(3), method="qbp")
