@@ -170,6 +170,7 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
     Codes are drawn when they are read; dead and hot pixels of the sensor's defects are filled.
     """
     sensing, draw = light.sensing(seed), light.draw(clip, seed)
+    bad = defects.of_draw(draw, clip.exposure, (clip.shape[1], clip.shape[2]))
 
     def read(start: int, stop: int) -> Array:
         try:
@@ -180,7 +181,7 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
     codes = Codes(
         name=f"{clip.name}, {light.label}",
         shape=clip.shape,
-        sensor=draw.sensor,
+        sensor=defects.behind(bad, draw.defects, draw.sensor),
         exposure=clip.exposure,
         frame_rate=clip.frame_rate,
         read=read,
@@ -190,16 +191,16 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
         ppp=draw.level.ppp,
         colour=draw.colour,
     )
-    return filled(codes, defects.of_draw(draw, clip.exposure, (clip.shape[1], clip.shape[2]))), draw.level.factor
+    return filled(codes, bad), draw.level.factor
 
 
 def stream_codes(stream: Stream) -> Codes:
     """Return the codes of a stored stream; its dead and hot pixels, where it states them, are filled."""
-    meta = stream.meta
+    meta, bad = stream.meta, defects.of_stream(stream)
     codes = Codes(
         stream.name,
         stream.shape,
-        stream.sensor,
+        stream.sensor if bad is None else defects.behind(bad, defects.read_defects(meta["defects"]), stream.sensor),
         stream.exposure,
         float(meta["frame_rate"]),
         stream.codes,
@@ -210,7 +211,7 @@ def stream_codes(stream: Stream) -> Codes:
         stream.shares,
         colour=stream.colour_filter,
     )
-    return filled(codes, defects.of_stream(stream))
+    return filled(codes, bad)
 
 
 def open_stream(path: Path) -> Stream:

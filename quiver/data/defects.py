@@ -76,6 +76,19 @@ def defective(
     return bad if bad.any() else None
 
 
+def behind(bad: Array | None, defects: Defects | None, sensor: Sensor) -> Sensor:
+    """Return the sensor of filled codes: its dark rate is the mean of the good pixels, bool [H, W] `bad` being false.
+
+    The mean over all pixels belongs mostly to the hot ones. Restored light would be too dark by their share of it.
+    """
+    if bad is None or defects is None:
+        return sensor
+    array = PixelArray.of(defects, sensor, *bad.shape)
+    if array.maps.dark is None or bad.all():
+        return sensor
+    return sensor.with_dark_rate(array.sensor.dark_rate * float(array.maps.dark[~bad].mean()))
+
+
 def of_draw(draw: Draw, exposure: float, shape: tuple[int, int]) -> Array | None:
     """Return the defective pixels of a clip that is sensed now."""
     return defective(draw.defects, draw.sensor, exposure * draw.planes, draw.level.ppp * draw.planes, shape)

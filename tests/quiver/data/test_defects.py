@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from clips import ClipMaker
-from sensor_files import QIS, SPAD, sensor_file
+from sensor_files import COUNTER, QIS, SPAD, sensor_file
 from stats import assert_mean
 
 from qsim.clip.sensing import Sensing, sense
@@ -97,6 +97,24 @@ def test_a_stream_states_its_dead_and_hot_pixels(make_clip: ClipMaker, tmp_path)
     assert now.read(0, 4)[:, now.defective].mean() == pytest.approx(now.read(0, 4)[:, ~now.defective].mean(), rel=0.25)
     healthy = sensor_file(tmp_path, QIS + "prnu = 0.05\n", bits=3, name="healthy.toml")
     assert sensed(clip, Illumination(healthy, 3.25, 3))[0].defective is None
+
+
+@pytest.mark.parametrize("model", [QIS, COUNTER], ids=["QIS", "COUNTER"])
+def test_hot_pixels_do_not_darken_the_others(make_clip: ClipMaker, tmp_path, model):
+    """A uniform field: 1 % of hot pixels hold nearly all dark counts of the map, and the restored light is right."""
+    clip = make_clip(radiance=np.full((11, 40, 40), 0.5))
+    rates = np.full((40, 40), 20.0)
+    rates.flat[::101] = 2e5  # 100 counts in 0.5 ms; over all pixels one per frame
+    np.save(tmp_path / "rates.npy", rates)
+    path = sensor_file(tmp_path, model + 'dark_map = "rates.npy"\n', bits=4)
+    stored = stream_codes(sense(clip, Sensing(path, None, ppp=3.0))[0])
+    now, _ = sensed(clip, Illumination(path, 3.0, None))
+    assert stored.sensor == now.sensor
+    assert now.sensor.dark_rate == pytest.approx(20.0)
+    # The variance of one code, in photons: shot noise over the efficiency, read noise and rounding
+    count, variance = now.defective.size * 11, (3.0 / 0.5) * 1.3
+    found = METHODS["likelihood"].restore(now.read(0, 11), now.sensor, now.exposure)[:, ~now.defective]
+    assert abs(found.mean() - 3.0) < 5 * np.sqrt(variance / count) * 1.5 + 0.02  # middle frames are in more windows
 
 
 def test_a_training_window_is_filled_too(make_clip: ClipMaker, tmp_path):
