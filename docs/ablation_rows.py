@@ -1,0 +1,144 @@
+"""Repeats the paper's ablation with a QUIVER of a million parameters: six networks, two seeds, one row each.
+
+    python docs/ablation_rows.py out/starter                       # 20 minutes for each row that is missing
+    python docs/ablation_rows.py out/starter --rows all,none       # these networks alone, with both seeds
+    python docs/ablation_rows.py out/tiny --tiny --out out/rows    # seconds for each row: a test of this program
+
+A row is RESULTS/NAME-SEED.json: one of the six networks of the paper's Table 4, with one seed of weights and windows.
+It is written when it is complete and made once; an interrupted one resumes from WORK. A wider recurrent cell stands for
+missing parts, so all six have as many parameters. Busy cores are refused (rows.py); --busy marks such rows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rows import LIGHTS, TINY, Budget, check_row, make_row, notes_on, scores
+
+from qsim.files import read_json, write_bytes
+from qsim.tables import markdown_table
+from quiver.model.config import Config
+from quiver.model.equal_cost import EQUAL_COST
+from quiver.model.presets import ABLATIONS, ablated, assemble, parameter_count
+from quiver.training.loop import train
+from quiver.training.settings import PROTOCOLS, Settings
+
+ROOT = Path(__file__).parents[1]
+FORMAT = "quiver-ablation-1"
+MILLION = replace(
+    EQUAL_COST["quiver-s"], channels=4, deformable_groups=4, denoiser_growth=8, flow_channels=(20, 40, 20, 10)
+)
+SEEDS = (0, 1)
+RATE = 3e-4  # the lower one of docs/equal_budget.py: the same for all six
+LIMITS = """Twenty minutes show which parts help at once, not which help after days of training. The spread of two seeds
+is the only measure of chance here: differences within it mean nothing."""
+
+
+def main(words: list[str] | None = None) -> int:
+    args = options().parse_args(words)
+    budget, names = TINY if args.tiny else Budget(minutes=20.0), args.rows.split(",")
+    unknown = sorted(set(names) - set(ABLATIONS))
+    if unknown:
+        print(f"ablation_rows: no row is called {unknown[0]!r}; known are {', '.join(ABLATIONS)}", file=sys.stderr)
+        return 2
+    todo = [(name, seed) for seed in SEEDS for name in names]
+    try:
+        for name, seed in todo:  # all that exist are checked before any is made
+            if (args.out / f"{name}-{seed}.json").exists():
+                check_row(args.out / f"{name}-{seed}.json", budget, args.data)
+        for name, seed in todo:
+            make = partial(network, name, seed, args, budget)
+            make_row(args.out / f"{name}-{seed}.json", budget, args.data, make, busy=args.busy or args.tiny)
+            write_table(args.out)
+    except (ValueError, OSError) as error:
+        print(f"ablation_rows: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def options() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, help="data set with splits train, val and test")
+    parser.add_argument("--rows", default=",".join(ABLATIONS), help="comma-separated (default all six)")
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "docs" / "results" / "ablation_rows", help="folder of the rows"
+    )
+    parser.add_argument(
+        "--work", type=Path, default=Path("out/ablation_rows"), help="folder of runs, which can be deleted"
+    )
+    parser.add_argument("--tiny", action="store_true", help="seconds for each row, on tiny crops and any cores")
+    parser.add_argument("--busy", action="store_true", help="make rows on busy cores too, and mark them")
+    return parser
+
+
+def network(name: str, seed: int, args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
+    """Return the row of one network: a run and its scores. It is trained in this process."""
+    config = variant(name)
+    folder = args.work / f"{name}-{seed}"
+    settings = Settings(
+        str(args.data),
+        str(folder),
+        network=f"quiver of {parameter_count(config):,} parameters, {name}",
+        minutes=budget.minutes,
+        sensor="quiver-physical",
+        ppp=(float(LIGHTS[0]),),
+        bits=(3,),
+        crop=budget.crop,
+        batch=budget.batch,
+        seed=seed,
+        threads=budget.threads,
+        **PROTOCOLS["control"] | {"learning_rate": RATE, "loss": "published"},
+    )
+    torch.manual_seed(seed)
+    train(assemble(config), settings, progress=False)
+    history = read_json(folder / "history.json")["history"]
+    scored = scores([str(folder)], args.work / f"{name}-{seed}_scores", args.data, LIGHTS[:1], budget)
+    return {
+        "format": FORMAT,
+        "name": f"{name}-{seed}",
+        "ablation": name,
+        "seed": seed,
+        "parameters": parameter_count(config),
+        "rate": RATE,
+        "steps": history[-1]["step"],
+        "curve": history,
+        "scores": next(iter(scored[folder.name].values()))["scores"],
+    }
+
+
+def variant(name: str) -> Config:
+    """Return the configuration of a row."""
+    return ablated(MILLION, name)
+
+
+def write_table(out: Path) -> None:
+    """Write OUT.md from the rows that exist: of each network the mean over its seeds and their half-spread."""
+    rows = [read_json(path) for path in sorted(out.glob("*.json"))]
+    table = []
+    for name, parts in ABLATIONS.items():
+        own = [row for row in rows if row["ablation"] == name]
+        if not own:
+            continue
+        cells = ["yes" if part else "no" for part in parts] + [f"{own[0]['parameters']:,}"]
+        cells += [", ".join(str(row["steps"]) for row in own)]
+        for key, digits in (("psnr_matched", 2), ("ssim_matched", 3)):
+            found = [row["scores"][key]["mean"] for row in own]
+            cells.append("n/a" if None in found else f"{np.mean(found):.{digits}f} ± {np.ptp(found) / 2:.{digits}f}")
+        table.append([*cells, ", ".join(f"{row['seed']}" + ("" if row["quiet"] else r"\*") for row in own)])
+    header = ("pre-denoiser", "flow", "multi-scale", "parameters", "steps", "PSNR matched", "SSIM matched", "seeds")
+    text = [
+        *("# The paper's ablation with a million parameters", "", "    python docs/ablation_rows.py DATA", ""),
+        *(LIMITS, "", *markdown_table(table, header), "", *notes_on(rows)),
+    ]
+    write_bytes(out.with_suffix(".md"), "\n".join(text).encode())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

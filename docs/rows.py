@@ -1,0 +1,210 @@
+"""Shares what programs of stored rows need: commands, the machine, and whether its cores were quiet.
+
+    python docs/rows.py     # the speed of the reference convolution, and how many cores other programs use now
+
+Rows of a table compare networks by what they learn in a fixed time. A row that was made beside other programs got less,
+so busy cores are refused before a row begins, and a row states how many cores others used while it was made.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from qsim.files import VERSION, read_json, write_json
+
+LIGHTS = ("3.25", "1", "9.75", "26")  # photons per pixel; training is at the first
+QUIET = 0.1  # cores that other programs may use
+WATCH = 3.0  # s, before a row begins
+REFERENCE_RUNS = 20
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What every row gets."""
+
+    minutes: float = 30.0
+    trial_minutes: float = 5.0
+    threads: int = 2
+    crop: int = 96  # px; a multiple of 16
+    batch: int = 4
+    size: str = "128x128"  # of the frames whose cost is measured
+
+
+TINY = Budget(minutes=0.02, trial_minutes=0.01, threads=1, crop=32, batch=2, size="32x32")
+
+
+# ---- The machine
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Processor time at one moment [s]."""
+
+    wall: float
+    everybody: float | None  # of all programs since the machine started; None: the system does not state it
+    ours: float  # of this process and of its children that have ended
+
+    @classmethod
+    def now(cls) -> Watch:
+        """Return the times of this moment."""
+        return cls(time.monotonic(), everybodys_seconds(), sum(os.times()[:4]))
+
+    def others(self) -> float | None:
+        """Return how many cores other programs used since then; None where the system does not state it."""
+        now = Watch.now()
+        if now.everybody is None or self.everybody is None:
+            return None
+        others = now.everybody - self.everybody - (now.ours - self.ours)
+        return max(0.0, others / max(now.wall - self.wall, 1e-9))
+
+
+def everybodys_seconds() -> float | None:
+    """Return the processor seconds of all programs since the machine started, from Linux's /proc/stat."""
+    try:
+        words = Path("/proc/stat").read_text().split("\n", 1)[0].split()
+        user, nice, system, _idle, _waiting, interrupts, soft = (int(word) for word in words[1:8])
+    except (OSError, ValueError):
+        return None
+    return (user + nice + system + interrupts + soft) / os.sysconf("SC_CLK_TCK")
+
+
+def refuse_busy(seconds: float = WATCH) -> None:
+    """Raise `ValueError` if other programs use more than QUIET cores now."""
+    watch = Watch.now()
+    time.sleep(seconds)
+    others = watch.others()
+    if others is not None and others > QUIET:
+        raise ValueError(
+            f"other programs use {others:.1f} cores, and a row needs quiet ones: at most {QUIET}; stop them, or give "
+            "--busy for rows that are marked"
+        )
+
+
+def machine() -> str:
+    """Return system, processor and version of torch."""
+    return f"{platform.system()} {platform.machine()}, {processor()}, torch {torch.__version__}"
+
+
+def processor() -> str:
+    """Return the name of the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.processor())
+
+
+def reference_convolution(threads: int) -> float:
+    """Return the milliseconds of a 3 x 3 convolution of 64 channels at 128 x 128 px: the least of twenty."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    layer, image = torch.nn.Conv2d(64, 64, 3, padding=1), torch.zeros(1, 64, 128, 128)
+    taken = []
+    with torch.inference_mode():
+        for _ in range(REFERENCE_RUNS):
+            started = time.perf_counter()
+            layer(image)
+            taken.append(time.perf_counter() - started)
+    torch.set_num_threads(before)
+    return 1000 * min(taken)
+
+
+# ---- Rows
+
+
+def make_row(path: Path, budget: Budget, data: Path, make: Callable[[], dict[str, Any]], *, busy: bool) -> None:
+    """Write one row, unless it exists. `make` returns what is its own; the rest is budget, machine and its speed.
+
+    `ValueError` if it exists with another budget or data set, and on busy cores unless `busy`. A row states the cores
+    that others used, and the convolution before and after.
+    """
+    if path.exists():
+        check_row(path, budget, data)
+        return
+    if not busy:
+        refuse_busy()
+    watch, before = Watch.now(), reference_convolution(budget.threads)
+    own = make()
+    others = watch.others()
+    row = {
+        "quiver": VERSION,
+        "budget": asdict(budget),
+        "data": data.name,
+        "machine": machine(),
+        "reference_convolution_ms": [before, reference_convolution(budget.threads)],
+        "cores_of_others": others,
+        "quiet": others is not None and others <= QUIET,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, row | own)
+    used = "an unknown number of" if others is None else f"{others:.1f}"
+    print(f"{path}: written{'' if row['quiet'] else f', marked: other programs used {used} cores'}", flush=True)
+
+
+def check_row(path: Path, budget: Budget, data: Path) -> None:
+    """Raise `ValueError` if a row was made with another budget or on another data set."""
+    found = read_json(path)
+    wanted = {"budget": asdict(budget), "data": data.name}
+    for name, value in wanted.items():
+        if found.get(name) != value:
+            raise ValueError(f"{path}: was made with {name} {found.get(name)}; now it is {value}; choose another --out")
+
+
+def notes_on(rows: list[dict[str, Any]]) -> list[str]:
+    """Return lines below a table: which rows were made beside other programs, and the machines."""
+    loud = [row["name"] for row in rows if not row["quiet"]]
+    machines = sorted({f"{row['machine']}, {row['budget']['threads']} threads" for row in rows})
+    speeds = [speed for row in rows for speed in row["reference_convolution_ms"]]
+    text = [f"\\* made beside other programs: {', '.join(loud)}.", ""] if loud else []
+    span = f" Reference convolution: {min(speeds):.2f} to {max(speeds):.2f} ms." if speeds else ""
+    return [*text, f"Machine: {'; '.join(machines)}.{span}", ""]
+
+
+# ---- Commands
+
+
+def quiver(*words: object, budget: Budget) -> None:
+    """Print and run one command of `quiver` in its own process."""
+    line = [str(word) for word in (*words, "--threads", budget.threads)]
+    print(f"\n$ quiver {shlex.join(line)}", flush=True)
+    subprocess.run([sys.executable, "-m", "quiver", *line], check=True)
+
+
+def scores(methods: list[str], folder: Path, data: Path, lights: tuple[str, ...], budget: Budget) -> dict[str, Any]:
+    """Return the scores on test clips by method and light."""
+    quiver(
+        *("evaluate", data, "-o", folder, "--methods", ",".join(methods), "--ppp", ",".join(lights), "-q"),
+        budget=budget,
+    )
+    found: dict[str, Any] = {}
+    for line in read_json(folder / "evaluation.json")["table"]:
+        kept = ("scores", "psnr_by_motion", "psnr_matched_per_frame", "seconds_per_frame", "failures")
+        found.setdefault(line["method"], {})[line["light"]] = {key: line[key] for key in kept}
+    return found
+
+
+def interval(found: dict[str, Any], digits: int) -> str:
+    """Return a mean with its half-width as text."""
+    if found["mean"] is None:
+        return "n/a"
+    half = "" if found["half_width"] is None else f" ± {found['half_width']:.{digits}f}"
+    return f"{found['mean']:.{digits}f}{half}"
+
+
+if __name__ == "__main__":
+    started = Watch.now()
+    time.sleep(WATCH)
+    others = started.others()
+    print(f"reference convolution on two threads: {reference_convolution(2):.2f} ms")
+    print("cores of other programs: " + ("not stated by this system" if others is None else f"{others:.2f}"))
