@@ -75,17 +75,17 @@ class FoldedConfig(Config):
         for name, (least, most) in _WHOLE.items():
             value = getattr(self, name)
             if value is not None or name != "attention_width":
-                whole_number(f"Config.{name}", value, least, most)
+                whole_number(f"FoldedConfig.{name}", value, least, most)
         if self.attention_temperature is not None:
-            real_number("Config.attention_temperature", self.attention_temperature, -1e6, 1e6)
-        real_number("Config.largest_velocity", self.largest_velocity, 0.0, 32.0)
-        flag("Config.lecun", self.lecun)
+            real_number("FoldedConfig.attention_temperature", self.attention_temperature, -1e6, 1e6)
+        real_number("FoldedConfig.largest_velocity", self.largest_velocity, 0.0, 32.0)
+        flag("FoldedConfig.lecun", self.lecun)
         if not isinstance(self.flow_channels, tuple) or not 1 <= len(self.flow_channels) <= _FLOW_LAYERS:
             raise ValueError(
-                f"Config.flow_channels must be 1 to {_FLOW_LAYERS} widths, got {shown(self.flow_channels)}"
+                f"FoldedConfig.flow_channels must be 1 to {_FLOW_LAYERS} widths, got {shown(self.flow_channels)}"
             )
         for value in self.flow_channels:
-            whole_number("Config.flow_channels", value, 1, 1024)
+            whole_number("FoldedConfig.flow_channels", value, 1, 1024)
         for name in ("flow_kernel", "deformable_kernel"):
             if getattr(self, name) % 2 == 0:
                 raise ValueError(f"Config.{name} must be odd, got {getattr(self, name)}")
