@@ -85,7 +85,7 @@ def choose(prefer: str | None = None) -> Engine:
     wanted = prefer or os.environ.get("QSIM_ENGINE") or None
     if wanted not in (None, *BACKENDS):
         raise ValueError(f"engine {wanted!r}: expected one of {', '.join(BACKENDS)}")
-    return decide(wanted)
+    return decided(wanted)
 
 
 def on_gpu(engine: str) -> bool:
@@ -113,7 +113,6 @@ def report() -> dict[str, Any]:
     return asdict(engine) | {"probes": probes, "software": software, "cache": str(_cache_file())}
 
 
-@lru_cache
 def decide(wanted: str | None) -> Engine:
     failures = []
     if wanted in (None, "cuda"):
@@ -139,6 +138,9 @@ def decide(wanted: str | None) -> Engine:
         raise ValueError(f"engine {wanted} does not work here ({why}); {hint}")
     warnings.warn(f"rendering with the slow scalar engine ({why}): {INSTALL_HINT}", RuntimeWarning, stacklevel=3)
     return Engine(VARIANTS["scalar"], "scalar", None, why)
+
+
+decided = lru_cache(decide)
 
 
 def llvm_candidates() -> list[str]:

@@ -86,12 +86,12 @@ def test_without_a_usable_llvm_the_scalar_engine_says_what_to_install(monkeypatc
     monkeypatch.setattr(backend, "cached_probe", lambda *args: failed)
     monkeypatch.setattr(backend, "probe_cuda", lambda: backend.Probe("cuda", None, False, "no NVIDIA driver"))
     with pytest.warns(RuntimeWarning, match="apt install libllvm19"):
-        chosen = backend.decide.__wrapped__(None)
+        chosen = backend.decide(None)
     assert chosen.variant == "scalar_rgb"
     with pytest.raises(ValueError, match=r"engine llvm does not work here .*older than LLVM 16.*install LLVM 16"):
-        backend.decide.__wrapped__("llvm")
+        backend.decide("llvm")
     with pytest.raises(ValueError, match=r"engine cuda does not work here .*no NVIDIA driver"):
-        backend.decide.__wrapped__("cuda")
+        backend.decide("cuda")
 
 
 def test_a_gpu_without_optix_is_told_what_to_update(monkeypatch):
@@ -110,9 +110,9 @@ def test_a_gpu_without_optix_is_told_what_to_update(monkeypatch):
     monkeypatch.setattr(backend, "probe_cuda", lambda: probe)
     monkeypatch.setattr(backend, "llvm_candidates", lambda: ["new.so"])
     monkeypatch.setattr(backend, "cached_probe", lambda *args: works)
-    assert backend.decide.__wrapped__(None).backend == "llvm"
+    assert backend.decide(None).backend == "llvm"
     with pytest.raises(ValueError, match=r"engine cuda does not work here \(CUDA: OptiX is missing.*NVIDIA GPU"):
-        backend.decide.__wrapped__("cuda")
+        backend.decide("cuda")
 
 
 def test_a_working_gpu_is_taken_first_and_another_engine_can_be_asked_for(monkeypatch):
@@ -121,7 +121,7 @@ def test_a_working_gpu_is_taken_first_and_another_engine_can_be_asked_for(monkey
     monkeypatch.setattr(backend, "probe_cuda", lambda: cuda)
     monkeypatch.setattr(backend, "llvm_candidates", lambda: ["new.so"])
     monkeypatch.setattr(backend, "cached_probe", lambda *args: llvm)
-    variants = {name: backend.decide.__wrapped__(name).variant for name in (None, *backend.BACKENDS)}
+    variants = {name: backend.decide(name).variant for name in (None, *backend.BACKENDS)}
     assert variants == {None: "cuda_ad_mono", "cuda": "cuda_ad_mono", "llvm": "llvm_ad_mono", "scalar": "scalar_rgb"}
 
 

@@ -375,7 +375,7 @@ def test_a_folder_that_is_not_ours(folder, monkeypatch, capsys):
 def test_no_gpu(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     monkeypatch.setenv("QSIM_ENGINE", "cuda")
-    monkeypatch.setattr(backend, "decide", backend.decide.__wrapped__)
+    monkeypatch.setattr(backend, "decided", backend.decide)
     monkeypatch.setattr(
         backend, "probe_cuda", lambda: backend.Probe("cuda", None, False, "no NVIDIA driver on this machine")
     )
@@ -394,7 +394,7 @@ def test_no_gpu_for_a_network(folder, monkeypatch, capsys):
 def test_an_old_llvm(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     monkeypatch.setenv("QSIM_ENGINE", "llvm")
-    monkeypatch.setattr(backend, "decide", backend.decide.__wrapped__)
+    monkeypatch.setattr(backend, "decided", backend.decide)
     monkeypatch.setattr(backend, "llvm_candidates", lambda: ["/usr/lib/libLLVM-14.so"])
     monkeypatch.setattr(backend, "cached_probe", lambda *_: backend.Probe("llvm", None, False, "older than LLVM 16"))
     err = told(capsys, "qsim doctor")
