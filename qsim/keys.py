@@ -21,8 +21,8 @@ import numpy as np
 from numpy import ndarray as Array
 
 ROUNDS = 7  # of Philox4x32; Dr.Jit's default
-_MULTIPLIERS = (np.uint64(0xD2511F53), np.uint64(0xCD9E8D57))
-_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
+MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
+KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 _BATCH = 1 << 13  # blocks that stay in the cache
 _LOW, _SHIFT = np.uint64(0xFFFFFFFF), np.uint64(32)
 
@@ -68,15 +68,15 @@ def philox4x32(counters: Array, key: int) -> Array:
     even, odd = np.empty_like(c0), np.empty_like(c2)
     k0, k1 = key >> 32 & 0xFFFFFFFF, key & 0xFFFFFFFF
     for _ in range(ROUNDS):  # in place: this is the inner loop of the reference engine
-        np.multiply(_MULTIPLIERS[0], c0, out=even)
-        np.multiply(_MULTIPLIERS[1], c2, out=odd)
+        np.multiply(np.uint64(MULTIPLIERS[0]), c0, out=even)
+        np.multiply(np.uint64(MULTIPLIERS[1]), c2, out=odd)
         for c, old, product, k in ((c0, c1, odd, k0), (c2, c3, even, k1)):
             np.right_shift(product, _SHIFT, out=c)
             np.bitwise_xor(c, old, out=c)
             np.bitwise_xor(c, np.uint64(k), out=c)
         np.bitwise_and(odd, _LOW, out=c1)
         np.bitwise_and(even, _LOW, out=c3)
-        k0, k1 = (k0 + _KEY_STEPS[0]) & 0xFFFFFFFF, (k1 + _KEY_STEPS[1]) & 0xFFFFFFFF
+        k0, k1 = (k0 + KEY_STEPS[0]) & 0xFFFFFFFF, (k1 + KEY_STEPS[1]) & 0xFFFFFFFF
     return state.astype(np.uint32)
 
 

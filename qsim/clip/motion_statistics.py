@@ -14,12 +14,6 @@ CODE_BITS = 3  # motion is stated per frame of 3 bits, for all compared depths
 CODE_PLANES = 2**CODE_BITS - 1
 
 
-def largest_motion(length: Array) -> float:
-    """Return the 99.9th percentile of the known lengths [...] of a motion, in their unit; 0 if none is known."""
-    known = length[np.isfinite(length)]
-    return float(np.percentile(known, 99.9)) if known.size else 0.0
-
-
 def moving_mean(length: Array, frames: int = 1) -> float | None:
     """Return the mean motion [px] of pixels that move more than `MOVING` in `frames` clip frames; None if none does.
 

@@ -20,8 +20,8 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import Errors, Stated, white_in
-from qsim.clip.motion_statistics import MOVING, largest_motion
-from qsim.colour import psnr
+from qsim.clip.motion_statistics import MOVING
+from qsim.colour import bright_end, psnr
 from qsim.optics.camera import Camera
 from qsim.optics.diffraction import diffraction_line
 from qsim.optics.radiometry import WHITE_PER_MEAN
@@ -203,7 +203,7 @@ def moving(extent: Array, shutter: float) -> Finding:
     fast = speed[speed > MOVING]
     size = f"more than {MOVING:g} px/frame"
     if fast.size:
-        fastest = max(map(largest_motion, speed))
+        fastest = max(map(bright_end, speed))
         size += f"; those by {fast.mean():.3g} on average, 99.9 % of all pixels by at most {fastest:.3g}"
     return Finding("motion", f"{_percent(fast.size / speed.size)} of the pixels move", size)
 
@@ -220,7 +220,7 @@ def fewest_instants(extent: Array, contrast: float, changes: Callable[[int], flo
     between the means of K and of more instants, is at most SHARE. `changes` and `contrast` (of the picture) are
     fractions of the allowed error.
     """
-    fastest = max(map(largest_motion, extent))
+    fastest = max(map(bright_end, extent))
     runs = float((extent > 0.1).mean(axis=(1, 2)).max())
     edge = SHARE / max(contrast * math.sqrt(runs), 1e-300)
     count = 3

@@ -16,7 +16,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import Errors
-from qsim.clip.motion_statistics import largest_motion
+from qsim.colour import bright_end
 from qsim.optics.camera import Camera, Pose
 from qsim.rendering.budget import Allowed, Budget, Finding, grid_samples, instants, light_windows
 from qsim.rendering.denoiser import AROUND, DENOISE_COST, available, cleaned_mean
@@ -61,7 +61,7 @@ class Pilot:
             known |= set(np.unique(bodies[most]).tolist())
             times.add(looks[most])
         if shutter > 0:
-            times.add(looks[int(np.argmax([largest_motion(frame) for frame in extent]))])
+            times.add(looks[int(np.argmax([bright_end(frame) for frame in extent]))])
             times |= _fastest(scene, {t: renderer.time(t) for t in {*looks, *times}}, times)
         return cls(renderer, extent, middle, tuple(sorted(times)))
 

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from qsim import colour
 from qsim.clip import gates
-from qsim.clip.clamped_error import stated
+from qsim.clip.clamped_error import rms, stated
 from qsim.clip.clip import Clip
-from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, MOVING, SLOWEST, largest_motion, moving_mean
+from qsim.clip.motion_statistics import CODE_BITS, CODE_PLANES, MOVING, SLOWEST, moving_mean
 from qsim.clip.photons import clip_photons
 from qsim.clip.stream import Stream
+from qsim.colour import bright_end
 from qsim.report import html as page
 from qsim.report.panels import (
     FRAMES,
@@ -43,7 +44,7 @@ _PIXELS = 4096  # largest number of a frame in the expected histogram of codes
 def motion(clip: Clip, frames: Sequence[int]) -> tuple[float | None, float]:
     """Return the mean motion of pixels that move (None if none does) and the 99.9th percentile of all [px/frame]."""
     speed = np.stack([np.hypot(*clip.flow(t)) for t in frames])
-    return moving_mean(speed), largest_motion(speed)
+    return moving_mean(speed), bright_end(speed)
 
 
 def clip_section(clip: Clip) -> page.Section:
@@ -174,9 +175,9 @@ def error_lines(meta: dict[str, Any]) -> list[str]:
     lines = []
     errors = meta.get("error_per_frame")
     if errors:
-        rms = float(np.sqrt(np.mean(np.square(errors))))
+        error = rms(np.asarray(errors))
         lines.append(
-            f"Error of a frame (noise, blur, omitted bounces): {rms:.3g} rms in the unit of the radiance, "
+            f"Error of a frame (noise, blur, omitted bounces): {error:.3g} rms in the unit of the radiance, "
             f"worst {max(errors):.3g}"
         )
     found = stated(meta)

@@ -15,9 +15,9 @@ from qsim import colour
 from qsim.clip.clamped_error import Errors, white_in
 from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
-from qsim.clip.motion_statistics import largest_motion
 from qsim.clip.photons import clip_photons
 from qsim.clip.stream import Stream
+from qsim.colour import bright_end
 from qsim.report import html as page
 from qsim.sensor.demosaicing import demosaic
 
@@ -138,7 +138,7 @@ def truth_panels(clip: Clip, frames: range) -> tuple[list[page.Panel], float, Li
     grey = colour.tone(truth if clip.bands is None else truth.mean(axis=1), white := colour.peak(truth))
     flow = np.stack([clip.flow(t) for t in frames])
     speed = np.hypot(flow[:, 0], flow[:, 1])
-    largest = max(largest_motion(speed), 0.5)
+    largest = max(bright_end(speed), 0.5)
     panels = [page.Panel(light_name(clip), fit(toned(truth, white)))]
     panels.append(
         page.Panel(f"flow, full colour at {largest:.1f} px/frame", fit(_over(grey, colour.flow_colours(flow, largest))))

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from qsim import colour, files
 from qsim.checks import check_shape, check_video
 from qsim.clip.clip import Clip
-from qsim.clip.motion_statistics import largest_motion
 from qsim.clip.stream import Stream
+from qsim.colour import bright_end
 from qsim.files import load_array
 from qsim.formats.recording import checked_codes
 from qsim.sensor import packing
@@ -197,7 +197,7 @@ def _code_views(
 
 def _flow_view(clip: Clip) -> View:
     speeds = np.stack([np.hypot(*clip.flow(t)) for t in _samples(len(clip))])
-    largest = max(largest_motion(speeds), 0.5)
+    largest = max(bright_end(speeds), 0.5)
     declared = f"flow to the next frame: rim of the wheel = {largest:.3g} px/frame, white still, grey unknown"
     return View(
         "flow",

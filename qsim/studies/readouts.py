@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.clip.clamped_error import rms
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
 from qsim.clip.stream import Stream
@@ -71,7 +72,7 @@ def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) ->
     peak = WHITE_PER_MEAN * float(np.mean([clip_photons(clip, t).mean() for t in range(len(clip))]))
 
     def score(found: Array) -> float:
-        return psnr(peak, float(np.sqrt(np.mean((found - truth) ** 2))))
+        return psnr(peak, rms(found - truth))
 
     blurred = np.stack([_light(clip, t - window // 2, window) for t in centres])
     rows = [ReadoutRow("", "light", None, window, window * frame, None, score(blurred), None)]

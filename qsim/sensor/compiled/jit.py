@@ -13,10 +13,8 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import backend as engine
-from qsim.keys import ROUNDS
+from qsim.keys import KEY_STEPS, MULTIPLIERS, ROUNDS
 
-_MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # of Philox4x32; see keys.py
-_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 _PACKET = 16  # numbers that a kernel works on at a time, at most
 _INFINITY = 0x7F800000  # float32; larger bit patterns are NaN or negative
 
@@ -106,9 +104,9 @@ def philox(x: Any, y: Any, frame: Any, high: Any, low: Any) -> list[Any]:
     u32 = type(x)
     c0, c1, c2, c3 = x, y, frame, u32(0)
     for _ in range(ROUNDS):
-        a, b = u32(_MULTIPLIERS[0]), u32(_MULTIPLIERS[1])
+        a, b = u32(MULTIPLIERS[0]), u32(MULTIPLIERS[1])
         c0, c1, c2, c3 = dr.mul_hi(b, c2) ^ c1 ^ high, b * c2, dr.mul_hi(a, c0) ^ c3 ^ low, a * c0
-        high, low = high + _KEY_STEPS[0], low + _KEY_STEPS[1]
+        high, low = high + KEY_STEPS[0], low + KEY_STEPS[1]
     return [c0, c1, c2, c3]
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import colour, keys
+from qsim.clip.clamped_error import rms
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons, light_level
 from qsim.figures import figure_png, new_figure
@@ -69,8 +70,8 @@ def figure_1(clip: Clip, *, lux: float = 1.0, seed: int = 0) -> list[Panel]:
             "motion_px_per_frame": None if speed is None else n * speed,
             "photons_per_frame": float(light.mean()),
             "electrons_per_frame": float(sensor.efficiency * light.mean()),
-            "blur_error": _rms(light / n - sharp) / peak,
-            "psnr_db": colour.psnr(peak, _rms(image - sharp)),
+            "blur_error": rms(light / n - sharp) / peak,
+            "psnr_db": colour.psnr(peak, rms(image - sharp)),
         }
         panels.append(Panel(f"{name}, {fps:g} fps", image, numbers))
     return panels
@@ -94,18 +95,14 @@ def figure_2(clip: Clip, ppp: float, *, seed: int = 0, bits: Sequence[int] = BIT
             "fps": clip.frame_rate / m,
             "motion_px_per_frame": None if speed is None else m * speed,
             "detections_per_pixel": float(frame.fired.mean()),
-            "blur_error": _rms(frame.photons / m - sharp) / peak,
-            "psnr_db": colour.psnr(peak, _rms(image - sharp)),
+            "blur_error": rms(frame.photons / m - sharp) / peak,
+            "psnr_db": colour.psnr(peak, rms(image - sharp)),
         }
         shown = replace(plane, bits=b)
         panels.append(
             Panel(f"{b} bit, {clip.frame_rate / m:.4g} fps", image, numbers | {"white": shown.white(1.0) / m})
         )
     return panels
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def draw(rows: Sequence[Sequence[Panel]]) -> bytes:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.clip.clamped_error import rms
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
 from qsim.colour import psnr
@@ -67,7 +68,7 @@ class Sweep:
         best = {m: np.array([[found.best(m).bits for found in line] for line in self.studies]) for m in MODELS}
         return {
             "simulated": sigmas.size,
-            "rms_sigmas": float(np.sqrt(np.mean(sigmas**2))),
+            "rms_sigmas": rms(sigmas),
             "largest_sigmas": float(np.abs(sigmas).max()),
             "cells": sum(bits.size for bits in best.values()),
             "cells_with_another_depth": sum(int((best[m] != self.predicted[m]).sum()) for m in MODELS),
