@@ -117,7 +117,7 @@ def test_time_of_this_process_is_not_that_of_others():
     while sum(rows.os.times()[:4]) < watch.ours + 0.5:
         sum(range(10_000))
     now = rows.Watch.now()
-    assert now.ours - watch.ours >= 0.5
+    assert now.ours - watch.ours > 0.49
     if watch.everybody is not None:
         assert now.everybody - watch.everybody > 0.4
         assert watch.others() >= 0
