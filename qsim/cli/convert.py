@@ -16,7 +16,7 @@ from qsim.dataset.recipe import SPLITS
 from qsim.formats import challenge, detection, exporting, importing, pairs
 from qsim.formats.recording import TRANSFERS, Hints
 
-_SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr", ".h5": "pairs", ".dat": "spike"}
+_SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr", ".h5": "pairs", ".dat": "spike", ".npz": "photons"}
 
 
 def add_convert(sub: Any) -> None:
@@ -130,7 +130,7 @@ def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
     if not (args.input / "dataset.json").is_file():
         opened = Stream.open(args.input) if args.input.suffix == ".json" else Clip.open(args.input)
         return [exporting.described(opened, args.output, wanted, force=args.force)]
-    suffix = {"cube": ".npy", "mp4": ".mp4", "zarr": ".zarr", "spike": ".dat"}.get(kind, "")
+    suffix = {"cube": ".npy", "mp4": ".mp4", "zarr": ".zarr", "spike": ".dat", "photons": ".npz"}.get(kind, "")
     made = []
     clips = Dataset.open(args.input).clips()
     for clip in clips:

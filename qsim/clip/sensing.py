@@ -27,7 +27,7 @@ from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
 from qsim.sensor.defects.defect_table import Defects
-from qsim.sensor.defects.event_simulation import TOLERANCE
+from qsim.sensor.defects.event_simulation import TOLERANCE, Effects
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
@@ -52,6 +52,7 @@ class Sensing:
     rows: Rows | None = None  # rows or columns at their own time; None: all at once
     colour: str | ColourFilter | None = None  # rggb, quad, rgbw or .toml with a table [colour]; None: as for defects
     exposures: tuple[float, ...] | None = None  # shares of a code's time, in turn; None: all of it
+    follow: bool = False  # counting SPAD: draw photon by photon, even where the closed form is exact
 
     @property
     def stream_name(self) -> str:
@@ -150,8 +151,8 @@ def _checked_exposures(sensing: Sensing, sensor: Sensor, found: Defects | None) 
     remembers = found is not None and (found.afterpulse or found.carry_dead_time)
     if isinstance(sensor, SpikeCamera):
         raise ValueError(f"exposures: {sensing.sensor_name} integrates without a pause; leave them out")
-    if remembers or (sensing.slices > 1 and isinstance(sensor, CountingSPAD)):
-        what = "afterpulses and carried dead time" if remembers else "slices of a counting pixel"
+    if remembers or ((sensing.follow or sensing.slices > 1) and isinstance(sensor, CountingSPAD)):
+        what = "afterpulses and carried dead time" if remembers else "slices and followed photons of a counting pixel"
         raise ValueError(f"exposures: {what} need codes of equal exposure; leave one of them out")
     return shares
 
@@ -170,6 +171,8 @@ def _check_rows(rows: Rows, clip: ClipFolder, planes: int, period: int) -> None:
 def _check_planes(sensor: Sensor, sensing: Sensing, clip: ClipFolder) -> None:
     """Raise `ValueError` if sums of planes or slices of exposures do not fit the sensor or the clip."""
     kind = type(sensor).__name__
+    if sensing.follow and not isinstance(sensor, CountingSPAD):
+        raise ValueError(f"{sensing.sensor_name}: only the photons of a CountingSPAD are followed, this is a {kind}")
     if sensing.group and not isinstance(sensor, BinarySPAD):
         raise ValueError(f"{sensing.sensor_name}: only a clocked SPAD (BinarySPAD) sums planes, this is a {kind}")
     if sensing.slices > 1 and not isinstance(sensor, CountingSPAD | QIS):
@@ -240,8 +243,11 @@ def sense(
         effects = [key for key, value in draw.defects.to_dict().items() if value and key != "device_seed"]
         line += f"; defects: {', '.join(effects) or 'none'}"
     missed = draw.missed(clip)
+    if missed is None and sensing.follow:
+        missed = Effects(0.0, 0.0, 0.0)
     if missed is not None:
-        draw = dataclasses.replace(draw, followed=missed if missed.largest > TOLERANCE else None)
+        followed = sensing.follow or missed.largest > TOLERANCE
+        draw = dataclasses.replace(draw, followed=missed if followed else None)
         meta["drawn_by"] = draw.law
         meta["dead_time_effects"] = dataclasses.asdict(missed)
         line += f"; {missed}: {'photon by photon' if draw.followed else 'below ' + str(TOLERANCE) + ', closed form'}"

@@ -242,6 +242,20 @@ class Draw:
         exposure, frame_time = self._exposure(clip), self.planes / clip.frame_rate
         return event_simulation.follow(array, self._slices(clip), shape, exposure, frame_time, self.key)
 
+    def trace(self, clip: ClipFolder, frames: int) -> Iterator[tuple[Array, Array]]:
+        """Yield the times [n] in s and kinds [n] of the events behind the first codes of each pixel, row by row.
+
+        Time 0 is the start of the first exposure. `ValueError` for codes that were not followed photon by photon.
+        """
+        array = self._array(clip)
+        if self.followed is None or array is None:
+            raise ValueError(
+                f"{clip.name}: its codes were not drawn photon by photon; sense a CountingSPAD with --follow"
+            )
+        shape = (frames, *clip.shape[1:])
+        exposure, frame_time = self._exposure(clip), self.planes / clip.frame_rate
+        return event_simulation.trace(array, self._slices(clip), shape, exposure, frame_time, self.key)
+
 
 def stored(stream: Stream) -> Draw:
     """Return the draw of a stored stream, from its json, by the law of its version.

@@ -67,6 +67,7 @@ class Job:
             for key, off in (
                 ("defects", None),
                 ("slices", 1),
+                ("follow", False),
                 ("rows", None),
                 ("colour", None),
                 ("exposures", None),

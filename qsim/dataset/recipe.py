@@ -29,6 +29,7 @@
     seed = 1                   # of the noise; default: that of [recipe]
     name = "dim"               # of the stream; default: made from sensor, bits and light
     group = true               # a code sums 2^bits - 1 clip frames as binary planes; default false
+    follow = true              # a counting SPAD is drawn photon by photon, so that their times are known; default false
     slices = 16                # clip frames in one exposure of a QIS or a counting SPAD; default 1
     diffraction = true         # blur by the lens's Airy pattern; default false
     row_delay = 2e-6           # seconds from one row, or column, to the next; default: all at once
@@ -251,6 +252,7 @@ def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
             group=given.get("group", False),
             diffraction=given.get("diffraction", False),
             slices=given.get("slices", 1),
+            follow=given.get("follow", False),
             rows=rows,
             exposures=given.get("exposures"),
             **light,
@@ -340,7 +342,7 @@ SCENES: Table = {
 STREAMS: Table = {
     "sensor": checks.text, "bits, if any": checks.list_of(checks.bits),
     "ppp, if any": checks.list_of(checks.light), "lux, if any": checks.list_of(checks.light),
-    "absolute, if any": checks.flag,
+    "absolute, if any": checks.flag, "follow, if any": checks.flag,
     "seed, if any": checks.seed, "name, if any": _name,
     "group, if any": checks.flag, "slices, if any": checks.whole, "diffraction, if any": checks.flag,
     "row_delay, if any": checks.positive, "row_order, if any": checks.row_order,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from qsim.files import load_array
-from qsim.formats import array_files, images, mat_files, raw_cameras, video
+from qsim.formats import array_files, images, mat_files, photon_times, raw_cameras, video
 from qsim.formats.recording import Hints, Recording
 
 Reader = Callable[[Path, Hints], Recording]
@@ -26,6 +26,7 @@ LAYOUTS: dict[str, Reader] = {  # the names of --layout
     "zarr": array_files.read_zarr,
     "mat": mat_files.read_mat,
     "spike": raw_cameras.read_spike,
+    "photons": photon_times.read_photons,
 }
 _WHOLE = "none: whole bytes per pixel"
 # (bit order, orientation) of layouts whose readers do not state it, and the reason for it.
@@ -38,6 +39,7 @@ ASSUMED: dict[str, tuple[str, str]] = {
     "tiff": ("msb if 1-bit", "upright"),  # tifffile undoes FillOrder; an Orientation tag is not applied
     "visionsim": ("msb", "upright"),  # np.packbits along rows of pictures as rendered
     "zarr": (_WHOLE, "upright"),  # quanta-spad-sim draws row 0 on top
+    "photons": (_WHOLE, "upright"),  # as the stream that it was made from
     "mat": (_WHOLE, "as stored"),  # OUTPUT's rows are the array's; the camera's orientation is not in a file
 }
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv")
@@ -52,7 +54,8 @@ def detect(path: Path) -> str:
     if path.is_dir():
         return _detect_folder(path)
     suffix = "".join(path.suffixes[-2:]) if path.suffix == ".gz" else path.suffix.lower()
-    simple = {".png": "png", ".tif": "tiff", ".tiff": "tiff", ".mat": "mat", ".dat": "spike", ".npy.gz": "cube"}
+    simple = {".png": "png", ".tif": "tiff", ".tiff": "tiff", ".mat": "mat", ".dat": "spike", ".npy.gz": "cube",
+              ".npz": "photons"}  # fmt: skip
     if suffix in simple:
         return simple[suffix]
     if suffix in VIDEOS:

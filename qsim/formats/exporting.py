@@ -16,7 +16,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream, orientation
 from qsim.colour import code_levels, peak
 from qsim.files import VERSION
-from qsim.formats import array_files, challenge, images, raw_cameras, video
+from qsim.formats import array_files, challenge, images, photon_times, raw_cameras, video
 
 BLOCK = 16  # frames read at a time
 
@@ -25,7 +25,7 @@ BLOCK = 16  # frames read at a time
 class Export:
     """The format of an export."""
 
-    kind: str  # cube, mp4, png, exr, zarr, challenge, spike
+    kind: str  # cube, mp4, png, exr, zarr, challenge, spike, photons
     transfer: str = "gamma 2.2"  # of pictures of light
     white: float | None = None  # light that becomes full scale; None: the 99.9th percentile
     lossless: bool = True  # of mp4
@@ -45,7 +45,7 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
         raise FileExistsError(f"{path}: exists; name another, or use --force to replace it")
     meta = _export_meta(source, wanted)
     path.parent.mkdir(parents=True, exist_ok=True)
-    single = wanted.kind in ("cube", "mp4", "spike")
+    single = wanted.kind in ("cube", "mp4", "spike", "photons")
     side, part = path.with_name(path.name + ".json"), path.with_name(path.name + ".part")
     for place in [path, *([side] if single else [part])]:
         _check_ours(place, side if single else place / "meta.json", single)
@@ -174,6 +174,12 @@ def _spike(source: Clip | Stream, path: Path, _wanted: Export, meta: dict[str, A
     meta |= {"bit_order": "lsb", "orientation": "upside down"}
 
 
+def _photons(source: Clip | Stream, path: Path, _wanted: Export, meta: dict[str, Any]) -> None:
+    if isinstance(source, Clip):
+        raise ValueError(f"{source.path}: a clip has light, and no single photons; name one of its streams")
+    meta |= {"events": photon_times.write(source, path)}
+
+
 EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
     "cube": _cube,
     "mp4": _mp4,
@@ -182,6 +188,7 @@ EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
     "zarr": _zarr,
     "challenge": _challenge,
     "spike": _spike,
+    "photons": _photons,
 }
 
 

@@ -123,6 +123,8 @@ MISTAKES = [
     ),
     ("qsim sense lit --ppp 3 --sensor iso.sensor.toml", "iso needs a full_well above 0 and codes above the offset"),
     ("qsim convert lit x.dat", "lit: a spike file holds one bit per pixel, this is light; name a stream of one bit"),
+    ("qsim sense lit --ppp 3 --follow", "only the photons of a CountingSPAD are followed, this is a QIS"),
+    ("qsim convert lit x.npz", "lit: a clip has light, and no single photons; name one of its streams"),
     ("qsim compare lit --span 1", "has no streams to compare; make some with `qsim sense`"),
     # What is in the way
     ("qsim render fan -o text.txt --force", "text.txt: exists and is not a clip, which is all that --force replaces"),

@@ -15,7 +15,7 @@ may leave a carrier as well.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from functools import reduce
 from heapq import heapify, heappop, heappush
@@ -31,6 +31,9 @@ from qsim.sensor.defects.pixel_array import PixelArray
 
 TOLERANCE = 1e-3  # relative change of the mean count that a closed form may miss
 _STRIP_BYTES = 1 << 25  # of light in memory while single pixels are followed through a clip
+
+DETECTED, RELEASED = 1, 2  # of an event: the pixel counted it; it was a trapped carrier, no arrival
+Event = tuple[float, int]  # time [s] and the sum of these
 
 IncidentLight = Callable[[int, int, int], Array]  # (frame, first row, rows) -> photons [slices, rows, W]
 
@@ -148,14 +151,19 @@ def simulate(
     frame_time: float,
     memory: Memory,
     rng: np.random.Generator,
+    log: list[Event] | None = None,
 ) -> Array:
-    """Return counts [T], not clipped, of one pixel for expected photons [T, S] in S equal slices of each exposure."""
+    """Return counts [T], not clipped, of one pixel for expected photons [T, S] in S equal slices of each exposure.
+
+    `log` receives every event of the exposures, in time order; it changes no count.
+    """
     rates = sensor.efficiency * photons + sensor.dark_rate * exposure / photons.shape[1]
     counts = np.zeros(len(photons), np.int64)
     state = State()
     for t, row in enumerate(rates):
         start = t * frame_time
-        counts[t], state = expose(sensor, arrival_times(row, start, exposure, rng), start, exposure, memory, state, rng)
+        arrivals = arrival_times(row, start, exposure, rng)
+        counts[t], state = expose(sensor, arrivals, start, exposure, memory, state, rng, log)
         if not memory.carry:
             state = State()
     return counts
@@ -175,9 +183,10 @@ def expose(
     memory: Memory,
     state: State,
     rng: np.random.Generator,
+    log: list[Event] | None = None,
 ) -> tuple[int, State]:
     """Return the count of one exposure and the state after it; arrivals [s] and released carriers in time order."""
-    waiting = [*arrivals, *(time for time in state.trapped if time >= start)]
+    waiting, carriers = [*arrivals, *(time for time in state.trapped if time >= start)], set(state.trapped)
     heapify(waiting)
     count, dead_until = 0, state.dead_until
     while waiting and waiting[0] < start + exposure:
@@ -186,7 +195,10 @@ def expose(
         if live:
             count += 1
             if memory.afterpulse and rng.random() < memory.afterpulse:
-                heappush(waiting, time + rng.exponential(memory.afterpulse_delay))
+                carriers.add(release := time + rng.exponential(memory.afterpulse_delay))
+                heappush(waiting, release)
+        if log is not None:
+            log.append((time, DETECTED * live + RELEASED * (time in carriers)))
         if live or sensor.paralyzable:
             dead_until = time + sensor.dead_time
     return count, State(dead_until, tuple(waiting))
@@ -236,16 +248,41 @@ def follow(
     array: PixelArray, light: IncidentLight, shape: tuple[int, int, int], exposure: float, frame_time: float, key: Key
 ) -> Array:
     """Return codes of a clip of `shape` (T, H, W), each pixel followed photon by photon from the first frame."""
-    frames, height, width = shape
     codes = np.empty(shape, array.sensor.dtype)
     memory = memory_of(array.defects)
-    slices = len(light(0, 0, 1))
-    step = max(1, _STRIP_BYTES // (8 * frames * slices * width))
-    for y in range(0, height, step):
-        rows = min(step, height - y)
-        parts = [_lit(array, light(t, y, rows), y, exposure) for t in range(frames)]
-        sensor, photons = parts[0][0], np.stack([part for _, part in parts])
-        codes[:, y : y + rows] = _follow_pixels(sensor, photons, exposure, frame_time, memory, key, (y, 0))
+    for y, sensor, photons in _strips(array, light, shape, exposure):
+        rows = slice(y, y + photons.shape[2])
+        codes[:, rows] = _follow_pixels(sensor, photons, exposure, frame_time, memory, key, (y, 0))
     if array.maps.dead is not None:
         codes[:, array.maps.dead] = 0
     return codes
+
+
+def trace(
+    array: PixelArray, light: IncidentLight, shape: tuple[int, int, int], exposure: float, frame_time: float, key: Key
+) -> Iterator[tuple[Array, Array]]:
+    """Yield the events behind the codes of `follow`, pixel by pixel, row by row: times [n] in s, kinds uint8 [n].
+
+    A kind is the sum of DETECTED and RELEASED. Dead pixels have no events.
+    """
+    memory = memory_of(array.defects)
+    for first, sensor, photons in _strips(array, light, shape, exposure):
+        for y, x in np.ndindex(photons.shape[2:]):
+            log: list[Event] = []
+            if array.maps.dead is None or not array.maps.dead[first + y, x]:
+                rng = pixel_stream(key, first + y, x)
+                simulate(sensor, photons[:, :, y, x], exposure, frame_time, memory, rng, log)
+            times, kinds = zip(*log, strict=True) if log else ((), ())
+            yield np.array(times, np.float64), np.array(kinds, np.uint8)
+
+
+def _strips(
+    array: PixelArray, light: IncidentLight, shape: tuple[int, int, int], exposure: float
+) -> Iterator[tuple[int, CountingSPAD, Array]]:
+    """Yield the first row, the sensor and the light [T, slices, rows, W] of strips of a clip that fit into memory."""
+    frames, height, width = shape
+    slices = len(light(0, 0, 1))
+    step = max(1, _STRIP_BYTES // (8 * frames * slices * width))
+    for y in range(0, height, step):
+        parts = [_lit(array, light(t, y, min(step, height - y)), y, exposure) for t in range(frames)]
+        yield y, parts[0][0], np.stack([part for _, part in parts])

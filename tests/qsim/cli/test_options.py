@@ -169,6 +169,10 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Acts("sense clip --ppp 3 --name n", "--exposures 1,0.25"),
         Refused("sense clip", "--exposures 1,2", "share of a full exposure"),
     ],
+    ("sense", "--follow"): [
+        Acts("sense clip --sensor counter.toml --name n", "--follow"),
+        Refused("sense clip", "--follow", "followed"),
+    ],
     ("sense", "--replay"): [
         Acts("sense clip --ppp 3.25 --bits 3 --name s", "--replay clip:1", stdout),
         Refused("sense clip --replay clip:1", "--row-order up", "row delay"),
@@ -176,6 +180,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
             Refused("sense clip --replay clip:1", option, option.split()[0])
             for option in (
                 "--group",
+                "--follow",
                 "--diffraction",
                 "--defects bad.toml",
                 "--slices 2",
