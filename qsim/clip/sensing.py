@@ -152,7 +152,11 @@ def _checked_exposures(sensing: Sensing, sensor: Sensor, found: Defects | None) 
     if isinstance(sensor, SpikeCamera):
         raise ValueError(f"exposures: {sensing.sensor_name} integrates without a pause; leave them out")
     if remembers or ((sensing.follow or sensing.slices > 1) and isinstance(sensor, CountingSPAD)):
-        what = "afterpulses and carried dead time" if remembers else "slices and followed photons of a counting pixel"
+        what = (
+            "afterpulses and carried dead time"
+            if remembers
+            else f"{'followed photons' if sensing.follow else 'slices'} of a counting pixel"
+        )
         raise ValueError(f"exposures: {what} need codes of equal exposure; leave one of them out")
     return shares
 

@@ -5,8 +5,9 @@
                first  int64 [H W + 1]: pixel (y, x) has the events first[y W + x] ... first[y W + x + 1] - 1
                meta   uint8, a JSON text: format, shape [T, H, W], exposure, frame_rate, sensor
 
-Frame t is exposed from t / frame_rate on, each row by the clock of its own delay. Times are not rounded to a clock, so dead times hold exactly. Events of kind
-0 came while the pixel was dead: with them the file holds the photons that other pixels would have seen.
+Frame t is exposed from t / frame_rate on, by each row's clock if rows have delays. Times are not rounded, so dead times
+hold exactly. Events of kind 0 came while the pixel was dead: with them the file holds the photons that other pixels
+would have seen.
 """
 
 from __future__ import annotations
