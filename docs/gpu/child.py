@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import os
 import signal
 import threading
@@ -46,10 +47,10 @@ def measured(job: Job) -> dict[str, Any]:
         section = importlib.import_module(job.section)
         section.names(job.sizes)  # where the list was not made: the reason
         rows = section.measure(job)
-        rows = [{name: None if value != value else value for name, value in row.items()} for row in rows]  # no NaN
+        rows = [{name: finite(value) for name, value in row.items()} for row in rows]
         found = {"state": "unfinished" if job.stopped else "done", "rows": rows}
     except Absent as reason:
-        found = {"state": "absent", "why": str(reason)}
+        found = {"state": reason.state, "why": str(reason)}
     except ModuleNotFoundError as error:
         traceback.print_exc()
         why = f"needs the package {error.name}, which is not installed; install it, or name wheels with --wheels FOLDER"
@@ -60,11 +61,19 @@ def measured(job: Job) -> dict[str, Any]:
     return found | {"seconds": time.perf_counter() - started}
 
 
+def finite(value: Any) -> Any:
+    """Return a value for JSON, which knows neither NaN nor infinity: None instead of them."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def main() -> None:
     """Read the job, make it, write its record."""
     line = b""
     while not line.endswith(b"\n"):
-        line += os.read(0, 1)
+        letter = os.read(0, 1)
+        if not letter:
+            return None  # the parent was killed before it told the job
+        line += letter
     threading.Thread(target=end_with_parent, daemon=True).start()
     told = json.loads(line)
     if told["section"] == "table":
@@ -74,7 +83,7 @@ def main() -> None:
     job = Job.of(told)
     if job.section == "plan":
         return write(job.result, {"result": plan(job)})
-    return write(job.result, told["record"] | measured(job))
+    return write(job.result, job.record | measured(job))
 
 
 if __name__ == "__main__":

@@ -125,7 +125,7 @@ def write(path: Path, value: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{path.name}.tmp-{os.getpid()}")
     with open(temporary, "w", encoding="utf-8") as file:
-        json.dump(value, file, indent=1)  # columns of rows keep their order
+        json.dump(value, file, indent=1, allow_nan=False)  # columns of rows keep their order
         file.flush()
         os.fsync(file.fileno())
     os.replace(temporary, path)

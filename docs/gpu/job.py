@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+from folder import read, write
 from sizes import Sizes
 
 SECTIONS = ("doctor", "sensor", "render", "train", "restore")
 SAVING = 20.0  # s before the end of its time at which a resumable measurement stops, at most a fifth of it
+MARGIN = 1.25  # times its longest part, for which a resumable measurement needs time to go on
 
 
 class Absent(Exception):
-    """A measurement is not possible on this machine; the message states why."""
+    """A measurement is not possible on this machine, or lacks one that has another state; the message states why."""
+
+    def __init__(self, why: str, state: str = "absent") -> None:
+        super().__init__(why)
+        self.state = state
 
 
 @dataclass
@@ -30,19 +36,31 @@ class Job:
     sizes: Sizes
     seconds: float  # that it may take
     end: float  # of these, on the clock of `time.monotonic`, which all processes share
+    record: dict[str, Any]  # what its record holds beside the result
     stopped: bool = False  # the time was too short: the next piece resumes
+    last: float = field(default_factory=time.monotonic)  # when its last part ended; at first when it began
+    longest: float | None = None  # s, of its parts
 
     @classmethod
     def of(cls, told: dict[str, Any]) -> Job:
         """Return the job that the parent wrote."""
         sizes = Sizes(**told["sizes"])
-        return cls(
-            told["section"], told["name"], Path(told["out"]), Path(told["result"]), sizes, told["seconds"], told["end"]
-        )
+        paths = (Path(told["out"]), Path(told["result"]))
+        return cls(told["section"], told["name"], *paths, sizes, told["seconds"], told["end"], told["record"])
 
     def is_over(self) -> bool:
-        """Return whether a resumable measurement should stop now, and note it."""
-        self.stopped = time.monotonic() > self.end - min(SAVING, self.seconds / 5)
+        """Return, at the end of each part of a resumable measurement, whether it should stop now, and note it.
+
+        It stops when another part as long as the longest may not fit. From the first part on its record is unfinished,
+        with the rows of an earlier piece, so that the next piece continues it also after a kill.
+        """
+        if self.longest is None:
+            earlier = (read(self.result) or {}).get("rows")
+            write(self.result, self.record | {"state": "unfinished", "rows": earlier or []})
+        now = time.monotonic()
+        self.longest = max(self.longest or 0.0, now - self.last)
+        self.last = now
+        self.stopped = now > self.end - max(min(SAVING, self.seconds / 5), MARGIN * self.longest)
         return self.stopped
 
 

@@ -124,18 +124,23 @@ def run_child(piece: Piece, job: dict[str, Any], result: Path, seconds: float) -
                 process.stdin.flush()
             code = process.wait(timeout=seconds)
         except subprocess.TimeoutExpired:
-            return "late"
+            return None if changed(result, before) else "late"
         finally:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
             with contextlib.suppress(BrokenPipeError):
                 process.stdin.close()
-    if result.exists() and result.stat().st_mtime_ns != before and code == 0:
+    if code == 0 and changed(result, before):
         return None
     lines = log.read_text(errors="replace").strip().splitlines()
     ended = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
     return f"its process ended with {ended}{': ' + lines[-1][:REASON] if lines else ''}"
+
+
+def changed(result: Path, before: int | None) -> bool:
+    """Return whether a file was written since its time was `before` (None: it was missing)."""
+    return result.exists() and result.stat().st_mtime_ns != before
 
 
 def measure(piece: Piece, section: str, name: str, fixed: dict[str, Any], seconds: float, first: bool) -> str:
@@ -178,6 +183,8 @@ def run(piece: Piece) -> int:
             state = measure(piece, *one, fixed, max(remaining, 1.0), first=i == 0)
             why = f": {(record_of(piece, *one) or {}).get('why')}" if state in ("failed", "late", "absent") else ""
             print(f"{state}, {time.monotonic() - started:.0f} s{why}", flush=True)
+            if state == "unfinished":  # its next part may not fit, and others may need it
+                break
         return summed_up(piece, chosen)
 
 

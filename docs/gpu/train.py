@@ -8,8 +8,8 @@ import time
 from statistics import median
 from typing import Any
 
-from folder import read, write
-from job import Job
+from folder import read, read_record, write
+from job import Absent, Job
 from sizes import Sizes
 
 PRECISIONS = ("float32", "bfloat16")
@@ -55,12 +55,19 @@ def measure(job: Job) -> list[dict[str, Any]]:
     """Return the rows of a measurement; a data set or run that is not finished resumes in the next piece."""
     if job.name == "data":
         return _data(job)
-    if not (job.out / "data" / "dataset.json").is_file():
-        raise RuntimeError("the data set is missing; see the record of train/data")
+    check_data(job)
     if job.name == "copies":
         return _copies(job)
     network, _, precision = job.name.rpartition("-")
     return _run(job, network, precision)
+
+
+def check_data(job: Job) -> None:
+    """Raise `Absent` with the state of the data set unless it is complete: a part of it would train other weights."""
+    made = read_record(job.out / "train" / "data.json") or {"state": "absent"}
+    if made["state"] != "done":
+        why = made.get("why") or "it is not complete"
+        raise Absent(f"needs the data set, see train/data: {why}", made["state"])
 
 
 class _Over(Exception):
@@ -167,7 +174,7 @@ def _run(job: Job, network: str, precision: str) -> list[dict[str, Any]]:
             "steps per s": rate,
             "steps per s with validation": state.step / max(state.elapsed, 1e-9),
             "PSNR matched [dB]": state.history[-1]["psnr_matched"] if state.history else None,
-            "peak memory [MB]": memory.bytes() / 1e6,
+            "peak memory [MB]": memory.bytes() / 1e6 if steps else None,  # not where the run was finished before
         }
     ]
 

@@ -49,6 +49,9 @@ def measure(work):
     if act == "import":
         import tinywheel
         return [{{"found": tinywheel.VALUE}}]
+    if act == "part":  # one part, and then another that does not end
+        work.is_over()
+        time.sleep(60)
     work.stopped = act == "long"
     time.sleep(act if isinstance(act, (int, float)) else 0)
     return [{{"name": work.name, "pid": os.getpid()}}]
@@ -209,14 +212,19 @@ def test_a_measurement_that_is_not_the_first_is_done_by_the_next_piece(bench):
     assert pieces.measure(piece, "sensor", "one", {}, 0.5, first=True) == "late"
 
 
-def test_a_measurement_stops_before_its_end(bench):
+def test_a_measurement_stops_before_its_end(bench, tmp_path):
     import job
     from sizes import Sizes
 
     for seconds, left, stops in ((540.0, 21.0, False), (540.0, 19.0, True), (10.0, 3.0, False), (10.0, 1.0, True)):
         end = time.monotonic() + left
-        work = job.Job("train", "data", Path(), Path(), Sizes(), seconds, end)
+        work = job.Job("train", "data", tmp_path, tmp_path / "data.json", Sizes(), seconds, end, {})
         assert work.is_over() == work.stopped == stops
+    now = time.monotonic()
+    for longest, left, stops in ((100.0, 130.0, False), (100.0, 120.0, True)):  # room for another part, or not
+        work = job.Job("train", "data", tmp_path, tmp_path / "data.json", Sizes(), 540.0, now + left, {})
+        work.last = now - longest
+        assert work.is_over() == stops
 
 
 def test_a_resumable_measurement_keeps_what_it_has(bench):
@@ -228,6 +236,63 @@ def test_a_resumable_measurement_keeps_what_it_has(bench):
     bench.acts()
     assert bench("--section", "train") == 0
     assert bench.state("train.one") == "done"
+
+
+def test_what_is_killed_after_a_part_continues_in_the_next_piece(bench, capsys):
+    """A clip that takes longer than those before it makes no measurement "late", which the same command leaves."""
+    bench.acts(train_one="part", doctor_machine=None, sensor_one=None, render_one=None)
+    assert bench("--minutes", "0.05") == 0
+    assert "train: one ... unfinished" in capsys.readouterr().out
+    assert bench.made() == ["train.one"]  # what follows may need it
+    record = json.loads((bench.out / "train" / "one.json").read_text())
+    (bench.out / "train" / "one.json").write_text(json.dumps(record | {"rows": [{"clips": 3}]}))
+    assert bench("--minutes", "0.05") == 0
+    assert json.loads((bench.out / "train" / "one.json").read_text())["rows"] == [{"clips": 3}]
+    assert bench.state("train.one") == "unfinished"
+    bench.acts(doctor_machine=None, sensor_one=None, render_one=None)
+    assert bench("--minutes", "0.5") == 0
+    assert bench.state("train.one") == bench.state("restore.one") == "done"
+
+
+@pytest.mark.parametrize(
+    ("state", "why"),
+    [("late", "too long"), ("failed", "black"), ("absent", "no mitsuba"), (None, "it is not complete")],
+)
+def test_nothing_is_trained_on_a_part_of_the_data_set(bench, state, why):
+    import train
+    from job import Absent, Job
+    from sizes import Sizes
+
+    folder = bench.out / "train"
+    folder.mkdir(parents=True)
+    (bench.out / "data").mkdir()
+    (bench.out / "data" / "dataset.json").write_text("{}")  # it is there from the first clip on
+    record = {"state": state, "why": why, "setup": {}, "minutes": 9, "command": ""}
+    if state is not None:
+        (folder / "data.json").write_text(json.dumps(record))
+    work = Job("train", "nano-float32", bench.out, folder / "nano-float32.json", Sizes(), 540.0, 1e9, {})
+    with pytest.raises(Absent, match=f"needs the data set, see train/data: {why}") as told:
+        train.measure(work)
+    assert told.value.state == (state or "absent")
+    (folder / "data.json").write_text(json.dumps(record | {"state": "done"}))
+    train.check_data(work)
+
+
+def test_a_measurement_whose_parent_ended_at_once_ends_too():
+    command = [sys.executable, str(PARTS / "child.py")]
+    for told in (b"", b'{"section": '):
+        assert subprocess.run(command, input=told, timeout=60, check=False).returncode == 0
+
+
+def test_numbers_that_json_does_not_know_are_left_out(bench, tmp_path):
+    import child
+    import folder
+
+    values = [float("nan"), float("inf"), -float("inf"), 1.5, 3, "nan", None]
+    assert [child.finite(value) for value in values] == [None, None, None, 1.5, 3, "nan", None]
+    with pytest.raises(ValueError, match="JSON"):
+        folder.write(tmp_path / "a.json", {"rows": [{"x": float("inf")}]})
+    assert not (tmp_path / "a.json").exists()
 
 
 def _start(bench: Bench, *words: str) -> subprocess.Popen[bytes]:
