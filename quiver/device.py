@@ -66,11 +66,11 @@ def random_states() -> list[Tensor]:
 
 
 def set_random_states(states: list[Tensor]) -> None:
-    """Restore what `random_states` returned, where there is a GPU."""
+    """Restore what `random_states` returned, for the GPUs that are here: a run may come from a machine with more."""
     import torch
 
     if states and torch.cuda.is_available():
-        torch.cuda.set_rng_state_all([state.cpu() for state in states])
+        torch.cuda.set_rng_state_all([state.cpu() for state in states[: torch.cuda.device_count()]])
 
 
 class PeakMemory:

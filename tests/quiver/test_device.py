@@ -34,11 +34,14 @@ def test_tensors_that_are_there_are_not_copied():
 def test_random_states_of_a_machine_with_gpus_are_kept_on_one_without(monkeypatch):
     restored = []
     monkeypatch.setattr(torch.cuda, "set_rng_state_all", restored.append)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     for there in (False, True):
         monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
         device.set_random_states([])
         device.set_random_states([torch.zeros(16, dtype=torch.uint8)])
         assert len(restored) == int(there)
+    device.set_random_states([torch.full((16,), i, dtype=torch.uint8) for i in range(4)])  # of a machine with more
+    assert [len(states) for states in restored] == [1, 1]
 
 
 def test_the_peak_of_memory_grows_with_what_is_held():
