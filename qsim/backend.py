@@ -3,8 +3,8 @@
     CUDA with OptiX -> LLVM 16 or newer -> scalar (slow, always available)
 
 Dr.Jit 1.5 refuses LLVM 14 with an ImportError. With LLVM 15 the first render aborts the process. So no library is
-loaded before a child process has rendered with it. Results are stored in the user's cache folder; their key is the
-library's path and time and the versions of Mitsuba and Dr.Jit.
+loaded before a child process has rendered with it. Results that last are stored in the user's cache folder; their key
+is the library's path and time, or the driver and CUDA_VISIBLE_DEVICES, and the versions of Mitsuba and Dr.Jit.
 
 Environment: DRJIT_LIBLLVM_PATH names an LLVM to try first; QSIM_ENGINE=cuda|llvm|scalar requires one engine.
 """
@@ -31,6 +31,7 @@ LLVM_VERSIONS = (22, 21, 20, 19, 18, 17, 16)  # newest first
 BACKENDS = ("cuda", "llvm", "scalar")
 VARIANTS = {"cuda": "cuda_ad_mono", "llvm": "llvm_ad_mono", "scalar": "scalar_rgb"}
 PROBE_SECONDS = 180
+NO_FRAME, OPTIX = "no frame after", "OptiX is missing or too old"  # of failures that pass, and that stay
 INSTALL_HINT = "install LLVM 16 or newer (Debian, Ubuntu: apt install libllvm19) or set DRJIT_LIBLLVM_PATH to one"
 
 # Runs in a child process: one 4x4 frame of a lit sphere whose mean must be a positive number.
@@ -108,7 +109,8 @@ def limit_threads() -> None:
 def report() -> dict[str, Any]:
     """Return what `qsim doctor` prints about rendering: the choice, every probe, versions, cache file."""
     engine = choose()
-    probes = [asdict(probe) for probe in _cached_probes()]
+    cuda, stored = probe_cuda(), _cached_probes()
+    probes = [asdict(probe) for probe in (stored if cuda in stored else [cuda, *stored])]  # one that passes is not kept
     software = {"mitsuba": version("mitsuba"), "drjit": version("drjit")}
     return asdict(engine) | {"probes": probes, "software": software, "cache": str(_cache_file())}
 
@@ -174,7 +176,8 @@ def probe_cuda() -> Probe:
     if not (driver.exists() or ctypes.util.find_library("cuda") or ctypes.util.find_library("nvcuda")):
         return Probe("cuda", None, False, "no NVIDIA driver on this machine")
     stamp = driver.read_text().splitlines()[0] if driver.exists() else "driver"
-    return cached_probe(VARIANTS["cuda"], None, stamp)
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return cached_probe(VARIANTS["cuda"], None, stamp if visible is None else f"{stamp}, visible: {visible}")
 
 
 def cached_probe(variant: str, library: str | None, stamp: str = "") -> Probe:
@@ -184,9 +187,22 @@ def cached_probe(variant: str, library: str | None, stamp: str = "") -> Probe:
     key = json.dumps([variant, os.path.realpath(library) if library else None, modified, stamp, *software])
     answers = _read_cache()
     if key not in answers:
-        answers = _read_cache() | {key: asdict(run_probe(variant, library))}
+        probe = run_probe(variant, library)
+        if not lasts(probe):
+            return probe
+        answers = _read_cache() | {key: asdict(probe)}
         _write_cache(answers)
     return Probe(**answers[key])
+
+
+def lasts(probe: Probe) -> bool:
+    """Return whether a probe would have the same result again; a GPU may be full, or a machine too busy, for a while.
+
+    A GPU without OptiX stays without it until its driver changes.
+    """
+    return probe.works or not (
+        probe.detail.startswith(NO_FRAME) or (on_gpu(probe.backend) and OPTIX not in probe.detail)
+    )
 
 
 def run_probe(variant: str, library: str | None) -> Probe:
@@ -195,15 +211,15 @@ def run_probe(variant: str, library: str | None) -> Probe:
     try:
         child = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False)
     except subprocess.TimeoutExpired:
-        return Probe(backend, library, False, f"no frame after {PROBE_SECONDS} s")
+        return Probe(backend, library, False, f"{NO_FRAME} {PROBE_SECONDS} s")
     numbers = re.search(r"^version (\d+)$", child.stdout, re.MULTILINE)
     if child.returncode == 0 and child.stdout.rstrip().endswith("rendered"):
         return Probe(backend, library, True, f"LLVM {numbers.group(1)}" if numbers else "CUDA with OptiX")
     lines = [line.strip() for line in (child.stderr + "\n" + child.stdout).splitlines() if line.strip()]
     last = next((line for line in lines if "ERROR" in line.upper()), lines[-1] if lines else "no message")
     ended = f"child process crashed with signal {-child.returncode}: " if child.returncode < 0 else ""
-    if backend == "cuda" and any("optix" in line.lower() for line in lines):
-        last = f"OptiX is missing or too old ({last}); update the NVIDIA driver"
+    if backend == "cuda" and "memory" not in last.lower() and any("optix" in line.lower() for line in lines):
+        last = f"{OPTIX} ({last}); update the NVIDIA driver"
     return Probe(backend, library, False, (ended + last)[:300])
 
 

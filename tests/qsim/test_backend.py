@@ -72,6 +72,60 @@ def test_a_library_is_probed_once_until_it_changes(tmp_path, monkeypatch):
     assert len(calls) == 2
 
 
+@pytest.mark.parametrize(
+    ("variant", "detail", "tests"),
+    [
+        ("cuda", "jit_malloc(): out of memory", 2),
+        ("cuda", "no frame after 180 s", 2),
+        ("cuda", "OptiX is missing or too old (no libnvoptix); update the NVIDIA driver", 1),
+        ("llvm", "no frame after 180 s", 2),
+        ("llvm", "older than LLVM 16, which Dr.Jit cannot use safely", 1),
+    ],
+)
+def test_a_failure_that_may_pass_is_tested_again(tmp_path, monkeypatch, variant, detail, tests):
+    """A GPU that another program filled for a moment must not be refused for ever."""
+    calls = []
+
+    def probe(name, path):
+        calls.append(name)
+        return backend.Probe(variant, path, False, detail)
+
+    monkeypatch.setattr(backend, "run_probe", probe)
+    library = tmp_path / "libLLVM.so.19.1"
+    library.write_bytes(b"one")
+    for _ in range(2):
+        assert not backend.cached_probe(backend.VARIANTS[variant], str(library)).works
+    assert len(calls) == tests
+
+
+def test_the_report_tells_why_there_is_no_cuda(monkeypatch):
+    full = backend.Probe("cuda", None, False, "jit_malloc(): out of memory")
+    monkeypatch.setattr(backend, "probe_cuda", lambda: full)
+    assert "jit_malloc(): out of memory" in [probe["detail"] for probe in backend.report()["probes"]]
+
+
+def test_a_full_gpu_is_not_taken_for_one_without_optix(monkeypatch):
+    said = "RuntimeError: jit_optix_check(): OPTIX_ERROR_DEVICE_OUT_OF_MEMORY"
+    child = subprocess.CompletedProcess([], 1, stdout="", stderr=said)
+    monkeypatch.setattr(backend.subprocess, "run", lambda *args, **options: child)
+    probe = backend.run_probe(backend.VARIANTS["cuda"], None)
+    assert not probe.works
+    assert not backend.lasts(probe)
+
+
+def test_hidden_gpus_have_their_own_probe(monkeypatch):
+    """What was found with CUDA_VISIBLE_DEVICES empty says nothing about the GPU that a later command sees."""
+    stamps = []
+    monkeypatch.setattr(backend.ctypes.util, "find_library", lambda name: "libcuda.so.1")
+    monkeypatch.setattr(backend, "cached_probe", lambda variant, library, stamp: stamps.append(stamp))
+    for visible in ("", "0", "1"):
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+        backend.probe_cuda()
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    backend.probe_cuda()
+    assert len(set(stamps)) == 4
+
+
 def test_a_file_that_is_no_library_fails_its_probe(tmp_path):
     library = tmp_path / "libLLVM.so.22.1"
     library.write_bytes(b"not a library")
