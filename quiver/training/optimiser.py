@@ -22,7 +22,7 @@ EDGES = ("leave",)  # names of last layers, which Adam updates
 class Optimiser:
     """Adam, or Muon and Adam, for the weights of a network, which must already be on their device.
 
-    `ValueError` if the kind is Muon and a kernel is not contiguous.
+    `ValueError` if the kind is Muon and a kernel is not contiguous, or torch is older than Muon.
     """
 
     def __init__(self, model: nn.Module, kind: Kind, rate: float, betas: tuple[float, float]) -> None:
@@ -36,6 +36,8 @@ class Optimiser:
         rest = [weight for _, weight in named if not any(weight is kernel for kernel in self.kernels)]
         self.parts: list[torch.optim.Optimizer] = [torch.optim.Adam(rest, lr=rate, betas=betas, eps=1e-8)]
         if self.matrices:
+            if not hasattr(torch.optim, "Muon"):
+                raise ValueError(f"Muon needs torch 2.9 or newer, this is {torch.__version__}; choose --optimiser adam")
             muon = torch.optim.Muon(self.matrices, lr=rate, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
             self.parts.append(muon)
 

@@ -31,6 +31,13 @@ def steps(unet: UNet, kind: str) -> dict[str, torch.Tensor]:
     return {name: weight.detach() - before[name] for name, weight in unet.named_parameters()}
 
 
+def test_a_torch_without_muon_is_told(monkeypatch):
+    monkeypatch.delattr(torch.optim, "Muon")
+    with pytest.raises(ValueError, match=r"Muon needs torch 2\.9 or newer, this is .*; choose --optimiser adam"):
+        Optimiser(network(), "muon", RATE, (0.9, 0.99))
+    Optimiser(network(), "adam", RATE, (0.9, 0.99))
+
+
 def check_first_step_of_adam(unet: UNet, name: str, step: torch.Tensor) -> None:
     """Assert a step of -rate * g / (|g| + 1e-8) for the gradient g.
 
