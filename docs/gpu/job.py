@@ -14,7 +14,7 @@ from sizes import Sizes
 
 SECTIONS = ("doctor", "sensor", "render", "train", "restore")
 SAVING = 20.0  # s before the end of its time at which a resumable measurement stops, at most a fifth of it
-MARGIN = 1.25  # times its longest part, for which a resumable measurement needs time to go on
+MARGIN = 1.25  # times its longest part: the time that a resumable measurement needs for another
 
 
 class Absent(Exception):
