@@ -129,6 +129,8 @@ def _check_jobs(jobs: list[tuple[Job, Section]], path: Path) -> None:
     """
     if not jobs:
         raise ValueError(f"{path}: no [[scenes]], nothing to render")
+    from qsim.scenes import FAMILIES
+
     seen: set[str] = set()
     split_of: dict[str, str] = {}
     tested = {job.stem for job, _ in jobs if job.split == "test"}
@@ -148,6 +150,9 @@ def _check_jobs(jobs: list[tuple[Job, Section]], path: Path) -> None:
             where = f"{section.where()}: family {job.stem} is in the splits '{job.split}' and 'test'"
             raise ValueError(f"{where}; the test split holds families that training never sees: move its scenes")
         for sensing in job.streams:
+            if sensing.colour is not None and job.settings.bands is None and job.family in FAMILIES:
+                cure = 'render the scenes with bands = "rgb", or leave colour out'
+                raise ValueError(f"{section.where()}: one band, and {sensing.stream_name} has colour filters; {cure}")
             if sensing.rows is not None:
                 with section.naming():
                     at = job.settings

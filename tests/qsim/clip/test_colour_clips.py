@@ -1,14 +1,18 @@
 """Tests clips of three bands: files, crops, photons per band, light levels, and what refuses them."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import OpenEXR
 import pytest
 from clips import colour_clip, write_clip
+from PIL import Image
 
+from qsim.cli import main
 from qsim.clip.photons import clip_photons, light_level
 from qsim.clip.writer import ClipWriter
+from qsim.colour import from_linear
 from qsim.optics.diffraction import diffract
 from qsim.optics.radiometry import LIGHT_SPEED, PLANCK, RGB, expected_photons
 from qsim.report.explore import explore_page
@@ -67,6 +71,20 @@ def test_views_films_and_pages_are_in_colour(tmp_path):
     assert clip.show().pictures.shape == (3, 7, 9, 3)
     assert "<img" in clip._repr_html_()
     assert "in each of 3 bands" in repr(clip)
+
+
+def test_exports_are_in_colour(tmp_path):
+    clip = colour_clip(tmp_path / "c", frames=2, height=8, width=10)
+    assert main(["convert", str(clip.path), str(tmp_path / "exr"), "--to", "exr"]) == 0
+    with OpenEXR.File(str(tmp_path / "exr" / "000001.exr"), separate_channels=True) as file:
+        for band, name in zip(clip.radiance(1), "RGB", strict=True):
+            np.testing.assert_array_equal(file.channels()[name].pixels, band)
+    assert main(["convert", str(clip.path), str(tmp_path / "png"), "--to", "png"]) == 0
+    white = json.loads((tmp_path / "png" / "meta.json").read_text())["white"]
+    with Image.open(tmp_path / "png" / "000001.png") as opened:
+        expected = from_linear(np.moveaxis(clip.radiance(1), 0, -1) / white, "gamma 2.2", 255)
+        np.testing.assert_array_equal(opened, expected)
+    assert main(["convert", str(clip.path), str(tmp_path / "z.zarr"), "--to", "zarr"]) == 2
 
 
 def test_what_takes_one_band_says_so(tmp_path):

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from clips import colour_clip, write_clip
+from PIL import Image
 
 from qsim.cli import main
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
+from qsim.clip.rows import Rows
 from qsim.clip.sensing import Sensing, prepare, replay
 from qsim.clip.simulation import stored
 from qsim.dataset.redraw import redraw
@@ -92,6 +94,35 @@ def test_light_behind_a_filter_is_that_of_its_band(place):
     assert (np.abs(mean - own) < 5 * np.sqrt(own / 150)).all()
 
 
+def test_rows_at_their_own_time_keep_their_filters(place):
+    """A code is that of a clip in which every row was taken at its time: light first, then filters."""
+    clip = colour_clip(place / "c", frames=6, shutter=1.0)
+    late = Rows(0.5 / 2000 / 7)
+    stream = clip.sense("mine.toml", ppp=4.0, rows=late)
+    light = prepare(clip, Sensing("mine.toml", ppp=4.0, rows=late)).light(clip, 0, 2)
+    for t, y in np.ndindex(2, 7):
+        share = y * 0.5 / 7
+        photons = [clip_photons(clip, t + ahead, stream.photons_factor)[:, y : y + 1] for ahead in (0, 1)]
+        mixed = (1 - share) * photons[0] + share * photons[1]
+        np.testing.assert_allclose(light[t, y], stream.colour_filter.mosaic(mixed, 0.8, (y, 0))[0], rtol=1e-9)
+    assert stream.truth().shape == (len(stream), 3, 7, 9)
+    np.testing.assert_array_equal(replay(clip, stream, 1)[0], stream.codes(1, 2)[0])
+
+
+def test_three_filters_over_all_pixels_are_three_bands(place):
+    """The layout of the challenge: one stream per band; its picture has the colours of the last plane."""
+    from qsim.formats.challenge import picture
+
+    clip = colour_clip(place / "c", frames=4)
+    for seed, name in enumerate(("red", "green", "blue")):
+        clip.sense("spad512s", ppp=0.4, bits=1, colour=name, name=name, seed=seed)
+    assert main(["convert", "c", "cubes", "--to", "challenge", "--window", "4"]) == 0
+    truth = clip.stream("red").truth(3, 4)[0]
+    np.testing.assert_array_equal(clip.stream("blue").truth(3, 4)[0], truth)
+    with Image.open(next((place / "cubes").glob("*.png"))) as opened:
+        np.testing.assert_array_equal(opened, picture(np.moveaxis(truth, 0, -1) * 0.5 / 0.5))
+
+
 REFUSED = [
     ("sense c --ppp 3", "has three bands and quiver-physical no colour filters"),
     ("sense g --ppp 3 --colour rggb", "has one band, and the sensor has colour filters"),
@@ -126,5 +157,8 @@ def test_a_recipe_names_its_filters(place):
     assert job.streams[0].stream_name == "quiver-physical-quad_3bit_3ppp"
     grey = recipe.parse(head.replace('bands = "rgb"\n', ""))
     assert grey.jobs[0].digest != recipe.parse(head).jobs[0].digest
+    colour = '[[streams]]\nsensor = "quiver-physical"\nppp = 3\ncolour = "rggb"\n'
+    with pytest.raises(ValueError, match="one band, and quiver-physical-rggb_3ppp has colour filters"):
+        recipe.parse(head.replace('bands = "rgb"\n', "") + colour)
     with pytest.raises(ValueError, match=r"recipe\.toml:12: unknown colour filter array 'x'"):
         recipe.parse(head + '[[streams]]\nsensor = "quiver-physical"\nppp = 3\ncolour = "x"\n')
