@@ -129,8 +129,6 @@ def _check_jobs(jobs: list[tuple[Job, Section]], path: Path) -> None:
     """
     if not jobs:
         raise ValueError(f"{path}: no [[scenes]], nothing to render")
-    from qsim.scenes import FAMILIES
-
     seen: set[str] = set()
     split_of: dict[str, str] = {}
     tested = {job.stem for job, _ in jobs if job.split == "test"}
@@ -150,9 +148,8 @@ def _check_jobs(jobs: list[tuple[Job, Section]], path: Path) -> None:
             where = f"{section.where()}: family {job.stem} is in the splits '{job.split}' and 'test'"
             raise ValueError(f"{where}; the test split holds families that training never sees: move its scenes")
         for sensing in job.streams:
-            if sensing.colour is not None and job.settings.bands is None and job.family in FAMILIES:
-                cure = 'render the scenes with bands = "rgb", or leave colour out'
-                raise ValueError(f"{section.where()}: one band, and {sensing.stream_name} has colour filters; {cure}")
+            if sensing.colour is not None and job.settings.bands is None and job.family == job.stem:
+                raise ValueError(f"{section.where()}: one band, but {sensing.stream_name} has filters; give bands")
             if sensing.rows is not None:
                 with section.naming():
                     at = job.settings
@@ -241,7 +238,6 @@ def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
     levels = _light(section, given)
     bits, name = given.get("bits", [None]), given.get("name")
     sensor = _sensor(section, given["sensor"], bits, given.get("group", False), given.get("slices", 1))
-    colour = _colour(section, given.get("colour"))
     with section.naming("row_order"):
         rows = Rows.of(given.get("row_delay"), given.get("row_order"))
     if name is not None and (count := len(bits) * len(levels)) > 1:
@@ -252,7 +248,7 @@ def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
             sensor,
             bits=b,
             name=name,
-            colour=colour,
+            colour=_colour(section, given.get("colour")),
             seed=given.get("seed", seed),
             group=given.get("group", False),
             diffraction=given.get("diffraction", False),
@@ -310,12 +306,11 @@ def _colour(section: Section, colour: str | None) -> str | None:
     """Return the name or absolute file of colour filters; `ValueError` if they cannot be read."""
     from qsim.sensor import colour_filter
 
-    if colour is None:
-        return None
-    found = str((section.text.path.parent / colour).resolve()) if colour.endswith(".toml") else colour
-    with section.naming("colour"):
-        colour_filter.load(found)
-    return found
+    if colour is not None:
+        colour = str((section.text.path.parent / colour).resolve()) if colour.endswith(".toml") else colour
+        with section.naming("colour"):
+            colour_filter.load(colour)
+    return colour
 
 
 def _name(value: Any) -> str:

@@ -150,7 +150,7 @@ def score_video(video: Array, stream: Stream, *, peak: float | None = None) -> m
     frames, height, width = stream.shape
     expected = stream.shape if stream.colour_filter is None else (frames, 3, height, width)
     if np.shape(video) != expected:
-        raise ValueError(f"video has shape {list(np.shape(video))}, expected {list(expected)} as of the stream's light")
+        raise ValueError(f"video has shape {list(np.shape(video))}, stream {list(expected)}; they must be equal")
     target = stream.truth()
     white = peak_of(float(stream.meta.get("ppp") or target.mean()), peak)
     return metrics.score(np.asarray(video) / np.float32(white), target / white, valid=stream.known())

@@ -102,5 +102,5 @@ def test_small_frames_and_other_shapes_are_refused(tmp_path):
     stream = clip.sense(SENSOR, ppp=6.0, colour="quad")
     with pytest.raises(ValueError, match="3 x 9 px are smaller than the mask's 4 x 4"):
         quiver.restore(stream, "naive")
-    with pytest.raises(ValueError, match=r"video has shape \[2, 3, 9\], expected \[2, 3, 3, 9\]"):
+    with pytest.raises(ValueError, match=r"video has shape \[2, 3, 9\], stream \[2, 3, 3, 9\]"):
         quiver.score(np.ones((2, 3, 9)), stream)
