@@ -19,7 +19,7 @@ from qsim.clip.photons import clip_photons
 from qsim.clip.stream import Stream
 from qsim.colour import bright_end
 from qsim.report import html as page
-from qsim.sensor.demosaicing import demosaic
+from qsim.sensor.demosaicing import demosaic, determines_bands
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -95,9 +95,12 @@ def stream_panels(stream: Stream, frames: range, truth: Light | None = None) -> 
     light, average, filters = one(shown), many(averages), stream.colour_filter
     mosaic, picture = truth, average
     if filters is not None:
-        names = names[0], f"{names[1]}, demosaiced"
-        picture = demosaic(average, filters, stream.sensor.efficiency)
         mosaic = None if truth is None else filters.mosaic(truth, stream.sensor.efficiency)
+        if determines_bands(filters, stream.sensor.efficiency):
+            names = names[0], f"{names[1]}, demosaiced"
+            picture = demosaic(average, filters, stream.sensor.efficiency)
+        else:  # one filter over all pixels: what it lets pass, in grey
+            truth = mosaic
     white = colour.peak(picture if truth is None else truth)
     brightest = float(one(np.array([2.0**stream.bits - 1]))[0])
     return [

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from qsim.colour import bright_end
 from qsim.files import load_array
 from qsim.formats.recording import checked_codes
 from qsim.sensor import packing
-from qsim.sensor.demosaicing import demosaic
+from qsim.sensor.demosaicing import demosaic, determines_bands
 
 Picture = NDArray[np.uint8]  # [H, W, 3]
 SAMPLES = 16  # frames on which the scales of a clip are measured
@@ -102,7 +103,9 @@ def _stream_source(stream: Stream) -> Source:
         return stream.codes(start, stop)
 
     filters, own = stream.colour_filter, stream.sensor.efficiency
-    bands = None if filters is None else lambda mosaic: demosaic(mosaic, filters, own)
+    bands = None
+    if filters is not None and determines_bands(filters, own):  # else one filter over all pixels, shown in grey
+        bands = partial(demosaic, filters=filters, efficiency=own)
     views = _code_views(stream.name, stream.bits, len(stream), read, bands)
     return Source(stream.name, len(stream), float(stream.meta["frame_rate"]), views)
 

@@ -35,7 +35,7 @@ def demosaic(mosaic: Array, filters: ColourFilter, efficiency: float) -> Array:
     if height < rows or width < columns:
         raise ValueError(f"demosaicing: frames of {height} x {width} px are smaller than the tile, {rows} x {columns}")
     weights = filters.weights(efficiency)
-    if np.linalg.matrix_rank(weights.reshape(3, -1), tol=1e-6) < 3:
+    if not determines_bands(filters, efficiency):
         raise ValueError(f"demosaicing: the mask {' '.join(filters.mask)} does not determine three bands")
     kernels = _kernels(weights.tobytes(), rows, columns)
     reach = kernels.shape[-1] // 2
@@ -48,6 +48,11 @@ def demosaic(mosaic: Array, filters: ColourFilter, efficiency: float) -> Array:
         found = np.tensordot(place, kernels[i, j], axes=((-2, -1), (-2, -1)))
         out[..., i::rows, j::columns] = np.moveaxis(found, -1, -3)
     return np.maximum(out, 0)
+
+
+def determines_bands(filters: ColourFilter, efficiency: float) -> bool:
+    """Return whether the colours of a mask determine three bands; one filter over all pixels does not."""
+    return bool(np.linalg.matrix_rank(filters.weights(efficiency).reshape(3, -1), tol=1e-6) == 3)
 
 
 def _within(count: int, period: int, reach: int) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clips import write_clip
+from clips import colour_clip, write_clip
 
 from qsim import colour
 from qsim.cli.program import main
@@ -13,7 +13,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.photons import clip_photons
 from qsim.clip.writer import ClipWriter
-from qsim.report import panels
+from qsim.report import panels, views
 
 
 @pytest.fixture(scope="module")
@@ -130,3 +130,17 @@ def test_a_still_clip_of_one_body_shows_its_flow_only(tmp_path):
     found, largest, _ = panels.truth_panels(clip, range(2))
     assert [panel.caption for panel in found][1:] == ["flow, full colour at 0.5 px/frame"]
     assert largest == 0.5
+
+
+@pytest.mark.parametrize("name", ["red", "green", "rggb"])
+def test_a_stream_behind_one_filter_is_shown_in_grey(tmp_path, name):
+    """What one filter lets pass is compared with the light behind it; a mosaic becomes colours."""
+    clip = colour_clip(tmp_path / "c", frames=12, height=9, width=11)
+    stream = clip.sense("spad512s", bits=1, ppp=0.4, colour=name, name="s")
+    frames = range(3, 6)
+    codes, mean = panels.stream_panels(stream, frames, panels.truth_photons(clip, stream, frames))
+    assert ("demosaiced" in mean.caption) == (name == "rggb")
+    assert codes.score.endswith("dB")
+    assert mean.score.endswith("dB")
+    average = views.open_source(stream.path.with_suffix(".json")).views["average"]
+    assert ("demosaiced" in average.declared) == (name == "rggb")
