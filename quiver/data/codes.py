@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,7 @@ __all__ = [
     "array_codes",
     "array_digest",
     "filled",
+    "frame_reader",
     "open_stream",
     "sensed",
     "stored",
@@ -44,6 +46,7 @@ __all__ = [
     "windows_sensed",
 ]
 
+BLOCK_PIXELS = 1 << 22  # codes that `frame_reader` reads at a time: 4 MB
 DIGEST_BYTES = 1 << 24  # of an array, hashed at a time
 LIGHT_FRAMES = 11  # spread over a stream, from which its light is estimated where it is not stated
 WINDOW_STAGE = 1000  # of the random keys of published test windows, + frame; 0 is `qsim sense`
@@ -113,6 +116,22 @@ def filled(codes: Codes, bad: Array | None) -> Codes:
         return before and hashlib.sha256(before.encode() + np.packbits(marked).tobytes()).hexdigest()
 
     return replace(codes, read=read, digest=digest, defective=marked)
+
+
+def frame_reader(codes: Codes) -> Callable[[int], Array]:
+    """Return a function of t that returns frame t [H, W]; it reads, and draws, blocks of frames and keeps two."""
+    length, height, width = codes.shape
+    step = max(1, BLOCK_PIXELS // (height * width))  # blocks are faster than frames
+
+    @lru_cache(maxsize=2)
+    def block(i: int) -> Array:
+        return codes.read(i * step, min((i + 1) * step, length))
+
+    def frame(t: int) -> Array:
+        found: Array = block(t // step)[t % step]
+        return found
+
+    return frame
 
 
 def light_of(codes: Codes) -> float:

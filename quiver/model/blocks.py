@@ -4,7 +4,7 @@ Conventions of all blocks:
 
 * `conv` has stride 1, zero padding (k-1)/2 and a bias; GELU is the exact erf form.
 * There is no normalisation layer, no dropout, and no activation on any output.
-* C is the channel unit. f2 is the number of channels of a frame: 1 in QUIVER, fold^2 in FoldedQUIVER.
+* C is the channel unit. f2 is the number of channels of a frame: 1 in the published network.
 * A flow is in pixels of its scale, channel 0 = x (right), 1 = y (down). It is given on the grid of frame t+1 and points
   into frame t.
 * Values of frames are in units of x = photons/white.

@@ -3,7 +3,7 @@
     codes/(2^b - 1) [B, T, 1, H, W] -> denoised frames, flows, aligned and fused features, recurrent fusion,
     temporal attention, refinement from 1/4 to full scale -> Output
 
-Every stage agrees with the published network (tests/quiver/model/test_golden.py). FoldedQUIVER is our smaller one.
+Every stage agrees with the published network (tests/quiver/model/test_golden.py).
 """
 
 from collections.abc import Callable, Sequence
@@ -72,7 +72,7 @@ class QUIVER(nn.Module):
         return self.restored(x)
 
     def restored(self, frames: Tensor) -> Output:
-        """Run all stages on frames [B, T, 1, H, W], unchecked; in FoldedQUIVER on folded frames [B, T, f2, h, w]."""
+        """Run all stages on frames [B, T, 1, H, W], unchecked."""
         denoised = _per_frame(self.denoise, frames)[0]
         flows = _per_frame(self.flows, denoised[:, 1:], denoised[:, :-1])
         r1, r2, entries = self._encode(frames, denoised, flows)

@@ -8,18 +8,15 @@ memory does not hold it; tiles are blended, since paths reach far.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
 
 from qsim.files import Progress
-from quiver.data.codes import Codes
+from quiver.data.codes import Codes, frame_reader
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.pieces import Disagreement, cut_pieces, warn_of_cut
-
-BLOCK_PIXELS = 1 << 22  # codes read at a time: 4 MB
 
 
 def fill_merged(
@@ -36,19 +33,13 @@ def fill_merged(
     length, height, width = codes.shape
     domain = information_domain(codes.sensor, codes.exposure)
     pieces = cut_pieces(network, height, width, options.memory, options.mode)
-    step = max(1, BLOCK_PIXELS // (height * width))
-    apart, done = Disagreement.nothing(height, width), 0
-
-    @lru_cache(maxsize=2)
-    def block(i: int) -> Array:
-        return codes.read(i * step, min((i + 1) * step, length))
-
+    apart, done, read = Disagreement.nothing(height, width), 0, frame_reader(codes)
     for tile in pieces.tiles:
         rows, columns = tile.weight.shape
         part = (slice(tile.y, tile.y + rows), slice(tile.x, tile.x + columns))
 
         def frame(t: int, part: tuple[slice, slice] = part) -> Array:
-            return block(t // step)[(t % step, *part)]
+            return read(t)[part]
 
         for t, merged in enumerate(stream(frame, length, domain, WINDOW, range(first, first + len(out)))):
             restored = corrected(network, merged, domain, options)[:rows, :columns]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,7 @@ from numpy import ndarray as Array
 
 from qsim.files import Progress
 from quiver.baselines.sliding_window import reflect
-from quiver.data.codes import Codes
+from quiver.data.codes import Codes, frame_reader
 from quiver.data.noise import noise_table
 from quiver.device import moved, pick_device
 from quiver.restoration.interface import RestoreOptions, Restorer
@@ -24,7 +23,6 @@ from quiver.restoration.pieces import Disagreement, cut_pieces, warn_of_cut
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-BLOCK_PIXELS = 1 << 22  # codes read at a time: 4 MB
 # Restores into zeros; called with (network, codes, zeros, first, options, progress)
 RestoreNetwork = Callable[[Any, Codes, Array, int, RestoreOptions, Progress | None], None]
 CONTEXT = 5  # frames that a network needs before and after the one it restores
@@ -194,17 +192,10 @@ def padded_frames(codes: Codes, part: tuple[slice, slice], first: int, count: in
     """
     import torch
 
-    length, height, width = codes.shape
-    top = codes.sensor.levels - 1
-    step = max(1, BLOCK_PIXELS // (height * width))  # blocks are read, and drawn, faster than frames
-
-    @lru_cache(maxsize=2)
-    def block(i: int) -> Array:
-        return codes.read(i * step, min((i + 1) * step, length))
-
+    length, top = codes.shape[0], codes.sensor.levels - 1
+    read = frame_reader(codes)
     for t in reflect(np.arange(first - CONTEXT, first + count + CONTEXT), length):
-        frame = block(int(t) // step)[(int(t) % step, *part)].astype(np.float32) / np.float32(top)
-        yield torch.from_numpy(frame)[None, None]
+        yield torch.from_numpy(read(int(t))[part].astype(np.float32) / np.float32(top))[None, None]
 
 
 def pad_space(frame: Tensor, multiple: int) -> Tensor:

@@ -32,7 +32,7 @@ class System:
     loss: Loss
     restored: Restored  # what a validation scores
     protocols: Mapping[str, Mapping[str, Any]]  # name -> settings that options override
-    losses: tuple[str, ...] = ("own",)  # values of Settings.loss that `loss` knows
+    losses: tuple[str, ...] = ("own",)  # values of Settings.loss that `loss` accepts
     frames: int = 11  # of the windows of a validation, and least of those of training
     multiple: int | None = None  # px that divides the side of a crop; None: the network's own `multiple`, else 1
     prepare: Prepare | None = None  # computes more inputs where samples are drawn

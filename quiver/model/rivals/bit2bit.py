@@ -10,7 +10,7 @@ Two laws of the codes:
 
 - Binomial, our design: a code is the sum of n binary planes, as of a SPAD array. The output is the logit of the
   probability pi of a one per plane. Of the n - a planes that did not give their one to the input, the target counts
-  b ~ Binomial(n - a, q), q = pi (1 - p) / (1 - pi p), where p is the share of the input. The network is told p.
+  b ~ Binomial(n - a, q), q = pi (1 - p) / (1 - pi p), where p is the share of the input. p is an input of the network.
 - Photons, `as_published`: the output is the log of the brightness up to a factor; each restored frame gets the mean of
   its codes. It holds for photon counts, as of a QIS with a gain near 1 whose codes are seldom saturated; voxels with
   the largest code do not train. The binomial law must not be used there: for photon counts of mean m its best answer

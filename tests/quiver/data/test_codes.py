@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from clips import ClipMaker
+from random_codes import random_codes
 
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from quiver.data.clips import open_clips, truth
-from quiver.data.codes import array_codes, sensed
+from quiver.data.codes import array_codes, frame_reader, sensed
 from quiver.data.illumination import Illumination
 from quiver.data.windows import as_input
 
@@ -50,3 +53,18 @@ def test_codes_in_memory_are_checked():
 def test_splits(tiny_dataset):
     assert [len(open_clips(tiny_dataset, split)) for split in ("train", "val", "test", None)] == [3, 2, 2, 7]
     assert open_clips(open_clips(tiny_dataset)[0].path)[0].shape == (14, 36, 44)
+
+
+def test_single_frames_are_read_in_blocks(monkeypatch):
+    """Blocks of four frames: three reads for ten frames in order, and each frame is that of the stream."""
+    source, reads = random_codes(10, 5, 7), []
+
+    def read(start: int, stop: int) -> np.ndarray:
+        reads.append((start, stop))
+        return source.read(start, stop)
+
+    monkeypatch.setattr("quiver.data.codes.BLOCK_PIXELS", 4 * 5 * 7 + 3)
+    frame = frame_reader(replace(source, read=read))
+    for t in (*range(10), 3, 9):
+        np.testing.assert_array_equal(frame(t), source.read(t, t + 1)[0])
+    assert reads == [(0, 4), (4, 8), (8, 10), (0, 4)]
