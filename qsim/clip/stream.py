@@ -152,6 +152,11 @@ class Stream:
         where = f"{self.path.with_suffix('.json')}: rows"
         return from_dict(self.meta["rows"], where) if "rows" in self.meta else None
 
+    def require_even(self, what: str) -> None:
+        """Raise `ValueError` if rows have their own time or codes different exposures, which `what` does not know."""
+        if self.rows is not None or self.shares is not None:
+            raise ValueError(f"{self.path}: {what} needs rows read at once and equal exposures; leave this stream out")
+
     def _at_mid_exposure(self, read: Callable[..., Array], t: int, at: str = "row") -> Array:
         """Return `read(clip frame, crop)` [H, W] in the middle of code t: of each row's exposure, or of all of them."""
         if self.rows is None:

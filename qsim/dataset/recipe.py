@@ -33,8 +33,8 @@
     slices = 16                # clip frames in one exposure of a QIS or a counting SPAD; default 1
     diffraction = true         # blur by the lens's Airy pattern; default false
     row_delay = 2e-6           # seconds from one row, or column, to the next; default: all at once
-    exposures = [1.0, 0.25]    # shares of a code's time with light, in turn; default: all of it
     row_order = "down"         # order of rows: down, the default, or up; of columns: right or left
+    exposures = [1.0, 0.25]    # shares of a code's time with light, in turn; default: all of it
     colour = "rggb"            # colour filters: rggb, quad, rgbw or a .toml with [colour]; default: the sensor's
 
 A (family, seed) belongs to one split at every speed, and a family of the test split to no other split.

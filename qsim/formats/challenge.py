@@ -73,6 +73,7 @@ def bands_of(clip: Clip, planes: int) -> list[Stream]:
         )
     bands = [clip.stream(name) for name in COLOURS]
     for band in bands:
+        band.require_even("a cube of the challenge")
         single = band.bits == 1 and (band.meta.get("planes_per_code") or 1) == 1
         if not (single and isinstance(band.sensor, BinarySPAD)) or band.shape != bands[0].shape:
             kind = type(band.sensor).__name__

@@ -59,6 +59,8 @@ def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) ->
     streams = [clip.stream(name) for name in names or clip.streams]
     if not streams:
         raise ValueError(f"{clip.path}: has no streams to compare; make some with `qsim sense`")
+    for stream in streams:
+        stream.require_even("a comparison of readouts")
     frame = 1 / clip.frame_rate
     seconds = max(frame * _frames_per_code(stream) for stream in streams) if span is None else span
     window = round(seconds / frame)

@@ -11,11 +11,13 @@ from qsim.clip import gates
 from qsim.clip.rows import Rows
 from qsim.clip.sensing import Sensing, prepare, replay, sense
 from qsim.dataset.redraw import redraw
+from qsim.formats.challenge import bands_of
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.fixed_pattern import FixedPattern
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
+from qsim.studies.readouts import compare
 
 SCHEDULE = (1.0, 0.25, 0.0625)
 SENSORS = {
@@ -121,3 +123,16 @@ def test_pixels_that_remember_are_refused(tmp_path):
         prepare(clip, Sensing(plane, exposures=SCHEDULE, defects=Defects(afterpulse=0.1)))
     with pytest.raises(ValueError, match="exposures: slices of a counting pixel need codes of equal exposure"):
         prepare(clip, Sensing(SENSORS["counting"][0], exposures=SCHEDULE, slices=2))
+
+
+@pytest.mark.parametrize("how", [{"exposures": SCHEDULE}, {"rows": Rows(2e-5)}])
+def test_what_takes_equal_exposures_read_at_once_refuses_others(tmp_path, how):
+    clip = write_clip(tmp_path / "clip", frames=6, height=4, width=5)
+    for name in ("red", "green", "blue"):
+        sense(clip, Sensing(BinarySPAD(0.5, 900.0, bits=1), name=name, **how))
+    for run, what in (
+        (lambda: compare(clip), "a comparison of readouts"),
+        (lambda: bands_of(clip, 4), "a cube of the challenge"),
+    ):
+        with pytest.raises(ValueError, match=f"{what} needs rows read at once and equal exposures; leave this stream"):
+            run()
