@@ -321,7 +321,7 @@ def load_array(path: Path) -> np.ndarray:
         if array.dtype.hasobject or array.dtype.kind not in "buif":
             raise ValueError(f"{path}: an array of {array.dtype}; numbers are expected")
         if array.ndim and array.nbytes + 64 > path.stat().st_size:
-            raise ValueError(f"{path}: the header promises {array.nbytes} bytes, the file has {path.stat().st_size}")
+            raise ValueError(f"{path}: the header states {array.nbytes} bytes, the file has {path.stat().st_size}")
         return array
 
 
@@ -343,6 +343,6 @@ def _read_npy(path: Path, file: gzip.GzipFile | BinaryIO) -> np.ndarray:
     while len(content) < wanted:
         block = file.read(min(1 << 24, wanted - len(content)))
         if not block:
-            raise ValueError(f"{path}: the header promises {wanted} bytes, the file has {len(content)}")
+            raise ValueError(f"{path}: the header states {wanted} bytes, the file has {len(content)}")
         content += block
     return np.frombuffer(content, dtype).reshape(shape)

@@ -1,4 +1,4 @@
-"""What every compared network promises: any size, finite numbers, separate clips, look-ahead, half precision.
+"""Every compared network: any size, finite numbers, separate clips, look-ahead, half precision.
 
 The networks come from tests/support/rivals.py.
 """
