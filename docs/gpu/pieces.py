@@ -110,11 +110,12 @@ def run_child(piece: Piece, job: dict[str, Any], result: Path, seconds: float) -
     log.parent.mkdir(exist_ok=True)
     given = [os.path.abspath(entry) for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry]
     path = os.pathsep.join([str(piece.packages), str(ROOT), *given])
+    inherited = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}  # hides gpu/ from it
     before = result.stat().st_mtime_ns if result.exists() else None
     with open(log, "wb") as text:
         process = subprocess.Popen(
             piece.child, stdin=subprocess.PIPE, stdout=text, stderr=text, start_new_session=True,
-            env=SLEEPING | os.environ | {"PYTHONPATH": path}, cwd=piece.out,
+            env=SLEEPING | inherited | {"PYTHONPATH": path}, cwd=piece.out,
         )  # fmt: skip
         assert process.stdin is not None
         try:

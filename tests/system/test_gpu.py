@@ -284,6 +284,16 @@ def test_a_measurement_whose_parent_ended_at_once_ends_too():
         assert subprocess.run(command, input=told, timeout=60, check=False).returncode == 0
 
 
+def test_a_measurement_finds_its_files_where_python_leaves_out_their_folder(bench, monkeypatch):
+    import pieces
+
+    monkeypatch.setenv("PYTHONSAFEPATH", "1")
+    bench.out.mkdir()
+    piece = pieces.Piece(bench.out, None, 9.0, {}, pieces.CHILD)
+    job = {"section": "table", "name": "table", "out": str(bench.out), "record": {}}
+    assert pieces.run_child(piece, job, bench.out / "table.json", 60.0) is None
+
+
 def test_numbers_that_json_does_not_know_are_left_out(bench, tmp_path):
     import child
     import folder
