@@ -170,7 +170,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Refused("sense clip", "--exposures 1,2", "share of a full exposure"),
     ],
     ("sense", "--follow"): [
-        Acts("sense clip --sensor counter.toml --name n", "--follow"),
+        Acts("sense clip --sensor counter.toml --ppp 3 --name n", "--follow"),
         Refused("sense clip", "--follow", "followed"),
     ],
     ("sense", "--replay"): [
