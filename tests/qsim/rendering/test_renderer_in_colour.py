@@ -17,7 +17,7 @@ PAINT = np.random.default_rng(3).random((5, 7, 3)).astype(np.float32)
 LIGHTS = [
     Constant((0.7, 0.4, 1.2)),
     SunSky(sun_irradiance=(5.0, 3.0, 1.0), sky_irradiance=0.5),
-    AreaLamp((1, 2, 3), (0, 0, 0), 1.0, 1.0, (9.0, 4.0, 0.0)),
+    AreaLamp((1, 2, 3), (0, 0, 0), 1.0, 1.0, (9.0, 4.0, 0.2)),
     EnvironmentImage(np.random.default_rng(4).random((4, 8, 3)).astype(np.float32)),
 ]
 
@@ -96,9 +96,9 @@ def test_denoised_bands_keep_their_light():
     plain = renderer(scene, Budget(samples=8, bounces=2)).frame(0, with_truth=False)
     clean = renderer(scene, Budget(samples=8, bounces=2, denoise=True)).frame(0, with_truth=False)
     truth = renderer(scene, Budget(samples=1024, bounces=2)).frame(0, with_truth=False).radiance
-    assert np.mean((clean.radiance - truth) ** 2) < np.mean((plain.radiance - truth) ** 2)
+    assert np.sqrt(np.mean((clean.radiance - truth) ** 2)) < 1.5 * clean.error, "the stated error holds in colour"
     np.testing.assert_allclose(clean.radiance.mean((1, 2)), plain.radiance.mean((1, 2)), atol=plain.error)
-    assert clean.radiance[2].max() < 0.1 * clean.radiance[0].max(), "the lamp and the sign have no blue"
+    assert clean.radiance[2].max() < 0.1 * clean.radiance[0].max(), "lamp and sign have hardly any blue"
 
 
 @pytest.mark.slow
