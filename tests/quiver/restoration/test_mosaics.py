@@ -56,6 +56,7 @@ def test_methods_of_single_pixels_need_no_places(stream, method):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:(nano|mergenet) ")  # measured or not for such streams
 @pytest.mark.parametrize("method", [*METHODS, "nano", "mergenet"])
 def test_every_method_restores_colours(stream, method):
     truth = stream.truth()
