@@ -3,9 +3,11 @@
     codes -> phi of pooled codes at scales 8, 4, 2 -> paths (motion_paths.py) -> moved codes -> weights ->
     mean code, count
 
-Frames beside the reference are compared with it; farther ones, in pairs, with the mean of the nearest three. The
-statistic is the squared mean difference of 6 x 6 pixels over its exact variance: 1 on average where the scene is the
-same. A frame that a path leads out of the picture has no weight, so the ends of a stream need no invented frames.
+Frames beside the reference are compared with it; farther ones, in pairs, with the mean of the nearest three. Two
+statistics compare: the squared mean differences of 6 x 6 and of 2 x 2 pixels over their exact variance, averaged
+nearby: 1 where the scene is the same. The first finds large areas at little light, the second edges and textures that
+a path misses by a pixel. The worse one decides. A frame that a path leads out of the picture has no weight, so the ends
+of a stream need no invented frames.
 
 The count of a pixel is (sum of weights)^2 / sum of squared weights: the codes that, averaged alike, have its noise.
 
@@ -30,9 +32,9 @@ from quiver.baselines.information_domain import FLOOR, InformationDomain, inform
 from quiver.baselines.motion_paths import SCALES, box_mean, displacement, enlarged, look, paths
 from quiver.baselines.sliding_window import check_codes, check_window, in_units, look_ahead
 
-TOLERANCE = 2.0  # of the statistic, up to which frames agree
-SOFTNESS = 1.0  # excess over it at which a frame has half its weight
-CELLS = 36  # pixels whose mean difference the statistic squares: 3 x 3 cells of 2 x 2
+# (cells of 2 x 2 px beside the own one whose mean difference is squared, and over which squares are averaged; statistic
+# up to which frames agree; excess over it at which a frame has half its weight)
+STATISTICS = ((1, 1, 3.0, 1.0), (0, 2, 1.6, 0.25))
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ class Merged:
 
     mean_code: Array
     count: Array
+    alone: Array  # codes of the frame
     near: Array  # mean code of the frame and its two neighbours, moved and weighted
     near_count: Array
     still: Array  # mean code of the window without motion
@@ -83,8 +86,9 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
         weight = weights(moved, inside, offsets, domain)
         near = [i for i, offset in enumerate(offsets) if abs(offset) <= 1]
         still = torch.stack([frame.codes for frame in window]).mean(0)
+        alone = window[offsets.index(0)].codes.numpy()
         return Merged(
-            *_weighted(moved, weight), *_weighted(moved[near], weight[near]), still.numpy(), frames=len(window)
+            *_weighted(moved, weight), alone, *_weighted(moved[near], weight[near]), still.numpy(), frames=len(window)
         )
 
 
@@ -124,10 +128,13 @@ def weights(moved: Tensor, inside: Tensor, offsets: Sequence[int], domain: Infor
 
 def agreement(difference: Tensor, variance: Tensor) -> Tensor:
     """Return weights [H, W] from a difference of moved codes [H, W] and its variance per pixel [H/2, W/2]."""
-    mean = box_mean(functional.avg_pool2d(difference[None], 2), 1)[0]
-    statistic = box_mean((mean.square() * (CELLS / variance))[None], 1)[0]
-    weight = 1 / (1 + (statistic - TOLERANCE).clamp_(min=0) / SOFTNESS)
-    return enlarged(weight[None], difference.shape)[0]
+    cells = functional.avg_pool2d(difference[None], 2)
+    excess = torch.zeros_like(variance)
+    for beside, around, tolerance, softness in STATISTICS:
+        pixels = 4 * (2 * beside + 1) ** 2
+        statistic = box_mean(box_mean(cells, beside).square() * (pixels / variance), around)[0]
+        excess = torch.maximum(excess, (statistic - tolerance) / softness)
+    return enlarged((1 / (1 + excess))[None], difference.shape)[0]
 
 
 def stream(

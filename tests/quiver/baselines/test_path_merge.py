@@ -25,12 +25,24 @@ def plain_agreement(difference, variance):
     """agreement() in loops over cells of 2 x 2 pixels."""
     cells = difference.reshape(difference.shape[0] // 2, 2, -1, 2).mean((1, 3))
 
-    def box(x):
-        grown = np.pad(x, 1, mode="edge")
-        return np.array([[grown[y : y + 3, z : z + 3].mean() for z in range(x.shape[1])] for y in range(x.shape[0])])
+    def box(x, radius):
+        grown, side = np.pad(x, radius, mode="edge"), 2 * radius + 1
+        rows, columns = (range(length) for length in x.shape)
+        return np.array([[grown[y : y + side, z : z + side].mean() for z in columns] for y in rows])
 
-    statistic = box(box(cells) ** 2 * 36 / variance)
-    return 1 / (1 + np.maximum(statistic - pm.TOLERANCE, 0) / pm.SOFTNESS)
+    coarse = box(box(cells, 1) ** 2 * 36 / variance, 1)
+    fine = box(cells**2 * 4 / variance, 2)
+    return 1 / (1 + np.maximum(0, np.maximum(coarse - 3, (fine - 1.6) / 0.25)))
+
+
+def test_fine_detail_that_a_path_misses_costs_weight():
+    """Stripes two pixels wide, moved by their width: means of 6 x 6 pixels hardly differ, cells of 2 x 2 do."""
+    noise = np.random.default_rng(0).normal(0, 1, (24, 24)).astype(np.float32)
+    stripes = np.where(np.arange(24) // 2 % 2, 2.0, -2.0).astype(np.float32)
+    variance = torch.ones(12, 12)
+    same, missed = (pm.agreement(torch.from_numpy(noise + x), variance).numpy() for x in (0 * stripes, stripes))
+    assert np.median(same) > 0.9
+    assert np.median(missed) < 0.1
 
 
 @pytest.mark.parametrize("seed", range(6))
