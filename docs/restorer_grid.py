@@ -1,0 +1,203 @@
+"""Scores the restorer that ships and every classical method on test clips: sensor x bits x light, by motion, too.
+
+    qsim generate scenes/restorer_test.toml -o out/restorer_test
+    python docs/restorer_grid.py out/restorer_test                             # cells that are missing: hours
+    python docs/restorer_grid.py out/restorer_test --cells qis-3-3.25 --out out/grid --restorer out/mine
+
+A cell is RESULTS/NAME.json: QIS with 1 to 7 bits at six levels of light, and sums of 1, 7 and 31 SPAD planes at three.
+It is written when it is complete, and made once. Classical methods run with several windows; the best one counts,
+chosen by the mean over clips in the cell, or in the bin of motion. Tables beside RESULTS show the cells that exist.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qsim.clip.clip import Clip
+from qsim.figures import new_figure, write_figure
+from qsim.files import VERSION, read_json, sha256, write_bytes, write_json
+from qsim.tables import markdown_table
+from quiver.data.clips import known, mean_light, open_clips, peak_of, truth
+from quiver.data.codes import sensed
+from quiver.data.illumination import Illumination
+from quiver.evaluation import metrics
+from quiver.evaluation.breakdown import bin_names, by_motion, pooled, speeds
+from quiver.restoration.restorers import restorer, weights_path
+
+ROOT = Path(__file__).parents[1]
+FORMAT = "quiver-restorer-grid-1"
+CLASSICAL = (
+    *("naive", "moment:3", "moment:7", "moment:11", "transform-denoise:3", "transform-denoise:7", "transform-denoise"),
+    *("qbp:5", "qbp", "qbp-bm3d:5", "qbp-bm3d", "path-merge"),
+)
+BITS = (1, 2, 3, 5, 7)
+LIGHTS = (0.5, 1.0, 3.25, 9.75, 26.0, 100.0)  # photons per pixel and code
+PLANES = {1: (0.3, 1.0, 3.0), 3: (1.0, 4.9, 15.0), 5: (5.0, 20.0, 60.0)}  # bits of a sum: light of its planes together
+FRAMES = 4  # of every clip, evenly spread; the window around each is complete
+
+
+@dataclass(frozen=True)
+class Place:
+    """One cell: its name, and the sensor and light."""
+
+    name: str
+    light: Illumination
+
+
+def places() -> list[Place]:
+    """Return all cells."""
+    qis = [Place(f"qis-{b}-{ppp:g}", Illumination("quiver-physical", ppp, b)) for b in BITS for ppp in LIGHTS]
+    spad = [(2**b - 1, Illumination("spad-320x240", ppp, b)) for b, levels in PLANES.items() for ppp in levels]
+    return qis + [Place(f"spad-{planes}-{light.ppp:g}", light) for planes, light in spad]
+
+
+def main(words: list[str] | None = None) -> int:
+    args = options().parse_args(words)
+    every = {place.name: place for place in places()}
+    names = list(every) if args.cells is None else args.cells.split(",")
+    try:
+        for name in names:
+            if name not in every:
+                raise ValueError(f"no cell is called {name!r}; known are {', '.join(every)}")
+        clips = open_clips(args.data, "test")
+        if not clips:
+            raise ValueError(f"{args.data}: no finished clip in split 'test'; finish `qsim generate`")
+        same = {"format": FORMAT, "quiver": VERSION, "restorer": args.restorer, "frames": args.frames}
+        same |= {"weights": sha256(weights_path(args.restorer)), "clips": [clip.name for clip in clips]}
+        args.out.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            path = args.out / f"{name}.json"
+            if path.exists():
+                check(path, same)
+                continue
+            scores = {clip.name: measured(clip, every[name].light, args) for clip in clips}
+            write_json(path, same | {"name": name, "scores": scores})
+            print(f"{path}: written", flush=True)
+        write_tables(args.out, names)
+    except (ValueError, OSError) as error:
+        print(f"restorer_grid: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def options() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, help="data set with a test split")
+    parser.add_argument("--restorer", default="mergenet", help="shipped weights, a weights file or a run folder")
+    parser.add_argument("--cells", help="comma-separated (default all)")
+    parser.add_argument("--frames", type=int, default=FRAMES, help=f"restored frames of every clip (default {FRAMES})")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "restorer", help="folder of the cells")
+    return parser
+
+
+def check(path: Path, same: dict[str, Any]) -> None:
+    """Raise `ValueError` if a cell was measured otherwise."""
+    found = read_json(path)
+    changed = [key for key, value in same.items() if found.get(key) != value]
+    if changed:
+        raise ValueError(f"{path}: was measured with another {', '.join(changed)}; choose another --out, or remove it")
+
+
+# ---- One cell
+
+
+def measured(clip: Clip, light: Illumination, args: argparse.Namespace) -> dict[str, Any]:
+    """Return for each method its matched PSNR [dB], and pixels and squared error of every bin of motion."""
+    codes, factor = sensed(clip, light, 0)
+    peak = peak_of(mean_light(clip, factor))
+    frames = np.unique(np.linspace(0, len(clip) - 1, args.frames + 2).round().astype(int)[1:-1]).tolist()
+    target = np.concatenate([truth(clip, factor, t, t + 1) for t in frames]) / peak
+    parts = [known(clip, t, t + 1) for t in frames]
+    valid = None if parts[0] is None else np.concatenate([part for part in parts if part is not None])
+    moves = [speeds(clip, range(t, t + 1)) for t in frames]
+    speed = np.concatenate([move for move in moves if move is not None]) if clip.has_truth else None
+    found: dict[str, Any] = {}
+    for name in (args.restorer, *CLASSICAL):
+        method = restorer(name)
+        try:
+            restored = np.concatenate([method.restore(codes, t, t + 1) for t in frames]) / peak
+        except ValueError:
+            if method.learned:
+                raise
+            continue  # a classical method that cannot restore such codes
+        score = metrics.score(restored, target, valid=valid)
+        row: dict[str, Any] = {"psnr": score.psnr_matched, "raw": score.psnr, "scale": score.scale}
+        if speed is not None:
+            row["pixels"], row["squares"] = by_motion(restored * score.scale, target, speed)
+        found["restorer" if name == args.restorer else name] = row
+    return found
+
+
+# ---- Tables
+
+
+def write_tables(out: Path, names: list[str]) -> None:
+    """Write OUT.md and OUT.png from the cells that exist."""
+    cells = [read_json(path) for name in names if (path := out / f"{name}.json").exists()]
+    if not cells:
+        return
+    rows = [(cell["name"], *compared(cell)) for cell in cells]
+    gains = [own - rival for _, own, _, rival, _ in rows]
+    lost = [name for (name, *_), gain in zip(rows, gains, strict=True) if gain < 0]
+    text = ["# The restorer against every classical method", ""]
+    text += ["    qsim generate scenes/restorer_test.toml -o out/restorer_test"]
+    text += ["    python docs/restorer_grid.py out/restorer_test", ""]
+    text += [f"Matched PSNR in dB, peak 2.5 times the mean light, mean over {len(cells[0]['clips'])} clips, "
+             f"{cells[0]['frames']} frames of each. Weights: {cells[0]['weights'][:12]}.", ""]  # fmt: skip
+    text += [f"Mean over {len(rows)} cells: {np.mean(gains):+.2f} dB. Least: {min(gains):+.2f} dB. Below the best "
+             f"classical method: {', '.join(lost) or 'no cell'}.", ""]  # fmt: skip
+    table = [
+        (name, f"{own:.2f}", f"{best} {rival:.2f}", f"{own - rival:+.2f}", *(f"{x:+.2f}" for x in bins))
+        for name, own, best, rival, bins in rows
+    ]
+    bins = tuple(f"{name} px" for name in bin_names())
+    text += [*markdown_table(table, ("cell", "restorer", "best classical", "difference", *bins)), ""]
+    text += ["Columns of motion [px/frame]: difference from the classical method that is best in the bin. "
+             "Cells: sensor, bits or planes, photons per pixel and code.", ""]  # fmt: skip
+    write_bytes(out.with_suffix(".md"), "\n".join(text).encode())
+    draw(dict(zip((row[0] for row in rows), gains, strict=True)), out.with_suffix(".png"))
+
+
+def compared(cell: dict[str, Any]) -> tuple[float, str, float, list[float]]:
+    """Return the restorer's score, the best classical method and its score, and the difference per bin of motion."""
+    clips = list(cell["scores"].values())
+    methods = [name for name in CLASSICAL if all(name in clip for clip in clips)]
+    mean = {name: float(np.mean([clip[name]["psnr"] for clip in clips])) for name in ("restorer", *methods)}
+    best = max(methods, key=lambda name: mean[name])
+
+    def bins(name: str) -> np.ndarray:
+        told = [clip[name] for clip in clips if "pixels" in clip[name]]
+        return np.array(pooled([row["pixels"] for row in told], [row["squares"] for row in told]))
+
+    rivals = np.stack([bins(name) for name in methods])
+    rivals = np.where(np.isnan(rivals).all(0), np.nan, np.nanmax(np.nan_to_num(rivals, nan=-math.inf), 0))
+    return mean["restorer"], best, mean[best], (bins("restorer") - rivals).tolist()
+
+
+def draw(gains: dict[str, float], path: Path) -> None:
+    """Draw the difference from the best classical method in every cell of a QIS."""
+    grid = np.array([[gains.get(f"qis-{b}-{ppp:g}", math.nan) for ppp in LIGHTS] for b in BITS])
+    figure = new_figure(6.5, 3.5)
+    axes = figure.subplots()
+    most = max(2.0, float(np.nanmax(np.abs(grid)))) if np.isfinite(grid).any() else 2.0
+    shown = axes.imshow(grid, cmap="RdBu", vmin=-most, vmax=most, aspect="auto")
+    for (y, x), gain in np.ndenumerate(grid):
+        if math.isfinite(gain):
+            axes.text(x, y, f"{gain:+.1f}", ha="center", va="center")
+    axes.set_xticks(range(len(LIGHTS)), [f"{ppp:g}" for ppp in LIGHTS])
+    axes.set_yticks(range(len(BITS)), [str(b) for b in BITS])
+    axes.set_xlabel("photons per pixel and code")
+    axes.set_ylabel("bits")
+    figure.colorbar(shown, label="dB above the best classical method")
+    write_figure(figure, path)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
