@@ -1,6 +1,6 @@
 """Defines MergeNet, our restorer of one frame from merged frames: one set of weights for every light, depth and sensor.
 
-    channels [N, 5, H, W] in units of the noise -> U-Net, widths 24, 48, 96 -> correction [N, 1, H, W], the same unit
+    channels [N, 6, H, W] in units of the noise -> U-Net, widths 40, 80, 160 -> correction [N, 1, H, W], the same unit
 
 The frame restored is merged phi + deviation x correction. On the scale phi all sensors look alike: the noise of n codes
 has the deviation 1 / sqrt(n), and the signal is between one and a hundred of them. So one network sees every bit
@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 
+import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
@@ -23,17 +24,22 @@ from qsim.structure import make
 from quiver.model.blocks import conv
 from quiver.model.config import whole_number
 
+INPUTS = 6  # channels, of quiver/restoration/merge_inputs.py
+
 
 @dataclass(frozen=True)
 class MergeNetConfig:
-    """Configuration: three scales with widths w, 2w, 4w; w = 24 gives 0.33 million parameters."""
+    """Configuration: three scales with widths w, 2w, 4w; w = 40 gives 0.91 million parameters."""
 
-    width: int = 24
-    inputs: int = 5  # channels, of quiver/restoration/merge_inputs.py
+    width: int = 40
+    inputs: int = INPUTS
 
     def __post_init__(self) -> None:
         whole_number("MergeNetConfig.width", self.width, 1, 256)
-        whole_number("MergeNetConfig.inputs", self.inputs, 1, 64)
+        if self.inputs != INPUTS:
+            raise ValueError(
+                f"MergeNetConfig.inputs is {self.inputs!r}, this version prepares {INPUTS}; train such weights again"
+            )
 
     def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON."""
@@ -67,7 +73,7 @@ class MergeNet(nn.Module):
 
     def forward(self, channels: Tensor) -> Tensor:
         """[N, inputs, H, W] -> [N, 1, H, W], in deviations of the noise; H and W are multiples of 4."""
-        fine = self.fine(channels)
+        fine = self.fine(channels.contiguous(memory_format=torch.channels_last))  # 1.2 to 1.4 times as fast on a CPU
         middle = self.middle(functional.avg_pool2d(fine, 2))
         coarse = self.coarse(functional.avg_pool2d(middle, 2))
         middle = self.middle_again(middle + _twice(coarse))

@@ -1,6 +1,6 @@
 """Prepares the inputs of MergeNet: merged frames on the scale phi, in units of their noise, with maps of what is known.
 
-    Merged (path_merge.py) -> phi (information_domain.py) -> channels [5, H, W] -> MergeNet -> phi again -> photons
+    Merged (path_merge.py) -> phi (information_domain.py) -> channels [6, H, W] -> MergeNet -> phi again -> photons
 
 All channels describe a pixel and its near surroundings; none depends on the size of the frame.
 """
@@ -19,7 +19,6 @@ from quiver.baselines.motion_paths import box_mean
 from quiver.baselines.path_merge import Merged, stream
 from quiver.data.codes import Codes
 
-CHANNELS = 5
 LOCAL = 8  # px: half the side of the squares whose mean is the local level
 UNIT = 4.0  # deviations of the noise that a channel's 1 stands for
 LEAST_LIGHT = 1e-3  # photons, added to light before it is compared with its noise
@@ -29,7 +28,7 @@ LEAST_LIGHT = 1e-3  # photons, added to light before it is compared with its noi
 class MergeInputs:
     """Inputs of one frame, float32."""
 
-    channels: Tensor  # [5, H, W]
+    channels: Tensor  # [6, H, W]
     phi: Tensor  # [H, W], of the merged mean code
     deviation: Tensor  # [H, W], of the noise of phi
 
@@ -47,11 +46,12 @@ def middle_inputs(codes: Codes) -> tuple[MergeInputs, InformationDomain]:
 def merge_inputs(merged: Merged, domain: InformationDomain) -> MergeInputs:
     """Return the inputs of a merged frame [H, W].
 
-    Channels: the merged phi over its local mean, the nearest three frames and the unmoved window over the merged phi,
-    each in units of its noise; the deviation of the noise; and the logarithm of the light over its noise, which is low
-    where codes carry nothing.
+    Channels: the merged phi over its local mean; the frame alone, the nearest three and the unmoved window over the
+    merged phi, each in units of its noise; the deviation of the noise; and the logarithm of the light over its noise,
+    which is low where codes carry nothing.
     """
     phi, deviation = _stabilised(merged.mean_code, merged.count, domain)
+    alone, alone_deviation = _stabilised(merged.alone, np.ones_like(merged.alone), domain)
     near, near_deviation = _stabilised(merged.near, merged.near_count, domain)
     still, still_deviation = _stabilised(merged.still, np.full_like(merged.still, merged.frames), domain)
     local = box_mean(torch.from_numpy(phi)[None], LOCAL)[0].numpy()
@@ -60,6 +60,7 @@ def merge_inputs(merged: Merged, domain: InformationDomain) -> MergeInputs:
     known = np.log2((light + LEAST_LIGHT) / (blurred + LEAST_LIGHT)).clip(-4, 8) / UNIT
     channels = [
         (phi - local) / (UNIT * deviation),
+        (alone - phi) / (UNIT * alone_deviation),
         (near - phi) / (UNIT * near_deviation),
         (still - phi) / (UNIT * still_deviation),
         deviation,

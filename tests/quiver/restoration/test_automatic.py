@@ -58,7 +58,10 @@ def test_a_named_method_is_taken_without_a_word():
     assert (method.name, line) == ("moment:3", None)
 
 
-def test_shipped_weights_state_what_was_measured():
-    method, line = automatic.chosen("auto", stream(0.5))
-    assert method.name == "qbp-bm3d"  # measured 17.61 dB, mergenet 17.52
-    assert "measured at" in line
+@pytest.mark.parametrize("ppp", [0.5, 3.25, 26.0])
+def test_shipped_weights_decide_by_what_was_measured(ppp):
+    method, line = automatic.chosen("auto", stream(ppp))
+    cells = restorer("mergenet").scope.domain.cells
+    cell = next(c for c in cells if (c.sensor, c.place.bits, c.ppp) == ("quiver-physical", 3, ppp))
+    assert method.name == ("mergenet" if cell.network >= cell.classical_psnr else cell.classical)
+    assert f"measured at quiver-physical, 3 bit, {ppp:g} PPP" in line

@@ -8,16 +8,17 @@ from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from quiver.baselines.information_domain import information_domain
 from quiver.baselines.path_merge import Merged, stream
-from quiver.restoration.merge_inputs import CHANNELS, UNIT, merge_inputs
+from quiver.model.mergenet import INPUTS
+from quiver.restoration.merge_inputs import UNIT, merge_inputs
 
 EXPOSURE = 5e-4
 
 
 def mean_of(codes):
-    """A merged frame whose three means are that of all codes [T, H, W], without motion."""
+    """A merged frame whose means are that of all codes [T, H, W], without motion."""
     count = np.full(codes.shape[1:], len(codes), np.float32)
     mean = codes.mean(0, dtype=np.float32)
-    return Merged(mean, count, mean, count, mean, len(codes))
+    return Merged(mean, count, codes[5].astype(np.float32), mean, count, mean, len(codes))
 
 
 @pytest.mark.parametrize(
@@ -34,14 +35,15 @@ def test_noise_is_one_unit_whatever_the_sensor(sensor, photons):
     inputs = merge_inputs(mean_of(codes), information_domain(sensor, EXPOSURE))
     noise = float(inputs.channels[0].std()) * UNIT
     assert noise == pytest.approx(1, abs=0.15)  # 11 codes: the delta method errs by 0.85 to 1.15
-    assert not inputs.channels[1:3].any()
+    assert not inputs.channels[2:4].any()
+    assert inputs.channels[1].any()
 
 
 def test_the_map_of_knowledge_falls_where_codes_tell_nothing():
     sensor = QIS(0.8, 1.6, 0.2, 1, gain=0.5 / 26)
     light = np.repeat([6.0, 31.0], 48)[None, :] * np.ones((48, 1))
     codes = sensor.sample(np.broadcast_to(light, (11, 48, 96)), EXPOSURE, key=Key(0, 1), engine="reference")
-    known = merge_inputs(mean_of(codes), information_domain(sensor, EXPOSURE)).channels[4]
+    known = merge_inputs(mean_of(codes), information_domain(sensor, EXPOSURE)).channels[5]
     assert float(known[:, :32].mean()) < float(known[:, 64:].mean()) - 0.5
 
 
@@ -53,6 +55,6 @@ def test_extreme_codes_give_finite_inputs(level, bits):
     domain = information_domain(sensor, EXPOSURE)
     merged = next(stream(lambda t: codes[t], 4, domain, 11, range(1)))
     inputs = merge_inputs(merged, domain)
-    assert inputs.channels.shape == (CHANNELS, 8, 16)
+    assert inputs.channels.shape == (INPUTS, 8, 16)
     assert np.isfinite(inputs.channels.numpy()).all()
     assert np.isfinite(domain.inverse(inputs.phi.numpy())).all()
