@@ -75,7 +75,7 @@ class Section:
 
     @contextlib.contextmanager
     def naming(self, key: str | None = None, words: str = "") -> Iterator[None]:
-        """Put `FILE:LINE: ` of a key, or of the section's head, and some words before an error's message."""
+        """Put file and line of a key, or of the head of the section, and some words before the message of an error."""
         try:
             yield
         except (ValueError, OSError) as error:
