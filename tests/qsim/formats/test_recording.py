@@ -11,7 +11,7 @@ import raw_planes
 from recordings import CAPTURE, everything, random_planes
 
 from qsim.clip.sensing import Sensing, sense
-from qsim.formats import array_files, detection, exporting, images, importing, video
+from qsim.formats import array_files, detection, exporting, images, importing, photon_times, video
 from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints, Recording, numbered
 
@@ -71,6 +71,12 @@ def sample(folder: Path, layout: str) -> tuple[Path, Hints]:
 
         path = folder / "a.mat"
         savemat(path, {"OUTPUT": planes_.transpose(1, 2, 0)})
+    elif layout == "photons":
+        path = folder / "a.npz"
+        meta = {"format": photon_times.FORMAT, "shape": [2, 16, 16], "exposure": 1e-3, "frame_rate": 1e3}
+        first, kind = np.arange(257), np.ones(256, np.uint8)  # one photon for each pixel
+        text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+        np.savez(path, times=np.linspace(0, 1.9e-3, 256), kind=kind, first=first, meta=text)
     else:
         path = folder / "a.bin"
         path.write_bytes(bytes(64 if layout == "spike" else 32768))
