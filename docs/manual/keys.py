@@ -11,12 +11,14 @@ from collections.abc import Iterator, Mapping
 from importlib import import_module
 from typing import Any, NamedTuple
 
-# Section -> module with the commented file, and the name of its checks.
+# Section -> module with the commented file, module of its checks, and their name.
+_RECIPE, _SECTIONS = "qsim.dataset.recipe", "qsim.dataset.recipe_sections"
+_DEFECTS = "qsim.sensor.defects.defect_table"
 SECTIONS = {
-    "[recipe]": ("qsim.dataset.recipe", "HEAD"),
-    "[[scenes]]": ("qsim.dataset.recipe", "SCENES"),
-    "[[streams]]": ("qsim.dataset.recipe", "STREAMS"),
-    "[defects]": ("qsim.sensor.defects.defect_table", "TABLE"),
+    "[recipe]": (_RECIPE, _RECIPE, "HEAD"),
+    "[[scenes]]": (_RECIPE, f"{_SECTIONS}.scenes_section", "SCENES"),
+    "[[streams]]": (_RECIPE, f"{_SECTIONS}.streams_section", "STREAMS"),
+    "[defects]": (_DEFECTS, _DEFECTS, "TABLE"),
 }
 _MARK = re.compile(r"^<!-- keys: (\[\S+\]) -->$", re.MULTILINE)
 
@@ -38,13 +40,12 @@ def insert(text: str) -> str:
 
 def keys(section: str) -> list[Key]:
     """Return the keys of a section, in the order of its checks."""
-    module, name = SECTIONS[section]
-    home = import_module(module)
-    text = home.__doc__ or ""
+    commented_in, checked_in, name = SECTIONS[section]
+    text = import_module(commented_in).__doc__ or ""
     examples = commented(text, "[recipe]") | commented(text, section)  # [[scenes]] may repeat keys of [recipe]
     return [
         Key(entry.removesuffix(", if any"), ", if any" not in entry, accepted(check), *examples[entry.split(",")[0]])
-        for entry, check in flat(getattr(home, name))
+        for entry, check in flat(getattr(import_module(checked_in), name))
     ]
 
 

@@ -47,16 +47,14 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks
-from qsim.checks import MAX_PIXELS
-from qsim.clip.rows import Rows
 from qsim.clip.sensing import Sensing
-from qsim.dataset.job import Job, Settings
-from qsim.dataset.recipe_toml import Section, Text
-from qsim.files import check_name
-from qsim.structure import Check, Table
+from qsim.dataset.job import Job
+from qsim.dataset.recipe_sections.scenes_section import SETTINGS, jobs_of, settings_of
+from qsim.dataset.recipe_sections.streams_section import streams_of
+from qsim.dataset.recipe_sections.toml_section import Section, Text, file_name
+from qsim.structure import Table
 
 SPLITS = checks.SPLITS
-MAX_STEM = 180  # characters of a scene's name, which gets a seed, a speed and a temporary ending as a file's name
 
 
 @dataclass(frozen=True)
@@ -110,14 +108,14 @@ def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
     head = Section(written, "recipe", 0, document.table["recipe"])
     given = head.values(HEAD)
     name, seed = given["name"], given.get("seed", 0)
-    defaults = {"frame_rate": 2000.0} | _settings(given)
+    defaults = {"frame_rate": 2000.0} | settings_of(given)
     streams: list[Sensing] = []
     taken: set[str] = set()
     for section in document.sections("streams"):
-        streams += _streams(section, seed, taken)
+        streams += streams_of(section, seed, taken)
     jobs: list[tuple[Job, Section]] = []
     for section in document.sections("scenes"):
-        jobs += [(job, section) for job in _jobs(section, defaults, seed, tuple(streams))]
+        jobs += [(job, section) for job in jobs_of(section, defaults, seed, tuple(streams))]
     _check_jobs(jobs, path)
     return Recipe(name, tuple(job for job, _ in jobs), document.table)
 
@@ -161,190 +159,13 @@ def _check_jobs(jobs: list[tuple[Job, Section]], path: Path) -> None:
                 raise ValueError(f"{section.where()}: {few} {cure}")
 
 
-def _jobs(section: Section, defaults: dict[str, Any], seed: int, streams: tuple[Sensing, ...]) -> list[Job]:
-    """Return one job per seed and speed of a [[scenes]] section."""
-    given = section.values(SCENES)
-    family = _family(section, given["family"])
-    seeds = _seeds(section, given)
-    speeds = given.get("speed", [1.0])
-    if family.endswith(".xml") and speeds != [1.0]:
-        why = "an .xml scene has no motion, so speed changes nothing; leave it out"
-        raise ValueError(f"{section.where('speed')}: {why}")
-    split = given.get("split", "train")
-    settings = Settings(**(defaults | _settings(given)))
-    if settings.height * settings.width > MAX_PIXELS:
-        size = f"frames of {settings.height} x {settings.width} pixels"
-        raise ValueError(f"{section.where()}: {size}; at most {MAX_PIXELS} pixels are rendered")
-    stem = Path(family).stem
-    with section.naming("family", "clips are named after the scene: "):
-        check_name(f"{stem}_{seeds[0]:04d}")
-    if len(stem) > MAX_STEM:
-        long = f"whose name has {len(stem)} characters; at most {MAX_STEM}"
-        raise ValueError(f"{section.where('family')}: clips are named after the scene, {long}")
-    return [
-        Job(
-            name=f"{stem}_{s:04d}" + ("" if speed == 1 else f"_x{speed:g}"),
-            family=family,
-            scene_seed=s,
-            speed=speed,
-            split=split,
-            settings=settings,
-            seed=seed,
-            streams=streams,
-        )
-        for s in seeds
-        for speed in speeds
-    ]
-
-
-def _settings(given: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of `Settings` that a section gives."""
-    return {key: given[key] for key in _SETTINGS if key in given}
-
-
-def _family(section: Section, family: str) -> str:
-    """Return a family of the library, or the absolute path of an existing scene file or folder."""
-    file = (section.text.path.parent / family).resolve()
-    if "/" in family and file.is_dir():
-        return str(file)
-    if family.endswith((".py", ".xml")):
-        if not file.is_file():
-            raise ValueError(f"{section.where('family')}: no such scene file {file}")
-        return str(file)
-    from qsim.scenes import FAMILIES
-
-    if family not in FAMILIES:
-        meant = f"{family!r}{checks.suggest(family, FAMILIES)}; there are: {', '.join(sorted(FAMILIES))}"
-        raise ValueError(f"{section.where('family')}: unknown family {meant}")
-    return family
-
-
-def _seeds(section: Section, given: dict[str, Any]) -> list[int]:
-    """Return the seeds of a section, listed or counted."""
-    if "seeds" in given:
-        if other := next((key for key in ("count", "first") if key in given), None):
-            raise ValueError(f"{section.where(other)}: give either seeds or count, not both")
-        return list(given["seeds"])
-    first, count = given.get("first", 0), given.get("count", 1)
-    if first + count > 2**31:
-        key = "count" if "count" in given else "first"
-        raise ValueError(f"{section.where(key)}: seeds {first} to {first + count - 1}; the largest is 2^31 - 1")
-    return list(range(first, first + count))
-
-
-def _streams(section: Section, seed: int, taken: set[str]) -> list[Sensing]:
-    """Return one stream per bits and light level, and add their names to `taken`; `ValueError` for a taken name."""
-    given = section.values(STREAMS)
-    levels = _light(section, given)
-    bits, name = given.get("bits", [None]), given.get("name")
-    sensor = _sensor(section, given["sensor"], bits, given.get("group", False), given.get("slices", 1))
-    with section.naming("row_order"):
-        rows = Rows.of(given.get("row_delay"), given.get("row_order"))
-    if name is not None and (count := len(bits) * len(levels)) > 1:
-        cure = "give one bits and one light level, or leave the name out"
-        raise ValueError(f"{section.where('name')}: one name for {count} streams; {cure}")
-    found = [
-        Sensing(
-            sensor,
-            bits=b,
-            name=name,
-            colour=_colour(section, given.get("colour")),
-            seed=given.get("seed", seed),
-            group=given.get("group", False),
-            diffraction=given.get("diffraction", False),
-            slices=given.get("slices", 1),
-            follow=given.get("follow", False),
-            rows=rows,
-            exposures=given.get("exposures"),
-            **light,
-        )
-        for b in bits
-        for light in levels
-    ]
-    for sensing in found:
-        with section.naming("sensor", "streams are named after the sensor: "):
-            stream = sensing.stream_name
-        if stream in taken:
-            raise ValueError(f"{section.where()}: two [[streams]] are called '{stream}'; give one of them a name")
-        taken.add(stream)
-    return found
-
-
-def _light(section: Section, given: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the fields of `Sensing` that state each light level; absolute light has none."""
-    units = [key for key in ("ppp", "lux", "absolute") if key in given]
-    if len(units) != 1:
-        wanted = "give one light level, ppp = ..., lux = ... or absolute = true"
-        raise ValueError(f"{section.where()}: {wanted}; {' and '.join(units) or 'none'} given")
-    unit = units[0]
-    if unit != "absolute":
-        return [{unit: level} for level in given[unit]]
-    if not given["absolute"]:
-        raise ValueError(f"{section.where('absolute')}: absolute can only be true; or give a ppp")
-    return [{}]
-
-
-def _sensor(section: Section, sensor: str, bits: list[int | None], group: bool, slices: int) -> str:
-    """Return the sensor's name or absolute file; `ValueError` if it lacks these bits, or cannot be read as asked."""
-    from qsim.sensor import QIS, BinarySPAD, CountingSPAD, devices
-
-    if sensor.endswith(".toml"):
-        sensor = str((section.text.path.parent / sensor).resolve())
-    for depth in bits:
-        with section.naming("sensor"):
-            found = devices.load(sensor, ppp=3.25, bits=depth, exposure=5e-4)
-        if group and not (depth and isinstance(found, BinarySPAD)):
-            what = f"this is a {type(found).__name__}" if depth else "the bits of a code are needed, as in bits = 3"
-            raise ValueError(f"{section.where('group')}: group sums planes of a clocked SPAD; {what}")
-        if slices > 1 and (group or not isinstance(found, QIS | CountingSPAD)):
-            what = "group sums planes instead" if group else f"this is a {type(found).__name__}"
-            raise ValueError(f"{section.where('slices')}: slices are of one exposure of a QIS or CountingSPAD; {what}")
-    return sensor
-
-
-def _colour(section: Section, colour: str | None) -> str | None:
-    """Return the name or absolute file of colour filters; `ValueError` if they cannot be read."""
-    from qsim.sensor import colour_filter
-
-    if colour is not None:
-        colour = str((section.text.path.parent / colour).resolve()) if colour.endswith(".toml") else colour
-        with section.naming("colour"):
-            colour_filter.load(colour)
-    return colour
-
-
-def _name(value: Any) -> str:
-    """Return a text that can name a file."""
-    return check_name(checks.text(value))
-
-
 def _kept(value: Any) -> Any:
     """Return the value: sections are checked one by one."""
     return value
 
 
-_SETTINGS: dict[str, Check] = {
-    "frames": checks.whole, "height": checks.whole, "width": checks.whole,
-    "frame_rate": checks.frame_rate, "shutter": checks.shutter, "psnr": checks.psnr,
-    "bands": checks.bands,
-}  # fmt: skip
 HEAD: Table = {
-    "name": _name,
+    "name": file_name,
     "seed, if any": checks.seed,
-    **{key if key in ("frames", "height", "width") else f"{key}, if any": check for key, check in _SETTINGS.items()},
+    **{key if key in ("frames", "height", "width") else f"{key}, if any": check for key, check in SETTINGS.items()},
 }
-SCENES: Table = {
-    "family": checks.text,
-    "seeds, if any": checks.list_of(checks.seed), "count, if any": checks.whole, "first, if any": checks.seed,
-    "speed, if any": checks.list_of(checks.speed), "split, if any": checks.split,
-    **{f"{key}, if any": check for key, check in _SETTINGS.items()},
-}  # fmt: skip
-STREAMS: Table = {
-    "sensor": checks.text, "bits, if any": checks.list_of(checks.bits),
-    "ppp, if any": checks.list_of(checks.light), "lux, if any": checks.list_of(checks.light),
-    "absolute, if any": checks.flag, "follow, if any": checks.flag,
-    "seed, if any": checks.seed, "name, if any": _name,
-    "group, if any": checks.flag, "slices, if any": checks.whole, "diffraction, if any": checks.flag,
-    "row_delay, if any": checks.positive, "row_order, if any": checks.row_order,
-    "colour, if any": checks.text, "exposures, if any": checks.shares,
-}  # fmt: skip

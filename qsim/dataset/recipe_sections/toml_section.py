@@ -9,8 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from qsim import checks
+from qsim.files import check_name
 from qsim.parsing import parse_toml
 from qsim.structure import Table, structure
+
+
+def file_name(value: Any) -> str:
+    """Return a text that can name a file."""
+    return check_name(checks.text(value))
 
 
 @dataclass(frozen=True)
