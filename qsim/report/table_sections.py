@@ -69,12 +69,20 @@ def training_section(path: Path) -> page.Section:
     axes.legend()
     name = path.parent.name
     story = f"Training {name} reached {scores[best]:.2f} dB on the validation clips after {minutes[best]:.1f} minutes."
+    story += _drop_after(scores[best], scores[-1])
     words = (
         f"{history[-1]['step']} steps in {minutes[-1]:.1f} minutes. The weights of the best validation are kept "
         f"({scores[best]:.2f} dB); the last one has {scores[-1]:.2f} dB."
     )
     facts = [page.Fact(f"{scores[best]:.2f} dB", f"best validation of {name}")]
     return page.section(f"Training: {name}", save(words), story=story, facts=facts)
+
+
+def _drop_after(best: float, last: float) -> str:
+    """Return a sentence if a curve [dB] ends below its best by more than what two digits show, else nothing."""
+    if not last < best - 0.005:
+        return ""
+    return f" It then got worse: the last validation is {best - last:.2f} dB below the best, whose weights are kept."
 
 
 def evaluation_section(path: Path) -> page.Section:

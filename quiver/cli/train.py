@@ -7,7 +7,7 @@ import contextlib
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -199,10 +199,23 @@ def _summary(folder: Path, state: Any) -> tuple[dict[str, Any], str]:
     if state.history:
         found |= {"best_psnr_matched": state.best, "weights": weights, "last_validation": state.history[-1]}
         text += f", best validation PSNR {state.best:.2f} dB (after the best factor): {weights}"
+        text += _drop_after(state.best, state.history)
     elif state.finished:
         found |= {"weights": weights}
         text += f": {weights}"
     return found, text
+
+
+def _drop_after(best: float, history: Sequence[Mapping[str, float]]) -> str:
+    """Return a second line if a curve [dB] ends below its best by more than what two digits show, else nothing."""
+    last = history[-1]["psnr_matched"]
+    if not last < best - 0.005:
+        return ""
+    minutes = max(history, key=lambda entry: entry["psnr_matched"])["elapsed"] / 60
+    return (
+        f"\nit then got worse: the last validation is {best - last:.2f} dB below the best, of minute {minutes:.1f}, "
+        "whose weights are kept"
+    )
 
 
 # ablate

@@ -2,7 +2,10 @@
 
 import json
 
+import pytest
+
 from qsim.report import report
+from qsim.report.table_sections import training_section
 from qsim.studies.validation.reading import ReadingReport
 
 
@@ -46,9 +49,18 @@ def test_the_top_of_a_page_tells_the_best_method_and_the_kept_weights(tmp_path):
     assert "reached 22.76 dB on the validation clips after 2.0 minutes" in top
     assert "<strong>22.76 dB</strong>" in top
     assert "are kept (22.76 dB); the last one has 22.26 dB" in page
+    assert "It then got worse: the last validation is 0.50 dB below the best" in top
     assert '<td class="number">65 µs</td>' in page
     assert page.count("class=best") == 2
     assert "RVRT" not in page
+
+
+@pytest.mark.parametrize(("last", "told"), [(22.0, False), (21.996, False), (21.99, True)])
+def test_a_page_says_that_a_curve_got_worse(tmp_path, last, told):
+    entries = [{"step": i, "elapsed": 60.0 * i, "psnr_matched": psnr} for i, psnr in enumerate((20.0, 22.0, last))]
+    path = tmp_path / "history.json"
+    path.write_text(json.dumps({"history": entries}))
+    assert ("got worse" in training_section(path).story) == told
 
 
 def test_headings_have_units(tmp_path):

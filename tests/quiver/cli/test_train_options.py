@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,8 @@ from safetensors.torch import load_file
 
 from quiver.cli.program import main
 from quiver.evaluation.cost import checked_cases
+from quiver.evaluation.metrics import Score
+from quiver.training import loop
 from quiver.training.run_folder import alone_in
 
 FAST = ("--steps", "2", "--crop", "16", "--batch", "1", "--preset", "unet", "--protocol", "control")
@@ -81,6 +84,24 @@ def test_an_option_changes_the_weights(tiny_dataset, tmp_path, words):
     plain = trained(tiny_dataset, tmp_path / "a")
     other = trained(tiny_dataset, tmp_path / "b", *words)
     assert any(not torch.equal(plain[name], other[name]) for name in plain)
+
+
+@pytest.mark.parametrize(
+    ("scores", "told"),
+    [((20.0, 22.5, 22.0), "got worse: the last validation is 0.50 dB below the best"), ((20.0, 22.5, 22.5), None)],
+)
+def test_a_curve_that_falls_is_told(capsys, tiny_dataset, tmp_path, monkeypatch, scores, told):
+    found, validate = iter(scores), loop.validate
+
+    def scripted(*args: object) -> tuple[Score, torch.Tensor]:
+        score, picture = validate(*args)
+        return replace(score, psnr_matched=next(found)), picture
+
+    monkeypatch.setattr(loop, "validate", scripted)
+    trained(tiny_dataset, tmp_path / "r", "--steps", "3", "--validate-every", "1")
+    said = capsys.readouterr().out
+    assert "best validation PSNR 22.50 dB" in said
+    assert told in said if told else "worse" not in said
 
 
 @pytest.mark.parametrize(
