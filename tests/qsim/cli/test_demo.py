@@ -45,6 +45,8 @@ def test_every_step_is_a_command_of_the_programs(ran, tmp_path: Path):
         *("quiver restore", "quiver evaluate", "quiver evaluate", "qsim report"),
     ]
     assert ran[0][1][1] == "demo"
+    train = PARSERS["quiver"].parse_args(ran[1][1])
+    assert (train.preset, train.start, train.minutes) == ("mergenet", "mergenet", 2)
     assert np.load(tmp_path / "ball_12bit.npy").shape == (15, 384, 384)
     assert all(Path(word).is_file() for _, words in ran for word in words if word.endswith(".npz"))
 
