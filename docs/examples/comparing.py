@@ -16,7 +16,7 @@ import quiver
 
 side = 96  # tests: 16
 lights = (0.5, 2.0, 8.0, 26.0)  # tests: (2.0, 8.0)
-methods = ("naive:11", "moment:3", "transform-denoise", "nano")  # tests: ("naive:11", "moment:3")
+methods = ("naive:11", "moment:3", "transform-denoise", "mergenet")  # tests: ("naive:11", "moment:3")
 clip = qsim.render("text", frames=11, height=side, width=side, speed=3, psnr=34)
 
 # %%
@@ -30,7 +30,8 @@ for method, found in scores.items():
     print(f"{method:20}" + "".join(f"{value:8.2f}" for value in found))
 
 # %%
-# The network was trained at 3.25 photons per pixel. Outside of the light it was measured for, `quiver.restore` warns.
+# The network has one set of weights for all light. Where a classical method was measured to be better, `quiver.restore`
+# warns.
 
 figure, axis = plt.subplots(figsize=(6, 3.4), layout="constrained")
 for method, found in scores.items():

@@ -1,8 +1,8 @@
 """
 # Restoring video
 
-Few-bit frames go in, photons per pixel come out. Classical methods need no training; the network `nano` is shipped
-with its weights.
+Few-bit frames go in, photons per pixel come out. Classical methods need no training; the network `mergenet` is
+shipped with its weights.
 """
 
 # %%
@@ -19,10 +19,10 @@ stream = clip.sense("quiver-physical", bits=3, ppp=3.25)
 
 # %%
 # `naive` is the mean of eleven frames, `moment` inverts the exact mean code, `qbp` aligns patches before it averages,
-# and `nano` is a small network on aligned frames. A score compares with the truth of the stream; its peak is 2.5
-# times the mean light.
+# and `mergenet` is a small network on frames merged along motion. A score compares with the truth of the stream; its
+# peak is 2.5 times the mean light.
 
-methods = ("naive:11", "moment:3", "qbp", "nano")  # tests: ("naive:11", "moment:3", "nano")
+methods = ("naive:11", "moment:3", "qbp", "mergenet")  # tests: ("naive:11", "moment:3", "mergenet")
 videos = {method: quiver.restore(stream, method) for method in methods}
 scores = {method: quiver.score(video, stream) for method, video in videos.items()}
 for method, score in scores.items():

@@ -45,7 +45,7 @@ summary = generate(recipe.parse(description), "tiny", Options(workers=0))
 print(f"{summary.done} of {summary.jobs} clips")
 
 # %%
-# Sensor, bits and light are those of the data set's streams. `unet` is a plain network; `nano` and `quiver` are
+# Sensor, bits and light are those of the data set's streams. `unet` is a plain network; `quiver` is
 # trained alike.
 
 torch.manual_seed(0)

@@ -18,7 +18,7 @@ def add_domain(sub: Any) -> None:
     parser = command(
         sub, "domain", _run_domain,
         "Measure where weights are better than the classical methods and store it in their file, or show it.",
-        "quiver domain nano\n"
+        "quiver domain mergenet\n"
         "quiver domain out/mine out/data --bits 1,3 --ppp 1,3.25,10\n"
         "quiver domain out/mine out/data --sensor spad-320x240 --bits 1 --ppp 0.3,1,3", resumes=True,
     )  # fmt: skip

@@ -38,9 +38,9 @@ def add_evaluate(sub: Any) -> None:
     parser = command(
         sub, "evaluate", _run_evaluate, "Compare methods on held-out clips, or on real photons of a static object.",
         "quiver evaluate out/starter -o out/table --methods naive,moment,out/mine,out/unet --ppp 3.25,9.75,26\n"
-        "quiver evaluate out/starter/clips/fan_0003 -o out/fan_table --methods moment,nano --split all\n"
+        "quiver evaluate out/starter/clips/fan_0003 -o out/fan_table --methods moment,mergenet --split all\n"
         "quiver evaluate I2-2000FPS/test -o out/published --protocol quiver-published --methods moment,out/mine\n"
-        "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,nano", resumes=True,
+        "quiver evaluate --static hazelnut_gates6_TKYX_uint8.npy --methods moment,mergenet", resumes=True,
     )  # fmt: skip
     parser.add_argument("source", nargs="?", help="data set or clip folder; with --protocol the folder of a test set")
     parser.add_argument("-o", "--output", type=Path, help="folder for evaluation.md, .json, .png (needed for clips)")
@@ -202,10 +202,10 @@ def add_bench(sub: Any) -> None:
     parser = command(
         sub, "bench", _run_bench, "Measure what a restored frame costs, beside its PSNR.",
         "quiver bench\n"
-        "quiver bench --methods moment,nano,quiver-s --modes exact,streaming,windows --size 128x128 -o out/bench",
+        "quiver bench --methods moment,mergenet,quiver-s --modes exact,streaming,windows --size 128x128 -o out/bench",
     )  # fmt: skip
     parser.add_argument(
-        "--methods", type=words, default="moment,unet,nano", help="comma-separated (default moment,unet,nano)"
+        "--methods", type=words, default="moment,unet,mergenet", help="comma-separated (default moment,unet,mergenet)"
     )
     parser.add_argument("--modes", type=words, help="modes of networks (default exact,streaming)")
     parser.add_argument(

@@ -46,7 +46,7 @@ def add_train(sub: Any) -> None:
         help="data set folder, or several, whose clips count alike; for bit2bit a stored stream, or a clip with one",
     )
     parser.add_argument("-o", "--output", required=True, help="folder of the run")
-    parser.add_argument("--preset", default="nano", choices=NETWORKS, help="network (default nano)")
+    parser.add_argument("--preset", default="mergenet", choices=NETWORKS, help="network (default mergenet)")
     parser.add_argument(
         "--protocol",
         default="quick",
@@ -228,7 +228,7 @@ def add_ablate(sub: Any) -> None:
     )  # fmt: skip
     parser.add_argument("data", help="data set folder")
     parser.add_argument("-o", "--output", required=True, help="folder of the six runs and their table")
-    parser.add_argument("--preset", default="nano", choices=QUIVERS, help="network (default nano)")
+    parser.add_argument("--preset", default="quiver-s", choices=QUIVERS, help="network (default quiver-s)")
     parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
     parser.add_argument("--steps", type=count, help="optimiser steps of each")
     parser.add_argument("--minutes", type=positive, help="wall-clock limit of each")

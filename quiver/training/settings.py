@@ -27,7 +27,7 @@ class Settings:
 
     data: str | tuple[str, ...]  # data set folder, or several
     out: str  # folder of the run
-    network: str = "nano"  # name of the model, for the record
+    network: str = "mergenet"  # name of the model, for the record
     start: str | None = None  # SHA-256 of the weights file that the run starts from; None: random weights
     steps: int | None = None  # of the optimiser; with `minutes` too, the limit that is reached first ends the run
     minutes: float | None = None  # wall-clock limit, validation included

@@ -173,7 +173,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("completion", "--json"): [Acts("completion bash", "--json", is_json)],
     # train
     ("train", "--output"): [Acts(TRAIN, "-o other", names), Refused(TRAIN, "-o clip", "is not a training run")],
-    ("train", "--preset"): of_training("--preset", "nano"),
+    ("train", "--preset"): of_training("--preset", "quiver-s"),
     ("train", "--protocol"): of_training("--protocol", "spad-sum"),
     ("train", "--start"): of_training(
         "--start", "trained", Refused(TRAIN, "--start small.safetensors", "the preset unet")
@@ -423,7 +423,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         "--methods",
         "moment",
         Acts(CELLS, "--methods moment", cells),
-        Refused(CELLS, "--methods nano", "measured against classical methods"),
+        Refused(CELLS, "--methods mergenet", "measured against classical methods"),
     ),
     ("domain", "--seed"): of_measuring("--seed", "1", Acts(CELLS, "--seed 1", cells)),
     ("domain", "--memory"): of_measuring(
@@ -443,7 +443,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("domain", "--force"): of_measuring("--force", "", Acts(CELLS, "--force", seen("cell"), before=CELLS)),
     # ablate
     ("ablate", "--output"): [Acts(ABLATE, "-o seven", names)],
-    ("ablate", "--preset"): [Acts(ABLATE, "--preset quiver-s", tensors)],
+    ("ablate", "--preset"): [Acts(ABLATE, "--preset quiver", tensors)],
     ("ablate", "--protocol"): [Acts(ABLATE, "--protocol spad-sum", tensors)],
     ("ablate", "--steps"): [Acts(ABLATE, "--steps 2", tensors)],
     ("ablate", "--minutes"): [Acts(f"{ABLATE} --steps 2", "--minutes 1e-7", tensors)],
@@ -534,8 +534,8 @@ def scale() -> Iterator[None]:
     number = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "nano", TINY)
-        patch.setitem(PRESETS, "quiver-s", replace(TINY, channels=4))
+        patch.setitem(PRESETS, "quiver-s", TINY)
+        patch.setitem(PRESETS, "quiver", replace(TINY, channels=4))
         for name in set(ABLATIONS) - {"all"}:
             patch.delitem(ABLATIONS, name)
         patch.setattr(presets, "build", tiny)
