@@ -196,6 +196,12 @@ CAMERA: Table = {
     "focus_distance, if any": POSITIVE,
     "vignetting, if any": FLAG,
     "aperture_blur, if any": FLAG,
+    "lens, if any": {
+        "k1": NUMBER,
+        "k2": NUMBER,
+        "falloff": expected("a list of numbers", list_of(is_number)),
+        "shift": expected("two numbers", list_of(is_number, 2)),
+    },
 }
 
 

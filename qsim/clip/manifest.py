@@ -7,6 +7,7 @@ from typing import Any
 
 from qsim import files, structure
 from qsim.optics.camera import Camera
+from qsim.optics.lens import Lens
 
 FORMAT_VERSION = 1
 PHYSICAL = "W m^-2 sr^-1"
@@ -56,6 +57,9 @@ def camera_of(meta: dict[str, Any], where: Path) -> Camera | None:
         else:
             values[key] = tuple(values[key])
     try:
+        if values.get("lens") is not None:
+            lens = {key: value for key, value in values["lens"].items() if key != "kind"}
+            values["lens"] = Lens(**lens | {key: tuple(lens[key]) for key in ("falloff", "shift")})
         return Camera(**values)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: camera: {error}") from None

@@ -7,12 +7,14 @@ from qsim.files import lazy_names
 if TYPE_CHECKING:
     from qsim.optics.camera import Camera
     from qsim.optics.diffraction import diffract
+    from qsim.optics.lens import Lens
     from qsim.optics.radiometry import RGB, WHITE_PER_MEAN, LightLevel, band_photons, expected_photons, photons_per_lux
 
 __all__ = [
     "RGB",
     "WHITE_PER_MEAN",
     "Camera",
+    "Lens",
     "LightLevel",
     "band_photons",
     "diffract",
@@ -24,6 +26,7 @@ __getattr__ = lazy_names(
     __name__,
     {
         "Camera": "camera",
+        "Lens": "lens",
         "LightLevel": "radiometry",
         "RGB": "radiometry",
         "WHITE_PER_MEAN": "radiometry",

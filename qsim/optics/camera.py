@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import functools
+import math
+from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+
+from qsim.optics.lens import Lens
 
 Vector = tuple[float, float, float]
 
@@ -40,6 +44,7 @@ class Camera:
     motion: Pose | None = None  # in the camera's own axes: x right, y down, z forward
     aperture_blur: bool = False  # thin lens of diameter focal_length / f_number instead of a pinhole
     focus_distance: float | None = None  # m; None: distance from origin to target
+    lens: Lens | None = field(default=None, metadata={"described": "if any"})  # distortion, fall-off; None: ideal
 
     def __post_init__(self) -> None:
         if not 0 < self.pixel_pitch < 1e-3:
@@ -58,17 +63,61 @@ class Camera:
                 raise ValueError(
                     f"Camera.{name} must be a positive whole number of pixels, got {getattr(self, name)!r}"
                 )
+        if self.focus_distance is not None and not 0 < self.focus_distance < math.inf:
+            raise ValueError(f"Camera.focus_distance is in metres before the camera, got {self.focus_distance!r}")
         forward = np.subtract(self.target, self.origin)
         if not np.linalg.norm(np.cross(forward, self.up)) > 1e-9 * np.linalg.norm(forward):
             raise ValueError(
                 f"Camera: origin {self.origin}, target {self.target} and up {self.up} give no orientation; choose a "
                 "target other than the origin, and an up that is not along the view"
             )
+        if self.aperture_blur and not self.focus > self.focal_length:
+            raise ValueError(
+                f"Camera: a lens of {self.focal_length:g} m cannot focus on a distance of {self.focus:g} m; give a "
+                "focus_distance above its focal_length, or leave aperture_blur off"
+            )
+        if self.lens == Lens():
+            object.__setattr__(self, "lens", None)
+        if self.lens is not None:
+            self.lens.check(self.corner)
+
+    @property
+    def image_distance(self) -> float:
+        """Distance from the lens to the pixels [m]: `focal_length`, or with `aperture_blur` that of a focused lens."""
+        if not self.aperture_blur:
+            return self.focal_length
+        return self.focal_length * self.focus / (self.focus - self.focal_length)
 
     @property
     def focal_pixels(self) -> float:
-        """Focal length in pixels: a point at (x, y, z) in camera axes falls on (W/2 + f x/z, H/2 + f y/z)."""
-        return self.focal_length / self.pixel_pitch
+        """`image_distance` in pixels, f: a point at (x, y, z) in camera axes is seen at (W/2 + f x/z, H/2 + f y/z)."""
+        return self.image_distance / self.pixel_pitch
+
+    @property
+    def working_f_number(self) -> float:
+        """`image_distance` over the diameter of the entrance pupil: f_number, or more where the focus is near."""
+        return self.f_number * (self.image_distance / self.focal_length)
+
+    @property
+    def axis(self) -> tuple[float, float]:
+        """Pixel (x, y) that the optical axis meets: the middle, unless `lens` is shifted."""
+        x, y = (0.0, 0.0) if self.lens is None else self.lens.shift
+        return self.width / 2 + x * self.height, self.height / 2 + y * self.height
+
+    @property
+    def corner(self) -> float:
+        """Length of the slope at which the farthest corner of the picture is seen."""
+        away = [max(at, size - at) for at, size in zip(self.axis, (self.width, self.height), strict=True)]
+        return math.hypot(*away) / self.focal_pixels
+
+    def circle_of_confusion(self, depth: np.ndarray) -> np.ndarray:
+        """Return the diameter [px] of the blur of points at `depth` [m] along the axis, [...], with `aperture_blur`.
+
+        It is A f |z - s| / (z |s - f|) for the focal length f, the pupil's diameter A and the focus s.
+        """
+        depth = np.asarray(depth, np.float64)
+        scale = self.focal_length / abs(self.focus - self.focal_length) / self.pixel_pitch
+        return 2 * self.pupil_radius * scale * np.abs(depth - self.focus) / depth
 
     @property
     def focus(self) -> float:
@@ -81,7 +130,13 @@ class Camera:
         return self.focal_length / (2 * self.f_number)
 
     def resized(self, height: int, width: int) -> Camera:
-        """Return a camera of this vertical field of view, pixel pitch and f-number with another number of pixels."""
+        """Return a camera of this vertical field of view and f-number with another number of pixels.
+
+        The pitch stays and the focal length changes. With `aperture_blur` the focal length stays and the pitch changes,
+        so that blur keeps its share of the picture.
+        """
+        if self.aperture_blur:
+            return replace(self, height=height, width=width, pixel_pitch=self.pixel_pitch * self.height / height)
         return replace(self, height=height, width=width, focal_length=self.focal_length * height / self.height)
 
     def pose(self, t: float = 0.0) -> np.ndarray:
@@ -95,10 +150,17 @@ class Camera:
 
     def directions(self) -> np.ndarray:
         """Return rays through the pixel centres in camera axes with z = 1, float64 [H, W, 3]."""
-        y, x = np.mgrid[: self.height, : self.width] + 0.5
-        return np.stack(
-            [(x - self.width / 2) / self.focal_pixels, (y - self.height / 2) / self.focal_pixels, np.ones_like(x)], -1
-        )
+        slopes = _pixel_slopes(self.height, self.width, self.axis, self.focal_pixels)
+        if self.lens is not None:
+            slopes = _traced(self.lens, self.height, self.width, self.axis, self.focal_pixels)
+        return np.concatenate([slopes, np.ones_like(slopes[..., :1])], axis=-1)
+
+    def seen(self, slopes: np.ndarray) -> np.ndarray:
+        """Return where the lens shows slopes (x / z, y / z) [2, N], in the same unit: pixels are `focal_pixels` long.
+
+        Slopes so steep that the distortion would fold them back stay outside the picture.
+        """
+        return slopes if self.lens is None else self.lens.seen(slopes.T).T
 
     def cosines(self) -> np.ndarray:
         """Return the cosine of the off-axis angle at the pixel centres, float64 [H, W]."""
@@ -109,8 +171,24 @@ class Camera:
         pose = self.pose(t)
         local = (np.asarray(points, np.float64) - pose[:3, 3]) @ pose[:3, :3]
         with np.errstate(divide="ignore", invalid="ignore"):
-            pixels = local[..., :2] / local[..., 2:] * self.focal_pixels + (self.width / 2, self.height / 2)
+            slopes = local[..., :2] / local[..., 2:]
+            shown = slopes if self.lens is None else self.lens.seen(slopes)
+            pixels = shown * self.focal_pixels + self.axis
         return pixels, local[..., 2]
+
+
+def _pixel_slopes(height: int, width: int, axis: tuple[float, float], focal_pixels: float) -> np.ndarray:
+    """Return the slopes at which the pixel centres are seen, float64 [H, W, 2]."""
+    y, x = np.mgrid[:height, :width] + 0.5
+    return np.stack([(x - axis[0]) / focal_pixels, (y - axis[1]) / focal_pixels], axis=-1)
+
+
+@functools.lru_cache(maxsize=4)
+def _traced(lens: Lens, height: int, width: int, axis: tuple[float, float], focal_pixels: float) -> np.ndarray:
+    """Return the slopes of the rays through the pixel centres, float64 [H, W, 2], read-only."""
+    slopes = lens.traced(_pixel_slopes(height, width, axis, focal_pixels))
+    slopes.setflags(write=False)
+    return slopes
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

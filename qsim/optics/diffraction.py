@@ -10,7 +10,7 @@ from qsim.optics.camera import Camera
 
 def airy_diameter(camera: Camera) -> float:
     """Return the diameter of the first dark ring, 2.44 lambda N, in pixels: 3.4 at f/2.8, 550 nm, 1.1 um."""
-    return 2.439339 * camera.wavelength * camera.f_number / camera.pixel_pitch
+    return 2.439339 * camera.wavelength * camera.working_f_number / camera.pixel_pitch
 
 
 def mtf(frequency: Array, camera: Camera) -> Array:
@@ -18,7 +18,7 @@ def mtf(frequency: Array, camera: Camera) -> Array:
 
     Source: Goodman, Fourier Optics, section 6.4.
     """
-    nu = np.minimum(np.abs(frequency) * camera.wavelength * camera.f_number / camera.pixel_pitch, 1.0)
+    nu = np.minimum(np.abs(frequency) * camera.wavelength * camera.working_f_number / camera.pixel_pitch, 1.0)
     contrast: Array = 2 / np.pi * (np.arccos(nu) - nu * np.sqrt(1 - nu * nu))
     return contrast
 
@@ -42,7 +42,7 @@ def airy_kernel(camera: Camera) -> Array:
     nodes, weights = np.polynomial.legendre.leggauss(points)
     positions = (np.arange(-reach, reach + 1)[:, None] + nodes / 2).ravel()
     radius = np.hypot(positions[:, None], positions) * camera.pixel_pitch
-    x = np.maximum(np.pi * radius / (camera.wavelength * camera.f_number), 1e-9)
+    x = np.maximum(np.pi * radius / (camera.wavelength * camera.working_f_number), 1e-9)
     pattern = (2 * special.j1(x) / x) ** 2
     summed = np.einsum("yixj,i,j->yx", pattern.reshape(2 * reach + 1, points, -1, points), weights, weights)
     kernel: Array = summed / summed.sum()

@@ -3,9 +3,9 @@
     radiance [W m^-2 sr^-1] -> irradiance [W m^-2] -> photons [expected per pixel and exposure, before the sensor]
 
 Nothing here is random. The lens obeys the sine condition, so irradiance = pi L T cos^4 / (4 N^2). Every factor enters
-once: transmission, fill factor and vignetting here, quantum efficiency in the sensor. A light level is one factor for a
-clip (`LightLevel`), from a target in photons per pixel (PPP) or in faceplate lux; without a target it is 1. Left out:
-aberrations, stray light, and the working f-number of close objects.
+once: transmission, fill factor, vignetting and fall-off here, quantum efficiency in the sensor. A light level is one
+factor for a clip (`LightLevel`), from a target in photons per pixel (PPP) or in faceplate lux; without a target it is
+1. N is the working f-number where the camera focuses (`aperture_blur`). Left out: other aberrations, and stray light.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.optics.camera import Camera
+from qsim.optics.lens import Lens
 
 PLANCK = 6.62607015e-34  # J s, exact (SI)
 LIGHT_SPEED = 299792458.0  # m s^-1, exact (SI)
@@ -48,7 +49,7 @@ def to_irradiance(radiance: Array, camera: Camera, cos_theta: float | Array = 1.
 
     `radiance` is [...] in W m^-2 sr^-1; `cos_theta` is a number or broadcasts with it.
     """
-    scale = np.pi * camera.transmission / (4 * camera.f_number**2)
+    scale = np.pi * camera.transmission / (4 * camera.working_f_number**2)
     return np.asarray(radiance, np.float64) * (scale * cos_theta**4)
 
 
@@ -73,13 +74,14 @@ def expected_photons(
         raise ValueError(f"exposure: expected seconds above 0, got {exposure!r}; a full frame time at 2000 fps is 5e-4")
     radiance = np.asarray(radiance, np.float64)
     cosines: float | Array = 1.0
-    if camera.vignetting and radiance.ndim >= 2:
+    if (camera.vignetting or camera.lens is not None) and radiance.ndim >= 2:
         height, width = radiance.shape[-2:]
-        if origin is None:
-            centre_y, centre_x = height / 2, width / 2
+        y, x = origin or ((camera.height - height) / 2, (camera.width - width) / 2)
+        axis = height, width, camera.axis[1] - y, camera.axis[0] - x, camera.focal_pixels
+        if camera.lens is not None:
+            radiance = radiance * illumination(*axis, camera.lens, camera.vignetting)
         else:
-            centre_y, centre_x = camera.height / 2 - origin[0], camera.width / 2 - origin[1]
-        cosines = off_axis_cosines(height, width, centre_y, centre_x, camera.focal_length / camera.pixel_pitch)
+            cosines = off_axis_cosines(*axis)
     return to_photons(to_irradiance(radiance, camera, cosines), camera, exposure)
 
 
@@ -103,6 +105,20 @@ def off_axis_cosines(height: int, width: int, centre_y: float, centre_x: float, 
     cosines: Array = 1 / np.sqrt(1 + x * x + y * y)
     cosines.setflags(write=False)
     return cosines
+
+
+@functools.lru_cache(maxsize=16)
+def illumination(
+    height: int, width: int, centre_y: float, centre_x: float, focal_pixels: float, lens: Lens, natural: bool
+) -> Array:
+    """Return the share of the axis' light at the pixel centres behind a lens (`Lens.illumination`), [H, W], read-only.
+
+    Arguments as of `off_axis_cosines`, whose fourth power it is for an ideal lens with `natural`.
+    """
+    y, x = (np.mgrid[:height, :width] + 0.5 - np.array([centre_y, centre_x])[:, None, None]) / focal_pixels
+    share = lens.illumination(np.stack([x, y], axis=-1), natural=natural)
+    share.setflags(write=False)
+    return share
 
 
 def photons_per_lux(camera: Camera, exposure: float) -> float:

@@ -117,7 +117,8 @@ def choose_budget(
     if fewer is not None:
         samples = fewer
         about_samples = Finding("samples", f"{samples} per pixel, denoised", f"without: {about_samples.chosen}")
-    lens = (*_flicker(pilot.renderer.strengths(frames)), *_left_out(scene.camera, pilot.truths()))
+    effects = (*_flicker(pilot.renderer.strengths(frames)), *_lens(scene.camera))
+    lens = (*effects, *_left_out(scene.camera, pilot.truths()))
     pixels = scene.camera.height * scene.camera.width
     noisy = noise.at(samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
     about_light, about_motion = _light(dimmed, noisy, fewer is not None), moving(pilot.extent, shutter)
@@ -294,14 +295,21 @@ def _flicker(strengths: dict[str, Array]) -> tuple[Finding, ...]:
     return (Finding("flicker", "exact mean over each exposure", ", ".join(sizes)),) if sizes else ()
 
 
+def _lens(camera: Camera) -> tuple[Finding, ...]:
+    """Return a finding for a lens that is not ideal: how far it moves the corner, and the light left there."""
+    if camera.lens is None:
+        return ()
+    corner = np.array([camera.corner, 0.0])
+    moved = float(corner[0] - camera.lens.traced(corner)[0]) * camera.focal_pixels
+    share = float(camera.lens.illumination(corner, natural=camera.vignetting))
+    return (Finding("lens", "exact rays", f"corner moved by {moved:+.3g} px, with {100 * share:.3g} % of the light"),)
+
+
 def _left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, ...]:
     """Return findings for effects that the renderer leaves out, with their size where it can be computed."""
     depths = np.concatenate([truth["depth"].ravel() for truth in truths])
     depths = depths[np.isfinite(depths) & (depths > camera.focal_length)]
-    focus = camera.focus
-    # Circle of confusion of a thin lens: (f^2 / N) / (s - f) * |z - s| / z.
-    circle = camera.focal_length**2 / camera.f_number / abs(focus - camera.focal_length)
-    blur = float(np.max(circle * np.abs(depths - focus) / depths, initial=0.0)) / camera.pixel_pitch
+    blur = float(np.max(camera.circle_of_confusion(depths), initial=0.0))
     how = "thin lens" if camera.aperture_blur else "left out, pinhole"
     return (
         Finding("depth of field", how, f"largest blur circle {blur:.2g} px at f/{camera.f_number:g}"),

@@ -4,7 +4,8 @@
 
 Each hit belongs to a body. The body's poses (or its deformed triangle) carry the point to another time, and the
 camera's pose of that time projects it. Nothing is estimated from images. Points of the surroundings are infinitely
-distant and move only with the camera's rotation. For glass and mirrors, the flow is that of the surface.
+distant and move only with the camera's rotation. For glass and mirrors, the flow is that of the surface. A thin lens
+has the truth of a pinhole in its middle; distortion bends rays and flow alike.
 
 A point is a ray [3, N] in the camera's axes and a distance d in lengths of that ray. A rigid motion (R, T) maps the ray
 r to R r + T / d and keeps d. Nearby points and those at infinity (d = inf) therefore follow one rule, and points at
@@ -41,11 +42,12 @@ def flow_between(scene: Scene, rays: Array, hits: Hits, t: float, later: float) 
     camera = scene.camera
     start, end = seen_again(scene, rays, hits, t, later)
     ahead = end[2] > 0
-    place = end[:2] / np.where(ahead, end[2], 1.0)
+    place = camera.seen(end[:2] / np.where(ahead, end[2], 1.0))
     inside = ahead
-    for along, size in zip(place, (camera.width, camera.height), strict=True):
-        inside = inside & (np.abs(along) <= size / 2 / camera.focal_pixels)
-    flow = np.where(ahead, place - start[:2] / start[2], 0.0) * camera.focal_pixels
+    for along, axis, size in zip(place, camera.axis, (camera.width, camera.height), strict=True):
+        low, high = (edge / camera.focal_pixels for edge in (axis, size - axis))
+        inside = inside & (along >= -low) & (along <= high)
+    flow = np.where(ahead, place - camera.seen(start[:2] / start[2]), 0.0) * camera.focal_pixels
     return flow, inside, end
 
 

@@ -162,8 +162,13 @@ def film_pass(
     integrator: Any,
     sampler: str = "multijitter",
 ) -> Array:
-    """Render a window (y, x, height, width) with Mitsuba's own camera and film: radiance, float64 [H, W]."""
+    """Render a window (y, x, height, width) with Mitsuba's own camera and film: radiance, float64 [H, W].
+
+    `ValueError` for a lens that distorts, or whose axis is off the middle: that camera has none.
+    """
     mi, camera = stage.mi, stage.scene.camera
+    if camera.lens is not None and (camera.lens.distorts or camera.lens.shift != (0.0, 0.0)):
+        raise ValueError("Camera.lens: the scalar engine has no distortion and no shift; install LLVM, or leave it out")
     y, x, height, width = crop
     film: dict[str, Any] = {
         "type": "hdrfilm",

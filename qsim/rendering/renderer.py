@@ -27,6 +27,7 @@ from qsim.keys import Key, hash_name, words
 from qsim.optics.radiometry import Crop, check_crop
 from qsim.rendering import ground_truth
 from qsim.rendering.budget import Budget, blur_left, grid_samples, instants, light_windows
+from qsim.rendering.camera_rays import CameraRays
 from qsim.rendering.denoiser import cleaned_mean
 from qsim.rendering.engine import activate, in_colour, select
 from qsim.rendering.mitsuba_scene import Stage, film_pass
@@ -101,6 +102,7 @@ class Renderer:
         self._integrators: dict[int, Any] = {}
         self._samplers: dict[int, Any] = {}
         self._caster = RayCaster(self.stage, self.engine.backend)
+        self._rays: Any = None if self.engine.backend == "scalar" else CameraRays(mi, scene.camera)
 
     def time(self, t: int) -> float:
         """Return the mid-exposure time of frame t [s]."""
@@ -231,7 +233,7 @@ class Renderer:
             self.stage.place(instant)
             for part, seed in zip(parts, row, strict=True):
                 sampler, position = self._film_positions(int(seed), samples, part)
-                ray = self._camera_ray(self.scene.camera.pose(instant), position, sampler)
+                ray = self._rays.through(self.scene.camera.pose(instant), position, sampler)
                 found = self.stage.loaded.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
                 bsdf = found.bsdf(ray)
                 seen = found.is_valid()
@@ -255,7 +257,7 @@ class Renderer:
 
         integrator = self._integrator(bounces)  # first: loading it later would change the kernel once
         sampler, position = self._film_positions(seed, samples, part, 2)
-        ray = self._camera_ray(pose, position, sampler)
+        ray = self._rays.through(pose, position, sampler)
         radiance, _, _ = integrator.sample(self.stage.loaded, sampler, ray)
         means = [dr.block_sum(radiance[band], samples) / samples for band in range(len(radiance))]
         dr.eval(*means)  # together: each alone would trace the rays again
@@ -287,25 +289,6 @@ class Renderer:
             plugin = {"type": "path", "max_depth": bounces + 1, "rr_depth": 1000}
             self._integrators[bounces] = self.mi.load_dict(plugin)
         return self._integrators[bounces]
-
-    def _camera_ray(self, pose: Array, position: Any, sampler: Any) -> Any:
-        """Return rays through film positions [px]; the pose is data, not code, so that motion compiles no kernel."""
-        import drjit as dr
-
-        mi, camera = self.mi, self.scene.camera
-        axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in pose[:3, i])) for i in range(4)]
-        f = camera.focal_pixels
-        across = (position.x - camera.width / 2) / f
-        down = (position.y - camera.height / 2) / f
-        direction = axes[0] * across + axes[1] * down + axes[2]
-        origin = axes[3]
-        if camera.aperture_blur:
-            focus = camera.focus
-            lens = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d()) * (camera.pupil_radius)
-            shift = axes[0] * lens.x + axes[1] * lens.y
-            origin = origin + shift
-            direction = direction * focus - shift
-        return mi.RayDifferential3f(o=mi.Point3f(origin), d=dr.normalize(direction))
 
     def _sampler(self, samples: int) -> Any:
         if samples not in self._samplers:

@@ -6,7 +6,7 @@ Lengths are metres, angles radians, y points up. Bodies are described in their o
 body to world) places them at time t [s]. The camera looks from `origin` to `target`; its optional motion acts in the
 camera's own axes (x right, y down, z forward): a spin about y is a pan, a translation along z a dolly. Radiance belongs
 to one band around `Camera.wavelength`, or to the three `bands` of a colour scene. Left out: polarisation, spectra,
-participating media, lens aberrations.
+participating media, lens aberrations but the distortion of `Camera.lens`.
 """
 
 from __future__ import annotations
@@ -195,8 +195,10 @@ class Scene:
 def describe(value: Any) -> Any:
     """Return a record as JSON-ready values: dataclasses with their kind, arrays with shape, type and SHA-256."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {field.name: describe(getattr(value, field.name)) for field in dataclasses.fields(value)}
-        return {"kind": type(value).__name__} | fields
+        values = {
+            field.name: getattr(value, field.name) for field in dataclasses.fields(value) if _is_told(value, field)
+        }
+        return {"kind": type(value).__name__} | {name: describe(each) for name, each in values.items()}
     if isinstance(value, np.ndarray):
         if value.size <= 16:
             return value.tolist()
@@ -213,6 +215,11 @@ def describe(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     return f"{type(value).__module__}.{type(value).__qualname__}"
+
+
+def _is_told(record: Any, field: dataclasses.Field[Any]) -> bool:
+    """Return whether a description holds a field: not where it is marked "if any" and None, as in earlier versions."""
+    return "described" not in field.metadata or getattr(record, field.name) is not None
 
 
 def _check_motion(scene: str, body: Body | Part) -> None:

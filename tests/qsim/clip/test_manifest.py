@@ -1,5 +1,6 @@
 """Tests the checks of clip.json: impossible clips, other versions, damage."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,6 +10,9 @@ from tiny_clip import meta, write
 from qsim import files
 from qsim.clip.clip import Clip
 from qsim.clip.writer import ClipWriter
+from qsim.optics.camera import Camera
+from qsim.optics.lens import Lens
+from qsim.scene import describe
 
 
 @pytest.mark.parametrize(
@@ -53,3 +57,23 @@ def test_a_damaged_manifest_is_named(tmp_path: Path):
         Clip.open(tmp_path / "b")
     with pytest.raises(FileNotFoundError, match="not a clip folder"):
         Clip.open(tmp_path)
+
+
+def test_a_lens_is_stored_and_read_again(tmp_path: Path):
+    lens = Lens(-0.2, 0.1, (-0.3, 0.1), (0.02, -0.01))
+    camera = Camera(8e-3, 2.8, 1.1e-6, 10, 7, lens=lens)
+    assert write(tmp_path / "a", camera=describe(camera)).camera.lens == lens
+    ideal = describe(dataclasses.replace(camera, lens=None))
+    assert "lens" not in ideal  # as in clips of earlier versions
+    assert write(tmp_path / "b", camera=ideal).camera.lens is None
+
+
+def test_a_damaged_lens_is_named(tmp_path: Path):
+    clip = write(tmp_path / "a")
+    good = {"k1": -0.2, "k2": 0.1, "falloff": [], "shift": [0.0, 0.0]}
+    for damage in ({"k1": "x"}, {"falloff": 3}, {"shift": [1.0]}, {"falloff": [None]}, {"k3": 0.1}, {"k1": -1e9}):
+        camera = clip.meta["camera"] | {"lens": good | damage}
+        unsealed = {key: value for key, value in clip.meta.items() if key != "checksum"}
+        files.write_json(clip.path / "clip.json", unsealed | {"camera": camera})
+        with pytest.raises(ValueError, match=r"clip\.json.*lens|clip\.json: camera: .*k3"):
+            assert Clip.open(clip.path).camera

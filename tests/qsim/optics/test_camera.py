@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from qsim.optics import radiometry
 from qsim.optics.camera import Camera
+from qsim.optics.lens import Lens
 from qsim.scene import Spin
 
 CAMERA = Camera(focal_length=8e-3, f_number=2.8, pixel_pitch=1e-5, height=7, width=10)
@@ -58,3 +62,74 @@ def test_resizing_keeps_the_view_pitch_and_f_number():
 def test_off_axis_cosines_of_a_wide_view():
     wide = Camera(focal_length=1e-4, f_number=2, pixel_pitch=1e-4, height=1, width=3)
     np.testing.assert_allclose(wide.cosines(), [[2**-0.5, 1, 2**-0.5]])
+
+
+def test_a_distorting_lens_sees_its_pixel_rays_at_the_pixel_centres():
+    rng = np.random.default_rng(4)
+    y, x = np.mgrid[:7, :10] + 0.5
+    for _ in range(100):
+        lens = Lens(*rng.uniform(-0.3, 0.5, 2), shift=tuple(rng.uniform(-0.4, 0.4, 2)))
+        camera = dataclasses.replace(CAMERA, focal_length=1e-4 * rng.uniform(1, 4), lens=lens)
+        points = camera.pose()[:3, 3] + rng.uniform(0.1, 9) * camera.directions() @ camera.pose()[:3, :3].T
+        np.testing.assert_allclose(camera.project(points)[0], np.stack([x, y], -1), atol=1e-10)
+
+
+def test_resizing_keeps_what_a_lens_shows():
+    lens = Lens(-0.2, 0.05, (-0.3,), (0.1, -0.07))
+    camera = dataclasses.replace(CAMERA, focal_length=1e-4, lens=lens)
+    point = np.array([0.4, -0.3, 1.0])
+    np.testing.assert_allclose(camera.resized(21, 30).project(point)[0], 3 * camera.project(point)[0], rtol=1e-12)
+
+
+def test_an_ideal_lens_is_none():
+    assert dataclasses.replace(CAMERA, lens=Lens()).lens is None
+    with pytest.raises(ValueError, match="the picture folds"):
+        dataclasses.replace(CAMERA, focal_length=5e-5, lens=Lens(k1=-0.4))
+
+
+def thin(rng: np.random.Generator) -> Camera:
+    """Return a random thin lens in focus."""
+    focal = float(10 ** rng.uniform(-3, -1))
+    focus = focal * float(1 + 10 ** rng.uniform(-1, 3))
+    return Camera(
+        focal, rng.uniform(0.5, 16), 1e-5, 7, 10, aperture_blur=True, focus_distance=focus, origin=(0, 0, 2 * focus)
+    )
+
+
+def test_a_thin_lens_obeys_its_laws():
+    """1/f = 1/s + 1/v, the circle of confusion of a textbook, and its irradiance: pi L A^2 / (4 v^2)."""
+    rng = np.random.default_rng(5)
+    for _ in range(100):
+        camera = thin(rng)
+        f, s, v = camera.focal_length, camera.focus, camera.image_distance
+        assert 1 / s + 1 / v == pytest.approx(1 / f, rel=1e-12)
+        assert camera.focal_pixels == pytest.approx(v / 1e-5)
+        depth, pupil = s * rng.uniform(0.3, 5), f / camera.f_number
+        circle = pupil * f * abs(depth - s) / (depth * (s - f)) / 1e-5
+        assert float(camera.circle_of_confusion(depth)) == pytest.approx(circle, rel=1e-9)
+        irradiance = radiometry.to_irradiance(np.array(3.0), camera)
+        assert float(irradiance) == pytest.approx(np.pi * 3.0 * pupil**2 / (4 * v**2), rel=1e-9)
+
+
+def test_resizing_a_thin_lens_keeps_the_share_of_its_blur():
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        camera = thin(rng)
+        large = camera.resized(70, 110)
+        depth = camera.focus * rng.uniform(0.3, 5)
+        assert large.circle_of_confusion(depth) == pytest.approx(10 * camera.circle_of_confusion(depth), rel=1e-12)
+        assert large.focal_pixels == pytest.approx(10 * camera.focal_pixels, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"focus_distance": -1.0}, "focus_distance is in metres before the camera, got -1.0"),
+        ({"focus_distance": float("nan")}, "before the camera"),
+        ({"aperture_blur": True, "focus_distance": 7e-3}, "cannot focus on a distance of 0.007 m"),
+        ({"f_number": -2.0}, "f_number must be at least 0.5"),
+    ],
+)
+def test_impossible_lenses_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(CAMERA, **changes)
