@@ -99,8 +99,8 @@ class Lens:
         """Raise `ValueError` if a picture whose corner is seen at a slope of this length folds, or loses its light."""
         if abs(self.k1) * corner**2 > STRONGEST or abs(self.k2) * corner**4 > STRONGEST:
             raise ValueError(
-                f"Camera.lens: k1 = {self.k1:g} and k2 = {self.k2:g} are beyond any lens for a picture whose corner is at "
-                f"{corner:.4g} focal lengths from the axis; they multiply its square and its fourth power"
+                f"Camera.lens: k1 = {self.k1:g} and k2 = {self.k2:g} are beyond any lens; they multiply the square and "
+                f"the fourth power of {corner:.4g} focal lengths, at which the corner of the picture is"
             )
         fold = self.fold
         if self.distorts and math.isfinite(fold):
