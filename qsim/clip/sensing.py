@@ -79,6 +79,11 @@ class Sensing:
         return type(self.sensor).__name__ if isinstance(self.sensor, Sensor) else self.sensor
 
     @property
+    def planes(self) -> int:
+        """The clip frames in a code: planes that are summed, or slices of an exposure."""
+        return 2 ** (self.depth or 1) - 1 if self.group else self.slices
+
+    @property
     def depth(self) -> int | None:
         """The bits of a code, as requested or of a record; None: the device's own."""
         return self.sensor.bits if self.bits is None and isinstance(self.sensor, Sensor) else self.bits
@@ -86,45 +91,43 @@ class Sensing:
 
 def prepare(clip: ClipFolder, sensing: Sensing) -> Draw:
     """Return the draw of a clip with these settings; `ValueError` if they do not fit the clip."""
-
     own = sensing.sensor_name if sensing.sensor_name.endswith(".toml") else None
     source = sensing.defects or own
     return assemble(clip, sensing, defect_table.from_toml(source) if isinstance(source, str) else source)
 
 
-def filters_of(clip: ClipFolder, sensing: Sensing) -> ColourFilter | None:
-    """Return the colour filter array of a sensor that sees this clip, from the clip's first pixel on; None without one.
-
-    `ValueError` for a colour clip and a sensor without filters, and for the reverse.
-    """
-    found: ColourFilter | None = None
+def filters_of(sensing: Sensing) -> ColourFilter | None:
+    """Return the colour filter array that the settings or the sensor's file state; None without one."""
     if sensing.colour is not None:
-        found = colour_filter.load(sensing.colour) if isinstance(sensing.colour, str) else sensing.colour
-    elif sensing.sensor_name.endswith(".toml"):
-        found = colour_filter.from_toml(sensing.sensor_name)
+        return colour_filter.load(sensing.colour) if isinstance(sensing.colour, str) else sensing.colour
+    return colour_filter.from_toml(sensing.sensor_name) if sensing.sensor_name.endswith(".toml") else None
+
+
+def _fitting_filters(clip: ClipFolder, sensing: Sensing) -> ColourFilter | None:
+    """Return the same from the clip's first pixel on; `ValueError` for a colour clip without filters, and reverse."""
+    found = filters_of(sensing)
     if (found is None) == (clip.bands is None):
         return None if found is None else found.shifted(*clip.origin)
     if found is None:
         cure = "give some, as in --colour rggb, or a table [colour] in the sensor's file"
         raise ValueError(f"{clip.name}: has three bands and {sensing.sensor_name} no colour filters; {cure}")
-    raise ValueError(f"{clip.name}: has one band, and the sensor has colour filters; render it with --bands rgb")
+    raise ValueError(f"{clip.name}: has one band, and the sensor has colour filters; render it in colour (bands rgb)")
 
 
 def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sensor | None = None) -> Draw:
     """Return the draw of a clip as `prepare`, with given defects and, if given, the sensor `own`."""
-    filters = filters_of(clip, sensing)
-    planes = sensing.slices
+    filters = _fitting_filters(clip, sensing)
+    planes = sensing.planes
     if sensing.group:
         if sensing.depth is None:
             raise ValueError(f"{clip.name}: summing planes needs the bits of a code, as in --bits 3")
         if sensing.slices != 1:
             raise ValueError(f"{clip.name}: --group sums planes, --slices are of one exposure; give one of them")
-        planes = 2**sensing.depth - 1
     if not 1 <= planes <= len(clip):
         what = f"one code of {planes} planes" if sensing.group else f"one exposure of {planes} slices"
         raise ValueError(f"{clip.name}: {len(clip)} frames are too few for {what}")
     if sensing.rows is not None:
-        _check_rows(sensing.rows, clip, planes, 1 if sensing.group else planes)
+        _check_rows(sensing, clip, 1 if sensing.group else planes)
     target = None if sensing.ppp is None else sensing.ppp / planes
     level = light_level(clip, ppp=target, lux=sensing.lux)
     sensor = own or devices.load(
@@ -161,13 +164,19 @@ def _checked_exposures(sensing: Sensing, sensor: Sensor, found: Defects | None) 
     return shares
 
 
-def _check_rows(rows: Rows, clip: ClipFolder, planes: int, period: int) -> None:
-    """Raise `ValueError` if rows cannot be read at their times: codes of `planes`, planes of `period` clip frames."""
+def frames_needed(sensing: Sensing, height: int, width: int, frame_rate: float) -> int:
+    """Return the clip frames of the first code: its planes or slices, and those that its last row still needs."""
+    return sensing.planes + (0 if sensing.rows is None else sensing.rows.reach(height, width, frame_rate))
+
+
+def _check_rows(sensing: Sensing, clip: ClipFolder, period: int) -> None:
+    """Raise `ValueError` if rows cannot be read at their times: planes or codes of `period` clip frames."""
+    assert sensing.rows is not None
     _, height, width = clip.shape
     if clip.exposure < 0.999 / clip.frame_rate:
         raise ValueError(f"{clip.name}: rows at their own time need a clip whose shutter is open all the time")
-    rows.check(height, width, clip.frame_rate, period, clip.name)
-    needed = planes + rows.reach(height, width, clip.frame_rate)
+    sensing.rows.check(height, width, clip.frame_rate, period, clip.name)
+    needed = frames_needed(sensing, height, width, clip.frame_rate)
     if len(clip) < needed:
         raise ValueError(f"{clip.name}: {len(clip)} frames are too few for one code, whose last row needs {needed}")
 

@@ -42,16 +42,18 @@ A (family, seed) belongs to one split at every speed, and a family of the test s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from qsim import checks
-from qsim.clip.sensing import Sensing
-from qsim.dataset.job import Job
+from qsim.clip.clip_folder import ClipFolder
+from qsim.clip.sensing import Sensing, filters_of, prepare
+from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe_sections.scenes_section import SETTINGS, jobs_of, settings_of
 from qsim.dataset.recipe_sections.streams_section import streams_of
 from qsim.dataset.recipe_sections.toml_section import Section, Text, file_name
+from qsim.optics.radiometry import RGB
 from qsim.structure import Table
 
 SPLITS = checks.SPLITS
@@ -121,7 +123,7 @@ def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
 
 
 def _check_jobs(jobs: list[tuple[Job, Section]], path: Path) -> None:
-    """`ValueError` without jobs, for a clip listed twice, a split that shares a scene, or too few frames for a sum.
+    """`ValueError` without jobs, for a clip listed twice, or a split that shares a scene.
 
     A scene may be in one split only, and a family of the test split in no other split.
     """
@@ -145,18 +147,36 @@ def _check_jobs(jobs: list[tuple[Job, Section]], path: Path) -> None:
         if job.split != "test" and job.stem in tested:
             where = f"{section.where()}: family {job.stem} is in the splits '{job.split}' and 'test'"
             raise ValueError(f"{where}; the test split holds families that training never sees: move its scenes")
+    _check_streams(jobs)
+
+
+def _check_streams(jobs: list[tuple[Job, Section]]) -> None:
+    """`ValueError` with the line of [[scenes]] for clips whose streams could not be drawn after rendering."""
+    seen = set()
+    for job, section in jobs:
+        own = job.family != job.stem  # a scene of the user may state bands
+        case = (job.settings, own)
+        if case in seen:
+            continue
+        seen.add(case)
         for sensing in job.streams:
-            if sensing.colour is not None and job.settings.bands is None and job.family == job.stem:
-                raise ValueError(f"{section.where()}: one band, but {sensing.stream_name} has filters; give bands")
-            if sensing.rows is not None:
-                with section.naming():
-                    at = job.settings
-                    sensing.rows.check(at.height, at.width, at.frame_rate, sensing.slices, sensing.stream_name)
-            taken = 2 ** (sensing.bits or 1) - 1 if sensing.group else sensing.slices
-            if job.settings.frames < taken:
-                few = f"{job.settings.frames} frames are too few for {sensing.stream_name}, whose codes sum"
-                cure = f"{taken} of them; render more frames, or use fewer bits or slices"
-                raise ValueError(f"{section.where()}: {few} {cure}")
+            with section.naming():
+                colour = job.settings.bands is not None or (own and filters_of(sensing) is not None)
+                clip = _unrendered(sensing.stream_name, job.settings, colour)
+                prepare(clip, replace(sensing, ppp=1.0, lux=None))
+
+
+def _unrendered(name: str, settings: Settings, colour: bool) -> ClipFolder:
+    """Return a clip of mean light 1 without frames, for the checks of sensing."""
+    meta = {
+        "name": name,
+        "shape": [settings.frames, settings.height, settings.width],
+        "frame_rate": settings.frame_rate,
+        "exposure": (settings.shutter or 1.0) / settings.frame_rate,
+        "mean_radiance": 1.0,
+        "bands": RGB if colour else None,
+    }
+    return ClipFolder(Path(name), meta)
 
 
 def _kept(value: Any) -> Any:

@@ -158,7 +158,7 @@ def test_a_recipe_names_its_filters(place):
     grey = recipe.parse(head.replace('bands = "rgb"\n', ""))
     assert grey.jobs[0].digest != recipe.parse(head).jobs[0].digest
     colour = '[[streams]]\nsensor = "quiver-physical"\nppp = 3\ncolour = "rggb"\n'
-    with pytest.raises(ValueError, match="one band, but quiver-physical-rggb_3ppp has filters; give bands"):
+    with pytest.raises(ValueError, match="quiver-physical-rggb_3ppp: has one band, and the sensor has colour filters"):
         recipe.parse(head.replace('bands = "rgb"\n', "") + colour)
     with pytest.raises(ValueError, match=r"recipe\.toml:12: unknown colour filter array 'x'"):
         recipe.parse(head + '[[streams]]\nsensor = "quiver-physical"\nppp = 3\ncolour = "x"\n')

@@ -2,6 +2,7 @@
 
 import json
 import random
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -114,11 +115,11 @@ MISTAKES = [
     ("speed = [1.0, 2.5]", "speed = 1e9", 11, r"factor on all motions from 0\.001 to 1000"),
     ("seeds = [0, 2]", "seeds = [0, 2]\nheight = 90000\nwidth = 90000", 8, r"90000 x 90000 pixels; at most 67108864"),
     ("ppp = [0.5, 3.25]", "ppp = 1\ngroup = true", 24, r"group sums planes of a clocked SPAD; this is a QIS"),
-    ("ppp = [0.5, 3.25]", "ppp = 1\nslices = 4", 8, r"3 frames are too few for .*, whose codes sum 4 of them"),
+    ("ppp = [0.5, 3.25]", "ppp = 1\nslices = 4", 8, r"3 frames are too few for one exposure of 4 slices"),
     ("ppp = [0.5, 3.25]", "ppp = 1\nslices = 0", 24, r"slices: expected a whole number from 1 to 100000, got 0"),
     ('"quiver-physical"', '"spad512s"\nslices = 2', 22, r"slices are of one exposure of a QIS or CountingSPAD; this"),
     ('"quiver-physical"\nbits = [1, 3]', '"spad512s"\ngroup = true', 22, r"the bits of a code are needed"),
-    ('"quiver-physical"', '"spad512s"\ngroup = true', 8, r"3 frames are too few for spad512s_3bit_0\.5ppp, .* sum 7"),
+    ('"quiver-physical"', '"spad512s"\ngroup = true', 8, r"3 frames are too few for one code of 7 planes"),
     ('split = "test"', f'split = "test"\n{AGAIN}"fan"', 18, r"the clip fan_0000 is listed twice"),
     ('split = "test"', f'split = "test"\n{AGAIN}"tumble"', 18, r"family tumble is in the splits 'train' and"),
     ('split = "test"', f'split = "val"\n{AGAIN}"tumble"\nfirst = 5\nspeed = 2', 18, r"splits 'val' and 'train'"),
@@ -161,6 +162,53 @@ def test_each_mistake_is_named_with_file_and_line(tmp_path: Path, old: str, new:
 def test_recipes_without_sense(text: str, message: str):
     with pytest.raises(ValueError, match=message):
         parse(text)
+
+
+SPIKE = '[sensor]\nmodel = "SpikeCamera"\nquantum_efficiency = 0.6\ndark_current = 0.0\nthreshold = 9\n'
+COUNTER = '[sensor]\nmodel = "CountingSPAD"\npde = 0.4\ndark_count_rate = 9.0\ndead_time = 1e-8\nbits = 4\n'
+
+
+@pytest.mark.parametrize(
+    ("render", "sensor", "stream", "message"),
+    [
+        ('bands = "rgb"', "spad512s", "", "has three bands and spad512s no colour filters"),
+        ("", "spad512s", 'colour = "rggb"', "has one band, and the sensor has colour filters"),
+        ("", COUNTER + '[colour]\nmask = ["RG"]\n', "", "has one band, and the sensor has colour filters"),
+        ("", SPIKE, "exposures = [1.0, 0.5]", "exposures: .* integrates without a pause"),
+        ("", SPIKE + "[defects]\nprnu = 0.1\n", "", "defects of spike cameras are not modelled"),
+        ("", COUNTER, "slices = 2\nexposures = [1.0, 0.5]", "exposures: slices of a counting pixel need"),
+        (
+            "",
+            COUNTER + "[defects]\nafterpulse = 0.1\nafterpulse_delay = 1e-7\n",
+            "exposures = [0.5]",
+            "exposures: afterpulses and carried dead",
+        ),
+        ("", "quiver-physical", "follow = true", "only the photons of a CountingSPAD are followed, this is a QIS"),
+        ("shutter = 0.5", "quiver-physical", "row_delay = 1e-6", "rows .* need a clip whose shutter is open all the"),
+        ("shutter = 0.5", "quiver-physical", "slices = 2", "slices of one exposure need a clip whose shutter is open"),
+        ("", "quiver-physical", "slices = 4\nrow_delay = 1e-6", "4 frames are too few for one code, whose last row"),
+        ("", COUNTER + "[defects]\ndark_map = 'map.npy'\n", "", "map.npy"),
+    ],
+)
+def test_streams_that_could_not_be_drawn_fail_before_rendering(tmp_path, render, sensor, stream, message):
+    """Some of these sentences came only after a clip had been rendered."""
+    if sensor.startswith("[sensor]"):
+        (tmp_path / "s.toml").write_text(sensor)
+        sensor = "s.toml"
+    head = f'[recipe]\nname = "t"\nframes = 4\nheight = 7\nwidth = 9\n{render}\n[[scenes]]\nfamily = "fan"\n'
+    path = tmp_path / "r.toml"
+    path.write_text(f'{head}[[streams]]\nsensor = "{sensor}"\nppp = 3.0\n{stream}\n')
+    with pytest.raises(ValueError, match=message) as caught:
+        recipe.load(path)
+    assert re.match(rf"{re.escape(str(path))}:\d+: ", str(caught.value))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("unit", ["ppp = 3.0", "lux = 3.0", "absolute = true"])
+def test_streams_are_checked_without_their_light(unit):
+    """A recipe with every unit of light is accepted; scenes of the user may state bands of their own."""
+    stream = f'[[streams]]\nsensor = "spad512s"\nbits = 1\n{unit}\n'
+    assert parse(HEAD + SCENES + stream).jobs[0].streams
 
 
 def test_a_sensor_whose_name_holds_a_dot_keeps_it():
