@@ -111,7 +111,7 @@ def _fitting_filters(clip: ClipFolder, sensing: Sensing) -> ColourFilter | None:
     if found is None:
         cure = "give some, as in --colour rggb, or a table [colour] in the sensor's file"
         raise ValueError(f"{clip.name}: has three bands and {sensing.sensor_name} no colour filters; {cure}")
-    raise ValueError(f"{clip.name}: has one band, and the sensor has colour filters; render it in colour (bands rgb)")
+    raise ValueError(f"{clip.name}: has one band, and the sensor has colour filters; render it with --bands rgb")
 
 
 def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sensor | None = None) -> Draw:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from qsim.backend import on_gpu
 from qsim.clip.clip import Clip
-from qsim.clip.sensing import sense
+from qsim.clip.sensing import frames_needed, sense
 from qsim.dataset import job_runner
 from qsim.dataset.job import Job
 from qsim.dataset.recipe import Recipe
@@ -159,7 +159,10 @@ def _machines(count: int) -> str:
 
 
 def forecast(recipe: Recipe, *, frames: int = 5, progress: Progress | None = None) -> Forecast:
-    """Measure one job of each kind with `frames` frames, at least 2 because the first one compiles."""
+    """Measure one job of each kind with `frames` frames, at least 2 because the first one compiles.
+
+    Streams whose codes take more frames are measured with the frames of one code.
+    """
     from qsim import backend
 
     if frames < 2:
@@ -190,7 +193,9 @@ def measure_kind(members: list[Job], folder: Path, frames: int) -> Cost:
     job = looked_at[middle]
     settings = job.settings
     started = Seconds.now()
-    clip, moments = render_first_frames(job, budgets[middle], folder, min(frames, settings.frames))
+    size = (settings.height, settings.width)
+    a_code = max((frames_needed(stream, *size, settings.frame_rate) for stream in job.streams), default=1)
+    clip, moments = render_first_frames(job, budgets[middle], folder, min(max(frames, a_code), settings.frames))
     # The first frame includes scene and compilation; the others give the cost of each further frame.
     first, more = moments[0].since(started), moments[-1].since(moments[0])
     if len(moments) > 1:
@@ -203,7 +208,7 @@ def measure_kind(members: list[Job], folder: Path, frames: int) -> Cost:
     stored = sum(file.stat().st_size for file in clip.path.rglob("*.exr")) / len(clip)
     return Cost(
         family=Path(job.family).stem,
-        size=(settings.height, settings.width),
+        size=size,
         clips=len(members),
         frames=len(members) * settings.frames,
         setup=setup,

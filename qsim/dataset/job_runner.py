@@ -88,9 +88,10 @@ def render_seed(job: Job) -> int:
 
 
 def choose_budget(job: Job, scene: Scene) -> Budget:
-    """Choose the budget for the wanted error and for the noise of the stream that collects most electrons.
+    """Choose the budget for the wanted error and for the noise of the stream that collects most electrons per frame.
 
-    Streams in lux or with absolute light do not count: their photons are known only after rendering.
+    A code of several clip frames averages their errors, too. Streams in lux or with absolute light do not count: their
+    photons are known only after rendering.
     """
     from qsim.rendering import fidelity
     from qsim.sensor import devices
@@ -100,9 +101,9 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
     for sensing in job.streams:
         if sensing.ppp is not None:
             sensor = devices.load(sensing.sensor, ppp=sensing.ppp, bits=sensing.bits, exposure=1 / settings.frame_rate)
-            share = sensor.efficiency
-            if sensing.ppp * share > electrons:
-                electrons, ppp = sensing.ppp * share, sensing.ppp
+            share, of_frame = sensor.efficiency, sensing.ppp / sensing.planes
+            if of_frame * share > electrons:
+                electrons, ppp = of_frame * share, of_frame
     return fidelity.choose_budget(
         scene,
         frame_rate=settings.frame_rate,

@@ -107,6 +107,33 @@ def test_a_clip_costs_the_choice_of_its_budget_as_well(monkeypatch: pytest.Monke
     assert cost.setup == Seconds(5 + 3 - 2, 2 * (5 + 3 - 2))
 
 
+@pytest.mark.parametrize(
+    ("stream", "frames"),
+    [
+        ("", 3),
+        ("slices = 7", 7),
+        ("slices = 7\nrow_delay = 1e-5", 8),
+        ('sensor = "spad512s"\nbits = 3\ngroup = true\nrow_delay = 1e-5', 8),
+    ],
+)
+def test_streams_of_long_codes_are_measured_with_the_frames_of_a_code(monkeypatch, stream, frames):
+    """A plan of the recipes `rolling` and `readouts` failed: its five frames were too few for one code."""
+    asked = []
+    monkeypatch.setattr(job_runner, "load_scene", lambda job: job)
+    monkeypatch.setattr(job_runner, "choose_budget", lambda job, scene: Budget(8))
+
+    def first_frames(job, budget, path, frames):
+        asked.append(frames)
+        return FakeClip(), [Seconds(1.0, 1.0)] * frames
+
+    monkeypatch.setattr(cost_forecast, "render_first_frames", first_frames)
+    monkeypatch.setattr(cost_forecast, "sense_streams", lambda job, clip: (Seconds(0.0, 0.0), 0.0))
+    sensor = "" if "sensor" in stream else 'sensor = "quiver-physical"\nbits = 3\n'
+    text = RECIPE[: RECIPE.index("[[streams]]")] + f"[[streams]]\n{sensor}ppp = 3.25\n{stream}\n"
+    cost_forecast.measure_kind(list(recipe.parse(text).jobs), Path(), 3)
+    assert asked == [frames]
+
+
 class FakeClip:
     """A clip of one frame that is not stored."""
 

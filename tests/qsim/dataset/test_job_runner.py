@@ -118,3 +118,19 @@ def failing(name: str, step: int, number: int, monkeypatch: pytest.MonkeyPatch):
             yield job_runner.run_job(chosen[0], place, maker)
 
     return run
+
+
+def test_the_budget_hides_behind_the_noise_of_a_clip_frame(monkeypatch):
+    """A code of 7 planes or 12 slices averages the errors of its frames, so each frame has a share of its photons."""
+    from qsim.rendering import fidelity
+
+    asked = []
+    monkeypatch.setattr(fidelity, "choose_budget", lambda scene, **given: asked.append(given))
+    head = '[recipe]\nname = "t"\nframes = 12\nheight = 7\nwidth = 9\n[[scenes]]\nfamily = "fan"\n'
+    summed = '[[streams]]\nsensor = "spad512s"\nbits = 3\ngroup = true\nppp = 14.0\n'
+    sliced = '[[streams]]\nsensor = "quiver-physical"\nbits = 3\nslices = 12\nppp = 36.0\n'
+    for streams, ppp, efficiency in ((summed, 2.0, 0.5), (sliced, 3.0, 0.8), (summed + sliced, 3.0, 0.8)):
+        (job,) = recipe.parse(head + streams).jobs
+        job_runner.choose_budget(job, job_runner.load_scene(job))
+        assert asked[-1]["ppp"] == pytest.approx(ppp)
+        assert asked[-1]["quantum_efficiency"] == pytest.approx(efficiency)

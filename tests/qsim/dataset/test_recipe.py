@@ -206,7 +206,7 @@ def test_streams_that_could_not_be_drawn_fail_before_rendering(tmp_path, render,
 
 @pytest.mark.parametrize("unit", ["ppp = 3.0", "lux = 3.0", "absolute = true"])
 def test_streams_are_checked_without_their_light(unit):
-    """A recipe with every unit of light is accepted; scenes of the user may state bands of their own."""
+    """A recipe with every unit of light is accepted."""
     stream = f'[[streams]]\nsensor = "spad512s"\nbits = 1\n{unit}\n'
     assert parse(HEAD + SCENES + stream).jobs[0].streams
 
