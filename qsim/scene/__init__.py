@@ -6,6 +6,9 @@ from qsim.files import lazy_names
 
 if TYPE_CHECKING:
     from qsim.optics.camera import Camera
+    from qsim.scene.animated.gltf_body import animated_file
+    from qsim.scene.animated.skinning import Joint, Morph, Skinned
+    from qsim.scene.animated.tracks import Clock, Track
     from qsim.scene.deformation import Flag, Ripple
     from qsim.scene.flicker import Flicker, Mains, PulseWidth, RectifiedSine
     from qsim.scene.lights import AreaLamp, Constant, EnvironmentImage, Light, PointLight, SunSky
@@ -42,6 +45,7 @@ __all__ = [
     "Body",
     "Bump",
     "Camera",
+    "Clock",
     "Composition",
     "Conductor",
     "Constant",
@@ -52,12 +56,14 @@ __all__ = [
     "Flag",
     "Flicker",
     "Glow",
+    "Joint",
     "Keyframes",
     "Light",
     "Mains",
     "Material",
     "Mesh",
     "MitsubaFile",
+    "Morph",
     "Motion",
     "NormalMap",
     "Oscillation",
@@ -71,12 +77,15 @@ __all__ = [
     "RoughPlastic",
     "Scene",
     "Shake",
+    "Skinned",
     "Spin",
     "Still",
     "SunSky",
     "Texture",
+    "Track",
     "Translation",
     "Wave",
+    "animated_file",
     "describe",
 ]
 
@@ -88,6 +97,7 @@ __getattr__ = lazy_names(
         "Body": "scene",
         "Bump": "materials",
         "Camera": "scene",
+        "Clock": "animated.tracks",
         "Composition": "motion",
         "Conductor": "materials",
         "Constant": "lights",
@@ -98,12 +108,14 @@ __getattr__ = lazy_names(
         "Flag": "deformation",
         "Flicker": "flicker",
         "Glow": "materials",
+        "Joint": "animated.skinning",
         "Keyframes": "motion",
         "Light": "lights",
         "Mains": "flicker",
         "Material": "materials",
         "Mesh": "scene",
         "MitsubaFile": "scene",
+        "Morph": "animated.skinning",
         "Motion": "motion",
         "NormalMap": "materials",
         "Oscillation": "motion",
@@ -117,12 +129,15 @@ __getattr__ = lazy_names(
         "RoughPlastic": "materials",
         "Scene": "scene",
         "Shake": "motion",
+        "Skinned": "animated.skinning",
         "Spin": "motion",
         "Still": "motion",
         "SunSky": "lights",
         "Texture": "materials",
+        "Track": "animated.tracks",
         "Translation": "motion",
         "Wave": "motion",
+        "animated_file": "animated.gltf_body",
         "describe": "scene",
     },
 )

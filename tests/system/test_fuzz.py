@@ -21,6 +21,7 @@ import pytest
 import raw_planes
 from fakes import RECIPE
 from forks import forked
+from gltf_files import arm
 
 from qsim import files
 from qsim.calibration import sensor_file
@@ -34,6 +35,7 @@ from qsim.dataset import checking, recipe
 from qsim.formats import array_files, detection, images, importing, video
 from qsim.formats.recording import Hints
 from qsim.process import peak_memory
+from qsim.scene import animated_file
 from qsim.sensor import devices
 from qsim.sensor.defects import defect_table
 from qsim.sensor.defects.pixel_array import PixelArray
@@ -195,6 +197,20 @@ def read_detected(folder: Path) -> None:
     assert detection.detect(folder / "a.npy") in detection.LAYOUTS
 
 
+def make_glb(folder: Path) -> None:
+    arm().write(folder / "a.glb")
+
+
+def make_gltf(folder: Path) -> None:
+    arm().write(folder / "a.gltf", "beside")
+
+
+def read_body(folder: Path) -> None:
+    mesh, motion = animated_file(next(folder.glob("a.gl*")), 0.1)
+    assert np.isfinite(motion.deform(0.3)).all()
+    assert motion.deform(0.7).shape == mesh.vertices.shape
+
+
 def read_calibration(folder: Path) -> None:
     sensor_file.read_stack(folder / "a.npy", bits=3, exposure=1e-3, photons=None)
 
@@ -223,6 +239,8 @@ FORMATS: dict[str, tuple[Callable[[Path], None], Callable[[Path], None]]] = {
     "restored": (make_video, read_video),
     "bare codes": (make_counts, read_bare),
     "calibration": (make_counts, read_calibration),
+    "glb": (make_glb, read_body),
+    "gltf": (make_gltf, read_body),
     "recipe": (make_recipe, lambda folder: recipe.load(folder / "r.toml")),
 }
 

@@ -10,7 +10,20 @@ from small_scenes import CAMERA, RATE, plate, renderer, scene, square
 
 from qsim.optics.camera import Camera
 from qsim.rendering.budget import Budget
-from qsim.scene import Body, Diffuse, EnvironmentImage, Mesh, Spin, Still, Texture, Translation
+from qsim.scene import (
+    Body,
+    Diffuse,
+    EnvironmentImage,
+    Joint,
+    Mesh,
+    Pendulum,
+    Skinned,
+    Spin,
+    Still,
+    Texture,
+    Translation,
+)
+from qsim.scene.shapes import sheet
 
 
 def test_a_translating_plate_flows_by_focal_length_times_speed_over_depth():
@@ -133,6 +146,46 @@ def test_a_deforming_body_carries_its_flow():
     x = np.broadcast_to(np.arange(33) + 0.5 - 16.5, (24, 33))[on]
     assert np.abs(frame.flow[0][on] - x * 200.0 / RATE).max() < 0.02
     assert np.abs(frame.flow[1][on]).max() < 0.02
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_flow_of_a_skinned_body_is_that_of_its_points(seed):
+    """Every hit is carried by loops over its triangle's corners, not by the code of skinning, and projected by hand."""
+    rng = np.random.default_rng(seed)
+    cloth = sheet(1.6, 1.4, 5, 3)
+    pivot = (0.1, 0.2, 0.0)
+    bones = (Spin((0.2, 0.1, 1), 300.0, 0.1), Pendulum(pivot, (0, 1, 0.3), 0.4, 90.0))
+    shares = rng.dirichlet((1, 1), len(cloth.vertices))
+    joints = (Joint(bones[0]), Joint(bones[1], 0))
+    carrier = Translation((300.0, -200.0, 100.0))
+    motion = Skinned(cloth.vertices, joints, np.tile([0, 1], (len(shares), 1)), shares, carrier=carrier)
+    views = renderer(scene(Body("wall", square(12, -1)), Body("cloth", cloth, motion=motion)))
+    truth = views.frame(2)
+
+    def place(vertex, t):
+        outer, inner = (bone.pose(t) for bone in bones)
+        both = [outer @ (*cloth.vertices[vertex], 1), outer @ inner @ (*cloth.vertices[vertex], 1)]
+        return (shares[vertex] @ both)[:3] + np.multiply(t, (300.0, -200.0, 100.0))
+
+    now, later = (np.array([place(v, t) for v in range(len(shares))]) for t in (2 / RATE, 3 / RATE))
+    on, seen = truth.body_id == 1, 0
+    for y, x in np.argwhere(on)[::7]:
+        ray = np.array([(x + 0.5 - 16.5), -(y + 0.5 - 12), -CAMERA.focal_pixels]) / CAMERA.focal_pixels
+        matches = []
+        for face in cloth.faces:
+            a, b, c = now[face]
+            d, u, v = np.linalg.solve(np.column_stack([ray, a - b, a - c]), a - (0, 0, 4))
+            if d > 0 and min(u, v, 1 - u - v) > 1e-3:
+                a, b, c = later[face]
+                end = a + u * (b - a) + v * (c - a) - (0, 0, 4)
+                matches.append((d, CAMERA.focal_pixels * np.array([end[0] / -end[2], -end[1] / -end[2]])))
+        if matches:
+            seen += 1
+            end = min(matches, key=lambda match: match[0])[1]
+            start = np.array([x + 0.5 - 16.5, y + 0.5 - 12])
+            np.testing.assert_allclose(truth.flow[:, y, x], end - start, atol=0.02)
+    assert seen > 10
+    assert np.abs(truth.flow[:, on]).max() > 1
 
 
 def test_a_body_behind_the_camera_next_is_not_valid():

@@ -1,0 +1,1 @@
+"""Describes bodies that bones and morph targets deform, and reads them from glTF files."""

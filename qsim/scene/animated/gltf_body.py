@@ -1,0 +1,298 @@
+"""Reads one animated body from a glTF file: its mesh, and the motion of its vertices.
+
+    body.glb -> Mesh, Skinned
+
+All meshes of the file's scene become one mesh. A mesh with a skin follows the joints of the skin; one without follows
+its node. Normals are computed again from the vertices. Materials, cameras and lights of the file are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qsim.scene.animated.gltf_buffers import Document, entries_of, open_document
+from qsim.scene.animated.gltf_nodes import (
+    INDICES,
+    animation_names,
+    chosen_animation,
+    fixed,
+    joints_of,
+    nodes_of,
+    parents_first,
+    tracks_of,
+)
+from qsim.scene.animated.skinning import LARGEST, Joint, Morph, Skinned, check_shares
+from qsim.scene.animated.tracks import Clock, Fixed, Keyed, Track
+from qsim.scene.motion import Motion, Still
+from qsim.scene.rotation import pose_matrix
+from qsim.scene.scene import Mesh
+from qsim.structure import COUNT, Table, expected, is_count, is_number, list_of, mapping_of, structure
+
+GLTF_SUFFIXES = (".glb", ".gltf")
+ROUNDING = 0.01  # by which the weights of a file may differ from a sum of 1: four bytes round by less
+TRIANGLES = 4
+
+ATTRIBUTES = expected("a table of accessors", mapping_of(r"\w+", is_count))
+PRIMITIVE: Table = {
+    "attributes": ATTRIBUTES,
+    "indices, if any": COUNT,
+    "mode, if any": COUNT,
+    "targets, if any": expected("a list of tables", list_of(mapping_of(r"\w+", is_count))),
+}
+MESH: Table = {
+    "primitives": expected("a list of one or more", lambda value: isinstance(value, list) and bool(value)),
+    "weights, if any": expected("a list of numbers", list_of(is_number)),
+}
+SKIN: Table = {"joints": INDICES, "inverseBindMatrices, if any": COUNT}
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """One primitive: vertices in the coordinates of its joints."""
+
+    vertices: np.ndarray  # [V, 3]
+    faces: np.ndarray  # [F, 3]
+    uv: np.ndarray  # [V, 2], NaN where the file has none
+    smooth: bool
+    owners: np.ndarray  # [V, n]
+    shares: np.ndarray  # [V, n]
+    displacements: np.ndarray  # [M, V, 3]
+    weights: Track | None  # [K, M]
+
+
+def animations_in(path: str | Path) -> list[str]:
+    """Return the names of the animations in a .glb or .gltf file; one without a name has its number."""
+    return animation_names(open_document(Path(path)))
+
+
+def animated_file(
+    path: str | Path,
+    size: float | None = None,
+    *,
+    animation: str | None = None,
+    speed: float = 1.0,
+    start: float = 0.0,
+    repeat: bool = True,
+    carrier: Motion | None = None,
+) -> tuple[Mesh, Skinned]:
+    """Return the mesh of a .glb or .gltf file and its motion, centred on the bounding box of the first pose.
+
+    `size` [m] scales the longest side of that pose. `animation` may be left out for a file with one. `start` [s] is the
+    time of the animation at t = 0 and `speed` its rate. At its end it starts again, or with `repeat=False` holds its
+    last pose. `carrier` moves the complete body. `FileNotFoundError` for a missing file or buffer, `ValueError` with
+    the name of the file and the entry for one that is damaged, that has no animation, or whose skin is incomplete.
+    """
+    document = open_document(Path(path))
+    nodes = nodes_of(document)
+    order, parents = parents_first(document, nodes)
+    targets = {i: n for i, node in enumerate(nodes) if (n := _target_count(document, node))}
+    tracks = tracks_of(document, chosen_animation(document, animation), nodes, targets)
+    joints, number = joints_of(document, nodes, tracks, order, parents)
+    shown = [i for i in _shown(document, nodes, order, parents) if "mesh" in nodes[i]]
+    pieces = [piece for i in shown for piece in _pieces(document, i, nodes, tracks, joints, number)]
+    if not pieces:
+        raise ValueError(f"{document.path}: its scene has no mesh")
+    clock = Clock(speed, start, max(float(track.times[-1]) for track in tracks.values()), repeat)
+    return _joined(document, pieces, joints, clock, size, carrier or Still())
+
+
+def _shown(
+    document: Document, nodes: list[dict[str, Any]], order: list[int], parents: Mapping[int, int]
+) -> Iterator[int]:
+    """Yield the nodes of the file's scene; without scenes, all nodes."""
+    scenes = entries_of(document.path, document.content, "scenes")
+    if not scenes:
+        yield from order
+        return
+    about = structure(document.content, {"scene, if any": COUNT}, str(document.path), closed=False)
+    table: Table = {"nodes, if any": INDICES}
+    roots = set(document.entry("scenes", about.get("scene", 0), table, "scene").get("nodes", []))
+    for i in order:
+        if i in roots or parents.get(i) in roots:
+            roots.add(i)
+            yield i
+
+
+def _target_count(document: Document, node: Mapping[str, Any]) -> int:
+    """Return how many morph targets the mesh of a node has."""
+    if "mesh" not in node:
+        return 0
+    mesh = document.entry("meshes", node["mesh"], MESH, "a node")
+    where = f"{document.path}: meshes[{node['mesh']}]"
+    counts = {
+        len(structure(each, PRIMITIVE, f"{where}.primitives[{i}]", closed=False).get("targets", []))
+        for i, each in enumerate(mesh["primitives"])
+    }
+    if len(counts) > 1:
+        raise ValueError(f"{where}: its primitives have {sorted(counts)} morph targets; all need as many")
+    return counts.pop()
+
+
+def _pieces(
+    document: Document,
+    number: int,
+    nodes: list[dict[str, Any]],
+    tracks: Mapping[tuple[int, str], Track],
+    joints: list[Joint],
+    joint_of: Mapping[int, int],
+) -> Iterator[_Piece]:
+    """Yield the primitives of a node; joints that a skin adds are appended to `joints`."""
+    node = nodes[number]
+    mesh = document.entry("meshes", node["mesh"], MESH, f"nodes[{number}]")
+    bones = _bones(document, node["skin"], f"nodes[{number}]", joints, joint_of) if "skin" in node else None
+    for i, each in enumerate(mesh["primitives"]):
+        where = f"meshes[{node['mesh']}].primitives[{i}]"
+        primitive = structure(each, PRIMITIVE, f"{document.path}: {where}", closed=False)
+        attributes = primitive["attributes"]
+        if primitive.get("mode", TRIANGLES) != TRIANGLES:
+            raise ValueError(f"{document.path}: {where} is not made of triangles (mode 4); export triangles")
+        if "POSITION" not in attributes:
+            raise ValueError(f"{document.path}: {where} has no POSITION")
+        vertices = document.array(attributes["POSITION"], where, "VEC3").astype(np.float64)
+        count = len(vertices)
+        if bones is None:
+            owners, shares = np.full((count, 1), joint_of[number]), np.ones((count, 1))
+        else:
+            owners, shares = _influences(document, attributes, where, count, len(bones))
+            owners = bones[owners]
+        uv = np.full((count, 2), np.nan)
+        if "TEXCOORD_0" in attributes:  # v runs down in the file, up in a mesh
+            uv = document.array(attributes["TEXCOORD_0"], where, "VEC2", count) * (1, -1) + (0, 1)
+        displacements = np.array(
+            [
+                document.array(target["POSITION"], where, "VEC3", count)
+                if "POSITION" in target
+                else np.zeros((count, 3))
+                for target in primitive.get("targets", [])
+            ],
+            np.float64,
+        ).reshape(-1, count, 3)
+        weights = _weights(document, number, node, mesh, tracks, len(displacements)) if len(displacements) else None
+        faces = _faces(document, primitive, where, count)
+        yield _Piece(vertices, faces, uv, "NORMAL" in attributes, owners, shares, displacements, weights)
+
+
+def _bones(document: Document, skin: int, by: str, joints: list[Joint], joint_of: Mapping[int, int]) -> np.ndarray:
+    """Return the joints of a skin, each behind its node and with its inverse bind matrix; they are appended."""
+    about = document.entry("skins", skin, SKIN, by)
+    missing = [node for node in about["joints"] if node not in joint_of]
+    if missing or not about["joints"]:
+        raise ValueError(f"{document.path}: skins[{skin}]: its joints need nodes, found {(missing or ['none'])[0]}")
+    binds = np.tile(np.eye(4).ravel(), (len(about["joints"]), 1))
+    if "inverseBindMatrices" in about:
+        binds = document.array(about["inverseBindMatrices"], f"skins[{skin}]", "MAT4", len(binds))
+    first, where = len(joints), f"{document.path}: skins[{skin}]"
+    joints += [Joint(fixed(where, bind), joint_of[node]) for node, bind in zip(about["joints"], binds, strict=True)]
+    return np.arange(first, len(joints))
+
+
+def _influences(
+    document: Document, attributes: Mapping[str, int], where: str, count: int, joints: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the joints [V, n] of a skin and the weights [V, n] of its vertices, from all sets of four."""
+    sets = [i for i in range(len(attributes)) if f"JOINTS_{i}" in attributes or f"WEIGHTS_{i}" in attributes]
+    for i in sets or [0]:
+        for name in (f"JOINTS_{i}", f"WEIGHTS_{i}"):
+            if name not in attributes:
+                raise ValueError(f"{document.path}: {where} has a skin but no {name}")
+    owners, shares = (
+        np.concatenate([document.array(attributes[f"{name}_{i}"], where, "VEC4", count) for i in sets], axis=1)
+        for name in ("JOINTS", "WEIGHTS")
+    )
+    if owners.dtype != np.int64:
+        raise ValueError(f"{document.path}: {where}: JOINTS are whole numbers, found an accessor of other numbers")
+    return owners, check_shares(f"{document.path}: {where}", owners, shares, count, joints, ROUNDING)
+
+
+def _weights(
+    document: Document,
+    number: int,
+    node: Mapping[str, Any],
+    mesh: Mapping[str, Any],
+    tracks: Mapping[tuple[int, str], Track],
+    targets: int,
+) -> Track:
+    """Return the morph weights of a node: animated, its own, those of its mesh, or zeros."""
+    if (number, "weights") in tracks:
+        return tracks[number, "weights"]
+    found = node.get("weights", mesh.get("weights", [0.0] * targets))
+    if len(found) != targets:
+        raise ValueError(f"{document.path}: nodes[{number}]: {len(found)} weights for {targets} morph targets")
+    return Track.constant(found)
+
+
+def _faces(document: Document, primitive: Mapping[str, Any], where: str, count: int) -> np.ndarray:
+    """Return triangles [F, 3]."""
+    if "indices" not in primitive:
+        corners = np.arange(count)
+    else:
+        corners = document.array(primitive["indices"], where, "SCALAR")[:, 0]
+    if len(corners) % 3 or corners.dtype != np.int64 or corners.max() >= count or corners.min() < 0:
+        raise ValueError(f"{document.path}: {where}: triangles need three indices each, of its {count} vertices")
+    return corners.reshape(-1, 3)
+
+
+def _joined(
+    document: Document, pieces: list[_Piece], joints: list[Joint], clock: Clock, size: float | None, carrier: Motion
+) -> tuple[Mesh, Skinned]:
+    """Return all pieces as one mesh and one motion, centred and scaled."""
+    if size is not None and not 0 < size < np.inf:
+        raise ValueError(f"animated_file: size must be a length above 0 [m], got {size!r}")
+    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)]).tolist()
+    most = max(piece.owners.shape[1] for piece in pieces)
+    wide = [((0, 0), (0, most - piece.owners.shape[1])) for piece in pieces]
+    raw = Skinned(
+        np.concatenate([piece.vertices for piece in pieces]),
+        tuple(joints),
+        np.concatenate([np.pad(piece.owners, pad) for piece, pad in zip(pieces, wide, strict=True)]),
+        np.concatenate([np.pad(piece.shares, pad) for piece, pad in zip(pieces, wide, strict=True)]),
+        tuple(
+            Morph(start, piece.displacements, piece.weights)
+            for start, piece in zip(starts, pieces, strict=False)
+            if piece.weights is not None
+        ),
+    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        reach, moment = _reach(raw), clock.at(0.0)
+    if not reach <= LARGEST:
+        raise ValueError(f"{document.path}: its numbers let vertices move {reach:.2g} m away, beyond {LARGEST:g} m")
+    first = raw.deform(moment)
+    low, high = first.min(0), first.max(0)
+    longest = float((high - low).max())
+    if not longest > 0:
+        raise ValueError(f"{document.path}: all its vertices lie in one point")
+    scale = 1.0 if size is None else size / longest
+    if not 2 * reach * scale <= LARGEST:
+        raise ValueError(f"{document.path}: scaled by {scale:.2g} to {size:g} m, it moves beyond {LARGEST:g} m")
+    place = Fixed(pose_matrix(scale * np.eye(3), -scale * (low + high) / 2))
+    motion = replace(raw, joints=(Joint(place), *raw.joints[1:]), clock=clock, carrier=carrier)
+    vertices = motion.deform(0.0)
+    uv = np.concatenate([piece.uv for piece in pieces])
+    uv = np.where(np.isnan(uv), vertices[:, :2] / (longest * scale) + 0.5, uv)
+    mirrored = np.linalg.det(motion.matrices(moment)[:, :3, :3]) < 0
+    faces = [
+        (piece.faces[:, ::-1] if mirrored[piece.owners[0, 0]] else piece.faces) + start
+        for piece, start in zip(pieces, starts, strict=False)
+    ]
+    return Mesh(vertices, np.concatenate(faces), uv, all(piece.smooth for piece in pieces)), motion
+
+
+def _reach(body: Skinned) -> float:
+    """Return a distance [m] from the origin that no vertex exceeds at any time."""
+    grown: list[tuple[float, float]] = []  # factor and shift of each joint
+    for joint in body.joints:
+        assert isinstance(joint.motion, Keyed | Fixed)
+        factor, shift = joint.motion.bounds()
+        above = grown[joint.parent] if joint.parent >= 0 else (1.0, 0.0)
+        grown.append((above[0] * factor, above[0] * shift + above[1]))
+    farthest = float(np.linalg.norm(body.rest, axis=1).max())
+    for morph in body.morphs:
+        longest = np.linalg.norm(morph.displacements, axis=2).max(axis=1)
+        farthest += float(longest.sum()) * morph.weights.largest()
+    factors, shifts = np.array(grown)[np.unique(body.owners)].T
+    return float(np.max(factors * farthest + shifts))  # NaN if one is

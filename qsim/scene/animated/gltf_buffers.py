@@ -1,0 +1,214 @@
+"""Reads the container of glTF 2.0: .glb or .gltf, its JSON, buffers in the file or beside it, and its arrays.
+
+    file -> Document -> array [count, numbers] of an accessor
+
+Every index, offset and size is checked before anything is read, and every message names the file and the entry.
+Source: Khronos, glTF 2.0 specification, sections 3.6 and 4.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from qsim.checks import require_finite
+from qsim.parsing import parse_json
+from qsim.structure import COUNT, FLAG, TEXT, WHOLE, Table, expected, structure
+
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+# What a file may require: these change materials or the type of numbers, which are read in any type.
+KNOWN_EXTENSIONS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_punctual", "KHR_mesh_quantization")
+
+COMPONENT = expected(f"one of {', '.join(map(str, TYPES))}", lambda value: type(value) is int and value in TYPES)
+SHAPE = expected(f"one of {', '.join(NUMBERS)}", lambda value: isinstance(value, str) and value in NUMBERS)
+ACCESSOR: Table = {
+    "componentType": COMPONENT,
+    "count": WHOLE,
+    "type": SHAPE,
+    "bufferView, if any": COUNT,
+    "byteOffset, if any": COUNT,
+    "normalized, if any": FLAG,
+    "sparse, if any": {
+        "count": WHOLE,
+        "indices": {"bufferView": COUNT, "componentType": COMPONENT, "byteOffset, if any": COUNT},
+        "values": {"bufferView": COUNT, "byteOffset, if any": COUNT},
+    },
+}
+VIEW: Table = {"buffer": COUNT, "byteLength": WHOLE, "byteOffset, if any": COUNT, "byteStride, if any": WHOLE}
+BUFFER: Table = {"byteLength": WHOLE, "uri, if any": TEXT}
+
+
+@dataclass(frozen=True, eq=False)
+class Document:
+    """The JSON of a file and its buffers."""
+
+    path: Path
+    content: dict[str, Any]
+    buffers: tuple[bytes, ...]
+
+    def entry(self, kind: str, index: int, table: Table, by: str) -> dict[str, Any]:
+        """Return entry `index` of a list, checked; `by` names who asks for it."""
+        entries = entries_of(self.path, self.content, kind)
+        if index >= len(entries):
+            raise ValueError(f"{self.path}: {by} names {kind}[{index}]; there are {len(entries)}")
+        return structure(entries[index], table, f"{self.path}: {kind}[{index}]", closed=False)
+
+    def array(self, index: int, by: str, shape: str, count: int | None = None) -> np.ndarray:
+        """Return an accessor of this shape, float64 or int64 [count, numbers]; normalized numbers become -1 .. 1.
+
+        `count` is the expected number of elements; an accessor without data is zero and needs it.
+        """
+        where = f"accessors[{index}]"
+        about = self.entry("accessors", index, ACCESSOR, by)
+        if about["type"] != shape or count not in (None, about["count"]):
+            raise ValueError(
+                f"{self.path}: {by} needs {'' if count is None else f'{count} of '}{shape}, "
+                f"but {where} has {about['count']} of {about['type']}"
+            )
+        kind, numbers = np.dtype(TYPES[about["componentType"]]), NUMBERS[shape]
+        if "bufferView" in about:
+            start = about.get("byteOffset", 0)
+            values = self._elements(about["bufferView"], start, about["count"], numbers, kind, where)
+        elif count is None:
+            raise ValueError(f"{self.path}: {where} has no bufferView, so {by} has no numbers")
+        else:
+            values = np.zeros((count, numbers), kind)
+        if "sparse" in about:
+            values = self._patched(values, about["sparse"], where)
+        if kind.kind == "f":
+            require_finite(f"{self.path}: {where}", values)
+        if not about.get("normalized", False):
+            return values.astype(np.float64 if kind.kind == "f" else np.int64)
+        if kind.kind == "f":
+            raise ValueError(f"{self.path}: {where} is of float numbers, which cannot be normalized")
+        return np.maximum(values / float(np.iinfo(kind).max), -1.0)
+
+    def _patched(self, values: np.ndarray, sparse: Mapping[str, Any], where: str) -> np.ndarray:
+        """Return the values with some replaced, of a sparse accessor."""
+        count, indices = sparse["count"], sparse["indices"]
+        if count > len(values) or TYPES[indices["componentType"]][1] != "u":
+            raise ValueError(f"{self.path}: {where}: sparse needs unsigned indices, at most as many as values")
+        places = self._elements(
+            indices["bufferView"],
+            indices.get("byteOffset", 0),
+            count,
+            1,
+            np.dtype(TYPES[indices["componentType"]]),
+            where,
+        )[:, 0]
+        start = sparse["values"].get("byteOffset", 0)
+        changed = self._elements(sparse["values"]["bufferView"], start, count, values.shape[1], values.dtype, where)
+        if places.max() >= len(values):
+            raise ValueError(f"{self.path}: {where}: sparse index {places.max()}; there are {len(values)} values")
+        values = values.copy()
+        values[places] = changed
+        return values
+
+    def _elements(self, view: int, offset: int, count: int, numbers: int, kind: np.dtype, where: str) -> np.ndarray:
+        about = self.entry("bufferViews", view, VIEW, where)
+        if about["buffer"] >= len(self.buffers):
+            raise ValueError(f"{self.path}: bufferViews[{view}] names buffers[{about['buffer']}], which does not exist")
+        data, start = self.buffers[about["buffer"]], about.get("byteOffset", 0)
+        size = numbers * kind.itemsize
+        stride = about.get("byteStride", size)
+        end = offset + stride * (count - 1) + size
+        if stride < size or end > about["byteLength"] or start + about["byteLength"] > len(data):
+            raise ValueError(
+                f"{self.path}: {where} reaches byte {start + end} of buffers[{about['buffer']}]; "
+                f"bufferViews[{view}] holds {about['byteLength']} bytes from {start}, the buffer {len(data)}"
+            )
+        return np.ndarray((count, numbers), kind, data, start + offset, (stride, kind.itemsize))
+
+
+def open_document(path: Path) -> Document:
+    """Return a .glb or .gltf file of version 2; `FileNotFoundError`, or `ValueError` with the name of the file."""
+    if not path.is_file():
+        raise FileNotFoundError(f"mesh {path}: no such file")
+    raw = path.read_bytes()
+    text, chunk = _chunks(path, raw) if raw[:4] == b"glTF" else (raw, None)
+    try:
+        content = parse_json(path, text.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: neither a .glb nor a .gltf file: {error.reason} at byte {error.start}") from None
+    version = structure(content, {"asset": {"version": TEXT}}, str(path), closed=False)["asset"]["version"]
+    if not version.startswith("2."):
+        raise ValueError(f"{path}: glTF of version {version[:20]}; version 2.0 is read")
+    needed = content.get("extensionsRequired", [])
+    if not isinstance(needed, list) or not all(isinstance(name, str) for name in needed):
+        raise ValueError(f"{path}: extensionsRequired: expected a list of names")
+    unknown = [name for name in needed if not name.startswith(KNOWN_EXTENSIONS)]
+    if unknown:
+        raise ValueError(f"{path}: needs the extension {unknown[0]:.60}, which is not read; export without it")
+    buffers = entries_of(path, content, "buffers")
+    return Document(path, content, tuple(_buffer(path, i, each, chunk) for i, each in enumerate(buffers)))
+
+
+def entries_of(path: Path, content: Mapping[str, Any], kind: str) -> list[Any]:
+    """Return a list of the document, empty if it is missing."""
+    found = content.get(kind, [])
+    if not isinstance(found, list):
+        raise ValueError(f"{path}: {kind}: expected a list, got a {type(found).__name__}")
+    return found
+
+
+def _chunks(path: Path, raw: bytes) -> tuple[bytes, bytes | None]:
+    """Return the JSON of a .glb file, and its binary chunk if it has one."""
+    if len(raw) < 20:
+        raise ValueError(f"{path}: {len(raw)} bytes are no .glb file; it is truncated")
+    _, version, length = struct.unpack_from("<4sII", raw)
+    if version != 2:
+        raise ValueError(f"{path}: glTF container of version {version}; version 2 is read")
+    if length > len(raw):
+        raise ValueError(f"{path}: truncated: {len(raw)} bytes of {length}")
+    chunks, at = [], 12
+    while at + 8 <= length:
+        size, kind = struct.unpack_from("<II", raw, at)
+        if at + 8 + size > length:
+            raise ValueError(f"{path}: the chunk at byte {at} reaches beyond the end of the file; it is damaged")
+        chunks.append((kind, raw[at + 8 : at + 8 + size]))
+        at += 8 + size
+    if not chunks or chunks[0][0] != JSON_CHUNK:
+        raise ValueError(f"{path}: the first chunk of a .glb file is JSON; this one is not, it is damaged")
+    binary = [data for kind, data in chunks[1:2] if kind == BINARY_CHUNK]
+    return chunks[0][1], binary[0] if binary else None
+
+
+def _buffer(path: Path, index: int, entry: Any, chunk: bytes | None) -> bytes:
+    where = f"{path}: buffers[{index}]"
+    about = structure(entry, BUFFER, where, closed=False)
+    uri = about.get("uri")
+    if uri is None:
+        if index or chunk is None:
+            raise ValueError(f"{where}: the buffer is missing: no uri, and no binary chunk in the file")
+        data = chunk
+    elif uri.startswith("data:"):
+        try:
+            data = base64.b64decode(uri.partition(";base64,")[2], validate=True)
+        except (binascii.Error, ValueError):
+            raise ValueError(f"{where}: its data: uri is not base64; the file is damaged") from None
+    else:
+        data = _file_beside(path, where, uri)
+    if len(data) < about["byteLength"]:
+        raise ValueError(f"{where}: {len(data)} bytes, but {about['byteLength']} are stated; the file is truncated")
+    return data
+
+
+def _file_beside(path: Path, where: str, uri: str) -> bytes:
+    name = unquote(uri)
+    if ":" in uri.partition("/")[0] or "\0" in name:
+        raise ValueError(f"{where}: uri {uri[:60]!r}; the name of a file beside it is expected")
+    target = path.parent / name
+    try:
+        return target.read_bytes()
+    except OSError as error:
+        raise FileNotFoundError(f"{where}: the buffer is missing: {target}: {error.strerror}") from None
