@@ -55,7 +55,7 @@ _ALSO_CALLED = {
 OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
     "networks": (
         ("torch", "safetensors", "tensorboard"),
-        "networks, qbp and transform-denoise: all commands of quiver",
+        "networks and path-merge: all commands of quiver",
     ),
     "video": (("av",), "video files: qsim convert, qsim preview"),
     "formats": (("zarr", "h5py"), "Zarr and HDF5 files: qsim convert, qsim calibrate"),

@@ -18,11 +18,15 @@ used: its licence forbids commercial use.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy import ndarray as Array
-from torch import Tensor
+
+from quiver.baselines.arrays import add_at, single, smallest, strided, whole, xp, zeros
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 BLOCK = 8  # pixels, side of a block
 AREA = BLOCK * BLOCK
@@ -59,13 +63,12 @@ def denoise(image: Array, sigma: float, *, peak: float = 1.0, profile: Profile =
         return image.astype(np.float32)
     grey = 255.0 / peak
     level = float(image.mean(dtype=np.float64))  # subtracted: float32 loses less
-    noisy = torch.from_numpy(pad((image - level) * grey).astype(np.float32))
-    with torch.no_grad():
-        coefficients = block_table(noisy)
-        basic = aggregate(*threshold_step(coefficients, noisy.shape, sigma * grey, profile), noisy.shape)
-        final = aggregate(*wiener_step(coefficients, basic, sigma * grey, profile), noisy.shape)
+    noisy = single(pad((image - level) * grey))
+    coefficients = block_table(noisy)
+    basic = aggregate(*threshold_step(coefficients, noisy.shape, sigma * grey, profile), noisy.shape)
+    final = aggregate(*wiener_step(coefficients, basic, sigma * grey, profile), noisy.shape)
     height, width = image.shape
-    return (final[:height, :width] / grey + level).numpy()
+    return np.asarray(final[:height, :width] / grey + level)
 
 
 def pad(image: Array) -> Array:
@@ -79,7 +82,7 @@ def dct_matrix() -> Tensor:
     n = np.arange(BLOCK)
     one = np.cos(np.pi * (2 * n[None, :] + 1) * n[:, None] / (2 * BLOCK)) * np.sqrt(2 / BLOCK)
     one[0] /= np.sqrt(2)
-    return torch.from_numpy(np.kron(one, one).astype(np.float32))
+    return single(np.kron(one, one))
 
 
 def wavelet_matrix() -> Tensor:
@@ -94,7 +97,7 @@ def wavelet_matrix() -> Tensor:
         one[:size] = level @ one[:size]
         size //= 2
     one /= np.linalg.norm(one, axis=1, keepdims=True)
-    return torch.from_numpy(np.kron(one, one).astype(np.float32))
+    return single(np.kron(one, one))
 
 
 def haar_matrix(size: int) -> Tensor:
@@ -103,10 +106,10 @@ def haar_matrix(size: int) -> Tensor:
     while len(matrix) < size:
         fine = np.kron(np.eye(len(matrix)), [1, -1])
         matrix = np.concatenate([np.kron(matrix, [1, 1]), fine]) / np.sqrt(2)
-    return torch.from_numpy(matrix.astype(np.float32))
+    return single(matrix)
 
 
-def table_size(shape: torch.Size) -> tuple[int, int, int, int]:
+def table_size(shape: tuple[int, ...]) -> tuple[int, int, int, int]:
     """Return tiles down and across, and height and width of the table of positions: the image's, with a border for the
     search.
     """
@@ -117,18 +120,20 @@ def table_size(shape: torch.Size) -> tuple[int, int, int, int]:
 def block_table(image: Tensor) -> Tensor:
     """Return the DCT of the block at every position: rows [table height * table width, 64]; zeros outside the image."""
     _, _, height, width = table_size(image.shape)
-    table = torch.zeros(height, width, AREA)
-    blocks = image.unfold(0, BLOCK, 1).unfold(1, BLOCK, 1)  # [positions down, across, 8, 8], a view
+    table = zeros(height, width, AREA)
+    side = image.shape[1]
+    shape = image.shape[0] - BLOCK + 1, side - BLOCK + 1, BLOCK, BLOCK
+    blocks = strided(image, shape, (side, 1, side, 1))  # [positions down, across, 8, 8], a view
     basis = dct_matrix().T
     for y, row in enumerate(blocks):
         table[y + RADIUS, RADIUS : RADIUS + len(row)] = row.reshape(-1, AREA) @ basis
-    return table.view(-1, AREA)
+    return table.reshape(-1, AREA)
 
 
-def inside_image(shape: torch.Size) -> Tensor:
+def inside_image(shape: tuple[int, ...]) -> Tensor:
     """Return which positions of the table [height, width] hold a block of the image."""
     _, _, height, width = table_size(shape)
-    inside = torch.zeros(height, width, dtype=torch.bool)
+    inside = xp.zeros((height, width), dtype=xp.bool)
     inside[RADIUS : RADIUS + shape[0] - BLOCK + 1, RADIUS : RADIUS + shape[1] - BLOCK + 1] = True
     return inside
 
@@ -141,97 +146,102 @@ class Matches:
     size: Tensor  # [references], blocks of the stack that count: a power of two
 
 
-def match_blocks(table: Tensor, norm: Tensor, tile_row: int, shape: torch.Size, stack: int, limit: float) -> Matches:
+def match_blocks(
+    table: Tensor, norm: Tensor, tile_row: int, shape: tuple[int, ...], stack: int, limit: float
+) -> Matches:
     """Return the most similar blocks within the search window of every reference block in one row of tiles."""
     _, across, _, width = table_size(shape)
     top, jump = tile_row * TILE * STEP, TILE * STEP
-    view = table.as_strided((across, REACH, REACH, AREA), (jump * AREA, width * AREA, AREA, 1), top * width * AREA)
+    view = strided(table, (across, REACH, REACH, AREA), (jump * AREA, width * AREA, AREA, 1), top * width * AREA)
     candidates = view.reshape(across, REACH * REACH, AREA)
     reference = view[:, RADIUS : -RADIUS or None : STEP, RADIUS : -RADIUS or None : STEP]
     reference = reference.reshape(across, TILE * TILE, AREA)
-    far = norm.as_strided((across, 1, REACH, REACH), (jump, 0, width, 1), top * width)
-    distance = torch.bmm(reference, candidates.transpose(1, 2)).view(across, TILE * TILE, REACH, REACH)
-    distance = distance.mul_(-2).add_(far)  # the reference's own norm is added to its winners below
+    far = strided(norm, (across, 1, REACH, REACH), (jump, 0, width, 1), top * width)
+    distance = (reference @ candidates.mT).reshape(across, TILE * TILE, REACH, REACH)
+    distance *= -2
+    distance += far  # the reference's own norm is added to its winners below
     # From the region of the tile to the window of each block: windows of neighbours lie STEP positions apart.
     side = 2 * RADIUS + 1
     area = REACH * REACH
-    window = distance.as_strided(
+    window = strided(
+        distance,
         (across, TILE, TILE, side, side),
         (TILE * TILE * area, TILE * area + STEP * REACH, area + STEP, REACH, 1),
     ).reshape(across, TILE, TILE, side * side)
     window[..., side * RADIUS + RADIUS] = -FAR
-    best, index = window.topk(stack, largest=False)
-    corner = top * width + torch.arange(across)[:, None, None] * jump
-    corner = corner + torch.arange(TILE)[:, None] * STEP * width + torch.arange(TILE) * STEP
+    best, index = smallest(window, stack)
+    corner = top * width + xp.arange(across)[:, None, None] * jump
+    corner = corner + xp.arange(TILE)[:, None] * STEP * width + xp.arange(TILE) * STEP
     position = corner[..., None] + index // side * width + index % side
-    own = norm.view(-1)[position[..., 0]]
+    own = norm.reshape(-1)[position[..., 0]]
     similar = (best + own[..., None] <= limit * AREA).sum(-1)
     exists = own < FAR
-    size = 2 ** torch.log2(similar.clamp(min=1).float()).floor().long()
+    size = 2 ** whole(xp.floor(xp.log2(xp.clip(similar, 1, None))))
     return Matches(position[exists], size[exists])
 
 
-def norms(table: Tensor, shape: torch.Size) -> Tensor:
+def norms(table: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Return the squared length of every row [table height, width]; FAR outside the image."""
     inside = inside_image(shape)
-    return table.square().sum(1).view(inside.shape).masked_fill_(~inside, FAR)
+    return xp.where(inside, xp.square(table).sum(1).reshape(inside.shape), FAR)
 
 
-def similar_blocks(table: Tensor, shape: torch.Size, stack: int, limit: float) -> list[Tensor]:
+def similar_blocks(table: Tensor, shape: tuple[int, ...], stack: int, limit: float) -> list[Tensor]:
     """Return all stacks as positions [n, size], one tensor per size and row of tiles."""
     norm, found = norms(table, shape), []
     for tile_row in range(table_size(shape)[0]):
         matches = match_blocks(table, norm, tile_row, shape, stack, limit)
-        for size in matches.size.unique().tolist():
+        for size in np.unique(matches.size).tolist():
             found.append(matches.position[matches.size == size][:, :size])
     return found
 
 
-def threshold_step(table: Tensor, shape: torch.Size, sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
+def threshold_step(table: Tensor, shape: tuple[int, ...], sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
     """Return sums of weighted rows [positions, 64] after hard thresholding, and of their weights [positions]."""
-    total, weights = torch.zeros_like(table), torch.zeros(len(table))
+    total, weights = xp.zeros_like(table), zeros(len(table))
     to_wavelet = wavelet_matrix() @ dct_matrix().T
     wavelets = table @ to_wavelet.T
     for position in similar_blocks(table, shape, profile.stack, profile.limit + 2 * sigma**2):
         haar = haar_matrix(position.shape[1])
-        stack = torch.einsum("ab,nbk->nak", haar, wavelets[position])
-        mean = stack[:, 0, 0].clone()
-        stack.masked_fill_(stack.abs() < profile.threshold * sigma, 0)
-        stack[:, 0, 0] = mean
-        weight = 1 / (sigma**2 * torch.count_nonzero(stack, (1, 2)).clamp(min=1))
-        add_blocks(total, weights, position, torch.einsum("ab,nak->nbk", haar, stack), weight)
-    return total @ torch.linalg.inv(to_wavelet).T, weights
+        stack = haar @ wavelets[position]
+        small = xp.abs(stack) < profile.threshold * sigma
+        small[:, 0, 0] = False
+        stack[small] = 0
+        weight = 1 / (sigma**2 * xp.clip(xp.count_nonzero(stack, (1, 2)), 1, None))
+        add_blocks(total, weights, position, haar.T @ stack, weight)
+    return total @ xp.linalg.inv(to_wavelet).T, weights
 
 
 def wiener_step(table: Tensor, basic: Tensor, sigma: float, profile: Profile) -> tuple[Tensor, Tensor]:
     """Return the same sums after an empirical Wiener filter, whose spectrum comes from the basic estimate."""
-    total, weights = torch.zeros_like(table), torch.zeros(len(table))
+    total, weights = xp.zeros_like(table), zeros(len(table))
     pilot_table = block_table(basic)
     for position in similar_blocks(pilot_table, basic.shape, profile.second_stack, profile.second_limit):
         haar = haar_matrix(position.shape[1])
-        power = torch.einsum("ab,nbk->nak", haar, pilot_table[position]).square_()
+        power = xp.square(haar @ pilot_table[position])
         gain = power / (power + sigma**2)
         gain[:, 0, 0] = 1
-        weight = 1 / (sigma**2 * gain.square().sum((1, 2)))
-        stack = gain.mul_(torch.einsum("ab,nbk->nak", haar, table[position]))
-        add_blocks(total, weights, position, torch.einsum("ab,nak->nbk", haar, stack), weight)
+        weight = 1 / (sigma**2 * xp.square(gain).sum((1, 2)))
+        stack = gain * (haar @ table[position])
+        add_blocks(total, weights, position, haar.T @ stack, weight)
     return total, weights
 
 
 def add_blocks(total: Tensor, weights: Tensor, position: Tensor, stack: Tensor, weight: Tensor) -> None:
     """Add weighted stacks [n, size, 64] to the running sums, at their positions."""
-    total.index_add_(0, position.flatten(), (stack * weight[:, None, None]).flatten(0, 1))
-    weights.index_add_(0, position.flatten(), weight[:, None].expand_as(position).flatten())
+    weight = single(weight)[:, None]
+    add_at(total, position.reshape(-1), (stack * weight[..., None]).reshape(-1, AREA))
+    add_at(weights, position.reshape(-1), xp.broadcast_to(weight, position.shape).reshape(-1))
 
 
-def aggregate(total: Tensor, weights: Tensor, shape: torch.Size) -> Tensor:
+def aggregate(total: Tensor, weights: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Return the weighted mean of all overlapping filtered blocks: an image of this shape."""
     height, width = table_size(shape)[2:]
-    kaiser = torch.from_numpy(np.kaiser(BLOCK, KAISER).astype(np.float32))
-    kaiser = torch.outer(kaiser, kaiser).flatten()
-    pixels = (dct_matrix().T @ total.T).mul_(kaiser[:, None]).view(AREA, height, width)
-    weight = weights.view(height, width)
-    above, below = torch.zeros(2, height + BLOCK - 1, width + BLOCK - 1).unbind()
+    kaiser = single(np.kaiser(BLOCK, KAISER))
+    kaiser = xp.outer(kaiser, kaiser).reshape(-1)
+    pixels = (dct_matrix().T @ total.T * kaiser[:, None]).reshape(AREA, height, width)
+    weight = weights.reshape(height, width)
+    above, below = zeros(2, height + BLOCK - 1, width + BLOCK - 1)
     for k in range(AREA):
         y, x = divmod(k, BLOCK)
         above[y : y + height, x : x + width] += pixels[k]

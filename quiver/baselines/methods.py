@@ -5,7 +5,7 @@
 
 With a range `frames`, only these are restored, also from the frames around them. Any number of frames and any size is
 allowed; a clip is continued by reflection at both ends. METHODS is the complete list; the module of a method has its
-other settings. Methods that align patches or use BM3D import torch when they run; the others never do.
+other settings. Path merge needs torch; QBP and BM3D use it where it is installed (arrays.py).
 """
 
 from __future__ import annotations

@@ -15,10 +15,12 @@ reference to the other image: reference(p) is like other(p + shift).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
+from quiver.baselines.arrays import mixed, single, whole, xp, zeros
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 MULTIPLE = 64  # of the sides of an image, which pyramid and patch sizes divide
 
@@ -37,96 +39,101 @@ class Level:
 # Finest first. The integer search alone reaches 8 * 8 + 4 * 2 + 1 = 73 pixels.
 LEVELS = (Level(1, 16, 8, 1, False), Level(2, 16, 16, 4, True), Level(4, 8, 8, 8, True))
 ITERATIONS = 3  # of Lucas-Kanade
+TIE = 1e-5  # mean absolute difference per pixel, in units of the top code, below which two shifts are equally good
 
 
 def pad_image(image: Tensor) -> Tensor:
     """Return the image with bottom and right replicated until both sides are multiples of 64."""
-    height, width = image.shape
-    return pad(image[None, None], (0, -width % MULTIPLE, 0, -height % MULTIPLE), mode="replicate")[0, 0]
+    y, x = (xp.clip(xp.arange(side + -side % MULTIPLE), None, side - 1) for side in image.shape)
+    return image[y[:, None], x[None]]
 
 
 def pyramid(image: Tensor, levels: tuple[Level, ...] = LEVELS) -> list[Tensor]:
     """Return box means of an image [H, W] with sides that are multiples of 64, finest first."""
     images = [image]
     for level in levels[1:]:
-        images.append(avg_pool2d(images[-1][None], level.ratio)[0])
+        fine, step = images[-1], level.ratio
+        images.append(sum((fine[y::step, x::step] for y in range(step) for x in range(step)), zeros(1)) / step**2)
     return images
 
 
-def grid(shape: torch.Size, level: Level) -> tuple[Tensor, int, int]:
+def grid(shape: tuple[int, ...], level: Level) -> tuple[Tensor, int, int]:
     """Return the upper left corners [2, N] (y, x) of the patches in raster order, and their number down and across."""
     down, across = ((side - level.patch) // level.stride + 1 for side in shape)
-    y, x = torch.meshgrid(torch.arange(down), torch.arange(across), indexing="ij")
-    return torch.stack([y.flatten(), x.flatten()]) * level.stride, down, across
+    y, x = xp.meshgrid(xp.arange(down), xp.arange(across), indexing="ij")
+    return xp.stack([y.reshape(-1), x.reshape(-1)]) * level.stride, down, across
 
 
 def gather(image: Tensor, corner: Tensor, size: int) -> Tensor:
     """Return squares [size, size, N] with these upper left corners [2, N]; outside, the border repeats."""
     height, width = image.shape
-    step = torch.arange(size)
-    y = (corner[0] + step[:, None]).clamp_(0, height - 1) * width
-    x = (corner[1] + step[:, None]).clamp_(0, width - 1)
-    return image.flatten()[y[:, None] + x[None]]
+    step = xp.arange(size)
+    y = xp.clip(corner[0] + step[:, None], 0, height - 1) * width
+    x = xp.clip(corner[1] + step[:, None], 0, width - 1)
+    return image.reshape(-1)[y[:, None] + x[None]]
 
 
 def search(patches: Tensor, other: Tensor, corner: Tensor, centre: Tensor, radius: int) -> tuple[Tensor, Tensor]:
     """Return the best integer shift [2, N] within `radius` of each `centre`, and its sum of absolute differences [N].
 
-    Only shifts that keep the patch inside the image count; among equals the first in raster order.
+    Only shifts that keep the patch inside the image count; among equals the first in raster order. Sums of few-bit codes
+    are often equal, and rounding, which differs between machines, must not choose.
     """
-    size, limit = patches.shape[0], torch.tensor(other.shape)[:, None]
+    size, limit = patches.shape[0], xp.asarray(other.shape)[:, None]
     low, high = -corner, limit - patches.shape[0] - corner
-    centre = torch.maximum(torch.minimum(centre, high + radius), low - radius)
+    centre = xp.maximum(xp.minimum(centre, high + radius), low - radius)
     window = gather(other, corner + centre - radius, size + 2 * radius)
-    best, least = centre.clone(), torch.full(corner.shape[1:], torch.inf)
+    best, least = centre, xp.full(corner.shape[1:], xp.inf, dtype=xp.float32)
     for v in range(2 * radius + 1):
         for u in range(2 * radius + 1):
-            shift = centre + torch.tensor([[v - radius], [u - radius]])
-            cost = (window[v : v + size, u : u + size] - patches).abs_().sum((0, 1))
-            better = (cost < least) & ((shift >= low) & (shift <= high)).all(0)
-            best, least = torch.where(better, shift, best), torch.where(better, cost, least)
+            shift = centre + xp.asarray([[v - radius], [u - radius]])
+            cost = xp.abs(window[v : v + size, u : u + size] - patches).sum((0, 1))
+            better = (cost < least - TIE * size**2) & ((shift >= low) & (shift <= high)).all(0)
+            best, least = xp.where(better, shift, best), xp.where(better, cost, least)
     return best, least
 
 
 def derivatives(image: Tensor) -> tuple[Tensor, Tensor]:
     """Return (d/dy, d/dx) by (f(x-2) - 8 f(x-1) + 8 f(x+1) - f(x+2)) / 12, borders mirrored."""
+    return _slope(image), _slope(image.T).T
+
+
+def _slope(image: Tensor) -> Tensor:
+    """Return the derivative along the rows' index."""
+    height = len(image)
+    wide = image[xp.asarray([1, 0, *range(height), height - 1, height - 2])]
     kernel = (1 / 12, -8 / 12, 0.0, 8 / 12, -1 / 12)
-    found = []
-    for axis in (0, 1):
-        ends = image.narrow(axis, 0, 2).flip(axis), image, image.narrow(axis, image.shape[axis] - 2, 2).flip(axis)
-        wide, side = torch.cat(ends, axis), image.shape[axis]
-        found.append(sum((k * wide.narrow(axis, i, side) for i, k in enumerate(kernel) if k), torch.zeros(())))
-    return found[0], found[1]
+    return sum((k * wide[i : i + height] for i, k in enumerate(kernel) if k), zeros(1))
 
 
 def cubic_weights(fraction: Tensor) -> Tensor:
     """Return weights [4, N] of the pixels -1, 0, 1, 2 for a position between 0 and 1 (Catmull-Rom)."""
     t = fraction
-    return torch.stack([((2 - t) * t - 1) * t, (3 * t - 5) * t**2 + 2, ((4 - 3 * t) * t + 1) * t, (t - 1) * t**2]) / 2
+    return xp.stack([((2 - t) * t - 1) * t, (3 * t - 5) * t**2 + 2, ((4 - 3 * t) * t + 1) * t, (t - 1) * t**2]) / 2
 
 
 def sample_cubic(image: Tensor, position: Tensor, size: int) -> Tensor:
     """Return bicubic patches [size, size, N] with upper left corners at real positions [2, N]."""
-    whole = position.floor()
-    square = gather(image, whole.long() - 1, size + 3)
-    y, x = cubic_weights(position[0] - whole[0]), cubic_weights(position[1] - whole[1])
-    zero = torch.zeros(())
+    floor = xp.floor(position)
+    square = gather(image, whole(floor) - 1, size + 3)
+    y, x = cubic_weights(position[0] - floor[0]), cubic_weights(position[1] - floor[1])
+    zero = zeros(1)
     rows = sum((y[k] * square[k : k + size] for k in range(4)), zero)
     return sum((x[k] * rows[:, k : k + size] for k in range(4)), zero)
 
 
 def sample_linear(image: Tensor, position: Tensor, size: int) -> Tensor:
     """Return bilinear patches [size, size, N] with upper left corners at real positions [2, N]."""
-    whole = position.floor()
-    square = gather(image, whole.long(), size + 1)
-    y, x = position - whole
-    rows = torch.lerp(square[:-1], square[1:], y)
-    return torch.lerp(rows[:, :-1], rows[:, 1:], x)
+    floor = xp.floor(position)
+    square = gather(image, whole(floor), size + 1)
+    y, x = position - floor
+    rows = mixed(square[:-1], square[1:], y)
+    return mixed(rows[:, :-1], rows[:, 1:], x)
 
 
-def inside(shape: torch.Size, position: Tensor, size: int) -> Tensor:
+def inside(shape: tuple[int, ...], position: Tensor, size: int) -> Tensor:
     """Return which pixels of patches at real positions [2, N] lie in the image: bool [size, size, N]."""
-    at = position[:, None] + torch.arange(size)[:, None]
+    at = position[:, None] + xp.arange(size)[:, None]
     y, x = ((at[k] >= 0) & (at[k] <= shape[k] - 1) for k in (0, 1))
     return y[:, None] & x[None]
 
@@ -139,54 +146,55 @@ def lucas_kanade(reference: Tensor, other: Tensor, corner: Tensor, shift: Tensor
     """
     template, flats = gather(reference, corner, size), derivatives(other)
     slopes = [gather(image, corner, size) for image in derivatives(reference)]
-    shift = shift.to(torch.float32)
-    moving = torch.ones(corner.shape[1:], dtype=torch.bool)
+    shift = single(shift)
+    moving = xp.ones(corner.shape[1:], dtype=xp.bool)
     for _ in range(ITERATIONS):
-        position = corner + shift
+        position = single(corner + shift)
         valid = inside(other.shape, position, size)
         error = (template - sample_cubic(other, position, size)) * valid
         gy, gx = ((s + sample_cubic(f, position, size)) / 2 * valid for s, f in zip(slopes, flats, strict=True))
         yy, xy, xx, ye, xe = ((a * b).sum((0, 1)) for a, b in ((gy, gy), (gy, gx), (gx, gx), (gy, error), (gx, error)))
         det = yy * xx - xy**2
         moving = moving & (det > 1e-6 * (yy + xx) ** 2) & (det > 1e-12)
-        step = torch.stack([xx * ye - xy * xe, yy * xe - xy * ye]) / torch.where(moving, det, 1.0)
-        step = step / step.norm(dim=0).clamp(min=1.0)
-        shift = torch.where(moving, shift + step, shift)
+        step = xp.stack([xx * ye - xy * xe, yy * xe - xy * ye]) / xp.where(moving, det, 1.0)
+        step = step / xp.clip(xp.sqrt(xp.square(step).sum(0)), 1.0, None)
+        shift = xp.where(moving, shift + step, shift)
     return shift
 
 
 def candidates(parent: Tensor, down: int, across: int, fine: Level, coarse: Level) -> list[Tensor]:
     """Return integer shifts [2, N] for the patches of the finer level from their parent and two of its neighbours."""
-    scaled = (parent * coarse.ratio).round().long()
+    scaled = whole(xp.round(parent * coarse.ratio))
 
     def parents(count: int, limit: int) -> tuple[Tensor, Tensor]:
-        place = torch.arange(count) * fine.stride / (coarse.ratio * coarse.patch)
-        first = place.floor().long().clamp(max=limit - 1)
+        place = xp.arange(count) * fine.stride / (coarse.ratio * coarse.patch)
+        first = xp.clip(whole(xp.floor(place)), None, limit - 1)
         onward = ((place - first >= 0.5) & (first + 1 < limit)) | (first == 0)
-        return first, torch.where(onward, first + 1, first - 1).clamp(0, limit - 1)
+        return first, xp.clip(xp.where(onward, first + 1, first - 1), 0, limit - 1)
 
     y, other_y = parents(down, parent.shape[1])
     x, other_x = parents(across, parent.shape[2])
-    return [scaled[:, rows][:, :, columns].flatten(1) for rows, columns in ((y, x), (other_y, x), (y, other_x))]
+    return [scaled[:, rows][:, :, columns].reshape(2, -1) for rows, columns in ((y, x), (other_y, x), (y, other_x))]
 
 
 def align(reference: list[Tensor], other: list[Tensor], *, refine_finest: bool = False) -> Tensor:
     """Return shifts [2, N] of the finest level's patches between two pyramids; integers (as floats) unless refined."""
-    shifts = torch.zeros(2, 1, 1)
+    shifts = zeros(2, 1, 1)
     for depth in range(len(LEVELS) - 1, -1, -1):
         level, image = LEVELS[depth], reference[depth]
         corner, down, across = grid(image.shape, level)
         patches = gather(image, corner, level.patch)
         if depth == len(LEVELS) - 1:
-            starts = [torch.zeros_like(corner)]
+            starts = [xp.zeros_like(corner)]
         else:
             starts = candidates(shifts, down, across, level, LEVELS[depth + 1])
         found, least = search(patches, other[depth], corner, starts[0], level.radius)
         for start in starts[1:]:
             shift, cost = search(patches, other[depth], corner, start, level.radius)
-            found, least = torch.where(cost < least, shift, found), torch.minimum(cost, least)
-        fine = found.to(torch.float32)
+            better = cost < least - TIE * level.patch**2
+            found, least = xp.where(better, shift, found), xp.where(better, cost, least)
+        fine = single(found)
         if level.refine or (depth == 0 and refine_finest):
             fine = lucas_kanade(image, other[depth], corner, fine, level.patch)
-        shifts = fine.view(2, down, across)
-    return shifts.flatten(1)
+        shifts = fine.reshape(2, down, across)
+    return shifts.reshape(2, -1)

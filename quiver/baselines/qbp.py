@@ -21,18 +21,20 @@ the noise over that of a full average.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import torch
 from numpy import ndarray as Array
-from torch import Tensor
 
 from qsim.sensor.estimation import Response
 from qsim.sensor.sensor import Sensor
 from quiver.baselines import bm3d, patch_alignment
+from quiver.baselines.arrays import add_at, mixed, single, whole, xp, zeros
 from quiver.baselines.sliding_window import check_codes, check_window, in_units, window_frames
 from quiver.baselines.vst import stabiliser
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ class Settings:
 
 CALIBRATED = Settings()
 AS_PUBLISHED = Settings(prefilter=1, wiener=8.0, wiener_variance="patch", refine_finest=False)
+EPSILON = float(np.finfo(np.float32).eps)  # least variance, in units of the top code squared
 EXCESS = 1.0  # best of 0.8, 1, 1.25, 1.5, 2 on the clips on which CALIBRATED was chosen
 
 
@@ -96,11 +99,10 @@ def merge(codes: Array, frame: int, table: Response, window: int, settings: Sett
         raise ValueError(f"window is {window} frames, which blocks of {settings.block} do not divide")
     height, width = codes.shape[1:]
     stack = codes[window_frames(frame, window, len(codes))].astype(np.float32) / table.top
-    frames = torch.from_numpy(stack).unflatten(0, (-1, settings.block))  # [blocks, frames of a block, H, W]
-    frames = torch.stack([torch.stack([patch_alignment.pad_image(image) for image in block]) for block in frames])
-    with torch.no_grad():
-        merged = _merge_patches(frames, frame_shifts(frames, settings), table, settings)
-    return (table.top * merged[:height, :width]).numpy()
+    frames = xp.stack([patch_alignment.pad_image(image) for image in single(stack)])
+    frames = frames.reshape(-1, settings.block, *frames.shape[1:])  # [blocks, frames of a block, H, W]
+    merged = _merge_patches(frames, frame_shifts(frames, settings), table, settings)
+    return np.asarray(table.top * merged[:height, :width])
 
 
 def frame_shifts(frames: Tensor, settings: Settings = CALIBRATED) -> Tensor:
@@ -114,16 +116,17 @@ def frame_shifts(frames: Tensor, settings: Settings = CALIBRATED) -> Tensor:
     half = width // 2
     matched = [i for i in range(half, len(frames) - half) if i == middle or abs(i - middle) >= width]
     pyramids = {i: patch_alignment.pyramid(blocks[i - half : i + half + 1].mean(0)) for i in matched}
-    still = torch.zeros(patch_alignment.grid(blocks.shape[1:], patch_alignment.LEVELS[0])[0].shape)
+    still = zeros(*patch_alignment.grid(blocks.shape[1:], patch_alignment.LEVELS[0])[0].shape)
     found = [
         still
         if i == middle
         else patch_alignment.align(pyramids[middle], pyramids[i], refine_finest=settings.refine_finest)
         for i in matched
     ]
-    place = (torch.arange(blocks.shape[0] * frames.shape[1]) + 0.5) / frames.shape[1] - 0.5  # of a frame, in blocks
-    shifts = _interpolate(place - middle, torch.tensor(matched) - middle, torch.stack(found))
-    return shifts.unflatten(0, tuple(frames.shape[:2]))
+    count, block = frames.shape[:2]
+    place = (single(xp.arange(count * block)) + 0.5) / block - 0.5  # of a frame, in blocks
+    shifts = _interpolate(place - middle, single(matched) - middle, xp.stack(found))
+    return shifts.reshape(count, block, *still.shape)
 
 
 def _interpolate(place: Tensor, known: Tensor, values: Tensor) -> Tensor:
@@ -131,12 +134,13 @@ def _interpolate(place: Tensor, known: Tensor, values: Tensor) -> Tensor:
     beyond.
     """
     if len(known) == 1:
-        return values.expand(len(place), *values.shape[1:])
-    within = place.clamp(float(known[0]), float(known[-1]))
-    right = torch.searchsorted(known, within).clamp(1, len(known) - 1)
+        return xp.broadcast_to(values, (len(place), *values.shape[1:]))
+    within = xp.clip(place, float(known[0]), float(known[-1]))
+    right = xp.clip(xp.searchsorted(known, within), 1, len(known) - 1)
     share = (within - known[right - 1]) / (known[right] - known[right - 1])
-    beyond = torch.where(within == 0, 1.0, place / within)
-    return torch.lerp(values[right - 1], values[right], share[:, None, None]) * beyond[:, None, None]
+    beyond = place / xp.where(within == 0, 1.0, within)
+    between = mixed(values[right - 1], values[right], share[:, None, None])
+    return between * xp.where(within == 0, 1.0, beyond)[:, None, None]
 
 
 def _warp_block(frames: Tensor, shifts: Tensor, corner: Tensor, smooth: bool) -> Tensor:
@@ -145,17 +149,17 @@ def _warp_block(frames: Tensor, shifts: Tensor, corner: Tensor, smooth: bool) ->
     Pixels from outside the image are left out; where no frame has any, the border repeats.
     """
     size = patch_alignment.LEVELS[0].patch
-    total, count, edge = torch.zeros(3, size, size, corner.shape[1]).unbind()
+    total, count, edge = zeros(3, size, size, corner.shape[1])
     for image, shift in zip(frames, shifts, strict=True):
-        position = corner + (shift if smooth else shift.round())
+        position = single(corner + (shift if smooth else xp.round(shift)))
         patch = (
             patch_alignment.sample_linear(image, position, size)
             if smooth
-            else patch_alignment.gather(image, position.long(), size)
+            else patch_alignment.gather(image, whole(position), size)
         )
         valid = patch_alignment.inside(image.shape, position, size)
         total, count, edge = total + patch * valid, count + valid, edge + patch
-    return torch.where(count > 0, total / count.clamp(min=1), edge / len(frames))
+    return xp.where(count > 0, total / xp.clip(count, 1, None), edge / len(frames))
 
 
 def _merge_patches(frames: Tensor, shifts: Tensor, table: Response, settings: Settings) -> Tensor:
@@ -165,36 +169,38 @@ def _merge_patches(frames: Tensor, shifts: Tensor, table: Response, settings: Se
     smooth = settings.refine_finest
     reference = _warp_block(frames[count // 2], shifts[count // 2], corner, smooth)
     noise = 2 * size * size * settings.wiener * _noise(reference, table, settings)
-    spectrum = torch.fft.rfft2(reference, dim=(0, 1))
-    total = spectrum.clone()
+    spectrum = xp.fft.rfft2(reference, None, (0, 1))
+    total = spectrum + 0
     for i in range(count):
         if i == count // 2:
             continue
-        other = torch.fft.rfft2(_warp_block(frames[i], shifts[i], corner, smooth), dim=(0, 1))
+        other = xp.fft.rfft2(_warp_block(frames[i], shifts[i], corner, smooth), None, (0, 1))
         other -= spectrum
-        power = other.real.square() + other.imag.square()
+        power = xp.square(other.real) + xp.square(other.imag)
         total += spectrum + other * (noise / (power + noise))  # A F0 + (1 - A) Fz, A = power / (power + noise)
-    patches = torch.fft.irfft2(total / count, s=(size, size), dim=(0, 1))
-    return overlap_add(patches, corner, frames.shape[2:]).clamp_(min=0)
+    patches = xp.fft.irfft2(total / count, (size, size), (0, 1))
+    return xp.clip(overlap_add(patches, corner, frames.shape[2:]), 0, None)
 
 
 def _noise(reference: Tensor, table: Response, settings: Settings) -> Tensor:
     """Return the variance of a pixel of each reference patch [N], in units of the top code squared."""
+    size = len(reference)
     if settings.wiener_variance == "patch":
-        return reference.flatten(0, 1).var(0).clamp(min=float(np.finfo(np.float32).eps))
-    mean_code = table.top * reference.mean((0, 1)).numpy()
+        spread = reference - reference.mean((0, 1))
+        return xp.clip(xp.square(spread).sum((0, 1)) / (size**2 - 1), EPSILON, None)
+    mean_code = np.asarray(table.top * reference.mean((0, 1)))
     variance = np.interp(mean_code, table.mean, table.variance) / (settings.block * table.top**2)
-    return torch.from_numpy(variance.astype(np.float32)).clamp(min=float(np.finfo(np.float32).eps))
+    return single(np.maximum(variance, EPSILON))
 
 
-def overlap_add(patches: Tensor, corner: Tensor, shape: torch.Size) -> Tensor:
+def overlap_add(patches: Tensor, corner: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Return an image of this shape: the mean of overlapping patches [size, size, N], weighted by a raised cosine."""
     size, width = patches.shape[0], shape[1]
-    one = 0.5 - 0.5 * torch.cos(2 * torch.pi * (torch.arange(size) + 0.5) / size)
-    weight = torch.outer(one, one)[..., None]
-    step = torch.arange(size)
+    step = xp.arange(size)
+    one = 0.5 - 0.5 * xp.cos(2 * xp.pi * (single(step) + 0.5) / size)
+    weight = xp.outer(one, one)[..., None]
     index = ((corner[0] + step[:, None]) * width)[:, None] + (corner[1] + step[:, None])[None]
-    above, below = torch.zeros(2, shape.numel()).unbind()
-    above.index_add_(0, index.flatten(), (patches * weight).flatten())
-    below.index_add_(0, index.flatten(), weight.expand_as(patches).flatten())
-    return (above / below).view(shape)
+    above, below = zeros(2, shape[0] * width)
+    add_at(above, index.reshape(-1), (patches * weight).reshape(-1))
+    add_at(below, index.reshape(-1), xp.broadcast_to(weight, patches.shape).reshape(-1))
+    return (above / below).reshape(tuple(shape))

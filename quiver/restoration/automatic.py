@@ -15,6 +15,7 @@ from quiver.restoration.restorers import restorer
 
 AUTO = "auto"
 NETWORK = "mergenet"
+WITHOUT = "qbp-bm3d"  # without the packages of networks
 
 
 def chosen(name: str, codes: Codes, options: RestoreOptions | None = None) -> tuple[Restorer, str | None]:
@@ -23,7 +24,10 @@ def chosen(name: str, codes: Codes, options: RestoreOptions | None = None) -> tu
         return restorer(name, options), None
     if codes.shares is not None:
         return restorer("likelihood", options), "auto: likelihood; the codes have different exposures"
-    network = restorer(NETWORK, options)
+    try:
+        network = restorer(NETWORK, options)
+    except ModuleNotFoundError as error:
+        return restorer(WITHOUT, options), f"auto: {WITHOUT}; {NETWORK} needs the package {error.name}"
     ppp = light_of(codes)
     domain = None if network.scope is None else network.scope.domain
     cell = None if domain is None else domain.nearest(place_of(codes.sensor, codes.exposure, ppp))

@@ -1,9 +1,10 @@
 """What the program computed at commit 19b9ba0, before its modules moved, it still computes: codes, light, video.
 
 Made once, by `python tests/system/test_unchanged.py --write`, from commit 19b9ba0, and never rewritten to make a
-failing test pass: a failing test says that results changed. One part followed a change that was meant: what
-`quiver-physical` gives where its gain is now 1 (below (2^b - 1) / 2 photons); all other results stayed. Only names that
-survive every move are used: those of `import qsim`, `quiver.restore`, and the command lines.
+failing test pass: a failing test says that results changed. Two parts followed changes that were meant: what
+`quiver-physical` gives where its gain is now 1 (below (2^b - 1) / 2 photons), and QBP, where the first of two equally
+good shifts is now taken; all other results stayed. Only names that survive every move are used: those of `import qsim`,
+`quiver.restore`, and the command lines.
 
 data/unchanged.json has checksums (of codes: SHA-256, no code may differ), data/unchanged.npz numbers: light within
 1e-6 of its mean, video within 1e-5, other numbers as each section says. Clips are stored as halves, so light within
