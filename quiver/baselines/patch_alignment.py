@@ -76,8 +76,8 @@ def gather(image: Tensor, corner: Tensor, size: int) -> Tensor:
 def search(patches: Tensor, other: Tensor, corner: Tensor, centre: Tensor, radius: int) -> tuple[Tensor, Tensor]:
     """Return the best integer shift [2, N] within `radius` of each `centre`, and its sum of absolute differences [N].
 
-    Only shifts that keep the patch inside the image count; among equals the first in raster order. Sums of few-bit codes
-    are often equal, and rounding, which differs between machines, must not choose.
+    Only shifts that keep the patch inside the image count; among equals the first in raster order. Sums of few-bit
+    codes are often equal, and rounding, which differs between machines, must not choose.
     """
     size, limit = patches.shape[0], xp.asarray(other.shape)[:, None]
     low, high = -corner, limit - patches.shape[0] - corner
