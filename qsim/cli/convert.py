@@ -16,6 +16,7 @@ from qsim.dataset.recipe import SPLITS
 from qsim.formats import challenge, detection, exporting, importing, pairs
 from qsim.formats.recording import TRANSFERS, Hints
 
+PICTURES = ("mp4", "png", "nerfstudio")  # kinds that show light through a transfer curve
 _SUFFIXES = {".npy": "cube", ".mp4": "mp4", ".zarr": "zarr", ".h5": "pairs", ".dat": "spike", ".npz": "photons"}
 
 
@@ -30,6 +31,7 @@ def add_convert(sub: Any) -> None:
         "qsim convert out/starter out/starter_mp4 --to mp4\n"
         "qsim convert out/starter out/starter.h5 --to pairs\n"
         "qsim convert out/challenge out/cubes --to challenge\n"
+        "qsim convert out/room out/room_poses --to nerfstudio\n"
         "qsim convert out/fan/streams/spad.json out/fan_cube.npy",
     )  # fmt: skip
     parser.add_argument("input", type=Path, help="a file, a folder, a clip, a stream (its .npy or .json), a data set")
@@ -64,7 +66,7 @@ def add_convert(sub: Any) -> None:
         "--to",
         choices=sorted([*exporting.EXPORTS, "pairs"]),
         help="kind of the output (default: from the suffix of its name); pairs: codes, truth and flow in one .h5; "
-        "challenge: cubes of colour planes with their truth",
+        "challenge: cubes of colour planes with their truth; nerfstudio: pictures and their poses, transforms.json",
     )
     writing.add_argument(
         "--window",
@@ -78,7 +80,7 @@ def add_convert(sub: Any) -> None:
     parser.add_argument(
         "--white", type=float,
         help="reading: pixel value at which the camera saturates, as in 4095 (default: the largest that whole numbers "
-        "hold); writing mp4 and png: light that becomes full scale (default: the 99.9th percentile)",
+        "hold); writing pictures: light that becomes full scale (default: the 99.9th percentile)",
     )  # fmt: skip
     parser.add_argument("--force", action="store_true", help="replace an existing output")
 
@@ -104,7 +106,7 @@ _READING = ("layout", "frame_rate", "exposure", "height", "width", "bits", "stre
 def _refuse_what_cannot_act(args: argparse.Namespace, kind: str, light: bool) -> None:
     """Raise `ValueError` for options of writing without effect on this kind of output."""
     where = f"{args.output}, a {kind} of {'light' if light else 'codes'}"
-    if not (light and kind in ("mp4", "png")):
+    if not (light and kind in PICTURES):
         refuse_idle(args, where, ["transfer"])
     if kind != "mp4":
         refuse_idle(args, where, ["lossy"])
@@ -123,8 +125,8 @@ def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
     _refuse_what_cannot_act(args, kind, args.input.suffix != ".json")
     planes = args.window or challenge.PLANES
     wanted = exporting.Export(kind, args.transfer or "gamma 2.2", args.white, not args.lossy, planes=planes)
-    if args.white is not None and (kind not in ("mp4", "png") or args.input.suffix == ".json"):
-        raise ValueError("--white: acts on light written as mp4 or png; leave it out")
+    if args.white is not None and (kind not in PICTURES or args.input.suffix == ".json"):
+        raise ValueError("--white: acts on light written as mp4, png or nerfstudio; leave it out")
     if kind == "pairs":
         return [_pairs(args)]
     if not (args.input / "dataset.json").is_file():

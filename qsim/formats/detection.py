@@ -86,7 +86,7 @@ def recordings(folder: Path, layout: str | None) -> list[Path]:
 
 
 def _detect_folder(path: Path) -> str:
-    if (path / "transforms.json").is_file():
+    if (path / "transforms.json").is_file() and not any(path.glob("*.png")):  # our pictures with poses have both
         return "visionsim"
     if (path / "transforms.db").is_file():
         raise ValueError(f"{path}: describes its frames in transforms.db; let visionsim write a transforms.json")

@@ -1,4 +1,4 @@
-"""Writes clips and streams for other programs: cubes, mp4, PNG, EXR, zarr, spike .dat, with a .json beside it."""
+"""Writes clips and streams for other programs: cubes, mp4, PNG, EXR, zarr, spike .dat, camera paths; with a .json."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from qsim.clip.stream import Stream, orientation
 from qsim.colour import code_levels, peak
 from qsim.files import VERSION
 from qsim.formats import array_files, challenge, images, photon_times, raw_cameras, video
+from qsim.scene.camera_path import camera_path
 
 BLOCK = 16  # frames read at a time
 
@@ -25,7 +26,7 @@ BLOCK = 16  # frames read at a time
 class Export:
     """The format of an export."""
 
-    kind: str  # cube, mp4, png, exr, zarr, challenge, spike, photons
+    kind: str  # cube, mp4, png, exr, zarr, challenge, spike, photons, nerfstudio
     transfer: str = "gamma 2.2"  # of pictures of light
     white: float | None = None  # light that becomes full scale; None: the 99.9th percentile
     lossless: bool = True  # of mp4
@@ -71,11 +72,15 @@ def export(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = F
 
 
 def check(source: Clip | Stream, wanted: Export) -> None:
-    """Raise `ValueError` if the challenge cannot hold this source; other kinds check theirs when they write."""
+    """Raise `ValueError` if the challenge or a camera path cannot hold this source; others check when they write."""
     if wanted.kind == "challenge":
         if not isinstance(source, Clip):
             raise ValueError(f"{source.path}: is one stream, the challenge has three colours; name the clip's folder")
         challenge.bands_of(source, wanted.planes)
+    if wanted.kind == "nerfstudio":
+        if not isinstance(source, Clip):
+            raise ValueError(f"{source.path}: is a stream, and poses belong to light; name the clip's folder")
+        camera_file(source)
 
 
 def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool = False) -> tuple[Path, str]:
@@ -100,7 +105,7 @@ def described(source: Clip | Stream, path: Path, wanted: Export, *, force: bool 
 
 
 _MARK = {"software": {"qsim": VERSION}}  # in every description of an export: this program wrote it
-_NAMES = r"meta\.json|[0-9]{6,}\.(png|exr|npy)|zarr\.json|frames/zarr\.json|frames/c/[0-9]+/[0-9]+/[0-9]+"
+_NAMES = r"(meta|transforms)\.json|[0-9]{6,}\.(png|exr|npy)|zarr\.json|frames/zarr\.json|frames/c/[0-9]+/[0-9]+/[0-9]+"
 
 
 def _check_ours(place: Path, description: Path, single: bool) -> None:
@@ -143,6 +148,29 @@ def _png(source: Clip | Stream, path: Path, wanted: Export, meta: dict[str, Any]
     else:
         codes = (image for block in _code_blocks(source) for image in block)
         images.write_png(path, (image.astype(bool) if source.bits == 1 else image for image in codes))
+
+
+def _nerfstudio(source: Any, path: Path, wanted: Export, meta: dict[str, Any]) -> None:
+    images.write_png(path, _grey(source, wanted, meta))
+    files.write_json(path / "transforms.json", camera_file(source))
+
+
+def camera_file(clip: Clip) -> dict[str, Any]:
+    """Return the content of a transforms.json of a clip: its camera, and a pose per frame named 000000.png and so on.
+
+    `ValueError` for a clip without a camera, with less than two frames, and for one whose poses were not stored.
+    """
+    if clip.camera is None:
+        raise ValueError(f"{clip.path}: has no camera (imported video); only rendered clips have poses")
+    if len(clip) < 2:
+        raise ValueError(f"{clip.path}: has one frame; a camera path needs two or more")
+    poses = clip.meta.get("poses") or [clip.camera.pose()] * len(clip)
+    moved = clip.meta["camera"].get("motion") is not None
+    if len(poses) != len(clip) or (moved and "poses" not in clip.meta):
+        raise ValueError(f"{clip.path}: its camera moves, and clip.json lacks a pose for each frame; render it again")
+    height, width = clip.shape[1:]
+    names = [f"{t:06d}.png" for t in range(len(clip))]
+    return camera_path(clip.camera, poses, names, clip.frame_rate, clip.origin) | {"w": width, "h": height}
 
 
 def _exr(source: Clip | Stream, path: Path, _wanted: Export, _meta: dict[str, Any]) -> None:
@@ -189,6 +217,7 @@ EXPORTS: dict[str, Callable[[Any, Path, Export, dict[str, Any]], None]] = {
     "challenge": _challenge,
     "spike": _spike,
     "photons": _photons,
+    "nerfstudio": _nerfstudio,
 }
 
 
@@ -203,7 +232,7 @@ def _export_meta(source: Clip | Stream, wanted: Export) -> dict[str, Any]:
     if isinstance(source, Clip):
         written = {"exr": "linear", "zarr": "linear", "challenge": "srgb"}
         found["transfer"] = written.get(wanted.kind, wanted.transfer)
-        if wanted.kind in ("mp4", "png"):
+        if wanted.kind in ("mp4", "png", "nerfstudio"):
             found["white"] = wanted.white if wanted.white is not None else _white(source)
     elif wanted.kind == "mp4":
         found["stretched"] = True

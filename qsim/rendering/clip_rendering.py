@@ -50,6 +50,8 @@ def render_clip(
         "seed": seed,
         "render": asdict(renderer.budget) | {"engine": renderer.engine.backend, "variant": renderer.engine.variant},
     }
+    if scene.camera.motion is not None:  # camera-to-world matrices at mid-exposure
+        meta["poses"] = [scene.camera.pose(renderer.time(t)).tolist() for t in range(frames)]
     if scene.flickers:
         strengths = renderer.strengths(frames)
         meta["flicker"] = {

@@ -293,6 +293,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ],
     ("convert", "--to"): [
         Acts("convert clip e", "--to png", exit_code, codes=(0, 2)),
+        Acts("convert clip e --to png", "--to nerfstudio"),
         Refused(CODES, "--to png", "--to"),
     ],
     ("convert", "--window"): [

@@ -10,6 +10,7 @@ from clips import write_clip
 from fakes import RECIPE, make
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from recordings import CAPTURE, SIZES, clip_of, everything
 
 from qsim.cli.program import main
@@ -18,6 +19,10 @@ from qsim.dataset.dataset import Dataset
 from qsim.formats import exporting, importing
 from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints
+from qsim.optics.camera import Camera
+from qsim.optics.lens import Lens
+from qsim.scene import Spin, Translation, describe
+from qsim.scene.camera_path import read_camera_path
 
 
 @pytest.mark.parametrize("bits", range(1, 9))
@@ -148,3 +153,43 @@ def test_what_was_written_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[
     ]:
         assert main(["convert", str(clip.path), str(tmp_path / kind), "--to", kind]) == 0
         assert f"{tmp_path / kind}: {words}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_a_clip_is_written_with_its_camera_path(tmp_path: Path, moves: bool):
+    """Pictures of 8 bits, and poses, view and lens of the window that the clip shows."""
+    lens = Lens(-0.1, 0.02, shift=(0.05, -0.02))
+    motion = Spin((0.2, 1, 0), 300.0) @ Translation((20.0, -10, 30)) if moves else None
+    camera = Camera(2e-5, 2.8, 1e-6, 11, 15, lens=lens, origin=(1, 2, 3), motion=motion)
+    poses = {"poses": [camera.pose(t / 2000.0).tolist() for t in range(4)]} if moves else {}
+    clip = write_clip(tmp_path / "clip", frames=4, height=7, width=10, camera=describe(camera), origin=[3, 4], **poses)
+    assert main(["convert", str(clip.path), str(tmp_path / "out"), "--to", "nerfstudio"]) == 0
+    found = read_camera_path(tmp_path / "out" / "transforms.json")
+    assert (found.height, found.width) == (7, 10)
+    for t in range(4):
+        np.testing.assert_allclose(found.pose(t / 2000.0), camera.pose(t / 2000.0), atol=1e-9)
+    points = camera.pose(0)[:3, 3] + camera.directions().reshape(-1, 3) @ camera.pose(0)[:3, :3].T
+    np.testing.assert_allclose(found.project(points)[0], camera.project(points)[0] - (4, 3), atol=1e-9)
+    content = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    for frame in content["frames"]:
+        with Image.open(tmp_path / "out" / frame["file_path"]) as picture:
+            assert (picture.mode, picture.size) == ("L", (10, 7))
+    assert everything(tmp_path / "out", layout="png", transfer="gamma 2.2").shape == (4, 7, 10)
+
+
+def test_clips_without_poses_have_no_camera_path(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    moving = describe(Camera(2e-5, 2.8, 1e-6, 7, 10, motion=Spin((0, 1, 0), 1.0)))
+    size = {"height": 7, "width": 10}
+    for name, message, more in (
+        ("relative", "has no camera", {"frames": 3, "relative": True}),
+        ("one", "a camera path needs two or more", {"frames": 1}),
+        ("lost", "lacks a pose for each frame", {"frames": 3, "camera": moving}),
+        ("fewer", "lacks a pose for each frame", {"frames": 3, "camera": moving, "poses": [np.eye(4).tolist()] * 2}),
+    ):
+        write_clip(tmp_path / name, **size, **more)
+        assert main(["convert", str(tmp_path / name), str(tmp_path / "out"), "--to", "nerfstudio"]) == 2
+        assert message in capsys.readouterr().err
+    stream = write_clip(tmp_path / "good", frames=3, **size).sense(ppp=1.0, bits=1)
+    assert main(["convert", str(stream.path), str(tmp_path / "out"), "--to", "nerfstudio"]) == 2
+    assert "is a stream, and poses belong to light" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,249 @@
+"""Reads and writes camera paths in the transforms.json of nerfstudio, instant-ngp and Blender's NeRF scenes.
+
+    transforms.json -> Camera whose motion passes every pose        Camera + times -> transforms.json
+
+A file holds one lens and a list of camera-to-world matrices, in camera axes x right, y up, z back (OpenGL) and a world
+whose z points up. Here the camera's axes are x right, y down, z forward, and the world's y points up: (x, y, z) of the
+file is (x, z, -y), exactly. Between poses the position follows a cubic Hermite path and the rotation is uniform (slerp,
+`Keyframes`); before the first and after the last the camera rests. Poses are equally spaced in time.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim import files
+from qsim.checks import MAX_PIXELS
+from qsim.optics.camera import Camera
+from qsim.optics.lens import Lens
+from qsim.scene.motion import Keyframes
+from qsim.scene.rotation import logarithm, vector
+from qsim.structure import FLAG, NUMBER, POSITIVE, TEXT, Table, expected, is_number, list_of, structure
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: y up, z back <-> y down, z forward
+UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # world: z up -> y up
+SKEW = 1e-3  # by which the axes of a pose may fail to be orthonormal; the nearest rotation is taken
+SQUARE = 1e-6  # relative difference of fl_x and fl_y
+MODELS = ("OPENCV", "PINHOLE", "RADIAL", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "PERSPECTIVE")
+PLAIN = Camera(focal_length=1e-3, f_number=2.8, pixel_pitch=1.1e-6, height=1, width=1)  # its size does not count
+ZERO = ("k3", "k4", "p1", "p2")  # terms of lenses that are not modelled
+
+_SIZE = expected("a whole number of pixels", lambda v: is_number(v) and v == int(v) and 1 <= v <= MAX_PIXELS)
+_ANGLE = expected("an angle of view from 0 to pi [rad]", lambda v: is_number(v) and 1e-6 <= v <= 3.14)
+_LENS: Table = {
+    **{f"{key}, if any": _SIZE for key in ("w", "h")},
+    **{f"{key}, if any": POSITIVE for key in ("fl_x", "fl_y")},
+    **{f"{key}, if any": NUMBER for key in ("cx", "cy", "k1", "k2", *ZERO)},
+    **{f"{key}, if any": _ANGLE for key in ("camera_angle_x", "camera_angle_y")},
+    "camera_model, if any": TEXT,
+    "is_fisheye, if any": FLAG,
+}
+_KEYS = tuple(key.removesuffix(", if any") for key in _LENS)
+_FILE: Table = {
+    **_LENS,
+    "frames": expected("a list of frames", lambda v: isinstance(v, list) and all(isinstance(f, dict) for f in v)),
+    "frame_rate, if any": POSITIVE,
+}
+_FRAME: Table = {
+    **_LENS,
+    "transform_matrix": expected(
+        "a matrix of 4 x 4 numbers", lambda v: list_of(list_of(is_number, 4))(v) and len(v) in (3, 4)
+    ),
+    "file_path, if any": TEXT,
+}
+
+
+def read_camera_path(
+    path: str | os.PathLike[str],
+    like: Camera | None = None,
+    *,
+    frame_rate: float | None = None,
+    speed: float = 1.0,
+    scale: float = 1.0,
+) -> Camera:
+    """Return the camera of a transforms.json: its view, distortion, principal point, and all poses as its motion.
+
+    The rest is as in `like` (without it f/2.8 and pixels of 1.1 um), also the size [px] if the file states none. Poses
+    are in the order of their `file_path`, the first at time 0, as many per second as the file states, else
+    `frame_rate`; `speed` is a factor on that. `scale` is the length of the file's unit [m]. `motion` starts at the
+    first pose, in the camera's own axes: another camera that takes it moves alike.
+
+    `FileNotFoundError`, or `ValueError` for less than two poses, a pose that is no rotation, pixels that are not
+    square, lenses of several cameras, fisheye and tangential lenses.
+    """
+    where = str(path)
+    for name, value in (("scale", scale), ("speed", speed)):
+        if not 0 < value < math.inf:
+            raise ValueError(f"{where}: {name} must be a number above 0, got {value!r}")
+    content = structure(files.read_json(Path(path)), _FILE, where, closed=False)
+    frames = _in_order(content["frames"], where)
+    rate = content.get("frame_rate") or frame_rate
+    if rate is None:
+        raise ValueError(f"{where}: states no frame_rate; give the poses per second, as in frame_rate=30")
+    poses = [_pose(frame, scale) for frame in frames]
+    placed = _seen_from(content | _common(frames, where), where, like or PLAIN, poses[0], like is not None)
+    inside = [np.linalg.inv(placed.pose()) @ pose for pose in poses]
+    motion = Keyframes(
+        tuple(i / (rate * speed) for i in range(len(poses))),
+        tuple(vector(pose[:3, 3]) for pose in inside),
+        tuple(vector(logarithm(pose[:3, :3])) for pose in inside),
+    )
+    return replace(placed, motion=motion)
+
+
+def camera_path(
+    camera: Camera, poses: Sequence[Array], names: Sequence[str], frame_rate: float, origin: tuple[int, int] = (0, 0)
+) -> dict[str, Any]:
+    """Return the content of a transforms.json: a lens, and a pose per picture of `names`.
+
+    `poses` are camera-to-world matrices [4, 4] in the camera's axes of this program, `frame_rate` of them per second;
+    `origin` is the (y, x) of the pictures' first pixel in the frame of the camera, and their size is `camera`'s.
+    """
+    lens, (x, y) = camera.lens or Lens(), camera.axis
+    placed = [UPRIGHT.T @ np.asarray(pose, np.float64) @ FLIP for pose in poses]
+    return {
+        "camera_model": "OPENCV",
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.focal_pixels,
+        "fl_y": camera.focal_pixels,
+        "cx": x - origin[1],
+        "cy": y - origin[0],
+        "k1": float(lens.k1),
+        "k2": float(lens.k2),
+        "p1": 0.0,
+        "p2": 0.0,
+        "frame_rate": float(frame_rate),
+        "frames": [
+            {"file_path": name, "transform_matrix": (pose + 0.0).tolist()}
+            for name, pose in zip(names, placed, strict=True)
+        ],
+    }
+
+
+def write_camera_path(
+    path: str | os.PathLike[str], camera: Camera, *, frames: int, frame_rate: float, force: bool = False
+) -> None:
+    """Write the poses of a camera at the times 0, 1 / frame_rate, ... [s] as transforms.json.
+
+    Pictures are named 000000.png and so on. `FileExistsError` if the file exists and `force` is off; `ValueError` for
+    less than two frames and a frame rate that is not above 0.
+    """
+    if frames < 2 or not 0 < frame_rate < math.inf:
+        raise ValueError(f"{path}: a path needs two or more frames at a rate above 0, got {frames} at {frame_rate!r}")
+    if Path(path).exists() and not force:
+        raise FileExistsError(f"{path}: exists; name another file, or replace it with force=True")
+    poses = [camera.pose(t / frame_rate) for t in range(frames)]
+    content = camera_path(camera, poses, [f"{t:06d}.png" for t in range(frames)], frame_rate)
+    files.write_json(Path(path), content)
+
+
+def _in_order(frames: list[dict[str, Any]], where: str) -> list[dict[str, Any]]:
+    """Return the checked frames in the order of their pictures, as listed if not all have one."""
+    if len(frames) < 2:
+        raise ValueError(f"{where}: a path needs two or more frames, found {len(frames)}")
+    found = [
+        structure(frame, _FRAME, f"{where}, frame {i}", closed=False) | {"where": f"{where}, frame {i}"}
+        for i, frame in enumerate(frames)
+    ]
+    if all(frame.get("file_path") is not None for frame in found):
+        found.sort(key=lambda frame: _counted(str(frame["file_path"])))
+    return found
+
+
+def _counted(name: str) -> list[tuple[int, str]]:
+    """Return a key that sorts names by their numbers: frame_2 before frame_10."""
+    parts = re.split("([0-9]+)", name)
+    return [(len(part.lstrip("0")), part.lstrip("0")) if i % 2 else (0, part) for i, part in enumerate(parts)]
+
+
+def _pose(frame: dict[str, Any], scale: float) -> Array:
+    """Return a frame's pose [4, 4] in the axes of this program, its rotation made exact."""
+    matrix = np.eye(4)
+    given = np.array(frame["transform_matrix"], np.float64)
+    matrix[: len(given)] = given
+    turn = matrix[:3, :3]
+    if (
+        not np.abs(turn.T @ turn - np.eye(3)).max() <= SKEW
+        or np.linalg.det(turn) < 0
+        or (matrix[3] != (0, 0, 0, 1)).any()
+    ):
+        raise ValueError(
+            f"{frame['where']}: transform_matrix is no rotation with a position; its axes must be orthonormal and "
+            "right-handed, and its last row 0, 0, 0, 1"
+        )
+    left, _, right = np.linalg.svd(turn)
+    matrix[:3, :3] = left @ right
+    matrix[:3, 3] *= scale
+    return UPRIGHT @ matrix @ FLIP
+
+
+def _common(frames: list[dict[str, Any]], where: str) -> dict[str, Any]:
+    """Return the lens that every frame states alike; `ValueError` if they differ."""
+    found: dict[str, Any] = {}
+    for key in _KEYS:
+        values = [frame[key] for frame in frames if frame.get(key) is not None]
+        if values and (len(values) < len(frames) or any(value != values[0] for value in values)):
+            raise ValueError(f"{where}: frames differ in {key}; a path has one lens, so split the file by cameras")
+        if values:
+            found[key] = values[0]
+    return found
+
+
+def _seen_from(found: dict[str, Any], where: str, like: Camera, pose: Array, sized: bool) -> Camera:
+    """Return `like` at a pose [4, 4], with the size, view and lens that a file states."""
+    stated = {key: found[key] for key in _KEYS if found.get(key) is not None}
+    _check_lens(stated, where)
+    if not sized and not {"w", "h"} <= stated.keys():
+        raise ValueError(f"{where}: states no w and h; give a camera of the size of its pictures, like=Camera(...)")
+    height, width = int(stated.get("h", like.height)), int(stated.get("w", like.width))
+    if "fl_x" not in stated and "camera_angle_x" not in stated:
+        raise ValueError(f"{where}: states neither fl_x nor camera_angle_x; one of them gives the view")
+    focal = stated.get("fl_x") or width / 2 / math.tan(stated["camera_angle_x"] / 2)
+    other = stated.get("fl_y", focal)
+    if abs(other / focal - 1) > SQUARE:
+        raise ValueError(
+            f"{where}: fl_x is {focal:g} and fl_y {other:g}: pixels are square here; calibrate with one focal length "
+            "(COLMAP's model RADIAL), or resample the pictures"
+        )
+    shift = ((stated.get("cx", width / 2) - width / 2) / height, (stated.get("cy", height / 2) - height / 2) / height)
+    bent = Lens(stated.get("k1", 0.0), stated.get("k2", 0.0), () if like.lens is None else like.lens.falloff, shift)
+    distance, ahead = focal * like.pixel_pitch, like.focus
+    try:
+        return replace(
+            like,
+            height=height,
+            width=width,
+            focal_length=distance * ahead / (distance + ahead) if like.aperture_blur else distance,
+            origin=vector(pose[:3, 3]),
+            target=vector(pose[:3, 3] + ahead * pose[:3, 2]),
+            up=vector(-pose[:3, 1]),
+            focus_distance=ahead,
+            motion=None,
+            lens=bent,
+        )
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _check_lens(stated: dict[str, Any], where: str) -> None:
+    """Raise `ValueError` for a lens that is not modelled."""
+    model = stated.get("camera_model", "OPENCV")
+    if model not in MODELS or stated.get("is_fisheye"):
+        found = f"camera_model is {model!r:.40}" if model not in MODELS else "is_fisheye is true"
+        raise ValueError(f"{where}: {found}; only perspective lenses are read: {', '.join(MODELS)}")
+    wrong = [key for key in ZERO if stated.get(key, 0) != 0]
+    if wrong:
+        raise ValueError(
+            f"{where}: {wrong[0]} is {stated[wrong[0]]:g}; only k1 and k2 are modelled here: calibrate without "
+            f"{', '.join(wrong)} (COLMAP's model RADIAL), or undistort the pictures"
+        )

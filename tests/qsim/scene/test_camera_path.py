@@ -1,0 +1,198 @@
+"""Tests camera paths in transforms.json: round trips, the axes of nerfstudio, what is refused, and damaged files."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hostile import VALUES, one_line
+
+from qsim.optics.camera import Camera
+from qsim.optics.lens import Lens
+from qsim.scene import Spin, Still, Translation
+from qsim.scene.camera_path import read_camera_path, write_camera_path
+
+CAMERA = Camera(2e-3, 2.8, 3e-6, 48, 65, origin=(0.3, 1.0, 2.0))
+LEVEL = [[1.0, 0, 0, 0], [0, 0, -1, -2], [0, 1, 0, 0], [0, 0, 0, 1]]  # two metres before the z axis, z up, along +y
+
+
+def written(path: Path, **changes: Any) -> Path:
+    """Write a path of three level poses, one metre apart along x."""
+    frames = [{"file_path": f"frame_{i}.png", "transform_matrix": copy.deepcopy(LEVEL)} for i in (9, 10, 11)]
+    for i, frame in enumerate(frames):
+        frame["transform_matrix"][0][3] = float(i)
+    content = {"fl_x": 500.0, "fl_y": 500.0, "w": 64, "h": 48, "frame_rate": 10.0, "frames": frames} | changes
+    path.write_text(json.dumps({key: value for key, value in content.items() if value is not None}))
+    return path
+
+
+def random_camera(rng: np.random.Generator) -> Camera:
+    motion = Spin(tuple(rng.normal(size=3)), float(rng.uniform(0, 2000))) @ Translation(tuple(rng.normal(size=3) * 10))
+    lens = Lens(*rng.uniform(-0.02, 0.02, 2), shift=tuple(rng.normal(size=2) * 0.1))
+    origin, target, up = (tuple(rng.normal(size=3)) for _ in range(3))
+    height, width = (int(n) for n in rng.integers(1, 600, 2))
+    return Camera(2e-3, 2.8, 3e-6, height, width, lens=lens, origin=origin, target=target, up=up, motion=motion)
+
+
+def test_a_path_comes_back_to_a_billionth(tmp_path: Path):
+    """Poses, view and lens of random cameras, at any angle between two poses up to half a turn."""
+    rng = np.random.default_rng(0)
+    for i in range(60):
+        camera, file, again = random_camera(rng), tmp_path / f"{i}.json", tmp_path / f"{i}_again.json"
+        write_camera_path(file, camera, frames=7, frame_rate=700.0)
+        found = read_camera_path(file, camera)
+        for t in range(7):
+            np.testing.assert_allclose(found.pose(t / 700.0), camera.pose(t / 700.0), atol=1e-9)
+        points = rng.normal(size=(20, 3)) * 5
+        np.testing.assert_allclose(found.project(points, 3 / 700.0)[0], camera.project(points, 3 / 700.0)[0], rtol=1e-9)
+        write_camera_path(again, found, frames=7, frame_rate=700.0)
+        first, second = (json.loads(path.read_text()) for path in (file, again))
+        for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "frame_rate"):
+            assert second[key] == pytest.approx(first[key], rel=1e-9, abs=1e-9)
+        for one, other in zip(first["frames"], second["frames"], strict=True):
+            assert one["file_path"] == other["file_path"]
+            np.testing.assert_allclose(one["transform_matrix"], other["transform_matrix"], atol=1e-9)
+
+
+def test_the_world_of_a_file_has_z_up_and_its_cameras_look_back(tmp_path: Path):
+    """Poses as nerfstudio documents them: z up in the world, x right, y up and z back in the camera."""
+    camera = read_camera_path(written(tmp_path / "transforms.json"))
+    np.testing.assert_allclose(camera.pose(0.0)[:3, 3], (0, 0, 2), atol=1e-12)
+    np.testing.assert_allclose(camera.pose(0.2)[:3, 3], (2, 0, 2), atol=1e-12)
+    pixels, depth = camera.project(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), 0.0)
+    np.testing.assert_allclose(depth, 2)
+    np.testing.assert_allclose(pixels, [(32, 24), (32 + 25, 24), (32, 24 - 25)], atol=1e-9)  # y is up here
+
+
+def test_between_poses_it_moves_smoothly_and_turns_evenly(tmp_path: Path):
+    frames = []
+    for i, angle in enumerate((0.0, 0.6, 1.2)):
+        c, s = math.cos(angle), math.sin(angle)
+        frames.append({"transform_matrix": [[c, -s, 0, 3.0 * i], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]})
+    camera = read_camera_path(written(tmp_path / "p.json", frames=frames), scale=0.5)
+    for share in (0.25, 0.5, 1.75):
+        pose = camera.pose(share / 10)
+        turn = camera.pose(0)[:3, :3].T @ pose[:3, :3]
+        assert math.acos((np.trace(turn) - 1) / 2) == pytest.approx(0.6 * share, rel=1e-9)
+        assert pose[0, 3] == pytest.approx(1.5 * share, rel=1e-9)
+    np.testing.assert_allclose(camera.pose(9.0), camera.pose(0.2))  # it rests at the end
+
+
+def test_the_motion_of_a_path_moves_another_camera_alike(tmp_path: Path):
+    motion = read_camera_path(written(tmp_path / "p.json")).motion
+    moved = replace(CAMERA, motion=motion)
+    np.testing.assert_allclose(moved.pose(0), CAMERA.pose(0), atol=1e-12)
+    right = CAMERA.pose()[:3, 0]
+    np.testing.assert_allclose(moved.pose(0.2)[:3, 3], np.asarray(CAMERA.origin) + 2 * right, atol=1e-12)
+
+
+def test_what_files_of_other_programs_state_is_read(tmp_path: Path):
+    """Blender states an angle and no size; frames may repeat the lens, and are numbered without zeros."""
+    blender = written(tmp_path / "b.json", fl_x=None, fl_y=None, w=None, h=None, camera_angle_x=0.7)
+    camera = read_camera_path(blender, CAMERA)
+    assert (camera.height, camera.width) == (48, 65)
+    assert camera.focal_pixels == pytest.approx(32.5 / math.tan(0.35))
+    lens = {"fl_x": 300.0, "fl_y": 300.0, "w": 640.0, "h": 480.0, "cx": 330.0, "cy": 235.5, "k1": -0.02, "p1": 0.0}
+    frames = json.loads(written(tmp_path / "c.json").read_text())["frames"]
+    each = [frame | lens for frame in reversed(frames)]
+    found = read_camera_path(written(tmp_path / "c.json", fl_x=None, fl_y=None, w=None, h=None, frames=each))
+    assert found.axis == pytest.approx((330.0, 235.5))
+    assert (found.lens.k1, found.height, found.width) == (-0.02, 480, 640)
+    assert [found.pose(i / 10)[0, 3] for i in range(3)] == pytest.approx([0, 1, 2])  # frame_9 first
+    assert read_camera_path(tmp_path / "c.json", speed=2.0).pose(0.05)[0, 3] == pytest.approx(1)
+    slow = written(tmp_path / "d.json", frame_rate=None)
+    assert read_camera_path(slow, frame_rate=5.0).pose(0.2)[0, 3] == pytest.approx(1)
+
+
+def test_a_thin_lens_keeps_its_focus_and_gets_the_view(tmp_path: Path):
+    like = replace(CAMERA, aperture_blur=True, focus_distance=0.05, f_number=1.4, lens=Lens(falloff=(-0.2,)))
+    camera = read_camera_path(written(tmp_path / "p.json", k1=0.01), like)
+    assert camera.focal_pixels == pytest.approx(500, rel=1e-12)
+    assert (camera.focus, camera.f_number, camera.lens) == (0.05, 1.4, Lens(0.01, 0.0, (-0.2,)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frames": []}, "needs two or more frames, found 0"),
+        ({"frames": [{"transform_matrix": LEVEL}]}, "needs two or more frames, found 1"),
+        ({"frames": [{"transform_matrix": [[2.0, 0, 0, 0], *LEVEL[1:]]}] * 2}, "frame 0: transform_matrix is no rotat"),
+        ({"frames": [{"transform_matrix": [[-1.0, 0, 0, 0], *LEVEL[1:]]}] * 2}, "right-handed"),
+        ({"frames": [{"transform_matrix": [*LEVEL[:3], [0, 0, 1, 1]]}] * 2}, "no rotation with a position"),
+        ({"frames": [{"transform_matrix": LEVEL[:2]}] * 2}, "expected a matrix of 4 x 4 numbers"),
+        ({"frames": [{"transform_matrix": LEVEL, "fl_x": 5.0 + i} for i in (0, 1)]}, "frames differ in fl_x"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "only perspective lenses are read"),
+        ({"camera_model": "ORTHOPHOTO"}, "only perspective lenses are read"),
+        ({"is_fisheye": True}, "is_fisheye is true"),
+        ({"p1": 1e-3}, "p1 is 0.001; only k1 and k2 are modelled here"),
+        ({"k3": 0.1, "p2": 0.2}, "calibrate without k3, p2"),
+        ({"fl_y": 501.0}, "pixels are square here"),
+        ({"fl_x": None}, "states neither fl_x nor camera_angle_x"),
+        ({"w": None}, "states no w and h"),
+        ({"frame_rate": None}, "states no frame_rate"),
+        ({"k1": -99.0, "fl_x": 50.0, "fl_y": 50.0}, "the picture folds"),
+        ({"fl_x": 1e9, "fl_y": 1e9}, "focal_length is in metres"),
+        ({"camera_angle_x": 4.0}, "an angle of view from 0 to pi"),
+    ],
+)
+def test_paths_that_are_not_modelled_are_refused(tmp_path: Path, changes: dict[str, Any], message: str):
+    path = written(tmp_path / "transforms.json", **changes)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_camera_path(path)
+    one_line(caught.value, path)
+
+
+def test_mutated_files_are_refused_in_one_line_or_give_finite_poses(tmp_path: Path):
+    """Every value of a file is replaced by wrong ones of every kind, and the text is cut everywhere."""
+    whole = written(tmp_path / "p.json", cx=30.0, cy=20.0, k1=0.1, k2=0.0, camera_model="OPENCV", camera_angle_x=0.5)
+    content = json.loads(whole.read_text())
+    places = [(key,) for key in content] + [("frames", 0), ("frames", 1, "file_path"), ("frames", 1, "fl_x")]
+    places += [("frames", 2, "transform_matrix", *more) for more in ((), (0,), (1, 2), (3, 3))]
+    path, read = tmp_path / "q.json", 0
+    texts = [whole.read_text()[:cut] for cut in range(0, len(whole.read_text()), 37)] + [
+        "[]",
+        "null",
+        '{"a": "\\ud800"}',
+    ]
+    for place in places:
+        for value in VALUES:
+            damaged = copy.deepcopy(content)
+            inner = damaged
+            for step in place[:-1]:
+                inner = inner[step]
+            inner[place[-1]] = value
+            texts.append(json.dumps(damaged))
+    for text in texts:
+        path.write_text(text)
+        try:
+            camera = read_camera_path(path)
+        except ValueError as error:
+            one_line(error, path)
+        else:
+            read += 1
+            assert np.isfinite([camera.pose(t) for t in (0.0, 0.1, 7.0)]).all()
+    assert 0 < read < len(texts) / 3
+
+
+def test_paths_are_written_whole_or_not_at_all(tmp_path: Path):
+    file = tmp_path / "transforms.json"
+    for wrong in ({"frames": 1, "frame_rate": 10.0}, {"frames": 3, "frame_rate": 0.0}):
+        with pytest.raises(ValueError, match="two or more frames at a rate above 0"):
+            write_camera_path(file, CAMERA, **wrong)
+    assert list(tmp_path.iterdir()) == []
+    write_camera_path(file, CAMERA, frames=2, frame_rate=10.0)
+    with pytest.raises(FileExistsError, match="exists"):
+        write_camera_path(file, replace(CAMERA, motion=Still()), frames=3, frame_rate=10.0)
+    write_camera_path(file, CAMERA, frames=3, frame_rate=10.0, force=True)
+    assert len(json.loads(file.read_text())["frames"]) == 3
+    with pytest.raises(FileNotFoundError):
+        read_camera_path(tmp_path / "none.json")
+    for wrong in ({"scale": 0.0}, {"speed": math.nan}):
+        with pytest.raises(ValueError, match="must be a number above 0"):
+            read_camera_path(file, **wrong)
