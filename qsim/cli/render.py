@@ -55,6 +55,12 @@ def add_render(sub: Any) -> None:
         help="requested error of the radiance, in dB below white and clamped at white (default 40)",
     )
     parser.add_argument("--bands", choices=["rgb"], help="rgb: in colour, three bands (default: one band)")
+    parser.add_argument(
+        "--camera-path",
+        type=Path,
+        metavar="FILE",
+        help="transforms.json whose poses, view and distortion the camera has (default: the camera of the scene)",
+    )
     light = checked(checks.positive)
     parser.add_argument("--ppp", type=light, help=LIGHT)
     parser.add_argument("--engine", choices=BACKENDS, help="engine to use (default: QSIM_ENGINE, else the fastest)")
@@ -79,9 +85,9 @@ def _run_render(args: argparse.Namespace) -> int:
         os.environ["QSIM_ENGINE"] = args.engine
         backend.choose()
     taken = {name: getattr(args, name) for name in ("frames", "seed", "frame_rate", "shutter", "psnr", "ppp")}
-    size = {name: getattr(args, name) for name in ("height", "width", "speed", "bands")}
+    size = {name: getattr(args, name) for name in ("height", "width", "speed", "bands", "camera_path")}
     if args.output is None:
-        scene, _ = load_scene(args.scene, **size, seed=args.seed)
+        scene, _ = load_scene(args.scene, **size, seed=args.seed, frame_rate=args.frame_rate)
         chosen = choose_budget(scene, **taken)
         output(args, {"render": dataclasses.asdict(chosen)}, explain(chosen.findings))
         return 0

@@ -24,6 +24,7 @@ class Settings:
     shutter: float = 0.0  # open share of a frame, 0..1
     psnr: float = 40.0  # wanted error of the radiance, dB below white
     bands: str | None = None  # "rgb": in colour
+    camera_path: str | None = None  # absolute path of a transforms.json
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,11 @@ class Job:
         """
         described = dataclasses.asdict(self) | {"family": Path(self.family).stem}
         described["streams"] = [stream | {"sensor": Path(stream["sensor"]).name} for stream in described["streams"]]
-        if self.settings.bands is None:
-            del described["settings"]["bands"]
+        described["settings"] = {
+            key: value
+            for key, value in described["settings"].items()
+            if key != "camera_path" and (key, value) != ("bands", None)
+        }
         for stream in described["streams"]:  # options that are off stay out: data sets of earlier versions resume
             for key, off in (
                 ("defects", None),
@@ -74,9 +78,8 @@ class Job:
             ):
                 if stream[key] == off:
                     del stream[key]
-        own = [
-            path for path in (self.family, *(stream.sensor_name for stream in self.streams)) if Path(path).is_absolute()
-        ]
+        named = (self.family, self.settings.camera_path or "", *(stream.sensor_name for stream in self.streams))
+        own = [path for path in named if Path(path).is_absolute()]
         if own:  # the content of a file decides, not its name
             described["own"] = [_contents(path) for path in own]
         return hashlib.sha256(to_json(described | more)).hexdigest()

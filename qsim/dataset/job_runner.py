@@ -74,10 +74,12 @@ def load_scene(job: Job) -> Scene:
 def load_traced(job: Job) -> tuple[Scene, dict[str, str]]:
     """Return the job's scene at its size, and the SHA-256 of each file of the user that it read."""
     from qsim.dataset import scene_files
-    from qsim.dataset.scene_rendering import in_bands
+    from qsim.dataset.scene_rendering import along_path, in_bands
 
+    settings = job.settings
     scene, read = scene_files.load(job.family, seed=job.scene_seed, speed=job.speed)
-    return in_bands(scene.resized(job.settings.height, job.settings.width), job.settings.bands), read
+    scene = along_path(scene, settings.camera_path, settings.frame_rate, job.speed)
+    return in_bands(scene.resized(settings.height, settings.width), settings.bands), read
 
 
 def render_seed(job: Job) -> int:

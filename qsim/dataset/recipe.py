@@ -10,6 +10,7 @@
     shutter = 0.0              # open share of a frame; 0, the default: a sharp instant with the light of a full frame
     psnr = 40.0                # wanted error of the radiance, dB below white, clamped there; default 40
     bands = "rgb"              # colour: bands R, G and B; default: one band
+    camera_path = "path.json"  # poses, view and distortion of the camera, a transforms.json; default: the scene's
 
     [[scenes]]                 # one clip per family, seed and speed
     family = "fan"             # a family of scenes/; or a .py file, .xml file or folder beside the recipe ("./things")
@@ -18,7 +19,7 @@
     first = 0                  # first seed of a count; default 0
     speed = [1.0, 2.0]         # factor on all motions, a number or a list; default 1
     split = "train"            # train, the default, val or test
-    # frames, height, width, frame_rate, shutter, psnr, bands: as above, for these scenes only
+    # frames, height, width, frame_rate, shutter, psnr, bands, camera_path: as above, for these scenes only
 
     [[streams]]                # optional; one stream per bits and light level, in every clip
     sensor = "quiver-physical" # a name of `qsim doctor --devices`, or a .toml file beside the recipe
@@ -110,7 +111,7 @@ def parse(text: str, path: Path = Path("recipe.toml")) -> Recipe:
     head = Section(written, "recipe", 0, document.table["recipe"])
     given = head.values(HEAD)
     name, seed = given["name"], given.get("seed", 0)
-    defaults = {"frame_rate": 2000.0} | settings_of(given)
+    defaults = {"frame_rate": 2000.0} | settings_of(head, given)
     streams: list[Sensing] = []
     taken: set[str] = set()
     for section in document.sections("streams"):

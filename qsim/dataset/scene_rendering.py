@@ -18,6 +18,7 @@ from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.fidelity import choose_budget
 from qsim.scene import Scene
+from qsim.scene.camera_path import read_camera_path
 from qsim.scenes.colours import coloured
 
 FRAMES = 21
@@ -38,6 +39,7 @@ def render(
     psnr: float = 40.0,
     ppp: float | None = None,
     bands: str | None = None,
+    camera_path: str | os.PathLike[str] | None = None,
     budget: Budget | None = None,
     progress: Progress | None = None,
     force: bool = False,
@@ -50,6 +52,8 @@ def render(
     per second, `shutter` the open fraction of a frame, 0 for sharp frames. `psnr` [dB] is the requested error, `ppp`
     the brightest light that will be sensed [photons/pixel] (`choose_budget`); a `budget` decides both instead.
     `bands="rgb"` gives a scene of one band colours (scenes/colours.py) and renders red, green and blue.
+    `camera_path` is a transforms.json whose view, distortion and poses replace those of the scene's camera; a file
+    that states no rate has one pose per frame (qsim/scene/camera_path.py).
 
     `path` is the folder of the clip; an equal call resumes an interrupted one. Without it, the clip lies in a temporary
     folder that is deleted after the last use of the clip and its streams. `progress(done, frames)` is called after each
@@ -61,7 +65,7 @@ def render(
         raise ValueError("force= replaces the clip of a folder, and no path is given; leave it out")
     if path is not None:
         target_of(path, force)  # before the pilot
-    loaded, read = load_scene(scene, height, width, seed, speed, bands)
+    loaded, read = load_scene(scene, height, width, seed, speed, bands, camera_path, frame_rate)
     if budget is None:
         budget = choose_budget(
             loaded, frame_rate=frame_rate, shutter=shutter, frames=frames, psnr=psnr, ppp=ppp, seed=seed
@@ -90,14 +94,27 @@ def load_scene(
     seed: int,
     speed: float | None,
     bands: str | None = None,
+    camera_path: str | os.PathLike[str] | None = None,
+    frame_rate: float = 2000.0,
 ) -> tuple[Scene, dict[str, str]]:
     """Return a scene in its size, and the SHA-256 of each file that it reads; arguments and errors as of `render`."""
     if isinstance(scene, Scene):
         if speed is not None:
             raise ValueError(f"scene {scene.name}: a Scene has its motions already; leave speed= out")
+        scene = along_path(scene, camera_path, frame_rate)
         return in_bands(scene.resized(height or scene.camera.height, width or scene.camera.width), bands), {}
     loaded, read = scene_files.load(os.fspath(scene), seed, 1.0 if speed is None else speed)
+    loaded = along_path(loaded, camera_path, frame_rate, 1.0 if speed is None else speed)
     return in_bands(loaded.resized(SIDE if height is None else height, SIDE if width is None else width), bands), read
+
+
+def along_path(
+    scene: Scene, camera_path: str | os.PathLike[str] | None, frame_rate: float, speed: float = 1.0
+) -> Scene:
+    """Return a scene seen by the camera of a transforms.json, or as it is without one; errors as of its reader."""
+    if camera_path is None:
+        return scene
+    return replace(scene, camera=read_camera_path(camera_path, scene.camera, frame_rate=frame_rate, speed=speed))
 
 
 def in_bands(scene: Scene, bands: str | None) -> Scene:

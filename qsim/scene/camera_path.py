@@ -81,6 +81,8 @@ def read_camera_path(
     square, lenses of several cameras, fisheye and tangential lenses.
     """
     where = str(path)
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{where}: no such file")
     for name, value in (("scale", scale), ("speed", speed)):
         if not 0 < value < math.inf:
             raise ValueError(f"{where}: {name} must be a number above 0, got {value!r}")

@@ -11,13 +11,14 @@ from qsim.clip.sensing import Sensing
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe_sections.toml_section import Section
 from qsim.files import check_name
+from qsim.scene.camera_path import PLAIN, read_camera_path
 from qsim.structure import Check, Table
 
 MAX_STEM = 180  # characters of a scene's name, which gets a seed, a speed and a temporary ending as a file's name
 SETTINGS: dict[str, Check] = {
     "frames": checks.whole, "height": checks.whole, "width": checks.whole,
     "frame_rate": checks.frame_rate, "shutter": checks.shutter, "psnr": checks.psnr,
-    "bands": checks.bands,
+    "bands": checks.bands, "camera_path": checks.text,
 }  # fmt: skip
 SCENES: Table = {
     "family": checks.text,
@@ -37,7 +38,7 @@ def jobs_of(section: Section, defaults: dict[str, Any], seed: int, streams: tupl
         why = "an .xml scene has no motion, so speed changes nothing; leave it out"
         raise ValueError(f"{section.where('speed')}: {why}")
     split = given.get("split", "train")
-    settings = Settings(**(defaults | settings_of(given)))
+    settings = Settings(**(defaults | settings_of(section, given)))
     if settings.height * settings.width > MAX_PIXELS:
         size = f"frames of {settings.height} x {settings.width} pixels"
         raise ValueError(f"{section.where()}: {size}; at most {MAX_PIXELS} pixels are rendered")
@@ -63,9 +64,15 @@ def jobs_of(section: Section, defaults: dict[str, Any], seed: int, streams: tupl
     ]
 
 
-def settings_of(given: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of `Settings` that a section gives."""
-    return {key: given[key] for key in SETTINGS if key in given}
+def settings_of(section: Section, given: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of `Settings` that a section gives; a camera path beside the recipe is read, to be checked."""
+    found = {key: given[key] for key in SETTINGS if key in given}
+    if "camera_path" in found:
+        file = (section.text.path.parent / found["camera_path"]).resolve()
+        with section.naming("camera_path", "camera_path: "):
+            read_camera_path(file, PLAIN, frame_rate=1.0)
+        found["camera_path"] = str(file)
+    return found
 
 
 def _family(section: Section, family: str) -> str:

@@ -29,6 +29,8 @@ import qsim.cli.program
 from qsim.cli.console import refuse_idle
 from qsim.cli.program import main
 from qsim.cli.validate import ACTING
+from qsim.optics.camera import Camera
+from qsim.scene.camera_path import write_camera_path
 
 RENDER = "render fan --frames 2 --height 16 --width 24 --psnr 20"
 STILL = "render still.py --frames 2 --height 16 --width 24 --psnr 20 -o r"
@@ -111,6 +113,10 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("render", "--bands"): [
         Acts(f"{RENDER} -o r", "--bands rgb", slow=True),
         Refused(RENDER, "--bands grey", "--bands"),
+    ],
+    ("render", "--camera-path"): [
+        Acts(f"{RENDER} -o r", "--camera-path path.json", slow=True),
+        Refused(f"{RENDER} -o r", "--camera-path none.json", "no such file"),
     ],
     ("render", "--psnr"): [Acts(f"{RENDER} -o r", "--psnr 34", slow=True), Refused(RENDER, "--psnr 5", "psnr")],
     ("render", "--ppp"): [Acts(f"{RENDER} -o r", "--ppp 3000", slow=True)],
@@ -482,6 +488,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for seed, name in enumerate(("red", "green", "blue")):
         bands.sense("spad512s", ppp=0.4, bits=1, seed=seed, name=name)
     colour_clip(folder / "coloured")
+    write_camera_path(folder / "path.json", Camera(2e-4, 2.8, 1e-5, 16, 24, origin=(0, 0, 3)), frames=2, frame_rate=2e3)
     np.save(folder / "codes.npy", rng.integers(0, 4, (3, 16, 24)).astype(np.uint8))
     np.save(folder / "light.npy", rng.integers(0, 60000, (3, 16, 24)).astype(np.uint16))
     np.save(folder / "cube.npy", rng.integers(0, 256, (3, 16, 2)).astype(np.uint8))

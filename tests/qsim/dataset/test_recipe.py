@@ -5,6 +5,7 @@ import random
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,8 @@ from qsim import checks
 from qsim.dataset import job_runner, provenance, recipe
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe import Recipe, parse
+from qsim.optics.camera import Camera
+from qsim.scene.camera_path import write_camera_path
 from qsim.scenes import RECIPES
 
 HEAD = """[recipe]
@@ -78,6 +81,28 @@ def test_a_digest_changes_with_everything_that_decides_the_files():
     assert digests(base.replace('name = "tiny"\n', 'name = "tiny"\nseed = 1\n')).isdisjoint(digests(base))
 
 
+def test_a_camera_path_is_read_beside_the_recipe_and_decides_the_files(tmp_path: Path):
+    camera = Camera(2e-4, 2.8, 1e-5, 8, 10)
+    write_camera_path(tmp_path / "path.json", camera, frames=2, frame_rate=9.0)
+    text = HEAD.replace("width = 10", 'width = 10\ncamera_path = "path.json"') + SCENES
+    (job, *_), (plain, *_) = (parse(each, tmp_path / "r.toml").jobs for each in (text, HEAD + SCENES))
+    assert job.settings.camera_path == str(tmp_path / "path.json")
+    assert plain.settings.camera_path is None
+    before = job.digest
+    assert before != plain.digest
+    write_camera_path(tmp_path / "path.json", camera, frames=3, frame_rate=9.0, force=True)
+    assert job.digest not in (before, plain.digest)
+    (tmp_path / "moved").mkdir()
+    (tmp_path / "path.json").rename(tmp_path / "moved" / "path.json")
+    assert (
+        parse(text, tmp_path / "moved" / "r.toml").jobs[0].digest
+        == replace(job, settings=replace(job.settings, camera_path=str(tmp_path / "moved" / "path.json"))).digest
+    )
+    (tmp_path / "path.json").write_text('{"frames": []}')
+    with pytest.raises(ValueError, match=r"r\.toml:6: camera_path: .*path\.json: a path needs two or more frames"):
+        parse(text, tmp_path / "r.toml")
+
+
 AGAIN = "[[scenes]]\nfamily = "
 MISTAKES = [
     # (text in the good recipe, its replacement, line, the message)
@@ -93,6 +118,8 @@ MISTAKES = [
     ("width = 10", "width = 10\nshutter = 50", 6, r"open share of a frame, 0 to 1, got 50"),
     ("width = 10", "width = 10\npsnr = 0.01", 6, r"wanted error in dB"),
     ("width = 10", 'width = 10\nbands = "cmyk"', 6, r'expected "rgb", red, green and blue'),
+    ("width = 10", 'width = 10\ncamera_path = "none.json"', 6, r"camera_path|none\.json"),
+    ("width = 10", "width = 10\ncamera_path = 3", 6, r"camera_path: expected a text"),
     ('name = "tiny"', 'name = "../tiny"', 2, r"letters, digits"),
     ('"fan"', '"fann"', 9, r"unknown family 'fann' \(did you mean 'fan'\?\)"),
     ("seeds = [0, 2]", "seeds = [0, 0]", 10, r"seeds: 0 is listed twice"),

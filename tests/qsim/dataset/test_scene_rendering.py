@@ -1,6 +1,7 @@
 """Tests rendering in one call: families, files and records, with and without a folder."""
 
 import gc
+import json
 import os
 import pickle
 from pathlib import Path
@@ -10,7 +11,11 @@ import pytest
 
 from qsim import scenes
 from qsim.dataset.scene_rendering import SIDE, TemporaryFolder, load_scene, render
+from qsim.optics.camera import Camera
+from qsim.optics.lens import Lens
 from qsim.rendering.budget import Budget
+from qsim.scene import Spin, Translation
+from qsim.scene.camera_path import write_camera_path
 
 QUICK = {"frames": 2, "height": 12, "width": 14, "budget": Budget(samples=8, bounces=2)}
 
@@ -41,6 +46,26 @@ def test_sizes_default_to_the_camera_of_a_record_and_to_a_small_square(tmp_path:
         render("fan", force=True)
     with pytest.raises(ValueError, match=r"no scene family 'fam' \(did you mean 'fan'\?\)"):
         render("fam")
+
+
+def test_a_camera_path_replaces_the_camera_of_a_scene(tmp_path: Path):
+    """Its poses at the rate of the file, faster by `speed`; a file without a rate has one pose per frame."""
+    motion = Spin((0, 1, 0), 40.0) @ Translation((9.0, 0, 5))
+    camera = Camera(3e-4, 2.8, 1e-5, 12, 14, lens=Lens(-0.05), origin=(0, 1, 3), motion=motion)
+    file = tmp_path / "transforms.json"
+    write_camera_path(file, camera, frames=5, frame_rate=1000.0)
+    clip = render("fan", **QUICK, camera_path=file)
+    for t, pose in enumerate(clip.meta["poses"]):
+        np.testing.assert_allclose(pose, camera.pose(t / 2000.0), atol=1e-4)  # between two poses of the file
+    assert clip.camera.lens == Lens(-0.05)
+    assert clip.camera.focal_pixels == pytest.approx(camera.focal_pixels)
+    fast, _ = load_scene("fan", 12, 14, 0, 2.0, camera_path=file)
+    np.testing.assert_allclose(fast.camera.pose(1 / 2000), camera.pose(1 / 1000), atol=1e-12)
+    content = json.loads(file.read_text())
+    del content["frame_rate"]
+    file.write_text(json.dumps(content))
+    slow, _ = load_scene(scenes.load("fan"), 12, 14, 0, None, camera_path=file, frame_rate=50.0)
+    np.testing.assert_allclose(slow.camera.pose(1 / 50), camera.pose(1 / 1000), atol=1e-12)
 
 
 def test_a_temporary_clip_lasts_as_long_as_its_streams():
