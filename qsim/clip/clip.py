@@ -67,6 +67,7 @@ class Clip(ClipFolder):
         rows: Rows | None = None,
         colour: str | ColourFilter | None = None,
         exposures: tuple[float, ...] | None = None,
+        follow: bool = False,
         force: bool = False,
         progress: Progress | None = None,
     ) -> Stream:
@@ -80,7 +81,7 @@ class Clip(ClipFolder):
         """
         chosen = sensor if isinstance(sensor, Sensor) else os.fspath(sensor)
         light = (chosen, bits, ppp, lux, seed, name)
-        wanted = Sensing(*light, group, diffraction, defects, slices, rows, colour, exposures)
+        wanted = Sensing(*light, group, diffraction, defects, slices, rows, colour, exposures, follow)
         return self.stream(sense(self, wanted, force=force, progress=progress)[0].name)
 
     @property

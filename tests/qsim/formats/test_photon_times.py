@@ -16,7 +16,6 @@ from stats import assert_histogram, assert_share
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
-from qsim.clip.sensing import Sensing, sense
 from qsim.clip.stream import Stream
 from qsim.formats import importing, photon_times
 from qsim.formats.recording import Hints
@@ -28,7 +27,7 @@ FALSE_ALARM = 1e-6
 
 
 def followed(clip: Clip, sensor: CountingSPAD, ppp: float, **more) -> Stream:
-    return sense(clip, Sensing(sensor, ppp=ppp, name="p", follow=True, **more), force=True)[0]
+    return clip.sense(sensor, ppp=ppp, name="p", follow=True, force=True, **more)
 
 
 def static(path: Path, frames: int, height: int, width: int) -> Clip:
