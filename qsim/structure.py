@@ -229,7 +229,7 @@ CLIP: Table = {
     "mean_photons, if any": LIGHT,
     "shutter, if any": LIGHT,
     "flicker, if any": expected(
-        "the kind and the strengths from 0 of each light", mapping_of(r"[a-z]+[0-9]+", _flickers)
+        "the kind and the strengths from 0 of each light", mapping_of(r"[^\n]{1,200}", _flickers)
     ),
     "poses, if any": expected("a matrix of 4 x 4 numbers per frame", list_of(list_of(list_of(is_number, 4), 4))),
     "clipped_pixels, if any": COUNT,

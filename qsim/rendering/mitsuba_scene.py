@@ -29,7 +29,6 @@ LARGE = 20_000  # triangles from which a rigid body becomes an instance
 # rays find them anyway, and sampling them takes samples from the sun or the lamp. test_mitsuba_scene.py requires 1.25
 # times less error than with 1; docs/log.md has the measurement.
 SMOOTH_WEIGHT = 1 / 1024
-EMISSION = ("emitter.radiance.value", "radiance.value", "intensity.value", "scale")  # lamp or glow, even, point, image
 SUN_DISTANCE = 1000.0  # in units of the scene's reach from the camera: parallax of the sun under 1 mrad
 
 
@@ -81,7 +80,7 @@ class Stage:
 
     def _emission(self, name: str) -> tuple[str, Any]:
         """Return the parameter that scales a light, and its value without flicker."""
-        key = next(key for suffix in EMISSION if (key := f"{name}.{suffix}") in self._parameters)
+        key = next(key for suffix in mitsuba_xml.EMISSION if (key := f"{name}.{suffix}") in self._parameters)
         value = self._parameters[key]
         return key, type(value)(value)
 

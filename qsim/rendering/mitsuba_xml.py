@@ -1,8 +1,9 @@
 """Reads scenes in Mitsuba's XML; our camera and motions replace those of the file.
 
-    scene.xml + {shape id: motion} -> Scene(file, parts)
+    scene.xml + {shape id: motion} + {light id: flicker} -> Scene(file, parts)
 
-Mitsuba keeps shapes, materials and lights. The `Scene` holds the names of the shapes, their motions and the camera.
+Mitsuba keeps shapes, materials and lights. The `Scene` holds the names of the shapes, their motions, flickers of lights
+and the camera.
 `mi` is the Mitsuba module.
 """
 
@@ -21,18 +22,30 @@ from qsim.optics.camera import Camera, Pose, Vector
 from qsim.rendering.engine import errors_only, select
 from qsim.rendering.mitsuba_mesh import POSITIONS
 from qsim.scene import MitsubaFile, Part, Scene
+from qsim.scene.flicker import Flicker
 
 F_NUMBER, PITCH = 2.8, 1.1e-6  # of the camera made from the file's sensor, which has no pixels in metres
 MOVABLE = ("to_world", POSITIONS)
+EMISSION = (  # what scales a light: lamp or glow, even, point or spot, parallel, image
+    *("emitter.radiance.value", "radiance.value", "intensity.value", "irradiance.value", "scale"),
+)
 
 
-def read_mitsuba(xml: str | Path, motions: Mapping[str, Pose] | None = None, *, camera: Camera | None = None) -> Scene:
+def read_mitsuba(
+    xml: str | Path,
+    motions: Mapping[str, Pose] | None = None,
+    *,
+    camera: Camera | None = None,
+    flickers: Mapping[str, Flicker] | None = None,
+) -> Scene:
     """Return the scene of a Mitsuba XML file; shapes named by their `id` follow `motions`, all others rest.
 
+    `flickers` are the strengths over time of emitters by their `id`, of glowing shapes by that of the shape.
     Without `camera` the file's first sensor is taken, a pinhole of its field of view and size behind an f/2.8 lens on
     pixels of 1.1 um. The file's integrator and samples do not count. `FileNotFoundError` for a missing file;
     `ValueError` for a file that Mitsuba refuses, without light, with participating media, with a camera that is not a
-    plain `perspective`, and for motions of unknown shapes or of shapes that cannot be moved rigidly.
+    plain `perspective`, for motions of unknown shapes or of shapes that cannot be moved rigidly, and for flickers of
+    lights that are unknown or whose strength is not one number.
     """
     select()
     import mitsuba as mi
@@ -52,9 +65,24 @@ def read_mitsuba(xml: str | Path, motions: Mapping[str, Pose] | None = None, *, 
             raise ValueError(f"{path}: no shape has the id {name!r}{meant}")
         if not any(f"{name}.{key}" in parameters for key in MOVABLE):
             raise ValueError(f"{path}: shape {name!r} has neither vertices nor a placement to move; use a mesh")
+    for name, flicker in (flickers or {}).items():
+        _check_flicker(path, name, flicker, loaded, parameters)
     parts = tuple(Part(name, motions.get(name)) for name in names)
     camera = camera or _camera(mi, loaded, path)
-    return Scene(path.stem, 0, camera, (), (), file=MitsubaFile(str(path), files.sha256(path)), parts=parts)
+    file = MitsubaFile(str(path), files.sha256(path), dict(flickers) if flickers else None)
+    return Scene(path.stem, 0, camera, (), (), file=file, parts=parts)
+
+
+def _check_flicker(path: Path, name: str, flicker: Flicker, loaded: Any, parameters: Any) -> None:
+    """Raise `ValueError` unless the flicker is one of ours and one number scales the light of this name."""
+    if not isinstance(flicker, Flicker):
+        kinds = "Mains, RectifiedSine or PulseWidth"
+        raise ValueError(f"{path}: flicker of {name!r}: {kinds} is expected, got {flicker!r}")
+    known = {(light if light.get_shape() is None else light.get_shape()).id() for light in loaded.emitters()}
+    lights = {light for light in known if any(f"{light}.{end}" in parameters for end in EMISSION)}
+    if name not in lights:
+        meant = suggest(name, lights) or f"; there are {', '.join(map(repr, sorted(lights))) or 'none'}"
+        raise ValueError(f"{path}: no light whose strength is one number has the id {name!r}{meant}")
 
 
 def load(mi: Any, path: str) -> Any:

@@ -97,6 +97,7 @@ class MitsubaFile:
 
     path: str
     sha256: str  # of the file; meshes and pictures that it names are not counted
+    flickers: dict[str, Flicker] | None = dataclasses.field(default=None, metadata={"described": "if any"})  # by id
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +177,12 @@ class Scene:
 
     @functools.cached_property
     def flickers(self) -> dict[str, Flicker]:
-        """The flicker of each light that has one: `light0` by its place in `lights`, `body3` for a glowing body."""
+        """The flicker of each light that has one: `light0` by its place in `lights`, `body3` for a glowing body.
+
+        Lights of a Mitsuba file have the id of their emitter, or of the shape that glows.
+        """
+        if self.file is not None:
+            return dict(self.file.flickers or {})
         lights = {f"light{i}": getattr(light, "flicker", None) for i, light in enumerate(self.lights)}
         glowing = {f"body{i}": getattr(body.material, "flicker", None) for i, body in enumerate(self.bodies)}
         return {name: flicker for name, flicker in (lights | glowing).items() if flicker is not None}

@@ -11,7 +11,7 @@ from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.mitsuba_xml import read_mitsuba
 from qsim.rendering.renderer import Renderer
-from qsim.scene import Body, Flag, Mesh, Scene, Spin, Still, Translation
+from qsim.scene import Body, Flag, Mains, Mesh, PulseWidth, Scene, Spin, Still, Translation
 
 SENSOR = """<sensor type="perspective"><float name="fov" value="40"/><string name="fov_axis" value="y"/>
   <transform name="to_world"><lookat origin="0,0.5,4" target="0,0,0" up="0,1,0"/></transform>
@@ -127,3 +127,53 @@ def test_a_missing_file_and_a_mixture_are_refused(tmp_path, room):
     assert read.camera is CAMERA
     with pytest.raises(ValueError, match="either records or those of a Mitsuba file"):
         Scene("mix", 0, CAMERA, (), (Body("a", Mesh(np.eye(3), np.array([[0, 1, 2]]))),), file=read.file)
+
+
+LIGHTS = {
+    "bulb": """<emitter type="point" id="bulb"><rgb name="intensity" value="4"/>
+        <point name="position" x="0" y="1" z="3"/></emitter>""",
+    "sun": '<emitter type="directional" id="sun"><rgb name="irradiance" value="1"/></emitter>',
+    "sky": '<emitter type="constant" id="sky"><rgb name="radiance" value="0.2"/></emitter>',
+    "lamp": """<shape type="sphere" id="lamp"><point name="center" x="0" y="1" z="1"/><float name="radius" value="0.2"/>
+        <emitter type="area" id="glow"><rgb name="radiance" value="9"/></emitter></shape>""",
+}
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_lights_of_a_file_flicker(tmp_path, name):
+    """One light alone: every frame is that of the steady light times the exact mean strength of its exposure."""
+    path = written(tmp_path, SENSOR, LIGHTS[name], SHAPES)
+    flicker = PulseWidth(400.0, duty=0.3)
+    budget = Budget(samples=4, bounces=2)
+    found = Renderer(read_mitsuba(path, flickers={name: flicker}), frame_rate=RATE, budget=budget)
+    steady = Renderer(read_mitsuba(path), frame_rate=RATE, budget=budget)
+    strengths = found.strengths(4)[name]
+    assert np.ptp(strengths) > 1
+    for t, strength in enumerate(strengths):
+        expected = strength * steady.frame(t).radiance
+        np.testing.assert_allclose(found.frame(t).radiance, expected, rtol=2e-5, atol=1e-7)
+
+
+def test_a_clip_states_the_flicker_of_a_file(tmp_path):
+    path = written(tmp_path, SENSOR, LIGHTS["bulb"], LIGHTS["sky"], SHAPES)
+    scene = read_mitsuba(path, flickers={"bulb": Mains(100.0)})
+    clip = render_clip(scene, tmp_path / "clip", frames=3, frame_rate=RATE, budget=BUDGET)
+    assert set(clip.strengths) == {"bulb"}
+    assert clip.meta["flicker"]["bulb"]["frequency"] == 100.0
+    assert scene.to_dict()["file"]["flickers"]["bulb"]["kind"] == "Mains"
+    assert "flickers" not in read_mitsuba(path).to_dict()["file"]
+
+
+@pytest.mark.parametrize(
+    ("flickers", "message"),
+    [
+        ({"bulbb": Mains(100.0)}, r"no light whose strength is one number has the id 'bulbb' \(did you mean 'bulb'"),
+        ({"box": Mains(100.0)}, "has the id 'box'; there are 'bulb', 'lamp'$"),
+        ({"glow": Mains(100.0)}, "has the id 'glow'"),
+        ({"bulb": 100.0}, "flicker of 'bulb': Mains, RectifiedSine or PulseWidth is expected, got 100.0"),
+    ],
+)
+def test_flickers_of_no_light_are_refused(tmp_path, flickers, message):
+    path = written(tmp_path, SENSOR, LIGHTS["bulb"], LIGHTS["lamp"], SHAPES)
+    with pytest.raises(ValueError, match=message):
+        read_mitsuba(path, flickers=flickers)
