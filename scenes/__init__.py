@@ -15,6 +15,7 @@ import numpy as np
 
 from qsim.checks import suggest
 from qsim.scene import Scene
+from qsim.scene.animated.gltf_body import GLTF_SUFFIXES
 from qsim.scenes import (
     asset_folder,
     crowd,
@@ -25,6 +26,7 @@ from qsim.scenes import (
     gears,
     glass,
     glossy,
+    gltf_file,
     lamp,
     mains,
     pellets,
@@ -33,6 +35,7 @@ from qsim.scenes import (
     shadow,
     text,
     tumble,
+    walker,
     wires,
 )
 
@@ -55,6 +58,7 @@ FAMILIES: dict[str, Family] = {
     "shadow": shadow.scene,
     "text": text.scene,
     "tumble": tumble.scene,
+    "walker": walker.scene,
     "wires": wires.scene,
 }
 
@@ -62,11 +66,12 @@ RECIPES = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.toml
 
 
 def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
-    """Return the scene of a family, a Python file with `scene(seed, *, speed)`, a folder of assets, or Mitsuba XML.
+    """Return the scene of a family, a .py file with `scene(seed, *, speed)`, a folder of assets, glTF or Mitsuba XML.
 
-    `asset_folder.py` states what a folder may hold. An XML scene stands still and has no seed: a Python file that calls
-    `qsim.read_mitsuba` moves its shapes. `FileNotFoundError` for a missing file; `ValueError` for a name that is none
-    of these, and for a speed other than 1 that changes no motion of a .py or .xml scene.
+    `asset_folder.py` states what a folder may hold, `gltf_file.py` what becomes of an animated .glb or .gltf. An XML
+    scene stands still and has no seed: a Python file that calls `qsim.read_mitsuba` moves its shapes.
+    `FileNotFoundError` for a missing file; `ValueError` for a name that is none of these, and for a speed other than 1
+    that changes no motion of a .py or .xml scene.
     """
     if str(name) in FAMILIES:
         return FAMILIES[str(name)](seed, speed=speed)
@@ -84,13 +89,15 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
         from qsim.rendering.mitsuba_xml import read_mitsuba
 
         return read_mitsuba(name)
+    if str(name).endswith(GLTF_SUFFIXES):
+        return gltf_file.scene(seed, speed=speed, file=name)
     if (Path(name) / "clip.json").is_file():
-        raise ValueError(f"{name}: is a clip, made from a scene already; name a family, a .py or .xml file or a folder")
+        raise ValueError(f"{name}: is a clip, made from a scene already; name a family, a file or a folder")
     if Path(name).is_dir():
         return asset_folder.scene(seed, speed=speed, folder=name)
     raise ValueError(
         f"no scene family {str(name)!r}{suggest(str(name), FAMILIES)}; there are {', '.join(FAMILIES)}, "
-        "or give a .py or .xml file or a folder"
+        "or give a .py, .glb, .gltf or .xml file or a folder"
     )
 
 

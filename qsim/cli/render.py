@@ -29,7 +29,8 @@ def add_render(sub: Any) -> None:
         threads="threads of the renderer (Dr.Jit); the picture does not depend on it",
     )  # fmt: skip
     parser.add_argument(
-        "scene", help="a family of scenes/, a .py file with scene(seed, speed=...), Mitsuba .xml, a folder of assets"
+        "scene",
+        help="a family of scenes/, a .py file with scene(seed, speed=...), an animated .glb, Mitsuba .xml, a folder",
     )
     parser.add_argument("-o", "--output", type=Path, help="clip folder to make (may be left out with --explain)")
     parser.add_argument(

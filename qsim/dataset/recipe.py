@@ -13,7 +13,7 @@
     camera_path = "path.json"  # poses, view and distortion of the camera, a transforms.json; default: the scene's
 
     [[scenes]]                 # one clip per family, seed and speed
-    family = "fan"             # a family of scenes/; or a .py file, .xml file or folder beside the recipe ("./things")
+    family = "fan"             # a family of scenes/; or a .py, .xml, .glb file or folder beside the recipe ("./things")
     seeds = [0, 1, 2]          # one clip each; or give count
     count = 3                  # clips of the seeds first ... first + count - 1
     first = 0                  # first seed of a count; default 0

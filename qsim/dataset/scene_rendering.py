@@ -46,14 +46,14 @@ def render(
 ) -> Clip:
     """Render a scene at a stated error and return its clip: radiance, sharp frames and ground truth.
 
-    `scene` is a `Scene`, or what `qsim render` takes: a family, a .py file with `scene(seed, *, speed)`, Mitsuba .xml,
-    or a folder of assets. `height` and `width` [px] default to the camera of a `Scene` and to 128 of all others. `seed`
-    is that of the scene and of its samples; `speed` is a factor on all motions (default 1). `frame_rate` is in frames
-    per second, `shutter` the open fraction of a frame, 0 for sharp frames. `psnr` [dB] is the requested error, `ppp`
-    the brightest light that will be sensed [photons/pixel] (`choose_budget`); a `budget` decides both instead.
-    `bands="rgb"` gives a scene of one band colours (scenes/colours.py) and renders red, green and blue.
-    `camera_path` is a transforms.json whose view, distortion and poses replace those of the scene's camera; a file
-    that states no rate has one pose per frame (qsim/scene/camera_path.py).
+    `scene` is a `Scene`, or what `qsim render` takes: a family, a .py file with `scene(seed, *, speed)`, an animated
+    .glb or .gltf, Mitsuba .xml, or a folder of assets. `height` and `width` [px] default to the camera of a `Scene` and
+    to 128 of all others. `seed` is that of the scene and of its samples; `speed` is a factor on all motions (default
+    1). `frame_rate` is in frames per second, `shutter` the open fraction of a frame, 0 for sharp frames. `psnr` [dB] is
+    the requested error, `ppp` the brightest light that will be sensed [photons/pixel] (`choose_budget`); a `budget`
+    decides both instead. `bands="rgb"` gives a scene of one band colours (scenes/colours.py) and renders red, green and
+    blue. `camera_path` is a transforms.json whose view, distortion and poses replace those of the scene's camera; a
+    file that states no rate has one pose per frame (qsim/scene/camera_path.py).
 
     `path` is the folder of the clip; an equal call resumes an interrupted one. Without it, the clip lies in a temporary
     folder that is deleted after the last use of the clip and its streams. `progress(done, frames)` is called after each

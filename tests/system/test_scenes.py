@@ -177,7 +177,8 @@ def test_loading_by_name_and_by_file(tmp_path):
     own.write_text("from qsim.scenes.fan import scene\n")
     assert scenes.load(own, 3).to_dict() == scenes.load("fan", 3).to_dict()
     with pytest.raises(
-        ValueError, match=r"no scene family 'fun'.*; there are .*fan.*or give a .py or .xml file or a folder"
+        ValueError,
+        match=r"no scene family 'fun'.*; there are .*fan.*or give a .py, .glb, .gltf or .xml file or a folder",
     ):
         scenes.load("fun")
     with pytest.raises(FileNotFoundError, match=r"missing.py: no such file"):

@@ -11,6 +11,7 @@ from qsim.clip.sensing import Sensing
 from qsim.dataset.job import Job, Settings
 from qsim.dataset.recipe_sections.toml_section import Section
 from qsim.files import check_name
+from qsim.scene.animated.gltf_body import GLTF_SUFFIXES, animated_file, animations_in
 from qsim.scene.camera_path import PLAIN, read_camera_path
 from qsim.structure import Check, Table
 
@@ -80,9 +81,11 @@ def _family(section: Section, family: str) -> str:
     file = (section.text.path.parent / family).resolve()
     if "/" in family and file.is_dir():
         return str(file)
-    if family.endswith((".py", ".xml")):
+    if family.endswith((".py", ".xml", *GLTF_SUFFIXES)):
         if not file.is_file():
             raise ValueError(f"{section.where('family')}: no such scene file {file}")
+        if family.endswith(GLTF_SUFFIXES):
+            _check_animations(section, file)
         return str(file)
     from qsim.scenes import FAMILIES
 
@@ -90,6 +93,16 @@ def _family(section: Section, family: str) -> str:
         meant = f"{family!r}{checks.suggest(family, FAMILIES)}; there are: {', '.join(sorted(FAMILIES))}"
         raise ValueError(f"{section.where('family')}: unknown family {meant}")
     return family
+
+
+def _check_animations(section: Section, file: Path) -> None:
+    """`ValueError` with the line of the recipe if an animation of a glTF file cannot be read."""
+    try:
+        names: list[str | None] = [*animations_in(file)]
+        for name in names or [None]:
+            animated_file(file, animation=name)
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{section.where('family')}: {error}") from None
 
 
 def _seeds(section: Section, given: dict[str, Any]) -> list[int]:
