@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,16 +24,13 @@ from rows import LIGHTS, TINY, Budget, check_row, make_row, notes_on, scores
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
 from quiver.model.config import Config
-from quiver.model.equal_cost import EQUAL_COST
 from quiver.model.presets import ABLATIONS, ablated, assemble, parameter_count
 from quiver.training.loop import train
 from quiver.training.settings import PROTOCOLS, Settings
 
 ROOT = Path(__file__).parents[1]
 FORMAT = "quiver-ablation-1"
-MILLION = replace(
-    EQUAL_COST["quiver-s"], channels=4, deformable_groups=4, denoiser_growth=8, flow_channels=(20, 40, 20, 10)
-)
+MILLION = Config(channels=4, deformable_groups=4, denoiser_growth=8, flow_channels=(20, 40, 20, 10))
 SEEDS = (0, 1)
 RATE = 3e-4  # the lower one of docs/equal_budget.py: the same for all six
 LIMITS = """Twenty minutes show which parts help at once, not which help after days of training. The spread of two seeds

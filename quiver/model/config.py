@@ -1,4 +1,4 @@
-"""Holds the configuration of QUIVER: its width, and the switches of the paper's ablation."""
+"""Holds the configuration of QUIVER: its width, the switches of the paper's ablation, and the sizes of some parts."""
 
 from dataclasses import asdict, dataclass
 from typing import Self
@@ -6,7 +6,7 @@ from typing import Self
 from qsim.checks import shown
 from qsim.structure import make
 
-GROUPS = 16  # of channels that share offsets in the published alignment
+_FLOW_LAYERS = 8  # at most, of one level
 
 
 def whole_number(name: str, value: object, least: int, most: int) -> None:
@@ -31,26 +31,33 @@ def flag(name: str, value: object) -> None:
 class Config:
     """Configuration of a QUIVER network; the defaults are the published design at full width."""
 
-    channels: int = 64  # the unit C of all widths, a multiple of 16
+    channels: int = 64  # the unit C of all widths
     cell_growth: int | None = None  # channels that a layer of the recurrent cell adds; None = 2C as published
     pre_denoiser: bool = True  # ablation: False feeds the noisy frames to both streams and to the flow
     flow: bool = True  # ablation: False aligns by the learnt offsets alone
     multi_scale: bool = True  # ablation: False makes a picture at full scale only
+    deformable_groups: int = 16  # of channels that share offsets in the alignment; they divide `channels`
+    denoiser_growth: int = 64  # channels that a dense layer of the pre-denoiser adds
+    flow_channels: tuple[int, ...] = (32, 64, 32, 16)  # widths of the layers of each flow level
 
     def __post_init__(self) -> None:
         """Raise `ValueError` for a value out of range."""
-        self.check(GROUPS)
-
-    def check(self, groups: int) -> None:
-        """Raise `ValueError` for a value out of range, or a width that so many deformable groups do not divide."""
         whole_number("Config.channels", self.channels, 2, 1024)
+        whole_number("Config.deformable_groups", self.deformable_groups, 1, 1024)
+        whole_number("Config.denoiser_growth", self.denoiser_growth, 1, 1024)
         if self.cell_growth is not None:
             whole_number("Config.cell_growth", self.cell_growth, 1, 8192)
         for name in ("pre_denoiser", "flow", "multi_scale"):
             flag(f"Config.{name}", getattr(self, name))
-        if self.channels % 2 or self.channels % groups:
+        if not isinstance(self.flow_channels, tuple) or not 1 <= len(self.flow_channels) <= _FLOW_LAYERS:
+            found = shown(self.flow_channels)
+            raise ValueError(f"Config.flow_channels must be 1 to {_FLOW_LAYERS} widths, got {found}")
+        for value in self.flow_channels:
+            whole_number("Config.flow_channels", value, 1, 1024)
+        if self.channels % 2 or self.channels % self.deformable_groups:
             raise ValueError(
-                f"Config.channels must be even and a multiple of the {groups} deformable groups, got {self.channels}"
+                f"Config.channels must be even and a multiple of the {self.deformable_groups} deformable groups, "
+                f"got {self.channels}"
             )
 
     def to_dict(self) -> dict[str, object]:

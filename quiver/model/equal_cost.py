@@ -6,7 +6,7 @@ long clip, whose ends do not count.
 
 from typing import Any
 
-from quiver.model.folded import FoldedConfig
+from quiver.model.config import Config
 from quiver.model.mergenet import MergeNetConfig
 from quiver.model.rivals.bit2bit import Bit2BitConfig
 from quiver.model.rivals.emvd import EMVDConfig
@@ -31,22 +31,6 @@ EQUAL_COST: dict[str, Any] = {
     "bit2bit": Bit2BitConfig(width=40),  # 1.00 M; every frame lies in two pieces
     "fastdvdnet": FastDVDnetConfig(width=57),  # 0.99 M
     "unet": UNetConfig(width=90),  # 0.99 M
-    # 1.02 M; the published width 16 costs 2.5. QUIVER without additions: no folding, initial estimate or temperature.
-    "quiver-s": FoldedConfig(
-        channels=12,
-        deformable_groups=12,
-        deformable_kernel=3,
-        denoiser_growth=24,
-        denoiser_passes=5,
-        flow_channels=(16, 32, 16, 8),
-        flow_kernel=7,
-        flow_levels=4,
-        cell_blocks=11,
-        attention_width=None,
-        attention_temperature=None,
-        fold=1,
-        estimate_width=0,
-        largest_velocity=0.0,
-        lecun=False,
-    ),
+    # 1.02 M; the published width 16 costs 2.5
+    "quiver-s": Config(channels=12, deformable_groups=12, denoiser_growth=24, flow_channels=(16, 32, 16, 8)),
 }

@@ -13,7 +13,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from qsim.checks import shown
 from quiver.model.blocks import (
     RADIUS,
     WINDOW,
@@ -36,9 +35,7 @@ from quiver.model.quiver import QUIVER
 # Least and largest value of each number: a configuration comes from a file, and a network is built before its weights
 # are compared with it.
 _WHOLE = {
-    "deformable_groups": (1, 1024),
     "deformable_kernel": (1, 15),
-    "denoiser_growth": (1, 1024),
     "denoiser_passes": (1, 64),
     "flow_kernel": (1, 31),
     "flow_levels": (3, 10),
@@ -47,7 +44,6 @@ _WHOLE = {
     "fold": (1, 16),
     "estimate_width": (0, 1024),
 }
-_FLOW_LAYERS = 8  # at most, of one level
 
 
 @dataclass(frozen=True)
@@ -80,16 +76,10 @@ class FoldedConfig(Config):
             real_number("FoldedConfig.attention_temperature", self.attention_temperature, -1e6, 1e6)
         real_number("FoldedConfig.largest_velocity", self.largest_velocity, 0.0, 32.0)
         flag("FoldedConfig.lecun", self.lecun)
-        if not isinstance(self.flow_channels, tuple) or not 1 <= len(self.flow_channels) <= _FLOW_LAYERS:
-            raise ValueError(
-                f"FoldedConfig.flow_channels must be 1 to {_FLOW_LAYERS} widths, got {shown(self.flow_channels)}"
-            )
-        for value in self.flow_channels:
-            whole_number("FoldedConfig.flow_channels", value, 1, 1024)
         for name in ("flow_kernel", "deformable_kernel"):
             if getattr(self, name) % 2 == 0:
                 raise ValueError(f"Config.{name} must be odd, got {getattr(self, name)}")
-        self.check(self.deformable_groups)
+        super().__post_init__()
 
 
 class ScaledAttention(TemporalAttention):

@@ -27,7 +27,7 @@ from quiver.model.blocks import (
     neighbourhoods,
     resize,
 )
-from quiver.model.config import GROUPS, Config
+from quiver.model.config import Config
 
 CHUNK_PIXELS = 2**16  # without gradients, frames are computed together up to this many pixels
 
@@ -55,11 +55,11 @@ class QUIVER(nn.Module):
             config = Config() if channels is None else Config(channels=channels)
         self.config = config
         c = config.channels
-        self.denoiser = PreDenoiser(1, c, growth=64, passes=5) if config.pre_denoiser else None
-        self.flow = FlowNetwork((32, 64, 32, 16), kernel=7, levels=4) if config.flow else None
+        self.denoiser = PreDenoiser(1, c, config.denoiser_growth, passes=5) if config.pre_denoiser else None
+        self.flow = FlowNetwork(config.flow_channels, kernel=7, levels=4) if config.flow else None
         self.noisy_features = Extractor(1, c)
         self.denoised_features = Extractor(1, c)
-        self.alignment = Alignment(c, GROUPS, kernel=3)
+        self.alignment = Alignment(c, config.deformable_groups, kernel=3)
         self.fusions = nn.ModuleList(GatedFusion(c) for _ in range(3))
         self.cell = RecurrentCell(1, c, blocks=11, growth=config.cell_growth or 2 * c)
         self.attention = TemporalAttention(4 * c * WINDOW, 4 * c * WINDOW, 4 * c)

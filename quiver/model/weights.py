@@ -28,22 +28,18 @@ DAMAGE = (  # errors that torch raises for damaged files and other content
     *(RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError, OverflowError, MemoryError),
     *(RecursionError, pickle.UnpicklingError, zipfile.BadZipFile, NotImplementedError, AssertionError),
 )
-# Earlier versions had one configuration for QUIVER and FoldedQUIVER: its fields beside those of Config, and their
-# defaults, which are the published sizes.
+# Fields that earlier versions had beside those of Config, by their last names, with the values of every QUIVER.
 EARLIER: dict[str, object] = {
-    "deformable_groups": 16,
     "deformable_kernel": 3,
-    "denoiser_growth": 64,
     "denoiser_passes": 5,
-    "flow_channels": [32, 64, 32, 16],
     "flow_kernel": 7,
     "flow_levels": 4,
     "cell_blocks": 11,
     "attention_width": None,
     "attention_temperature": None,
     "fold": 1,
-    "baseline": 0,
-    "sweep": 0.0,
+    "estimate_width": 0,
+    "largest_velocity": 0.0,
     "lecun": False,
 }
 RENAMED = {"baseline": "estimate_width", "sweep": "largest_velocity"}  # earlier field: field of FoldedConfig
@@ -140,8 +136,8 @@ def annotate(path: Path, notes: Mapping[str, str]) -> None:
 
 
 def _build(kind: str, values: dict[str, object]) -> nn.Module:
-    if kind == "QUIVER":
-        return assemble(_config_of(values))
+    if kind in ("QUIVER", "FoldedQUIVER"):
+        return assemble(_config_of(kind, values))
     for network, config in NETWORKS:
         if kind == network.__name__:
             return network(config.from_dict(without(values, NO_FIELDS.get(kind, ()))))  # type: ignore[attr-defined]
@@ -153,15 +149,15 @@ def without(values: dict[str, object], names: Sequence[str]) -> dict[str, object
     return {name: value for name, value in values.items() if name not in names} if isinstance(values, dict) else values
 
 
-def _config_of(values: dict[str, object]) -> Config:
-    """Return the configuration of a QUIVER file; of an earlier version it may describe a FoldedQUIVER."""
+def _config_of(kind: str, values: dict[str, object]) -> Config:
+    """Return the configuration of a QUIVER, which earlier versions wrote with more fields, or of a FoldedQUIVER."""
     if not isinstance(values, dict):
         raise ValueError("the configuration is not a table of values")
-    published = {name: value for name, value in values.items() if name not in EARLIER}
-    if published.keys() - Config().to_dict().keys() or all(values.get(k, v) == v for k, v in EARLIER.items()):
-        return Config.from_dict(published)
-    sizes = {RENAMED.get(name, name): value for name, value in (EARLIER | values).items()}
-    return FoldedConfig.from_dict(Config().to_dict() | sizes)
+    told = {RENAMED.get(name, name): value for name, value in values.items()}
+    earlier = {name: value for name, value in told.items() if name in EARLIER}
+    if (kind == "QUIVER" or "fold" in earlier) and all(EARLIER[name] == value for name, value in earlier.items()):
+        return Config.from_dict({name: value for name, value in told.items() if name not in EARLIER})
+    return FoldedConfig.from_dict(values if kind == "FoldedQUIVER" else Config().to_dict() | EARLIER | told)
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

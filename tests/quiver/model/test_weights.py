@@ -91,14 +91,26 @@ def test_weights_of_earlier_versions_are_read(tmp_path: Path, network):
     """Their configuration held every size of the published design, and parts had other names."""
     config = network.config.to_dict()
     if not isinstance(network, UNet):
-        old = {new: name for name, new in RENAMED.items()}
-        config = EARLIER | {old.get(name, name): value for name, value in config.items()}
+        config = {OLD.get(name, name): value for name, value in (EARLIER | config).items()}
     earlier(network, config, tmp_path / "w.safetensors")
     back = load(tmp_path / "w.safetensors")
     assert type(back) is type(network)
     assert back.config == network.config
     for name, value in network.state_dict().items():
         assert torch.equal(back.state_dict()[name], value), name
+
+
+def test_a_small_quiver_of_an_earlier_version_is_read(tmp_path: Path):
+    """It was a FoldedQUIVER without folding; now QUIVER itself has these sizes."""
+    config = Config(channels=2, deformable_groups=1, denoiser_growth=2, flow_channels=(2,))
+    network, path = QUIVER(config), tmp_path / "w.safetensors"
+    tensors = {name: value.contiguous() for name, value in network.state_dict().items()}
+    values = json.dumps(config.to_dict() | EARLIER)
+    save_file(tensors, path, {"format": "quiver-1", "network": "FoldedQUIVER", "config": values})
+    back = load(path)
+    assert type(back) is QUIVER
+    assert back.config == config
+    assert all(torch.equal(back.state_dict()[name], value) for name, value in tensors.items())
 
 
 def test_a_noise_table_of_an_earlier_version_is_left_out(tmp_path: Path):
