@@ -24,7 +24,8 @@ from rows import LIGHTS, TINY, Budget, check_row, make_row, notes_on, scores
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
 from quiver.model.config import Config
-from quiver.model.presets import ABLATIONS, ablated, assemble, parameter_count
+from quiver.model.presets import ABLATIONS, ablated, parameter_count
+from quiver.model.quiver import QUIVER
 from quiver.training.loop import train
 from quiver.training.settings import PROTOCOLS, Settings
 
@@ -93,7 +94,7 @@ def network(name: str, seed: int, args: argparse.Namespace, budget: Budget) -> d
         **PROTOCOLS["control"] | {"learning_rate": RATE, "loss": "published"},
     )
     torch.manual_seed(seed)
-    train(assemble(config), settings, progress=False)
+    train(QUIVER(config), settings, progress=False)
     history = read_json(folder / "history.json")["history"]
     scored = scores([str(folder)], args.work / f"{name}-{seed}_scores", args.data, LIGHTS[:1], budget)
     return {

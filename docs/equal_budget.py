@@ -36,8 +36,8 @@ ROOT = Path(__file__).parents[1]
 FORMAT = "quiver-equal-budget-2"
 CLASSICAL = ("moment:3", "moment", "transform-denoise", "qbp", "qbp-bm3d", "path-merge")
 FLOOR = "moment:3"  # a network below it is given no rank
-RATES = {"nano": ("3e-3", "6e-3"), "mergenet": ("5e-4", "1.5e-3")}  # nano by Muon; all others by Adam
-ADAM_RATES = ("3e-4", "1e-3")
+RATES = {"mergenet": ("5e-4", "1.5e-3")}
+RATES_OF_OTHERS = ("3e-4", "1e-3")
 DIVERGED = 1  # exit code of a training whose loss became NaN or infinite
 RECORD = (0.8e6, 1.2e6)  # multiply-accumulates per pixel and frame of the table of record
 LIMITS = """Thirty minutes cannot tell which network is best after days of training. Large networks make fewer steps in
@@ -98,7 +98,7 @@ def options() -> argparse.ArgumentParser:
 def network(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
     """Return the row of a network: trials, one run, scores and costs."""
     trials = {}
-    for rate in RATES.get(name.removesuffix("-1m"), ADAM_RATES):
+    for rate in RATES.get(name.removesuffix("-1m"), RATES_OF_OTHERS):
         folder = args.work / f"{name}_trial_{rate}"
         trials[rate] = trial(name, rate, folder, args.data, budget)
     rate = max(trials, key=lambda key: trials[key])

@@ -41,7 +41,7 @@ def add_domain(sub: Any) -> None:
 
 def _run_domain(args: argparse.Namespace) -> int:
     from quiver import threads
-    from quiver.model.weights import metadata_of
+    from quiver.model.weights import load, metadata_of
     from quiver.restoration.domain import Domain, read_scope, table
     from quiver.restoration.networks import network_restorer
     from quiver.restoration.restorers import weights_path
@@ -62,6 +62,7 @@ def _run_domain(args: argparse.Namespace) -> int:
         refuse(args, MEASURING, "is for measuring, and no clips are given")
         if args.force:
             raise ValueError("--force: is for measuring, and no clips are given; leave it out")
+        load(path)  # names a damaged file, and one of a network that was removed
         found = read_scope(path, metadata_of(path)).domain
     if found is None:
         raise ValueError(f"{path}: was never measured; give clips that were not used for training or tuning")

@@ -16,9 +16,10 @@ from qsim.cli.console import note
 from qsim.cli.options import count, memory_size, numbers, positive, whole_numbers, words
 from qsim.files import check_ours
 from quiver.device import DEVICES
+from quiver.model.removed import RemovedError, refuse_name
 from quiver.restoration.interface import COMPARED, MODES
 
-QUIVERS = ("nano", "quiver-s", "quiver")  # see quiver/model/presets.py
+QUIVERS = ("quiver-s", "quiver")  # see quiver/model/presets.py
 NETWORKS = (
     *QUIVERS,
     "mergenet",
@@ -37,6 +38,19 @@ def add_light(parser: argparse.ArgumentParser, several: bool) -> None:
     parser.add_argument("--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default quiver-physical)")
     parser.add_argument("--ppp", type=kind, help=f"mean photons per pixel and exposure (default 3.25){many}")
     parser.add_argument("--bits", type=whole, help="bits per code (default 3)")
+
+
+def add_preset(parser: argparse.ArgumentParser, default: str, known: Sequence[str]) -> None:
+    """Add --preset; its error for a network that was removed names what takes its place."""
+
+    def name(text: str) -> str:
+        try:
+            refuse_name(text)
+        except RemovedError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+        return text
+
+    parser.add_argument("--preset", type=name, default=default, choices=known, help=f"network (default {default})")
 
 
 def light_levels(text: str) -> tuple[float, ...]:

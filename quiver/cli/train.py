@@ -20,6 +20,7 @@ from quiver.cli.options import (
     PROTOCOLS,
     QUIVERS,
     add_noise,
+    add_preset,
     add_running,
     add_threads,
     command,
@@ -46,7 +47,7 @@ def add_train(sub: Any) -> None:
         help="data set folder, or several, whose clips count alike; for bit2bit a stored stream, or a clip with one",
     )
     parser.add_argument("-o", "--output", required=True, help="folder of the run")
-    parser.add_argument("--preset", default="mergenet", choices=NETWORKS, help="network (default mergenet)")
+    add_preset(parser, "mergenet", NETWORKS)
     parser.add_argument(
         "--protocol",
         default="quick",
@@ -70,7 +71,7 @@ def add_train(sub: Any) -> None:
     parser.add_argument(
         "--loss",
         choices=("published", "paper", "l1", "scales-l1"),
-        help="of quiver, nano and unet; default: the protocol's; compared networks have their own",
+        help="of quiver and unet; default: the protocol's; compared networks have their own",
     )
     parser.add_argument("--validate-every", type=count, help="steps between validations")
     parser.add_argument(
@@ -228,7 +229,7 @@ def add_ablate(sub: Any) -> None:
     )  # fmt: skip
     parser.add_argument("data", help="data set folder")
     parser.add_argument("-o", "--output", required=True, help="folder of the six runs and their table")
-    parser.add_argument("--preset", default="quiver-s", choices=QUIVERS, help="network (default quiver-s)")
+    add_preset(parser, "quiver-s", QUIVERS)
     parser.add_argument("--protocol", default="quick", choices=PROTOCOLS, help="bundle of defaults (default quick)")
     parser.add_argument("--steps", type=count, help="optimiser steps of each")
     parser.add_argument("--minutes", type=positive, help="wall-clock limit of each")

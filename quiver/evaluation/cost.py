@@ -37,7 +37,7 @@ from quiver.restoration.networks import network_restorer, wrap_network
 from quiver.restoration.restorers import restorer, weights_path
 
 EXPOSURE = 5e-4  # s
-MODAL = ("nano", "quiver-s", "quiver", "quiver-s-1m")  # presets that have several modes
+MODAL = ("quiver-s", "quiver", "quiver-s-1m")  # presets that have several modes
 PRESETS = (*MODAL, *COMPARED, *(f"{name}-1m" for name in ("mergenet", *COMPARED)))
 
 
@@ -220,12 +220,14 @@ def checked_cases(
     methods: Sequence[str], modes: Sequence[str] | None, precisions: Sequence[str] | None, device: str | None
 ) -> list[CostCase]:
     """Return `cases_of` with the defaults for None. `ValueError` for unknown names and options without effect."""
+    from quiver.model.weights import load
+
     networks = [method for method in methods if method.partition(":")[0] not in METHODS]
     for method in methods:
         if method not in networks:
             restorer(method)
         elif method not in PRESETS:
-            weights_path(method)
+            load(weights_path(method))
     for option, given, known in (("modes", modes, MODES), ("precisions", precisions, ("float32", "bfloat16"))):
         for name in given or ():
             if name not in known:
@@ -234,7 +236,7 @@ def checked_cases(
         if value is not None and not networks:
             raise ValueError(f"--{option}: acts on networks, and {', '.join(methods)} is classical; leave it out")
     if modes is not None and networks and all(_has_one_mode(network) for network in networks):
-        raise ValueError(f"--modes: acts on QUIVER and nano, {', '.join(networks)} has one mode; leave it out")
+        raise ValueError(f"--modes: acts on QUIVER, {', '.join(networks)} has one mode; leave it out")
     if networks:
         pick_device(device or "auto")
     return cases_of(methods, modes or ("exact", "streaming"), precisions or ("float32",))

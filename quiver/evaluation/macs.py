@@ -5,7 +5,6 @@ pixels are not. The count of a design is that of one more frame of a long clip. 
 the frames around each part, depends on the program (quiver/restoration/parts.py); `quiver bench` counts it.
 """
 
-import contextlib
 from typing import Any
 
 import torch
@@ -25,10 +24,9 @@ SIDE = 128  # px
 def design_macs(config: Any) -> float:
     """Return those of the network of a configuration, per pixel of one more frame of a long clip of 128 x 128 px.
 
-    Nothing is computed: tensors have a shape and no values. A plane sweep, which looks at values, is the exception.
+    Nothing is computed: tensors have a shape and no values.
     """
-    fake = contextlib.nullcontext() if getattr(config, "largest_velocity", 0) else FakeTensorMode()
-    with fake:
+    with FakeTensorMode():
         return macs_per_pixel(made(config).eval(), LONG if isinstance(config, Bit2BitConfig) else FRAMES)
 
 

@@ -6,7 +6,6 @@ from qsim.files import lazy_names
 
 if TYPE_CHECKING:
     from quiver.model.config import Config
-    from quiver.model.folded import FoldedConfig, FoldedQUIVER
     from quiver.model.published_weights import from_published
     from quiver.model.quiver import QUIVER
     from quiver.model.unet import UNet, UNetConfig
@@ -14,13 +13,11 @@ if TYPE_CHECKING:
 _HOMES = {
     "QUIVER": "quiver",
     "Config": "config",
-    "FoldedQUIVER": "folded",
-    "FoldedConfig": "folded",
     "UNet": "unet",
     "UNetConfig": "unet",
     "from_published": "published_weights",
 }
 
-__all__ = ["QUIVER", "Config", "FoldedConfig", "FoldedQUIVER", "UNet", "UNetConfig", "from_published"]
+__all__ = ["QUIVER", "Config", "UNet", "UNetConfig", "from_published"]
 
 __getattr__ = lazy_names(__name__, _HOMES)

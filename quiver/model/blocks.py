@@ -4,7 +4,7 @@ Conventions of all blocks:
 
 * `conv` has stride 1, zero padding (k-1)/2 and a bias; GELU is the exact erf form.
 * There is no normalisation layer, no dropout, and no activation on any output.
-* C is the channel unit. f2 is the number of channels of a frame: 1 in the published network.
+* C is the channel unit.
 * A flow is in pixels of its scale, channel 0 = x (right), 1 = y (down). It is given on the grid of frame t+1 and points
   into frame t.
 * Values of frames are in units of x = photons/white.
@@ -24,6 +24,8 @@ from quiver.model.deformable import deform_conv2d, warp
 RADIUS = 5  # frames before and after the restored one
 WINDOW = 2 * RADIUS + 1
 NEIGHBOURS = 5  # consecutive frames that a feature extractor takes
+PASSES = 5  # of the pre-denoiser's block
+BLOCKS = 11  # of the recurrent cell
 OFFSET_LIMIT = 10.0  # px, largest offset that the alignment adds to the flow
 GREY_MEAN, GREY_DEVIATION = 0.449, 0.226  # standardisation of the flow network's input; kept as float32 buffers
 
@@ -91,20 +93,19 @@ class ResidualDenseBlock(nn.Module):
 class PreDenoiser(nn.Module):
     """Denoises each frame alone: one residual dense block runs several times, its results are fused and added."""
 
-    def __init__(self, image: int, channels: int, growth: int, passes: int) -> None:
+    def __init__(self, channels: int, growth: int) -> None:
         super().__init__()
-        self.lift = conv(image, channels, 1)
+        self.lift = conv(1, channels, 1)
         self.enter = conv(channels, channels, 3)
         self.block = ResidualDenseBlock(channels, growth, nn.ReLU)
-        self.fuse = nn.Sequential(conv(passes * channels, channels, 1), conv(channels, channels, 3))
-        self.leave = conv(channels, image, 3)
-        self.passes = passes
+        self.fuse = nn.Sequential(conv(PASSES * channels, channels, 1), conv(channels, channels, 3))
+        self.leave = conv(channels, 1, 3)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[N, f2, H, W] -> the same shape."""
+        """[N, 1, H, W] -> the same shape."""
         shallow = self.lift(join(x))
         results = [self.enter(shallow)]
-        for _ in range(self.passes):
+        for _ in range(PASSES):
             results.append(self.block(results[-1]))
         return self.leave(self.fuse(join(*results[1:])) + shallow) + x
 
@@ -154,7 +155,7 @@ class FlowNetwork(nn.Module):
 def neighbourhoods(frames: Tensor, before: int = NEIGHBOURS // 2, after: int = NEIGHBOURS // 2) -> Tensor:
     """Stack every frame with two neighbours on each side as channels; zeros before the first and after the last.
 
-    [B, T, f2, H, W] -> [B, T + before + after - 4, f2*5, H, W], channels in the order (f2, time).
+    [B, T, 1, H, W] -> [B, T + before + after - 4, 5, H, W].
     """
     padded = F.pad(frames, (0, 0, 0, 0, 0, 0, before, after))
     stacks = padded.unfold(1, NEIGHBOURS, 1).permute(0, 1, 2, 5, 3, 4)
@@ -168,14 +169,14 @@ class Extractor(nn.Module):
     and it is faster for few channels.
     """
 
-    def __init__(self, image: int, channels: int) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        self.scale1 = nn.Conv3d(image, channels, NEIGHBOURS)
-        self.scale2 = nn.Conv3d(image, channels, NEIGHBOURS)
-        self.scale4 = nn.Conv3d(image, channels, NEIGHBOURS)
+        self.scale1 = nn.Conv3d(1, channels, NEIGHBOURS)
+        self.scale2 = nn.Conv3d(1, channels, NEIGHBOURS)
+        self.scale4 = nn.Conv3d(1, channels, NEIGHBOURS)
 
     def forward(self, stacks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """[N, f2*5, H, W] (see `neighbourhoods`) -> features [N, C, H/s, W/s] for s = 1, 2, 4."""
+        """[N, 5, H, W] (see `neighbourhoods`) -> features [N, C, H/s, W/s] for s = 1, 2, 4."""
         stacks = join(stacks)
         half = resize(stacks, stacks.shape[2] // 2, stacks.shape[3] // 2)
         return (
@@ -192,9 +193,9 @@ class Extractor(nn.Module):
 class Alignment(nn.Module):
     """Aligns the features of frame t-1 to frame t by a deformable convolution along the flow; one for all scales."""
 
-    def __init__(self, channels: int, groups: int, kernel: int = 3) -> None:
+    def __init__(self, channels: int, groups: int) -> None:
         super().__init__()
-        self.pairs = groups * kernel**2  # number of offset vectors: one for each tap of each group
+        self.pairs = groups * 3**2  # number of offset vectors: one for each tap of each group
         self.offsets = nn.Sequential(
             conv(2 * channels + 2, channels, 3),
             nn.LeakyReLU(0.1),
@@ -204,9 +205,9 @@ class Alignment(nn.Module):
             nn.LeakyReLU(0.1),
             conv(channels, 3 * self.pairs, 3),
         )
-        self.weight = nn.Parameter(torch.empty(channels, channels, kernel, kernel))
+        self.weight = nn.Parameter(torch.empty(channels, channels, 3, 3))
         self.bias = nn.Parameter(torch.zeros(channels))
-        bound = 1 / math.sqrt(kernel**2 * channels)
+        bound = 1 / math.sqrt(3**2 * channels)
         nn.init.uniform_(self.weight, -bound, bound)
         last = self.offsets[-1]
         assert isinstance(last, nn.Conv2d)
@@ -221,7 +222,7 @@ class Alignment(nn.Module):
         own = OFFSET_LIMIT * torch.tanh(raw[:, : 2 * self.pairs])
         offset = own + flow.flip(1).repeat(1, self.pairs, 1, 1)
         mask = torch.sigmoid(raw[:, 2 * self.pairs :])
-        return deform_conv2d(previous, offset, self.weight, self.bias, mask, padding=self.weight.shape[2] // 2)
+        return deform_conv2d(previous, offset, self.weight, self.bias, mask, padding=1)
 
 
 class GatedFusion(nn.Module):
@@ -249,12 +250,12 @@ class RecurrentCell(nn.Module):
     `encode` is the part without state, `step` the recurrent part, `state` the next state from the result of `step`.
     """
 
-    def __init__(self, image: int, channels: int, blocks: int, growth: int) -> None:
+    def __init__(self, channels: int, growth: int) -> None:
         super().__init__()
         c = channels
-        self.image1 = conv(image, c, 5)
-        self.image2 = conv(image, c, 3)
-        self.image4 = conv(image, c, 3)
+        self.image1 = conv(1, c, 5)
+        self.image2 = conv(1, c, 3)
+        self.image4 = conv(1, c, 3)
         self.fuse1 = conv(2 * c, 4 * c, 1)
         self.block1 = ResidualDenseBlock(4 * c, c)
         self.down1 = conv(4 * c, 4 * c, 5, stride=2)
@@ -262,13 +263,13 @@ class RecurrentCell(nn.Module):
         self.down2 = conv(6 * c, 4 * c, 5, stride=2)
         self.join = ResidualDenseBlock(8 * c, c)
         self.shrink = conv(8 * c, 4 * c, 3)
-        self.blocks = nn.ModuleList(ResidualDenseBlock(4 * c, growth) for _ in range(blocks))
-        self.collect = conv(4 * c * blocks, 4 * c, 1)
+        self.blocks = nn.ModuleList(ResidualDenseBlock(4 * c, growth) for _ in range(BLOCKS))
+        self.collect = conv(4 * c * BLOCKS, 4 * c, 1)
         self.smooth = conv(4 * c, 4 * c, 3)
         self.state = nn.Sequential(conv(4 * c, 2 * c, 3), ResidualDenseBlock(2 * c, 2 * c), conv(2 * c, 2 * c, 3))
 
     def encode(self, images: Sequence[Tensor], fused: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Images [N, f2, h, w] and fused features [N, C, h, w], three scales each -> R1, R2 [4C], entry [6C at 1/4]."""
+        """Images [N, 1, h, w] and fused features [N, C, h, w], three scales each -> R1, R2 [4C], entry [6C at 1/4]."""
         r1 = self.fuse1(join(self.image1(images[0]), fused[0]))
         r2 = self.down1(self.block1(r1))
         middle = join(r2, self.image2(images[1]), fused[1])
@@ -288,33 +289,30 @@ class RecurrentCell(nn.Module):
 class TemporalAttention(nn.Module):
     """Channel self-attention over the R4 of a window, stacked with the centre frame last."""
 
-    def __init__(self, inputs: int, width: int, outputs: int) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        self.enter = conv(inputs, width, 3, bias=False)
+        width = 4 * channels * WINDOW
+        self.enter = conv(width, width, 3, bias=False)
         self.spread = nn.Conv2d(width, width, 3, padding=1, groups=width, bias=False)
         self.qkv = conv(width, 3 * width, 1, bias=False)
         self.project = conv(width, width, 1, bias=False)
-        self.leave = conv(width, outputs, 1, bias=False)
+        self.leave = conv(width, 4 * channels, 1, bias=False)
 
     def forward(self, window: Sequence[Tensor]) -> Tensor:
         """R4 [N, 4C, h, w] of an odd number of frames in time order -> [N, 4C, h, w] for the centre frame."""
         centre = len(window) // 2
         c = self.enter(join(*window[:centre], *window[centre + 1 :], window[centre]))
         q, k, v = self.qkv(self.spread(c)).flatten(2).chunk(3, dim=1)
-        attended = (self.logits(q, k).softmax(dim=2) @ v).view_as(c)
+        cosines = F.normalize(q, dim=2) @ F.normalize(k, dim=2).transpose(1, 2)  # of every pair of channels
+        attended = (cosines.softmax(dim=2) @ v).view_as(c)
         return self.leave(self.project(attended) + c)
-
-    def logits(self, q: Tensor, k: Tensor) -> Tensor:
-        """Queries and keys [N, D, hw] -> cosine of every pair [N, D, D], in [-1, 1]."""
-        return F.normalize(q, dim=2) @ F.normalize(k, dim=2).transpose(1, 2)
 
 
 class Refinement(nn.Module):
     """Makes the picture of one scale: channel attention, an image branch, and a hidden branch for the next scale."""
 
-    def __init__(self, image: int, channels: int) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        self.image = image
         c = channels
         self.enter = conv(8 * c, 8 * c, 1)
         self.body = nn.Sequential(conv(8 * c, 8 * c, 1), nn.GELU(), conv(8 * c, 8 * c, 3))
@@ -323,18 +321,18 @@ class Refinement(nn.Module):
         )
         widths = (8 * c, 8 * c, 6 * c, 4 * c)
         self.hidden = nn.Sequential(*_gelu_chain(widths), nn.GELU(), upsample(4 * c, 4 * c))
-        self.picture = nn.Sequential(*_gelu_chain((8 * c, 6 * c, 4 * c, 2 * c, c)), conv(c, image, 3))
-        self.next_picture = upsample(image, image)
+        self.picture = nn.Sequential(*_gelu_chain((8 * c, 6 * c, 4 * c, 2 * c, c)), conv(c, 1, 3))
+        self.next_picture = upsample(1, 1)
 
     def forward(self, feature: Tensor, hidden: Tensor, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Feature, hidden [N, 4C, h, w], picture [N, f2, h, w] -> new picture [N, f2, h, w], g [N, 8C, h, w]."""
+        """Feature, hidden [N, 4C, h, w], picture [N, 1, h, w] -> new picture [N, 1, h, w], g [N, 8C, h, w]."""
         g0 = self.enter(join(feature, hidden))
         b = self.body(g0)
         g = self.gate(b.mean(dim=(2, 3), keepdim=True)) * b + g0
         return self.picture(g) + picture, g
 
     def onward(self, g: Tensor, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """g [N, 8C, h, w], picture [N, f2, h, w] -> hidden [N, 4C, 2h, 2w], picture [N, f2, 2h, 2w]."""
+        """g [N, 8C, h, w], picture [N, 1, h, w] -> hidden [N, 4C, 2h, 2w], picture [N, 1, 2h, 2w]."""
         return self.hidden(g), self.next_picture(picture)
 
 

@@ -6,9 +6,9 @@ from typing import Any
 import torch
 from torch import nn
 
+from quiver.model import removed
 from quiver.model.config import Config
 from quiver.model.equal_cost import EQUAL_COST
-from quiver.model.folded import FoldedConfig, FoldedQUIVER
 from quiver.model.mergenet import MergeNet, MergeNetConfig
 from quiver.model.quiver import QUIVER
 from quiver.model.rivals.bit2bit import Bit2Bit, Bit2BitConfig
@@ -24,7 +24,6 @@ from quiver.model.unet import UNet, UNetConfig
 PRESETS: dict[str, Config] = {
     "quiver": Config(),
     "quiver-s": Config(channels=16),
-    "nano": FoldedConfig(),  # small in every part; results: docs/results/starter.md
 }
 
 # The controls and the compared networks: mended, with the sensor's noise or factor, and as their ports have them.
@@ -49,7 +48,6 @@ OTHERS: dict[str, Any] = {
 # Each network with its configuration. The name of the class stands in weights files.
 NETWORKS: tuple[tuple[type[nn.Module], type], ...] = (
     (QUIVER, Config),
-    (FoldedQUIVER, FoldedConfig),
     (MergeNet, MergeNetConfig),
     (UNet, UNetConfig),
     (FastDVDnet, FastDVDnetConfig),
@@ -71,11 +69,6 @@ ABLATIONS: dict[str, tuple[bool, bool, bool]] = {
     "denoiser+scales": (True, False, True),
     "all": (True, True, True),
 }
-
-
-def assemble(config: Config) -> QUIVER:
-    """Return the QUIVER of a configuration, with random weights."""
-    return FoldedQUIVER(config) if isinstance(config, FoldedConfig) else QUIVER(config)
 
 
 def ablated(config: Config, row: str) -> Config:
@@ -100,11 +93,12 @@ def ablated(config: Config, row: str) -> Config:
 def parameter_count(config: Config) -> int:
     """Return the number of parameters, counted without memory for them."""
     with torch.device("meta"):
-        return sum(parameter.numel() for parameter in assemble(config).parameters())
+        return sum(parameter.numel() for parameter in QUIVER(config).parameters())
 
 
 def build(name: str) -> nn.Module:
     """Return a network by its name, with random weights; ValueError for other names."""
+    removed.refuse_name(name)
     known = PRESETS | OTHERS
     if name not in known:
         raise ValueError(f"no network is called {name!r}; known: {', '.join(known)}")

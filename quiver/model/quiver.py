@@ -13,7 +13,6 @@ from torch import Tensor, nn
 
 from quiver.model.blocks import (
     RADIUS,
-    WINDOW,
     Alignment,
     Extractor,
     FlowNetwork,
@@ -55,16 +54,16 @@ class QUIVER(nn.Module):
             config = Config() if channels is None else Config(channels=channels)
         self.config = config
         c = config.channels
-        self.denoiser = PreDenoiser(1, c, config.denoiser_growth, passes=5) if config.pre_denoiser else None
+        self.denoiser = PreDenoiser(c, config.denoiser_growth) if config.pre_denoiser else None
         self.flow = FlowNetwork(config.flow_channels, kernel=7, levels=4) if config.flow else None
-        self.noisy_features = Extractor(1, c)
-        self.denoised_features = Extractor(1, c)
-        self.alignment = Alignment(c, config.deformable_groups, kernel=3)
+        self.noisy_features = Extractor(c)
+        self.denoised_features = Extractor(c)
+        self.alignment = Alignment(c, config.deformable_groups)
         self.fusions = nn.ModuleList(GatedFusion(c) for _ in range(3))
-        self.cell = RecurrentCell(1, c, blocks=11, growth=config.cell_growth or 2 * c)
-        self.attention = TemporalAttention(4 * c * WINDOW, 4 * c * WINDOW, 4 * c)
-        self.refine4 = Refinement(1, c)
-        self.refine = Refinement(1, c)
+        self.cell = RecurrentCell(c, config.cell_growth or 2 * c)
+        self.attention = TemporalAttention(c)
+        self.refine4 = Refinement(c)
+        self.refine = Refinement(c)
 
     def forward(self, x: Tensor) -> Output:
         """[B, T, 1, H, W] of codes/(2^b - 1), T >= 11, H and W multiples of 4; ValueError otherwise."""
@@ -123,7 +122,7 @@ class QUIVER(nn.Module):
     def restore(self, window: Sequence[Tensor], r1: Tensor, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """R4 of eleven frames, R1 and R2 of their centre -> pictures [N, 1, h/s, w/s] at scales 1, 2, 4."""
         attended = self.attention(window)
-        nothing = attended.new_zeros(attended.shape[0], self.refine4.image, *attended.shape[2:])
+        nothing = attended.new_zeros(attended.shape[0], 1, *attended.shape[2:])
         picture4, g = self.refine4(attended, torch.zeros_like(attended), nothing)
         picture2, g = self.refine(r2, *self._onward(self.refine4, g, picture4))
         picture1, _ = self.refine(r1, *self._onward(self.refine, g, picture2))  # its hidden branch is not used

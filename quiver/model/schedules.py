@@ -12,15 +12,13 @@ All of them need memory that does not grow with the clip.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 import torch
 from torch import Tensor, nn
 
 from quiver.model.blocks import NEIGHBOURS, RADIUS, WINDOW, resize
-from quiver.model.folded import FoldedQUIVER
 from quiver.model.quiver import QUIVER, Encoded
 
 REACH = NEIGHBOURS // 2  # frames before and after that an extractor takes
@@ -43,38 +41,8 @@ class Features:
     denoised: tuple[Tensor, ...]
 
 
-def exact(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
-    """Yield restored frames 5 .. T-6 of frames [B, 1, H, W], equal to those of `windows`."""
-    return _restored(network, _exact, frames)
-
-
 def stream(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
     """Yield restored frames 5 .. T-6 of frames [B, 1, H, W], each after seven more frames, in one pass."""
-    return _restored(network, _stream, frames)
-
-
-def _restored(
-    network: QUIVER, schedule: Callable[[QUIVER, Iterable[Tensor]], Iterator[Tensor]], frames: Iterable[Tensor]
-) -> Iterator[Tensor]:
-    """Yield the pictures of a schedule; for a FoldedQUIVER the schedule runs on folded frames."""
-    if not isinstance(network, FoldedQUIVER):
-        yield from schedule(network, frames)
-        return
-    kept: deque[Tensor] = deque()  # folded frames from the first of the next window on
-
-    def folded() -> Iterator[Tensor]:
-        for frame in frames:
-            kept.append(network.fold(frame))
-            yield kept[-1]
-
-    for picture in schedule(network, folded()):
-        if network.estimate is not None:
-            picture = picture + network.estimate(list(islice(kept, WINDOW)))
-        yield network.unfold(picture)
-        kept.popleft()
-
-
-def _stream(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
     places: deque[Frame | None] = deque([None] * REACH, maxlen=NEIGHBOURS)  # frames around the encoded one
     r4: deque[Tensor] = deque(maxlen=WINDOW)
     finest: deque[tuple[Tensor, Tensor]] = deque(maxlen=RADIUS + 1)
@@ -94,7 +62,8 @@ def _stream(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
             yield network.restore(list(r4), *finest[0])[0]
 
 
-def _exact(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
+def exact(network: QUIVER, frames: Iterable[Tensor]) -> Iterator[Tensor]:
+    """Yield restored frames 5 .. T-6 of frames [B, 1, H, W], equal to those of `windows`."""
     window: deque[Frame] = deque(maxlen=WINDOW)
     inside: deque[Features] = deque(maxlen=WINDOW - 2 * REACH)  # of positions 2 .. 8
     entries: deque[Tensor] = deque(maxlen=WINDOW - 2 * REACH - 1)  # of positions 3 .. 8

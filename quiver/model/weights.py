@@ -18,8 +18,9 @@ from torch import Tensor, nn
 
 from qsim.files import write_bytes
 from quiver.model.config import Config
-from quiver.model.folded import FoldedConfig
-from quiver.model.presets import NETWORKS, assemble
+from quiver.model.presets import NETWORKS
+from quiver.model.quiver import QUIVER
+from quiver.model.removed import INSTEAD, NAME, RemovedError
 
 FORMAT = "quiver-1"  # value of the metadata key "format" in our files
 MAX_CONFIG = 10_000  # characters of a configuration
@@ -28,7 +29,7 @@ DAMAGE = (  # errors that torch raises for damaged files and other content
     *(RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError, OverflowError, MemoryError),
     *(RecursionError, pickle.UnpicklingError, zipfile.BadZipFile, NotImplementedError, AssertionError),
 )
-# Fields that earlier versions had beside those of Config, by their last names, with the values of every QUIVER.
+# Fields that earlier versions had beside those of Config, with the values of every QUIVER; nano had others.
 EARLIER: dict[str, object] = {
     "deformable_kernel": 3,
     "denoiser_passes": 5,
@@ -38,14 +39,15 @@ EARLIER: dict[str, object] = {
     "attention_width": None,
     "attention_temperature": None,
     "fold": 1,
+    "baseline": 0,
     "estimate_width": 0,
+    "sweep": 0.0,
     "largest_velocity": 0.0,
     "lecun": False,
 }
-RENAMED = {"baseline": "estimate_width", "sweep": "largest_velocity"}  # earlier field: field of FoldedConfig
 # Earlier fields: the noise of the sensor is now an input of these networks.
 NO_FIELDS = {"EMVD": ("variance",), "FloRNN": ("variance",), "FastDVDnet": ("variance",)}
-RENAMED_PARTS = {"baseline": "estimate", "hourglass": "body"}  # earlier part of a network: part today
+RENAMED_PARTS = {"hourglass": "body"}  # earlier part of a network: part today
 
 
 def current_names(state: Mapping[str, Any]) -> dict[str, Any]:
@@ -116,6 +118,8 @@ def load(path: Path) -> nn.Module:
         if any(buffer.is_meta for buffer in network.buffers()):  # constants that are not stored
             network = _build(metadata["network"], values)
             network.load_state_dict(tensors)
+    except RemovedError as error:
+        raise RemovedError(f"{path}: {error}") from None
     except DAMAGE as error:
         reason = " ".join(str(error).split())[:MAX_REASON]
         raise ValueError(f"{path}: weights and configuration do not fit ({reason})") from None
@@ -137,7 +141,7 @@ def annotate(path: Path, notes: Mapping[str, str]) -> None:
 
 def _build(kind: str, values: dict[str, object]) -> nn.Module:
     if kind in ("QUIVER", "FoldedQUIVER"):
-        return assemble(_config_of(kind, values))
+        return QUIVER(_config_of(kind, values))
     for network, config in NETWORKS:
         if kind == network.__name__:
             return network(config.from_dict(without(values, NO_FIELDS.get(kind, ()))))  # type: ignore[attr-defined]
@@ -150,14 +154,17 @@ def without(values: dict[str, object], names: Sequence[str]) -> dict[str, object
 
 
 def _config_of(kind: str, values: dict[str, object]) -> Config:
-    """Return the configuration of a QUIVER, which earlier versions wrote with more fields, or of a FoldedQUIVER."""
+    """Return the configuration of a QUIVER, which earlier versions wrote with more fields; `RemovedError` for nano.
+
+    A FoldedQUIVER of earlier versions without folding and estimate was a QUIVER of other sizes.
+    """
     if not isinstance(values, dict):
         raise ValueError("the configuration is not a table of values")
-    told = {RENAMED.get(name, name): value for name, value in values.items()}
-    earlier = {name: value for name, value in told.items() if name in EARLIER}
-    if (kind == "QUIVER" or "fold" in earlier) and all(EARLIER[name] == value for name, value in earlier.items()):
-        return Config.from_dict({name: value for name, value in told.items() if name not in EARLIER})
-    return FoldedConfig.from_dict(values if kind == "FoldedQUIVER" else Config().to_dict() | EARLIER | told)
+    earlier = {name: value for name, value in values.items() if name in EARLIER}
+    published = all(EARLIER[name] == value for name, value in earlier.items())
+    if not published or (kind == "FoldedQUIVER" and "fold" not in earlier):
+        raise RemovedError(f"weights of {NAME} (FoldedQUIVER), a network that was removed; {INSTEAD}")
+    return Config.from_dict({name: value for name, value in values.items() if name not in EARLIER})
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -42,21 +42,14 @@ def network_restorer(path: Path, options: RestoreOptions) -> Restorer:
 
 
 def network_title(model: nn.Module) -> str:
-    """Return a title for people: `nano (U-Net on aligned frames)`, `QUIVER (quiver-s)`, `U-Net`, `EMVD (emvd)`."""
-    from quiver.model.folded import FoldedQUIVER
+    """Return a title for people: `QUIVER (quiver-s)`, `U-Net`, `EMVD (emvd)`."""
     from quiver.model.presets import OTHERS, PRESETS
-    from quiver.model.quiver import QUIVER
     from quiver.model.unet import UNet
 
     if isinstance(model, UNet):
         return "U-Net"
     preset = next((name for name, config in (PRESETS | OTHERS).items() if config == model.config), None)
-    if not isinstance(model, QUIVER):
-        return type(model).__name__ if preset is None else f"{type(model).__name__} ({preset})"
-    if isinstance(model, FoldedQUIVER) and model.estimate is not None:  # the recurrent part hardly adds to it
-        what = "U-Net on aligned frames" if model.config.largest_velocity else "U-Net with a recurrent part"
-        return what if preset is None else f"{preset} ({what})"
-    return "QUIVER" if preset is None else f"QUIVER ({preset})"
+    return type(model).__name__ if preset is None else f"{type(model).__name__} ({preset})"
 
 
 def wrap_network(
@@ -99,14 +92,10 @@ def fill_network(
     """
     import torch
 
-    from quiver.model.folded import FoldedQUIVER
-
     device = next(model.parameters()).device
     dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
     height, width = codes.shape[1:]
     pieces = cut_pieces(model, height, width, options.memory, options.mode)
-    if isinstance(model, FoldedQUIVER) and model.estimate is not None:
-        model.estimate.pixels = pieces.estimate_pixels
     multiple = int(model.multiple)  # type: ignore[arg-type]
     apart, done = Disagreement.nothing(height, width), 0
     for tile in pieces.tiles:

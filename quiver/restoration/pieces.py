@@ -1,10 +1,9 @@
 """Decides how much of a frame a network computes at a time, within the memory bound and with the same result.
 
 A U-Net has a reach of 36 px: tiles that overlap by twice as much give the result of the complete frame. The attention
-and the gates of QUIVER average over the frame, and its recurrence reaches far: it takes the complete frame. Only the
-initial estimate of a FoldedQUIVER, which needs the most memory, runs tile by tile. A frame too large even for that is
-cut into tiles that are blended, and so is a frame too large for a compared network. Their result differs: a warning
-states by how much.
+and the gates of QUIVER average over the frame, and its recurrence reaches far: it takes the complete frame. A frame
+too large for that is cut into tiles that are blended, and so is a frame too large for a compared network. Their result
+differs: a warning states by how much.
 """
 
 from __future__ import annotations
@@ -25,9 +24,7 @@ if TYPE_CHECKING:
     from torch import nn
 
 BLENDED = 32  # px: half of the overlap of neighbouring tiles where no overlap makes them exact
-STARTING = 60_000_000  # bytes that torch takes for its kernels at first use
 TILING = 30_000_000  # bytes that tiles of several shapes take beyond those of the largest; 26 MB measured
-ESTIMATE_BYTES = 1_200  # per pixel of an initial estimate of width 32; 930 measured
 STEP = 16  # px: tiles of the compared networks begin at multiples of it
 MERGED_BYTES = 1_500  # per pixel that merging and MergeNet take
 COUNTS = 0.1  # weight from which the result of a tile is compared with its neighbours
@@ -38,7 +35,6 @@ class Pieces:
     """The cut of a frame."""
 
     tiles: list[Tile]
-    estimate_pixels: int | None = None  # of the initial estimate at a time; None: the complete tile
     exact: bool = True  # whether the result is that of the complete frame
     needed: int = 0  # bytes, about, for an exact cut; 0 for an exact one
 
@@ -53,41 +49,29 @@ class Pieces:
 
 def cut_pieces(model: nn.Module, height: int, width: int, memory: int, mode: str) -> Pieces:
     """Return the cut of a frame for a network and `memory` bytes. `ValueError` if they do not hold a small tile."""
-    from quiver.model.folded import FoldedQUIVER
     from quiver.model.quiver import QUIVER
-    from quiver.model.unet import SmallUNet
 
     pixels = memory // bytes_per_pixel(model, mode)
-    whole = Pieces(cut_tiles(height, width, height * width, 0))
     if height * width <= pixels:
-        return whole
+        return Pieces(cut_tiles(height, width, height * width, 0))
     reach = getattr(model, "reach", None)
     if reach is not None:
         return Pieces(cut_tiles(height, width, pixels, reach, int(model.multiple)))  # type: ignore[arg-type]
     if takes_clips(model):  # recurrent, or aligned along any motion: no overlap makes tiles exact
         needed = bytes_per_pixel(model, mode) * height * width
-        return Pieces(cut_tiles(height, width, pixels, BLENDED, STEP, blend=True), None, False, needed)
+        return Pieces(cut_tiles(height, width, pixels, BLENDED, STEP, blend=True), False, needed)
     multiple = int(model.multiple)  # type: ignore[arg-type]
     if not isinstance(model, QUIVER):
         return Pieces(cut_tiles(height, width, pixels, BLENDED, multiple, blend=True), exact=False)
-    padded = [side + -side % multiple for side in (height, width)]
     needed = bytes_per_pixel(model, mode) * height * width
-    if isinstance(model, FoldedQUIVER) and model.estimate is not None:
-        rest = STARTING + frame_bytes(model, mode) * padded[0] * padded[1]
-        least = 16 + 2 * SmallUNet.REACH  # below, overlaps are most of the work
-        per_pixel = ESTIMATE_BYTES * model.config.estimate_width // 32
-        needed = min(needed, rest + per_pixel * min(least, padded[0]) * min(least, padded[1]))
-        if memory >= needed:
-            return Pieces(whole.tiles, estimate_pixels=(memory - rest) // per_pixel)
     step, pixels = max(multiple, model.stride), max(memory - TILING, 0) // bytes_per_pixel(model, mode)
-    return Pieces(cut_tiles(height, width, pixels, BLENDED, step, blend=True), None, False, needed)
+    return Pieces(cut_tiles(height, width, pixels, BLENDED, step, blend=True), False, needed)
 
 
 def bytes_per_pixel(model: nn.Module, mode: str) -> int:
     """Return the working memory of a network per pixel of a tile, float32: about 1.5 times of what `quiver bench`
     measured.
     """
-    from quiver.model.folded import FoldedQUIVER
     from quiver.model.mergenet import MergeNet
     from quiver.model.quiver import QUIVER
 
@@ -98,10 +82,7 @@ def bytes_per_pixel(model: nn.Module, mode: str) -> int:
     if not isinstance(model, QUIVER):
         return 4_000
     held = 2 if mode == "windows" else 1  # windows of eleven frames at once
-    stages = held * (4000 + 1200 * model.config.channels)
-    if not isinstance(model, FoldedQUIVER):
-        return stages
-    return int(stages / model.config.fold**2) + 64 * model.config.estimate_width  # the estimate is at full size
+    return held * (4000 + 1200 * model.config.channels)
 
 
 # Bytes per pixel that restoring a part of a clip takes at published width: measured with one frame, and more for each.
@@ -123,15 +104,6 @@ def clip_bytes(network: Any) -> int:
     first, more = CLIP_BYTES[type(network).__name__]
     share = network.config.width / type(network.config)().width
     return 500 + int(1.5 * (share * first + more * (part.before + part.kept + part.after)))
-
-
-def frame_bytes(model: nn.Module, mode: str) -> int:
-    """Return the working memory per pixel of a FoldedQUIVER beside its initial estimate; nano: 1338, measured 1030."""
-    from quiver.model.folded import FoldedQUIVER
-
-    assert isinstance(model, FoldedQUIVER)
-    held = 2 if mode == "windows" else 1
-    return 700 + int(held * (1160 + 348 * model.config.channels) / model.config.fold**2)
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from qsim.files import Progress
 from quiver.baselines import METHODS, exposures
 from quiver.baselines.sliding_window import look_ahead
 from quiver.data.codes import Codes
+from quiver.model import removed
 from quiver.restoration.interface import RestoreInto, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 
@@ -116,8 +117,10 @@ def weights_path(name: str) -> Path:
         return path
     if (path / "best.safetensors").is_file():
         return path / "best.safetensors"
+    removed.refuse_run(path)
     if (path / "settings.json").is_file():
         raise FileNotFoundError(f"{path}: a training run without best.safetensors; continue it until it has validated")
+    removed.refuse_name(name)
     raise ValueError(
         f"no method {name!r}{suggest(name, method_names())}; known are {', '.join(method_names())}, a "
         ".safetensors file, and a folder of `quiver train`"

@@ -1,8 +1,6 @@
 """Repeats the paper's ablation: trains six networks of similar capacity without some parts, and compares them.
 
-    for each of six combinations of pre-denoiser, flow and multi-scale outputs: train, then score on held-out clips
-
-`nano` is trained without its initial estimate, whose picture from aligned frames would hide the effect of these parts.
+for each of six combinations of pre-denoiser, flow and multi-scale outputs: train, then score on held-out clips
 """
 
 from __future__ import annotations
@@ -17,8 +15,8 @@ from qsim.tables import markdown_table
 from quiver.device import pick_device
 from quiver.evaluation.comparison import Comparison, ComparisonRow, evaluate
 from quiver.model.config import Config
-from quiver.model.folded import FoldedConfig
-from quiver.model.presets import ABLATIONS, PRESETS, ablated, assemble, parameter_count
+from quiver.model.presets import ABLATIONS, PRESETS, ablated, parameter_count
+from quiver.model.quiver import QUIVER
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.restorers import restorer
 from quiver.training.loop import train
@@ -32,10 +30,7 @@ def networks(preset: str) -> dict[str, Config]:
     """Return the six configurations by name; ValueError if the preset has no ablation."""
     if preset not in PRESETS:
         raise ValueError(f"no ablation of {preset!r}; there is one of {', '.join(PRESETS)}")
-    whole = PRESETS[preset]
-    if isinstance(whole, FoldedConfig):
-        whole = replace(whole, estimate_width=0, largest_velocity=0.0)
-    return {name: ablated(whole, name) for name in ABLATIONS}
+    return {name: ablated(PRESETS[preset], name) for name in ABLATIONS}
 
 
 def one_noise(settings: Settings) -> tuple[Settings, list[str]]:
@@ -71,7 +66,7 @@ def _run_ablation(
     out = Path(settings.out)
     for name, config in networks(settings.network).items():
         torch.manual_seed(settings.seed)
-        network = assemble(config)
+        network = QUIVER(config)
         own = replace(settings, out=str(out / name), network=f"{settings.network} {name}")
         train(network, own, device=pick_device(options.device), should_stop=should_stop, progress=progress)
         if should_stop():

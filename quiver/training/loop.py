@@ -2,11 +2,9 @@
 
     windows (new noise) -> inputs -> model -> loss -> Adam or Muon; at intervals: validation, checkpoint, TensorBoard
 
-Inputs, loss and scored frame are those of the model's system (systems.py).
-
-Samples are numbered across steps and processes. A run that was killed and resumed therefore draws the same samples, and
-ends with the same weights, as one without interruption. NaN or Inf stop the run; the message names the step and the
-samples. Under `torchrun` every process draws its share of a batch.
+Inputs, loss and scored frame are those of the model's system (systems.py). Samples are numbered across steps and
+processes: a run that was killed and resumed draws the same ones, and ends with the same weights, as one that was not.
+NaN or Inf stop the run; the message names step and samples. Under `torchrun` every process draws its share of a batch.
 """
 
 from __future__ import annotations
@@ -32,6 +30,7 @@ from quiver.data.stream_windows import StreamWindows
 from quiver.data.windows import Batches, Windows, WindowSettings
 from quiver.device import device_of_process, group_backend, is_gpu, moved
 from quiver.evaluation import metrics
+from quiver.model.removed import refuse_run
 from quiver.training.optimiser import Optimiser
 from quiver.training.run_folder import Run
 from quiver.training.schedule import State, learning_rate, note_plateau, share_used, time_is_up, validation_due
@@ -317,6 +316,7 @@ def train(
     with joined(device) as process, contextlib.ExitStack() as stack:
         asked, system = settings.threads, system_of(model)
         system.refuse(model, settings)
+        refuse_run(Path(settings.out), replaced=force)
         windows: AnyWindows
         fixed: Subset[dict[str, Any]] | None = None
         if system.of_stream:

@@ -49,7 +49,6 @@ class Settings:
     flips: bool = True  # the eight flips and quarter turns
     reverse: bool = True  # time reversal
     drift: int = 0  # px/frame, largest speed at which half of the crops move through their clip
-    head_start: float = 0.0  # share of the run that trains the initial estimate alone, if the network has one
     force_exposure: bool = False  # scale every window to the light level by its own mean, as published
     validate_every: int = 300  # steps; without `steps` a run validates after every tenth of its time
     validation_split: str = "val"
@@ -118,7 +117,7 @@ class Settings:
 # Bundles of defaults, which options override: ours, those of the authors' program, and those of the paper's text.
 _PUBLISHED = {"schedule": "plateau", "warmup": 0, "crop": 128, "reverse": False, "ppp": (3.25,), "bits": (3,)}
 PROTOCOLS: dict[str, dict[str, Any]] = {
-    "quick": {"optimiser": "muon", "learning_rate": 6e-3, "loss": "scales-l1", "drift": 3, "head_start": 0.85},
+    "quick": {"optimiser": "muon", "learning_rate": 6e-3, "loss": "scales-l1", "drift": 3},
     "control": {"loss": "l1"},
     "published": _PUBLISHED
     | {"sensor": "quiver-published", "force_exposure": True, "learning_rate": 1e-4, "steps": 48_000},

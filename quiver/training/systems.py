@@ -59,10 +59,8 @@ def _protocols(published: dict[str, Any], **quick: Any) -> dict[str, dict[str, A
 
 
 def quiver_loss(network: nn.Module, batch: Batch, settings: Settings, share: float) -> Tensor:
-    """Return the loss of loss.py that the settings name; `head_start` of a run trains the initial estimate alone."""
-    alone = getattr(network, "estimate", None) is not None and share < settings.head_start
-    output = network(batch["codes"], **({"estimate_only": True} if alone else {}))
-    return training_loss(output, batch["target"], LOSSES[settings.loss], first=RADIUS)
+    """Return the loss of loss.py that the settings name."""
+    return training_loss(network(batch["codes"]), batch["target"], LOSSES[settings.loss], first=RADIUS)
 
 
 def quiver_restored(network: nn.Module, batch: Batch) -> tuple[Tensor, int]:

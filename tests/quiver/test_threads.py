@@ -113,7 +113,7 @@ for name in names:
 @two_cores
 @pytest.mark.parametrize(
     "methods",
-    ["nano unet moment", *(pytest.param(more, marks=pytest.mark.slow) for more in ("all", "quiver-s quiver"))],
+    ["mergenet unet moment", *(pytest.param(more, marks=pytest.mark.slow) for more in ("all", "quiver-s quiver"))],
 )
 def test_restored_video_does_not_depend_on_the_number(methods):
     """Every classical method and the shipped networks, and untrained presets: within 1e-5 of white."""
@@ -121,7 +121,7 @@ def test_restored_video_does_not_depend_on_the_number(methods):
     alone = os.environ | {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "2"}
     done = subprocess.run(words, cwd=ROOT, env=alone, capture_output=True, text=True, check=True)
     found = {line.rpartition(" ")[0]: float(line.rpartition(" ")[2]) for line in done.stdout.splitlines()}
-    named = {"naive", "qbp", "qbp-bm3d", "likelihood", "nano"} if methods == "all" else set(methods.split())
+    named = {"naive", "qbp", "qbp-bm3d", "likelihood", "mergenet"} if methods == "all" else set(methods.split())
     assert named <= found.keys()
     assert max(found.values()) < 1e-5, found
 

@@ -28,7 +28,6 @@ import json
 import math
 import zlib
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,31 +35,13 @@ import torch
 from torch import Tensor, nn
 
 from quiver.model.config import Config
-from quiver.model.folded import FoldedConfig
-from quiver.model.presets import assemble
 from quiver.model.published_weights import published_name
 from quiver.model.quiver import QUIVER
 
 DATA = Path(__file__).parents[1] / "data"
 SHARED = Path(__file__).parents[3] / "shared" / "rivals"  # the specification's full files, where they are available
-TINY = FoldedConfig(  # the published design with the smallest parts, for fast tests
-    channels=2,
-    deformable_kernel=3,
-    denoiser_growth=2,
-    flow_channels=(2,),
-    flow_kernel=7,
-    flow_levels=4,
-    attention_width=4,
-    attention_temperature=None,
-    fold=1,
-    estimate_width=0,
-    largest_velocity=0.0,
-    lecun=False,
-)
-SMALL = replace(TINY, channels=4, deformable_groups=2, denoiser_growth=4, denoiser_passes=2, flow_channels=(4, 4),
-                flow_kernel=3, cell_blocks=2)  # fmt: skip
-FOLDED = replace(SMALL, fold=2, estimate_width=4, largest_velocity=1.0, attention_width=16, attention_temperature=4.0,
-                 flow_levels=3)  # fmt: skip
+TINY = Config(channels=2, deformable_groups=1, denoiser_growth=2, flow_channels=(2,))  # for fast tests
+SMALL = Config(channels=4, deformable_groups=2, denoiser_growth=4, flow_channels=(4, 4))
 CONSTANTS = {"spynet.mean": 0.449, "spynet.std": 0.226}
 
 
@@ -102,7 +83,7 @@ def draw(*shape: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> Tens
 
 def lively(config: Config, dtype: torch.dtype = torch.float64) -> QUIVER:
     """Return a network with weights by rule, so that every stage contributes."""
-    network = fill_by_rule(assemble(config)).to(dtype).eval()
+    network = fill_by_rule(QUIVER(config)).to(dtype).eval()
     assert isinstance(network, QUIVER)
     return network
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import nn
 
 from quiver.model.config import Config
-from quiver.model.presets import PRESETS, assemble
+from quiver.model.quiver import QUIVER
 from quiver.model.rivals.emvd import EMVD, EMVDConfig
 from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
 from quiver.model.rivals.flornn import FloRNN, FloRNNConfig
@@ -40,8 +39,7 @@ def same_weights(a: nn.Module, b: nn.Module) -> bool:
 
 TINY: dict[str, Callable[[], nn.Module]] = {  # a small network of every system that the loop trains
     "unet": lambda: UNet(UNetConfig(4)),
-    "quiver": lambda: assemble(Config(channels=16, cell_growth=2)),
-    "nano": lambda: assemble(replace(PRESETS["nano"], estimate_width=4, attention_width=16)),
+    "quiver": lambda: QUIVER(Config(channels=16, cell_growth=2)),
     "emvd": lambda: EMVD(EMVDConfig(width=4)),
     "fastdvdnet": lambda: FastDVDnet(FastDVDnetConfig(width=4)),
     "student-teacher": lambda: StudentTeacher(StudentTeacherConfig(width=4, blocks=1)),

@@ -28,7 +28,9 @@ def run(*words: object, program: str = "equal_budget") -> subprocess.CompletedPr
 
 
 @pytest.mark.parametrize(
-    ("program", "known"), [(equal_budget, ("classical", "nano")), (ablation_rows, ("none", "denoiser+flow"))], ids=str
+    ("program", "known"),
+    [(equal_budget, ("classical", "unet")), (ablation_rows, ("none", "denoiser+flow"))],
+    ids=str,
 )
 def test_an_unknown_row_is_one_sentence(program, known, capsys):
     assert program.main(["data", "--rows", "emdv", "--tiny"]) == 2

@@ -270,7 +270,7 @@ def test_nothing_is_trained_on_a_part_of_the_data_set(bench, state, why):
     record = {"state": state, "why": why, "setup": {}, "minutes": 9, "command": ""}
     if state is not None:
         (folder / "data.json").write_text(json.dumps(record))
-    work = Job("train", "nano-float32", bench.out, folder / "nano-float32.json", Sizes(), 540.0, 1e9, {})
+    work = Job("train", "mergenet-float32", bench.out, folder / "mergenet-float32.json", Sizes(), 540.0, 1e9, {})
     with pytest.raises(Absent, match=f"needs the data set, see train/data: {why}") as told:
         train.measure(work)
     assert told.value.state == (state or "absent")
@@ -585,18 +585,18 @@ def _train(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
     from restore import weights_of
 
     assert rows["data"][0]["clips"] == 2
-    assert {"quiver-s-float32", "quiver-s-bfloat16", "nano-float32", "nano-bfloat16"} <= set(rows)
+    assert {"quiver-s-float32", "quiver-s-bfloat16", "mergenet-float32", "mergenet-bfloat16"} <= set(rows)
     for name in set(rows) - {"data", "copies"}:
         assert rows[name][0]["steps"] == TINY["steps"]
         assert rows[name][0]["steps per s"] > 0
     assert weights_of(out, "quiver-s") == (str(out / "runs" / "quiver-s-float32" / "best.safetensors"), "trained here")
-    (out / "train" / "nano-float32.json").unlink()  # as if killed before the record: the run is finished already
+    (out / "train" / "mergenet-float32.json").unlink()  # as if killed before the record: the run is finished already
     import pieces
 
     assert pieces.main([str(out), "--section", "train"], sizes=TINY) == 0
-    again = json.loads((out / "train" / "nano-float32.json").read_text())["rows"][0]
+    again = json.loads((out / "train" / "mergenet-float32.json").read_text())["rows"][0]
     assert again["steps"] == TINY["steps"]
-    assert again["PSNR matched [dB]"] == rows["nano-float32"][0]["PSNR matched [dB]"]
+    assert again["PSNR matched [dB]"] == rows["mergenet-float32"][0]["PSNR matched [dB]"]
 
 
 def _restore(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
@@ -604,7 +604,7 @@ def _restore(rows: dict[str, list[dict[str, object]]], out: Path) -> None:
 
     networks = {name.rpartition("-")[0] for name in set(rows) - set(METHODS)}
     assert set(METHODS) <= set(rows)
-    assert {"quiver-s", "quiver", "nano", "unet"} <= networks
+    assert {"quiver-s", "quiver", "mergenet", "unet"} <= networks
     largest = {name: found[0].get("largest [% of white]") for name, found in rows.items()}
     errors = {name: (largest[f"{name}-float32"], largest[f"{name}-bfloat16"]) for name in networks}
     for name, (exact, low) in errors.items():

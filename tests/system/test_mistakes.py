@@ -43,7 +43,7 @@ MISTAKES = [
     ("quiver trian data -o x", "unknown command 'trian' (did you mean 'train'?)"),
     ("quiver train data -o x --lr 1e-3", "unknown option --lr (did you mean '--learning-rate'?)"),
     ("quiver train data -o x --epochs 9", "unknown option --epochs (did you mean '--steps'?)"),
-    ("quiver train data -o x --preset nanno", "'nanno' (did you mean 'nano'?)"),
+    ("quiver train data -o x --preset mergnet", "'mergnet' (did you mean 'mergenet'?)"),
     ("quiver restore lit -o x.npy --mode fast", "there are: exact, streaming, windows"),
     # Scenes
     ("qsim render fann -o x", "no scene family 'fann' (did you mean 'fan'?)"),

@@ -63,9 +63,9 @@ def test_bash_completes_scenes_sensors_recipes_and_methods_or_files(capsys, tmp_
     assert complete(script, "qsim", "tradeoff", "gea", cwd=tmp_path) == ["gears"]
     script = completion(capsys, "quiver", "bash")
     assert complete(script, "quiver", "restore", "--method", "mo", cwd=tmp_path) == ["moment"]
-    assert complete(script, "quiver", "evaluate", "--methods", "naive,na", cwd=tmp_path) == [
-        "naive,naive",
-        "naive,nano",
+    assert complete(script, "quiver", "evaluate", "--methods", "naive,m", cwd=tmp_path) == [
+        "naive,moment",
+        "naive,mergenet",
     ]
     assert complete(script, "quiver", "evaluate", "--methods", "al", cwd=tmp_path) == ["all"]
 

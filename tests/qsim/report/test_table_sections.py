@@ -13,7 +13,7 @@ def test_an_evaluation_defines_its_scores(folder):
     """Before format 2 the peak was the sensor's white and the factor unclamped; a page never mixes the two."""
     assert "peak = the sensor&#39;s white" in report.build_page(folder, title="All")
     path = folder / "evaluation.json"
-    found = json.loads(path.read_text()) | {"peak": "2.5 x the stream's mean light", "remarks": ["<nano> was never"]}
+    found = json.loads(path.read_text()) | {"peak": "2.5 x the stream's mean light", "remarks": ["<mine> was never"]}
     line = found["table"][0] | {"above_peak": 0.0961, "truth_psnr": 21.0, "near_truth": ["psnr_matched"]}
     path.write_text(json.dumps(found | {"table": [line]}))
     page = report.build_page(folder, title="All")
@@ -22,7 +22,7 @@ def test_an_evaluation_defines_its_scores(folder):
         "9.6 %",
         "20.00 ± 1.00 †",
         "within 3 dB of the noise floor",
-        "&lt;nano&gt; was never",
+        "&lt;mine&gt; was never",
     ):
         assert words in page, words
     assert "of the earlier definition" not in page
@@ -79,7 +79,7 @@ def test_studies_costs_and_validations_have_their_sections(tmp_path):
     study = {"clip": "fan", "ppp": 0.65, "rows": rows, "structure_function": [0.0, 1.0]}
     sweep = {"cells": [{"speed": 2.0, "best_bits": 3}], "studies": [study]}
     figure = {"figure": 1, "rows": [{"clip": "fan", "panels": [{"label": "CMOS 60 fps", "psnr_db": 18.9}]}]}
-    cost = {"method": "nano", "seconds_per_frame": 0.25, "psnr_matched": None, "failure": None}
+    cost = {"method": "mergenet", "seconds_per_frame": 0.25, "psnr_matched": None, "failure": None}
     checked = {"model": "QIS", "engine": "fast", "megapixels_per_second": 99.5, "times_numpy": 25.0, "cdf_error": 1e-7}
     checked |= dict.fromkeys(("p_value", "z_mean", "z_variance", "mismatches_per_million"))
     sensor = {"ok": False, "pixels": 9, "rows": [checked], "cases": [{"name": "ties", "found": "right", "ok": False}]}

@@ -25,6 +25,7 @@ from quiver.cli import program
 from quiver.evaluation import cost, domain_measurement
 from quiver.model import presets
 from quiver.model.presets import ABLATIONS, PRESETS
+from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
 from quiver.restoration import domain, restorers
@@ -500,7 +501,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
 
 
 def tiny(name: str) -> torch.nn.Module:
-    return UNet(UNetConfig(8)) if name == "unet" else presets.assemble(PRESETS[name])
+    return UNet(UNetConfig(8)) if name == "unet" else QUIVER(PRESETS[name])
 
 
 @pytest.fixture(scope="module")  # of this module alone: what it replaces is back for the next one
@@ -580,7 +581,7 @@ def work(scale: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "[defects]\ncarry_dead_time = true\n"
     )
     torch.manual_seed(0)
-    small = fill_by_rule(presets.assemble(TINY))
+    small = fill_by_rule(QUIVER(TINY))
     save(small, TINY, folder / "small.safetensors")
     save(UNet(UNetConfig(2)), UNetConfig(2), folder / "unet.safetensors")
     seen_by = devices.load("quiver-physical", ppp=26, bits=3, exposure=5e-4)

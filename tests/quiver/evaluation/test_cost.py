@@ -21,10 +21,10 @@ def test_the_clip_is_fixed_and_as_bright_as_asked():
 
 
 def test_only_cases_that_differ_are_run():
-    cases = cases_of(("moment:3", "unet", "nano"), ("exact", "streaming"), ("float32", "bfloat16"))
+    cases = cases_of(("moment:3", "unet", "quiver-s"), ("exact", "streaming"), ("float32", "bfloat16"))
     assert [c for c in cases if c.method == "moment:3"] == [CostCase("moment:3", "exact", "float32")]
     assert len([c for c in cases if c.method == "unet"]) == 2
-    assert len([c for c in cases if c.method == "nano"]) == 4
+    assert len([c for c in cases if c.method == "quiver-s"]) == 4
 
 
 def test_a_classical_case_has_seconds_and_a_score():
@@ -37,5 +37,5 @@ def test_a_classical_case_has_seconds_and_a_score():
 
 
 def test_the_table_names_what_failed():
-    bad = CostRow("nano", "exact", "float32", False, math.nan, 0, math.nan, math.nan, failure="out of memory")
-    assert "| nano | exact | float32 | failed: out of memory" in markdown([bad], CostSettings())
+    bad = CostRow("mergenet", "exact", "float32", False, math.nan, 0, math.nan, math.nan, failure="out of memory")
+    assert "| mergenet | exact | float32 | failed: out of memory" in markdown([bad], CostSettings())

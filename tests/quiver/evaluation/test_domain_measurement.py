@@ -57,8 +57,8 @@ def test_cells_are_measured_stored_and_kept(tiny_dataset, tmp_path, monkeypatch)
     other = domain_measurement.measure(path, other_seed, RestoreOptions(device="cpu"), force=True)
     assert len(other.cells) == 1  # cells of another noise do not stand beside these
     assert not list(tmp_path.glob("*.lock"))
-    with pytest.raises(ValueError, match="measured against classical methods, got nano"):
-        domain_measurement.measure(path, replace(settings, methods=("nano",)), RestoreOptions(device="cpu"))
+    with pytest.raises(ValueError, match="measured against classical methods, got mergenet"):
+        domain_measurement.measure(path, replace(settings, methods=("mergenet",)), RestoreOptions(device="cpu"))
     with pytest.raises(ValueError, match="unknown split 'none'"):
         domain_measurement.clips_of([tiny_dataset], "none")
 

@@ -1,21 +1,16 @@
 """Tests QUIVER beyond the golden numbers: parts, shapes, batches, hard inputs."""
 
-from dataclasses import replace
-
 import pytest
 import torch
-from golden import FOLDED, SMALL, draw, lively, network
+from golden import SMALL, draw, lively, network
 from torch import Tensor
 
 from quiver.model import deformable
 from quiver.model import quiver as model_module
 from quiver.model.config import Config
-from quiver.model.folded import FoldedConfig
-from quiver.model.presets import PRESETS, assemble, build
+from quiver.model.presets import PRESETS, build
 from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
-
-BOTH = pytest.mark.parametrize("config", [SMALL, FOLDED], ids=["small", "folded"])
 
 
 def test_the_width_can_be_given_by_name_or_alone():
@@ -37,21 +32,19 @@ def test_the_parts_have_the_published_sizes():
 
 
 def test_wrong_names_and_settings_say_what_is_right():
-    with pytest.raises(ValueError, match="no network is called 'quivr'; known: quiver, quiver-s, nano, mergenet, unet"):
+    with pytest.raises(ValueError, match="no network is called 'quivr'; known: quiver, quiver-s, mergenet, unet"):
         build("quivr")
     with pytest.raises(ValueError, match="multiple of the 16 deformable groups, got 8"):
         Config(channels=8)
-    with pytest.raises(ValueError, match=r"Config\.flow_kernel must be odd, got 4"):
-        FoldedConfig(flow_kernel=4)
-    with pytest.raises(ValueError, match=r"Config\.flow_levels must be a whole number from 3 to 10, got 2"):
-        FoldedConfig(flow_levels=2)
-    with pytest.raises(ValueError, match=r"Config\.cell_blocks must be a whole number from 1 to 64, got 0"):
-        FoldedConfig(cell_blocks=0)
+    with pytest.raises(ValueError, match=r"Config\.denoiser_growth must be a whole number from 1 to 1024, got 0"):
+        Config(denoiser_growth=0)
+    with pytest.raises(ValueError, match=r"Config\.flow_channels must be 1 to 8 widths, got \(\)"):
+        Config(flow_channels=())
     with pytest.raises(ValueError, match="unknown key 'chanels' in Config"):
         Config.from_dict({"chanels": 3})
     with pytest.raises(ValueError, match="unknown key 'depth' in UNetConfig"):
         UNetConfig.from_dict({"depth": 3})
-    assert FoldedConfig.from_dict(FOLDED.to_dict()) == FOLDED
+    assert Config.from_dict(SMALL.to_dict()) == SMALL
     assert Config.from_dict(Config(32).to_dict()) == Config(32)
 
 
@@ -66,15 +59,14 @@ def test_wrong_names_and_settings_say_what_is_right():
     ],
 )
 def test_inputs_that_do_not_fit_are_refused(shape, message):
-    for refusing in (assemble(SMALL), QUIVER(16), UNet(UNetConfig(2)).windows):
+    for refusing in (QUIVER(SMALL), QUIVER(16), UNet(UNetConfig(2)).windows):
         with pytest.raises(ValueError, match=message):
             refusing(torch.zeros(shape))
 
 
-@BOTH
-def test_output_shapes_and_units(config):
-    """The flow of folded frames is also in full-size pixels, on the grid of the frames."""
-    out = lively(config, torch.float32)(draw(2, 13, 1, 16, 24, dtype=torch.float32))
+def test_output_shapes_and_units():
+    """The flow is in full-size pixels, on the grid of the frames."""
+    out = lively(SMALL, torch.float32)(draw(2, 13, 1, 16, 24, dtype=torch.float32))
     assert out.denoised.shape == (2, 13, 1, 16, 24)
     assert out.scale1.shape == (2, 3, 1, 16, 24)
     assert out.scale2.shape == (2, 3, 1, 8, 12)
@@ -82,19 +74,17 @@ def test_output_shapes_and_units(config):
     assert out.flow.shape == (2, 12, 2, 16, 24)
 
 
-@pytest.mark.parametrize("lecun", [False, True])
-@pytest.mark.parametrize("kernel", [1, 3])
-def test_alignment_starts_from_the_flow_alone(kernel, lecun):
+def test_alignment_starts_from_the_flow_alone():
     """With offsets of zero and masks of one half the result is half a convolution of the image moved by the flow."""
     torch.manual_seed(0)
-    alignment = assemble(replace(SMALL, deformable_kernel=kernel, lecun=lecun)).double().alignment
+    alignment = QUIVER(SMALL).double().alignment
     previous, current, flow = draw(1, 4, 8, 8), draw(1, 4, 8, 8, seed=1), torch.zeros(1, 2, 8, 8, dtype=torch.float64)
     moved = torch.nn.functional.pad(previous[..., 1:], (0, 1))
-    wanted = torch.nn.functional.conv2d(previous, alignment.weight / 2, padding=kernel // 2)
+    wanted = torch.nn.functional.conv2d(previous, alignment.weight / 2, padding=1)
     assert torch.allclose(alignment(previous, current, flow), wanted)
     flow[:, 0] = 1
     inside = (slice(None), slice(None), slice(1, -1), slice(1, -2))
-    wanted = torch.nn.functional.conv2d(moved, alignment.weight / 2, padding=kernel // 2)
+    wanted = torch.nn.functional.conv2d(moved, alignment.weight / 2, padding=1)
     assert torch.allclose(alignment(previous, current, flow)[inside], wanted[inside])
 
 
@@ -108,9 +98,8 @@ def test_inference_in_small_pieces_gives_the_same_numbers(monkeypatch):
         assert torch.allclose(network(x).scale1, with_gradients, atol=1e-12)
 
 
-@BOTH
-def test_clips_of_a_batch_do_not_see_each_other(config):
-    network, x = lively(config), draw(2, 11, 1, 16, 16)
+def test_clips_of_a_batch_do_not_see_each_other():
+    network, x = lively(SMALL), draw(2, 11, 1, 16, 16)
     with torch.no_grad():
         assert torch.allclose(network(x).scale1[1:], network(x[1:]).scale1, atol=1e-12)
 
@@ -126,13 +115,11 @@ def hard_inputs() -> dict[str, Tensor]:
     }
 
 
-@pytest.mark.parametrize("name", ["quiver-s", "nano"])
 @pytest.mark.parametrize("kind", list(hard_inputs()))
-def test_outputs_and_gradients_are_finite(name, kind):
+def test_outputs_and_gradients_are_finite(kind):
     """Constant input makes queries and keys constant or zero, where a norm has no gradient."""
     torch.manual_seed(0)
-    config = PRESETS[name]
-    network = assemble(config)
+    network = QUIVER(PRESETS["quiver-s"])
     out = network(hard_inputs()[kind])
     for part in (out.denoised, out.scale1, out.scale2, out.scale4, out.flow):
         assert torch.isfinite(part).all()
@@ -165,13 +152,10 @@ def test_flow_beyond_the_frame_is_survived(far):
     assert all(torch.isfinite(p.grad).all() for p in network.parameters() if p.grad is not None)
 
 
-@BOTH
-def test_the_smallest_frames(config):
-    """4 x 4 pixels (8 x 8 where folded) are one pixel at the coarsest scale."""
-    network = lively(config, torch.float32)
-    side = network.multiple
-    out = network(draw(1, 11, 1, side, side, dtype=torch.float32))
-    assert out.scale4.shape[3:] == (config.fold, config.fold)
+def test_the_smallest_frames():
+    """4 x 4 pixels are one pixel at the coarsest scale."""
+    out = lively(SMALL, torch.float32)(draw(1, 11, 1, 4, 4, dtype=torch.float32))
+    assert out.scale4.shape[3:] == (1, 1)
     assert torch.isfinite(out.scale1).all()
 
 

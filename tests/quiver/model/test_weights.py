@@ -18,27 +18,14 @@ from torch import nn
 
 from qsim.process import peak_memory, reset_peak
 from quiver.model.config import Config
-from quiver.model.folded import FoldedConfig, FoldedQUIVER
-from quiver.model.presets import PRESETS
+from quiver.model.presets import OTHERS
 from quiver.model.quiver import QUIVER
 from quiver.model.rivals.emvd import EMVD, EMVDConfig
 from quiver.model.unet import UNet, UNetConfig
-from quiver.model.weights import EARLIER, RENAMED, RENAMED_PARTS, load, save
+from quiver.model.weights import EARLIER, RENAMED_PARTS, load, save
 from quiver.restoration.restorers import weights_path
 
-SMALLEST = FoldedConfig(
-    channels=2,
-    denoiser_growth=2,
-    flow_channels=(2,),
-    attention_width=4,
-    attention_temperature=None,
-    fold=1,
-    estimate_width=2,
-    largest_velocity=1.0,
-    lecun=False,
-)
-OLD = {new: old for old, new in RENAMED.items()}
-EARLIER_TINY = {OLD.get(name, name): value for name, value in SMALLEST.to_dict().items()}
+EARLIER_TINY = TINY.to_dict() | EARLIER  # sizes that are fixed now were fields
 
 
 def notes(path: Path) -> dict[str, str]:
@@ -50,11 +37,10 @@ def notes(path: Path) -> dict[str, str]:
     "build",
     [
         lambda: QUIVER(Config(16, pre_denoiser=False, cell_growth=3)),
-        lambda: FoldedQUIVER(TINY),
-        lambda: FoldedQUIVER(replace(TINY, fold=2, estimate_width=4, attention_temperature=8.0, flow=False)),
+        lambda: QUIVER(TINY),
         lambda: UNet(UNetConfig(4)),
     ],
-    ids=["quiver", "small", "folded", "unet"],
+    ids=["quiver", "small", "unet"],
 )
 def test_saved_networks_come_back_the_same(tmp_path: Path, build):
     network = build()
@@ -70,28 +56,27 @@ def test_saved_networks_come_back_the_same(tmp_path: Path, build):
 
 
 def earlier(network: nn.Module, config: dict[str, object], path: Path) -> None:
-    """Write weights as earlier versions did, which had one configuration for QUIVER and FoldedQUIVER."""
+    """Write weights as earlier versions did, with their names of parts."""
     old = {new: name for name, new in RENAMED_PARTS.items()}
     parts = ((name.partition("."), value) for name, value in network.state_dict().items())
     tensors = {old.get(part, part) + dot + rest: value.contiguous() for (part, dot, rest), value in parts}
-    kind = "QUIVER" if isinstance(network, QUIVER) else type(network).__name__
-    save_file(tensors, path, {"format": "quiver-1", "network": kind, "config": json.dumps(config)})
+    about = {"format": "quiver-1", "network": type(network).__name__, "config": json.dumps(config)}
+    save_file(tensors, path, about)
 
 
 @pytest.mark.parametrize(
     "network",
     [
         QUIVER(Config(16, flow=False, cell_growth=3)),
-        FoldedQUIVER(replace(TINY, fold=2, estimate_width=4)),
         UNet(UNetConfig(2)),
     ],
-    ids=["quiver", "folded", "unet"],
+    ids=["quiver", "unet"],
 )
 def test_weights_of_earlier_versions_are_read(tmp_path: Path, network):
     """Their configuration held every size of the published design, and parts had other names."""
     config = network.config.to_dict()
     if not isinstance(network, UNet):
-        config = {OLD.get(name, name): value for name, value in (EARLIER | config).items()}
+        config = EARLIER | config
     earlier(network, config, tmp_path / "w.safetensors")
     back = load(tmp_path / "w.safetensors")
     assert type(back) is type(network)
@@ -102,14 +87,13 @@ def test_weights_of_earlier_versions_are_read(tmp_path: Path, network):
 
 def test_a_small_quiver_of_an_earlier_version_is_read(tmp_path: Path):
     """It was a FoldedQUIVER without folding; now QUIVER itself has these sizes."""
-    config = Config(channels=2, deformable_groups=1, denoiser_growth=2, flow_channels=(2,))
-    network, path = QUIVER(config), tmp_path / "w.safetensors"
+    network, path = QUIVER(TINY), tmp_path / "w.safetensors"
     tensors = {name: value.contiguous() for name, value in network.state_dict().items()}
-    values = json.dumps(config.to_dict() | EARLIER)
+    values = json.dumps(EARLIER_TINY)
     save_file(tensors, path, {"format": "quiver-1", "network": "FoldedQUIVER", "config": values})
     back = load(path)
     assert type(back) is QUIVER
-    assert back.config == config
+    assert back.config == TINY
     assert all(torch.equal(back.state_dict()[name], value) for name, value in tensors.items())
 
 
@@ -122,11 +106,11 @@ def test_a_noise_table_of_an_earlier_version_is_left_out(tmp_path: Path):
 
 
 def test_the_shipped_weights_are_those_of_the_preset():
-    assert load(weights_path("nano")).config == PRESETS["nano"]
+    assert load(weights_path("mergenet")).config == OTHERS["mergenet"]
 
 
 def test_weights_that_do_not_fit_are_refused(tmp_path: Path):
-    network, path = FoldedQUIVER(TINY), tmp_path / "w.safetensors"
+    network, path = QUIVER(TINY), tmp_path / "w.safetensors"
     with pytest.raises(ValueError, match=r"written as \.safetensors, got w\.pth"):
         save(network, TINY, tmp_path / "w.pth")
     save_file({"a": torch.ones(1)}, path)
@@ -138,7 +122,7 @@ def test_weights_that_do_not_fit_are_refused(tmp_path: Path):
     with safe_open(path, framework="pt") as file:
         metadata = file.metadata()
     save_file(network.state_dict(), path, metadata | {"config": '{"channel": 4}'})
-    with pytest.raises(ValueError, match="QUIVER: unknown key 'channel' in FoldedConfig"):
+    with pytest.raises(ValueError, match="QUIVER: unknown key 'channel' in Config"):
         load(path)
     save_file(network.state_dict(), path, metadata | {"network": "GAN"})
     with pytest.raises(ValueError, match="no network is called 'GAN'"):
@@ -151,7 +135,7 @@ def test_weights_that_do_not_fit_are_refused(tmp_path: Path):
 @pytest.fixture(scope="module")
 def tiny() -> dict[str, torch.Tensor]:
     torch.manual_seed(0)
-    return {name: value.contiguous() for name, value in FoldedQUIVER(SMALLEST).state_dict().items()}
+    return {name: value.contiguous() for name, value in QUIVER(TINY).state_dict().items()}
 
 
 def refused_or_loaded(path: Path) -> bool:
@@ -169,30 +153,33 @@ def refused_or_loaded(path: Path) -> bool:
     return refused
 
 
-@pytest.mark.parametrize("key", sorted(SMALLEST.to_dict()))
+@pytest.mark.parametrize("key", sorted(TINY.to_dict()))
 def test_any_value_of_any_key_of_a_configuration(tiny, tmp_path, key):
     """A file that is not refused loads with the same configuration."""
-    path, wanted = tmp_path / "w.safetensors", SMALLEST.to_dict()
+    path, wanted = tmp_path / "w.safetensors", TINY.to_dict()
     for value in VALUES:
         config = json.dumps(wanted | {key: value})
-        save_file(tiny, path, {"format": "quiver-1", "network": "FoldedQUIVER", "config": config})
-        if not refused_or_loaded(path):
-            assert load(path).config == FoldedConfig.from_dict(wanted | {key: value})
-
-
-@pytest.mark.parametrize("key", sorted(EARLIER_TINY))
-def test_any_value_of_any_key_of_an_earlier_configuration(tiny, tmp_path, key):
-    path = tmp_path / "w.safetensors"
-    for value in VALUES:
-        config = json.dumps(EARLIER_TINY | {key: value})
         save_file(tiny, path, {"format": "quiver-1", "network": "QUIVER", "config": config})
         if not refused_or_loaded(path):
-            assert load(path).config == FoldedConfig.from_dict(SMALLEST.to_dict() | {RENAMED.get(key, key): value})
+            assert load(path).config == Config.from_dict(wanted | {key: value})
+
+
+@pytest.mark.parametrize("kind", ["QUIVER", "FoldedQUIVER"])
+@pytest.mark.parametrize("key", sorted(EARLIER))
+def test_any_value_of_any_key_of_an_earlier_configuration(tiny, tmp_path, key, kind):
+    """Only the values of every QUIVER load; others are of nano."""
+    path = tmp_path / "w.safetensors"
+    for value in (*VALUES, EARLIER[key]):
+        config = json.dumps(EARLIER_TINY | {key: value})
+        save_file(tiny, path, {"format": "quiver-1", "network": kind, "config": config})
+        assert refused_or_loaded(path) == (value != EARLIER[key])
+        if value == EARLIER[key]:
+            assert load(path).config == TINY
 
 
 @pytest.mark.parametrize(
     "changes",
-    [{"deformable_groups": 0}, {"flow_channels": []}, {"fold": 1e300}, {"flow_levels": 10**9}, {"cell_blocks": 10**9}],
+    [{"deformable_groups": 0}, {"flow_channels": []}, {"denoiser_growth": 10**9}, {"flow_channels": [10**9]}],
     ids=str,
 )
 def test_configurations_that_crashed_or_hung(tiny, tmp_path, changes):
@@ -225,7 +212,7 @@ def test_a_configuration_that_is_none(tmp_path, network, config):
 def test_many_wrong_values_at_once(tiny, tmp_path, seed):
     rng, path = random.Random(seed), tmp_path / "w.safetensors"
     for _ in range(25):
-        kind, wanted = rng.choice([("QUIVER", EARLIER_TINY), ("FoldedQUIVER", SMALLEST.to_dict())])
+        kind, wanted = rng.choice([("QUIVER", TINY.to_dict()), ("FoldedQUIVER", EARLIER_TINY)])
         keys = rng.sample(sorted(wanted), rng.randint(1, 4))
         config = json.dumps(wanted | {key: rng.choice(VALUES) for key in keys})
         save_file(tiny, path, {"format": "quiver-1", "network": kind, "config": config})
@@ -234,7 +221,7 @@ def test_many_wrong_values_at_once(tiny, tmp_path, seed):
 
 def test_tensors_of_another_kind(tiny, tmp_path):
     path = tmp_path / "w.safetensors"
-    notes = {"format": "quiver-1", "network": "FoldedQUIVER", "config": json.dumps(SMALLEST.to_dict())}
+    notes = {"format": "quiver-1", "network": "QUIVER", "config": json.dumps(TINY.to_dict())}
     name = "cell.image1.weight"
     for value in (tiny[name].half(), tiny[name].long(), tiny[name].flatten(), torch.ones(()), torch.ones(0)):
         save_file(tiny | {name: value.contiguous()}, path, notes)
@@ -245,6 +232,6 @@ def test_tensors_of_another_kind(tiny, tmp_path):
 
 def test_files_of_ours_still_load(tmp_path):
     torch.manual_seed(0)
-    for network in (FoldedQUIVER(SMALLEST), UNet(UNetConfig(2))):
+    for network in (QUIVER(TINY), UNet(UNetConfig(2))):
         save(network, network.config, tmp_path / "w.safetensors")
         assert load(tmp_path / "w.safetensors").config == network.config

@@ -9,7 +9,7 @@ import quiver
 from quiver.cli.program import main
 
 
-@pytest.mark.filterwarnings("ignore:nano was")  # measured or not for such streams
+@pytest.mark.filterwarnings("ignore:mergenet ")  # measured or not for such streams
 def test_the_command_and_the_call_have_one_default_method(inputs, tmp_path):
     assert main(["restore", str(inputs["clip"]), "-o", str(tmp_path / "r.npy"), "-q"]) == 0
     np.testing.assert_allclose(quiver.restore(inputs["clip"]), np.load(tmp_path / "r.npy"), atol=1e-5)

@@ -40,7 +40,7 @@ def test_parts_of_a_stream_equal_the_whole(name):
         np.testing.assert_array_equal(small.restore(codes), whole)
 
 
-@pytest.mark.parametrize("name", ["qbp", "path-merge", "nano"])
+@pytest.mark.parametrize("name", ["qbp", "path-merge", "mergenet"])
 def test_methods_without_exposures_refuse_the_stream(name):
     with pytest.raises(ValueError, match=f"method '{name}': takes equal exposures only; use naive, moment, likelihood"):
         restorer(name).restore(bracketed())

@@ -24,16 +24,16 @@ from quiver.restoration.domain import Scope
 
 def test_inside_nothing_is_said_and_outside_the_better_method():
     scope = Scope(MEASURED)
-    assert domain_remarks.remark("nano", scope, stream()) is None
-    assert domain_remarks.remark("nano", scope, stream(ppp=4.0)) is None
-    dim = domain_remarks.remark("nano", scope, stream(ppp=1.2))
+    assert domain_remarks.remark("mine", scope, stream()) is None
+    assert domain_remarks.remark("mine", scope, stream(ppp=4.0)) is None
+    dim = domain_remarks.remark("mine", scope, stream(ppp=1.2))
     assert dim == (
-        "nano is worse than qbp-bm3d on quiver-physical, 3 bit, 1.2 PPP: qbp-bm3d 20.0 dB, network 15.0 dB "
+        "mine is worse than qbp-bm3d on quiver-physical, 3 bit, 1.2 PPP: qbp-bm3d 20.0 dB, network 15.0 dB "
         "at quiver-physical, 3 bit, 1 PPP"
     )
     others = (stream(bits=1), stream("quiver-published", 1.0), stream("spad512s", 1))
     for far in (stream(ppp=0.5), stream(ppp=100.0), *others):
-        said = domain_remarks.remark("nano", scope, far)
+        said = domain_remarks.remark("mine", scope, far)
         assert said is not None
         assert "was never measured near" in said
         assert "qbp-bm3d is mostly the best classical method" in said
@@ -45,8 +45,8 @@ def test_light_that_is_not_told_is_estimated():
     assert untold.ppp is None
     assert light_of(told) == 3.25
     assert light_of(untold) == pytest.approx(3.25, rel=0.1)
-    assert domain_remarks.remark("nano", Scope(MEASURED), untold) is None
-    assert "is worse than" in str(domain_remarks.remark("nano", Scope(MEASURED), stream(ppp=26.0, told=False)))
+    assert domain_remarks.remark("mine", Scope(MEASURED), untold) is None
+    assert "is worse than" in str(domain_remarks.remark("mine", Scope(MEASURED), stream(ppp=26.0, told=False)))
 
 
 def test_weights_without_cells_say_what_they_were_trained_on(tmp_path):

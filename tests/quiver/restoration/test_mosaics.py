@@ -56,8 +56,8 @@ def test_methods_of_single_pixels_need_no_places(stream, method):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:(nano|mergenet) ")  # measured or not for such streams
-@pytest.mark.parametrize("method", [*METHODS, "nano", "mergenet"])
+@pytest.mark.filterwarnings("ignore:mergenet ")  # measured or not for such streams
+@pytest.mark.parametrize("method", [*METHODS, "mergenet"])
 def test_every_method_restores_colours(stream, method):
     truth = stream.truth()
     found = quiver.restore(stream, method)

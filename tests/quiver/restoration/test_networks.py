@@ -10,19 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from domains import tensors_digest
+from golden import SMALL
 from numpy import ndarray as Array
 from random_codes import random_codes
 from torch import Tensor, nn
 
 from quiver.data.codes import Codes
 from quiver.model.blocks import Output
+from quiver.model.config import Config
 from quiver.model.presets import build
+from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
-from quiver.model.weights import load, save
+from quiver.model.weights import save
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import fill_network, network_title
-from quiver.restoration.restorers import PRETRAINED, restorer
+from quiver.restoration.restorers import restorer
 
 
 class CentreFrame(nn.Module):
@@ -86,7 +88,7 @@ def test_a_range_of_frames_equals_that_part_of_the_whole():
 def test_modes_of_the_network():
     """Exact equals windows recomputed; streaming is another schedule; bfloat16 stays near float32."""
     torch.manual_seed(0)
-    codes, model = random_codes(4, 16, 16), build("nano").eval()
+    codes, model = random_codes(4, 16, 16), QUIVER(SMALL).eval()
     windows = run(model, codes, RestoreOptions(mode="windows"))
     np.testing.assert_allclose(run(model, codes, RestoreOptions(mode="exact")), windows, atol=2e-4)
     assert np.isfinite(run(model, codes, RestoreOptions(mode="streaming"))).all()
@@ -121,12 +123,14 @@ import numpy as np
 from qsim.process import peak_memory, reset_peak
 from quiver.data.codes import array_codes
 from quiver.data.illumination import Illumination
+from quiver.model.config import Config
 from quiver.model.presets import build
+from quiver.model.quiver import QUIVER
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import wrap_network
 sensor = Illumination().device(5e-4)
 codes = array_codes(np.random.default_rng(0).integers(0, 8, (1, 320, 320), dtype=np.uint8), sensor, 5e-4)
-method = wrap_network(build("nano"), "nano", "", RestoreOptions(memory={memory}, mode="{mode}"))
+method = wrap_network(build("quiver-s"), "quiver-s", "", RestoreOptions(memory={memory}, mode="{mode}"))
 before = reset_peak()
 method.restore(codes)
 print(peak_memory() - before)
@@ -152,12 +156,9 @@ def test_the_memory_bound_holds(mode):
     assert tiled < 1.1 * 80_000_000 < whole
 
 
-NANO_TENSORS = "6a63ccb037b3b58e691acd1cc99acfc15ca5803003a647be778a7d7d36d2ab31"  # as they were trained
-
-
-def test_the_shipped_weights_are_those_that_were_trained():
-    """The metadata were added later: the tensors are the same, bit for bit, and the file stays small."""
-    path = PRETRAINED / "nano.safetensors"
-    assert tensors_digest(path) == NANO_TENSORS
-    assert path.stat().st_size < 5_000_000
-    assert network_title(load(path)) == "nano (U-Net on aligned frames)"
+def test_a_network_has_a_title():
+    config = Config(channels=32)
+    titles = {name: network_title(build(name)) for name in ("mergenet", "quiver-s", "unet", "emvd")}
+    assert titles == {"mergenet": "MergeNet (mergenet)", "quiver-s": "QUIVER (quiver-s)", "unet": "U-Net",
+                      "emvd": "EMVD (emvd)"}  # fmt: skip
+    assert network_title(QUIVER(config)) == "QUIVER"

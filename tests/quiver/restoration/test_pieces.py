@@ -8,21 +8,21 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from golden import SMALL, lively
 from numpy import ndarray as Array
-from torch import nn
 
 from qsim.sensor.qis import QIS
 from quiver.baselines import METHODS
 from quiver.data.codes import Codes, array_codes
 from quiver.model.presets import build
 from quiver.model.unet import SmallUNet, UNet, UNetConfig
-from quiver.model.weights import load
+from quiver.model.weights import save
 from quiver.restoration import pieces
-from quiver.restoration.interface import MODES, RestoreOptions, Restorer
+from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer, wrap_network
-from quiver.restoration.pieces import bytes_per_pixel, cut_pieces, frame_bytes
+from quiver.restoration.pieces import bytes_per_pixel, cut_pieces
 from quiver.restoration.restored_file import restore_to_file
-from quiver.restoration.restorers import restorer, weights_path
+from quiver.restoration.restorers import restorer
 
 SENSOR = QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25)
 
@@ -79,44 +79,8 @@ def test_a_convolutional_network_does_not_see_the_tiles():
     assert cut > 3
 
 
-def nano_memory(model: nn.Module, height: int, width: int, mode: str, pixels: int) -> int:
-    """Bytes that hold a frame, and its initial estimate with so many pixels at a time."""
-    padded = (height + -height % 8) * (width + -width % 8)
-    return frame_bytes(model, mode) * padded + 1200 * pixels
-
-
-def same_with_less_memory(name: str, mode: str, seed: int) -> None:
-    """A random size, a bound that holds the frame but not its initial estimate: equal to 1e-5 of white, no warning."""
-    path, rng = weights_path(name), np.random.default_rng(seed)
-    height, width = (int(n) for n in rng.integers(89, 116, 2))
-    codes, network = moving(2, height, width, seed), load(path).eval()
-    memory = nano_memory(network, height, width, mode, int(rng.integers(7744, min(9000, height * width))))
-    cut = cut_pieces(network, height, width, memory, mode)
-    assert cut.exact
-    assert cut.estimate_pixels is not None
-    assert cut.estimate_pixels < height * width  # the estimate does run in tiles
-    tiled, whole = (quiet(network_restorer(path, RestoreOptions(memory=m, mode=mode)), codes) for m in (memory, 10**10))
-    assert np.abs(tiled - whole).max() < 1e-5 * codes.white
-
-
-@pytest.mark.parametrize("name", ["nano"])
-@pytest.mark.parametrize("mode", MODES)
-def test_memory_does_not_change_what_a_network_with_an_estimate_answers(name, mode, monkeypatch):
-    monkeypatch.setattr(pieces, "STARTING", 0)  # tiny frames: they would fit into the memory that torch takes at first
-    same_with_less_memory(name, mode, MODES.index(mode))
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["nano"])
-@pytest.mark.parametrize("mode", MODES)
-def test_memory_does_not_change_what_a_network_with_an_estimate_answers_searched(name, mode, monkeypatch):
-    monkeypatch.setattr(pieces, "STARTING", 0)
-    for seed in range(3, 9):
-        same_with_less_memory(name, mode, seed)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("preset", ["nano", "quiver-s", "quiver", "unet"])
+@pytest.mark.parametrize("preset", ["quiver-s", "quiver", "unet"])
 def test_no_preset_changes_its_answer_unsaid(preset):
     """Tiny frames, small bounds: equal to 1e-5 of white, or a warning that states by how much tiles differ."""
     torch.manual_seed(1)
@@ -136,8 +100,9 @@ def test_no_preset_changes_its_answer_unsaid(preset):
 def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path, monkeypatch):
     """QUIVER averages over the frame: tiles differ. The warning states by how much, and the file how it was cut."""
     monkeypatch.setattr(pieces, "TILING", 0)  # a tiny frame would fit into it
-    path, codes = weights_path("nano"), moving(1, 104, 120)
-    network = load(path).eval()
+    path, codes = tmp_path / "w.safetensors", moving(1, 104, 120)
+    network = lively(SMALL, torch.float32)
+    save(network, SMALL, path)
     memory = bytes_per_pixel(network, "exact") * 9_000
     cut = cut_pieces(network, 104, 120, memory, "exact")
     assert not cut.exact
@@ -161,7 +126,7 @@ def test_threads_do_not_change_the_answer():
     """One and two threads of torch: equal to 1e-5 of white, by a network and by classical methods."""
     codes, before = moving(2, 48, 56), torch.get_num_threads()
     try:
-        for name in ("nano", "qbp-bm3d", "transform-denoise", "qbp"):
+        for name in ("mergenet", "qbp-bm3d", "transform-denoise", "qbp"):
             found = []
             for threads in (1, 2):
                 torch.set_num_threads(threads)

@@ -9,24 +9,23 @@ import os
 import socket
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 from clips import write_dataset
+from golden import TINY
 from runs import same_weights, settings, small_network
 from torch import Tensor, nn
 
 from quiver.evaluation import metrics
 from quiver.model.blocks import RADIUS, Output
-from quiver.model.presets import PRESETS, assemble
+from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNetConfig
 from quiver.model.weights import load
 from quiver.training import loop as training
 from quiver.training.loop import Diverged, make_windows, train
-from quiver.training.schedule import State
 from quiver.training.settings import settled
 from quiver.training.systems import system_of
 
@@ -136,17 +135,13 @@ def test_nan_stops_with_step_samples_and_state(tiny_dataset, tmp_path):
     assert math.isfinite(float(saved["model"]["factor"]))
 
 
-@pytest.mark.parametrize(("network", "optimiser", "rate"), [("unet", "adam", 1e-3), ("nano", "muon", 6e-3)])
+@pytest.mark.parametrize(("network", "optimiser", "rate"), [("unet", "adam", 1e-3), ("quiver", "muon", 6e-3)])
 def test_ten_times_the_rate_stays_finite_or_stops(tiny_dataset, tmp_path, network, optimiser, rate):
-    """200 steps of a protocol's optimiser; a narrow nano saves time."""
-    kinds = {"optimiser": optimiser, "learning_rate": 10 * rate, "loss": "scales-l1", "head_start": 0.85}
+    """200 steps of a protocol's optimiser; a narrow QUIVER saves time."""
+    kinds = {"optimiser": optimiser, "learning_rate": 10 * rate, "loss": "scales-l1"}
     fast = settings(tiny_dataset, tmp_path / "r", steps=200, batch=1, validate_every=100, **kinds)
     torch.manual_seed(0)
-    narrow = (
-        assemble(replace(PRESETS["nano"], estimate_width=4, attention_width=16))
-        if network == "nano"
-        else small_network()
-    )
+    narrow = QUIVER(TINY) if network == "quiver" else small_network()
     try:
         state = train(narrow, fast, progress=False)
     except Diverged:
@@ -225,29 +220,6 @@ def test_two_processes_train_as_one_with_twice_the_batch(tiny_dataset, tmp_path)
     together = load(tmp_path / "b/last.safetensors")
     for ours, theirs in zip(alone.state_dict().values(), together.state_dict().values(), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
-
-
-def test_a_head_start_trains_the_estimate_alone(tiny_dataset, tmp_path):
-    """In the first half only the estimate changes; in the second half the other parts do, from the last layers on."""
-
-    def moved(steps: int, out: str) -> set[str]:
-        torch.manual_seed(0)
-        network = assemble(replace(PRESETS["nano"], estimate_width=4, attention_width=16))
-        before = {name: p.detach().clone() for name, p in network.named_parameters()}
-        state = State()
-
-        def half() -> bool:
-            state.step += 1
-            return state.step == steps
-
-        run = settings(tiny_dataset, tmp_path / out, steps=4, head_start=0.5, loss="scales-l1")
-        train(network, run, should_stop=half, progress=False)
-        return {name.split(".")[0] for name, p in network.named_parameters() if not torch.equal(p, before[name])}
-
-    assert moved(2, "half") == {"estimate"}
-    assert moved(4, "more") >= {"denoiser", "estimate", "flow", "cell", "attention", "refine"}
-    plain = train(small_network(), settings(tiny_dataset, tmp_path / "unet", head_start=0.5), progress=False)
-    assert plain.finished, "a network without an initial estimate is trained as always"
 
 
 def test_validation_has_one_peak_for_every_sensor(tiny_dataset, tmp_path):
