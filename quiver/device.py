@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
-from qsim.process import peak_memory, reset_peak
+from qsim.process import peak_memory, reset_peak, resident_memory
 
 if TYPE_CHECKING:
     import torch
@@ -74,7 +74,10 @@ def set_random_states(states: list[Tensor]) -> None:
 
 
 class PeakMemory:
-    """Measures from its creation on the largest memory [bytes]: allocated on a GPU, else added to this process."""
+    """Measures from its creation on the largest memory [bytes]: allocated on a GPU, else added to this process.
+
+    A system that cannot reset its peak gives an upper bound: the peak since the process began.
+    """
 
     def __init__(self, kind: str) -> None:
         import torch
@@ -82,7 +85,9 @@ class PeakMemory:
         self.gpu = kind == "cuda"
         if self.gpu:
             torch.cuda.reset_peak_memory_stats()
-        self.before = 0 if self.gpu else reset_peak()
+        else:
+            reset_peak()
+        self.before = 0 if self.gpu else resident_memory()
 
     def bytes(self) -> int:
         """Return the peak so far."""

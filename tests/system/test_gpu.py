@@ -307,7 +307,8 @@ def test_numbers_that_json_does_not_know_are_left_out(bench, tmp_path):
 
 def _start(bench: Bench, *words: str) -> subprocess.Popen[bytes]:
     call = f"main({[str(bench.out), *words]!r}, child={bench.child!r})"
-    code = f"import sys; sys.path.insert(0, {str(PARTS)!r}); from pieces import main; sys.exit({call})"
+    wakes = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # in the background it is ignored
+    code = f"{wakes}; import sys; sys.path.insert(0, {str(PARTS)!r}); from pieces import main; sys.exit({call})"
     return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 
 
