@@ -49,7 +49,7 @@ def test_random_states_of_a_machine_with_gpus_are_kept_on_one_without(monkeypatc
 
 @pytest.mark.parametrize("resets", [True, False])
 def test_the_peak_of_memory_grows_with_what_is_held(resets):
-    """In a process of its own: another test may have held more, and not every system can reset the peak."""
+    """In a new process: another test may have held more, and not every system can reset the peak."""
     code = (
         "import torch; from quiver import device\n"
         f"if not {resets}: device.reset_peak = device.peak_memory\n"
