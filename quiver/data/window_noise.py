@@ -22,7 +22,7 @@ from qsim.keys import Key
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.sensor import Sensor
 from quiver.data.code_table import draw_codes
-from quiver.data.defects import Filler, defective
+from quiver.data.defects import Filler, behind, defective
 from quiver.data.noise import Noise, stored_defects
 
 NEGLIGIBLE = 1e-6  # chance of an afterpulse chain that is as long as the frames before a window
@@ -62,11 +62,17 @@ def check_windows(noise: Noise, clip: Clip) -> None:
             )
 
 
-def window_filler(noise: Noise, draw: Draw, clip: Clip, place: WindowPlace, side: int) -> Filler | None:
-    """Return what fills the dead and hot pixels of a window [side, side], not turned; None without any."""
-    assert noise.defects is not None
-    size = (clip.shape[1], clip.shape[2])
-    bad = defective(stored_defects(noise.defects), draw.sensor, clip.exposure, draw.level.ppp, size)
+def behind_defects(noise: Noise, draw: Draw, clip: Clip) -> tuple[Array | None, Sensor]:
+    """Return the dead and hot pixels of a clip's frames, bool [H, W] or None, and the sensor of filled codes."""
+    if noise.defects is None:
+        return None, draw.sensor
+    table = stored_defects(noise.defects)
+    bad = defective(table, draw.sensor, clip.exposure, draw.level.ppp, (clip.shape[1], clip.shape[2]))
+    return bad, behind(bad, table, draw.sensor)
+
+
+def window_filler(bad: Array | None, place: WindowPlace, side: int) -> Filler | None:
+    """Return what fills the dead and hot pixels `bad` of a window [side, side], not turned; None without any."""
     crop = None if bad is None else bad[place.y : place.y + side, place.x : place.x + side]
     return None if crop is None or not crop.any() else Filler(crop)
 

@@ -34,7 +34,7 @@ from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
 from quiver.data.mixture import Mixture, choose
 from quiver.data.noise import Noise
-from quiver.data.window_noise import WindowPlace, check_windows, window_codes, window_filler
+from quiver.data.window_noise import WindowPlace, behind_defects, check_windows, window_codes, window_filler
 
 # Computes inputs of a network from the codes of a window: name -> tensor, each the same shape for all windows. It runs
 # where samples are drawn, in worker processes too, and gets no gradients; it is a function of a module, not a lambda.
@@ -105,7 +105,7 @@ class Windows(Dataset[dict[str, Any]]):
         for noise in self.noise.noises:
             check_windows(noise, clips[0])
         self.length = len(clips) * (len(self.noise.noises) if fixed else repeats)
-        self._draws: dict[tuple[int, int], Draw] = {}
+        self._draws: dict[tuple[int, int], tuple[Draw, Array | None, Sensor]] = {}
 
     def __repr__(self) -> str:
         return f"<Windows of {len(self.clips)} clips; {'; '.join(self.noise.lines)}>"
@@ -157,7 +157,8 @@ class Windows(Dataset[dict[str, Any]]):
 
     def __getitem__(self, n: int) -> dict[str, Any]:
         place = self.place(n)
-        clip, noise, draw = self.clips[place.clip], self.noise.noises[place.light], self._draw(place)
+        clip, noise = self.clips[place.clip], self.noise.noises[place.light]
+        draw, bad, behind = self._draw(place)
         photons, sharp = self.photons_of(place)
         scale = 1.0
         if self.settings.force_exposure and noise.ppp is not None:
@@ -167,7 +168,7 @@ class Windows(Dataset[dict[str, Any]]):
                 codes = draw_codes(draw.sensor, photons * scale, clip.exposure, place.key)
             else:
                 drawn = window_codes(noise, draw, clip, place, self.settings.frames, self.settings.crop, scale)
-                filler = window_filler(noise, draw, clip, place, self.settings.crop)
+                filler = window_filler(bad, place, self.settings.crop)
                 drawn = drawn if filler is None else filler.fill(drawn, 0)
                 codes = turned(drawn, replace(place, backwards=False))  # in the order of exposure already
         except ValueError as error:
@@ -189,13 +190,13 @@ class Windows(Dataset[dict[str, Any]]):
             sample["still"] = as_input(draw_codes(draw.sensor, resting, clip.exposure, key), draw.sensor)
         if self.prepare is None:
             return sample
-        seen = array_codes(codes, draw.sensor, clip.exposure, name=clip.name)
+        seen = array_codes(codes, behind, clip.exposure, name=clip.name)
         return sample | dict(self.prepare(replace(seen, ppp=draw.level.ppp)))
 
     def photons_of(self, place: WindowPlace) -> tuple[Array, Array]:
         """Return the expected photons of the exposed and of the sharp window, float64 [T, h, w] each, turned."""
         clip, side = self.clips[place.clip], self.settings.crop
-        (dy, dx), draw = place.drift, self._draw(place)
+        (dy, dx), (draw, _, _) = place.drift, self._draw(place)
 
         def taken(sharp: bool) -> Array:
             return np.stack(
@@ -217,10 +218,12 @@ class Windows(Dataset[dict[str, Any]]):
             taken(sharp=True) if has_sharp(clip) or draw.diffraction else exposed, place
         )
 
-    def _draw(self, place: WindowPlace) -> Draw:
-        """Return sensor and light factor of a place's clip and noise."""
+    def _draw(self, place: WindowPlace) -> tuple[Draw, Array | None, Sensor]:
+        """Return what draws the codes of a place's clip and noise, its defective pixels, and the sensor behind them."""
         if (place.clip, place.light) not in self._draws:
-            self._draws[place.clip, place.light] = self.noise.noises[place.light].draw(self.clips[place.clip])
+            noise, clip = self.noise.noises[place.light], self.clips[place.clip]
+            draw = noise.draw(clip)
+            self._draws[place.clip, place.light] = draw, *behind_defects(noise, draw, clip)
         return self._draws[place.clip, place.light]
 
 

@@ -21,6 +21,7 @@ from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.fixed_pattern import DarkSpread, FixedPattern
 from qsim.sensor.defects.pixel_array import PixelArray
 from quiver.data.code_table import draw_codes
+from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise
 from quiver.data.window_noise import WindowPlace, window_codes
@@ -111,6 +112,20 @@ def test_a_window_is_turned_with_its_defects(make_clip: ClipMaker, tmp_path):
         window = np.broadcast_to(dead[place.y : place.y + 16, place.x : place.x + 16], (11, 16, 16))
         assert ((data[n]["codes"].numpy()[:, 0] < 0.5) == (turned(window, place) == 1)).all()
     assert {data.place(n).turn for n in range(40)} == set(range(8))
+
+
+def test_filled_windows_are_prepared_with_the_dark_rate_of_good_pixels(make_clip: ClipMaker, tmp_path):
+    """As in restoring: the mean over all pixels belongs mostly to the hot ones."""
+    dark = np.ones((20, 26))
+    dark[::5, ::5] = 1e4
+    np.save(tmp_path / "dark.npy", dark)
+    file = sensor_file(tmp_path, QIS + 'dark_map = "dark.npy"\n', 3)
+    clip = make_clip(radiance=np.full((14, 20, 26), 0.5), relative=True)
+    light, seen = Illumination(file, 10.0, 3), []
+    data = Windows([clip], WindowSettings(crop=16, lights=(light,)), prepare=lambda codes: seen.append(codes) or {})
+    data[0]
+    assert seen[0].sensor == sensed(clip, light)[0].sensor
+    assert seen[0].sensor.dark_rate < 0.01 * data.noise.noises[0].draw(clip).sensor.dark_rate
 
 
 def test_a_drifting_window_keeps_its_pixels(make_clip: ClipMaker, tmp_path):
