@@ -167,7 +167,10 @@ def film_pass(
     """
     mi, camera = stage.mi, stage.scene.camera
     if camera.lens is not None and (camera.lens.distorts or camera.lens.shift != (0.0, 0.0)):
-        raise ValueError("Camera.lens: the scalar engine has no distortion and no shift; install LLVM, or leave it out")
+        raise ValueError(
+            "Camera.lens: Mitsuba's own camera, which the scalar engine and `qsim validate render` use, has no "
+            "distortion and no shift; install LLVM for the engine, or choose another scene"
+        )
     y, x, height, width = crop
     film: dict[str, Any] = {
         "type": "hdrfilm",
