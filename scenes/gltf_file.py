@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from qsim.scene import Body, Diffuse, Scene, Still, animated_file
+from qsim.scene import Body, Diffuse, Scene, Skinned, Still, animated_file
 from qsim.scene.animated.gltf_body import animations_in
 from qsim.scenes import common
 from qsim.scenes.common import between, pick
@@ -33,3 +33,14 @@ def scene(seed: int = 0, *, speed: float = 1.0, file: str | Path) -> Scene:
     )
     view = common.camera((between(rng, -0.08, 0.08), between(rng, 0.02, 0.12), 0.65), (0, 0, 0), 0.5)
     return Scene(Path(file).stem, seed, view, (common.sun(rng),), bodies, speed)
+
+
+def played(scene: Scene) -> str:
+    """Return a line that states which animation a scene of this file plays, how fast, and what follows its end."""
+    body = scene.bodies[-1]
+    assert isinstance(body.motion, Skinned)
+    clock = body.motion.clock
+    return (
+        f"plays the animation {body.name} of {clock.length:g} s at {clock.speed:g} times its speed, again and again; "
+        "--seed chooses among those of the file, a scene in Python (animated_file) anything else"
+    )

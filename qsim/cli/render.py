@@ -69,12 +69,14 @@ def add_render(sub: Any) -> None:
 
 
 def _run_render(args: argparse.Namespace) -> int:
-    from qsim import backend
+    from qsim import backend, scenes
     from qsim.clip.clamped_error import stated
     from qsim.dataset.scene_rendering import load_scene, render
     from qsim.optics.diffraction import diffraction_line
     from qsim.rendering.budget import Finding, explain
     from qsim.rendering.fidelity import choose_budget, shortfall
+    from qsim.scene.animated.gltf_body import GLTF_SUFFIXES
+    from qsim.scenes.gltf_file import played
 
     if args.output is None and not args.explain:
         raise ValueError("-o/--output is required (optional only with --explain)")
@@ -104,6 +106,8 @@ def _run_render(args: argparse.Namespace) -> int:
     text = f"{clip.path}: {len(clip)} frames of {args.height} x {args.width}"
     text += f", mean radiance {clip.mean_radiance:.4g} W/m2/sr"
     text += f", {clip.mean_photons:.4g} photons per pixel"
+    if args.scene.endswith(GLTF_SUFFIXES):
+        text += f"\n{played(scenes.load(args.scene, args.seed, args.speed))}"
     text += "" if found is None else f"\nerror: {found.line}"
     text += (missed := shortfall(found, args.psnr)) and f"\nerror: {missed}"
     if "fireflies_per_frame" in clip.meta:

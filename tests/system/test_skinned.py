@@ -14,6 +14,7 @@ from qsim import scenes
 from qsim.clip.clip import Clip
 from qsim.rendering.budget import Budget
 from qsim.rendering.renderer import Renderer
+from qsim.scenes import gltf_file
 
 CHEAP = Budget(samples=4, bounces=2)
 
@@ -92,6 +93,7 @@ def test_an_animated_file_is_a_scene(tmp_path):
     assert body.vertices(0.0)[:, 1].min() == pytest.approx(scene.bodies[0].mesh.vertices[0, 1])  # on the floor
     assert np.array_equal(body.vertices(0.01), scenes.load(path, 1, 10.0).bodies[2].vertices(0.02))
     assert scenes.load(path, 2).to_dict() != scenes.load(path, 1).to_dict()
+    assert gltf_file.played(scene).startswith("plays the animation bend of 1 s at 20 times its speed, again and again")
 
 
 @pytest.mark.parametrize("command", ["render", "generate"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from gltf_files import Gltf, arm
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
@@ -262,6 +264,46 @@ def test_meshes_without_normals_pictures_or_right_handed_nodes(tmp_path):
     corners = mesh.vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (normals[:, 2] > 0).all()
+
+
+def test_files_of_another_program_are_read_as_it_reads_them(tmp_path):
+    """trimesh writes and reads meshes on nodes, without animations; one is added that leaves all at rest."""
+    rng = np.random.default_rng(4)
+    turned = trimesh.transformations.random_rotation_matrix(rng.random(3))
+    turned[:3, 3] = 1, 2, 3
+    smaller = np.diag([0.5, 0.7, 0.5, 1])
+    written = trimesh.Scene()
+    written.add_geometry(trimesh.creation.icosphere(1), node_name="a", transform=turned)
+    written.add_geometry(trimesh.creation.box(), node_name="b", parent_node_name="a", transform=smaller)
+    files = trimesh.exchange.gltf.export_gltf(written)
+    content = json.loads(files["model.gltf"])
+    key = base64.b64encode(np.array([0, 0, 0, 0], "<f4")).decode()
+    content["buffers"].append({"byteLength": 16, "uri": f"data:;base64,{key}"})
+    content["bufferViews"].append({"buffer": len(content["buffers"]) - 1, "byteLength": 16})
+    view, accessor = len(content["bufferViews"]) - 1, len(content["accessors"])
+    content["accessors"] += [
+        {"bufferView": view, "componentType": 5126, "count": 1, "type": "SCALAR"},
+        {"bufferView": view, "componentType": 5126, "count": 1, "type": "VEC3", "byteOffset": 4},
+    ]
+    content["nodes"].append({})
+    content["animations"] = [
+        {
+            "samplers": [{"input": accessor, "output": accessor + 1, "interpolation": "STEP"}],
+            "channels": [{"sampler": 0, "target": {"node": len(content["nodes"]) - 1, "path": "translation"}}],
+        }
+    ]
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    (tmp_path / "model.gltf").write_text(json.dumps(content))
+    mesh, motion = animated_file(tmp_path / "model.gltf")
+    assert animations_in(tmp_path / "model.gltf") == ["0"]
+    expected = trimesh.load(tmp_path / "model.gltf", force="mesh")
+    assert len(mesh.faces) == len(expected.faces) == 80 + 12
+    found, wanted = (
+        np.sort(corners.mean(axis=1), axis=0) for corners in (mesh.vertices[mesh.faces], expected.triangles)
+    )
+    np.testing.assert_allclose(found, wanted - (expected.bounds[0] + expected.bounds[1]) / 2, atol=1e-6)
+    assert np.array_equal(motion.deform(7.7), mesh.vertices)
 
 
 def nothing(file: Gltf) -> None:
