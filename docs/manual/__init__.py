@@ -13,6 +13,8 @@ from typing import Any
 from manual import api, commands, examples, keys, mathml, menu
 
 _PAGE = re.compile(r"^<!-- page: (\S+) -->$", re.MULTILINE)
+_SHELL = re.compile(r"^```sh\n.*?^```$", re.MULTILINE | re.DOTALL)
+_BEHIND = re.compile(r"(?<!\\\n)^(\S.*?) {2,}(# .*)$", re.MULTILINE)
 
 
 def setup(app: Any) -> dict[str, Any]:
@@ -35,4 +37,9 @@ def _insert(app: Any, page: str, source: list[str]) -> None:
     if page.startswith("examples/"):
         source[0] = examples.page(page.removeprefix("examples/"))
     source[0] = _PAGE.sub(lambda found: moved(Path(app.srcdir) / found[1]), source[0])
-    source[0] = menu.insert(commands.insert(keys.insert(source[0])))
+    source[0] = comments_above(menu.insert(commands.insert(keys.insert(source[0]))))
+
+
+def comments_above(text: str) -> str:
+    """Return a page whose comments behind shell commands stand above them, where phones show them in one piece."""
+    return _SHELL.sub(lambda block: _BEHIND.sub(r"\2\n\1", block[0]), text)

@@ -36,6 +36,8 @@ def _cards(items: list[tuple[str, str, str]]) -> str:
 
 def _picture(page: str) -> str:
     """Return the option for the last picture of an example, above its card; an empty text for other pages."""
+    if not page.startswith("examples/"):
+        return ""
     pictures = [name for cell in examples.outputs(page.removeprefix("examples/")) for name in cell.pictures]
     return f":img-top: examples/results/{pictures[-1]}\n" if pictures else ""
 

@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 sys.path.append(str(DOCS))
 
-from manual import api, commands, keys, mathml, menu  # noqa: E402
+from manual import api, commands, comments_above, keys, mathml, menu  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +141,20 @@ def test_every_page_is_in_one_menu():
     assert set(count) == there
     assert max(count.values()) == 1
     assert len(there) > 25
+
+
+def test_only_examples_have_pictures_on_their_cards():
+    cards = [
+        menu.insert((DOCS / f"{page}.md").read_text(encoding="utf-8")) for page in ("examples", "howto", "reference")
+    ]
+    assert [card.count(":img-top:") > 0 for card in cards] == [True, False, False]
+
+
+def test_comments_stand_above_the_commands_of_a_page():
+    """Not inside a text, and not within a command of several lines."""
+    page = "a  # b\n```sh\nqsim x -o y    # makes y\nqsim \\\n  z   # no\n# alone\necho a # b\n```\n"
+    wanted = "a  # b\n```sh\n# makes y\nqsim x -o y\nqsim \\\n  z   # no\n# alone\necho a # b\n```\n"
+    assert comments_above(page) == wanted
 
 
 def formulas() -> list[str]:
