@@ -55,7 +55,7 @@ _ALSO_CALLED = {
 OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
     "networks": (
         ("torch", "safetensors", "tensorboard"),
-        "networks and path-merge: all commands of quiver",
+        "networks and path-merge: quiver train, quiver restore, quiver evaluate",
     ),
     "video": (("av",), "video files: qsim convert, qsim preview"),
     "formats": (("zarr", "h5py"), "Zarr and HDF5 files: qsim convert, qsim calibrate"),
@@ -223,12 +223,18 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
             raise
         return _failed(f"{parser.prog}: {one_line(error)}", 2, args.json)
     except KeyboardInterrupt:
-        return _failed(f"\n{parser.prog}: interrupted; {args.after_interrupt}", 130, args.json)
+        return _failed(f"\n{parser.prog}: interrupted; {_then(args)}", 130, args.json)
     finally:
         quiet.reset(token)
         if args.verbose:
             spent, memory = time.perf_counter() - started, peak_memory() / 2**30
             print(f"{parser.prog}: {spent:.1f} s, at most {memory:.2f} GiB of memory", file=sys.stderr)
+
+
+def _then(args: argparse.Namespace) -> str:
+    """Return what the same command does after an interruption: before anything is stored, it cannot resume."""
+    stored = any(Path(f"{getattr(args, 'output', '.')}{end}").exists() for end in ("", ".part"))
+    return str(args.after_interrupt) if stored else STARTS_AGAIN
 
 
 def _failed(text: str, code: int, as_json: bool) -> int:

@@ -167,7 +167,7 @@ def _contents(jobs: Sequence[Job]) -> str:
         f"{s.frames} frames of {s.height} x {s.width} at {s.frame_rate:g} fps" for s in (job.settings for job in jobs)
     )
     streams = dict.fromkeys(sensing.stream_name for job in jobs for sensing in job.streams)
-    return f"{len(jobs)} clips of {' or '.join(sizes)}; streams: {', '.join(streams) or 'none'}"
+    return f"{len(jobs)} clip{'s' * (len(jobs) != 1)} of {' or '.join(sizes)}; streams: {', '.join(streams) or 'none'}"
 
 
 def add_check(sub: Any) -> None:

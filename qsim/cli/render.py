@@ -94,13 +94,8 @@ def _run_render(args: argparse.Namespace) -> int:
         chosen = choose_budget(scene, **taken)
         output(args, {"render": dataclasses.asdict(chosen)}, explain(chosen.findings))
         return 0
-    try:
-        with bar(args.output.name, first=PILOT) as progress:
-            clip = render(args.scene, args.output, **taken, **size, progress=progress, force=args.force)
-    except KeyboardInterrupt:
-        if not args.output.with_name(f"{args.output.name}.part").exists():
-            args.after_interrupt = "no frame is stored yet; run the same command again"
-        raise
+    with bar(args.output.name, first=PILOT) as progress:
+        clip = render(args.scene, args.output, **taken, **size, progress=progress, force=args.force)
     render_meta = clip.meta["render"]
     found = stated(clip.meta)
     text = f"{clip.path}: {len(clip)} frames of {args.height} x {args.width}"

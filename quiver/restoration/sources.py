@@ -84,7 +84,7 @@ def _of_clip(path: Path, args: argparse.Namespace) -> Codes:
         raise ValueError(f"{path}: choose one of its streams with --stream ({there}), or sense it now with --ppp")
     if args.stream is not None or args.ppp is None:
         stream = clip.stream(args.stream or clip.streams[0])
-        now = "" if args.stream else ", or sense the clip now with --ppp"
+        now = "" if args.stream else " (with --ppp the clip is sensed again)"
         refuse(args, LIGHT, f"{stream.path} is a stored stream, which has its own{now}")
         return stream_codes(stream)
     return sensed(clip, Illumination(_sensor(args), args.ppp, _bits(args)), args.seed or 0)[0]

@@ -385,7 +385,7 @@ def test_a_render_that_is_interrupted_before_its_first_frame_says_so(tmp_path, c
 
     monkeypatch.setattr("qsim.dataset.scene_rendering.choose_budget", interrupt)
     err = run(capsys, "render", "fan", "-o", tmp_path / "fan")[2].strip()
-    assert err.endswith("qsim: interrupted; no frame is stored yet; run the same command again")
+    assert err.endswith("qsim: interrupted; no incomplete file is left; run the same command again")
 
 
 def test_a_preview_of_a_damaged_clip_names_the_check(tmp_path, capsys):
