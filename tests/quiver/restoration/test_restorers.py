@@ -56,7 +56,7 @@ def test_methods_of_one_table_have_names_of_their_own(tmp_path):
 
 
 def test_the_shipped_weights_are_useful_at_once(make_clip: ClipMaker):
-    """A pattern that no training saw, 1.5 px/frame: X dB above the best window mean; 4 dB must be there."""
+    """A pattern that no training saw, 1.5 px/frame: measured 9.3 dB above the best window mean; 5 dB must be there."""
     clip = make_clip(frames=15, height=64, width=72)
     codes, factor = sensed(clip, Illumination())
     target = truth(clip, factor, 0, len(clip)) / codes.white
@@ -64,7 +64,7 @@ def test_the_shipped_weights_are_useful_at_once(make_clip: ClipMaker):
     def psnr(name: str) -> float:
         return metrics.score(restorer(name).restore(codes) / codes.white, target).psnr_matched
 
-    assert psnr("mergenet") > max(psnr(f"moment:{window}") for window in (1, 3, 5, 7, 9, 11)) + 4
+    assert psnr("mergenet") > max(psnr(f"moment:{window}") for window in (1, 3, 5, 7, 9, 11)) + 5
 
 
 @pytest.mark.parametrize("name", shipped_names())
