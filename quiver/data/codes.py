@@ -100,7 +100,8 @@ def filled(codes: Codes, bad: Array | None) -> Codes:
         )
     marked = bad if codes.defective is None else bad | codes.defective
     rows, columns = (1, 1) if codes.colour is None else codes.colour.tile  # neighbours of one colour fill a pixel
-    fillers = {(i, j): defects.Filler(marked[i::rows, j::columns]) for i in range(rows) for j in range(columns)}
+    places = {(i, j): marked[i::rows, j::columns] for i in range(rows) for j in range(columns)}
+    fillers = {place: defects.Filler(own) for place, own in places.items() if own.any()}
 
     def read(start: int, stop: int) -> Array:
         part = codes.read(start, stop)

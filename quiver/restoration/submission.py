@@ -42,12 +42,14 @@ def restore_cubes(
     """Write the last planes of cubes, restored from codes of `planes` planes, to PATH.zip; return its description.
 
     `FileExistsError` for a result without `force`, and for files that this function did not write; `ValueError` for
-    cubes of one name, and for a truth of another size.
+    cubes of one name, and for a truth that is damaged or of another size.
     """
     check_target(path, force)
     names = [cube.name for cube in cubes]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"{path}: two cubes are called {twice[0]}; a submission has one picture of each name")
+    for cube in cubes:  # a damaged truth is found before hours of work
+        cube.truth()
     scores: dict[str, float | None] = {}
     started = time.perf_counter()
     with files.replacing_described(path, path.with_suffix(".json")) as (packed, described):

@@ -67,6 +67,16 @@ def test_every_method_restores_colours(stream, method):
         assert np.mean((found - truth) ** 2) < np.mean((grey - truth) ** 2)
 
 
+def test_places_without_defective_pixels_need_no_good_one():
+    """Frames of one row lack half of the tile's places; a map was refused there with `all 0 pixels are marked`."""
+    codes = replace(array_codes(np.full((3, 1, 8), 5, np.uint8), SENSOR, 1e-3), colour=ColourFilter(MASKS["rggb"]))
+    bad = np.zeros((1, 8), bool)
+    bad[0, 2] = True
+    np.testing.assert_array_equal(filled(codes, bad).read(0, 3), codes.read(0, 3))
+    with pytest.raises(ValueError, match="all 4 pixels are marked as defective"):
+        filled(codes, np.arange(8)[None] % 2 == 0)
+
+
 def test_defective_pixels_are_filled_by_their_colour(stream):
     codes = stream_codes(stream)
     bad = np.zeros(codes.shape[1:], bool)

@@ -102,3 +102,17 @@ def test_a_failure_leaves_no_zip(tmp_path, capsys):
     assert main(["restore", str(source), "-o", str(tmp_path / "a.zip"), "--method", "naive"]) == 2
     assert "its cube needs RGB of 6 x 11" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_damaged_truth_is_found_before_anything_is_restored(tmp_path):
+    """The picture of the last of many cubes: it was read after the others had been restored, for hours."""
+    source = static_cubes(tmp_path / "cubes", planes=3)
+    (source / "night" / "000007.png").write_bytes(b"no picture")
+    with pytest.raises(ValueError, match=r"night/000007\.png: not readable as PNG"):
+        restore_cubes(cubes(source), Idle(), 1, tmp_path / "a.zip")
+
+
+class Idle:
+    """A method that is never asked."""
+
+    name = "idle"
