@@ -1,7 +1,9 @@
-"""Builds the camera's rays through film positions in Dr.Jit: pinhole or thin lens, with the distortion of the lens."""
+"""Draws film positions, and builds the camera's rays through them in Dr.Jit: pinhole or thin lens, with distortion."""
 
 from __future__ import annotations
 
+import copy
+import math
 from typing import Any
 
 import numpy as np
@@ -9,8 +11,64 @@ from numpy import ndarray as Array
 
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
+from qsim.optics.radiometry import Crop
 
+MAX_SAMPLES_IN_FLIGHT = 2**23  # samples in flight, about; a frame with more is rendered in parts
 KNOWN = 1024  # radii of the picture whose rays are known; tests/qsim/rendering/test_camera_rays.py measures the rest
+
+
+class Film:
+    """The pixels of a window (y, x, height, width) of a camera's frame, or every n-th row and column (`thinned`).
+
+    `rays` is None for the scalar engine, whose camera is Mitsuba's.
+    """
+
+    def __init__(self, mi: Any, camera: Camera, crop: Crop, thinned: int, rays: CameraRays | None) -> None:
+        self._mi, self.camera, self.crop, self.thinned = mi, camera, crop, thinned
+        self.shape = -(-crop[2] // thinned), -(-crop[3] // thinned)
+        self._samplers: dict[int, Any] = {}
+        self.rays: Any = rays
+
+    def window(self, crop: Crop) -> Film:
+        """Return the film of every pixel of another crop; it shares the samplers."""
+        other = copy.copy(self)
+        other.crop, other.thinned, other.shape = crop, 1, crop[2:]
+        return other
+
+    def parts(self, samples: int) -> list[range]:
+        """Return the window's pixels, row by row, in ranges of at most about MAX_SAMPLES_IN_FLIGHT samples.
+
+        Passes divide the pixels, not the samples: the error of a complete grid falls faster than that of its parts.
+        """
+        pixels = math.prod(self.shape)
+        count = min(pixels, math.ceil(pixels * samples / MAX_SAMPLES_IN_FLIGHT))
+        return [range(pixels * i // count, pixels * (i + 1) // count) for i in range(count)]
+
+    def positions(self, seed: int, samples: int, part: range, times: int = 1) -> tuple[Any, Any]:
+        """Return a seeded sampler and film positions [px], uniform in each pixel; its samples are neighbours in memory.
+
+        The pixels of `part` come `times` times over, each time with separate grids. Size and place of the window
+        are data, not code: a pilot and a whole frame share one compiled kernel.
+        """
+        import drjit as dr
+
+        mi = self._mi
+        in_flight = times * len(part) * samples
+        sampler = self._sampler(samples)
+        sampler.seed(seed, in_flight)
+        numbers = (len(part), part.start, self.shape[1], self.thinned, *self.crop[:2])
+        count, first, columns, step, y0, x0 = (dr.opaque(mi.UInt32, n) for n in numbers)
+        pixel = dr.arange(mi.UInt32, in_flight) // samples % count + first
+        row = pixel // columns
+        corner = mi.Point2f(mi.Float((pixel - row * columns) * step + x0), mi.Float(row * step + y0))
+        return sampler, corner + sampler.next_2d()
+
+    def _sampler(self, samples: int) -> Any:
+        if samples not in self._samplers:
+            sampler = self._mi.load_dict({"type": "multijitter", "sample_count": samples})
+            sampler.set_samples_per_wavefront(samples)
+            self._samplers[samples] = sampler
+        return self._samplers[samples]
 
 
 class CameraRays:

@@ -27,7 +27,7 @@ from qsim.keys import Key, hash_name, words
 from qsim.optics.radiometry import Crop, check_crop
 from qsim.rendering import ground_truth
 from qsim.rendering.budget import Budget, blur_left, grid_samples, instants, light_windows
-from qsim.rendering.camera_rays import CameraRays
+from qsim.rendering.camera_rays import CameraRays, Film
 from qsim.rendering.denoiser import cleaned_mean
 from qsim.rendering.engine import activate, in_colour, select
 from qsim.rendering.mitsuba_scene import Stage, film_pass
@@ -37,7 +37,6 @@ from qsim.scene import Scene
 RENDER_STAGE = 16  # of the random keys: sampler seeds
 SHARP_STAGE = 17  # the sharp instant has separate seeds
 SURFACE_SAMPLES = 16  # per pixel, for the denoiser's albedo and normals
-MAX_SAMPLES_IN_FLIGHT = 2**23  # samples in flight, about; a frame with more is rendered in parts
 FIREFLY = 10.0  # a pixel counts as a firefly where halves differ by this many rms of the frame's difference
 
 
@@ -89,20 +88,27 @@ class Renderer:
             raise ValueError(f"shutter: a share of the frame time, 0 to 1, got {shutter!r}")
         self.scene, self.frame_rate, self.shutter, self.seed = scene, frame_rate, shutter, seed
         self.budget = budget or Budget()
-        self.crop, self.thinned = _checked_crop(scene, crop), thinned
-        self.shape = -(-self.crop[2] // thinned), -(-self.crop[3] // thinned)
         self.engine = (engine or select()) if scene.bands is None else in_colour(engine or select())
-        self._film = (*(() if scene.bands is None else (3,)), math.prod(self.shape))
         activate(self.engine)
         import mitsuba as mi
 
         self.mi = mi
+        rays = None if self.engine.backend == "scalar" else CameraRays(mi, scene.camera)
+        self.film = Film(mi, scene.camera, _checked_crop(scene, crop), thinned, rays)
         self._key = Key(seed=seed, clip=hash_name(f"{scene.name}/{scene.seed}"), stage=RENDER_STAGE)
         self.stage = Stage(mi, scene)
         self._integrators: dict[int, Any] = {}
-        self._samplers: dict[int, Any] = {}
         self._caster = RayCaster(self.stage, self.engine.backend)
-        self._rays: Any = None if self.engine.backend == "scalar" else CameraRays(mi, scene.camera)
+
+    @property
+    def crop(self) -> Crop:
+        """The window (y, x, height, width) in the camera's frame."""
+        return self.film.crop
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of the frames [px]."""
+        return self.film.shape
 
     def time(self, t: int) -> float:
         """Return the mid-exposure time of frame t [s]."""
@@ -132,8 +138,7 @@ class Renderer:
     def window(self, crop: Crop) -> Renderer:
         """Return a renderer of the same loaded scene for every pixel of another crop."""
         other = copy.copy(self)
-        other.crop, other.thinned, other.shape = _checked_crop(self.scene, crop), 1, crop[2:]
-        other._film = (*self._film[:-1], math.prod(other.shape))
+        other.film = self.film.window(_checked_crop(self.scene, crop))
         return other
 
     def instants(self, t: int) -> list[float]:
@@ -154,9 +159,9 @@ class Renderer:
         The instants [s] are the middles of equal parts of an exposure; lights have their mean over `light_windows`.
         """
         n, samples = len(instants), budget.grid(len(instants))
-        parts = self.parts(2 * samples)
+        parts = self.film.parts(2 * samples)
         seeds = words(key, (2, n * len(parts))).reshape(2, n, len(parts))
-        sums = np.zeros((3, 2, *self._film))
+        sums = np.zeros((3, 2, *(() if self.scene.bands is None else (3,)), math.prod(self.shape)))
         windows = light_windows(instants, self.exposure)
         for i, instant in enumerate(instants):
             drawn = np.empty_like(sums[0])
@@ -167,7 +172,7 @@ class Renderer:
             if self.engine.backend == "scalar":
                 integrator = self._integrator(budget.bounces)
                 images = [film_pass(self.stage, pose, self.crop, int(s), samples, integrator) for s in seeds[:, i, 0]]
-                thin = [image[:: self.thinned, :: self.thinned] for image in images]
+                thin = [image[:: self.film.thinned, :: self.film.thinned] for image in images]
                 drawn[:] = np.reshape(thin, drawn.shape)
             else:
                 for part, seed in zip(parts, seeds[0, i], strict=True):
@@ -180,15 +185,6 @@ class Renderer:
         if self.scene.flickers and n > 3:  # the middle one has the light of its part: as if it had that of all
             sums[2] = sums[2] * (sums[0].mean() / sums[2].mean()) if sums[2].any() else sums[1]
         return sums.reshape(*sums.shape[:-1], *self.shape)
-
-    def parts(self, samples: int) -> list[range]:
-        """Return the window's pixels, row by row, in ranges of at most about MAX_SAMPLES_IN_FLIGHT samples.
-
-        Passes divide the pixels, not the samples: the error of a complete grid falls faster than that of its parts.
-        """
-        pixels = math.prod(self.shape)
-        count = min(pixels, math.ceil(pixels * samples / MAX_SAMPLES_IN_FLIGHT))
-        return [range(pixels * i // count, pixels * (i + 1) // count) for i in range(count)]
 
     def key(self, t: int, stage: int = RENDER_STAGE) -> Key:
         """Return the random key of frame t; seed, scene and stage select the samples."""
@@ -225,15 +221,15 @@ class Renderer:
 
         mi = self.mi
         samples = grid_samples(max(2, SURFACE_SAMPLES // len(instants)))
-        parts = self.parts(samples)
+        parts = self.film.parts(samples)
         seeds = words(key, (len(instants), len(parts)), redraw=1)
         colours = 1 if self.scene.bands is None else 3
         sums = np.zeros((colours + 3, math.prod(self.shape)))
         for instant, row in zip(instants, seeds, strict=True):
             self.stage.place(instant)
             for part, seed in zip(parts, row, strict=True):
-                sampler, position = self._film_positions(int(seed), samples, part)
-                ray = self._rays.through(self.scene.camera.pose(instant), position, sampler)
+                sampler, position = self.film.positions(int(seed), samples, part)
+                ray = self.film.rays.through(self.scene.camera.pose(instant), position, sampler)
                 found = self.stage.loaded.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
                 bsdf = found.bsdf(ray)
                 seen = found.is_valid()
@@ -256,32 +252,13 @@ class Renderer:
         import drjit as dr
 
         integrator = self._integrator(bounces)  # first: loading it later would change the kernel once
-        sampler, position = self._film_positions(seed, samples, part, 2)
-        ray = self._rays.through(pose, position, sampler)
+        sampler, position = self.film.positions(seed, samples, part, 2)
+        ray = self.film.rays.through(pose, position, sampler)
         radiance, _, _ = integrator.sample(self.stage.loaded, sampler, ray)
         means = [dr.block_sum(radiance[band], samples) / samples for band in range(len(radiance))]
         dr.eval(*means)  # together: each alone would trace the rays again
         found = np.array([np.array(mean, np.float64).reshape(2, len(part)) for mean in means])
         return found[0] if self.scene.bands is None else found.swapaxes(0, 1)
-
-    def _film_positions(self, seed: int, samples: int, part: range, times: int = 1) -> tuple[Any, Any]:
-        """Return a seeded sampler and film positions [px], uniform in each pixel; its samples are neighbours in memory.
-
-        The pixels of `part` come `times` times over, each time with separate grids. Size and place of the window
-        are data, not code: a pilot and a whole frame share one compiled kernel.
-        """
-        import drjit as dr
-
-        mi = self.mi
-        in_flight = times * len(part) * samples
-        sampler = self._sampler(samples)
-        sampler.seed(seed, in_flight)
-        numbers = (len(part), part.start, self.shape[1], self.thinned, *self.crop[:2])
-        count, first, columns, step, y0, x0 = (dr.opaque(mi.UInt32, n) for n in numbers)
-        pixel = dr.arange(mi.UInt32, in_flight) // samples % count + first
-        row = pixel // columns
-        corner = mi.Point2f(mi.Float((pixel - row * columns) * step + x0), mi.Float(row * step + y0))
-        return sampler, corner + sampler.next_2d()
 
     def _integrator(self, bounces: int) -> Any:
         """Return a path tracer without Russian roulette: equal seeds give equal paths at every depth."""
@@ -290,17 +267,10 @@ class Renderer:
             self._integrators[bounces] = self.mi.load_dict(plugin)
         return self._integrators[bounces]
 
-    def _sampler(self, samples: int) -> Any:
-        if samples not in self._samplers:
-            sampler = self.mi.load_dict({"type": "multijitter", "sample_count": samples})
-            sampler.set_samples_per_wavefront(samples)
-            self._samplers[samples] = sampler
-        return self._samplers[samples]
-
     def truth(self, t: int) -> dict[str, Array]:
         """Return flow, validity, depth and body of frame t at mid-exposure, as in `Frame`."""
         camera, now, after, shape = self.scene.camera, self.time(t), self.time(t + 1), self.shape
-        rays = pixel_rays(camera, self.crop, self.thinned)
+        rays = pixel_rays(camera, self.crop, self.film.thinned)
         self.stage.place(now)
         hits = self._caster.cast(camera.pose(now), rays)
         flow, inside, then = ground_truth.flow_between(self.scene, rays, hits, now, after)
@@ -321,7 +291,7 @@ class Renderer:
         With the shutter at 0, it is the motion per frame time at the speed of that instant.
         """
         now, exposure = self.time(t), self.exposure
-        rays = pixel_rays(self.scene.camera, self.crop, self.thinned)
+        rays = pixel_rays(self.scene.camera, self.crop, self.film.thinned)
         self.stage.place(now)
         hits = self._caster.cast(self.scene.camera.pose(now), rays)
         extent = ground_truth.motion_extent(self.scene, rays, hits, now, exposure, sharp=self.shutter == 0)

@@ -175,8 +175,8 @@ def test_a_frame_in_parts_is_as_good_as_a_complete_one(monkeypatch):
     entire, parts = (renderer(made, budget=Budget(128, 2)) for _ in range(2))
     whole = entire.frame(1, with_truth=False)
     halves = entire.halves([entire.time(1)], entire.budget, entire.key(1))
-    monkeypatch.setattr("qsim.rendering.renderer.MAX_SAMPLES_IN_FLIGHT", 128 * 50)
-    assert [len(part) for part in parts.parts(128)] == [49, 50] * 8
+    monkeypatch.setattr("qsim.rendering.camera_rays.MAX_SAMPLES_IN_FLIGHT", 128 * 50)
+    assert [len(part) for part in parts.film.parts(128)] == [49, 50] * 8
     split = parts.frame(1, with_truth=False)
     assert_same_rms(np.subtract(*halves), np.subtract(*parts.halves([parts.time(1)], parts.budget, parts.key(1))))
     assert abs(split.radiance - whole.radiance).mean() < 2 * whole.error
