@@ -36,11 +36,19 @@ class Budget:
     dimmed: float = 0.0  # share of the mean light that later bounces would add, by the pilot
     dimmed_error: float = 0.0  # standard error of that share
     findings: tuple[Finding, ...] = field(default=())
+    neighbours: int = 0  # frames on each side whose samples are carried into a frame (reuse/); 0: each frame alone
 
     def __post_init__(self) -> None:
         for name in ("samples", "bounces", "sub_frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"Budget.{name}: at least 1, got {getattr(self, name)!r}")
+        if self.neighbours < 0:
+            raise ValueError(f"Budget.neighbours: at least 0, got {self.neighbours!r}")
+
+    @property
+    def left_out_clamped(self) -> float:
+        """The error by later bounces of clamped pictures, W m^-2 sr^-1; the plain one if no white is known."""
+        return self.left_out_at_white if self.white else self.left_out
 
     def grid(self, instants: int) -> int:
         """Return the samples per pixel of each half at each of `instants` instants."""

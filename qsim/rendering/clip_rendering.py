@@ -36,7 +36,9 @@ def render_clip(
     """
     if frames < 1:
         raise ValueError(f"{path}: a clip needs at least one frame, got {frames}")
-    renderer = Renderer(scene, frame_rate=frame_rate, shutter=shutter, seed=seed, budget=budget, crop=crop)
+    renderer = Renderer(
+        scene, frame_rate=frame_rate, shutter=shutter, seed=seed, budget=budget, crop=crop, frames=frames
+    )
     y, x, height, width = renderer.crop
     meta = {
         "shape": [frames, height, width],

@@ -29,6 +29,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import clamped_squares
+from qsim.optics.radiometry import Crop
 
 DENOISE_COST = 15.0  # cost of two denoised halves, albedo and normals in samples per pixel (about, on two cores)
 AROUND = 33  # px, side of the square around a pixel in which errors are compared
@@ -71,16 +72,28 @@ class Mixture:
     lower: Array  # [H, W], the darker of the two halves, both mixed by `share`
     squares: Array  # [H, W], whose mean estimates the picture's squared error; single ones may be negative
     raw: Array  # [H, W], the same of the raw mean
+    noise: Array | float = 0.0  # [H, W], the same of the picture's own noise, which its error cannot be below
 
     @property
     def error(self) -> float:
         """The rms error of the picture, W m^-2 sr^-1."""
-        return _root(self.squares, self.raw)
+        return _root(self.squares, self.raw, 1.0, float(np.mean(self.noise)))
 
     def error_at(self, white: float, sigmas: float = 1.0) -> float:
         """Return the rms error of picture and truth clamped at white, plus `sigmas` of its standard errors."""
         squares = clamped_squares(self.squares, self.picture, self.lower, white)
-        return _root(squares, np.minimum(self.raw, white**2), sigmas)
+        least = float(np.mean(np.where(self.picture < white, self.noise, 0)))
+        return _root(squares, np.minimum(self.raw, white**2), sigmas, least)
+
+    def deviation_at(self, white: float) -> float:
+        """Return the standard deviation over the pixels of what estimates their squared error, clamped at white."""
+        return float(clamped_squares(self.squares, self.picture, self.lower, white).std())
+
+    def cut(self, crop: Crop, thinned: int) -> Mixture:
+        """Return every n-th (`thinned`) row and column of a window (y, x, height, width)."""
+        y, x, height, width = crop
+        arrays = (self.share, self.picture, self.lower, self.squares, self.raw, self.noise * np.ones_like(self.raw))
+        return Mixture(*(array[y : y + height : thinned, x : x + width : thinned] for array in arrays))
 
 
 def cleaned_mean(halves: Array, albedo: Array, normal: Array, white: float) -> Mixture:
@@ -89,11 +102,15 @@ def cleaned_mean(halves: Array, albedo: Array, normal: Array, white: float) -> M
     Its mean is that of the raw halves, unless the shift exceeds KEPT times its error at white.
     """
     cleaned = np.stack([denoised(half, albedo, normal) for half in halves])
-    mixed = mixture(halves, cleaned)
+    return keeping_mean(mixture(halves, cleaned), float(halves.mean()), white)
+
+
+def keeping_mean(mixed: Mixture, wanted: float, white: float) -> Mixture:
+    """Return a mixture with this mean radiance, or as near to it as KEPT times its error at white allows."""
     mean, most = float(mixed.picture.mean()), KEPT * mixed.error_at(white)
     if not mean > 0:
         return mixed
-    factor = 1 + float(np.clip(halves.mean() - mean, -most, most)) / mean
+    factor = 1 + float(np.clip(wanted - mean, -most, most)) / mean
     return replace(mixed, picture=factor * mixed.picture, lower=factor * mixed.lower)
 
 
@@ -118,6 +135,6 @@ def mixture(halves: Array, cleaned: Array) -> Mixture:
     return Mixture(share, mixed.mean(axis=0), mixed.min(axis=0), squares, z**2 / 4)
 
 
-def _root(squares: Array, raw: Array, sigmas: float = 1.0) -> float:
+def _root(squares: Array, raw: Array, sigmas: float, least: float) -> float:
     stated = squares.mean() + sigmas * squares.std() / np.sqrt(squares.size)
-    return float(np.sqrt(max(stated, 0.01 * np.mean(raw))))
+    return float(np.sqrt(max(stated, 0.01 * np.mean(raw), least)))

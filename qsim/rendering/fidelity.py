@@ -27,6 +27,7 @@ from qsim.optics.diffraction import diffraction_line
 from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.rendering.budget import Allowed, Budget, Finding, blur_error, grid_samples
 from qsim.rendering.pilot import COUNTS, Pilot, denoised_samples, rests
+from qsim.rendering.reuse.sharing import ALONE, NAME, Need, Sharing, shared_samples
 from qsim.scene import Scene
 
 SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
@@ -71,14 +72,16 @@ def choose_budget(
     ppp: float | None = None,
     quantum_efficiency: float = 1.0,
     denoise: bool | None = None,
+    reuse: bool = False,
     seed: int = 0,
 ) -> Budget:
     """Return the smallest budget with an error below `psnr` [dB] and, at `ppp` photons, below the sensor's noise.
 
     `ppp` is the highest light level at which the clip will be sensed; with None, only `psnr` counts. `denoise` None
-    denoises if Open Image Denoise is installed and cheaper at the same measured error. The result depends only on the
-    arguments and the installed software: an interrupted clip resumes with the same budget. `ValueError` for a `psnr`
-    outside 10 to 80 dB and for a scene without light.
+    denoises if Open Image Denoise is installed and cheaper at the same measured error. `reuse` lets neighbouring frames
+    share samples where that is predicted to cost less. The result depends only on the arguments and the installed
+    software: an interrupted clip resumes with the same budget. `ValueError` for a `psnr` outside 10 to 80 dB and for a
+    scene without light.
     """
     if not 10 <= psnr <= 80:
         raise ValueError(f"psnr: expected 10 to 80 dB, got {psnr!r}")
@@ -114,26 +117,35 @@ def choose_budget(
         fewer, about_denoiser = denoised_samples(
             pilot, instants, bounces, allowed, share, samples, denoise, lambda n: noise.at(n / instants, instants)
         )
+    chosen, about_reuse = Sharing(fewer or samples, 0, fewer is not None), Finding(NAME, ALONE, "not requested")
     if fewer is not None:
-        samples = fewer
-        about_samples = Finding("samples", f"{samples} per pixel, denoised", f"without: {about_samples.chosen}")
+        about_samples = Finding("samples", f"{fewer} per pixel, denoised", f"without: {about_samples.chosen}")
+    if reuse:
+        need = Need(allowed, share, bounces, frames, chosen, noise.at)
+        chosen, about_reuse = shared_samples(pilot, need, denoise)
+        if chosen is not need.alone:
+            size = f"frames alone: {about_samples.chosen}"
+            about_samples = Finding("samples", f"{chosen.samples} per pixel{', denoised' * chosen.denoise}", size)
+            about_denoiser = Finding("denoiser", "on" if chosen.denoise else "off", "tried on shared samples")
     effects = (*_flicker(pilot.renderer.strengths(frames)), *_lens(scene.camera))
     lens = (*effects, *_left_out(scene.camera, pilot.truths()))
     pixels = scene.camera.height * scene.camera.width
-    noisy = noise.at(samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
-    about_light, about_motion = _light(dimmed, noisy, fewer is not None), moving(pilot.extent, shutter)
-    findings = (limit, about_samples, about_denoiser, about_bounces, about_light, about_motion, about_blur, *lens)
+    noisy = noise.at(chosen.samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
+    about_light, about_motion = _light(dimmed, noisy, chosen.denoise), moving(pilot.extent, shutter)
+    shared = (limit, about_samples, about_denoiser, about_reuse)
+    findings = (*shared, about_bounces, about_light, about_motion, about_blur, *lens)
     return Budget(
-        samples,
+        chosen.samples,
         bounces,
         instants,
         instants > 1,
-        fewer is not None,
+        chosen.denoise,
         left_out.plain,
         left_out.at_white,
         allowed.white,
         *dimmed,
         findings,
+        chosen.neighbours,
     )
 
 

@@ -85,7 +85,7 @@ def seen_again(scene: Scene, rays: Array, hits: Hits, t: float, later: float) ->
                 points = _points(body, hits, chosen, moment) - view[:3, 3]
                 ends[:, chosen] = view[:3, :3].T @ points.T * inverse[chosen]
             continue
-        here, there = _pose(scene, number, t), _pose(scene, number, later)
+        here, there = body_pose(scene, number, t), body_pose(scene, number, later)
         if not np.array_equal(here, there):
             chosen = np.flatnonzero(hits.number == number)
             motion = there @ np.linalg.inv(here)
@@ -106,7 +106,8 @@ def _moved(rays: Array, inverse: Array, before: Array, motion: Array, after: Arr
     return whole[:3, :3] @ rays + whole[:3, 3:] * inverse
 
 
-def _pose(scene: Scene, number: int, t: float) -> Array:
+def body_pose(scene: Scene, number: int, t: float) -> Array:
+    """Return the body-to-world matrix [4, 4] at time t [s] of a body, lamp or part, by its number in ground truth."""
     motion = getattr((*scene.bodies, *scene.lights, *scene.parts)[number], "motion", None)
     return np.eye(4) if motion is None else np.asarray(motion.pose(t), np.float64)
 

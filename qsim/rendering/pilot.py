@@ -184,23 +184,23 @@ def denoised_samples(
     tried = [n for n in (count * each for each in COUNTS) if wanted or n + DENOISE_COST < raw]
     if not tried:
         return None, cheap
-    windows = [renderer.window(crop) for crop in _windows(camera)]
+    parts = [renderer.window(crop) for crop in windows(camera)]
     times, key = pilot.exposed(t, count), renderer.key(t, STAGE)
-    surfaces = [window.surfaces(times, key) for window in windows]
+    surfaces = [window.surfaces(times, key) for window in parts]
     errors: list[float] = []
     for samples in tried:
         squares = np.zeros(3)  # of the raw halves; of the denoised mixture at white and without a clamp
-        for window, (albedo, normal) in zip(windows, surfaces, strict=True):
+        for window, (albedo, normal) in zip(parts, surfaces, strict=True):
             halves = window.halves(times, Budget(samples, bounces), key)
             mixed = cleaned_mean(halves, albedo, normal, allowed.white)
             found = (Errors.of_halves(halves, allowed.white).plain, mixed.error_at(allowed.white, CAREFUL), mixed.error)
-            squares += np.square(found) / len(windows)
+            squares += np.square(found) / len(parts)
         noisy, *cleaned = np.sqrt(squares).tolist()
         missed = LUCK * noisy < expected(samples).plain
         errors.append(allowed.fraction(expected(samples) if missed else Errors(*cleaned)))
         if errors[-1] <= share:
             break
-    where = f"{'' if len(windows) == 1 else 'four windows of '}frame {t}"
+    where = f"{'' if len(parts) == 1 else 'four windows of '}frame {t}"
     needed, size = needed_samples(tried, errors, share), f"tried in {where}"
     most = MOST_DENOISED * count
     if needed > most:
@@ -213,7 +213,7 @@ def denoised_samples(
     return chosen, Finding("denoiser", "on", size)
 
 
-def _windows(camera: Camera) -> list[tuple[int, int, int, int]]:
+def windows(camera: Camera) -> list[tuple[int, int, int, int]]:
     """Return the windows (y, x, height, width) for the denoiser's trial: a small frame itself, or four of its parts."""
     height, width = camera.height, camera.width
     if height * width <= 4 * WINDOW**2:

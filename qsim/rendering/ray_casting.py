@@ -49,17 +49,29 @@ class RayCaster:
         eye = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in origin))
         ray = mi.Ray3f(eye, direction / length)
         found = self._stage.loaded.ray_intersect_preliminary(ray, coherent=True)
-        shape = dr.reinterpret_array(mi.UInt32, found.shape)
-        instance: Any = dr.reinterpret_array(mi.UInt32, found.instance)
         hit = found.is_valid()
-        # Dr.Jit leaves misses uninitialised.
-        index = dr.select(hit, dr.select(instance > 0, instance, shape), 0)
+        index = _index(mi, found)
         distance = dr.select(hit, found.t / length, dr.inf)
         triangle, weights = dr.select(hit, found.prim_index, 0), dr.select(hit, found.prim_uv, 0)
         dr.eval(index, distance, triangle, weights)  # together: separate evaluations would cast the rays again
         number = self._numbers[np.minimum(np.array(index), len(self._numbers) - 1)]
         far = np.where(number >= 0, np.array(distance, np.float64), np.inf)
         return Hits(far, number, np.array(triangle, np.int64), np.array(weights, np.float64).reshape(2, -1).T)
+
+    def first(self, view: Array, ray: Any) -> tuple[Any, Any]:
+        """Return 1 / depth [1/m] along the axis of a camera with this pose [4, 4], and body number + 1, of first hits.
+
+        Dr.Jit arrays, one entry per ray, not evaluated; 0 and 0 where nothing is hit. Not for the scalar engine.
+        """
+        import drjit as dr
+
+        mi = self._mi
+        found = self._stage.loaded.ray_intersect_preliminary(ray, coherent=True)
+        numbers = mi.UInt32((self._numbers + 1).astype(np.uint32))
+        index = dr.minimum(_index(mi, found), len(self._numbers) - 1)
+        body = dr.select(found.is_valid(), dr.gather(mi.UInt32, numbers, index), 0)
+        forward = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in view[:3, 2]))
+        return dr.select(body > 0, 1 / (found.t * dr.dot(ray.d, forward)), 0), body
 
     def _cast_one_by_one(self, origin: Array, directions: Array) -> Hits:
         mi = self._mi
@@ -90,3 +102,13 @@ class RayCaster:
         for index, shape in zip(indices, shapes, strict=True):
             table[index] = numbers.get(shape.id(), -1)
         return table
+
+
+def _index(mi: Any, found: Any) -> Any:
+    """Return Dr.Jit's registry index of the instance or shape that each ray meets first; 0 for a miss."""
+    import drjit as dr
+
+    shape = dr.reinterpret_array(mi.UInt32, found.shape)
+    instance: Any = dr.reinterpret_array(mi.UInt32, found.instance)
+    # Dr.Jit leaves misses uninitialised.
+    return dr.select(found.is_valid(), dr.select(instance > 0, instance, shape), 0)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,12 +33,16 @@ from qsim.rendering.denoiser import cleaned_mean
 from qsim.rendering.engine import activate, in_colour, select
 from qsim.rendering.mitsuba_scene import Stage, film_pass
 from qsim.rendering.ray_casting import RayCaster, pixel_rays
+from qsim.rendering.reuse.carrying import Carrier, unshared
+from qsim.rendering.reuse.choice import best_of, reused_mean
 from qsim.scene import Scene
 
 RENDER_STAGE = 16  # of the random keys: sampler seeds
 SHARP_STAGE = 17  # the sharp instant has separate seeds
 SURFACE_SAMPLES = 16  # per pixel, for the denoiser's albedo and normals
 FIREFLY = 10.0  # a pixel counts as a firefly where halves differ by this many rms of the frame's difference
+
+Exposed = tuple[Array, float, tuple[tuple[float, float], ...], int]  # radiance, its error, that at whites, fireflies
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +72,10 @@ class Renderer:
 
     `shutter` is the fraction of the frame time during which the shutter is open; 0 is an instant. `crop` = (y, x,
     height, width) selects a window of the camera's frame, and `thinned` = n every n-th row and column of it (for
-    pilots). `ValueError` for a crop outside the frame and for a frame rate or shutter outside its range.
+    pilots). `frames` is their number in the clip: samples of frames beyond it are not carried (None: no end). Where
+    frames share samples, a crop is cut from the complete frame, so that it agrees with it to the bit. `ValueError` for
+    a crop outside the frame, for a frame rate or shutter outside its range, and for a budget with neighbours where
+    frames cannot share samples.
     """
 
     def __init__(
@@ -80,6 +88,7 @@ class Renderer:
         budget: Budget | None = None,
         crop: Crop | None = None,
         thinned: int = 1,
+        frames: int | None = None,
         engine: Engine | None = None,
     ) -> None:
         if not frame_rate > 0:
@@ -99,6 +108,12 @@ class Renderer:
         self.stage = Stage(mi, scene)
         self._integrators: dict[int, Any] = {}
         self._caster = RayCaster(self.stage, self.engine.backend)
+        self._whole: Renderer | None = None
+        if self.budget.neighbours:
+            if reason := unshared(scene, shutter, self.engine.backend):
+                raise ValueError(f"Budget.neighbours: frames with {reason} cannot share samples; set it to 0")
+            self._whole = self.window((0, 0, scene.camera.height, scene.camera.width))
+            self._carrier = self._whole.carrier(self.budget, frames)
 
     @property
     def crop(self) -> Crop:
@@ -127,7 +142,10 @@ class Renderer:
     def frame(self, t: int, *, with_truth: bool = True) -> Frame:
         """Render frame t: arrays of the window's height and width [H, W]."""
         activate(self.engine)
-        radiance, error, errors_at, fireflies = self._exposed(self.instants(t), self.key(t))
+        if self._whole is not None:
+            radiance, error, errors_at, fireflies = self._shared(t, self._whole)
+        else:
+            radiance, error, errors_at, fireflies = self._exposed(self.instants(t), self.key(t))
         sharp = None
         if self.shutter > 0 and self.budget.sharp:
             sharp = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))[0]
@@ -190,14 +208,36 @@ class Renderer:
         """Return the random key of frame t; seed, scene and stage select the samples."""
         return replace(self._key, frame=t, stage=stage)
 
-    def _exposed(self, instants: list[float], key: Key) -> tuple[Array, float, tuple[tuple[float, float], ...], int]:
+    def carrier(self, budget: Budget, frames: int | None, stage: int = RENDER_STAGE) -> Carrier:
+        """Return what carries samples between the frames 0 .. frames - 1 (None: all) of this window.
+
+        Seed, scene and `stage` select the samples.
+        """
+        every = range(2**32) if frames is None else range(frames)
+        integrator, each, key = self._integrator(budget.bounces), budget.grid(1), partial(self.key, stage=stage)
+        return Carrier(self.stage, self.film, self._caster, integrator, each, budget.neighbours, every, self.time, key)
+
+    def _shared(self, t: int, whole: Renderer) -> Exposed:
+        """Return the same as `_exposed` of a frame that shares samples, cut from the complete frame."""
+        pictures = self._carrier.pictures(t)
+        own, broken = pictures[0], ~np.isfinite(pictures[0]).all(axis=0)
+        pictures[:, :, broken] = 0
+        white = self.budget.white or white_in(own.mean(axis=0))
+        surfaces = whole.surfaces([self.time(t)], self.key(t)) if self.budget.denoise else None
+        best, _ = best_of(pictures, white, self.budget.denoise)
+        cut = reused_mean(own, best, surfaces, white).cut(self.crop, self.film.thinned)
+        errors_at = frame_errors(lambda white: math.hypot(cut.error_at(white), self.budget.left_out_clamped), white)
+        y, x, height, width = self.crop
+        fireflies = int(np.count_nonzero(_fireflies(own, broken)[y : y + height, x : x + width]))
+        return cut.picture.astype(np.float32), math.hypot(cut.error, self.budget.left_out), errors_at, fireflies
+
+    def _exposed(self, instants: list[float], key: Key) -> Exposed:
         """Return the mean radiance [H, W], its rms error, that error at some whites, and the fireflies."""
         means = self.means(instants, self.budget, key)
         halves, broken = means[0], ~np.isfinite(means[0]).all(axis=0)
         means[:, :, broken] = 0  # they would break the denoiser and every mean around them
-        difference = (halves[0] - halves[1]) / 2
-        error, radiance = rms(difference), halves.mean(axis=0)
-        fireflies = int(np.count_nonzero(broken | ((np.abs(difference) > FIREFLY * error) & (error > 0))))
+        error, radiance = rms((halves[0] - halves[1]) / 2), halves.mean(axis=0)
+        fireflies = int(np.count_nonzero(_fireflies(halves, broken)))
         white = self.budget.white or white_in(radiance)
         mixed = None
         if self.budget.denoise:
@@ -206,9 +246,8 @@ class Renderer:
 
         def error_at(white: float) -> float:
             noise = mixed.error_at(white) if mixed else Errors.of_halves(halves, white).at_white
-            left_out = self.budget.left_out_at_white if self.budget.white else self.budget.left_out
             blur = blur_left(np.minimum(means, white), len(instants)) if len(instants) > 1 else 0.0
-            return math.hypot(noise, blur, left_out)
+            return math.hypot(noise, blur, self.budget.left_out_clamped)
 
         whole = math.hypot(error, blur_left(means, len(instants)), self.budget.left_out)
         return radiance.astype(np.float32), whole, frame_errors(error_at, white), fireflies
@@ -296,6 +335,13 @@ class Renderer:
         hits = self._caster.cast(self.scene.camera.pose(now), rays)
         extent = ground_truth.motion_extent(self.scene, rays, hits, now, exposure, sharp=self.shutter == 0)
         return extent.reshape(self.shape), hits.number.reshape(self.shape)
+
+
+def _fireflies(halves: Array, broken: Array) -> Array:
+    """Return which pixels [H, W] are broken, or differ between the halves [2, H, W] by more than FIREFLY rms."""
+    difference = (halves[0] - halves[1]) / 2
+    error = rms(difference)
+    return broken | ((np.abs(difference) > FIREFLY * error) & (error > 0))
 
 
 def _checked_crop(scene: Scene, crop: Crop | None) -> Crop:

@@ -1,0 +1,89 @@
+"""Chooses, tile by tile, from how many frames a picture is made, and states the error of what is returned.
+
+    own halves + pictures from 1, 3, 5 ... frames -> one picture in two halves -> denoised or not -> picture, error
+
+Let M be the mean of a frame's own halves A and B, and F any picture with halves F_A and F_B, where F_A has noise of the
+first halves only. M has no bias. The bias and the noise of F, and its error, follow without the truth:
+
+    bias^2 = E (F_A - A)(F_B - B),    noise^2 = E (F_A - F_B)^2 / 4,
+    E (F - truth)^2 = E [(F - M)^2 + (F_A - F_B)(A - B) / 2 - (A - B)^2 / 4].
+
+Shadows and reflections that do not follow their surface give a bias that is smoother than noise, so it is measured in
+means of BLOCK x BLOCK pixels. A tile takes the picture, and then the share of its denoised version, that errs least in
+the tiles around it, without the tile itself: the pixels that state its error have not chosen it. Their estimate has a
+standard error of about 2 / sqrt(pixels) of the squared noise of M, however small the error of F is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy import ndarray as Array
+
+from qsim.rendering.denoiser import Mixture, denoised, keeping_mean
+
+TILE = 8  # px, side of a tile
+BLOCK = 2  # px, side of the squares whose means show a bias; larger ones show less noise, but no edge of a shadow
+NEIGHBOURHOOD = 5  # tiles, side of the square around a tile that chooses for it
+LEFT_BY_DENOISER = 0.1  # of the squared noise, about; of bias it removes nothing
+
+
+def best_of(pictures: Array, white: float, denoises: bool) -> tuple[Array, Array]:
+    """Return the best picture of each tile, in two halves [2, H, W], and its number in each tile [h, w].
+
+    `pictures` [n, 2, H, W] are the frame's own halves, then those from more and more frames. They are compared clamped
+    at `white` [W m^-2 sr^-1, as all pictures]. Where a denoiser follows, noise counts by what it leaves of it.
+    """
+    clamped = np.minimum(pictures, white)
+    own = clamped[0]
+    scores = []
+    for picture in clamped:
+        noise = _around(_sums((picture[0] - picture[1]) ** 2 / 4, TILE))
+        first, second = (_sums(half, BLOCK) for half in picture - own)
+        bias = _around(_sums(first * second / _sums(np.ones_like(own[0]), BLOCK), TILE // BLOCK))
+        scores.append(np.maximum(bias, 0) + (LEFT_BY_DENOISER if denoises else 1.0) * noise)
+    number = np.argmin(scores, axis=0)
+    chosen = _spread(number, own.shape[1:])
+    return np.take_along_axis(pictures, chosen[None, None], axis=0)[0], number
+
+
+def reused_mean(own: Array, best: Array, surfaces: tuple[Array, Array] | None, white: float) -> Mixture:
+    """Return the picture of two halves `best` [2, H, W], denoised where that lowers its error against `own` [2, H, W].
+
+    `surfaces` are albedo [H, W] and normals [H, W, 3] for the denoiser; None does not denoise. Its mean is that of
+    `best`, as `denoiser.cleaned_mean` keeps it.
+    """
+    if surfaces is None:
+        return _mixed(own, best, best, np.zeros(own.shape[1:]))
+    cleaned = np.stack([denoised(half, *surfaces) for half in best])
+    z = own[0] - own[1]
+    apart, change = (cleaned - best).mean(axis=0), (cleaned[0] - cleaned[1]) - (best[0] - best[1])
+    gain = -(apart * (best - own).mean(axis=0) + change * z / 4)
+    shares = _around(_sums(gain, TILE)) / np.maximum(_around(_sums(apart**2, TILE)), 1e-300)
+    share = _spread(np.clip(shares, 0, 1), own.shape[1:])
+    return keeping_mean(_mixed(own, best, cleaned, share), float(best.mean()), white)
+
+
+def _mixed(own: Array, best: Array, cleaned: Array, share: Array) -> Mixture:
+    mixed = share * cleaned + (1 - share) * best
+    z, middle = own[0] - own[1], mixed.mean(axis=0)
+    squares = (middle - own.mean(axis=0)) ** 2 + (mixed[0] - mixed[1]) * z / 2 - z**2 / 4
+    return Mixture(share, middle, mixed.min(axis=0), squares, z**2 / 4, (mixed[0] - mixed[1]) ** 2 / 4)
+
+
+def _sums(values: Array, side: int) -> Array:
+    """Return the sums of an array [H, W] in squares of this side; the last ones may be smaller."""
+    rows, columns = (np.arange(0, size, side) for size in values.shape)
+    return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
+
+
+def _around(tiles: Array) -> Array:
+    """Return the sums over the tiles [h, w] around each, without itself."""
+    from scipy.ndimage import uniform_filter
+
+    count = NEIGHBOURHOOD**2
+    return uniform_filter(tiles, NEIGHBOURHOOD, mode="constant") * count - tiles
+
+
+def _spread(tiles: Array, shape: tuple[int, ...]) -> Array:
+    """Return the value of each pixel's tile [H, W], from values of tiles [h, w]."""
+    return np.repeat(np.repeat(tiles, TILE, axis=0), TILE, axis=1)[: shape[0], : shape[1]]
