@@ -64,6 +64,11 @@ def add_render(sub: Any) -> None:
     )
     light = checked(checks.positive)
     parser.add_argument("--ppp", type=light, help=LIGHT)
+    parser.add_argument(
+        "--reuse",
+        action="store_true",
+        help="let sharp frames share samples with their neighbours where that costs less (default: each frame alone)",
+    )
     parser.add_argument("--engine", choices=BACKENDS, help="engine to use (default: QSIM_ENGINE, else the fastest)")
     parser.add_argument("--force", action="store_true", help="replace an existing clip")
 
@@ -75,6 +80,7 @@ def _run_render(args: argparse.Namespace) -> int:
     from qsim.optics.diffraction import diffraction_line
     from qsim.rendering.budget import Finding, explain
     from qsim.rendering.fidelity import choose_budget, shortfall
+    from qsim.rendering.reuse.sharing import NAME as REUSE
     from qsim.scene.animated.gltf_body import GLTF_SUFFIXES
     from qsim.scenes.gltf_file import played
 
@@ -87,7 +93,7 @@ def _run_render(args: argparse.Namespace) -> int:
     if args.engine is not None:
         os.environ["QSIM_ENGINE"] = args.engine
         backend.choose()
-    taken = {name: getattr(args, name) for name in ("frames", "seed", "frame_rate", "shutter", "psnr", "ppp")}
+    taken = {name: getattr(args, name) for name in ("frames", "seed", "frame_rate", "shutter", "psnr", "ppp", "reuse")}
     size = {name: getattr(args, name) for name in ("height", "width", "speed", "bands", "camera_path")}
     if args.output is None:
         scene, _ = load_scene(args.scene, **size, seed=args.seed, frame_rate=args.frame_rate)
@@ -110,6 +116,9 @@ def _run_render(args: argparse.Namespace) -> int:
         how = "before denoising" if render_meta["denoise"] else "not removed"
         text += f"\n{fireflies} of {pixels} pixels are fireflies (Monte-Carlo outliers); {how}"
     findings = [Finding(**finding) for finding in render_meta["findings"]]
+    text += "".join(
+        f"\n{explain([one])}" for one in findings if one.effect == REUSE and args.reuse and not args.explain
+    )
     text += "\n" + (explain(findings) if args.explain or clip.camera is None else diffraction_line(clip.camera))
     output(args, {"clip": str(clip.path)} | {k: v for k, v in clip.meta.items() if k != "checksums"}, text)
     return 0

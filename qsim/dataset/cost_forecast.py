@@ -27,7 +27,7 @@ from qsim.dataset.worker_pool import Limits
 from qsim.files import Progress
 from qsim.process import peak_memory
 from qsim.rendering.budget import Budget
-from qsim.rendering.denoiser import DENOISE_COST
+from qsim.rendering.reuse.sharing import Sharing
 from qsim.tables import text_table
 
 START = 3.0  # s, start of a worker process with its renderer, once per Limits.jobs jobs; measured on two cores
@@ -63,6 +63,7 @@ class Cost:
     per_frame: Seconds  # rendering and storing, mean over the chosen budgets
     sensing: Seconds  # per frame, all streams
     frame_bytes: float  # radiance, ground truth and streams [bytes]
+    neighbours: tuple[int, int] = (0, 0)  # frames on each side that share samples, the fewest and the most
 
     @property
     def seconds(self) -> Seconds:
@@ -125,7 +126,7 @@ class Forecast:
 
     def lines(self, machines: int) -> list[str]:
         """Return the forecast as lines of text, for this many equal machines."""
-        header = ("family", "size", "clips", "frames", "samples", "s/clip", "s/frame", "hours", "GB")
+        header = ("family", "size", "clips", "frames", "samples", "neighbours", "s/clip", "s/frame", "hours", "GB")
         rows = [
             (
                 cost.family,
@@ -133,6 +134,7 @@ class Forecast:
                 f"{cost.clips}",
                 f"{cost.frames}",
                 "-".join(str(n) for n in sorted(set(cost.samples))),
+                "-".join(str(n) for n in sorted(set(cost.neighbours))),
                 f"{cost.setup.wall:.2f}",
                 f"{cost.per_frame.wall + cost.sensing.wall:.3f}",
                 f"{cost.hours:.3f}",
@@ -187,22 +189,20 @@ def measure_kind(members: list[Job], folder: Path, frames: int) -> Cost:
     """
     looked_at = evenly_spaced(members)
     budgets, choosing = zip(*map(_budget, looked_at), strict=True)
-    work = [_work(budget) for budget in budgets]
+    size = (members[0].settings.height, members[0].settings.width)
+    work = [Sharing.of(budget).cost(math.prod(size)) for budget in budgets]
     typical = Seconds(*map(median, zip(*choosing, strict=True)))  # the first of a process also imports
     middle = len(looked_at) // 2
     job = looked_at[middle]
     settings = job.settings
     started = Seconds.now()
-    size = (settings.height, settings.width)
     a_code = max((frames_needed(stream, *size, settings.frame_rate) for stream in job.streams), default=1)
-    clip, moments = render_first_frames(job, budgets[middle], folder, min(max(frames, a_code), settings.frames))
-    # The first frame includes scene and compilation; the others give the cost of each further frame.
-    first, more = moments[0].since(started), moments[-1].since(moments[0])
-    if len(moments) > 1:
-        per_frame = Seconds(*(seconds / (len(moments) - 1) for seconds in more))
-        setup = Seconds(*(a + max(0.0, b) for a, b in zip(typical, first.since(per_frame), strict=True)))
-    else:
-        per_frame, setup = first, typical
+    shared = budgets[middle].neighbours
+    clip, moments = render_first_frames(
+        job, budgets[middle], folder, min(max(frames, a_code, 2 * shared + 3), settings.frames)
+    )
+    setup, per_frame = setup_and_frame([moment.since(started) for moment in moments], shared)
+    setup = Seconds(*map(sum, zip(typical, setup, strict=True)))
     dearer = sum(work) / len(work) / work[middle]
     sensing, codes = sense_streams(job, clip)
     stored = sum(file.stat().st_size for file in clip.path.rglob("*.exr")) / len(clip)
@@ -216,7 +216,22 @@ def measure_kind(members: list[Job], folder: Path, frames: int) -> Cost:
         per_frame=Seconds(*(dearer * seconds for seconds in per_frame)),
         sensing=sensing,
         frame_bytes=stored + codes,
+        neighbours=(min(budget.neighbours for budget in budgets), max(budget.neighbours for budget in budgets)),
     )
+
+
+def setup_and_frame(moments: list[Seconds], shared: int) -> tuple[Seconds, Seconds]:
+    """Return the time of scene and compilation, and that of a further frame, from the time at the end of each frame.
+
+    Where frames share samples with `shared` ones on each side, the first frame also traces those after it, and the last
+    ones trace none: a further frame costs what those between them do, if there are two.
+    """
+    usual = moments[shared : len(moments) - shared]
+    usual = usual if len(usual) > 1 else moments
+    if len(usual) == 1:
+        return Seconds(0.0, 0.0), usual[0]
+    frame = Seconds(*(seconds / (len(usual) - 1) for seconds in usual[-1].since(usual[0])))
+    return Seconds(*(max(0.0, a - len(moments) * b) for a, b in zip(moments[-1], frame, strict=True))), frame
 
 
 def evenly_spaced(members: list[Job]) -> list[Job]:
@@ -229,11 +244,6 @@ def _budget(job: Job) -> tuple[Budget, Seconds]:
     """Return a job's budget, and the time that its choice took."""
     scene, started = job_runner.load_scene(job), Seconds.now()
     return job_runner.choose_budget(job, scene), Seconds.now().since(started)
-
-
-def _work(budget: Budget) -> float:
-    """Return the cost of a frame in samples per pixel; the rest of its cost is small."""
-    return budget.samples + (DENOISE_COST if budget.denoise else 0.0)
 
 
 def render_first_frames(job: Job, budget: Budget, path: Path, frames: int) -> tuple[Clip, list[Seconds]]:

@@ -114,6 +114,7 @@ def choose_budget(job: Job, scene: Scene) -> Budget:
         psnr=settings.psnr,
         ppp=ppp,
         quantum_efficiency=1.0 if ppp is None else electrons / ppp,
+        reuse=settings.reuse,
         seed=render_seed(job),
     )
 

@@ -11,6 +11,7 @@
     psnr = 40.0                # wanted error of the radiance, dB below white, clamped there; default 40
     bands = "rgb"              # colour: bands R, G and B; default: one band
     camera_path = "path.json"  # poses, view and distortion of the camera, a transforms.json; default: the scene's
+    reuse = true               # sharp frames share samples with neighbours where that costs less; default: each alone
 
     [[scenes]]                 # one clip per family, seed and speed
     family = "fan"             # a family of scenes/; or a .py, .xml, .glb file or folder beside the recipe ("./things")
@@ -19,7 +20,7 @@
     first = 0                  # first seed of a count; default 0
     speed = [1.0, 2.0]         # factor on all motions, a number or a list; default 1
     split = "train"            # train, the default, val or test
-    # frames, height, width, frame_rate, shutter, psnr, bands, camera_path: as above, for these scenes only
+    # frames, height, width, frame_rate, shutter, psnr, bands, camera_path, reuse: as above, for these scenes only
 
     [[streams]]                # optional; one stream per bits and light level, in every clip
     sensor = "quiver-physical" # a name of `qsim doctor --devices`, or a .toml file beside the recipe

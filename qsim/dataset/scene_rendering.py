@@ -40,6 +40,7 @@ def render(
     ppp: float | None = None,
     bands: str | None = None,
     camera_path: str | os.PathLike[str] | None = None,
+    reuse: bool = False,
     budget: Budget | None = None,
     progress: Progress | None = None,
     force: bool = False,
@@ -53,7 +54,8 @@ def render(
     the requested error, `ppp` the brightest light that will be sensed [photons/pixel] (`choose_budget`); a `budget`
     decides both instead. `bands="rgb"` gives a scene of one band colours (scenes/colours.py) and renders red, green and
     blue. `camera_path` is a transforms.json whose view, distortion and poses replace those of the scene's camera; a
-    file that states no rate has one pose per frame (qsim/scene/camera_path.py).
+    file that states no rate has one pose per frame (qsim/scene/camera_path.py). `reuse` lets sharp frames share
+    samples with their neighbours where that is predicted to cost less.
 
     `path` is the folder of the clip; an equal call resumes an interrupted one. Without it, the clip lies in a temporary
     folder that is deleted after the last use of the clip and its streams. `progress(done, frames)` is called after each
@@ -63,12 +65,14 @@ def render(
     """
     if path is None and force:
         raise ValueError("force= replaces the clip of a folder, and no path is given; leave it out")
+    if budget is not None and reuse:
+        raise ValueError("reuse= widens the choice of a budget, and budget= replaces it; give one of them")
     if path is not None:
         target_of(path, force)  # before the pilot
     loaded, read = load_scene(scene, height, width, seed, speed, bands, camera_path, frame_rate)
     if budget is None:
         budget = choose_budget(
-            loaded, frame_rate=frame_rate, shutter=shutter, frames=frames, psnr=psnr, ppp=ppp, seed=seed
+            loaded, frame_rate=frame_rate, shutter=shutter, frames=frames, psnr=psnr, ppp=ppp, reuse=reuse, seed=seed
         )
     temporary = TemporaryFolder() if path is None else None
     name = loaded.name if NAME.fullmatch(loaded.name) else "scene"

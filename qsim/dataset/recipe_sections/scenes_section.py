@@ -19,7 +19,7 @@ MAX_STEM = 180  # characters of a scene's name, which gets a seed, a speed and a
 SETTINGS: dict[str, Check] = {
     "frames": checks.whole, "height": checks.whole, "width": checks.whole,
     "frame_rate": checks.frame_rate, "shutter": checks.shutter, "psnr": checks.psnr,
-    "bands": checks.bands, "camera_path": checks.text,
+    "bands": checks.bands, "camera_path": checks.text, "reuse": checks.flag,
 }  # fmt: skip
 SCENES: Table = {
     "family": checks.text,

@@ -4,7 +4,8 @@
 
 The naive loop is `mi.render` per frame with the default integrator, the default `independent` sampler and a box filter.
 It takes the smallest power of two of samples that reaches the level. Ours is `Renderer.frame` without ground truth,
-with the budget of `choose_budget` for the level; the measurement of its error is included. Both start from a loaded
+with the budget of `choose_budget` for the level (for a clip of 21 frames); the measurement of its error is included.
+Frames that share samples are timed one after the other, when each traces one further frame. Both start from a loaded
 scene and are timed alternately. Processor seconds stand beside wall seconds, because other programs change them less.
 Rows of short frames take up to 15 rounds, since medians of three scatter. The variance of the reference is subtracted.
 """
@@ -60,6 +61,7 @@ class RenderRow:
     seconds: float  # per frame, median
     naive_processor: float = math.nan  # processor seconds per frame, all threads, median
     processor: float = math.nan  # the same, ours
+    neighbours: int = 0  # frames on each side that share samples, ours
 
     @property
     def ratio(self) -> float:
@@ -214,6 +216,7 @@ def _compare(
         float(seconds),
         float(naive_processor),
         float(processor),
+        ours.budget.neighbours,
     )
 
 
@@ -265,7 +268,7 @@ def _cells(row: RenderRow) -> list[str]:
         str(row.naive_samples),
         f"{row.naive_psnr:.1f}",
         f"{row.naive_seconds:.3f}{'*' if row.extrapolated else ''}",
-        f"{row.samples}{' denoised' if row.denoised else ''}",
+        f"{row.samples}{' denoised' * row.denoised}{f', {row.neighbours} neighbours' * (row.neighbours > 0)}",
         f"{row.psnr:.1f}",
         f"{row.seconds:.3f}",
         f"{row.ratio:.1f}",

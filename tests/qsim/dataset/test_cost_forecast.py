@@ -55,6 +55,18 @@ def test_the_arithmetic_of_a_forecast():
     assert (kind["frames"], kind["per_frame_seconds"]) == (300, {"wall": 1.5, "processor": 2.9})
 
 
+def test_frames_that_share_samples_are_timed_where_each_traces_one():
+    """Scene 5 s, paths 2 s, picture 0.5 s. With three neighbours the first frame traces four, the last three none."""
+    traced = [min(t + 4, 9) for t in range(9)]
+    moments = [Seconds(5 + 2 * n + 0.5 * t, 0.0) for t, n in enumerate(traced, 1)]
+    setup, frame = cost_forecast.setup_and_frame(moments, 3)
+    assert frame.wall == pytest.approx(2.5)
+    assert setup.wall == pytest.approx(5.0)
+    setup, frame = cost_forecast.setup_and_frame(moments[:5], 3)
+    assert setup.wall + 5 * frame.wall == pytest.approx(moments[4].wall)
+    assert cost_forecast.setup_and_frame([Seconds(4.0, 3.0)], 0) == ((0.0, 0.0), (4.0, 3.0))
+
+
 def test_a_few_jobs_are_looked_at_from_first_to_last():
     wanted = recipe.parse(RECIPE.replace("[0, 1, 2]", str(list(range(42)))))
     seeds = [job.scene_seed for job in cost_forecast.evenly_spaced(list(wanted.jobs))]
