@@ -2,11 +2,15 @@
 
     frames [K, H, W] at scales 8, 4, 2 (phi of pooled codes) ->
     scale 8: every velocity up to SPEED is tried, all frames vote -> scale 4: neighbours' velocities are tried ->
-    scales 4 and 2: Gauss-Newton of velocity v and acceleration a, all frames at once -> paths p + k v + k^2/2 a
+    scales 4 and 2: Gauss-Newton of velocity v and acceleration a, all frames at once -> no motion where it fits as well
+    -> paths p + k v + k^2/2 a
 
 All frames of the window vote for one path, so that little light suffices; a pair of frames is never matched alone.
-Costs are means over blocks and the corrections of flat places follow their neighbours: no path is chosen by one pixel.
+Costs are sums over blocks and the corrections of flat places follow their neighbours: no path is chosen by one pixel.
 Frames that do not fit (occlusions, light that changes) lose their vote.
+
+A frame seen between its pixels has less noise, so noise alone would prefer paths that lead there, and still scenes
+would be blurred. Squared differences therefore count above the noise that interpolation leaves.
 
 Ours; the steps are block matching, and the registration of Lucas and Kanade (1981) to the mean of all moved frames.
 Fields are [2, H, W] = (down, right), in pixels of the full frame per frame, at cells of one scale.
@@ -25,8 +29,11 @@ SPEED = 18.0  # px/frame, the fastest that is tried; refinement goes slightly be
 PARTS = 4  # velocities that are tried per cell of scale 8 and frame
 STEP = 1 / PARTS  # cells of scale 8 per frame, between them
 FAR = 4  # frames from the reference that vote in the search
-OUTSIDE = 0.25  # relative cost of a path that leads out of all frames; of half of them, where it is still allowed, half
-PREFERENCE = 0.05  # deviations of the noise per cell and frame: slower paths win among equals
+FITS = 4.0  # deviations of the noise; larger differences count by their size, not their square
+OUTSIDE = 20.0  # cost of a path that leads out of all frames; of half of them, where it is still allowed, half
+MOVES = 10.0  # cost of any motion, and
+FASTER = 2.0  # of each e-fold of 1 + px/frame down and right: slower paths win among equals
+STILL = (3, 60.0)  # radius of the block [cells of scale 2] over which a path must fit better than none, and by how much
 NEVER = 1e9  # cost of a path that leads out of more than half of the frames
 REFINE = ((4, 2, 2), (2, 4, 3))  # (scale, radius of the mean that is taken twice, in cells; iterations)
 CORRECTION = 1.0  # px/frame, expected size of a correction of v
@@ -66,6 +73,13 @@ def _sums(x: Tensor, count: int, dim: int) -> Tensor:
         width *= 2
 
 
+def kept_noise(moved: Tensor) -> Tensor:
+    """Return the share of the noise's variance [..., H, W] that is left at p + moved [2, ..., H, W], seen by `look`."""
+    part = moved - moved.floor()
+    share = part.square() + (1 - part).square()
+    return share[0] * share[1]
+
+
 def displacement(velocity: Tensor, acceleration: Tensor, offset: int, scale: int = 1) -> Tensor:
     """Return where paths lead after `offset` frames, [2, H, W], in cells of a scale."""
     return (velocity * offset + acceleration * (offset * offset / 2)) / scale
@@ -82,13 +96,16 @@ def look(image: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
     return seen[0, 0], inside.to(image.dtype)
 
 
-def paths(pyramid: dict[int, Tensor], offsets: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """Return velocity and acceleration [2, h, w] at scale 2, of frames at each scale: {scale: [K, H/scale, W/scale]}.
+def paths(
+    pyramid: dict[int, Tensor], offsets: Sequence[int], codes: Tensor, deviation: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return velocity and acceleration [2, H, W] of frames at each scale: {scale: [K, H/scale, W/scale]}.
 
     `offsets` are the frames' places in time; 0 is the reference. The noise of a frame at a scale has the deviation
-    1 / scale, as phi of pooled codes has.
+    1 / scale, as phi of pooled codes nearly has. Mean `codes` [K, H/2, W/2] of scale 2 and the `deviation` [H/2, W/2]
+    of one code tell what moves: of four codes of one bit, phi has up to 1.8 times that variance.
     """
-    velocity = search(pyramid[8], offsets)
+    velocity = search(pyramid[SCALES[0]], offsets)
     acceleration = torch.zeros_like(velocity)
     for scale, radius, iterations in REFINE:
         shape = pyramid[scale].shape[1:]
@@ -97,7 +114,10 @@ def paths(pyramid: dict[int, Tensor], offsets: Sequence[int]) -> tuple[Tensor, T
             velocity = neighbours(pyramid[scale], offsets, velocity, scale)
         for _ in range(iterations):
             velocity, acceleration = correct(pyramid[scale], offsets, velocity, acceleration, scale, radius)
-    return velocity, acceleration
+    full = [SCALES[-1] * side for side in codes.shape[1:]]
+    moves = moving(codes, deviation, offsets, velocity, acceleration)
+    moves = functional.interpolate(moves[None, None].to(velocity.dtype), size=full)[0]
+    return enlarged(velocity, full) * moves, enlarged(acceleration, full) * moves
 
 
 def enlarged(field: Tensor, shape: Sequence[int]) -> Tensor:
@@ -110,45 +130,47 @@ def search(frames: Tensor, offsets: Sequence[int]) -> Tensor:
 
     Frames move by steps of STEP cells, in both axes, up to SPEED.
     """
-    reference, noise = frames[offsets.index(0)], 1 / SCALES[0]
+    reference = frames[offsets.index(0)]
     most = round(SPEED / SCALES[0] / STEP)
     count = 2 * most + 1
-    differences, inside = torch.zeros(2, count, count, *reference.shape).unbind()
+    misfits, inside = torch.zeros(2, count, count, *reference.shape).unbind()
     voters = [(frame, offset) for frame, offset in zip(frames, offsets, strict=True) if 0 < abs(offset) <= FAR]
     if not voters:
         return torch.zeros(2, *reference.shape)
     for frame, offset in voters:
-        _add_differences(differences, inside, reference, frame, offset, most)
-    pace = torch.arange(-most, most + 1, dtype=frames.dtype).abs() * STEP
-    cost = _cost(differences.flatten(0, 1), inside.flatten(0, 1), len(voters), (1, 3))
-    cost += PREFERENCE * noise * (pace[:, None] + pace[None]).flatten()[:, None, None]
+        _add_misfits(misfits, inside, reference, frame, offset, most)
+    pace = torch.arange(-most, most + 1, dtype=frames.dtype).abs() * (STEP * SCALES[0])
+    pace = (pace[:, None] + pace).flatten()
+    cost = _cost(misfits.flatten(0, 1), inside.flatten(0, 1), len(voters), (1, 3))
+    cost += (MOVES * (pace > 0) + FASTER * pace.log1p())[:, None, None]
     best = cost.argmin(0)
     down, right = best // count, best % count
     found = [place - most + _between(cost, best, step, place, count) for place, step in ((down, count), (right, 1))]
-    return torch.stack(found) * (STEP * SCALES[0])
+    return torch.stack(found) * (STEP * SCALES[0]) * (best != cost.shape[0] // 2)
 
 
-def _cost(differences: Tensor, inside: Tensor, voters: int, radii: Sequence[int]) -> Tensor:
-    """Return costs [N, h, w] from sums of differences [N, h, w] over the frames `inside` of which N paths stay.
+def _cost(misfits: Tensor, inside: Tensor, voters: int, radii: Sequence[int]) -> Tensor:
+    """Return costs [N, h, w] from sums of misfits [N, h, w] over the frames `inside` of which N paths stay.
 
-    They are means over blocks of several radii at once: sharp at edges, steady elsewhere.
+    They are sums over blocks and frames, as if all frames were inside, of several radii at once: sharp at edges, steady
+    elsewhere.
     """
-    above = torch.stack([box_mean(differences, radius) for radius in radii]).sum(0)
-    below = torch.stack([box_mean(inside, radius) for radius in radii]).sum(0) / len(radii)
-    outside = 1 - below / max(voters, 1)
-    cost = above / (len(radii) * below).clamp_(min=1e-6) * (1 + OUTSIDE * outside)
-    return torch.where(outside > 0.5 + 1e-4, NEVER, cost)
+    below = [box_mean(inside, radius) for radius in radii]
+    above = [box_mean(misfits, radius) * (2 * radius + 1) ** 2 for radius in radii]
+    cost = torch.stack([x / y.clamp_(min=1e-6) for x, y in zip(above, below, strict=True)]).mean(0) * voters
+    outside = 1 - torch.stack(below).mean(0) / max(voters, 1)
+    return torch.where(outside > 0.5 + 1e-4, NEVER, cost + OUTSIDE * outside)
 
 
-def _add_differences(
-    differences: Tensor, inside: Tensor, reference: Tensor, frame: Tensor, offset: int, most: int
-) -> None:
-    """Add |frame moved by every velocity - reference| to sums [2 most + 1, 2 most + 1, h, w], and 1 to `inside`, where
-    the moved place lies in the frame.
+def _add_misfits(misfits: Tensor, inside: Tensor, reference: Tensor, frame: Tensor, offset: int, most: int) -> None:
+    """Add the misfit of a frame moved by every velocity to sums [2 most + 1, 2 most + 1, h, w], and 1 to `inside`,
+    where the moved place lies in the frame.
     """
     (height, width), count, far = reference.shape, 2 * most + 1, abs(offset) * most
     fine, start = _in_steps(frame, far)
     line = fine.shape[1]
+    part = torch.tensor([offset * (u - most) % PARTS * STEP for u in range(count)])
+    noise = 1 + kept_noise(torch.stack(torch.meshgrid(part, part, indexing="ij")))
     columns = torch.zeros(count, 1, width)
     for u in range(count):
         columns[u, :, _kept(offset * (u - most), width)] = 1
@@ -161,8 +183,18 @@ def _add_differences(
         places = (count, rows.stop - rows.start, width), (abs(offset), PARTS * line, PARTS), corner
         moved = fine.as_strided(*places)  # by -far ... far steps to the right
         moved = moved if offset > 0 else moved.flip(0)
-        differences[v, :, rows] += (moved - reference[rows]).abs_().mul_(columns)
+        misfits[v, :, rows] += _misfit((moved - reference[rows]).mul_(SCALES[0]), noise[v, :, None, None]).mul_(columns)
         inside[v, :, rows] += columns
+
+
+def _misfit(difference: Tensor, noise: Tensor) -> Tensor:
+    """Return squares of differences in deviations of the noise, less their mean where only noise differs: `noise`.
+
+    Differences above FITS count by their size (Huber 1964).
+    """
+    size = difference.abs()
+    square = size.clamp(max=FITS)
+    return size.mul_(2).sub_(square).mul_(square).sub_(noise)
 
 
 def _in_steps(frame: Tensor, far: int) -> tuple[Tensor, int]:
@@ -203,14 +235,36 @@ def neighbours(frames: Tensor, offsets: Sequence[int], velocity: Tensor, scale: 
     voters = [(frame, offset) for frame, offset in zip(frames, offsets, strict=True) if 0 < abs(offset) <= FAR]
     nothing, costs = torch.zeros_like(velocity), []
     for choice in choices:
-        differences, inside = torch.zeros(2, 1, height, width).unbind()
+        misfits, inside = torch.zeros(2, 1, height, width).unbind()
         for frame, offset in voters:
-            seen, there = look(frame, displacement(choice, nothing, offset, scale))
-            differences += (seen - reference).abs_() * there
+            moved = displacement(choice, nothing, offset, scale)
+            seen, there = look(frame, moved)
+            misfits += _misfit((seen - reference) * scale, 1 + kept_noise(moved)) * there
             inside += there
-        costs.append(_cost(differences, inside, len(voters), (2,))[0])
+        costs.append(_cost(misfits, inside, len(voters), (2,))[0])
     best = torch.stack(costs).argmin(0)
     return torch.stack(choices).gather(0, best[None, None].expand(1, 2, -1, -1))[0]
+
+
+def moving(codes: Tensor, deviation: Tensor, offsets: Sequence[int], velocity: Tensor, acceleration: Tensor) -> Tensor:
+    """Return where paths at scale 2 fit the codes (see `paths`) better than no motion does, beyond what noise explains:
+    bool [h, w].
+    """
+    radius, margin = STILL
+    nothing = torch.zeros_like(velocity)
+    still, moved = (_spread(codes, deviation, offsets, *path) for path in ((nothing,) * 2, (velocity, acceleration)))
+    return box_mean((still - moved)[None], radius)[0] * (2 * radius + 1) ** 2 > margin
+
+
+def _spread(codes: Tensor, deviation: Tensor, offsets: Sequence[int], velocity: Tensor, acceleration: Tensor) -> Tensor:
+    """Return misfits of moved frames to their mean, summed over frames [h, w]; 1 for one that the path leaves."""
+    scale = SCALES[-1]
+    moved = [displacement(velocity, acceleration, offset, scale) for offset in offsets]
+    seen, there = (torch.stack(x) for x in zip(*map(look, codes, moved), strict=True))
+    count = there.sum(0)
+    mean = (seen * there).sum(0) / count
+    noise = torch.stack([kept_noise(x) for x in moved]) * (1 - 1 / count)
+    return torch.where(there > 0, _misfit((seen - mean) * (scale / deviation), noise), 1.0).sum(0)
 
 
 def correct(

@@ -35,6 +35,7 @@ from quiver.baselines.sliding_window import check_codes, check_window, in_units,
 # (cells of 2 x 2 px beside the own one whose mean difference is squared, and over which squares are averaged; statistic
 # up to which frames agree; excess over it at which a frame has half its weight)
 STATISTICS = ((1, 1, 3.0, 1.0), (0, 2, 1.6, 0.25))
+GROUPS = ((-1,), (1,), (-2, -3), (2, 3), (-4, -5), (4, 5))  # offsets of the frames that `Merged.groups` averages
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ class Merged:
     near_count: Array
     still: Array  # mean code of the window without motion
     frames: int  # in the window
+    groups: Array  # [6, H, W], mean codes of GROUPS, moved and not weighted
+    group_counts: Array  # [6, H, W], frames of each that lie in the picture
 
 
 @dataclass(frozen=True)
@@ -72,9 +75,10 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
     """Return the merged reference frame of a window of frames; `offsets` are their places in time, with 0."""
     with torch.no_grad():
         pyramid = {scale: torch.stack([frame.pyramid[scale] for frame in window]) for scale in SCALES}
-        velocity, acceleration = paths(pyramid, offsets)
+        codes = torch.stack([functional.avg_pool2d(frame.codes[None], SCALES[-1])[0] for frame in window])
+        deviation = variance_of(box_mean(codes.mean(0)[None], 2)[0], domain).sqrt()
+        velocity, acceleration = paths(pyramid, offsets, codes, deviation)
         shape = window[0].codes.shape
-        velocity, acceleration = enlarged(velocity, shape), enlarged(acceleration, shape)
         seen = [
             look(frame.codes, displacement(velocity, acceleration, offset))
             if offset
@@ -87,9 +91,19 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
         near = [i for i, offset in enumerate(offsets) if abs(offset) <= 1]
         still = torch.stack([frame.codes for frame in window]).mean(0)
         alone = window[offsets.index(0)].codes.numpy()
+        groups = [[i for i, offset in enumerate(offsets) if offset in group] for group in GROUPS]
+        counts = torch.stack([inside[group].sum(0) for group in groups])
+        sums = torch.stack([(moved[group] * inside[group]).sum(0) for group in groups])
         return Merged(
-            *_weighted(moved, weight), alone, *_weighted(moved[near], weight[near]), still.numpy(), frames=len(window)
-        )
+            *_weighted(moved, weight), alone, *_weighted(moved[near], weight[near]), still.numpy(), frames=len(window),
+            groups=(sums / counts.clamp(min=1)).numpy(), group_counts=counts.numpy(),
+        )  # fmt: skip
+
+
+def variance_of(mean_code: Tensor, domain: InformationDomain) -> Tensor:
+    """Return the variance of a code [...] at mean codes [...], FLOOR at least."""
+    variance = np.interp(mean_code.numpy(), domain.mean_code, domain.variance)
+    return torch.from_numpy(np.maximum(variance, FLOOR).astype(np.float32))
 
 
 def _weighted(moved: Tensor, weight: Tensor) -> tuple[Array, Array]:
@@ -102,9 +116,7 @@ def weights(moved: Tensor, inside: Tensor, offsets: Sequence[int], domain: Infor
     """Return weights [K, H, W] of moved codes [K, H, W], 0 where not `inside`; the reference has the weight 1."""
     centre = offsets.index(0)
     half = functional.avg_pool2d((moved * inside).sum(0)[None] / inside.sum(0)[None], 2)
-    local = box_mean(half, 1)[0].numpy()
-    variance = torch.from_numpy(np.interp(local, domain.mean_code, domain.variance).astype(np.float32))
-    variance.clamp_(min=FLOOR)
+    variance = variance_of(box_mean(half, 1)[0], domain)
     weight = torch.zeros_like(moved)
     weight[centre] = 1.0
     for i, offset in enumerate(offsets):

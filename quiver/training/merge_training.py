@@ -28,8 +28,9 @@ PROTOCOLS: Mapping[str, Mapping[str, Any]] = {
     "quick": {
         "sensor": ("quiver-physical", "spad-320x240"),  # of a SPAD, 2^bits - 1 planes are summed
         "ppp": tuple(float(f"{level:.3g}") for level in np.geomspace(0.3, 100, 16)),
-        "bits": (1, 2, 3, 5, 7),
-        "learning_rate": 1.5e-3,
+        "bits": (1, 2, 3, 4, 5, 6, 7),
+        "optimiser": "muon",
+        "learning_rate": 3e-3,
         "crop": 96,
         "batch": 6,
         "clip_norm": 1.0,
@@ -72,8 +73,12 @@ def loss(network: nn.Module, batch: Batch, settings: Settings, share: float) -> 
     """Return the mean over windows of log(mean squared error of light over the peak, clamped)."""
     light, middle = restored(network, batch)
     unit = (batch["white"] / batch["peak"]).to(light.dtype)[:, None, None]
-    error = _shown(light[:, 0, 0] * unit) - _shown(batch["target"][:, middle, 0] * unit)
-    return (error.square().mean((1, 2)) + FLOOR).log().mean()
+    return log_error(light[:, 0, 0] * unit, batch["target"][:, middle, 0] * unit).mean()
+
+
+def log_error(light: Tensor, target: Tensor) -> Tensor:
+    """Return log(mean squared error) of windows [B] of light over the peak [B, h, w], clamped."""
+    return ((_shown(light) - _shown(target)).square().mean((1, 2)) + FLOOR).log()
 
 
 def _shown(light: Tensor) -> Tensor:

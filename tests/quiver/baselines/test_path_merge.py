@@ -104,6 +104,17 @@ def test_flat_light_keeps_its_mean_and_nearly_all_frames(sensor, photons):
     assert found.frames == 11
 
 
+def test_groups_are_means_of_their_frames():
+    """Of a still scene: nothing moves, so that plain means are known."""
+    codes = still(SENSOR, 2.0, 9)
+    found = merged(codes, 3)
+    for group, mean, count in zip(pm.GROUPS, found.groups, found.group_counts, strict=True):
+        there = [3 + offset for offset in group if 0 <= 3 + offset < 9]
+        assert np.array_equal(count, np.full(count.shape, len(there)))
+        expected = codes[there].mean(0) if there else np.zeros(mean.shape)
+        assert (np.abs(mean - expected) < 1e-4).mean() > 0.9  # noise may move a few places
+
+
 @pytest.mark.parametrize("speed", [1.5, 6.0, 14.0])
 def test_a_moving_texture_is_merged_sharp(speed):
     """The merged frame has less error than three frames could have, where a mean without motion has far more."""

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from quiver.model.mergenet import MergeNet, MergeNetConfig
+from quiver.model.mergenet import INPUTS, MergeNet, MergeNetConfig
 from quiver.model.presets import build
 from quiver.model.weights import load, save
 
@@ -17,7 +17,7 @@ def trained(seed=0, width=4):
 
 
 def test_an_untrained_network_changes_nothing():
-    assert not build("mergenet")(torch.randn(1, 6, 16, 24)).any()
+    assert not build("mergenet")(torch.randn(1, INPUTS, 16, 24)).any()
 
 
 def test_the_size_is_as_stated():
@@ -28,11 +28,11 @@ def test_the_size_is_as_stated():
 def test_shapes(seed):
     torch.manual_seed(seed)
     count, down, across = (int(n) for n in torch.randint(1, 6, (3,)))
-    assert trained()(torch.randn(count, 6, 4 * down, 4 * across)).shape == (count, 1, 4 * down, 4 * across)
+    assert trained()(torch.randn(count, INPUTS, 4 * down, 4 * across)).shape == (count, 1, 4 * down, 4 * across)
 
 
 def test_a_pixel_depends_on_nothing_beyond_the_reach():
-    network, x = trained(), torch.randn(1, 6, 96, 96)
+    network, x = trained(), torch.randn(1, INPUTS, 96, 96)
     far = torch.ones_like(x, dtype=bool)
     far[..., 48 - network.REACH : 49 + network.REACH, 48 - network.REACH : 49 + network.REACH] = False
     with torch.no_grad():
@@ -42,7 +42,7 @@ def test_a_pixel_depends_on_nothing_beyond_the_reach():
 
 
 def test_a_weights_file_comes_back(tmp_path):
-    network, x = trained(), torch.randn(1, 6, 8, 12)
+    network, x = trained(), torch.randn(1, INPUTS, 8, 12)
     save(network, network.config, tmp_path / "net.safetensors")
     found = load(tmp_path / "net.safetensors")
     assert isinstance(found, MergeNet)
@@ -55,7 +55,7 @@ def test_a_weights_file_comes_back(tmp_path):
     [
         ({"width": 0}, "must be a whole number"),
         ({"width": 1.5}, "must be a whole number"),
-        ({"inputs": 5}, "inputs is 5, this version prepares 6; train such weights again"),
+        ({"inputs": 5}, "inputs is 5, this version prepares 13; train such weights again"),
     ],
 )
 def test_a_wrong_configuration_is_refused(values, told):

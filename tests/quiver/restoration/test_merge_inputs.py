@@ -7,7 +7,7 @@ from qsim.keys import Key
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from quiver.baselines.information_domain import information_domain
-from quiver.baselines.path_merge import Merged, stream
+from quiver.baselines.path_merge import GROUPS, Merged, stream
 from quiver.model.mergenet import INPUTS
 from quiver.restoration.merge_inputs import UNIT, merge_inputs
 
@@ -18,7 +18,9 @@ def mean_of(codes):
     """A merged frame whose means are that of all codes [T, H, W], without motion."""
     count = np.full(codes.shape[1:], len(codes), np.float32)
     mean = codes.mean(0, dtype=np.float32)
-    return Merged(mean, count, codes[5].astype(np.float32), mean, count, mean, len(codes))
+    counts = np.array([len(group) for group in GROUPS], np.float32)[:, None, None] * np.ones_like(mean)
+    groups = np.stack([codes[[5 + offset for offset in group]].mean(0, dtype=np.float32) for group in GROUPS])
+    return Merged(mean, count, codes[5].astype(np.float32), mean, count, mean, len(codes), groups, counts)
 
 
 @pytest.mark.parametrize(
@@ -37,14 +39,38 @@ def test_noise_is_one_unit_whatever_the_sensor(sensor, photons):
     assert noise == pytest.approx(1, abs=0.15)  # 11 codes: the delta method errs by 0.85 to 1.15
     assert not inputs.channels[2:4].any()
     assert inputs.channels[1].any()
+    for channel, group in zip(inputs.channels[7:], GROUPS, strict=True):  # the merged frame holds the group, too
+        assert float(channel.std()) * UNIT == pytest.approx(np.sqrt(1 - len(group) / 11), abs=0.1)
 
 
 def test_the_map_of_knowledge_falls_where_codes_tell_nothing():
     sensor = QIS(0.8, 1.6, 0.2, 1, gain=0.5 / 26)
     light = np.repeat([6.0, 31.0], 48)[None, :] * np.ones((48, 1))
     codes = sensor.sample(np.broadcast_to(light, (11, 48, 96)), EXPOSURE, key=Key(0, 1), engine="reference")
-    known = merge_inputs(mean_of(codes), information_domain(sensor, EXPOSURE)).channels[5]
+    known = merge_inputs(mean_of(codes), information_domain(sensor, EXPOSURE)).channels[6]
     assert float(known[:, :32].mean()) < float(known[:, 64:].mean()) - 0.5
+
+
+def test_the_level_near_saturation_is_that_of_pooled_codes():
+    """Of pixels that are nearly all saturated, the mean of phi is too dark; phi of the mean code is not."""
+    sensor, photons = BinarySPAD(1.0, 0.0, 1), 4.0
+    codes = sensor.sample(np.full((11, 96, 96), photons), EXPOSURE, key=Key(0, 1), engine="reference")
+    domain = information_domain(sensor, EXPOSURE)
+    inputs = merge_inputs(mean_of(codes), domain)
+    truth = float(domain.forward(sensor.mean(np.array(photons), EXPOSURE)))
+    around = inputs.phi + inputs.channels[4] * UNIT * inputs.deviation
+    assert abs(float(around.mean()) - truth) < 0.5 * abs(float(inputs.phi.mean()) - truth)
+
+
+def test_groups_without_a_frame_tell_nothing():
+    codes = np.random.default_rng(3).integers(0, 8, (3, 16, 24)).astype(np.uint8)
+    sensor = QIS(0.8, 1.6, 0.2, 3)
+    domain = information_domain(sensor, EXPOSURE)
+    merged = next(stream(lambda t: codes[t], 3, domain, 11, range(1)))
+    assert merged.group_counts.max((1, 2)).tolist() == [0, 1, 0, 1, 0, 0]
+    channels = merge_inputs(merged, domain).channels[7:]
+    assert not channels[[0, 2, 4, 5]].any()
+    assert channels[1].any()
 
 
 @pytest.mark.parametrize("level", ["dark", "saturated"])
