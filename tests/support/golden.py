@@ -4,8 +4,8 @@
 
 builds the weights of network NAME from the table of published names, runs it in float64 on the inputs that the file
 holds, at whatever size they have, and prints one JSON object: max |ours - golden| / std(golden) of every key. The exit
-code is 1 if a key is not computed, has another shape or is not finite (its error is then null). NAME is emvd, flornn,
-memdeblur, rvrt, spk2imgnet or quiver.
+code is 1 if a key is not computed, has another shape or is not finite (its error is then null), and 2, with one line,
+for a file or table that cannot be used. NAME is emvd, flornn, memdeblur, rvrt, spk2imgnet or quiver.
 
 A network contributes a file `tests/support/golden_NAME.py` with
 
@@ -14,6 +14,7 @@ A network contributes a file `tests/support/golden_NAME.py` with
   network, loads it (`load_published`), and returns all keys of the golden file but the inputs, in their published
   shapes and channel slices, for any batch, frame count and size. Forward hooks record stages (`Recorder`);
 - `INPUTS`: the names of the file's arrays that are inputs;
+- `MULTIPLE`, where the port takes only sides that it divides;
 - `START`, where the table has the fill `init`: published name -> start value;
 - `small() -> network`: a float64 network in evaluation mode, of the smallest width, with weights of natural size
   (`fill_by_rule`). tests/quiver/model/rivals/test_all.py runs over all of them.
@@ -26,6 +27,7 @@ import argparse
 import importlib
 import json
 import math
+import sys
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -34,6 +36,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from qsim.files import decoding_errors
 from quiver.model.config import Config
 from quiver.model.published_weights import published_name
 from quiver.model.quiver import QUIVER
@@ -114,17 +117,19 @@ def weights_by_table(
 ) -> dict[str, Tensor]:
     """All entries of a table but constants; a table without the column `fill` (QUIVER's) is filled like `rule`."""
     state: dict[str, Tensor] = {}
-    for line in table.read_text().splitlines():
-        if line.startswith("#") or not line.strip():
-            continue
-        name, size, kind, *rest = line.split("\t")
-        if kind.startswith("same tensor as "):
-            state[name] = state[kind.removeprefix("same tensor as ")]
-            continue
-        shape = tuple(int(side) for side in size.split("x")) if size not in ("", "scalar", "()") else ()
-        fill = rest[0] if rest else "const" if kind == "buffer" else "bias" if len(shape) == 1 else "fan0.8"
-        if fill != "const":
-            state[name] = torch.from_numpy(np.asarray(fill_value(name, shape, fill, prefix, start or {}))).to(dtype)
+    with decoding_errors(table, "a table of names, shapes and kinds"):
+        for line in table.read_text().splitlines():
+            if line.startswith("#") or not line.strip():
+                continue
+            name, size, kind, *rest = line.split("\t")
+            if kind.startswith("same tensor as "):
+                state[name] = state[kind.removeprefix("same tensor as ")]
+                continue
+            shape = tuple(int(side) for side in size.split("x")) if size not in ("", "scalar", "()") else ()
+            fill = rest[0] if rest else "const" if kind == "buffer" else "bias" if len(shape) == 1 else "fan0.8"
+            if fill != "const":
+                value = np.asarray(fill_value(name, shape, fill, prefix, start or {}))
+                state[name] = torch.from_numpy(value).to(dtype)
     return state
 
 
@@ -141,12 +146,12 @@ class Recorder:
 
 
 def compare(ours: Mapping[str, object], golden: Mapping[str, np.ndarray]) -> dict[str, float | None]:
-    """max |ours - golden| / std(golden) of every key; None where ours is missing, of another shape or not finite."""
+    """max |ours - golden| / std(golden) of every key; None where ours is missing, of another shape, or not finite."""
     result: dict[str, float | None] = {}
     for key, array in golden.items():
         wanted = array.astype(np.float64)
         found = np.asarray(ours[key], np.float64) if key in ours else np.empty(0)
-        if found.shape != wanted.shape or not np.isfinite(found).all():
+        if found.shape != wanted.shape or not found.size or not np.isfinite(found - wanted).all():
             result[key] = None
             continue
         result[key] = float(np.abs(found - wanted).max() / (wanted.std() or 1.0))
@@ -154,8 +159,19 @@ def compare(ours: Mapping[str, object], golden: Mapping[str, np.ndarray]) -> dic
 
 
 def errors(name: str, golden: Mapping[str, np.ndarray], table: Path, prefix: str = "") -> dict[str, float | None]:
-    """Error of every key of a golden file that is no input, from a float64 run with weights by rule."""
+    """Error of every key of a golden file that is no input, from a float64 run with weights by rule.
+
+    `ValueError` and errors of torch for arrays and tables that do not fit; `KeyError` if one lacks an entry.
+    """
     network = importlib.import_module(f"golden_{name}")
+    codes = golden["codes"]
+    if codes.dtype.kind not in "iuf" or codes.ndim not in (4, 5) or not codes.size or not np.isfinite(codes).all():
+        raise ValueError(f"codes are numbers [B, T, 1, H, W] or [B, T, H, W], got {codes.dtype} {list(codes.shape)}")
+    multiple, (height, width) = getattr(network, "MULTIPLE", 1), codes.shape[-2:]
+    if height % multiple or width % multiple:
+        raise ValueError(f"{name} takes frames whose sides {multiple} divides, got {height} x {width}")
+    if not golden.keys() - set(network.INPUTS):
+        raise ValueError(f"nothing to compare: the file holds {', '.join(golden)} alone")
     weights = weights_by_table(table, prefix, getattr(network, "START", None))
     with torch.no_grad():
         ours = network.stages(dict(golden), weights)
@@ -169,8 +185,8 @@ def golden_files(name: str) -> list[Path]:
 
 
 def arrays_of(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of a golden file."""
-    with np.load(path) as file:
+    """All arrays of a golden file; `ValueError` for another file, `FileNotFoundError` for none."""
+    with decoding_errors(path, "an archive of arrays (.npz)"), np.load(path) as file:
         return dict(file)
 
 
@@ -178,6 +194,12 @@ def cut(source: Path, target: Path, keys: list[str]) -> None:
     """Write the golden file of some keys."""
     arrays = arrays_of(Path(source))
     np.savez_compressed(target, **{key: arrays[key] for key in keys})
+
+
+def refused(why: str) -> int:
+    """Print why files cannot be compared, in one line; return the exit code."""
+    print(f"golden: {' '.join(why.split())}", file=sys.stderr)
+    return 2
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -188,7 +210,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("table", type=Path)
     parser.add_argument("--prefix", default="")
     given = parser.parse_args(arguments)
-    found = errors(given.name, arrays_of(given.golden), given.table, given.prefix)
+    try:
+        found = errors(given.name, arrays_of(given.golden), given.table, given.prefix)
+    except KeyError as error:
+        return refused(f"{error} is missing; give the golden file and the table of {given.name}")
+    except (OSError, ValueError, IndexError, RuntimeError) as error:
+        return refused(str(error))
     print(json.dumps(found, indent=1))
     return int(any(error is None for error in found.values()))
 

@@ -13,6 +13,7 @@ from quiver.model.rivals.noise import table_of
 from quiver.model.rivals.published_names import load_published
 
 INPUTS = ("codes", "noise_ab")
+MULTIPLE = 8
 COLOUR = [[0.5, 0.5, 0.5, 0.5], [-0.5, 0.5, 0.5, -0.5], [0.65, 0.2784, -0.2784, -0.65], [-0.2784, 0.65, -0.65, 0.2764]]
 HAAR = np.array([[1, 1], [1, -1]]) / np.sqrt(2)
 START = {

@@ -11,6 +11,7 @@ from quiver.model.rivals.memdeblur import MemDeblur, MemDeblurConfig
 from quiver.model.rivals.published_names import load_published
 
 INPUTS = ("codes",)
+MULTIPLE = 4
 SCORED = 5  # the frame that the port scores
 NAMES = ("quarter", "half", "full")
 

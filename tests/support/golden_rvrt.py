@@ -8,13 +8,17 @@ from golden import Recorder, fill_by_rule
 from torch import Tensor
 
 from quiver.model.rivals.published_names import load_published
-from quiver.model.rivals.rvrt import CLIP, PASSES, RVRT, RVRTConfig, reduced
+from quiver.model.rivals.rvrt import CLIP, PASSES, QUARTER, RVRT, RVRTConfig, reduced
 
 INPUTS = ("codes",)
+MULTIPLE = QUARTER
 
 
 def stages(arrays: Mapping[str, np.ndarray], weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """One run; a single clip of two frames is never aligned and has fewer stages."""
+    """One run; a single clip of two frames is never aligned and has fewer stages. `ValueError` for an odd clip."""
+    count = arrays["codes"].shape[1]
+    if count % CLIP:
+        raise ValueError(f"rvrt takes an even number of frames, got {count}")
     return recorded(built(weights), torch.from_numpy(np.asarray(arrays["codes"], np.float64) / 7))
 
 
