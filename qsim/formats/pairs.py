@@ -12,7 +12,6 @@ A window is T successive codes of a stream; windows do not overlap. One chunk ho
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +20,9 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim import files
 from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream
-from qsim.files import VERSION, Progress
+from qsim.files import VERSION, Progress, replacing
 
 WINDOW = 11  # frames, as QUIVER takes them
 
@@ -111,22 +109,14 @@ def write(
     groups = windows(splits, frames)
     _check_target(path, force)
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.tmp-{os.getpid()}")
     total, done = sum(map(len, groups.values())), 0
-    try:
-        with h5py.File(part, "w") as file:
-            file.attrs.update({"format": "qsim-pairs-1", "software": f"qsim {VERSION}", "truth": "photons"})
-            for split, listed in groups.items():
-                for _ in _fill(file.create_group(split), listed):
-                    done += 1
-                    if progress is not None:
-                        progress(done, total)
-        with open(part, "rb") as written:
-            os.fsync(written.fileno())
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
-    files.sync_folder(path.parent)
+    with replacing(path) as part, h5py.File(part.name, "w") as file:  # by name: HDF5 also reads what it wrote
+        file.attrs.update({"format": "qsim-pairs-1", "software": f"qsim {VERSION}", "truth": "photons"})
+        for split, listed in groups.items():
+            for _ in _fill(file.create_group(split), listed):
+                done += 1
+                if progress is not None:
+                    progress(done, total)
     return _line(groups, frames)
 
 
