@@ -20,7 +20,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from importlib import import_module, metadata
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 
@@ -310,7 +310,7 @@ def load_array(path: Path) -> np.ndarray:
     """
     if path.suffix == ".gz":
         with decoding_errors(path, "gzipped .npy"), gzip.open(path, "rb") as packed:
-            return _read_npy(path, packed)
+            return read_npy(path, packed)
     with decoding_errors(path, ".npy"):
         with open(path, "rb") as file:
             if file.read(2) == b"PK":
@@ -325,17 +325,18 @@ def load_array(path: Path) -> np.ndarray:
         return array
 
 
-def _read_npy(path: Path, file: gzip.GzipFile | BinaryIO) -> np.ndarray:
-    """Return an array from a stream; memory grows with the bytes that are there, not with the header."""
+def read_npy(path: Path, file: IO[bytes] | gzip.GzipFile) -> np.ndarray:
+    """Return a .npy array of numbers from a stream; memory grows with the bytes that are there, not with the header.
+
+    `ValueError` as for `load_array`, with the name `path`; errors of the stream itself are its own.
+    """
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise ValueError(f"{path}: version {version} of .npy is not known")
     reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = reader(file)
-    if fortran or dtype.hasobject or dtype.kind not in "buif":
-        raise ValueError(
-            f"{path}: {dtype} in column order; only numbers in row order are read" if fortran else f"{path}: {dtype}"
-        )
+    if dtype.hasobject or dtype.kind not in "buif":
+        raise ValueError(f"{path}: an array of {dtype}; numbers are expected")
     if not shape:
         raise ValueError(f"{path}: a single number without axes; an array is expected")
     wanted = int(np.prod(shape, dtype=object)) * dtype.itemsize
@@ -345,4 +346,4 @@ def _read_npy(path: Path, file: gzip.GzipFile | BinaryIO) -> np.ndarray:
         if not block:
             raise ValueError(f"{path}: the header states {wanted} bytes, the file has {len(content)}")
         content += block
-    return np.frombuffer(content, dtype).reshape(shape)
+    return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.files import decoding_errors
+from qsim.files import decoding_errors, load_array, read_npy
 
-LARGEST = 1 << 32  # bytes of an array of counts
+LARGEST = 1 << 32  # bytes of an array of counts in a .npz
 
 
 @dataclass(frozen=True)
@@ -54,26 +52,14 @@ def read_counts(path: Path) -> Counts:
 
 def _load(path: Path) -> Array:
     """Return the one array of a .npy or .npz."""
-    with open(path, "rb") as file:
-        if path.suffix == ".npy":
-            return _array(file, path.stat().st_size)
-        with zipfile.ZipFile(file) as archive:
-            members = archive.infolist()
-            if len(members) != 1:
-                names = ", ".join(member.filename.removesuffix(".npy") for member in members[:3])
-                raise ValueError(f"holds {len(members)} arrays ({names}); one is read")
-            with archive.open(members[0]) as member:
-                return _array(member, members[0].file_size)
-
-
-def _array(file: IO[bytes], size: int) -> Array:
-    """Return an array in the .npy format; the header may not ask for more than `size` bytes."""
-    reader = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    version = np.lib.format.read_magic(file)
-    if version not in reader:
-        raise ValueError(f"version {version} of the format is unknown")
-    shape, _, dtype = reader[version](file)
-    if math.prod(shape) * dtype.itemsize > min(size, LARGEST):
-        raise ValueError(f"{dtype} {list(shape)} needs more than the {size:,} bytes of the file")
-    file.seek(0)
-    return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+    if path.suffix == ".npy":
+        return load_array(path)
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if len(members) != 1:
+            names = ", ".join(member.filename.removesuffix(".npy") for member in members[:3])
+            raise ValueError(f"holds {len(members)} arrays ({names}); one is read")
+        if members[0].file_size > LARGEST:
+            raise ValueError(f"its array has {members[0].file_size:,} bytes, and {LARGEST:,} are read at most")
+        with archive.open(members[0]) as member:
+            return read_npy(path, member)

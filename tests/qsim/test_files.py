@@ -1,6 +1,7 @@
 """Tests leftovers of interrupted writes, links, and the wording of the system's errors."""
 
 import errno
+import gzip
 import os
 from pathlib import Path
 
@@ -58,3 +59,11 @@ def test_wordings():
     with pytest.raises(OSError) as caught, files.replacing(Path("/nowhere/x")):
         pass
     assert "None" not in str(caught.value)
+
+
+def test_an_array_in_any_order_is_read_from_a_file_and_from_a_stream(tmp_path: Path):
+    for array in (np.arange(30, dtype=">i2").reshape(2, 3, 5), np.asfortranarray(np.eye(3, 4))):
+        np.save(tmp_path / "a.npy", array)
+        (tmp_path / "a.npy.gz").write_bytes(gzip.compress((tmp_path / "a.npy").read_bytes()))
+        for path in (tmp_path / "a.npy", tmp_path / "a.npy.gz"):
+            np.testing.assert_array_equal(files.load_array(path), array)
