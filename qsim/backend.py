@@ -59,7 +59,7 @@ print("rendered" if mean > 0 else f"rendered a mean of {mean}")
 
 
 @dataclass(frozen=True)
-class Engine:
+class RenderEngine:
     """The chosen renderer and why."""
 
     variant: str  # Mitsuba variant
@@ -78,7 +78,7 @@ class Probe:
     detail: str  # version, or the last line of the failure
 
 
-def choose(prefer: str | None = None) -> Engine:
+def choose(prefer: str | None = None) -> RenderEngine:
     """Return the engine, chosen once per process; `prefer` or QSIM_ENGINE requires "cuda", "llvm" or "scalar".
 
     `ValueError` if the required engine does not work; it states the reason and what to install.
@@ -115,31 +115,31 @@ def report() -> dict[str, Any]:
     return asdict(engine) | {"probes": probes, "software": software, "cache": str(_cache_file())}
 
 
-def decide(wanted: str | None) -> Engine:
+def decide(wanted: str | None) -> RenderEngine:
     failures = []
     if wanted in (None, "cuda"):
         probe = probe_cuda()
         if probe.works:
-            return Engine(VARIANTS["cuda"], "cuda", None, probe.detail)
+            return RenderEngine(VARIANTS["cuda"], "cuda", None, probe.detail)
         failures.append(f"CUDA: {probe.detail}")
     if wanted in (None, "llvm"):
         for library in llvm_candidates():
             probe = cached_probe(VARIANTS["llvm"], library)
             if probe.works:
-                return Engine(VARIANTS["llvm"], "llvm", library, f"{probe.detail}, {library}")
+                return RenderEngine(VARIANTS["llvm"], "llvm", library, f"{probe.detail}, {library}")
             failures.append(f"{library}: {probe.detail}")
             if library == os.environ.get("DRJIT_LIBLLVM_PATH"):
                 warnings.warn(f"DRJIT_LIBLLVM_PATH={failures[-1]}; looking further", RuntimeWarning, stacklevel=3)
         if not llvm_candidates():
             failures.append("no libLLVM of version 16 to 22 found")
     if wanted == "scalar":
-        return Engine(VARIANTS["scalar"], "scalar", None, "asked for")
+        return RenderEngine(VARIANTS["scalar"], "scalar", None, "asked for")
     why = "; ".join(failures)
     if wanted is not None:
         hint = INSTALL_HINT if wanted == "llvm" else "it needs an NVIDIA GPU whose driver brings OptiX"
         raise ValueError(f"engine {wanted} does not work here ({why}); {hint}")
     warnings.warn(f"rendering with the slow scalar engine ({why}): {INSTALL_HINT}", RuntimeWarning, stacklevel=3)
-    return Engine(VARIANTS["scalar"], "scalar", None, why)
+    return RenderEngine(VARIANTS["scalar"], "scalar", None, why)
 
 
 decided = lru_cache(decide)

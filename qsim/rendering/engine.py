@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from qsim.backend import INSTALL_HINT, Engine, choose, limit_threads
+from qsim.backend import INSTALL_HINT, RenderEngine, choose, limit_threads
 
 
-def select(prefer: str | None = None) -> Engine:
+def select(prefer: str | None = None) -> RenderEngine:
     """Choose (once per process) and activate an engine; `prefer` or QSIM_ENGINE requires "cuda", "llvm" or "scalar".
 
     `ValueError` if the required engine does not work on this machine, with the reason and what to install.
@@ -21,14 +21,14 @@ def select(prefer: str | None = None) -> Engine:
     return engine
 
 
-def in_colour(engine: Engine) -> Engine:
+def in_colour(engine: RenderEngine) -> RenderEngine:
     """Return the same engine with Mitsuba's variant of three bands; `ValueError` for the scalar engine."""
     if engine.backend == "scalar":
         raise ValueError(f"the scalar engine renders one band only ({engine.reason}); {INSTALL_HINT}")
     return replace(engine, variant=engine.variant.replace("_mono", "_rgb"))
 
 
-def activate(engine: Engine) -> None:
+def activate(engine: RenderEngine) -> None:
     """Make this engine's variant the current one; cheap if it is already active."""
     if engine.llvm_path:
         os.environ["DRJIT_LIBLLVM_PATH"] = engine.llvm_path

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.backend import Engine
+from qsim.backend import RenderEngine
 from qsim.clip.clamped_error import Errors, frame_errors, rms, white_in
 from qsim.keys import Key, hash_name, words
 from qsim.optics.radiometry import Crop, check_crop
@@ -89,7 +89,7 @@ class Renderer:
         crop: Crop | None = None,
         thinned: int = 1,
         frames: int | None = None,
-        engine: Engine | None = None,
+        engine: RenderEngine | None = None,
     ) -> None:
         if not frame_rate > 0:
             raise ValueError(f"frame_rate: a positive number of frames per second is needed, got {frame_rate!r}")

@@ -20,7 +20,7 @@ from qsim.colour import bright_end
 from qsim.report import html as page
 from qsim.report.panels import (
     FRAMES,
-    Light,
+    Photons,
     chosen_frames,
     fit,
     legend,
@@ -72,7 +72,7 @@ def clip_section(clip: Clip) -> page.Section:
     return page.section(f"Clip {clip.name}", *parts, story=story, facts=_facts(clip, frames))
 
 
-def _players(clip: Clip, frames: range, truth: Light) -> list[Markup]:
+def _players(clip: Clip, frames: range, truth: Photons) -> list[Markup]:
     """Return the light with all streams of one code per frame, and a player of each other stream."""
     panels = [page.Panel(light_name(clip), fit(toned(truth, colour.peak(truth))))]
     others = []

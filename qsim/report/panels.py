@@ -29,7 +29,7 @@ WIDTH = 512  # columns of a panel; wider pictures are reduced by a whole factor
 _BITS = 8  # of codes that are shown as light; deeper ones are shown as they are
 _GOLDEN = 0.6180339887  # turns between the hues of successive bodies
 
-Light = NDArray[np.floating]  # [T, H, W] photons; of colour clips [T, 3, H, W]
+Photons = NDArray[np.floating]  # [T, H, W] photons; of colour clips [T, 3, H, W]
 
 
 def chosen_frames(count: int) -> range:
@@ -43,7 +43,7 @@ def fit(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return frames[:, ::step, ::step]
 
 
-def toned(light: Light, white: float) -> NDArray[np.uint8]:
+def toned(light: Photons, white: float) -> NDArray[np.uint8]:
     """Return light as pictures on the tone curve of all panels: [T, H, W], or [T, H, W, 3] of [T, 3, H, W]."""
     return colour.tone_picture(light, white, colours=light.ndim == 4)
 
@@ -58,14 +58,14 @@ def truth_stack(clip: Clip, frames: range) -> NDArray[np.float32]:
     return np.stack([clip.sharp(t) for t in frames])
 
 
-def truth_photons(clip: Clip, stream: Stream, frames: range) -> Light | None:
+def truth_photons(clip: Clip, stream: Stream, frames: range) -> Photons | None:
     """Return the sharp light of these frames [photons] at the level of a stream; None if a code has other frames."""
     if stream.meta["ppp_factor"] is None or len(stream) != len(clip) or len(clip) < len(frames):
         return None
     return np.stack([clip_photons(clip, t, stream.photons_factor, sharp=True) for t in frames])
 
 
-def score(light: Light, truth: Light | None) -> str:
+def score(light: Photons, truth: Photons | None) -> str:
     """Return the PSNR of light below the white of the truth, both clamped there, as "24.1 dB"; "" without a truth."""
     if truth is None:
         return ""
@@ -74,7 +74,7 @@ def score(light: Light, truth: Light | None) -> str:
     return f"{decibels:.1f} dB" if np.isfinite(decibels) else ""
 
 
-def stream_panels(stream: Stream, frames: range, truth: Light | None = None) -> list[page.Panel]:
+def stream_panels(stream: Stream, frames: range, truth: Photons | None = None) -> list[page.Panel]:
     """Return panels of the codes, and of the naive mean of up to 11 frames around each, on the tone curve of the truth.
 
     `truth` is the light of these frames [photons]; with it, each panel states its PSNR.
@@ -109,7 +109,7 @@ def stream_panels(stream: Stream, frames: range, truth: Light | None = None) -> 
     ]
 
 
-def _inverse(stream: Stream, samples: int) -> Callable[[NDArray[np.number]], Light] | None:
+def _inverse(stream: Stream, samples: int) -> Callable[[NDArray[np.number]], Photons] | None:
     """Return a function, means of this many codes [...] -> light [photons].
 
     None for a sensor of more than _BITS bits or whose mean code does not rise, and for codes of different exposures.
@@ -124,7 +124,7 @@ def _inverse(stream: Stream, samples: int) -> Callable[[NDArray[np.number]], Lig
     return lambda codes: response.invert(codes, samples)
 
 
-def error_panel(name: str, light: Light, truth: Light) -> page.Panel:
+def error_panel(name: str, light: Photons, truth: Photons) -> page.Panel:
     """Return light - truth as colours: red is too bright, blue too dark, full colour at a fifth of white."""
     full = white_in(truth) / 5
     caption = f"error of {name}: red too bright, blue too dark, full colour at {full:.3g} photons"
@@ -132,7 +132,7 @@ def error_panel(name: str, light: Light, truth: Light) -> page.Panel:
     return page.Panel(caption, fit(colour.error_colours(error if error.ndim == 3 else error.mean(axis=1), full)))
 
 
-def truth_panels(clip: Clip, frames: range) -> tuple[list[page.Panel], float, Light]:
+def truth_panels(clip: Clip, frames: range) -> tuple[list[page.Panel], float, Photons]:
     """Return ground truth over the light: motion, depth, bodies, and points that have no place in the next frame.
 
     Also the motion of the full colour [px/frame], and the lengths of all motions [px/frame], [T, H, W].

@@ -22,7 +22,7 @@ KEPT, KEPT_OF_CLIP = 16, 8  # frames of a part; with AROUND, sixteen frames at a
 
 
 @dataclass(frozen=True)
-class Part:
+class ClipPart:
     """The frames that are restored at a time, and those around them."""
 
     before: int
@@ -37,13 +37,13 @@ def takes_clips(network: nn.Module) -> bool:
     return hasattr(network, "look_ahead")
 
 
-def part_of(network: Any) -> Part:
+def part_of(network: Any) -> ClipPart:
     """Return the parts in which a network restores a clip."""
     ahead = network.look_ahead
     if ahead is None:
         around, kept = getattr(network, "parts", (AROUND, KEPT_OF_CLIP))
-        return Part(around, kept, around, around + kept - 1, around + kept - 1)
+        return ClipPart(around, kept, around, around + kept - 1, around + kept - 1)
     if hasattr(network, "frames_in"):
         before = network.frames_in - 1 - ahead
-        return Part(before, KEPT, ahead, before, ahead)
-    return Part(PAST, KEPT, ahead, PAST + KEPT - 1, ahead)
+        return ClipPart(before, KEPT, ahead, before, ahead)
+    return ClipPart(PAST, KEPT, ahead, PAST + KEPT - 1, ahead)

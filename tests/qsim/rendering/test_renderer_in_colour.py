@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_scenes import CAMERA, plate, renderer, square
 
-from qsim.backend import Engine
+from qsim.backend import RenderEngine
 from qsim.optics.radiometry import RGB
 from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
@@ -123,4 +123,4 @@ def test_mistakes_are_named():
     with pytest.raises(ValueError, match="from 0 up"):
         Constant((0.5, -0.5, 1.5))
     with pytest.raises(ValueError, match="renders one band only"):
-        renderer(coloured(LIGHTS[0], None), engine=Engine("scalar_rgb", "scalar", None, "asked for"))
+        renderer(coloured(LIGHTS[0], None), engine=RenderEngine("scalar_rgb", "scalar", None, "asked for"))
