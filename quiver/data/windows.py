@@ -55,7 +55,7 @@ class WindowSettings:
     drift: int = 0  # px/frame; in half of the windows the crop moves, up to this far along each side
     force_exposure: bool = False  # published: every window is brought to the light level separately
     still: bool = False  # items also hold noisy copies of the centre frame, drawn without defects
-    ceiling: float = 2.0  # of targets, in units of white: 11 codes do not distinguish light above it from saturation
+    ceiling: float = 2.0  # of targets, in units of white, or the peak of the scores where that is more
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -71,7 +71,7 @@ class Windows(Dataset[dict[str, Any]]):
     An item holds:
 
         codes    float32 [T, 1, h, w] in [0, 1]
-        target   float32 [T, 1, h, w], sharp photons / white, up to `ceiling`
+        target   float32 [T, 1, h, w], sharp photons / white, up to `ceiling` or the peak
         white    photons
         peak     photons, of its scores
         ppp      mean photons per pixel and exposure
@@ -174,11 +174,13 @@ class Windows(Dataset[dict[str, Any]]):
         except ValueError as error:
             raise ValueError(f"{clip.path}: window from frame {place.start}: {error}") from None
         white = draw.sensor.white(clip.exposure)
+        peak = white if self.settings.force_exposure else peak_of(draw.level.ppp)
+        target = np.minimum(sharp / white, max(self.settings.ceiling, peak / white))  # a SPAD tells light above 2 white
         sample = {
             "codes": as_input(codes, draw.sensor),
-            "target": torch.from_numpy(np.minimum(sharp / white, self.settings.ceiling).astype(np.float32))[:, None],
+            "target": torch.from_numpy(target.astype(np.float32))[:, None],
             "white": white,
-            "peak": white if self.settings.force_exposure else peak_of(draw.level.ppp),
+            "peak": peak,
             "ppp": float((photons * scale).mean()),
             "sample": n,
             "key": f"{clip.name} frame {place.start}, (y, x) ({place.y}, {place.x}), turn {place.turn}, "

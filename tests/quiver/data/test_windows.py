@@ -45,6 +45,21 @@ def test_a_sample_is_what_the_docs_say(make_clip: ClipMaker):
     assert sharp.mean() == pytest.approx(1.1 * exposed.mean(), rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("light", "ceiling"),
+    [(Illumination("spad-320x240", 3.0, 1), 7.5), (Illumination("spad-320x240", 21.0, 3), 7.5)],
+    ids=["a plane near saturation", "seven planes"],
+)
+def test_targets_keep_all_light_that_is_scored(make_clip: ClipMaker, light: Illumination, ceiling: float):
+    """Light up to the peak of the scores, 2.5 times the mean, is never cut: a SPAD tells it above twice its white."""
+    data = Windows([make_clip(sharp=True)], WindowSettings(lights=(light,), crop=16))
+    free = Windows(data.clips, replace(data.settings, ceiling=np.inf))
+    assert max(float(free[n]["target"].max()) for n in range(4)) > 2
+    for n in range(4):
+        torch.testing.assert_close(data[n]["target"], free[n]["target"].clamp(max=ceiling))
+        assert float(data[n]["peak"]) <= ceiling * data[n]["white"]
+
+
 def test_codes_have_the_mean_of_their_photons(make_clip: ClipMaker):
     """A flat clip: 11 x 36 x 36 codes per sample against the sensor's exact mean and variance, turned or not."""
     clip = make_clip(radiance=np.full((14, 36, 36), 0.7), relative=True)
