@@ -1,12 +1,13 @@
 """Scores the restorer that ships and every classical method on test clips: sensor x bits x light, by motion, too.
 
     qsim generate scenes/restorer_test.toml -o out/restorer_test
-    python docs/restorer_grid.py out/restorer_test                             # cells that are missing: hours
+    python docs/restorer_grid.py out/restorer_test                             # what is missing: hours
     python docs/restorer_grid.py out/restorer_test --cells qis-3-3.25 --out out/grid --restorer out/mine
 
 A cell is RESULTS/NAME.json: QIS with 1 to 7 bits at six levels of light, and sums of 1, 7 and 31 SPAD planes at three.
-It is written when it is complete, and made once. Classical methods run with several windows; the best one counts,
-chosen by the mean over clips in the cell, or in the bin of motion. Tables beside RESULTS show the cells that exist.
+It grows by clips and methods; only what is missing is measured, and with other weights only the restorer. Classical
+methods run with several windows; the best one counts, chosen by the mean over clips in the cell, or in the bin of
+motion. Tables beside RESULTS show the cells that are complete.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,18 +71,10 @@ def main(words: list[str] | None = None) -> int:
         clips = open_clips(args.data, "test")
         if not clips:
             raise ValueError(f"{args.data}: no finished clip in split 'test'; finish `qsim generate`")
-        same = {"format": FORMAT, "quiver": VERSION, "restorer": args.restorer, "frames": args.frames}
-        same |= {"weights": sha256(weights_path(args.restorer)), "clips": [clip.name for clip in clips]}
         args.out.mkdir(parents=True, exist_ok=True)
         for name in names:
-            path = args.out / f"{name}.json"
-            if path.exists():
-                check(path, same)
-                continue
-            scores = {clip.name: measured(clip, every[name].light, args) for clip in clips}
-            write_json(path, same | {"name": name, "scores": scores})
-            print(f"{path}: written", flush=True)
-        write_tables(args.out, names)
+            grow(args.out / f"{name}.json", every[name], clips, args)
+        write_tables(args.out, names, [clip.name for clip in clips])
     except (ValueError, OSError) as error:
         print(f"restorer_grid: {error}", file=sys.stderr)
         return 2
@@ -97,19 +91,37 @@ def options() -> argparse.ArgumentParser:
     return parser
 
 
-def check(path: Path, same: dict[str, Any]) -> None:
-    """Raise `ValueError` if a cell was measured otherwise."""
-    found = read_json(path)
-    changed = [key for key, value in same.items() if found.get(key) != value]
-    if changed:
-        raise ValueError(f"{path}: was measured with another {', '.join(changed)}; choose another --out, or remove it")
-
-
 # ---- One cell
 
 
-def measured(clip: Clip, light: Illumination, args: argparse.Namespace) -> dict[str, Any]:
-    """Return for each method its matched PSNR [dB], and pixels and squared error of every bin of motion."""
+def grow(path: Path, place: Place, clips: Sequence[Clip], args: argparse.Namespace) -> None:
+    """Measure what a cell lacks, and write it after every clip. `ValueError` if it was measured otherwise."""
+    same = {"format": FORMAT, "quiver": VERSION, "frames": args.frames}
+    tried = {"restorer": args.restorer, "weights": sha256(weights_path(args.restorer))}
+    found = read_json(path) if path.exists() else {**same, "name": place.name, "scores": {}}
+    changed = [key for key, value in same.items() if found.get(key) != value]
+    if changed:
+        raise ValueError(f"{path}: was measured with another {', '.join(changed)}; choose another --out, or remove it")
+    if any(found.get(key) != value for key, value in tried.items()):
+        for rows in found["scores"].values():
+            rows.pop("restorer", None)
+        found |= tried
+    for clip in clips:
+        rows = found["scores"].setdefault(clip.name, {})
+        missing = [name for name in ("restorer", *CLASSICAL) if name not in rows]
+        if missing:
+            rows |= measured(clip, place.light, missing, args)
+            write_json(path, found)
+            print(f"{path}: {clip.name}", flush=True)
+
+
+def measured(
+    clip: Clip, light: Illumination, names: Sequence[str], args: argparse.Namespace
+) -> dict[str, dict[str, Any] | None]:
+    """Return for each method its matched PSNR [dB], and pixels and squared error of every bin of motion.
+
+    None for a classical method that cannot restore such codes.
+    """
     codes, factor = sensed(clip, light, 0)
     peak = peak_of(mean_light(clip, factor))
     frames = np.unique(np.linspace(0, len(clip) - 1, args.frames + 2).round().astype(int)[1:-1]).tolist()
@@ -118,29 +130,31 @@ def measured(clip: Clip, light: Illumination, args: argparse.Namespace) -> dict[
     valid = None if parts[0] is None else np.concatenate([part for part in parts if part is not None])
     moves = [speeds(clip, range(t, t + 1)) for t in frames]
     speed = np.concatenate([move for move in moves if move is not None]) if clip.has_truth else None
-    found: dict[str, Any] = {}
-    for name in (args.restorer, *CLASSICAL):
-        method = restorer(name)
+    found: dict[str, dict[str, Any] | None] = {}
+    for name in names:
+        method = restorer(args.restorer if name == "restorer" else name)
         try:
             restored = np.concatenate([method.restore(codes, t, t + 1) for t in frames]) / peak
         except ValueError:
             if method.learned:
                 raise
-            continue  # a classical method that cannot restore such codes
+            found[name] = None
+            continue
         score = metrics.score(restored, target, valid=valid)
         row: dict[str, Any] = {"psnr": score.psnr_matched, "raw": score.psnr, "scale": score.scale}
         if speed is not None:
             row["pixels"], row["squares"] = by_motion(restored * score.scale, target, speed)
-        found["restorer" if name == args.restorer else name] = row
+        found[name] = row
     return found
 
 
 # ---- Tables
 
 
-def write_tables(out: Path, names: list[str]) -> None:
-    """Write OUT.md and OUT.png from the cells that exist."""
-    cells = [read_json(path) for name in names if (path := out / f"{name}.json").exists()]
+def write_tables(out: Path, names: Sequence[str], clips: Sequence[str]) -> None:
+    """Write OUT.md and OUT.png from the cells that hold all clips."""
+    found = [read_json(path) for name in names if (path := out / f"{name}.json").exists()]
+    cells = [cell for cell in found if set(cell["scores"]) == set(clips)]
     if not cells:
         return
     rows = [(cell["name"], *compared(cell)) for cell in cells]
@@ -149,7 +163,7 @@ def write_tables(out: Path, names: list[str]) -> None:
     text = ["# The restorer against every classical method", ""]
     text += ["    qsim generate scenes/restorer_test.toml -o out/restorer_test"]
     text += ["    python docs/restorer_grid.py out/restorer_test", ""]
-    text += [f"Matched PSNR in dB, peak 2.5 times the mean light, mean over {len(cells[0]['clips'])} clips, "
+    text += [f"Matched PSNR in dB, peak 2.5 times the mean light, mean over {len(clips)} clips, "
              f"{cells[0]['frames']} frames of each. Weights: {cells[0]['weights'][:12]}.", ""]  # fmt: skip
     text += [f"Mean over {len(rows)} cells: {np.mean(gains):+.2f} dB. Least: {min(gains):+.2f} dB. Below the best "
              f"classical method: {', '.join(lost) or 'no cell'}.", ""]  # fmt: skip
@@ -168,7 +182,7 @@ def write_tables(out: Path, names: list[str]) -> None:
 def compared(cell: dict[str, Any]) -> tuple[float, str, float, list[float]]:
     """Return the restorer's score, the best classical method and its score, and the difference per bin of motion."""
     clips = list(cell["scores"].values())
-    methods = [name for name in CLASSICAL if all(name in clip for clip in clips)]
+    methods = [name for name in CLASSICAL if all(clip.get(name) for clip in clips)]
     mean = {name: float(np.mean([clip[name]["psnr"] for clip in clips])) for name in ("restorer", *methods)}
     best = max(methods, key=lambda name: mean[name])
 

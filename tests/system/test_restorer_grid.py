@@ -1,4 +1,4 @@
-"""The program of the restorer's grid: cells are made once, tables hold what the cells hold, mistakes are one line."""
+"""The program of the restorer's grid: what is measured stays, tables hold whole cells, mistakes are one line."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def cell(name: str, own: float, rivals: dict[str, float]) -> dict[str, object]:
         return {"psnr": psnr, "pixels": [100] * 6, "squares": [100 * 10 ** (-psnr / 10)] * 6}
 
     scores = {"clip": {"restorer": row(own)} | {method: row(psnr) for method, psnr in rivals.items()}}
-    return {"name": name, "frames": 4, "clips": ["clip"], "weights": "0" * 64, "scores": scores}
+    return {"name": name, "frames": 4, "weights": "0" * 64, "scores": scores}
 
 
 def test_a_cell_is_compared_with_its_best_rival():
@@ -47,17 +47,19 @@ def test_every_bin_has_its_own_rival_and_empty_bins_none():
 def test_a_method_that_fails_on_one_clip_is_no_rival():
     told = cell("qis-3-1", 25.0, {"naive": 20.0, "qbp": 24.0})
     other = json.loads(json.dumps(told["scores"]["clip"]))
-    del other["qbp"]
+    other["qbp"] = None
     told["scores"]["other"] = other
     assert restorer_grid.compared(told)[1] == "naive"
 
 
-def test_tables_hold_the_cells_that_exist(tmp_path):
+def test_tables_hold_the_cells_that_are_complete(tmp_path):
     out = tmp_path / "grid"
     out.mkdir()
     for name, own in (("qis-3-3.25", 25.0), ("qis-1-0.5", 23.5)):
         (out / f"{name}.json").write_text(json.dumps(cell(name, own, {"naive": 20.0, "qbp": 24.0})))
-    restorer_grid.write_tables(out, [place.name for place in restorer_grid.places()])
+    growing = cell("qis-3-1", 30.0, {"naive": 20.0, "qbp": 24.0}) | {"scores": {}}
+    (out / "qis-3-1.json").write_text(json.dumps(growing))
+    restorer_grid.write_tables(out, [place.name for place in restorer_grid.places()], ["clip"])
     text = out.with_suffix(".md").read_text()
     assert "Mean over 2 cells: +0.25 dB. Least: -0.50 dB. Below the best classical method: qis-1-0.5." in text
     assert text.index("| qis-1-0.5 |") < text.index("| qis-3-3.25 |")
@@ -90,16 +92,34 @@ def test_mistakes_are_one_sentence(tmp_path, monkeypatch, capsys, words, told):
     assert not list(tmp_path.glob("grid/*"))
 
 
-def test_a_cell_is_measured_once(tmp_path, monkeypatch, capsys):
+def test_only_what_is_missing_is_measured(tmp_path, monkeypatch, capsys):
+    """New clips and methods are added, other weights replace the restorer's rows, and nothing else changes."""
     write_dataset(tmp_path / "data", {"test": 2})
-    monkeypatch.setattr(restorer_grid, "CLASSICAL", ("naive", "moment:3"))
+    calls: list[tuple[str, list[str]]] = []
+    measured = restorer_grid.measured
+
+    def counted(clip, light, names, args):
+        calls.append((clip.name, list(names)))
+        return measured(clip, light, names, args)
+
+    monkeypatch.setattr(restorer_grid, "measured", counted)
+    monkeypatch.setattr(restorer_grid, "CLASSICAL", ("naive",))
     words = [str(tmp_path / "data"), "--cells", "qis-3-3.25", "--frames", "2", "--out", str(tmp_path / "grid")]
     assert restorer_grid.main(words) == 0
     path = tmp_path / "grid" / "qis-3-3.25.json"
-    found, written = json.loads(path.read_text()), path.stat().st_mtime_ns
-    assert all(set(clip) == {"restorer", "naive", "moment:3"} for clip in found["scores"].values())
+    first = json.loads(path.read_text())["scores"]
+    assert [names for _, names in calls] == [["restorer", "naive"]] * 2
+    monkeypatch.setattr(restorer_grid, "CLASSICAL", ("naive", "moment:3"))
     assert restorer_grid.main(words) == 0
-    assert path.stat().st_mtime_ns == written
+    assert [names for _, names in calls[2:]] == [["moment:3"]] * 2
+    monkeypatch.setattr(restorer_grid, "sha256", lambda path: "1" * 64)
+    assert restorer_grid.main(words) == 0
+    assert [names for _, names in calls[4:]] == [["restorer"]] * 2
+    told = json.loads(path.read_text())
+    assert told["weights"] == "1" * 64
+    assert all(told["scores"][name][method] == row for name, rows in first.items() for method, row in rows.items())
+    assert restorer_grid.main(words) == 0
+    assert len(calls) == 6
     capsys.readouterr()
     assert restorer_grid.main([*words[:3], "--frames", "3", *words[5:]]) == 2
     assert "was measured with another frames" in capsys.readouterr().err
