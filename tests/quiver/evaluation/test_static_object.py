@@ -15,7 +15,7 @@ from quiver.data.codes import array_codes
 from quiver.data.illumination import ideal_counter
 from quiver.data.photon_counts import Counts, read_counts
 from quiver.evaluation.static_object import evaluate_static, markdown, mean_square, reference
-from quiver.restoration.restorers import restorer
+from quiver.restoration.restorers import restorer, restorers
 
 HAZELNUT = Path(__file__).parents[2] / "data" / "hazelnut_gates6.npz"
 
@@ -71,3 +71,13 @@ def test_an_ideal_counter_counts():
     assert sensor.white(1.0) == 7
     codes = array_codes(np.full((1, 4, 4), 3, np.uint8), sensor, 1.0)
     np.testing.assert_allclose(restorer("naive:1").restore(codes), 3.0)
+
+
+def test_the_shipped_weights_win_on_real_photons():
+    """They must not darken what nears saturation: a crop in which a fifth of the pixels fill the 3-bit code."""
+    counts = read_counts(HAZELNUT)
+    crop = replace(counts, frames=counts.frames[:, 64:192, 64:192])
+    methods = restorers(["transform-denoise", "qbp-bm3d", "mergenet"])
+    *rivals, own = evaluate_static(crop, methods, splits=1)
+    assert own.psnr_matched > max(rival.psnr_matched for rival in rivals)
+    assert own.scale == pytest.approx(1, abs=0.05)
