@@ -1,0 +1,166 @@
+"""Times the restorer that ships beside QBP + BM3D of an older commit, in turn and in one run.
+
+    python docs/restorer_cost.py                 # docs/results/restorer_cost.md; about six minutes of quiet cores
+
+Both restore eleven frames of 512 x 1024: a photograph that slides by 2 px/frame, 3 bits, 3.25 PPP, with the threads
+of their defaults. Each program is a separate process that stays, their runs alternate, and the first ones are not
+counted. The older program comes from the history of this repository, so that a faster QBP of today moves nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import subprocess
+import sys
+import tarfile
+import tempfile
+from pathlib import Path
+from statistics import median
+
+import rows
+
+from qsim.files import write_bytes
+from qsim.tables import markdown_table
+
+ROOT = Path(__file__).parents[1]
+OLD = "5c22140"
+FRAMES = 11
+
+LIGHT = """
+import resource, sys, time
+import numpy as np
+from skimage import data
+height, width, frames = (int(word) for word in sys.argv[1:])
+picture = np.hstack([data.camera().astype(float)] * 2)[:height, :width]
+photons = np.stack([np.roll(picture, 2 * t, axis=1) for t in range(frames)]) * (3.25 / picture.mean())
+from qsim.keys import Key
+"""
+LOOP = """
+for _ in sys.stdin:
+    started = time.perf_counter()
+    once()
+    print(time.perf_counter() - started, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, flush=True)
+"""
+QBP = """
+from qsim.devices import quiver_physical
+from quiver.baselines import METHODS
+sensor = quiver_physical(3.25)
+codes = sensor.sample(photons, 5e-4, key=Key(0, 0))
+def once():
+    METHODS["qbp-bm3d"].restore(codes, sensor, 5e-4)
+"""
+MERGENET = """
+from qsim.sensor.devices import quiver_physical
+from quiver.data.codes import array_codes
+from quiver.restoration.restorers import restorer
+sensor = quiver_physical(3.25)
+codes = array_codes(sensor.sample(photons, 5e-4, key=Key(0, 0)), sensor, 5e-4)
+method = restorer("mergenet")
+def once():
+    method.restore(codes)
+"""
+
+
+def unpack(commit: str, folder: Path) -> None:
+    """Write the files of a commit. `ValueError` if this is no clone that holds it."""
+    done = subprocess.run(["git", "archive", commit], cwd=ROOT, capture_output=True, check=False)
+    if done.returncode:
+        raise ValueError(f"commit {commit} is not here; run this in a clone with the complete history")
+    with tarfile.open(fileobj=io.BytesIO(done.stdout)) as archive:
+        archive.extractall(folder, filter="data")
+
+
+class Program:
+    """One program that runs once for every line on its input."""
+
+    def __init__(self, text: str, folder: Path, size: tuple[int, int], frames: int) -> None:
+        words = [sys.executable, "-W", "ignore", "-c", LIGHT + text + LOOP, *map(str, (*size, frames))]
+        self.process = subprocess.Popen(
+            words, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment(folder)
+        )
+
+    def run(self) -> tuple[float, float]:
+        """Return the seconds of one run, and the most memory so far [bytes]."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        line = self.process.stdout.readline().split()
+        if len(line) != 2:
+            raise ValueError(f"a program ended with exit code {self.process.wait()}; its message stands above")
+        return float(line[0]), float(line[1])
+
+    def close(self) -> None:
+        """End the program."""
+        self.process.communicate()
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """Return the environment of a program whose modules lie in a folder."""
+    return {**os.environ, "PYTHONPATH": str(folder)}
+
+
+def main(words: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=3, help="counted runs of each program (default 3)")
+    parser.add_argument("--size", default="512x1024", help="HEIGHTxWIDTH, up to 512x1024 (default)")
+    parser.add_argument("--busy", action="store_true", help="measure beside other programs; the page says so")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "restorer_cost.md", help="page")
+    args = parser.parse_args(words)
+    height, _, width = args.size.partition("x")
+    try:
+        size = int(height), int(width)
+        if not args.busy:
+            rows.refuse_busy()
+        with tempfile.TemporaryDirectory() as folder:
+            unpack(OLD, Path(folder))
+            found = measured(Path(folder), size, args.runs)
+    except ValueError as error:
+        print(f"restorer_cost: {error}", file=sys.stderr)
+        return 2
+    text = page(found, args.size, args.busy)
+    write_bytes(args.out, text.encode())
+    print(text)
+    return 0
+
+
+def measured(old: Path, size: tuple[int, int], runs: int) -> dict[str, list[tuple[float, float]]]:
+    """Return seconds per frame and memory of the counted runs of both programs."""
+    programs = {
+        f"QBP + BM3D of {OLD}": Program(QBP, old, size, FRAMES),
+        "mergenet": Program(MERGENET, ROOT, size, FRAMES),
+    }
+    found: dict[str, list[tuple[float, float]]] = {name: [] for name in programs}
+    for turn in range(runs + 1):
+        for name, program in programs.items():
+            seconds, memory = program.run()
+            if turn:
+                found[name].append((seconds / FRAMES, memory))
+    for program in programs.values():
+        program.close()
+    return found
+
+
+def page(found: dict[str, list[tuple[float, float]]], size: str, busy: bool) -> str:
+    """Return the page of both programs."""
+    old, own = (median(seconds for seconds, _ in runs) for runs in found.values())
+    table = [
+        (
+            name,
+            f"{median(s for s, _ in runs):.2f}",
+            " ".join(f"{s:.2f}" for s, _ in runs),
+            f"{runs[-1][1] / 1e6:.0f} MB",
+        )
+        for name, runs in found.items()
+    ]
+    text = ["# What the restorer costs", "", "    python docs/restorer_cost.py", ""]
+    text += [f"Seconds per frame of {size}, eleven frames at 3 bits and 3.25 PPP, both programs in turn.", ""]
+    text += [*markdown_table(table, ("program", "median [s]", "runs [s]", "most memory of the process")), ""]
+    text += [f"Ratio of the medians: {old / own:.2f}. Machine: {rows.machine()}.", ""]
+    return "\n".join([*text, *(["Measured beside other programs.", ""] if busy else [])])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

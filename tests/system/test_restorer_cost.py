@@ -1,0 +1,40 @@
+"""The program that times the restorer beside an older commit: it runs both, and states the ratio of medians."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "docs"))
+
+import restorer_cost  # noqa: E402  (docs are not a package)
+
+
+def test_the_ratio_is_that_of_the_medians():
+    found = {"old": [(6.0, 1e9), (9.0, 1e9), (6.6, 1e9)], "own": [(2.0, 5e8), (2.2, 5e8), (8.0, 5e8)]}
+    text = restorer_cost.page(found, "512x1024", busy=False)
+    assert "Ratio of the medians: 3.00." in text
+    assert "| own | 2.20 | 2.00 2.20 8.00 | 500 MB |" in text
+    assert "beside other programs" not in text
+    assert "Measured beside other programs." in restorer_cost.page(found, "512x1024", busy=True)
+
+
+def test_mistakes_are_one_sentence(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(restorer_cost, "OLD", "0" * 40)
+    assert restorer_cost.main(["--busy", "--size", "32x32", "--out", str(tmp_path / "cost.md")]) == 2
+    assert "run this in a clone with the complete history" in capsys.readouterr().err
+    assert restorer_cost.main(["--busy", "--size", "32", "--out", str(tmp_path / "cost.md")]) == 2
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_both_programs_run(tmp_path):
+    if subprocess.run(["git", "cat-file", "-e", restorer_cost.OLD], cwd=ROOT, check=False).returncode:
+        pytest.skip(f"commit {restorer_cost.OLD} is not in this clone")
+    words = ["--busy", "--runs", "1", "--size", "32x32", "--out", str(tmp_path / "cost.md")]
+    assert restorer_cost.main(words) == 0
+    assert "Ratio of the medians" in (tmp_path / "cost.md").read_text()
