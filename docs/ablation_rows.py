@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from rows import LIGHTS, TINY, Budget, check_row, make_row, notes_on, scores
+from rows import LIGHTS, TINY, Budget, check_row, make_row, notes_on, options, scores
 
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
@@ -29,7 +29,6 @@ from quiver.model.quiver import QUIVER
 from quiver.training.loop import train
 from quiver.training.settings import PROTOCOLS, Settings
 
-ROOT = Path(__file__).parents[1]
 FORMAT = "quiver-ablation-1"
 MILLION = Config(channels=4, deformable_groups=4, denoiser_growth=8, flow_channels=(20, 40, 20, 10))
 SEEDS = (0, 1)
@@ -39,7 +38,7 @@ is the only measure of chance here: differences within it mean nothing."""
 
 
 def main(words: list[str] | None = None) -> int:
-    args = options().parse_args(words)
+    args = options(__doc__, "ablation_rows", ABLATIONS).parse_args(words)
     budget, names = TINY if args.tiny else Budget(minutes=20.0), args.rows.split(",")
     unknown = sorted(set(names) - set(ABLATIONS))
     if unknown:
@@ -58,21 +57,6 @@ def main(words: list[str] | None = None) -> int:
         print(f"ablation_rows: {error}", file=sys.stderr)
         return 2
     return 0
-
-
-def options() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, help="data set with splits train, val and test")
-    parser.add_argument("--rows", default=",".join(ABLATIONS), help="comma-separated (default all six)")
-    parser.add_argument(
-        "--out", type=Path, default=ROOT / "docs" / "results" / "ablation_rows", help="folder of the rows"
-    )
-    parser.add_argument(
-        "--work", type=Path, default=Path("out/ablation_rows"), help="folder of runs, which can be deleted"
-    )
-    parser.add_argument("--tiny", action="store_true", help="seconds for each row, on tiny crops and any cores")
-    parser.add_argument("--busy", action="store_true", help="make rows on busy cores too, and mark them")
-    return parser
 
 
 def network(name: str, seed: int, args: argparse.Namespace, budget: Budget) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rows import LIGHTS, TINY, Budget, check_row, interval, make_row, notes_on, quiver, scores
+from rows import LIGHTS, TINY, Budget, check_row, interval, make_row, notes_on, options, quiver, scores
 
 from qsim.figures import new_figure, write_figure
 from qsim.files import read_json, write_bytes
@@ -32,7 +32,6 @@ from qsim.tables import markdown_table
 from quiver.cli.options import NETWORKS
 from quiver.evaluation.breakdown import bin_names
 
-ROOT = Path(__file__).parents[1]
 FORMAT = "quiver-equal-budget-2"
 CLASSICAL = ("moment:3", "moment", "transform-denoise", "qbp", "qbp-bm3d", "path-merge")
 FLOOR = "moment:3"  # a network below it is given no rank
@@ -45,7 +44,7 @@ the same time, and recurrent ones learn late. A row states what a design gives f
 
 
 def main(words: list[str] | None = None) -> int:
-    args = options().parse_args(words)
+    args = parser().parse_args(words)
     budget, names = TINY if args.tiny else Budget(), args.rows.split(",")
     unknown = sorted(set(names) - {"classical", *NETWORKS})
     if unknown:
@@ -74,22 +73,13 @@ def main(words: list[str] | None = None) -> int:
     return 0
 
 
-def options() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, help="data set with splits train, val and test")
+def parser() -> argparse.ArgumentParser:
+    """Return the options of this program."""
     left_out = ("bit2bit", "bit2bit-1m")  # trained on the stream that they restore
     names = ["classical", *(n for n in NETWORKS if n not in left_out and not n.endswith("-as-published"))]
-    parser.add_argument("--rows", default=",".join(names), help="comma-separated (default all)")
-    parser.add_argument(
-        "--out", type=Path, default=ROOT / "docs" / "results" / "equal_budget", help="folder of the rows"
-    )
-    parser.add_argument(
-        "--work", type=Path, default=Path("out/equal_budget"), help="folder of runs, which can be deleted"
-    )
-    parser.add_argument("--budget-seconds", type=float, help="another budget than 30 minutes, for trying this program")
-    parser.add_argument("--tiny", action="store_true", help="seconds for each row, on tiny crops and any cores")
-    parser.add_argument("--busy", action="store_true", help="make rows on busy cores too, and mark them")
-    return parser
+    made = options(__doc__, "equal_budget", names)
+    made.add_argument("--budget-seconds", type=float, help="another budget than 30 minutes, for trying this program")
+    return made
 
 
 # ---- Rows

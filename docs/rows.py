@@ -8,13 +8,14 @@ so busy cores are refused before a row begins, and a row states how many cores o
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ import torch
 
 from qsim.files import VERSION, read_json, write_json
 
+ROOT = Path(__file__).parents[1]
 LIGHTS = ("3.25", "1", "9.75", "26")  # photons per pixel; training is at the first
 QUIET = 0.1  # cores that other programs may use
 WATCH = 3.0  # s, before a row begins
@@ -172,6 +174,18 @@ def notes_on(rows: list[dict[str, Any]]) -> list[str]:
 
 
 # ---- Commands
+
+
+def options(text: str | None, folder: str, names: Iterable[str]) -> argparse.ArgumentParser:
+    """Return the options of a program whose rows are networks; `folder` holds the rows and, elsewhere, the runs."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, help="data set with splits train, val and test")
+    parser.add_argument("--rows", default=",".join(names), help="comma-separated (default all)")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / folder, help="folder of the rows")
+    parser.add_argument("--work", type=Path, default=Path("out") / folder, help="folder of runs, which can be deleted")
+    parser.add_argument("--tiny", action="store_true", help="seconds for each row, on tiny crops and any cores")
+    parser.add_argument("--busy", action="store_true", help="make rows on busy cores too, and mark them")
+    return parser
 
 
 def quiver(*words: object, budget: Budget) -> None:
