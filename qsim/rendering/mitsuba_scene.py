@@ -48,10 +48,14 @@ class Stage:
         self._placed: dict[str, bytes] = {}
         self._normals: dict[str, Array] = {}  # of smooth bodies that moved; replace those of Mitsuba
         self._rest_normals: dict[str, Array] = {}
+        self._time: float | None = None  # of the last placement [s]
         self._steady = {name: self._emission(name) for name in scene.flickers}
 
     def place(self, t: float) -> None:
         """Move everything to time t [s]; parameters equal to those of the last call are not set again."""
+        if t == self._time:  # an update costs as much as a sample per pixel of a small frame, also if nothing changed
+            return
+        self._time = None  # until all is placed
         for i, body in enumerate(self.scene.bodies):
             if body.motion is not None:
                 self._place_body(f"body{i}", body, t)
@@ -69,6 +73,7 @@ class Stage:
                 self._parameters[key] = normals.ravel()
             self._normals.clear()
             self._parameters.update()
+        self._time = t
 
     def light(self, start: float, stop: float) -> None:
         """Set every flickering light to its mean strength over the times from `start` to `stop` [s]."""

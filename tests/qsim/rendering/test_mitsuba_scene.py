@@ -149,3 +149,30 @@ def test_glass_renders_and_a_clear_pane_keeps_the_light_of_a_furnace():
     pane = Body("pane", square(2), Dielectric(thin=True))
     frame = renderer(scene(pane), budget=Budget(32, 4)).frame(0)
     np.testing.assert_allclose(frame.radiance, 0.7, rtol=1e-3)
+
+
+def test_a_scene_is_updated_once_per_time(monkeypatch):
+    """Light, surfaces and ground truth of a frame share its placement, also after an interruption."""
+    one = renderer(plate(Spin((0, 0, 1), 20.0)), budget=CHEAP)
+    parameters = type(one.mi.traverse(one.stage.loaded))
+    update, calls = parameters.update, []
+
+    def counted(self, *values):
+        calls.append(1)
+        return update(self, *values)
+
+    def interrupted(self, *values):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(parameters, "update", counted)
+    one.frame(3)  # leaves the scene at frame 4
+    calls.clear()
+    one.frame(4)
+    assert len(calls) == 1
+    monkeypatch.setattr(parameters, "update", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        one.stage.place(one.time(9))
+    monkeypatch.setattr(parameters, "update", counted)
+    calls.clear()
+    one.stage.place(one.time(5))
+    assert calls
