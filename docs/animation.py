@@ -3,8 +3,8 @@
 python docs/animation.py docs/pictures/demo.webp     # about three minutes of processor time
 
 A scene of the family `text` is rendered and sensed at 3.25 photons per pixel with 1 bit and with 3 bits. `mergenet` was
-trained on photographs, on nothing rendered. All panels show photons on one tone curve. PSNR is that of `quiver.score`
-over the complete clip: peak 2.5 times the mean light.
+trained on photographs and on rendered scenes of other families. All panels show photons on one tone curve. PSNR is that
+of `quiver.score` over the complete clip: peak 2.5 times the mean light.
 """
 
 from __future__ import annotations
