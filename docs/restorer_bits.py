@@ -124,7 +124,7 @@ def page(found: Array, scenes: int, size: int, weights: str) -> str:
     """Return the page of all numbers."""
     best = np.take(BITS, found.argmax(-1))
     three = BITS.index(3)
-    text = ["# The best bit depth with the default restorer", "", "    python docs/restorer_bits.py", ""]
+    text = ["# The best bit depth with the default restorer", "", "Made by `python docs/restorer_bits.py`.", ""]
     text += [f"Mean over {scenes} scenes of {size} x {size} px in which photographs slide before one another; "
              f"weights {weights[:12]}. PSNR is matched, peak 2.5 times the mean light. Light is counted in photons per "
              "pixel and plane of 0.1 ms, alike for all depths, motion in px per 3-bit code.", ""]  # fmt: skip
@@ -152,12 +152,13 @@ def draw(found: Array, path: Path) -> None:
     shown = axes.imshow(best, cmap="viridis", vmin=BITS[0], vmax=BITS[-1], aspect="auto", origin="lower")
     for (i, j), bits in np.ndenumerate(best):
         lost = found[i, j].max() - found[i, j, BITS.index(3)]
-        axes.text(j, i, f"{bits}\n{-lost:.1f} dB", ha="center", va="center", color="black" if bits > 3 else "white")
+        text = f"{bits}" if bits == 3 else f"{bits}\n3: {-lost:.1f} dB"
+        axes.text(j, i, text, ha="center", va="center", color="black" if bits > 3 else "white")
     axes.set_xticks(range(len(LIGHTS)), [f"{p:g}" for p in LIGHTS])
     axes.set_yticks(range(len(MOTION)), [f"{m:g}" for m in MOTION])
     axes.set_xlabel("photons per pixel and plane")
     axes.set_ylabel("px per 3-bit code")
-    figure.colorbar(shown, label="best bits; below it what three bits lose", ticks=BITS)
+    figure.colorbar(shown, label="best bits; below it three bits beside it", ticks=BITS)
     write_figure(figure, path)
 
 

@@ -128,7 +128,7 @@ def page(found: dict[str, Any]) -> str:
     text = [
         "# The restorer: shifts, real photons, crops",
         "",
-        "    python docs/restorer_checks.py out/restorer_test COUNTS.npy",
+        "Made by `python docs/restorer_checks.py out/restorer_test COUNTS.npy`.",
         "",
     ]
     text += [f"Weights {found['weights'][:12]}.", "", "## A shift by one pixel", ""]

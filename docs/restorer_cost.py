@@ -155,7 +155,7 @@ def page(found: dict[str, list[tuple[float, float]]], size: str, busy: bool) -> 
         )
         for name, runs in found.items()
     ]
-    text = ["# What the restorer costs", "", "    python docs/restorer_cost.py", ""]
+    text = ["# What the restorer costs", "", "Made by `python docs/restorer_cost.py`.", ""]
     text += [f"Seconds per frame of {size}, eleven frames at 3 bits and 3.25 PPP, both programs in turn.", ""]
     text += [*markdown_table(table, ("program", "median [s]", "runs [s]", "most memory of the process")), ""]
     text += [f"Ratio of the medians: {old / own:.2f}. Machine: {rows.machine()}.", ""]

@@ -161,8 +161,10 @@ def write_tables(out: Path, names: Sequence[str], clips: Sequence[str]) -> None:
     gains = [own - rival for _, own, _, rival, _ in rows]
     lost = [name for (name, *_), gain in zip(rows, gains, strict=True) if gain < 0]
     text = ["# The restorer against every classical method", ""]
-    text += ["    qsim generate scenes/restorer_test.toml -o out/restorer_test"]
-    text += ["    python docs/restorer_grid.py out/restorer_test", ""]
+    text += [
+        "Made by `python docs/restorer_grid.py out/restorer_test` on the clips of `scenes/restorer_test.toml`.",
+        "",
+    ]
     text += [f"Matched PSNR in dB, peak 2.5 times the mean light, mean over {len(clips)} clips, "
              f"{cells[0]['frames']} frames of each. Weights: {cells[0]['weights'][:12]}.", ""]  # fmt: skip
     text += [f"Mean over {len(rows)} cells: {np.mean(gains):+.2f} dB. Least: {min(gains):+.2f} dB. Below the best "

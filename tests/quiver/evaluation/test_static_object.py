@@ -73,8 +73,8 @@ def test_an_ideal_counter_counts():
     np.testing.assert_allclose(restorer("naive:1").restore(codes), 3.0)
 
 
-def test_the_shipped_weights_win_on_real_photons():
-    """They must not darken what nears saturation: a crop in which a fifth of the pixels fill the 3-bit code."""
+def test_the_shipped_weights_do_not_darken_what_nears_saturation():
+    """Real photons, a crop in which a fifth of the pixels fill the 3-bit code."""
     counts = read_counts(HAZELNUT)
     crop = replace(counts, frames=counts.frames[:, 64:192, 64:192])
     methods = restorers(["transform-denoise", "qbp-bm3d", "mergenet"])
