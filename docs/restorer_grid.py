@@ -206,7 +206,8 @@ def draw(gains: dict[str, float], path: Path) -> None:
     shown = axes.imshow(grid, cmap="RdBu", vmin=-most, vmax=most, aspect="auto")
     for (y, x), gain in np.ndenumerate(grid):
         if math.isfinite(gain):
-            axes.text(x, y, f"{gain:+.1f}", ha="center", va="center")
+            shade = "white" if abs(gain) > 0.7 * most else "black"
+            axes.text(x, y, f"{gain:+.1f}", ha="center", va="center", color=shade)
     axes.set_xticks(range(len(LIGHTS)), [f"{ppp:g}" for ppp in LIGHTS])
     axes.set_yticks(range(len(BITS)), [str(b) for b in BITS])
     axes.set_xlabel("photons per pixel and code")
