@@ -38,7 +38,8 @@ CLASSICAL = ("naive", "moment", "transform-denoise", "qbp", RIVAL)
 SHIFTED = (Illumination("quiver-physical", 3.25, 3), Illumination("quiver-physical", 26.0, 3))
 SHOWN = (0.5, 3.25, 26.0, 100.0)  # photons per pixel, 3 bits
 WINDOW = 11  # frames of real photons
-SPLITS = 6  # into those and the truth, for the brightness
+SCORED = 3  # splits into those and the truth, for the scores
+SPLITS = 6  # likewise, for the brightness
 EDGE = 8  # px that are not compared
 CAPTION = 18  # px above a crop
 QUALITY = 85
@@ -174,7 +175,7 @@ def main(words: list[str] | None = None) -> int:
             )
         counts = read_counts(args.counts)
         names = [*CLASSICAL, args.restorer]
-        scores = evaluate_static(counts, restorers(names), bits=args.bits)
+        scores = evaluate_static(counts, restorers(names), frames=WINDOW, bits=args.bits, splits=SCORED)
         found = {
             "format": "quiver-restorer-checks-1",
             "quiver": VERSION,

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -109,9 +110,10 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--busy", action="store_true", help="measure beside other programs; the page says so")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "restorer_cost.md", help="page")
     args = parser.parse_args(words)
-    height, _, width = args.size.partition("x")
     try:
-        size = int(height), int(width)
+        size = sides(args.size)
+        if args.runs < 1:
+            raise ValueError(f"--runs {args.runs}: give at least 1")
         if not args.busy:
             rows.refuse_busy()
         with tempfile.TemporaryDirectory() as folder:
@@ -124,6 +126,15 @@ def main(words: list[str] | None = None) -> int:
     write_bytes(args.out, text.encode())
     print(text)
     return 0
+
+
+def sides(text: str) -> tuple[int, int]:
+    """Return height and width of HEIGHTxWIDTH; `ValueError` for anything else, and beyond the photograph."""
+    match = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
+    found = [int(part) for part in match.groups()] if match else []
+    if not found or not 16 <= found[0] <= 512 or not 16 <= found[1] <= 1024:
+        raise ValueError(f"--size {text}: give HEIGHTxWIDTH from 16x16 to 512x1024")
+    return found[0], found[1]
 
 
 def measured(old: Path, size: tuple[int, int], runs: int) -> dict[str, list[tuple[float, float]]]:

@@ -102,6 +102,9 @@ def grow(path: Path, place: Place, clips: Sequence[Clip], args: argparse.Namespa
     changed = [key for key, value in same.items() if found.get(key) != value]
     if changed:
         raise ValueError(f"{path}: was measured with another {', '.join(changed)}; choose another --out, or remove it")
+    foreign = sorted(set(found["scores"]) - {clip.name for clip in clips})
+    if foreign:
+        raise ValueError(f"{path}: holds clips that {args.data} lacks, as {foreign[0]}; choose another --out")
     if any(found.get(key) != value for key, value in tried.items()):
         for rows in found["scores"].values():
             rows.pop("restorer", None)

@@ -27,7 +27,11 @@ def test_mistakes_are_one_sentence(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(restorer_cost, "OLD", "0" * 40)
     assert restorer_cost.main(["--busy", "--size", "32x32", "--out", str(tmp_path / "cost.md")]) == 2
     assert "run this in a clone with the complete history" in capsys.readouterr().err
-    assert restorer_cost.main(["--busy", "--size", "32", "--out", str(tmp_path / "cost.md")]) == 2
+    for words in (["--size", "32"], ["--size", "600x1024"], ["--size", "axb"], ["--size", "8x8"], ["--runs", "0"]):
+        assert restorer_cost.main(["--busy", *words, "--out", str(tmp_path / "cost.md")]) == 2
+        told = capsys.readouterr().err
+        assert " ".join(words) + ": give" in told
+        assert told.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 

@@ -123,6 +123,10 @@ def test_only_what_is_missing_is_measured(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert restorer_grid.main([*words[:3], "--frames", "3", *words[5:]]) == 2
     assert "was measured with another frames" in capsys.readouterr().err
+    told["scores"]["elsewhere"] = {}
+    path.write_text(json.dumps(told))
+    assert restorer_grid.main(words) == 2
+    assert "holds clips that" in capsys.readouterr().err
 
 
 @pytest.mark.slow
