@@ -6,10 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from golden import SMALL
 from torch import nn
 
-from quiver.model.config import Config
+from quiver.model.mergenet import MergeNet, MergeNetConfig
 from quiver.model.quiver import QUIVER
+from quiver.model.rivals.bit2bit import Bit2Bit, Bit2BitConfig
 from quiver.model.rivals.emvd import EMVD, EMVDConfig
 from quiver.model.rivals.fastdvdnet import FastDVDnet, FastDVDnetConfig
 from quiver.model.rivals.flornn import FloRNN, FloRNNConfig
@@ -37,9 +39,9 @@ def same_weights(a: nn.Module, b: nn.Module) -> bool:
     return all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
 
 
-TINY: dict[str, Callable[[], nn.Module]] = {  # a small network of every system that the loop trains
+TINY: dict[str, Callable[[], nn.Module]] = {  # a small network of every system that is trained on clips
     "unet": lambda: UNet(UNetConfig(4)),
-    "quiver": lambda: QUIVER(Config(channels=16, cell_growth=2)),
+    "quiver": lambda: QUIVER(SMALL),
     "emvd": lambda: EMVD(EMVDConfig(width=4)),
     "fastdvdnet": lambda: FastDVDnet(FastDVDnetConfig(width=4)),
     "student-teacher": lambda: StudentTeacher(StudentTeacherConfig(width=4, blocks=1)),
@@ -47,13 +49,15 @@ TINY: dict[str, Callable[[], nn.Module]] = {  # a small network of every system 
     "memdeblur": lambda: MemDeblur(MemDeblurConfig(width=8, forward_blocks=1, backward_blocks=1)),
     "rvrt": lambda: RVRT(RVRTConfig(width=6, flow_levels=1)),
     "spk2imgnet": lambda: Spk2ImgNet(Spk2ImgNetConfig(width=8, blocks=1)),
+    "mergenet": lambda: MergeNet(MergeNetConfig(4)),
 }
+EVERY = TINY | {"bit2bit": lambda: Bit2Bit(Bit2BitConfig(width=4))}  # and of the one that is trained on a stream
 
 
 def tiny(name: str, seed: int = 0) -> nn.Module:
     """Return a small network of a system, with its random weights."""
     torch.manual_seed(seed)
-    return TINY[name]()
+    return EVERY[name]()
 
 
 def tiny_settings(network: nn.Module, data: Path, out: Path, **changes: object) -> Settings:

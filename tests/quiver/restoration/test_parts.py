@@ -1,12 +1,8 @@
-"""Networks that take clips: every frame of any clip, the same in ranges and parts, within the memory, as stated."""
+"""Networks that take clips: every frame of any clip, the same in ranges and parts."""
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-import warnings
 from dataclasses import replace
 from typing import ClassVar
 
@@ -15,22 +11,21 @@ import pytest
 import torch
 from numpy import ndarray as Array
 from random_codes import random_codes
-from runs import TINY, tiny
+from runs import EVERY, tiny
 from torch import Tensor, nn
 
 from qsim.sensor.qis import QIS
 from quiver.cli.program import main
 from quiver.data.codes import Codes
 from quiver.data.noise import noise_table
-from quiver.model.presets import OTHERS, build
+from quiver.model.presets import build
 from quiver.model.rivals.edges import reflected
 from quiver.model.weights import save
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import network_restorer, wrap_network
 from quiver.restoration.parts import part_of, takes_clips
-from quiver.restoration.pieces import bytes_per_pixel
 
-CLIPS = [name for name in TINY if takes_clips(tiny(name))]
+CLIPS = [name for name in EVERY if takes_clips(tiny(name))]
 
 
 class Means(nn.Module):
@@ -135,77 +130,6 @@ def test_the_noise_of_the_stream_is_that_of_its_sensor(name):
     assert np.abs(restored(network, five) - wanted).max() > 1e-3 * five.white
     with pytest.raises(ValueError, match="does not rise with light"):
         restored(tiny(name), replace(three, sensor=QIS(0.8, 1e9, 0.2, 3)))
-
-
-@pytest.mark.parametrize("name", CLIPS)
-def test_it_looks_ahead_as_far_as_it_says(name, tmp_path):
-    """A frame beyond the stated future changes nothing; the description states the future."""
-    network, codes = tiny(name).eval(), random_codes(40, 8, 8)
-    method, part = wrap_network(network, name, "a network", RestoreOptions()), part_of(network)
-    assert method.look_ahead == part.future
-    assert method.window == part.past + 1 + part.future
-    assert method.description == f"a network; look-ahead {part.future} frames"
-    stack = codes.read(0, 40).copy()
-    stack[9 + part.future + 1 :] = 7 - stack[9 + part.future + 1 :]
-    changed = Codes(**vars(codes) | {"read": lambda start, stop: stack[start:stop]})
-    np.testing.assert_array_equal(method.restore(changed, 8, 10), method.restore(codes, 8, 10))
-
-
-@pytest.mark.parametrize("name", [name for name in CLIPS if not hasattr(tiny(name), "reach")])  # others: exact
-def test_a_frame_beyond_the_memory_is_cut_with_a_word(name):
-    network, codes = tiny(name).eval(), random_codes(2, 96, 130)
-    whole = restored(network, codes, RestoreOptions(memory=10**12))
-    memory = bytes_per_pixel(network, "exact") * 9_000
-    with pytest.warns(UserWarning, match="differ where they overlap by .* avoids the cut") as caught:
-        cut = restored(network, codes, RestoreOptions(memory=memory))
-    assert np.isfinite(cut).all()
-    assert np.sqrt(np.mean((cut - whole) ** 2)) < 0.5 * codes.white
-    needed = int(str(caught[0].message).rpartition("--memory ")[2].partition("MB")[0]) * 10**6
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        np.testing.assert_array_equal(restored(network, codes, RestoreOptions(memory=needed)), whole)
-
-
-@pytest.mark.parametrize("name", CLIPS)
-def test_half_precision_stays_near(name):
-    network, codes = tiny(name).eval(), random_codes(3, 16, 16)
-    full, low = (restored(network, codes, RestoreOptions(precision=p)) for p in ("float32", "bfloat16"))
-    assert 0 < np.abs(low - full).max() < 0.2 * max(codes.white, np.abs(full).max())
-
-
-MEMORY_PROGRAM = """
-import warnings
-import numpy as np
-import torch
-from qsim.process import peak_memory, reset_peak
-from quiver.data.codes import array_codes
-from quiver.data.illumination import Illumination
-from quiver.model.presets import build
-from quiver.restoration.interface import RestoreOptions
-from quiver.restoration.networks import wrap_network
-warnings.simplefilter("ignore")
-torch.set_num_threads(1)
-sensor = Illumination().device(5e-4)
-codes = array_codes(np.random.default_rng(0).integers(0, 8, (40, 256, 256), dtype=np.uint8), sensor, 5e-4)
-method = wrap_network(build("{name}"), "n", "", RestoreOptions(memory={memory}))
-before = reset_peak()
-method.restore(codes, 16, 18)
-print(peak_memory() - before)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in OTHERS if "-" not in name])
-def test_the_memory_bound_holds(name):
-    """400 MB for frames of 256 x 256 px; peak of resident pages, in a separate process."""
-    run = subprocess.run(
-        [sys.executable, "-c", MEMORY_PROGRAM.format(name=name, memory=400_000_000)],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )
-    assert int(run.stdout) < 1.1 * 400_000_000
 
 
 def test_weights_are_restored_and_scored_by_the_commands(tiny_dataset, tmp_path, capsys):
