@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import random
 import time
@@ -12,6 +13,7 @@ import pytest
 import torch
 from golden import TINY
 from hostile import MEMORY, VALUES, one_line, patience
+from runs import EVERY
 from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import nn
@@ -33,17 +35,12 @@ def notes(path: Path) -> dict[str, str]:
         return file.metadata()
 
 
-@pytest.mark.parametrize(
-    "build",
-    [
-        lambda: QUIVER(Config(16, pre_denoiser=False, cell_growth=3)),
-        lambda: QUIVER(TINY),
-        lambda: UNet(UNetConfig(4)),
-    ],
-    ids=["quiver", "small", "unet"],
-)
-def test_saved_networks_come_back_the_same(tmp_path: Path, build):
-    network = build()
+SAVED = EVERY | {"ablated": lambda: QUIVER(Config(16, pre_denoiser=False, cell_growth=3))}
+
+
+@pytest.mark.parametrize("name", SAVED)
+def test_saved_networks_come_back_the_same(tmp_path: Path, name):
+    network = SAVED[name]()
     path = tmp_path / "w.safetensors"
     save(network, network.config, path, notes={"steps": "12"})
     back = load(path)
@@ -162,6 +159,20 @@ def test_any_value_of_any_key_of_a_configuration(tiny, tmp_path, key):
         save_file(tiny, path, {"format": "quiver-1", "network": "QUIVER", "config": config})
         if not refused_or_loaded(path):
             assert load(path).config == Config.from_dict(wanted | {key: value})
+
+
+@pytest.mark.parametrize("name", [name for name in EVERY if name != "quiver"])
+def test_any_value_of_any_key_of_a_configuration_of_any_network(tmp_path, name):
+    """As for QUIVER above."""
+    network, path = EVERY[name](), tmp_path / "w.safetensors"
+    weights = {key: value.contiguous() for key, value in network.state_dict().items()}
+    for key, value in itertools.product(network.config.to_dict(), VALUES):
+        config = network.config.to_dict() | {key: value}
+        save_file(
+            weights, path, {"format": "quiver-1", "network": type(network).__name__, "config": json.dumps(config)}
+        )
+        if not refused_or_loaded(path):
+            assert load(path).config == type(network.config).from_dict(config), (key, value)
 
 
 @pytest.mark.parametrize("kind", ["QUIVER", "FoldedQUIVER"])
