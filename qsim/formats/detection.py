@@ -44,6 +44,8 @@ ASSUMED: dict[str, tuple[str, str]] = {
 }
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv")
 PICTURES = {".png": "png", ".tif": "tiff", ".tiff": "tiff"}
+ZARR = ("zarr.json", ".zgroup", ".zarray")
+PARTS = (*PICTURES, ".json", ".db", ".mat", ".bin", ".npy")  # kinds of files that make a folder a single recording
 _SMALL = 8_388_608  # bytes that three raw layouts share
 
 
@@ -70,18 +72,20 @@ def detect(path: Path) -> str:
 def recordings(folder: Path, layout: str | None) -> list[Path]:
     """Return the recordings below a folder: videos at any depth (I2-2000FPS), or folders of pictures (X4K).
 
-    Empty if `folder` is a file or a single recording.
+    Empty if `folder` is a file or a single recording. Hidden files, and notes and archives beside the folders of
+    pictures, are left out.
     """
     if not folder.is_dir() or layout not in (None, "video", "png", "tiff"):
         return []
+    files = [file for file in folder.rglob("*") if not file.name.startswith(".")]
     if layout in (None, "video"):
-        videos = sorted(file for file in folder.rglob("*") if file.suffix.lower() in VIDEOS)
+        videos = sorted(file for file in files if file.suffix.lower() in VIDEOS)
         if videos or layout == "video":
             return videos
-    if any(item.is_file() for item in folder.iterdir()):
+    if any(item.is_file() and (item.suffix.lower() in PARTS or item.name in ZARR) for item in folder.iterdir()):
         return []
     kinds = (layout,) if layout else ("png", "tiff")
-    places = {file.parent for file in folder.rglob("*") if PICTURES.get(file.suffix.lower()) in kinds}
+    places = {file.parent for file in files if PICTURES.get(file.suffix.lower()) in kinds}
     return sorted(place for place in places if not any(place.glob("*.npy")))
 
 
@@ -90,7 +94,7 @@ def _detect_folder(path: Path) -> str:
         return "visionsim"
     if (path / "transforms.db").is_file():
         raise ValueError(f"{path}: describes its frames in transforms.db; let visionsim write a transforms.json")
-    if any((path / name).is_file() for name in ("zarr.json", ".zgroup", ".zarray")):
+    if any((path / name).is_file() for name in ZARR):
         return "zarr"
     if (path / "info.json").is_file() or any(path.glob("part_*.mat")):
         return "mat"

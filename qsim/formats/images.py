@@ -6,6 +6,7 @@ pixel, or stretched to 0 ... 255). Colour becomes linear luminance (Rec. 709). M
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ from qsim.formats.recording import (
 
 def read_png(path: Path, hints: Hints) -> Recording:
     """Read a PNG, or a folder of PNGs in the order of their numbers; see `picture`."""
-    pictures = [path] if path.is_file() else numbered(list(path.glob("*.png")))
+    pictures = [path] if path.is_file() else _pngs(path)
     if not pictures:
         raise FileNotFoundError(f"{path}: holds no .png")
     first = _png(pictures[0])
@@ -47,15 +48,33 @@ def read_png(path: Path, hints: Hints) -> Recording:
 def read_pictures(folder: Path) -> Iterator[Array]:
     """Yield the PNGs of a folder in the order of their numbers: 8-bit grey [H, W], or red, green and blue [H, W, 3].
 
-    `ValueError` for pictures of another depth or of different sizes.
+    `ValueError` for a folder without any, for numbers that leave one out, and for pictures of another depth or of
+    different sizes.
     """
     first: Array | None = None
-    for file in numbered(list(folder.glob("*.png"))):
+    _check_complete(folder, _pngs(folder))
+    for file in _pngs(folder):
         image = _png(file)
         first = image if first is None else first
         if image.dtype != np.uint8:
             raise ValueError(f"{file}: pixels of {image.dtype}, not of 8 bits")
         yield _same_size([file], [image], first.shape, first.dtype)[0]
+
+
+def _pngs(folder: Path) -> list[Path]:
+    return numbered([file for file in folder.iterdir() if file.suffix.lower() == ".png"])
+
+
+def _check_complete(folder: Path, pictures: list[Path]) -> None:
+    """Raise `ValueError` if there are no pictures, or if their numbers, the last in each name, leave one out."""
+    if not pictures:
+        raise ValueError(f"{folder}: holds no .png; give its frames as PNG")
+    numbers = [re.findall(r"\d+", file.stem) for file in pictures]
+    for i in range(1, len(pictures)):
+        if numbers[i - 1] and numbers[i] and int(numbers[i][-1]) > int(numbers[i - 1][-1]) + 1:
+            raise ValueError(
+                f"{folder}: no frame is between {pictures[i - 1].name} and {pictures[i].name}; add what is missing"
+            )
 
 
 def read_tiff(path: Path, hints: Hints) -> Recording:

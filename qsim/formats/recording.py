@@ -69,13 +69,16 @@ def check_size(path: Path, size: int, frame_bytes: int, what: str, footer: tuple
 
 
 def numbered(paths: list[Path]) -> list[Path]:
-    """Return files in the order of the last number in their names; a text sort puts 10 before 2."""
+    """Return files in the order of the last number in their names; a text sort puts 10 before 2.
+
+    Hidden files are left out: some systems put one beside each file.
+    """
 
     def key(path: Path) -> tuple[str, int, str]:
         numbers = re.findall(r"\d+", path.stem)
         return str(path.parent), int(numbers[-1]) if numbers else -1, path.name
 
-    return sorted(paths, key=key)
+    return sorted((path for path in paths if not path.name.startswith(".")), key=key)
 
 
 def light_recording(

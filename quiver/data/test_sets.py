@@ -56,12 +56,17 @@ TEST_SETS = {
 def import_test_set(folder: Path, which: TestSet, out: Path, progress: Progress | None = None) -> list[Clip]:
     """Write the clips of a test set that OUT does not hold yet, and return all of them in the order of their names.
 
-    `ValueError` if the folder holds no recordings or one of fewer than eleven frames, or if OUT holds clips of other
-    files.
+    `FileNotFoundError` without the folder. `ValueError` if it holds no recordings, both kinds of them or one of fewer
+    than eleven frames, or if OUT holds clips of other files.
     """
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder; name the folder of the test set")
     files = recordings(folder, None)
     if not files:
         raise ValueError(f"{folder}: holds no videos and no folders of pictures; name the folder of the test set")
+    if files[0].is_file() and (pictures := recordings(folder, "png")):
+        raise ValueError(f"{folder}: holds videos and folders of pictures ({pictures[0]}); name the folder of one kind")
+    _check_names(folder, files)
     clips = []
     for done, file in enumerate(files):
         if progress is not None:
@@ -86,6 +91,15 @@ def _name(folder: Path, file: Path) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]", "_", "_".join((*place.parts[:-1], place.stem if file.is_file() else place.name)))
 
 
+def _check_names(folder: Path, files: list[Path]) -> None:
+    """Raise `ValueError` if two recordings get the same name of a clip."""
+    taken: dict[str, Path] = {}
+    for file in files:
+        other = taken.setdefault(_name(folder, file), file)
+        if other != file:
+            raise ValueError(f"{folder}: {other} and {file} would both be clip {_name(folder, file)}; rename one")
+
+
 def _imported(file: Path, target: Path, which: TestSet) -> Clip:
     """Return the clip of a recording, written now unless it is there."""
     frames = read_frames(file) if file.is_file() else read_pictures(file)
@@ -107,8 +121,9 @@ def _imported(file: Path, target: Path, which: TestSet) -> Clip:
     }
     if target.exists():
         clip = Clip.open(target)
-        if clip.meta.get("source") != meta["source"]:
-            raise ValueError(f"{target}: is a clip of {(clip.meta.get('source') or {}).get('file')}, not of {file}; "
+        if clip.meta.get("source") != meta["source"] or list(clip.shape) != meta["shape"]:
+            of = (clip.meta.get("source") or {}).get("file")
+            raise ValueError(f"{target}: is a clip of {of} with {len(clip)} frames, not of {file} with {count}; "
                              "choose another -o")  # fmt: skip
         return clip
     with ClipWriter(target, meta) as writer:

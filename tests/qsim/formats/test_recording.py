@@ -26,7 +26,7 @@ def test_numbered_files_are_read_in_the_order_of_their_numbers(tmp_path: Path):
     assert recording.shape == (22, 256, 512)
     np.testing.assert_array_equal(recording.read(0, 22), expected)
     np.testing.assert_array_equal(recording.read(5, 13), expected[5:13])
-    assert [p.name for p in numbered([Path("a10.png"), Path("a9.png"), Path("a1.png")])] == [
+    assert [p.name for p in numbered([Path("a10.png"), Path("a9.png"), Path("._a2.png"), Path("a1.png")])] == [
         "a1.png",
         "a9.png",
         "a10.png",

@@ -131,6 +131,80 @@ def test_folders_that_hold_no_window_are_refused(tmp_path, lengths, message):
     assert not (tmp_path / "out").exists()
 
 
+def stray(folder: Path) -> None:
+    """What systems and archives leave beside pictures, and pictures in capitals."""
+    first = folder / "Type1/TEST01_000_f0433"
+    for name in (".DS_Store", "README.txt", "test.zip", "Type1/.DS_Store", "__MACOSX/Type1/._0000.png"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("x")
+    (first / "._0000.png").write_text("x")
+    (first / "Thumbs.db").write_text("x")
+    (first / "0003.png").rename(first / "0003.PNG")
+
+
+def test_files_that_are_no_pictures_change_nothing(tmp_path):
+    tiny = replace(X4K, size=lambda height, width: (16, 32))
+    plain, other = (x4k(tmp_path / name, 2, frames=12) for name in ("plain", "stray"))
+    stray(other)
+    wanted, found = (import_test_set(folder, tiny, tmp_path / f"{folder.name}_out") for folder in (plain, other))
+    assert [clip.name for clip in found] == [clip.name for clip in wanted]
+    for a, b in zip(found, wanted, strict=True):
+        assert a.shape == b.shape
+        assert all(np.array_equal(a.radiance(t), b.radiance(t)) for t in range(12))
+
+
+def without_a_frame(folder: Path) -> None:
+    (folder / "Type1/TEST01_000_f0433/0005.png").unlink()
+
+
+def as_tiff(folder: Path) -> None:
+    for file in folder.rglob("*.png"):
+        Image.open(file).save(file.with_suffix(".tif"))
+        file.unlink()
+
+
+def with_a_video(folder: Path) -> None:
+    write_video(folder / "preview.mp4", iter(moving(11, 16, 16, 0)), 30, lossless=True)
+
+
+def under_two_names(folder: Path) -> None:
+    (folder / "Type1/TEST01_000_f0433").rename(folder / "Type2/TEST02 000_f0433")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (without_a_frame, r"TEST01_000_f0433: no frame is between 0004\.png and 0006\.png; add what is missing"),
+        (as_tiff, r"TEST01_000_f0433: holds no \.png; give its frames as PNG"),
+        (with_a_video, "holds videos and folders of pictures .*; name the folder of one kind"),
+        (under_two_names, "would both be clip Type2_TEST02_000_f0433; rename one"),
+    ],
+)
+def test_folders_that_would_be_read_wrongly_are_refused(tmp_path, change, message):
+    folder = x4k(tmp_path / "test", 2, frames=12)
+    change(folder)
+    with pytest.raises(ValueError, match=message):
+        import_test_set(folder, X4K, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_recording_that_grew_is_not_taken_for_its_clip(tmp_path):
+    folder = i2(tmp_path / "test", (11,))
+    import_test_set(folder, I2, tmp_path / "out")
+    write_video(folder / "test_00000.mp4", iter(moving(12, 32, 48, 0)), 30, lossless=True)
+    with pytest.raises(ValueError, match=r"with 11 frames, not of .* with 12; choose another -o"):
+        import_test_set(folder, I2, tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["none", "file"])
+def test_a_folder_that_is_none_is_told(tmp_path, name, capsys):
+    (tmp_path / "file").write_text("x")
+    words = ["evaluate", str(tmp_path / name), "-o", str(tmp_path / "out"), "--protocol", "x4k1000fps"]
+    assert main(words) == 2
+    assert "no such folder; name the folder of the test set" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_command_scores_windows_as_published(tmp_path, capsys):
     """A method that returns the mean light: its factor per window is right, its raw score is that of its brightness."""
     folder, out = i2(tmp_path / "test", (13, 11)), tmp_path / "table"
