@@ -14,6 +14,7 @@ A network contributes a file `tests/support/golden_NAME.py` with
   network, loads it (`load_published`), and returns all keys of the golden file but the inputs, in their published
   shapes and channel slices, for any batch, frame count and size. Forward hooks record stages (`Recorder`);
 - `INPUTS`: the names of the file's arrays that are inputs;
+- `FLAT`, true where codes may be [B, T, H, W] instead of [B, T, 1, H, W];
 - `MULTIPLE`, where the port takes only sides that it divides;
 - `START`, where the table has the fill `init`: published name -> start value;
 - `small() -> network`: a float64 network in evaluation mode, of the smallest width, with weights of natural size
@@ -165,8 +166,10 @@ def errors(name: str, golden: Mapping[str, np.ndarray], table: Path, prefix: str
     """
     network = importlib.import_module(f"golden_{name}")
     codes = golden["codes"]
-    if codes.dtype.kind not in "iuf" or codes.ndim not in (4, 5) or not codes.size or not np.isfinite(codes).all():
-        raise ValueError(f"codes are numbers [B, T, 1, H, W] or [B, T, H, W], got {codes.dtype} {list(codes.shape)}")
+    shaped = (codes.ndim == 5 and codes.shape[2] == 1) or (codes.ndim == 4 and getattr(network, "FLAT", False))
+    if not shaped or codes.dtype.kind not in "iuf" or not codes.size or not np.isfinite(codes).all():
+        shapes = "[B, T, H, W] or [B, T, 1, H, W]" if getattr(network, "FLAT", False) else "[B, T, 1, H, W]"
+        raise ValueError(f"codes are numbers {shapes}, got {codes.dtype} {list(codes.shape)}")
     multiple, (height, width) = getattr(network, "MULTIPLE", 1), codes.shape[-2:]
     if height % multiple or width % multiple:
         raise ValueError(f"{name} takes frames whose sides {multiple} divides, got {height} x {width}")

@@ -29,7 +29,10 @@ PUBLISHED = EMVDConfig(as_published=True)
 def stages(arrays: Mapping[str, np.ndarray], weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """One run with the noise constants of the file, one with those of the port."""
     width = len(weights["refine.net1.weight"])
-    slope, offset = (float(value) for value in arrays.get("noise_ab", PUBLISHED.published_noise))
+    noise = np.asarray(arrays.get("noise_ab", PUBLISHED.published_noise))
+    if noise.shape != (2,) or noise.dtype.kind not in "iuf":
+        raise ValueError(f"noise_ab is the slope and the offset of the noise, got {noise.dtype} {list(noise.shape)}")
+    slope, offset = (float(value) for value in noise)
     result = recorded(built(replace(PUBLISHED, width=width, published_noise=(slope, offset)), weights), arrays["codes"])
     output, _ = run(built(replace(PUBLISHED, width=width), weights), arrays["codes"])
     return {**result, "output_published_ab": output[:, -1]}

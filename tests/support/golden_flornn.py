@@ -57,6 +57,10 @@ def inputs(
         torch.from_numpy(np.asarray(arrays[key], np.float64)) for key in ("codes", "noise_map", "flow_forward",
                                                                            "flow_backward")
     )  # fmt: skip
+    for key, array, channels in (("flow_forward", forward, 2), ("flow_backward", backward, 2), ("noise_map", noise, 1)):
+        wanted = (len(codes), channels, *codes.shape[-2:])
+        if array.ndim != 5 or (len(array), *array.shape[2:]) != wanted or (key != "flow_backward" and not array.size):
+            raise ValueError(f"{key} is {[wanted[0], 'frames', *wanted[1:]]}, got {list(array.shape)}")
     length = forward.shape[1] + 1 if outputs is None else outputs + config.look_ahead
     order = reflected(0, length, codes.shape[1])
     images = (codes / 7)[:, order].expand(-1, -1, config.image_channels, -1, -1)

@@ -12,6 +12,7 @@ from quiver.model.rivals.published_names import load_published
 from quiver.model.rivals.spk2imgnet import Spk2ImgNet, Spk2ImgNetConfig
 
 INPUTS = ("codes",)
+FLAT = True
 
 
 def stages(arrays: Mapping[str, np.ndarray], weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

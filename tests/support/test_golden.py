@@ -140,6 +140,11 @@ def test_files_that_cannot_be_compared_are_one_line(tmp_path, capsys):
         "infinite": good | {"codes": np.full((1, 2, 1, 8, 8), np.inf)},
         "inputs": {"codes": codes},
         "good": good,
+        "colour": good | {"codes": codes.repeat(4, axis=2)},
+        "frames": good | {"codes": codes[:, :, 0]},
+        "noise": good | {"noise_ab": np.ones(3)},
+        "no_flow": good | {"flow_forward": np.zeros((1, 3, 2, 8, 8)), "flow_backward": np.zeros((1, 1, 3, 8, 8)),
+                           "noise_map": np.zeros((1, 2, 1, 8, 8))},
         "odd": good | {"codes": codes[:, :1]},
         "emvd": good | {"codes": codes[..., :7], "noise_ab": np.ones(2)},
         "flornn": good | {"flow_forward": np.zeros((1, 3, 2, 4, 4)), "flow_backward": np.zeros((1, 1, 2, 4, 4)),
@@ -152,7 +157,9 @@ def test_files_that_cannot_be_compared_are_one_line(tmp_path, capsys):
         ("memdeblur", "text.npz", "t.tsv", "text.npz: not readable as an archive of arrays"),
         ("memdeblur", "one.npy", "t.tsv", "one.npy: not readable as an archive of arrays"),
         ("memdeblur", "no_codes.npz", "t.tsv", "'codes' is missing; give the golden file and the table of memdeblur"),
-        ("memdeblur", "flat.npz", "t.tsv", "codes are numbers [B, T, 1, H, W] or [B, T, H, W], got uint8 [8, 8]"),
+        ("memdeblur", "flat.npz", "t.tsv", "codes are numbers [B, T, 1, H, W], got uint8 [8, 8]"),
+        ("emvd", "colour.npz", "t.tsv", "codes are numbers [B, T, 1, H, W], got uint8 [1, 2, 4, 8, 8]"),
+        ("emvd", "frames.npz", "t.tsv", "codes are numbers [B, T, 1, H, W], got uint8 [1, 2, 8, 8]"),
         ("memdeblur", "words.npz", "t.tsv", "codes are numbers"),
         ("memdeblur", "infinite.npz", "t.tsv", "codes are numbers"),
         ("memdeblur", "inputs.npz", "t.tsv", "nothing to compare: the file holds codes alone"),
@@ -172,9 +179,17 @@ def test_files_that_cannot_be_compared_are_one_line(tmp_path, capsys):
         assert message in shown.err, (file, shown.err)
         assert shown.err.startswith("golden: ")
         assert shown.err.count("\n") == 1
-    rows = write_table(FloRNN(FLORNN), tmp_path / "flornn.tsv")  # flows of another size than the codes
-    assert main(["flornn", str(tmp_path / "flornn.npz"), str(rows)]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    rows = write_table(FloRNN(FLORNN), tmp_path / "flornn.tsv")
+    for name, message in (
+        ("flornn", "flow_forward is [1, 'frames', 2, 8, 8], got [1, 3, 2, 4, 4]"),
+        ("no_flow", "flow_backward is [1, 'frames', 2, 8, 8], got [1, 1, 3, 8, 8]"),
+    ):
+        assert main(["flornn", str(tmp_path / f"{name}.npz"), str(rows)]) == 2
+        shown = capsys.readouterr().err
+        assert message in shown
+        assert shown.count("\n") == 1
+    assert main(["emvd", str(tmp_path / "noise.npz"), str(DATA / "emvd_state_dict.tsv")]) == 2
+    assert "noise_ab is the slope and the offset of the noise, got float64 [3]" in capsys.readouterr().err
 
 
 @pytest.mark.slow
