@@ -31,6 +31,12 @@ def test_shapes(seed):
     assert trained()(torch.randn(count, INPUTS, 4 * down, 4 * across)).shape == (count, 1, 4 * down, 4 * across)
 
 
+def test_frames_of_a_batch_do_not_meet():
+    network, x = trained().double(), torch.randn(2, INPUTS, 16, 24).double()
+    with torch.no_grad():
+        assert (network(x) - torch.cat([network(x[:1]), network(x[1:])])).abs().max() < 1e-12
+
+
 def test_a_pixel_depends_on_nothing_beyond_the_reach():
     network, x = trained(), torch.randn(1, INPUTS, 96, 96)
     far = torch.ones_like(x, dtype=bool)

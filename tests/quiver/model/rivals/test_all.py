@@ -62,6 +62,16 @@ def test_a_frame_uses_the_declared_future(network):
     assert differences[6] > 0
 
 
+def test_frames_beyond_the_look_ahead_need_not_be_there(network):
+    """What a network with a fixed look-ahead restores as frames come is that of the complete clip."""
+    if network.look_ahead is None:
+        return
+    frames = draw(1, network.look_ahead + 7, 1, 12, 10)
+    with torch.no_grad():
+        whole, early = network(frames), network(frames[:, : network.look_ahead + 3])
+    assert (whole[:, :3] - early[:, :3]).abs().max() < 1e-12
+
+
 def test_ends_of_time_are_reflections(network):
     """A network of windows gives the same for a clip that was reflected by hand."""
     if not hasattr(network, "windows"):
