@@ -233,6 +233,7 @@ MISTAKES = [
     ("quiver evaluate", "give a data set or clip folder and -o, or --static COUNTS"),
     ("quiver evaluate none -o x", "none: no such data set"),
     ("quiver evaluate lit -o x --protocol x4k1000fps", "lit: holds no videos and no folders of pictures; name the"),
+    ("quiver evaluate none -o x --protocol x4k1000fps", "none: no such folder; name the folder of the test set"),
     ("quiver evaluate data -o x --protocol x4k1000fps --bits 3", "--bits: --protocol x4k1000fps decides it; leave it"),
     ("quiver evaluate data -o x --methods naive,,moment", "expected names with commas between them"),
     ("quiver evaluate data -o lit", "lit exists and is not an evaluation; choose another -o"),
