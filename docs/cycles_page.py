@@ -12,7 +12,7 @@ from qsim.tables import markdown_table
 TARGET = 5.0  # times faster than the cheapest setting of Cycles that reaches the error
 HEAD = """# Beside Blender's Cycles
 
-*Written by `python docs/cycles_rows.py`, which says how; only missing rows are made.*
+*Written by `python docs/cycles_rows.py`, which says how. It makes missing rows, and marked ones again.*
 
 <!-- not run: needs Blender's bpy in a separate environment, and an hour or two -->
 ```sh
@@ -21,15 +21,14 @@ out/bpy/bin/pip install bpy==5.0.0 numpy
 python docs/cycles_rows.py --cycles out/bpy/bin/python
 ```
 
-Both programs render the same clip of 16 frames, of seed 4, with two threads. `docs/cycles_scene.py` writes it as a
-neutral file.
-`docs/cycles_render.py` imports nothing of this project and renders that file with Blender 5.0. Lacquered bodies are
-made diffuse, because the programs have different models of lacquer; metals stay metals. Cycles gets our pixel area, our
-number of bounces, no clamp and no adaptive samples. It also gets what makes it cheaper here: a scene that stays loaded
-between frames, no light tree, blue noise, and faster denoisers than its default. It renders grey as three colours.
+Both programs render the same clip of {frames} frames, of seed 4, with two threads. `docs/cycles_scene.py` writes it as
+a neutral file. `docs/cycles_render.py` imports nothing of ours and renders that file with Blender 5.0. Lacquered bodies
+are made diffuse, because the programs have different models of lacquer; metals stay metals. Cycles gets our pixel area,
+our number of bounces, no clamp and no adaptive samples. It also gets what makes it cheaper here: a scene that stays
+loaded between frames, no light tree, blue noise, and denoisers faster than its default. It renders three equal colours.
 
 Each program is judged by its own converged pictures. **reached** is in dB below white, picture and truth clamped there,
-over three frames. Ours takes a budget that asks for 40 dB. Ours and one setting of Cycles are rendered in turn. **s**
+over several frames. Ours takes a budget that asks for 40 dB. Ours and one setting of Cycles are rendered in turn. **s**
 is the median over all frames but the first, in which both programs load, in {clock}.
 """
 CONVERGED = """## Do both programs compute the same light?
@@ -66,7 +65,8 @@ def fastest(row: dict[str, Any], clock: str) -> dict[str, Any]:
 def page(rows: dict[str, dict[str, Any]]) -> str:
     """Return the page of the rows, by name."""
     clock = clock_of(rows)
-    text = [HEAD.format(clock=clock.replace("_seconds", " seconds"))]
+    frames = " or ".join(map(str, sorted({row["plan"]["frames"] for row in rows.values()})))
+    text = [HEAD.format(clock=clock.replace("_seconds", " seconds"), frames=frames)]
     text += [
         *markdown_table([summary(name, row, clock) for name, row in rows.items()], SUMMARY),
         "",
@@ -84,7 +84,10 @@ def page(rows: dict[str, dict[str, Any]]) -> str:
     machines = sorted({f"{row['processor']}, {row['plan']['threads']} threads" for row in rows.values()})
     text += ["", f"Machine: {'; '.join(machines)}."]
     if not all(row["quiet"] for row in rows.values()):
-        text += ["", f"{MARK.strip()} made beside other programs: wall seconds are not comparable; to be made again."]
+        text += [
+            "",
+            f"{MARK.strip()} made beside other programs, without wall seconds; to be made again on quiet cores.",
+        ]
     return "\n".join(text) + "\n"
 
 
@@ -131,8 +134,8 @@ def settings(row: dict[str, Any]) -> list[tuple[str, ...]]:
     """Return a line of cells for each clip of a scene."""
 
     def line(program: str, samples: str, each: dict[str, Any]) -> tuple[str, ...]:
-        seconds = (f"{each[key]:.3f}" for key in ("wall_seconds", "processor_seconds"))
-        return (program, samples, f"{each['reached']:.1f}", *seconds)
+        wall = f"{each['wall_seconds']:.3f}" if row["quiet"] else "–"
+        return (program, samples, f"{each['reached']:.1f}", wall, f"{each['processor_seconds']:.3f}")
 
     lines = [line("ours", how(each), each) for each in row["ours"]]
     return lines + [line(f"Cycles, {each['denoiser']}", str(each["samples"]), each) for each in row["cycles"]]

@@ -96,6 +96,12 @@ read by one thread, and the same windows are decoded from an mp4 by FFmpeg on al
 processor time depend less on other programs.
 """
 
+OTHER = """## Another renderer
+
+Blender's Cycles is another path tracer, by other people. On scenes with materials that both have, converged pictures of
+both are compared, and frames of equal error are timed: [beside Blender's Cycles](results/cycles.md).
+"""
+
 TESTS = """## Which test checks which claim
 
 | claim | test |
@@ -136,7 +142,7 @@ def page(found: dict[str, Any]) -> str:
             "change speeds, not errors.\n"
         )
         shown.append(section(found[what]["report"]) + "\n" + where)
-    return "\n".join([HEAD, *shown, TESTS]).rstrip() + "\n"
+    return "\n".join([HEAD, *shown, OTHER, TESTS]).rstrip() + "\n"
 
 
 def sensor(report: dict[str, Any]) -> str:

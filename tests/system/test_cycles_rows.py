@@ -192,7 +192,12 @@ AGREED = {"difference": 55.5, "as_seen": 51.0, "mean": 0.0002, "mean_error": 0.0
 
 
 def row(*, quiet: bool = True) -> dict:
-    return {"plan": {"level": 40.0, "threads": 2}, "processor": "P", "quiet": quiet, "agreement": AGREED} | {
+    return {
+        "plan": {"level": 40.0, "threads": 2, "frames": 16},
+        "processor": "P",
+        "quiet": quiet,
+        "agreement": AGREED,
+    } | {
         "ours": [OURS, OURS | {"neighbours": 2, "wall_seconds": 0.06, "processor_seconds": 0.09}],
         "cycles": SETTINGS,
     }
@@ -210,6 +215,7 @@ def test_the_page_states_ratios_the_target_and_marks():
     assert "| plain-128x256 | 8, denoised: 41.5 dB | 0.050 | 2, OIDN: 42.0 dB | 0.300 | 6.0 |" in page
     assert "as asked, is reached" in page
     assert "agree to 55.5 dB or better" in page
+    assert "clip of 16 frames" in page
     assert "beside other programs" not in page
     marked = cycles_page.page({"plain-128x256": row(quiet=False), "room-128x256": row()})
     line = "| plain-128x256 \\* | 8, 2 neighbours, denoised: 41.5 dB | 0.090 | 32, raw: 41.0 dB | 0.450 | 5.0 |"
