@@ -76,8 +76,10 @@ class MergeNet(nn.Module):
         fine = self.fine(channels.contiguous(memory_format=torch.channels_last))  # 1.2 to 1.4 times as fast on a CPU
         middle = self.middle(functional.avg_pool2d(fine, 2))
         coarse = self.coarse(functional.avg_pool2d(middle, 2))
-        middle = self.middle_again(middle + _twice(coarse))
-        restored: Tensor = self.leave(self.fine_again(fine + _twice(middle)))
+        middle = self.middle_again(_twice(coarse).add_(middle))
+        joined = _twice(middle).add_(fine)  # in place, and without the sum's parts: frames are large
+        del fine, middle
+        restored: Tensor = self.leave(self.fine_again(joined))
         return restored
 
 

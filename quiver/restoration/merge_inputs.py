@@ -74,9 +74,8 @@ def merge_inputs(merged: Merged, domain: InformationDomain) -> MergeInputs:
         known,
         *_groups(merged, around, domain),
     ]
-    return MergeInputs(
-        torch.from_numpy(np.stack(channels).astype(np.float32)), torch.from_numpy(phi), torch.from_numpy(deviation)
-    )
+    stacked = np.stack(channels, dtype=np.float32, casting="same_kind")
+    return MergeInputs(torch.from_numpy(stacked), torch.from_numpy(phi), torch.from_numpy(deviation))
 
 
 def _groups(merged: Merged, around: Array, domain: InformationDomain) -> Array:
