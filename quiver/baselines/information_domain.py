@@ -7,6 +7,9 @@ Codes are pooled first; the exact response inverts their mean, and phi of that l
 photons twice a square root. Where the mean code tells less than all codes together, the deviation is larger by a known
 factor: deviation = sqrt(V) dphi/dmu, by the delta method.
 
+Below the mean code of a dark pixel phi continues as a straight line, to negative values: cut off there, the noise of
+dark counts and of reading would on average be light.
+
 Where codes tell nothing (below a high threshold, at saturation) phi stands still while light grows: `slope` is large.
 
 Source: the root of the information as a stabiliser of variance is Fisher's; the tables are ours, from the exact law.
@@ -39,8 +42,10 @@ class InformationDomain:
     slope: Array  # [G], photons per unit of phi: the deviation of the light that one code tells
 
     def forward(self, mean_code: Array) -> Array:
-        """Return phi, float32 [...], of mean codes [...]."""
-        return np.interp(mean_code, self.mean_code, self.phi).astype(np.float32)
+        """Return phi, float32 [...], of mean codes [...]; negative below that of a dark pixel."""
+        slope = self.deviation[0] / np.sqrt(max(self.variance[0], FLOOR))  # of phi over the mean code of a dark pixel
+        below = slope * np.minimum(mean_code - self.mean_code[0], 0)
+        return (np.interp(mean_code, self.mean_code, self.phi) + below).astype(np.float32)
 
     def noise(self, mean_code: Array) -> Array:
         """Return the deviation of phi from one code, float32 [...], at mean codes [...]."""

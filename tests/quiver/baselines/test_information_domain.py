@@ -67,6 +67,35 @@ def test_the_noise_of_phi_has_the_stated_deviation(seed):
     assert float(expected) >= 0.97 / np.sqrt(codes)  # no estimate has less noise than the information allows
 
 
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        QIS(0.8, 3200.0, 0.2, 3),
+        QIS(0.8, 3200.0, 0.2, 5, gain=4.0),
+        QIS(0.8, 1.6, 2.0, 4),
+        QIS(0.8, 1.6, 1.0, 5, offset=3.0),
+        BinarySPAD(0.4, 2000.0, 4),
+        CountingSPAD(0.5, 1000.0, 1e-5, 3),
+    ],
+)
+def test_noise_of_a_dark_pixel_is_no_light(sensor):
+    """Cut off at darkness, the mean of phi would be 0.4 deviations instead of none."""
+    domain, codes, draws = information_domain(sensor, EXPOSURE), 400, 4000
+    pmf = sensor.pmf(np.array(0.0), EXPOSURE)
+    counts = np.random.default_rng(0).multinomial(codes, pmf / pmf.sum(), size=draws)
+    phi = domain.forward(counts @ np.arange(sensor.levels) / codes)
+    deviation = float(domain.noise(domain.mean_code[0])) / np.sqrt(codes)
+    assert abs(phi.mean()) < (0.05 + 5 / np.sqrt(draws)) * deviation  # phi is bent: up to 0.05 deviations
+    assert phi.std() == pytest.approx(deviation, rel=0.03 + 5 / np.sqrt(2 * draws))
+
+
+@pytest.mark.parametrize("gain", [0.5 / 26, 0.5 / 100, 0.5 / 400])
+def test_a_dark_pixel_below_a_high_threshold_is_finite(gain):
+    """The mean code of a dark pixel, and its rise, are down to 1e-300."""
+    domain = information_domain(QIS(0.8, 1.6, 0.2, 1, gain=gain), EXPOSURE)
+    assert domain.forward(np.array([0.0, 1e-30])) == pytest.approx([0.0, 0.0], abs=1e-4)
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_photons_come_back_where_codes_tell_something(seed):
     domain = information_domain(random_sensor(np.random.default_rng(200 + seed)), EXPOSURE)

@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 import torch
 
+from qsim.keys import Key
+from qsim.sensor.devices import quiver_physical
 from qsim.sensor.qis import QIS
 from quiver.baselines import path_merge
+from quiver.baselines.information_domain import information_domain
 from quiver.data.codes import array_codes
 from quiver.model.mergenet import MergeNet, MergeNetConfig
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import wrap_network
+from quiver.restoration.restorers import restorer
 
 SENSOR, EXPOSURE = QIS(0.8, 1.6, 0.2, 3), 5e-4
 
@@ -48,9 +52,9 @@ def test_any_size_and_any_number_of_frames(shape):
 
 def test_frames_restored_alone_are_those_of_the_stream():
     codes, _ = stream((8, 16, 16))
-    restorer = method()
-    assert restorer.look_ahead == 5
-    assert np.array_equal(restorer.restore(codes, 2, 4), restorer.restore(codes)[2:4])
+    small = method()
+    assert small.look_ahead == 5
+    assert np.array_equal(small.restore(codes, 2, 4), small.restore(codes)[2:4])
 
 
 def test_little_memory_cuts_tiles_and_says_so():
@@ -61,6 +65,25 @@ def test_little_memory_cuts_tiles_and_says_so():
     with pytest.warns(UserWarning, match="cut into 2 tiles"):
         cut = method(memory=1_500 * 16 * 180).restore(codes, 0, 1)
     assert np.sqrt(np.mean((cut - whole) ** 2)) < 0.4 * whole.std()  # codes of pure noise have arbitrary paths
+
+
+@pytest.mark.parametrize(
+    ("bits", "level", "ppp"), [(1, 1.0, 0.5), (2, 3.0, 3.25), (3, 0.5, 1.0), (3, 6.0, 3.25), (7, 50.0, 100.0)]
+)
+def test_a_flat_field_keeps_its_brightness(bits, level, ppp):
+    """The weights that ship, within 1 % beyond what the codes allow."""
+    sensor = quiver_physical(ppp, bits)
+    codes = sensor.sample(np.full((11, 64, 64), level), EXPOSURE, key=Key(0, bits), engine="reference")
+    restored = restorer("mergenet").restore(array_codes(codes, sensor, EXPOSURE), 5, 6)
+    slope = np.interp(level, *(getattr(information_domain(sensor, EXPOSURE), x) for x in ("photons", "slope")))
+    assert restored.mean() == pytest.approx(level, rel=0.01 + 5 * slope / np.sqrt(codes.size) / level)
+
+
+def test_dark_counts_are_hardly_light():
+    """1.6 dark electrons beside 0.1 photons, by the weights that ship: 0.16; 0.26 where phi is cut off at darkness."""
+    sensor = QIS(0.8, 3200.0, 0.2, 3)
+    codes = sensor.sample(np.full((11, 64, 64), 0.1), EXPOSURE, key=Key(0, 1), engine="reference")
+    assert restorer("mergenet").restore(array_codes(codes, sensor, EXPOSURE), 5, 6).mean() < 0.2
 
 
 MEMORY_PROGRAM = """
