@@ -49,6 +49,8 @@ __all__ = [
 BLOCK_PIXELS = 1 << 22  # codes that `frame_reader` reads at a time: 4 MB
 DIGEST_BYTES = 1 << 24  # of an array, hashed at a time
 LIGHT_FRAMES = 11  # spread over a stream, from which its light is estimated where it is not stated
+POOLED = 4  # px, side of the squares whose mean code is inverted for it: of single codes the inverse is not the light
+START = 0.01  # of the rise of the mean code, whose slope holds below that of a dark pixel, too
 WINDOW_STAGE = 1000  # of the random keys of published test windows, + frame; 0 is `qsim sense`
 
 
@@ -138,8 +140,9 @@ def frame_reader(codes: Codes) -> Callable[[int], Array]:
 def light_of(codes: Codes) -> float:
     """Return the mean photons per pixel and code of a stream: as stated, else estimated from LIGHT_FRAMES frames.
 
-    The estimate is the moment inverse of each pixel's mean code; where codes do not determine the light, the mean code
-    in units of white. Saturated pixels make it too low: no code tells how bright they are.
+    The estimate is the mean of the moment inverse of squares of POOLED pixels, negative below the mean code of a dark
+    pixel, so that noise adds no light; where codes do not determine the light, the mean code in units of white.
+    Saturated pixels make it too low: no code tells how bright they are.
     """
     if codes.ppp is not None and codes.ppp > 0:
         return float(codes.ppp)
@@ -147,10 +150,24 @@ def light_of(codes: Codes) -> float:
     taken = np.unique(np.linspace(0, length - 1, min(LIGHT_FRAMES, length)).round().astype(int))
     mean = np.mean([codes.read(int(t), int(t) + 1)[0] for t in taken], axis=0)
     try:
-        found = float(codes.sensor.response(codes.exposure).invert(mean, len(taken)).mean())
+        table = codes.sensor.response(codes.exposure)
+        rise = START * (table.mean[-1] - table.mean[0])
+        slope = np.interp(table.mean[0] + rise, table.mean, table.photons) / rise
+        pooled, pixels = _pooled(mean)
+        light = table.invert(pooled, len(taken) * int(pixels.max())) + slope * np.minimum(pooled - table.mean[0], 0)
+        found = float(np.average(light, weights=pixels))
     except ValueError:
         found = float(mean.mean()) / (codes.sensor.levels - 1) * codes.white
     return max(found, 1e-9 * codes.white)
+
+
+def _pooled(image: Array) -> tuple[Array, Array]:
+    """Return means of squares of POOLED pixels of an image [H, W], and their pixels: fewer at its end."""
+    places = [np.arange(0, length, POOLED) for length in image.shape]
+    sums, pixels = (
+        np.add.reduceat(np.add.reduceat(x, places[0], axis=0), places[1], axis=1) for x in (image, np.ones_like(image))
+    )
+    return sums / pixels, pixels
 
 
 def array_digest(array: Array) -> str:
