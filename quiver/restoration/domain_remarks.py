@@ -10,6 +10,9 @@ from quiver.data.illumination import Illumination
 from quiver.restoration.domain import NEAR, OperatingPoint, Scope, place_of
 from quiver.restoration.interface import Restorer
 
+DARK = 0.1  # dark counts over the events of the mean light, above which a stream is unlike all cells
+FRAMES = 4  # of the shortest stream that is like them: one frame was up to 16 % too bright, four less than 2 %
+
 
 def remark(name: str, scope: Scope, codes: Codes) -> str | None:
     """Return one line where a network is outside of what it was measured for; None inside."""
@@ -22,7 +25,24 @@ def remark(name: str, scope: Scope, codes: Codes) -> str | None:
     if cell is None:
         best = scope.domain.best_classical
         return f"{name} was never measured near {stream}; where it was, {best} is mostly the best classical method"
-    return None if cell.wins else f"{name} is worse than {cell.classical} on {stream}: {cell.scores} at {cell.name}"
+    if not cell.wins:
+        return f"{name} is worse than {cell.classical} on {stream}: {cell.scores} at {cell.name}"
+    return _unlike_cells(name, codes, ppp)
+
+
+def _unlike_cells(name: str, codes: Codes, ppp: float) -> str | None:
+    """Return the remark on a stream whose dark counts or frames are unlike those of all cells."""
+    share = codes.sensor.dark_rate * codes.exposure / (ppp * codes.sensor.efficiency)
+    if share > DARK:
+        return (
+            f"{name} was never measured where dark counts are {100 * share:.0f} % of the mean light, and makes dark "
+            "places too bright there; compare with qbp-bm3d"
+        )
+    if codes.shape[0] < FRAMES:
+        return (
+            f"{name} was never measured on {codes.shape[0]} frames, and its brightness may be wrong by several percent"
+        )
+    return None
 
 
 def remarks(methods: Iterable[Restorer], codes: Codes) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -153,3 +154,16 @@ def test_a_sensor_whose_codes_tell_no_light_still_has_a_remark():
     with pytest.raises(ValueError, match="does not"):
         METHODS["moment"].restore(codes.read(0, 3), sensor, 5e-4)
     assert light_of(codes) > 0
+
+
+def test_dark_counts_and_few_frames_are_told():
+    """In the middle of the measured cells: the sensor makes a fifth of the light itself, or there are three frames."""
+    scope, plain = Scope(MEASURED), stream()
+    assert domain_remarks.remark("mine", scope, plain) is None
+    noisy = replace(plain, sensor=plain.sensor.with_dark_rate(0.2 * 3.25 * plain.sensor.efficiency / plain.exposure))
+    assert "never measured where dark counts are 20 % of the mean light" in str(
+        domain_remarks.remark("mine", scope, noisy)
+    )
+    few = replace(plain, shape=(3, *plain.shape[1:]))
+    assert "never measured on 3 frames" in str(domain_remarks.remark("mine", scope, few))
+    assert domain_remarks.remark("mine", scope, replace(plain, shape=(4, *plain.shape[1:]))) is None
