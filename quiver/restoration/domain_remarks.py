@@ -39,9 +39,8 @@ def _unlike_cells(name: str, codes: Codes, ppp: float) -> str | None:
             "places too bright there; compare with qbp-bm3d"
         )
     if codes.shape[0] < FRAMES:
-        return (
-            f"{name} was never measured on {codes.shape[0]} frames, and its brightness may be wrong by several percent"
-        )
+        frames = "one frame" if codes.shape[0] == 1 else f"{codes.shape[0]} frames"
+        return f"{name} was never measured on {frames}, and its brightness may be wrong by several percent"
     return None
 
 

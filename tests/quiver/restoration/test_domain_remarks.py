@@ -164,6 +164,7 @@ def test_dark_counts_and_few_frames_are_told():
     assert "never measured where dark counts are 20 % of the mean light" in str(
         domain_remarks.remark("mine", scope, noisy)
     )
-    few = replace(plain, shape=(3, *plain.shape[1:]))
-    assert "never measured on 3 frames" in str(domain_remarks.remark("mine", scope, few))
+    for frames, words in ((1, "one frame,"), (3, "3 frames,")):
+        few = replace(plain, shape=(frames, *plain.shape[1:]))
+        assert f"never measured on {words}" in str(domain_remarks.remark("mine", scope, few))
     assert domain_remarks.remark("mine", scope, replace(plain, shape=(4, *plain.shape[1:]))) is None
