@@ -11,6 +11,9 @@ from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import Errors
 
+# Cost of two denoised halves, albedo and normals in samples per pixel, by quality (docs/log.md), best first.
+DENOISE_COST = {"high": 15.0, "balanced": 7.5, "fast": 5.0}
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -37,6 +40,7 @@ class Budget:
     dimmed_error: float = 0.0  # standard error of that share
     findings: tuple[Finding, ...] = field(default=())
     neighbours: int = 0  # frames on each side whose samples are carried into a frame (reuse/); 0: each frame alone
+    quality: str = "high"  # of the denoiser: high, balanced or fast
 
     def __post_init__(self) -> None:
         for name in ("samples", "bounces", "sub_frames"):
@@ -44,6 +48,8 @@ class Budget:
                 raise ValueError(f"Budget.{name}: at least 1, got {getattr(self, name)!r}")
         if self.neighbours < 0:
             raise ValueError(f"Budget.neighbours: at least 0, got {self.neighbours!r}")
+        if self.quality not in DENOISE_COST:
+            raise ValueError(f"Budget.quality: {', '.join(DENOISE_COST)}; got {self.quality!r}")
 
     @property
     def left_out_clamped(self) -> float:

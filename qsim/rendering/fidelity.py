@@ -117,21 +117,24 @@ def choose_budget(
         fewer, about_denoiser = denoised_samples(
             pilot, instants, bounces, allowed, share, samples, denoise, lambda n: noise.at(n / instants, instants)
         )
-    chosen, about_reuse = Sharing(fewer or samples, 0, fewer is not None), Finding(NAME, ALONE, "not requested")
+    chosen, about_reuse = Sharing(samples, 0, ""), Finding(NAME, ALONE, "not requested")
     if fewer is not None:
-        about_samples = Finding("samples", f"{fewer} per pixel, denoised", f"without: {about_samples.chosen}")
+        chosen = Sharing(fewer[0], 0, fewer[1])
+        about_samples = Finding("samples", f"{fewer[0]} per pixel, denoised", f"without: {about_samples.chosen}")
     if reuse:
         need = Need(allowed, share, bounces, frames, chosen, noise.at)
         chosen, about_reuse = shared_samples(pilot, need, denoise)
         if chosen is not need.alone:
             size = f"frames alone: {about_samples.chosen}"
-            about_samples = Finding("samples", f"{chosen.samples} per pixel{', denoised' * chosen.denoise}", size)
-            about_denoiser = Finding("denoiser", "on" if chosen.denoise else "off", "tried on shared samples")
+            about_samples = Finding(
+                "samples", f"{chosen.samples} per pixel{', denoised' if chosen.denoise else ''}", size
+            )
+            about_denoiser = Finding("denoiser", chosen.about_denoiser, "tried on shared samples")
     effects = (*_flicker(pilot.renderer.strengths(frames)), *_lens(scene.camera))
     lens = (*effects, *_left_out(scene.camera, pilot.truths()))
     pixels = scene.camera.height * scene.camera.width
     noisy = noise.at(chosen.samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
-    about_light, about_motion = _light(dimmed, noisy, chosen.denoise), moving(pilot.extent, shutter)
+    about_light, about_motion = _light(dimmed, noisy, bool(chosen.denoise)), moving(pilot.extent, shutter)
     shared = (limit, about_samples, about_denoiser, about_reuse)
     findings = (*shared, about_bounces, about_light, about_motion, about_blur, *lens)
     return Budget(
@@ -139,13 +142,14 @@ def choose_budget(
         bounces,
         instants,
         instants > 1,
-        chosen.denoise,
+        bool(chosen.denoise),
         left_out.plain,
         left_out.at_white,
         allowed.white,
         *dimmed,
         findings,
         chosen.neighbours,
+        chosen.denoise or "high",
     )
 
 

@@ -18,8 +18,8 @@ from numpy import ndarray as Array
 from qsim.clip.clamped_error import Errors
 from qsim.colour import bright_end
 from qsim.optics.camera import Camera, Pose
-from qsim.rendering.budget import Allowed, Budget, Finding, grid_samples, instants, light_windows
-from qsim.rendering.denoiser import AROUND, DENOISE_COST, available, cleaned_mean
+from qsim.rendering.budget import DENOISE_COST, Allowed, Budget, Finding, grid_samples, instants, light_windows
+from qsim.rendering.denoiser import AROUND, available, cleaned_mean
 from qsim.rendering.renderer import Renderer
 from qsim.scene import Scene, Still
 
@@ -33,6 +33,7 @@ STAGE = 18  # of the random keys
 LUCK = 3.0  # a trial with this many times less raw noise than the pilot's missed rare paths by chance
 CAREFUL = 2.0  # standard errors added to the error of a trial, whose result holds for the complete clip
 MOST_DENOISED = 256  # samples per instant up to which the error of denoised pictures is extrapolated
+MOST_FASTER = 32  # samples per instant up to which a faster denoiser is tried; with more, it saves less than it costs
 
 
 @dataclass(frozen=True)
@@ -167,8 +168,8 @@ def denoised_samples(
     raw: int,
     wanted: bool | None,
     expected: Callable[[int], Errors],
-) -> tuple[int | None, Finding]:
-    """Return the samples of a frame with which denoised windows reach the error, or None if `raw` samples cost less.
+) -> tuple[tuple[int, str] | None, Finding]:
+    """Return samples and denoiser's quality that reach the error at the least cost, or None if `raw` samples cost less.
 
     Complete windows of the clip's middle frame are rendered with `count` instants. The error to reach is `share` of the
     allowed one. `wanted` None denoises only if that costs less. `expected(samples)` are the errors of raw samples; they
@@ -181,36 +182,49 @@ def denoised_samples(
     if wanted is None and camera.height * camera.width < AROUND**2:
         return None, Finding("denoiser", "off", f"its error is not known well in fewer than {AROUND**2} pixels")
     cheap = Finding("denoiser", "off", f"{raw} raw samples cost no more")
-    tried = [n for n in (count * each for each in COUNTS) if wanted or n + DENOISE_COST < raw]
+    least = {n: DENOISE_COST["fast" if n <= MOST_FASTER * count else "high"] for n in (count * each for each in COUNTS)}
+    tried = [n for n, cost in least.items() if wanted or n + cost < raw]
     if not tried:
         return None, cheap
     parts = [renderer.window(crop) for crop in windows(camera)]
     times, key = pilot.exposed(t, count), renderer.key(t, STAGE)
     surfaces = [window.surfaces(times, key) for window in parts]
-    errors: list[float] = []
+    errors: dict[str, list[float]] = {quality: [] for quality in DENOISE_COST}
     for samples in tried:
-        squares = np.zeros(3)  # of the raw halves; of the denoised mixture at white and without a clamp
-        for window, (albedo, normal) in zip(parts, surfaces, strict=True):
-            halves = window.halves(times, Budget(samples, bounces), key)
-            mixed = cleaned_mean(halves, albedo, normal, allowed.white)
-            found = (Errors.of_halves(halves, allowed.white).plain, mixed.error_at(allowed.white, CAREFUL), mixed.error)
-            squares += np.square(found) / len(parts)
-        noisy, *cleaned = np.sqrt(squares).tolist()
-        missed = LUCK * noisy < expected(samples).plain
-        errors.append(allowed.fraction(expected(samples) if missed else Errors(*cleaned)))
-        if errors[-1] <= share:
+        halves = [window.halves(times, Budget(samples, bounces), key) for window in parts]
+        noisy = _root_mean([Errors.of_halves(pair, allowed.white).plain for pair in halves])
+        for quality in DENOISE_COST if samples <= MOST_FASTER * count else ["high"]:
+            each = zip(halves, surfaces, strict=True)
+            mixed = [cleaned_mean(pair, *seen, allowed.white, quality) for pair, seen in each]
+            at_white = _root_mean([one.error_at(allowed.white, CAREFUL) for one in mixed])
+            cleaned = Errors(at_white, _root_mean([one.error for one in mixed]))
+            missed = LUCK * noisy < expected(samples).plain
+            errors[quality].append(allowed.fraction(expected(samples) if missed else cleaned))
+        if errors["high"][-1] <= share:
             break
-    where = f"{'' if len(parts) == 1 else 'four windows of '}frame {t}"
-    needed, size = needed_samples(tried, errors, share), f"tried in {where}"
-    most = MOST_DENOISED * count
-    if needed > most:
-        if not wanted:
-            return None, cheap
-        needed, size = most, f"{errors[-1]:.2g} times the error allowed with {samples} samples"
-    chosen = 2 * count * grid_samples(math.ceil(needed / count / 2))
-    if not wanted and chosen + DENOISE_COST >= raw:
+    size = f"tried in {'' if len(parts) == 1 else 'four windows of '}frame {t}"
+    options = _enough(tried, errors, share, count)
+    if wanted and not options:
+        size = f"{errors['high'][-1]:.2g} times the error allowed with {samples} samples"
+        options = [(2 * count * grid_samples(MOST_DENOISED // 2), "high")]
+    chosen = min(options, key=lambda option: option[0] + DENOISE_COST[option[1]], default=None)
+    if chosen is None or (not wanted and chosen[0] + DENOISE_COST[chosen[1]] >= raw):
         return None, cheap
-    return chosen, Finding("denoiser", "on", size)
+    return chosen, Finding("denoiser", f"on, {chosen[1]} quality", size)
+
+
+def _root_mean(errors: list[float]) -> float:
+    return math.sqrt(float(np.mean(np.square(errors))))
+
+
+def _enough(tried: list[int], errors: dict[str, list[float]], share: float, count: int) -> list[tuple[int, str]]:
+    """Return samples and quality that reach `share` of the allowed error, by the trials of each quality."""
+    found = []
+    for quality, fractions in errors.items():
+        needed = needed_samples(tried[: len(fractions)], fractions, share)
+        if needed <= (MOST_DENOISED if quality == "high" else MOST_FASTER) * count:
+            found.append((2 * count * grid_samples(math.ceil(needed / count / 2)), quality))
+    return found
 
 
 def windows(camera: Camera) -> list[tuple[int, int, int, int]]:

@@ -225,7 +225,7 @@ class Renderer:
         white = self.budget.white or white_in(own.mean(axis=0))
         surfaces = whole.surfaces([self.time(t)], self.key(t)) if self.budget.denoise else None
         best, _ = best_of(pictures, white, self.budget.denoise)
-        cut = reused_mean(own, best, surfaces, white).cut(self.crop, self.film.thinned)
+        cut = reused_mean(own, best, surfaces, white, self.budget.quality).cut(self.crop, self.film.thinned)
         errors_at = frame_errors(lambda white: math.hypot(cut.error_at(white), self.budget.left_out_clamped), white)
         y, x, height, width = self.crop
         fireflies = int(np.count_nonzero(_fireflies(own, broken)[y : y + height, x : x + width]))
@@ -241,7 +241,7 @@ class Renderer:
         white = self.budget.white or white_in(radiance)
         mixed = None
         if self.budget.denoise:
-            mixed = cleaned_mean(halves, *self.surfaces(instants, key), white)
+            mixed = cleaned_mean(halves, *self.surfaces(instants, key), white, self.budget.quality)
             radiance, error = mixed.picture, mixed.error
 
         def error_at(white: float) -> float:

@@ -46,15 +46,17 @@ def best_of(pictures: Array, white: float, denoises: bool) -> tuple[Array, Array
     return np.take_along_axis(pictures, chosen[None, None], axis=0)[0], number
 
 
-def reused_mean(own: Array, best: Array, surfaces: tuple[Array, Array] | None, white: float) -> Mixture:
+def reused_mean(
+    own: Array, best: Array, surfaces: tuple[Array, Array] | None, white: float, quality: str = "high"
+) -> Mixture:
     """Return the picture of two halves `best` [2, H, W], denoised where that lowers its error against `own` [2, H, W].
 
-    `surfaces` are albedo [H, W] and normals [H, W, 3] for the denoiser; None does not denoise. Its mean is that of
-    `best`, as `denoiser.cleaned_mean` keeps it.
+    `surfaces` are albedo [H, W] and normals [H, W, 3] for the denoiser of this quality; None does not denoise. The mean
+    is that of `best`, as `denoiser.cleaned_mean` keeps it.
     """
     if surfaces is None:
         return _mixed(own, best, best, np.zeros(own.shape[1:]))
-    cleaned = np.stack([denoised(half, *surfaces) for half in best])
+    cleaned = np.stack([denoised(half, *surfaces, quality) for half in best])
     z = own[0] - own[1]
     apart, change = (cleaned - best).mean(axis=0), (cleaned[0] - cleaned[1]) - (best[0] - best[1])
     gain = -(apart * (best - own).mean(axis=0) + change * z / 4)

@@ -19,8 +19,8 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.clip.clamped_error import Errors
-from qsim.rendering.budget import Allowed, Budget, Finding, grid_samples
-from qsim.rendering.denoiser import DENOISE_COST, available
+from qsim.rendering.budget import DENOISE_COST, Allowed, Budget, Finding, grid_samples
+from qsim.rendering.denoiser import available
 from qsim.rendering.pilot import CAREFUL, COUNTS, LUCK, STAGE, Pilot, needed_samples, windows
 from qsim.rendering.reuse.carrying import REACH, unshared
 from qsim.rendering.reuse.choice import best_of, reused_mean
@@ -42,16 +42,21 @@ class Sharing:
 
     samples: int  # per pixel and frame
     neighbours: int  # frames on each side; 0: each frame alone
-    denoise: bool
+    denoise: str  # quality of the denoiser; empty: none
 
     @classmethod
     def of(cls, budget: Budget) -> Sharing:
         """Return the sharing of a budget."""
-        return cls(budget.samples, budget.neighbours, budget.denoise)
+        return cls(budget.samples, budget.neighbours, budget.quality if budget.denoise else "")
+
+    @property
+    def about_denoiser(self) -> str:
+        """Whether and how pictures are denoised, as text."""
+        return f"on, {self.denoise} quality" if self.denoise else "off"
 
     def cost(self, pixels: int) -> float:
         """Return the cost of a frame of so many pixels, in samples per pixel."""
-        alone = self.samples + DENOISE_COST * self.denoise
+        alone = self.samples + DENOISE_COST.get(self.denoise, 0.0)
         if not self.neighbours:
             return alone
         return alone + 2 * self.neighbours * CARRY_COST * self.samples + COVER_COST + FIXED_COST / pixels
@@ -86,7 +91,7 @@ def shared_samples(pilot: Pilot, need: Need, denoise: bool | None) -> tuple[Shar
         return alone, Finding(NAME, ALONE, f"not with {reason}")
     camera = renderer.scene.camera
     pixels = camera.height * camera.width
-    kinds = [kind for kind in (False, True) if denoise in (None, kind) and (available() or not kind)]
+    kinds = [kind for kind in ("", "high") if denoise in (None, bool(kind)) and (available() or not kind)]
     trials: list[Trial] = []
     for samples in COUNTS[:MOST_TRIED]:
         saved = need.frames * pixels * (alone.cost(pixels) - Sharing(samples, 1, kinds[0]).cost(pixels))
@@ -109,27 +114,27 @@ class Trial:
     """One frame with so many samples, by neighbours and denoiser."""
 
     samples: int
-    found: dict[tuple[int, bool], tuple[float, float]]  # error and doubt, both rms and over what is allowed
+    found: dict[tuple[int, str], tuple[float, float]]  # error and doubt, both rms and over what is allowed
 
     @classmethod
-    def of(cls, pilot: Pilot, need: Need, samples: int, kinds: list[bool]) -> Trial:
+    def of(cls, pilot: Pilot, need: Need, samples: int, kinds: list[str]) -> Trial:
         """Return the trial of the pilot's middle frame."""
         renderer, t, white = pilot.renderer, pilot.middle, need.allowed.white
         camera = renderer.scene.camera
         pixels = camera.height * camera.width
         most = most_neighbours(samples, pixels)
         reaches = [k for k in REACH if k <= most]
-        squares: dict[tuple[int, bool], list[Array]] = {(k, kind): [] for k in reaches for kind in kinds}
+        squares: dict[tuple[int, str], list[Array]] = {(k, kind): [] for k in reaches for kind in kinds}
         for crop in windows(camera):
             window = renderer.window(crop)
             budget = Budget(samples, need.bounces, neighbours=most)
             pictures = window.carrier(budget, need.frames, STAGE).pictures(t)
             noisy = Errors.of_halves(pictures[0], white).plain
+            surfaces = window.surfaces([renderer.time(t)], renderer.key(t, STAGE)) if any(kinds) else None
             for kind in kinds:
-                surfaces = window.surfaces([renderer.time(t)], renderer.key(t, STAGE)) if kind else None
                 for count, k in enumerate(reaches, 2):
-                    best, _ = best_of(pictures[:count], white, kind)
-                    mixed = reused_mean(pictures[0], best, surfaces, white)
+                    best, _ = best_of(pictures[:count], white, bool(kind))
+                    mixed = reused_mean(pictures[0], best, surfaces if kind else None, white, kind or "high")
                     doubt = mixed.deviation_at(white) / math.sqrt(pixels)
                     found = np.array([noisy, mixed.error_at(white, CAREFUL), mixed.error, math.sqrt(doubt)])
                     squares[k, kind].append(found**2)
@@ -157,10 +162,8 @@ def _fewer_at_ends(frames: int, t: int, neighbours: int) -> float:
 def _trial_cost(samples: int, pilot: Pilot) -> float:
     """Return the cost of a trial with its kernels, in samples."""
     pixels = sum(height * width for _, _, height, width in windows(pilot.renderer.scene.camera))
-    denoising = len(REACH) * DENOISE_COST * available()
-    return KERNEL_COST + pixels * (
-        2 * REACH[-1] * samples + Sharing(samples, REACH[-1], False).cost(pixels) + denoising
-    )
+    denoising = len(REACH) * DENOISE_COST["high"] * available()
+    return KERNEL_COST + pixels * (2 * REACH[-1] * samples + Sharing(samples, REACH[-1], "").cost(pixels) + denoising)
 
 
 def _cheapest(trials: list[Trial], alone: Sharing, pixels: int) -> Sharing:

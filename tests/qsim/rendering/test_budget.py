@@ -80,3 +80,8 @@ def test_samples_are_shared_among_halves_and_instants():
     assert Budget(samples=72).grid(1) == 36
     assert Budget(samples=72).grid(9) == 4
     assert Budget(samples=1).grid(5) == 4
+
+
+def test_a_quality_of_the_denoiser_that_does_not_exist_is_refused():
+    with pytest.raises(ValueError, match=r"Budget\.quality: high, balanced, fast; got 'best'"):
+        Budget(quality="best")

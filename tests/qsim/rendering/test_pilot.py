@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -61,3 +62,36 @@ def test_a_denoised_trial_with_far_less_noise_than_the_pilots_is_rejected():
     )
     assert lucky is None
     assert plain is not None
+
+
+@pytest.mark.parametrize(
+    ("over", "chosen"),
+    [
+        (0.7, (8, "fast")),  # 8 + 5: all three reach the error
+        (0.85, (8, "balanced")),  # 8 + 7.5: fast does not
+        (0.95, (8, "high")),  # 8 + 15: the others do not, and high ends the trials
+        (1.3, (24, "fast")),  # needs 21.1: 24 + 5, against 24 + 7.5 for 16.4 and 16 + 15 for 13.5
+        (1.7, (24, "high")),  # needs 23.1: 24 + 15; fast needs 36 samples, balanced 28 (32 + 7.5 = 39.5)
+        (2.5, (60, "high")),  # needs 50
+        (7.0, None),  # needs 392, more than raw samples
+    ],
+)
+def test_the_cheapest_quality_of_the_denoiser_that_reaches_the_error_is_chosen(monkeypatch, over, chosen):
+    """Errors of 1, 1.1 and 1.25 times `over`, falling by the root of the samples from 8 on, where 1 is allowed."""
+    factors = {"high": 1.0, "balanced": 1.1, "fast": 1.25}
+
+    def cleaned(halves, _albedo, _normal, _white, quality):
+        error = over * factors[quality] * math.sqrt(8 / halves[0, 0, 0])
+        return SimpleNamespace(error=error, error_at=lambda white, sigmas: error)
+
+    monkeypatch.setattr(pilot, "available", lambda: True)
+    monkeypatch.setattr(pilot, "cleaned_mean", cleaned)
+    monkeypatch.setattr(Renderer, "surfaces", lambda *_: (None, None))
+    monkeypatch.setattr(Renderer, "halves", lambda _, times, budget, key: np.full((2, 4, 4), float(budget.samples)))
+    made = plate(None, camera=replace(CAMERA, height=48, width=64))
+    loaded = pilot.Pilot(Renderer(made), np.zeros((1, 48, 64)), 0, (0,))
+    found, about = pilot.denoised_samples(
+        loaded, 1, 2, Allowed(10.0, 1.0), 1.0, 300, None, lambda samples: Errors(0.0, 0.0)
+    )
+    assert found == chosen
+    assert (f"{chosen[1]} quality" if chosen else "off") in about.chosen

@@ -34,10 +34,10 @@ def test_the_kept_samples_fit_into_memory():
 
 
 def test_small_frames_pay_for_their_kernels():
-    small, large = (Sharing(8, 5, False).cost(pixels) for pixels in (24 * 33, 512 * 1024))
+    small, large = (Sharing(8, 5, "").cost(pixels) for pixels in (24 * 33, 512 * 1024))
     assert small > 40
     assert large < 20
-    assert Sharing(8, 0, False).cost(1) == 8
+    assert Sharing(8, 0, "").cost(1) == 8
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def turning():
     white = white_in(halves.mean(axis=0))
     noise = Errors.of_halves(halves, white)
     allowed = Allowed(white, noise.at_white / 1.8)  # 8 * 1.8^(2 / 1.4) to 8 * 1.8^2 samples
-    return pilot, Need(allowed, 1.0, 2, 9, Sharing(2000, 0, False), lambda samples: Errors(0.0, 0.0))
+    return pilot, Need(allowed, 1.0, 2, 9, Sharing(2000, 0, ""), lambda samples: Errors(0.0, 0.0))
 
 
 def test_a_clip_shares_samples_where_that_costs_less(turning):
@@ -65,7 +65,7 @@ def test_a_clip_shares_samples_where_that_costs_less(turning):
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        ({"alone": Sharing(20, 0, False)}, "a trial would cost more than it could save"),
+        ({"alone": Sharing(20, 0, "")}, "a trial would cost more than it could save"),
         ({"frames": 1}, "not with one frame"),
         ({"allowed": Allowed(1.0, 1e-6)}, "frames alone cost no more"),
     ],
