@@ -305,7 +305,7 @@ def write_table(out: Path) -> None:
     size = rows[0]["size"]
     levels = [f"{key} PPP" for key in rows[0]["by_light"]]
     text = ["# What each idea of mergenet brings", ""]
-    text += ["    python docs/restorer_ablation.py out/photos out/restorer out/restorer_test", ""]
+    text += ["Made by `python docs/restorer_ablation.py out/photos out/restorer out/restorer_test`.", ""]
     text += [f"{size['steps']} steps of {size['batch']} windows of {size['crop']} x {size['crop']} px from "
              f"{size['windows']} windows. Mean PSNR in dB on windows of the test clips, peak 2.5 times the mean light, "
              "1, 3 and 7 bits at 0.5, 3.25 and 26 photons per pixel.", ""]  # fmt: skip

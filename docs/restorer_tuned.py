@@ -128,7 +128,7 @@ def write_table(out: Path) -> None:
         table.append((row["name"], f"{shipped.mean():.2f}", f"{tuned.mean():.2f}", f"{gain.mean():+.2f}", spread))
     size = rows[0]["size"]
     text = ["# The restorer beside weights for one cell", ""]
-    text += ["    python docs/restorer_tuned.py out/photos out/restorer out/restorer_val out/restorer_test", ""]
+    text += ["Made by `python docs/restorer_tuned.py out/photos out/restorer out/restorer_val out/restorer_test`.", ""]
     text += [f"{size['steps']} steps from the shipped weights with windows of one cell alone. Mean matched PSNR in dB "
              f"over {len(rows[0]['clips'])} test clips, {size['frames']} frames of each.", ""]  # fmt: skip
     text += [*markdown_table(table, ("cell", "shipped", "tuned", "difference", "of single clips")), ""]
