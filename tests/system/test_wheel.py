@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import zipfile
+from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 ROOT = Path(__file__).parents[2]
 SOURCES = ("qsim", "quiver", "scenes")
@@ -127,3 +130,18 @@ def test_the_commands_are_installed(installed: Path, tmp_path: Path):
     for program in ("qsim", "quiver"):
         said = run(sys.executable, installed / "bin" / program, "--version", cwd=tmp_path, PYTHONPATH=str(installed))
         assert said.startswith(f"{program} ")
+
+
+def test_pinned_packages_install_on_the_oldest_python():
+    """Debian 12 has Python 3.11.2: a pin that asks for 3.11.5 made every installation there fail."""
+    oldest = re.search(r'requires-python = ">=([0-9.]+)', (ROOT / "pyproject.toml").read_text())[1]
+    pins = re.findall(r"^([\w.-]+)==", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    asked = {}
+    for name in pins:
+        try:
+            asked[name] = metadata(name).get("Requires-Python") or ""
+        except PackageNotFoundError:
+            continue
+    assert len(asked) > len(pins) / 2
+    newer = {name: text for name, text in asked.items() if f"{oldest}.0" not in SpecifierSet(text)}
+    assert not newer, "pin a version that installs there"
