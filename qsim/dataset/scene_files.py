@@ -8,7 +8,8 @@
 * A folder of assets: every file in it.
 
 Names are relative to the scene's file; files outside its folder have absolute names. Installed packages, this program,
-caches and the system's /proc, /sys and /dev are left out. Families of the library read no files of the user.
+caches and the system's /proc, /sys and /dev are left out, but for files of users in /dev/shm. Families of the library
+read no files of the user.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ _LEFT_OUT = tuple(
     f"{os.path.realpath(folder)}{os.sep}"
     for folder in (*_INSTALLED, str(Path(__file__).parents[1]), "/proc", "/sys", "/dev")
 )
+_SHARED = f"/dev/shm{os.sep}"  # memory that holds files of users
 _LIBRARY = Path(scenes.__file__).resolve().parent
 _PARTS_LEFT_OUT = frozenset({".cache", "site-packages", "dist-packages"})
 
@@ -174,7 +176,8 @@ def _for_itself() -> bool:
 
 def _counts(path: Path) -> bool:
     """Return whether a file belongs to the user."""
-    if str(path).startswith(_LEFT_OUT) or not _PARTS_LEFT_OUT.isdisjoint(path.parts):
+    outside = str(path).startswith(_LEFT_OUT) and not str(path).startswith(_SHARED)
+    if outside or not _PARTS_LEFT_OUT.isdisjoint(path.parts):
         return False
     return "__pycache__" not in path.parts and not (path.parent == _LIBRARY and path.suffix == ".py")
 

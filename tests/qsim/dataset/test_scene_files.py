@@ -4,6 +4,7 @@ import os
 import random
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +91,19 @@ def test_a_python_scene_names_all_that_it_reads_every_time(place: Path):
         expected = {name for name in READ if not name.startswith(("seed", "meshes"))}
         assert set(read) == expected | {f"seed{seed}.bin", f"meshes/{'ab'[seed]}.obj", "meshes/*.obj"}
         assert all(files.sha256(place / name) == digest for name, digest in read.items() if "*" not in name)
+
+
+@pytest.mark.skipif(not os.access("/dev/shm", os.W_OK), reason="no shared memory")
+def test_files_in_shared_memory_are_the_users():
+    """All of /dev was left out, so that edits of a scene kept there were not seen."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
+        path = Path(folder) / "wheel.py"
+        path.write_text(
+            "from pathlib import Path\nfrom qsim import scenes\n\n\ndef scene(seed=0, speed=1.0):\n"
+            "    Path(__file__).with_name('a.txt').read_text()\n    return scenes.load('fan', seed, speed)\n"
+        )
+        (path.parent / "a.txt").write_text("1")
+        assert set(scene_files.load(path)[1]) == {"wheel.py", "a.txt"}
 
 
 def test_families_of_the_library_read_nothing_and_folders_everything(tmp_path: Path):
