@@ -4,8 +4,8 @@
     python docs/restorer_tuned.py out/tiny out/tiny out/tiny out/tiny --tiny --out out/rows    # seconds: a test of this
 
 One set of weights serves all cells. The cost of that is what a cell gains from weights for it alone: STEPS steps from
-the shipped ones, about 20 minutes on two quiet cores, with windows of this cell alone. Busy cores change no score. A
-row is RESULTS/CELL.json, made once; an interrupted training resumes from WORK.
+the shipped ones, an estimated 20 minutes on two quiet cores, with windows of this cell alone. Busy cores change no
+score. A row is RESULTS/CELL.json, made once; an interrupted training resumes from WORK.
 """
 
 from __future__ import annotations
