@@ -6,6 +6,7 @@ import glob
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -41,6 +42,26 @@ def test_an_old_llvm_is_refused_without_ending_the_process(number, tmp_path):
     chosen, mean = child.stdout.split()[-2:]
     assert chosen in backend.BACKENDS
     assert float(mean) == pytest.approx(1.0, rel=1e-4)
+
+
+def ensure_llvm(python: str, tmp_path: Path, engine: str) -> subprocess.CompletedProcess[str]:
+    """Run the script of `make setup` without a package manager."""
+    words = ["/bin/sh", str(Path(__file__).parents[2] / ".ci" / "ensure-llvm"), python]
+    environment = os.environ | {"QSIM_ENGINE": engine, "PATH": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)}
+    return subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_setup_says_that_llvm_is_missing(tmp_path):
+    """It said nothing and installed nothing for weeks: the module that it asked had moved."""
+    ended = ensure_llvm(sys.executable, tmp_path, "scalar")
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout == "", "a library is looked for in a package manager that is not there"
+    assert "apt-get install libllvm19" in ended.stderr
+
+
+def test_setup_fails_if_the_backend_cannot_be_asked(tmp_path):
+    ended = ensure_llvm("/bin/false", tmp_path, "scalar")
+    assert ended.returncode == 1
 
 
 def test_the_newest_library_is_tried_first_and_a_named_one_before_it(tmp_path, monkeypatch):
