@@ -121,17 +121,20 @@ def add_plan(sub: Any) -> None:
     parser.add_argument("recipe", type=Path, help="a .toml file, or a name of `qsim recipes`")
     parser.add_argument("--machines", type=int, default=10, help="number of machines that share the work (default 10)")
     parser.add_argument("--frames", type=int, default=5, help="frames rendered per kind (default 5)")
+    parser.add_argument("--shard", type=part_of, metavar="I/N", help="only the I-th of N parts, as in 7/100")
 
 
 def _run_plan(args: argparse.Namespace) -> int:
-    from qsim.dataset import cost_forecast, recipe
+    from qsim.dataset import cost_forecast, generation, recipe
 
     if args.machines < 1:
         raise ValueError(f"--machines: expected at least 1, got {args.machines}")
-    wanted = recipe.load(args.recipe)
+    whole = recipe.load(args.recipe)
+    wanted = dataclasses.replace(whole, jobs=tuple(generation.shard(whole.jobs, args.shard)))
     with bar("planning", "kind") as progress:
         found = cost_forecast.forecast(wanted, frames=args.frames, progress=progress)
-    facts = {"recipe": wanted.name, "machines": args.machines, "hours_each": found.hours / args.machines}
+    facts = {"recipe": wanted.name, "digest": wanted.digest, "machines": args.machines}
+    facts["hours_each"] = found.hours / args.machines
     output(args, facts | found.to_dict(), found.lines(args.machines))
     return 0
 

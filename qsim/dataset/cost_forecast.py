@@ -169,17 +169,22 @@ def forecast(recipe: Recipe, *, frames: int = 5, progress: Progress | None = Non
 
     if frames < 2:
         raise ValueError(f"plan: got {frames} frames; at least 2 frames are needed, because the first one compiles")
-    kinds: dict[tuple[Any, ...], list[Job]] = {}
-    for job in recipe.jobs:
-        kinds.setdefault((job.family, job.settings, job.streams), []).append(job)
-    costs = []
+    kinds, costs = kinds_of(recipe), []
     with tempfile.TemporaryDirectory(prefix="qsim-plan-") as folder:
-        for n, members in enumerate(kinds.values(), 1):
+        for n, members in enumerate(kinds, 1):
             costs.append(measure_kind(members, Path(folder) / f"kind{n}", frames))
             if progress is not None:
                 progress(n, len(kinds))
     chosen = backend.choose()
     return Forecast(tuple(costs), f"{chosen.backend}, {chosen.variant}", peak_memory() / 2**30)
+
+
+def kinds_of(recipe: Recipe) -> list[list[Job]]:
+    """Return the jobs by kind, in the order in which a forecast lists the kinds."""
+    kinds: dict[tuple[Any, ...], list[Job]] = {}
+    for job in recipe.jobs:
+        kinds.setdefault((job.family, job.settings, job.streams), []).append(job)
+    return list(kinds.values())
 
 
 def measure_kind(members: list[Job], folder: Path, frames: int) -> Cost:

@@ -48,7 +48,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from qsim import checks
+from qsim import checks, files
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.sensing import Sensing, filters_of, prepare
 from qsim.dataset.job import Job, Settings
@@ -73,6 +73,11 @@ class Recipe:
     def splits(self) -> dict[str, list[str]]:
         """Return the names of the clips of each split."""
         return {split: [job.name for job in self.jobs if job.split == split] for split in SPLITS}
+
+    @property
+    def digest(self) -> str:
+        """Return the SHA-256 of the jobs' digests: equal for equal jobs in equal order."""
+        return files.sha256(files.to_json([job.digest for job in self.jobs]))
 
 
 def load(path: str | Path) -> Recipe:

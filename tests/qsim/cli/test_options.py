@@ -227,6 +227,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ("plan", "--threads"): [Acts("plan t.toml", "--threads 1", threads, slow=True)],
     ("plan", "--machines"): [Acts("plan t.toml --json", "--machines 4", numbers("machines"), slow=True)],
     ("plan", "--frames"): [Refused("plan t.toml", "--frames 1", "frames")],
+    ("plan", "--shard"): [Acts("plan t.toml", "--shard 2/2", stdout, slow=True)],
     ("check", "--redraw"): [Acts("check clip", "--redraw", stdout)],
     # compare
     ("compare", "--streams"): [

@@ -163,6 +163,27 @@ def test_plans_without_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         assert message in capsys.readouterr().err
 
 
+def test_a_plan_of_a_shard_is_that_of_its_clips(tmp_path, capsys, monkeypatch):
+    """Of three clips the second of two shards has one; the digest tells whose plan it is."""
+    monkeypatch.setattr(cost_forecast, "measure_kind", lambda jobs, folder, frames: cost_of(len(jobs)))
+    path = tmp_path / "r.toml"
+    path.write_text(RECIPE)
+    found = {}
+    for shard in ([], ["--shard", "1/2"], ["--shard", "2/2"]):
+        assert main(["plan", str(path), *shard, "--json"]) == 0
+        found[tuple(shard[1:])] = json.loads(capsys.readouterr().out)
+    assert [plan["kinds"][0]["clips"] for plan in found.values()] == [3, 2, 1]
+    assert found[()]["digest"] == recipe.parse(RECIPE).digest
+    assert len({plan["digest"] for plan in found.values()}) == 3
+    assert main(["plan", str(path), "--shard", "3/2"]) == 2
+
+
+def cost_of(clips: int) -> Cost:
+    """Return the cost of clips of twelve frames that take no time."""
+    nothing = {name: Seconds(0.0, 0.0) for name in ("setup", "per_frame", "sensing")}
+    return Cost("fan", (32, 48), clips, 12 * clips, samples=(8, 8), **nothing, frame_bytes=0.0)
+
+
 def alone(home: Path, *words: str | Path) -> str:
     """Return what a command prints in a process with a new home, in which Dr.Jit keeps compiled kernels."""
     home.mkdir()
