@@ -1,0 +1,319 @@
+"""Measures what a frame of equal error costs: naive loop, program of commit 5c22140, frames alone, frames that share.
+
+    python docs/clip_rows.py                                         # nine families at 128 x 256: half an hour
+    python docs/clip_rows.py --size 512x1024 --rows plain,room,lamp  # half an hour
+    python docs/clip_rows.py --rows i2_2000fps                       # the plan of that recipe, by both programs
+    python docs/clip_rows.py --tiny --out out/rows                   # minutes: a test of this program
+
+A row is RESULTS/FAMILY-SIZE.json. It is written when it is complete, and made once. Only missing rows are made, and
+marked ones again on quiet cores.
+
+Errors are in two units: dB below white, with picture and truth clamped there (qsim/clip/clamped_error.py), and dB below
+the 99.9th percentile without a clamp, which commit 5c22140 asks for. That program is taken from the history of git and
+runs in a separate process. It is asked twice: for the PSNR in its own unit, and for the rms error that the PSNR below
+white allows. The naive loop is rendered with TRIAL samples; by MSE = c / samples, the power of two that reaches the
+PSNR in each unit follows, and its time.
+
+Each program is judged by its own converged pictures, drawn from equal seeds. The squared error of a picture F is the
+mean of (F - R1)(F - R2) over two halves of them. Processor seconds are of all threads, medians over frames without the
+first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import math
+import os
+import subprocess
+import sys
+import tarfile
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from clip_page import page
+from clip_parts import meta, timed_frames
+from cycles_rows import agreement, use_only
+from numpy import ndarray as Array
+from reuse_rows import FAMILIES, decibels
+from rows import QUIET, ROOT, Watch, processor, refuse_busy
+
+from qsim import scenes
+from qsim.clip.clamped_error import white_in
+from qsim.clip.motion_statistics import MOVING
+from qsim.clip.writer import ClipWriter
+from qsim.colour import bright_end, psnr
+from qsim.files import read_json, write_bytes, write_json
+from qsim.rendering.budget import Budget
+from qsim.rendering.fidelity import DEEPEST, choose_budget
+from qsim.rendering.renderer import Renderer
+from qsim.scene import Scene, describe
+from qsim.studies.validation.rendering import NaiveLoop
+
+EARLIER = "5c22140"
+TRIAL = 64  # samples per pixel of the naive loop
+SAME = 0.05  # dB; units that differ by less are asked for once
+TRIED = 6  # speeds
+TARGETS = {  # function: part of a frame
+    "qsim.rendering.renderer:Renderer.frame": "choice",
+    "qsim.rendering.renderer:Renderer._pass": "paths",
+    "qsim.rendering.reuse.carrying:Carrier._traced": "paths",
+    "qsim.rendering.reuse.carrying:Carrier.pictures": "carrying",
+    "qsim.rendering.renderer:Renderer.surfaces": "surfaces",
+    "qsim.rendering.denoiser:denoised": "denoiser",
+    "qsim.rendering.reuse.choice:denoised": "denoiser",
+    "qsim.rendering.mitsuba_scene:Stage.place": "scene",
+    "qsim.rendering.renderer:Renderer.truth": "truth",
+    "qsim.clip.writer:ClipWriter.add": "writing",
+}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What one row measures."""
+
+    height: int = 128
+    width: int = 256
+    frames: int = 16  # of the clip
+    rendered: tuple[int, ...] = (5, 6, 7, 8, 9, 10)  # consecutive, in its middle; the first one is not timed
+    judged: tuple[int, ...] = (6, 8, 10)  # of these, compared with references
+    level: float = 40.0  # asked [dB]
+    motion: float = 2.0  # px/frame of the median moving pixel; half as much more or less is accepted
+    scene_seed: int = 61
+    seed: int = 61  # of samples
+    reference: int = 512  # samples per pixel of both halves of a converged picture
+    threads: int = 2
+
+
+TINY = Plan(24, 32, 6, (1, 2, 3, 4), (2, 4), 25.0, reference=32)
+
+
+def plan_of(height: int, width: int, motion: float, reference: int | None) -> Plan:
+    """Return the plan of a size; large frames, whose means are of more pixels, are fewer with smaller references."""
+    plan = Plan(height, width, motion=motion)
+    if height * width > 2**16:
+        plan = replace(plan, rendered=(6, 7, 8, 9), judged=(7, 9), reference=128)
+    return replace(plan, reference=reference or plan.reference)
+
+
+def measure(family: str, plan: Plan, there: Path) -> dict[str, Any]:
+    """Return the row of a family; `there` is the folder of the earlier program."""
+    scene, motion = moving_scene(family, plan)
+    deep = Renderer(scene, budget=Budget(plan.reference, DEEPEST), seed=plan.seed + 1000)
+    halves = [deep.halves([deep.time(t)], deep.budget, deep.key(t)) for t in plan.judged]
+    own = np.stack(halves, axis=1)
+    white, peak = levels_of(own)
+    naive = naive_loop(scene, plan, own)
+    ours = {"alone": ours_at(scene, plan, own, False), "shared": ours_at(scene, plan, own, True)}
+    if not ours["shared"]["neighbours"]:
+        del ours["shared"]
+    levels = [plan.level]
+    if (apart := psnr(peak, white)) > SAME:  # the rms error of a PSNR below white, as a PSNR below the peak
+        levels.append(round(plan.level + apart, 3))
+    other, earlier = earlier_program(scene, plan, levels, there)
+    agree = agreement(own, other, white)["difference"]
+    return {
+        "speed": scene.speed,
+        "motion": round(motion, 3),
+        "white": white,
+        "peak": peak,
+        "references": {"agree": agree, "noise": noise_of(own, white)},
+        "ways": {**naive, **earlier, **ours},
+    }
+
+
+# ---- Scene
+
+
+def moving_scene(family: str, plan: Plan) -> tuple[Scene, float]:
+    """Return a scene at the speed at which its median moving pixel moves by about `plan.motion`, and that motion [px].
+
+    `ValueError` if no speed is found.
+    """
+    speed, found = 1.0, []
+    for _ in range(TRIED):
+        scene = scenes.load(family, seed=plan.scene_seed, speed=speed).resized(plan.height, plan.width)
+        motion = median_motion(scene, plan)
+        found.append(f"{motion:.2g} px at speed {speed:g}")
+        if 0.5 <= motion / plan.motion <= 1.5:
+            return scene, motion
+        speed = float(f"{speed * (plan.motion / motion if motion > 0 else 2):.2g}")
+    raise ValueError(f"{family}: no speed moves its pixels by {plan.motion:g} px/frame; tried {', '.join(found)}")
+
+
+def median_motion(scene: Scene, plan: Plan) -> float:
+    """Return the median motion [px/frame] of pixels that move in the judged frames, 0 if none does."""
+    renderer = Renderer(scene)
+    motions = np.concatenate([np.hypot(*renderer.truth(t)["flow"]).ravel() for t in plan.judged])
+    moving = motions[motions > MOVING]
+    return float(np.median(moving)) if moving.size else 0.0
+
+
+# ---- Errors
+
+
+def levels_of(references: Array) -> tuple[float, float]:
+    """Return white and the 99.9th percentile of references [2, J, H, W], in their unit."""
+    mean = references.mean(axis=0)
+    return white_in(mean), bright_end(mean)
+
+
+def reached(pictures: Array, references: Array) -> dict[str, float]:
+    """Return the PSNR [dB] of pictures [J, H, W] in both units, by references [2, J, H, W]."""
+    white, peak = levels_of(references)
+    apart = np.asarray(pictures, np.float64) - references
+    clamped = np.minimum(np.asarray(pictures, np.float64), white) - np.minimum(references, white)
+    squares = {"white": (white, clamped), "peak": (peak, apart)}
+    return {unit: round(decibels(top, float(np.mean(d[0] * d[1]))), 2) for unit, (top, d) in squares.items()}
+
+
+def noise_of(references: Array, white: float) -> float:
+    """Return the noise of the mean of references [2, J, H, W], dB below white."""
+    halves = np.minimum(references, white)
+    return round(decibels(white, float(np.mean((halves[0] - halves[1]) ** 2) / 4)), 2)
+
+
+# ---- Ways to render
+
+
+def ours_at(scene: Scene, plan: Plan, references: Array, reuse: bool) -> dict[str, Any]:
+    """Return what frames alone, or with neighbours, cost and reach."""
+    started = time.process_time()
+    budget = choose_budget(scene, frames=plan.frames, psnr=plan.level, seed=plan.seed, reuse=reuse)
+    choosing = time.process_time() - started
+    way = {name: getattr(budget, name) for name in ("samples", "denoise", "bounces", "neighbours")}
+    if reuse and not budget.neighbours:
+        return way
+    renderer = Renderer(scene, budget=budget, seed=plan.seed, frames=plan.frames)
+    with tempfile.TemporaryDirectory() as folder:
+        told = meta(scene, describe, len(plan.rendered), renderer.frame_rate)
+        pictures, taken = timed_frames(renderer, ClipWriter(Path(folder) / "clip", told), plan.rendered, TARGETS)
+    errors = reached(np.stack([pictures[t] for t in plan.judged]), references)
+    return way | {"asked": plan.level, "reached": errors, "choosing_seconds": round(choosing, 2)} | taken
+
+
+def naive_loop(scene: Scene, plan: Plan, references: Array) -> dict[str, Any]:
+    """Return what the naive loop costs that reaches the level in each unit, extrapolated from TRIAL samples."""
+    loop = NaiveLoop(Renderer(scene, seed=plan.seed))
+    loop.mean(plan.rendered[0], TRIAL)  # compiles
+    pictures, seconds = [], []
+    for t in plan.judged:
+        started = time.process_time()
+        pictures.append(loop.mean(t, TRIAL))
+        seconds.append(time.process_time() - started)
+    found = reached(np.stack(pictures), references)
+    return {f"naive, {unit}": extrapolated(found, unit, plan.level, median(seconds)) for unit in found}
+
+
+def extrapolated(found: dict[str, float], unit: str, level: float, seconds: float) -> dict[str, Any]:
+    """Return the power of two of samples that reaches a level, from errors and seconds of TRIAL samples."""
+    samples = 2 ** max(0, math.ceil(math.log2(TRIAL) + (level - found[unit]) / (10 * math.log10(2)) - 1e-9))
+    gain = 10 * math.log10(samples / TRIAL)
+    return {
+        "asked": level,
+        "samples": samples,
+        "reached": {name: round(value + gain, 2) for name, value in found.items()},
+        "processor_seconds": round(seconds * samples / TRIAL, 4),
+    }
+
+
+def earlier_program(scene: Scene, plan: Plan, levels: list[float], there: Path) -> tuple[Array, dict[str, Any]]:
+    """Return the references [2, J, H, W] of the earlier program, and what it costs and reaches at each level [dB]."""
+    request = {name: value for name, value in vars(plan).items() if name not in ("level", "motion")}
+    request |= {"family": scene.name, "speed": scene.speed, "levels": levels}
+    with tempfile.TemporaryDirectory() as folder:
+        asked, out = Path(folder) / "request.json", Path(folder) / "out.npz"
+        asked.write_text(json.dumps(request))
+        run_there(there, str(ROOT / "docs" / "clip_earlier.py"), str(asked), str(out))
+        with np.load(out) as stored:
+            references, pictures, about = stored["references"], stored["pictures"], json.loads(str(stored["about"]))
+    ways = {}
+    for unit, level, frames, told in zip(("peak", "white"), levels, pictures, about, strict=False):
+        ways[f"earlier, {unit}"] = told | {"asked": level, "reached": reached(frames, references)}
+    return references, ways
+
+
+def unpack(folder: Path) -> None:
+    """Write the program of commit EARLIER to a folder; `ValueError` where the history does not hold it."""
+    done = subprocess.run(["git", "archive", EARLIER, "qsim", "scenes"], cwd=ROOT, capture_output=True, check=False)
+    if done.returncode:
+        raise ValueError(
+            f"commit {EARLIER} is needed, and this copy lacks its history; fetch it: git fetch --unshallow"
+        )
+    with tarfile.open(fileobj=io.BytesIO(done.stdout)) as archive:
+        archive.extractall(folder, filter="data")
+
+
+def run_there(folder: Path, *words: str) -> str:
+    """Return what Python prints with the program in a folder; `ValueError` with the last line of its error."""
+    line, env = [sys.executable, *words], os.environ | {"PYTHONPATH": str(folder)}
+    done = subprocess.run(line, env=env, cwd=folder, capture_output=True, text=True, check=False)
+    if done.returncode:
+        said = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise ValueError(f"{' '.join(words[:3])} stopped with code {done.returncode}: {said}")
+    return done.stdout
+
+
+# ---- Plans of recipes
+
+
+def planned(recipe: str, there: Path) -> dict[str, Any]:
+    """Return the plans of a recipe by the program in a folder, and by this one with frames alone and that share."""
+    text, found = scenes.RECIPES[recipe].read_text(), {}
+    ways = {"earlier, peak": (there, ""), "alone": (ROOT, "reuse = false\n"), "shared": (ROOT, "reuse = true\n")}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{recipe}.toml"
+        for way, (program, line) in ways.items():
+            path.write_text(text.replace("[recipe]\n", "[recipe]\n" + line, 1))
+            found[way] = json.loads(run_there(program, "-m", "qsim", "plan", str(path), "--json", "-q"))
+    return {"recipe": recipe, "plans": found}
+
+
+def main(words: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", default=",".join(FAMILIES), help="families and recipes, separated by commas")
+    parser.add_argument("--size", default="128x256", help="HEIGHTxWIDTH in px (default 128x256)")
+    parser.add_argument("--motion", type=float, default=Plan.motion, help="px/frame (default 2)")
+    parser.add_argument("--reference", type=int, help="samples of a converged picture (default 512, large frames 128)")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "clips", help="folder of the rows")
+    parser.add_argument("--busy", action="store_true", help="also beside other programs; such rows are marked")
+    parser.add_argument("--tiny", action="store_true", help="few and small frames: a test of this program")
+    args = parser.parse_args(words)
+    height, width = map(int, args.size.split("x"))
+    plan = TINY if args.tiny else plan_of(height, width, args.motion, args.reference)
+    use_only(plan.threads)
+    args.out.mkdir(parents=True, exist_ok=True)
+    busy = args.busy or args.tiny
+    for name in args.rows.split(","):
+        fast = "" if plan.motion == Plan.motion else f"-{plan.motion:g}px"
+        recipe = name in scenes.RECIPES
+        path = args.out / (f"{name}.json" if recipe else f"{name}-{plan.height}x{plan.width}{fast}.json")
+        if path.exists() and (busy or read_json(path)["quiet"]):
+            continue
+        try:
+            if not busy:
+                refuse_busy()
+            watch = Watch.now()
+            with tempfile.TemporaryDirectory() as folder:
+                unpack(Path(folder))
+                row = planned(name, Path(folder)) if recipe else measure(name, plan, Path(folder))
+        except ValueError as error:
+            print(f"clip_rows: {error}", file=sys.stderr)
+            return 2
+        others = watch.others()
+        quiet = others is not None and others <= QUIET
+        write_json(path, {"plan": vars(plan), "processor": processor(), "quiet": quiet, **row})
+        print(f"{path}: written", flush=True)
+    rows = {path.stem: read_json(path) for path in sorted(args.out.glob("*.json"))}
+    write_bytes(args.out.with_suffix(".md"), page(rows).encode())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
