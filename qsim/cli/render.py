@@ -64,11 +64,15 @@ def add_render(sub: Any) -> None:
     )
     light = checked(checks.positive)
     parser.add_argument("--ppp", type=light, help=LIGHT)
-    parser.add_argument(
+    sharing = parser.add_mutually_exclusive_group()
+    sharing.add_argument(
         "--reuse",
         action="store_true",
-        help="let sharp frames share samples with their neighbours where that costs less (default: each frame alone)",
+        default=None,
+        help="let sharp frames share samples with their neighbours where that costs less (default: where trying it "
+        "costs little against the clip)",
     )
+    sharing.add_argument("--no-reuse", dest="reuse", action="store_false", default=None, help="render each frame alone")
     parser.add_argument("--engine", choices=BACKENDS, help="engine to use (default: QSIM_ENGINE, else the fastest)")
     parser.add_argument("--force", action="store_true", help="replace an existing clip")
 
@@ -116,9 +120,8 @@ def _run_render(args: argparse.Namespace) -> int:
         how = "before denoising" if render_meta["denoise"] else "not removed"
         text += f"\n{fireflies} of {pixels} pixels are fireflies (Monte-Carlo outliers); {how}"
     findings = [Finding(**finding) for finding in render_meta["findings"]]
-    text += "".join(
-        f"\n{explain([one])}" for one in findings if one.effect == REUSE and args.reuse and not args.explain
-    )
+    if not args.explain and (args.reuse or render_meta["neighbours"]):
+        text += "".join(f"\n{explain([one])}" for one in findings if one.effect == REUSE)
     text += "\n" + (explain(findings) if args.explain or clip.camera is None else diffraction_line(clip.camera))
     output(args, {"clip": str(clip.path)} | {k: v for k, v in clip.meta.items() if k != "checksums"}, text)
     return 0

@@ -25,7 +25,7 @@ class Settings:
     psnr: float = 40.0  # wanted error of the radiance, dB below white
     bands: str | None = None  # "rgb": in colour
     camera_path: str | None = None  # absolute path of a transforms.json
-    reuse: bool = False  # whether frames may share samples with their neighbours
+    reuse: bool | None = None  # whether frames share samples with their neighbours; None: where a trial costs little
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Job:
         described["settings"] = {
             key: value
             for key, value in described["settings"].items()
-            if key != "camera_path" and (key, value) not in (("bands", None), ("reuse", False))
+            if key != "camera_path" and (key, value) not in (("bands", None), ("reuse", None))
         }
         for stream in described["streams"]:  # options that are off stay out: data sets of earlier versions resume
             for key, off in (

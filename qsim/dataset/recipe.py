@@ -11,7 +11,8 @@
     psnr = 40.0                # wanted error of the radiance, dB below white, clamped there; default 40
     bands = "rgb"              # colour: bands R, G and B; default: one band
     camera_path = "path.json"  # poses, view and distortion of the camera, a transforms.json; default: the scene's
-    reuse = true               # sharp frames share samples with neighbours where that costs less; default: each alone
+    reuse = true               # sharp frames share samples with neighbours where that costs less; false: each alone;
+                               # default: where a trial costs little against the clip
 
     [[scenes]]                 # one clip per family, seed and speed
     family = "fan"             # a family of scenes/; or a .py, .xml, .glb file or folder beside the recipe ("./things")

@@ -40,7 +40,7 @@ def render(
     ppp: float | None = None,
     bands: str | None = None,
     camera_path: str | os.PathLike[str] | None = None,
-    reuse: bool = False,
+    reuse: bool | None = None,
     budget: Budget | None = None,
     progress: Progress | None = None,
     force: bool = False,
@@ -54,8 +54,9 @@ def render(
     the requested error, `ppp` the brightest light that will be sensed [photons/pixel] (`choose_budget`); a `budget`
     decides both instead. `bands="rgb"` gives a scene of one band colours (scenes/colours.py) and renders red, green and
     blue. `camera_path` is a transforms.json whose view, distortion and poses replace those of the scene's camera; a
-    file that states no rate has one pose per frame (qsim/scene/camera_path.py). `reuse` lets sharp frames share
-    samples with their neighbours where that is predicted to cost less.
+    file that states no rate has one pose per frame (qsim/scene/camera_path.py). `reuse` True lets sharp frames share
+    samples with their neighbours where that is predicted to cost less, None only where a trial costs little against the
+    clip, False never.
 
     `path` is the folder of the clip; an equal call resumes an interrupted one. Without it, the clip lies in a temporary
     folder that is deleted after the last use of the clip and its streams. `progress(done, frames)` is called after each

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from typing import TypeVar
 
 import numpy as np
 from numpy import ndarray as Array
@@ -32,6 +33,7 @@ from qsim.clip.clamped_error import clamped_squares
 from qsim.optics.radiometry import Crop
 
 AROUND = 33  # px, side of the square around a pixel in which errors are compared
+Kind = TypeVar("Kind", bound="Mixture")
 KEPT = 0.25  # of a frame's error: the largest shift of its mean towards that of the raw halves
 
 
@@ -106,7 +108,7 @@ def cleaned_mean(halves: Array, albedo: Array, normal: Array, white: float, qual
     return keeping_mean(mixture(halves, cleaned), float(halves.mean()), white)
 
 
-def keeping_mean(mixed: Mixture, wanted: float, white: float) -> Mixture:
+def keeping_mean(mixed: Kind, wanted: float, white: float) -> Kind:
     """Return a mixture with this mean radiance, or as near to it as KEPT times its error at white allows."""
     mean, most = float(mixed.picture.mean()), KEPT * mixed.error_at(white)
     if not mean > 0:

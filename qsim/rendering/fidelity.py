@@ -27,7 +27,7 @@ from qsim.optics.diffraction import diffraction_line
 from qsim.optics.radiometry import WHITE_PER_MEAN
 from qsim.rendering.budget import Allowed, Budget, Finding, blur_error, grid_samples
 from qsim.rendering.pilot import COUNTS, Pilot, denoised_samples, rests
-from qsim.rendering.reuse.sharing import ALONE, NAME, Need, Sharing, shared_samples
+from qsim.rendering.reuse.sharing import Need, Sharing, shared_samples
 from qsim.scene import Scene
 
 SHARE = 0.3  # of the allowed rms error, for the bounces left out and for the blur of finitely many instants
@@ -72,14 +72,15 @@ def choose_budget(
     ppp: float | None = None,
     quantum_efficiency: float = 1.0,
     denoise: bool | None = None,
-    reuse: bool = False,
+    reuse: bool | None = None,
     seed: int = 0,
 ) -> Budget:
     """Return the smallest budget with an error below `psnr` [dB] and, at `ppp` photons, below the sensor's noise.
 
     `ppp` is the highest light level at which the clip will be sensed; with None, only `psnr` counts. `denoise` None
-    denoises if Open Image Denoise is installed and cheaper at the same measured error. `reuse` lets neighbouring frames
-    share samples where that is predicted to cost less. The result depends only on the arguments and the installed
+    denoises if Open Image Denoise is installed and cheaper at the same measured error. `reuse` None lets neighbouring
+    frames share samples where that is predicted to cost less and the trial costs little against the clip; True tries
+    it at any length, False renders each frame alone. The result depends only on the arguments and the installed
     software: an interrupted clip resumes with the same budget. `ValueError` for a `psnr` outside 10 to 80 dB and for a
     scene without light.
     """
@@ -117,19 +118,16 @@ def choose_budget(
         fewer, about_denoiser = denoised_samples(
             pilot, instants, bounces, allowed, share, samples, denoise, lambda n: noise.at(n / instants, instants)
         )
-    chosen, about_reuse = Sharing(samples, 0, ""), Finding(NAME, ALONE, "not requested")
+    alone = Sharing(samples, 0, "")
     if fewer is not None:
-        chosen = Sharing(fewer[0], 0, fewer[1])
+        alone = Sharing(fewer[0], 0, fewer[1])
         about_samples = Finding("samples", f"{fewer[0]} per pixel, denoised", f"without: {about_samples.chosen}")
-    if reuse:
-        need = Need(allowed, share, bounces, frames, chosen, noise.at)
-        chosen, about_reuse = shared_samples(pilot, need, denoise)
-        if chosen is not need.alone:
-            size = f"frames alone: {about_samples.chosen}"
-            about_samples = Finding(
-                "samples", f"{chosen.samples} per pixel{', denoised' if chosen.denoise else ''}", size
-            )
-            about_denoiser = Finding("denoiser", chosen.about_denoiser, "tried on shared samples")
+    need = Need(allowed, share, bounces, frames, alone, noise.at)
+    chosen, about_reuse = shared_samples(pilot, need, denoise, reuse)
+    if chosen is not alone:
+        size = f"frames alone: {about_samples.chosen}"
+        about_samples = Finding("samples", f"{chosen.samples} per pixel{', denoised' if chosen.denoise else ''}", size)
+        about_denoiser = Finding("denoiser", chosen.about_denoiser, "tried on shared samples")
     effects = (*_flicker(pilot.renderer.strengths(frames)), *_lens(scene.camera))
     lens = (*effects, *_left_out(scene.camera, pilot.truths()))
     pixels = scene.camera.height * scene.camera.width

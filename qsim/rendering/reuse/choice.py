@@ -11,20 +11,54 @@ first halves only. M has no bias. The bias and the noise of F, and its error, fo
 Shadows and reflections that do not follow their surface give a bias that is smoother than noise, so it is measured in
 means of BLOCK x BLOCK pixels. A tile takes the picture, and then the share of its denoised version, that errs least in
 the tiles around it, without the tile itself: the pixels that state its error have not chosen it. Their estimate has a
-standard error of about 2 / sqrt(pixels) of the squared noise of M, however small the error of F is.
+standard error of about 2 / sqrt(pixels) of the squared noise of M, however small the error of F is. The same estimate
+from the means of blocks has half of it, but misses what alternates within a block. The larger of both is stated.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass, field, replace
+
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.clip.clamped_error import clamped_squares
+from qsim.optics.radiometry import Crop
 from qsim.rendering.denoiser import Mixture, denoised, keeping_mean
 
 TILE = 8  # px, side of a tile
 BLOCK = 2  # px, side of the squares whose means show a bias; larger ones show less noise, but no edge of a shadow
 NEIGHBOURHOOD = 5  # tiles, side of the square around a tile that chooses for it
 LEFT_BY_DENOISER = 0.1  # of the squared noise, about; of bias it removes nothing
+
+
+@dataclass(frozen=True, eq=False)
+class SharedMixture(Mixture):
+    """A mixture whose error is stated by its own samples: by single pixels and by blocks of them."""
+
+    apart: Array = field(kw_only=True)  # [2, H, W], halves of the picture less the halves of the frame's own samples
+
+    @property
+    def error(self) -> float:
+        """The rms error of the picture, W m^-2 sr^-1."""
+        return self.error_at(math.inf)
+
+    def error_at(self, white: float, sigmas: float = 1.0) -> float:
+        """Return the rms error of picture and truth clamped at white, plus `sigmas` standard errors of the blocks'."""
+        single = float(clamped_squares(self.squares, self.picture, self.lower, white).mean())
+        noise = float(clamped_squares(np.asarray(self.noise), self.picture, self.lower, white).mean())
+        blocks = products(np.where(self.picture < white, self.apart, 0))
+        error = float(blocks.std()) * math.sqrt(blocks.size)
+        stated = max(single, noise + float(blocks.sum()) / self.raw.size) + sigmas * error / self.raw.size
+        least = float(np.mean(np.where(self.picture < white, self.noise, 0)))
+        return math.sqrt(max(stated, 0.01 * float(np.mean(np.minimum(self.raw, white**2))), least))
+
+    def cut(self, crop: Crop, thinned: int) -> SharedMixture:
+        """Return every n-th (`thinned`) row and column of a window (y, x, height, width)."""
+        y, x, height, width = crop
+        apart = self.apart[:, y : y + height : thinned, x : x + width : thinned]
+        return replace(self, **vars(super().cut(crop, thinned)), apart=apart)
 
 
 def best_of(pictures: Array, white: float, denoises: bool) -> tuple[Array, Array]:
@@ -38,8 +72,7 @@ def best_of(pictures: Array, white: float, denoises: bool) -> tuple[Array, Array
     scores = []
     for picture in clamped:
         noise = _around(_sums((picture[0] - picture[1]) ** 2 / 4, TILE))
-        first, second = (_sums(half, BLOCK) for half in picture - own)
-        bias = _around(_sums(first * second / _sums(np.ones_like(own[0]), BLOCK), TILE // BLOCK))
+        bias = _around(_sums(products(picture - own), TILE // BLOCK))
         scores.append(np.maximum(bias, 0) + (LEFT_BY_DENOISER if denoises else 1.0) * noise)
     number = np.argmin(scores, axis=0)
     chosen = _spread(number, own.shape[1:])
@@ -48,7 +81,7 @@ def best_of(pictures: Array, white: float, denoises: bool) -> tuple[Array, Array
 
 def reused_mean(
     own: Array, best: Array, surfaces: tuple[Array, Array] | None, white: float, quality: str = "high"
-) -> Mixture:
+) -> SharedMixture:
     """Return the picture of two halves `best` [2, H, W], denoised where that lowers its error against `own` [2, H, W].
 
     `surfaces` are albedo [H, W] and normals [H, W, 3] for the denoiser of this quality; None does not denoise. The mean
@@ -65,11 +98,18 @@ def reused_mean(
     return keeping_mean(_mixed(own, best, cleaned, share), float(best.mean()), white)
 
 
-def _mixed(own: Array, best: Array, cleaned: Array, share: Array) -> Mixture:
+def _mixed(own: Array, best: Array, cleaned: Array, share: Array) -> SharedMixture:
     mixed = share * cleaned + (1 - share) * best
     z, middle = own[0] - own[1], mixed.mean(axis=0)
     squares = (middle - own.mean(axis=0)) ** 2 + (mixed[0] - mixed[1]) * z / 2 - z**2 / 4
-    return Mixture(share, middle, mixed.min(axis=0), squares, z**2 / 4, (mixed[0] - mixed[1]) ** 2 / 4)
+    noise = (mixed[0] - mixed[1]) ** 2 / 4
+    return SharedMixture(share, middle, mixed.min(axis=0), squares, z**2 / 4, noise, apart=mixed - own)
+
+
+def products(apart: Array) -> Array:
+    """Return the products of two differences' [2, H, W] sums in blocks, over the pixels of each block [h, w]."""
+    first, second = (_sums(half, BLOCK) for half in apart)
+    return first * second / _sums(np.ones_like(apart[0]), BLOCK)
 
 
 def _sums(values: Array, side: int) -> Array:

@@ -33,6 +33,7 @@ KERNEL_COST = 4e6  # cost of compiling the kernels of a clip, in samples
 SAMPLE_BYTES = 12  # that a kept sample takes: depth, body, radiance
 MOST_BYTES = 1.2e9  # that the kept samples of all neighbours may take
 MOST_TRIED = 2  # of COUNTS: a trial renders eleven frames
+MOST_TRIAL = 0.05  # of the predicted cost of a clip: what a trial may cost that nobody asked for
 NAME, ALONE = "reuse over time", "off, each frame alone"
 
 
@@ -80,29 +81,37 @@ def most_neighbours(samples: int, pixels: int) -> int:
     return max((k for k in REACH if (2 * k + 1) * kept <= MOST_BYTES), default=0)
 
 
-def shared_samples(pilot: Pilot, need: Need, denoise: bool | None) -> tuple[Sharing, Finding]:
+def shared_samples(
+    pilot: Pilot, need: Need, denoise: bool | None, wanted: bool | None = None
+) -> tuple[Sharing, Finding]:
     """Return how the frames of a clip share samples, `need.alone` where that is predicted to cost no more.
 
-    `denoise` None takes the cheaper; True and False leave no choice.
+    `denoise` None takes the cheaper; True and False leave no choice. `wanted` None tries only what costs little against
+    the clip, True whatever could pay for itself, False nothing.
     """
+    if wanted is False:
+        return need.alone, Finding(NAME, ALONE, "not requested")
     renderer, alone = pilot.renderer, need.alone
     reason = unshared(renderer.scene, renderer.shutter, renderer.engine.backend) or "one frame" * (need.frames == 1)
     if reason:
         return alone, Finding(NAME, ALONE, f"not with {reason}")
     camera = renderer.scene.camera
     pixels = camera.height * camera.width
-    kinds = [kind for kind in ("", "high") if denoise in (None, bool(kind)) and (available() or not kind)]
+    kinds = [kind for kind in ("", *DENOISE_COST) if denoise in (None, bool(kind)) and (available() or not kind)]
+    clip = need.frames * pixels * alone.cost(pixels)
     trials: list[Trial] = []
     for samples in COUNTS[:MOST_TRIED]:
-        saved = need.frames * pixels * (alone.cost(pixels) - Sharing(samples, 1, kinds[0]).cost(pixels))
-        if saved <= _trial_cost(samples, pilot) or not most_neighbours(samples, pixels):
+        saved = clip - need.frames * pixels * Sharing(samples, 1, kinds[0]).cost(pixels)
+        cost = _trial_cost(samples, pilot, kinds)
+        if saved <= cost or not most_neighbours(samples, pixels) or (wanted is None and cost > MOST_TRIAL * clip):
             break
         trials.append(Trial.of(pilot, need, samples, kinds))
         if min(map(max, trials[-1].found.values())) <= 1:
             break
     best = _cheapest(trials, alone, pixels)
     if best is alone:
-        why = "frames alone cost no more" if trials else "a trial would cost more than it could save"
+        dear = "more than it could save" if wanted else f"over {100 * MOST_TRIAL:g} % of the clip, or save nothing"
+        why = "frames alone cost no more" if trials else f"a trial would cost {dear}"
         return alone, Finding(NAME, ALONE, why)
     where = f"{'' if len(windows(camera)) == 1 else 'four windows of '}frame {pilot.middle}"
     size = f"tried in {where}; {100 * best.cost(pixels) / alone.cost(pixels):.0f} % of the cost without, by prediction"
@@ -159,10 +168,10 @@ def _fewer_at_ends(frames: int, t: int, neighbours: int) -> float:
     return float(np.mean(counts[t] / counts))
 
 
-def _trial_cost(samples: int, pilot: Pilot) -> float:
+def _trial_cost(samples: int, pilot: Pilot, kinds: list[str]) -> float:
     """Return the cost of a trial with its kernels, in samples."""
     pixels = sum(height * width for _, _, height, width in windows(pilot.renderer.scene.camera))
-    denoising = len(REACH) * DENOISE_COST["high"] * available()
+    denoising = len(REACH) * sum(DENOISE_COST.get(kind, 0.0) for kind in kinds)
     return KERNEL_COST + pixels * (2 * REACH[-1] * samples + Sharing(samples, REACH[-1], "").cost(pixels) + denoising)
 
 

@@ -120,7 +120,11 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ],
     ("render", "--psnr"): [Acts(f"{RENDER} -o r", "--psnr 34", slow=True), Refused(RENDER, "--psnr 5", "psnr")],
     ("render", "--ppp"): [Acts(f"{RENDER} -o r", "--ppp 3000", slow=True)],
-    ("render", "--reuse"): [Acts(f"{RENDER} -o r", "--reuse", stdout, slow=True)],
+    ("render", "--reuse"): [
+        Acts(f"{RENDER} -o r", "--reuse", stdout, slow=True),
+        Refused(f"{RENDER} -o r --no-reuse", "--reuse", "--reuse"),
+    ],
+    ("render", "--no-reuse"): [Acts(f"{RENDER} --explain", "--no-reuse", stdout, slow=True)],
     ("render", "--engine"): [Acts(f"{RENDER} -o r", "--engine scalar", slow=True)],
     ("render", "--force"): [
         Acts(f"{RENDER} -o clip", "--force", exit_code, codes=(0, 2), slow=True),

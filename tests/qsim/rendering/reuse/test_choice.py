@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from stats import critical_z
 
-from qsim.rendering.reuse.choice import TILE, best_of, reused_mean
+from qsim.rendering.reuse.choice import BLOCK, TILE, best_of, products, reused_mean
 
 SIZE = (120, 168)  # px
 FRAMES = np.array([1, 3, 5, 7, 11])
@@ -70,6 +70,40 @@ def test_the_stated_error_contains_the_bias(seed, size):
     assert abs(float(mixed.squares.mean()) - real) < critical_z(checks=9) * sigma
     assert mixed.error**2 >= float(np.mean((best[0] - best[1]) ** 2) / 4)
     assert mixed.error_at(1.2) <= mixed.error
+
+
+def test_a_bias_that_alternates_within_a_block_is_stated():
+    columns = np.arange(SIZE[1])
+    truth, pictures = drawn(4, 0.1 * (-1.0) ** columns * np.ones(SIZE))
+    mixed = reused_mean(pictures[0], pictures[4], None, 10.0)
+    real = float(np.mean((pictures[4].mean(axis=0) - truth) ** 2))
+    sigma = float(mixed.squares.std()) / np.sqrt(mixed.squares.size)
+    assert mixed.error_at(10.0, 0) ** 2 > real - critical_z(checks=1) * sigma
+    blocks = float(products(mixed.apart).sum()) / truth.size
+    assert blocks < real / 2, "blocks alone would see it, and this test would show nothing"
+
+
+def test_the_stated_error_is_seldom_too_good():
+    """By blocks it has less chance than by single pixels, and the larger of both is stated."""
+    apart, draws = [], 40
+    for seed in range(draws):
+        truth, pictures = drawn(seed, 0.05 * np.sin(np.arange(SIZE[1]) / 9.0) * np.ones(SIZE))
+        mixed = reused_mean(pictures[0], pictures[3], None, 10.0)
+        real = float(np.mean((pictures[3].mean(axis=0) - truth) ** 2))
+        blocks = products(mixed.apart)
+        sigma = float(blocks.std()) * np.sqrt(blocks.size) / truth.size
+        apart.append((mixed.error_at(10.0, 0) ** 2 - real) / sigma)
+    assert blocks.size * BLOCK**2 == truth.size
+    assert min(apart) > -critical_z(checks=draws)
+
+
+def test_a_part_of_a_picture_states_its_own_error():
+    truth, pictures = drawn(5, np.zeros(SIZE))
+    pictures[:, :, :60] += 0.3 * np.sin(np.arange(SIZE[1]) / 3.0) * (np.arange(5) > 0)[:, None, None, None]
+    mixed = reused_mean(pictures[0], pictures[4], None, 10.0)
+    above, below = (mixed.cut((y, 0, 60, SIZE[1]), 1) for y in (0, 60))
+    assert above.error > 2 * below.error
+    assert above.apart.shape == (2, 60, SIZE[1])
 
 
 def test_a_frame_smaller_than_a_tile_takes_its_own_samples():

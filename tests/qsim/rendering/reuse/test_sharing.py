@@ -54,7 +54,7 @@ def turning():
 
 def test_a_clip_shares_samples_where_that_costs_less(turning):
     pilot, need = turning
-    found, about = shared_samples(pilot, need, False)
+    found, about = shared_samples(pilot, need, False, True)
     assert 8 <= found.samples <= 32
     assert found.neighbours in (1, 2, 3, 5)
     assert not found.denoise
@@ -72,7 +72,7 @@ def test_a_clip_shares_samples_where_that_costs_less(turning):
 )
 def test_a_clip_is_rendered_alone_where_sharing_costs_more_or_errs_more(turning, change, why):
     pilot, need = turning
-    found, about = shared_samples(pilot, replace(need, **change), False)
+    found, about = shared_samples(pilot, replace(need, **change), False, True)
     assert found.neighbours == 0
     assert (about.chosen, about.size) == ("off, each frame alone", why)
 
@@ -81,14 +81,30 @@ def test_small_frames_share_only_samples_by_which_their_error_is_known(turning):
     """A stricter target needs more samples, for the error and for its doubt."""
     pilot, need = turning
     strict, loose = (
-        shared_samples(pilot, replace(need, allowed=replace(need.allowed, target=factor * need.allowed.target)), False)
+        shared_samples(
+            pilot, replace(need, allowed=replace(need.allowed, target=factor * need.allowed.target)), False, True
+        )
         for factor in (0.6, 1.0)
     )
     assert strict[0].samples > loose[0].samples
 
 
+def test_without_a_wish_a_trial_costs_little_against_the_clip(turning):
+    """The same clip shares samples if it has many frames, by as many trials as cost a twentieth of it each."""
+    pilot, need = turning
+    found = {frames: shared_samples(pilot, replace(need, frames=frames), False)[0] for frames in (9, 2000)}
+    assert found[9] is need.alone
+    assert found[2000].neighbours
+    assert shared_samples(pilot, replace(need, frames=2000), False, False)[0] is need.alone
+
+
 @pytest.mark.parametrize(
-    ("options", "why"), [({"shutter": 0.5, "reuse": True}, "not with an open shutter"), ({}, "not requested")]
+    ("options", "why"),
+    [
+        ({"shutter": 0.5, "reuse": True}, "not with an open shutter"),
+        ({"reuse": False}, "not requested"),
+        ({}, "a trial would cost over 5 % of the clip, or save nothing"),
+    ],
 )
 def test_the_finding_says_why_frames_are_rendered_alone(options, why):
     chosen = choose_budget(plate(None), psnr=20, frames=9, **options)
