@@ -143,7 +143,7 @@ def moving_scene(family: str, plan: Plan) -> tuple[Scene, float]:
         found.append(f"{motion:.2g} px at speed {speed:g}")
         if 0.5 <= motion / plan.motion <= 1.5:
             return scene, motion
-        speed = float(f"{speed * (plan.motion / motion if motion > 0 else 2):.2g}")
+        speed = float(f"{speed * (plan.motion / motion if motion > 0 else 0.5):.2g}")
     raise ValueError(f"{family}: no speed moves its pixels by {plan.motion:g} px/frame; tried {', '.join(found)}")
 
 
