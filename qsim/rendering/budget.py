@@ -81,12 +81,12 @@ def explain(findings: Sequence[Finding]) -> str:
 
 
 def grid_samples(samples: int) -> int:
-    """Return the next size of an even, nearly square grid: 4, 6, 8, 12, 16, 20, 24, 30, 36, 42, 48, 56, 64, ...
+    """Return the next size of an even, nearly square grid: 2, 4, 6, 8, 12, 16, 20, 24, 30, 36, 42, 48, 56, 64, ...
 
     Multijitter has larger errors on squares of odd numbers; on all other grids, error * samples^0.7 is nearly constant
     (docs/log.md).
     """
-    size = max(4, samples)
+    size = max(2, samples)
     while not _is_grid(size):
         size += 1
     return size

@@ -279,7 +279,7 @@ def _falling(errors: list[float]) -> tuple[float, ...]:
 
 def fewest_samples(noise: Noise, instants: int, allowed: Allowed, share: float) -> tuple[int, Finding]:
     """Return the samples per pixel and frame whose noise takes at most `share` of the allowed error, and a finding."""
-    each = 2 * grid_samples(COUNTS[0] // 2)
+    each = 2 * grid_samples(1)
     if min(noise.plain) <= 0:
         return each * instants, Finding("samples", f"{each * instants} per pixel", "the pilot found no noise")
     while allowed.fraction(noise.at(each, instants)) > share and each * instants < MOST_SAMPLES:

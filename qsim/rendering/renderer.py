@@ -259,7 +259,7 @@ class Renderer:
         import drjit as dr
 
         mi = self.mi
-        samples = grid_samples(max(2, SURFACE_SAMPLES // len(instants)))
+        samples = grid_samples(max(4, SURFACE_SAMPLES // len(instants)))
         parts = self.film.parts(samples)
         seeds = words(key, (len(instants), len(parts)), redraw=1)
         colours = 1 if self.scene.bands is None else 3

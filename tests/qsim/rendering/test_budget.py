@@ -79,7 +79,7 @@ def test_a_budget_without_samples_is_refused():
 def test_samples_are_shared_among_halves_and_instants():
     assert Budget(samples=72).grid(1) == 36
     assert Budget(samples=72).grid(9) == 4
-    assert Budget(samples=1).grid(5) == 4
+    assert Budget(samples=1).grid(5) == 2
 
 
 def test_a_quality_of_the_denoiser_that_does_not_exist_is_refused():

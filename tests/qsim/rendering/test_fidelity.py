@@ -25,7 +25,7 @@ def test_no_motion_needs_one_instant():
     assert not chosen.sharp
 
 
-@pytest.mark.parametrize("psnr", [32.0, 42.0])
+@pytest.mark.parametrize("psnr", [25.0, 32.0, 42.0])
 def test_the_requested_error_is_reached_without_waste(psnr):
     made = plate(Spin((0, 0, 1), 200.0), light=SunSky())
     chosen = choose_budget(made, psnr=psnr, denoise=False)

@@ -98,7 +98,7 @@ def test_the_stated_error_is_seldom_too_good():
 
 
 def test_a_part_of_a_picture_states_its_own_error():
-    truth, pictures = drawn(5, np.zeros(SIZE))
+    _, pictures = drawn(5, np.zeros(SIZE))
     pictures[:, :, :60] += 0.3 * np.sin(np.arange(SIZE[1]) / 3.0) * (np.arange(5) > 0)[:, None, None, None]
     mixed = reused_mean(pictures[0], pictures[4], None, 10.0)
     above, below = (mixed.cut((y, 0, 60, SIZE[1]), 1) for y in (0, 60))
