@@ -28,7 +28,7 @@ from quiver.model.blocks import (
 )
 from quiver.model.config import Config
 
-CHUNK_PIXELS = 2**16  # without gradients, frames are computed together up to this many pixels
+CHUNK_PIXELS = 2**12  # without gradients, frames are computed together up to this many; more take longer on a CPU
 
 Pair = tuple[Tensor, Tensor]  # of the previous and the current frame
 Encoded = tuple[Tensor, Tensor, Tensor]  # R1, R2 and the recurrent cell's entry

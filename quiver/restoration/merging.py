@@ -32,7 +32,7 @@ def fill_merged(
 
     length, height, width = codes.shape
     domain = information_domain(codes.sensor, codes.exposure)
-    pieces = cut_pieces(network, height, width, options.memory, options.mode)
+    pieces = cut_pieces(network, height, width, options.memory)
     apart, done, read = Disagreement.nothing(height, width), 0, frame_reader(codes)
     for tile in pieces.tiles:
         rows, columns = tile.weight.shape

@@ -78,7 +78,7 @@ def wrap_network(
     identity = {"weights_sha256": weights_sha256, "mode": mode, "precision": options.precision}
 
     def cut(height: int, width: int) -> str:
-        return cut_pieces(model, height, width, options.memory, options.mode).text
+        return cut_pieces(model, height, width, options.memory).text
 
     return Restorer(name, window, look_ahead, True, description, fill, mode != "streaming", identity, cut, together)
 
@@ -95,7 +95,7 @@ def fill_network(
     device = next(model.parameters()).device
     dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
     height, width = codes.shape[1:]
-    pieces = cut_pieces(model, height, width, options.memory, options.mode)
+    pieces = cut_pieces(model, height, width, options.memory)
     multiple = int(model.multiple)  # type: ignore[arg-type]
     apart, done = Disagreement.nothing(height, width), 0
     for tile in pieces.tiles:
@@ -127,7 +127,7 @@ def fill_parts(
     dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
     length, height, width = codes.shape
     part, last, done = part_of(network), first + len(out), 0
-    pieces = cut_pieces(network, height, width, options.memory, options.mode)
+    pieces = cut_pieces(network, height, width, options.memory)
     apart, known = Disagreement.nothing(height, width), known_of(network, codes)
     for start in range(first - first % part.kept, last, part.kept):
         end = min(length, start + part.kept + part.after)

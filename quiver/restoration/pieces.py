@@ -47,28 +47,28 @@ class Pieces:
         return f"{len(self.tiles)} tiles of at most {tallest} x {widest}"
 
 
-def cut_pieces(model: nn.Module, height: int, width: int, memory: int, mode: str) -> Pieces:
+def cut_pieces(model: nn.Module, height: int, width: int, memory: int) -> Pieces:
     """Return the cut of a frame for a network and `memory` bytes. `ValueError` if they do not hold a small tile."""
     from quiver.model.quiver import QUIVER
 
-    pixels = memory // bytes_per_pixel(model, mode)
+    pixels = memory // bytes_per_pixel(model)
     if height * width <= pixels:
         return Pieces(cut_tiles(height, width, height * width, 0))
     reach = getattr(model, "reach", None)
     if reach is not None:
         return Pieces(cut_tiles(height, width, pixels, reach, int(model.multiple)))  # type: ignore[arg-type]
     if takes_clips(model):  # recurrent, or aligned along any motion: no overlap makes tiles exact
-        needed = bytes_per_pixel(model, mode) * height * width
+        needed = bytes_per_pixel(model) * height * width
         return Pieces(cut_tiles(height, width, pixels, BLENDED, STEP, blend=True), False, needed)
     multiple = int(model.multiple)  # type: ignore[arg-type]
     if not isinstance(model, QUIVER):
         return Pieces(cut_tiles(height, width, pixels, BLENDED, multiple, blend=True), exact=False)
-    needed = bytes_per_pixel(model, mode) * height * width
-    step, pixels = max(multiple, model.stride), max(memory - TILING, 0) // bytes_per_pixel(model, mode)
+    needed = bytes_per_pixel(model) * height * width
+    step, pixels = max(multiple, model.stride), max(memory - TILING, 0) // bytes_per_pixel(model)
     return Pieces(cut_tiles(height, width, pixels, BLENDED, step, blend=True), False, needed)
 
 
-def bytes_per_pixel(model: nn.Module, mode: str) -> int:
+def bytes_per_pixel(model: nn.Module) -> int:
     """Return the working memory of a network per pixel of a tile, float32: about 1.5 times of what `quiver bench`
     measured.
     """
@@ -81,8 +81,7 @@ def bytes_per_pixel(model: nn.Module, mode: str) -> int:
         return MERGED_BYTES * max(24, model.config.width) // 24
     if not isinstance(model, QUIVER):
         return 4_000
-    held = 2 if mode == "windows" else 1  # windows of eleven frames at once
-    return held * (4000 + 1200 * model.config.channels)
+    return 4000 + 1200 * model.config.channels
 
 
 # Bytes per pixel that restoring a part of a clip takes at published width: measured with one frame, and more for each.

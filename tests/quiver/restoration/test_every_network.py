@@ -98,8 +98,8 @@ def test_a_frame_beyond_the_memory_is_cut_exactly_or_with_a_word(name, monkeypat
     """Tiles change nothing, or a warning states by how much they differ and, where that is known, what avoids it."""
     monkeypatch.setattr("quiver.restoration.pieces.TILING", 0)  # a small frame would fit into it
     network, codes = lively(name), random_codes(2, 96, 130)
-    memory = bytes_per_pixel(network, "exact") * 9_000
-    assert len(cut_pieces(network, 96, 130, memory, "exact").tiles) > 1
+    memory = bytes_per_pixel(network) * 9_000
+    assert len(cut_pieces(network, 96, 130, memory).tiles) > 1
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         cut = method_of(name, memory=memory).restore(codes)

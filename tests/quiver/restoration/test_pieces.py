@@ -71,10 +71,10 @@ def test_a_convolutional_network_does_not_see_the_tiles():
     rng, cut = np.random.default_rng(0), 0
     for seed in range(8):
         height, width = (int(n) for n in rng.integers(90, 200, 2))
-        memory = bytes_per_pixel(model, "exact") * int(rng.integers(9_000, 30_000))
+        memory = bytes_per_pixel(model) * int(rng.integers(9_000, 30_000))
         codes = moving(1, height, width, seed)
         tiled, whole = (quiet(wrap_network(model, "u", "", RestoreOptions(memory=m)), codes) for m in (memory, 10**10))
-        cut += len(cut_pieces(model, height, width, memory, "exact").tiles) > 1
+        cut += len(cut_pieces(model, height, width, memory).tiles) > 1
         assert np.abs(tiled - whole).max() < 1e-5 * codes.white
     assert cut > 3
 
@@ -89,7 +89,7 @@ def test_no_preset_changes_its_answer_unsaid(preset):
         height, width = (int(n) for n in rng.integers(96, 130, 2))
         codes = moving(1, height, width, seed)
         whole = wrap_network(model, preset, "", RestoreOptions(memory=10**12)).restore(codes)
-        memory = pieces.TILING + bytes_per_pixel(model, "exact") * int(rng.integers(8000, height * width))
+        memory = pieces.TILING + bytes_per_pixel(model) * int(rng.integers(8000, height * width))
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             tiled = wrap_network(model, preset, "", RestoreOptions(memory=memory)).restore(codes)
@@ -103,8 +103,8 @@ def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path, monkeypa
     path, codes = tmp_path / "w.safetensors", moving(1, 104, 120)
     network = lively(SMALL, torch.float32)
     save(network, SMALL, path)
-    memory = bytes_per_pixel(network, "exact") * 9_000
-    cut = cut_pieces(network, 104, 120, memory, "exact")
+    memory = bytes_per_pixel(network) * 9_000
+    cut = cut_pieces(network, 104, 120, memory)
     assert not cut.exact
     assert all(tile.y % 16 == tile.x % 16 == 0 for tile in cut.tiles)
     method = network_restorer(path, RestoreOptions(memory=memory))
@@ -118,7 +118,7 @@ def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path, monkeypa
     found = float(np.sqrt(np.mean((np.load(tmp_path / "r.npy") - whole) ** 2))) / codes.white
     assert 0 < found < 10 * said
     needed = int(re.search(r"--memory (\d+)MB avoids the cut", text)[1]) * 10**6  # type: ignore[index]
-    assert cut_pieces(network, 104, 120, needed, "exact").exact
+    assert cut_pieces(network, 104, 120, needed).exact
 
 
 @pytest.mark.slow
