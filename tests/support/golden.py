@@ -46,6 +46,7 @@ DATA = Path(__file__).parents[1] / "data"
 SHARED = Path(__file__).parents[3] / "shared" / "rivals"  # the specification's full files, where they are available
 TINY = Config(channels=2, deformable_groups=1, denoiser_growth=2, flow_channels=(2,))  # for fast tests
 SMALL = Config(channels=4, deformable_groups=2, denoiser_growth=4, flow_channels=(4, 4))
+TOP = 7  # the largest code of 3 bits
 CONSTANTS = {"spynet.mean": 0.449, "spynet.std": 0.226}
 
 
@@ -170,6 +171,8 @@ def errors(name: str, golden: Mapping[str, np.ndarray], table: Path, prefix: str
     if not shaped or codes.dtype.kind not in "iuf" or not codes.size or not np.isfinite(codes).all():
         shapes = "[B, T, H, W] or [B, T, 1, H, W]" if getattr(network, "FLAT", False) else "[B, T, 1, H, W]"
         raise ValueError(f"codes are numbers {shapes}, got {codes.dtype} {list(codes.shape)}")
+    if (codes < 0).any() or (codes > TOP).any() or (codes != np.floor(codes)).any():
+        raise ValueError(f"codes are whole numbers 0 to {TOP}, got some of {codes.min()} to {codes.max()}")
     multiple, (height, width) = getattr(network, "MULTIPLE", 1), codes.shape[-2:]
     if height % multiple or width % multiple:
         raise ValueError(f"{name} takes frames whose sides {multiple} divides, got {height} x {width}")

@@ -15,11 +15,17 @@ MULTIPLE = QUARTER
 
 
 def stages(arrays: Mapping[str, np.ndarray], weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """One run; a single clip of two frames is never aligned and has fewer stages. `ValueError` for an odd clip."""
-    count = arrays["codes"].shape[1]
+    """One run; a single clip of two frames is never aligned and has fewer stages.
+
+    `ValueError` for an odd clip, and for frames so small that the coarsest flow of the port has one pixel.
+    """
+    count, (height, width) = arrays["codes"].shape[1], arrays["codes"].shape[-2:]
     if count % CLIP:
         raise ValueError(f"rvrt takes an even number of frames, got {count}")
-    return recorded(built(weights), torch.from_numpy(np.asarray(arrays["codes"], np.float64) / 7))
+    network = built(weights)
+    if min(height, width) < network.least:
+        raise ValueError(f"rvrt takes frames whose sides are at least {network.least} px, got {height} x {width}")
+    return recorded(network, torch.from_numpy(np.asarray(arrays["codes"], np.float64) / 7))
 
 
 def built(weights: Mapping[str, Tensor]) -> RVRT:

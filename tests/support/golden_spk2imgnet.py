@@ -7,23 +7,21 @@ import torch
 from golden import Recorder, fill_by_rule
 from torch import Tensor
 
-from quiver.model.rivals.edges import pad_space, reflected
 from quiver.model.rivals.published_names import load_published
 from quiver.model.rivals.spk2imgnet import Spk2ImgNet, Spk2ImgNetConfig
 
 INPUTS = ("codes",)
 FLAT = True
+MULTIPLE = 4
 
 
 def stages(arrays: Mapping[str, np.ndarray], weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """One run on the first ten frames; fewer frames are reflected, other sizes padded and the full ones cut."""
-    codes = torch.from_numpy(np.asarray(arrays["codes"], np.float64) / 7)
-    height, width = codes.shape[-2:]
-    frames = pad_space(codes.reshape(len(codes), -1, height, width), 4)
+    """One run on the ten frames of a window; `ValueError` for another number."""
+    codes = np.asarray(arrays["codes"], np.float64)
     network = built(weights)
-    found = recorded(network, frames[:, reflected(0, network.frames_in, frames.shape[1])])
-    whole = frames.shape[-2:]
-    return {key: x[..., :height, :width] if x.shape[-2:] == whole else x for key, x in found.items()}
+    if codes.shape[1] != network.frames_in:
+        raise ValueError(f"spk2imgnet takes {network.frames_in} frames, got {codes.shape[1]}")
+    return recorded(network, torch.from_numpy(codes.reshape(*codes.shape[:2], *codes.shape[-2:]) / 7))
 
 
 def built(weights: Mapping[str, Tensor]) -> Spk2ImgNet:

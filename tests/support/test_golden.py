@@ -88,7 +88,7 @@ OTHERS = {  # a network of small width, and sizes that no golden file has: batch
     "flornn": (lambda: FloRNN(FLORNN), [(2, 3, 9, 14), (2, 5, 12, 7)]),
     "memdeblur": (golden_memdeblur.small, [(2, 1, 8, 20), (2, 7, 12, 16)]),
     "rvrt": (golden_rvrt.small, [(2, 2, 12, 20), (2, 6, 20, 8)]),
-    "spk2imgnet": (golden_spk2imgnet.small, [(2, 4, 9, 14), (2, 10, 12, 8)]),
+    "spk2imgnet": (golden_spk2imgnet.small, [(2, 10, 8, 20), (2, 10, 12, 8)]),
 }
 
 
@@ -145,6 +145,11 @@ def test_files_that_cannot_be_compared_are_one_line(tmp_path, capsys):
         "noise": good | {"noise_ab": np.ones(3)},
         "no_flow": good | {"flow_forward": np.zeros((1, 3, 2, 8, 8)), "flow_backward": np.zeros((1, 1, 3, 8, 8)),
                            "noise_map": np.zeros((1, 2, 1, 8, 8))},
+        "high": good | {"codes": codes + 8},
+        "low": good | {"codes": codes - 1.0},
+        "half": good | {"codes": codes + 0.5},
+        "eleven": good | {"codes": codes.repeat(11, axis=1)[:, :11]},
+        "one_pixel": good | {"codes": codes.repeat(16, axis=3).repeat(17, axis=4)},
         "odd": good | {"codes": codes[:, :1]},
         "emvd": good | {"codes": codes[..., :7], "noise_ab": np.ones(2)},
         "flornn": good | {"flow_forward": np.zeros((1, 3, 2, 4, 4)), "flow_backward": np.zeros((1, 1, 2, 4, 4)),
@@ -169,6 +174,10 @@ def test_files_that_cannot_be_compared_are_one_line(tmp_path, capsys):
         ("spk2imgnet", "good.npz", "t.tsv", "is missing; give the golden file and the table of spk2imgnet"),
         ("flornn", "good.npz", "t.tsv", "is missing; give the golden file and the table of flornn"),
         ("quiver", "good.npz", "t.tsv", "not a published QUIVER checkpoint"),
+        ("memdeblur", "high.npz", "t.tsv", "codes are whole numbers 0 to 7, got some of 8 to 8"),
+        ("memdeblur", "low.npz", "t.tsv", "codes are whole numbers 0 to 7, got some of -1.0 to -1.0"),
+        ("memdeblur", "half.npz", "t.tsv", "codes are whole numbers 0 to 7, got some of 0.5 to 0.5"),
+        ("spk2imgnet", "emvd.npz", "t.tsv", "spk2imgnet takes frames whose sides 4 divides, got 8 x 7"),
         ("rvrt", "odd.npz", "t.tsv", "rvrt takes an even number of frames, got 1"),
         ("emvd", "emvd.npz", "t.tsv", "emvd takes frames whose sides 8 divides, got 8 x 7"),
     ]  # fmt: skip
@@ -188,6 +197,14 @@ def test_files_that_cannot_be_compared_are_one_line(tmp_path, capsys):
         shown = capsys.readouterr().err
         assert message in shown
         assert shown.count("\n") == 1
+    for name, file, message in (
+        ("rvrt", "one_pixel", "rvrt takes frames whose sides are at least 132 px, got 128 x 136"),
+        ("spk2imgnet", "eleven", "spk2imgnet takes 10 frames, got 11"),
+        ("spk2imgnet", "good", "spk2imgnet takes 10 frames, got 2"),
+    ):
+        rows = DATA / f"{name}_state_dict.tsv"
+        assert main([name, str(tmp_path / f"{file}.npz"), str(rows)]) == 2
+        assert capsys.readouterr().err == f"golden: {message}\n"
     assert main(["emvd", str(tmp_path / "noise.npz"), str(DATA / "emvd_state_dict.tsv")]) == 2
     assert "noise_ab is the slope and the offset of the noise, got float64 [3]" in capsys.readouterr().err
 

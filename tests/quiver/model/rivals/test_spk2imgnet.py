@@ -37,13 +37,12 @@ def test_every_stage_equals_the_published_one():
     assert found["output"] < 1e-12
 
 
-def test_stages_of_other_widths_batches_frames_and_sizes():
+def test_stages_of_other_widths_batches_and_sizes():
     weights = golden_spk2imgnet.small().state_dict()
     large = golden_spk2imgnet.stages(codes(3, 10, 12, 16), weights)
     alone = golden_spk2imgnet.stages({"codes": codes(3, 10, 12, 16)["codes"][1:2]}, weights)
     for key, array in large.items():
         assert torch.allclose(array[1:2], alone[key], rtol=0, atol=1e-12), key
-    assert golden_spk2imgnet.stages(codes(2, 4, 1, 13, 6), weights)["output"].shape == (2, 1, 13, 6)
 
 
 def test_weights_depend_on_the_prefix():
