@@ -13,6 +13,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -67,11 +68,15 @@ def import_test_set(folder: Path, which: TestSet, out: Path, progress: Progress 
     if files[0].is_file() and (pictures := recordings(folder, "png")):
         raise ValueError(f"{folder}: holds videos and folders of pictures ({pictures[0]}); name the folder of one kind")
     _check_names(folder, files)
+    described = [_described(file, which) for file in files]  # all are checked before the first is written
+    targets = [out / _name(folder, file) for file in files]
+    for target, meta in zip(targets, described, strict=True):
+        _check_target(target, meta)
     clips = []
-    for done, file in enumerate(files):
+    for done, (file, target, meta) in enumerate(zip(files, targets, described, strict=True)):
         if progress is not None:
             progress(done, len(files))
-        clips.append(_imported(file, out / _name(folder, file), which))
+        clips.append(_imported(file, target, meta))
     if progress is not None:
         progress(len(files), len(files))
     return clips
@@ -100,8 +105,8 @@ def _check_names(folder: Path, files: list[Path]) -> None:
             raise ValueError(f"{folder}: {other} and {file} would both be clip {_name(folder, file)}; rename one")
 
 
-def _imported(file: Path, target: Path, which: TestSet) -> Clip:
-    """Return the clip of a recording, written now unless it is there."""
+def _described(file: Path, which: TestSet) -> dict[str, Any]:
+    """Return what a clip of a recording states of itself; `ValueError` for one of fewer than eleven frames."""
     frames = read_frames(file) if file.is_file() else read_pictures(file)
     first = next(frames, None)
     if first is None:
@@ -110,7 +115,7 @@ def _imported(file: Path, target: Path, which: TestSet) -> Clip:
     count = sum(1 for _ in frames) + 1
     if count < WINDOW:
         raise ValueError(f"{file}: {count} frames; a published window has {WINDOW}")
-    meta = {
+    return {
         "shape": [count, *size],
         "frame_rate": which.frame_rate,
         "exposure": 1 / which.frame_rate,
@@ -119,13 +124,26 @@ def _imported(file: Path, target: Path, which: TestSet) -> Clip:
         "source": {"file": str(file.resolve()), "test_set": which.name, "size": list(first.shape[:2])},
         "split": "test",
     }
+
+
+def _check_target(target: Path, meta: dict[str, Any]) -> None:
+    """Raise `ValueError` if the folder of a clip holds another one."""
+    if not target.exists():
+        return
+    clip = Clip.open(target)
+    if clip.meta.get("source") != meta["source"] or list(clip.shape) != meta["shape"]:
+        of = (clip.meta.get("source") or {}).get("file")
+        raise ValueError(
+            f"{target}: is a clip of {of} with {len(clip)} frames, not of {meta['source']['file']} with "
+            f"{meta['shape'][0]}; choose another -o"
+        )
+
+
+def _imported(file: Path, target: Path, meta: dict[str, Any]) -> Clip:
+    """Return the clip of a recording, written now unless it is there."""
     if target.exists():
-        clip = Clip.open(target)
-        if clip.meta.get("source") != meta["source"] or list(clip.shape) != meta["shape"]:
-            of = (clip.meta.get("source") or {}).get("file")
-            raise ValueError(f"{target}: is a clip of {of} with {len(clip)} frames, not of {file} with {count}; "
-                             "choose another -o")  # fmt: skip
-        return clip
+        return Clip.open(target)
+    size = tuple(meta["shape"][1:])
     with ClipWriter(target, meta) as writer:
         for t, frame in enumerate(read_frames(file) if file.is_file() else read_pictures(file)):
             if not writer.has(t):

@@ -131,6 +131,23 @@ def test_folders_that_hold_no_window_are_refused(tmp_path, lengths, message):
     assert not (tmp_path / "out").exists()
 
 
+def test_nothing_is_written_unless_every_recording_fits(tmp_path):
+    """The last one is too short, or its place holds another clip."""
+    folder, out = i2(tmp_path / "test", (12, 11, 10)), tmp_path / "out"
+    with pytest.raises(ValueError, match=r"test_00002\.mp4: 10 frames; a published window has 11"):
+        import_test_set(folder, I2, out)
+    assert not out.exists()
+    write_video(folder / "test_00002.mp4", iter(moving(11, 32, 48, 2)), 30, lossless=True)
+    only = tmp_path / "only"
+    only.mkdir()
+    (folder / "test_00002.mp4").rename(only / "test_00002.mp4")
+    import_test_set(only, I2, out)
+    write_video(folder / "test_00002.mp4", iter(moving(11, 32, 48, 3)), 30, lossless=True)
+    with pytest.raises(ValueError, match=r"test_00002: is a clip of .*choose another -o"):
+        import_test_set(folder, I2, out)
+    assert [clip.name for clip in out.iterdir()] == ["test_00002"]
+
+
 def stray(folder: Path) -> None:
     """What systems and archives leave beside pictures, and pictures in capitals."""
     first = folder / "Type1/TEST01_000_f0433"
