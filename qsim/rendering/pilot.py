@@ -24,10 +24,11 @@ from qsim.rendering.renderer import Renderer
 from qsim.scene import Scene, Still
 
 COUNTS = (8, 32, 128)  # samples of the pilots: 2x2, 4x4 and 8x8 in each half
+FEWEST, RISE = 4, 1.25  # samples that are tried if COUNTS[0] leave room, and the least by which they raise the error
 PIXELS = 3000  # of the frame that a pilot renders, about
 MOST_MORE = 3  # frames added for hidden bodies, and as many for fast motion
 STRENGTHS = 6  # frames in which flickering light is rendered
-WINDOW = 96  # px, side of the windows in which the denoiser is tested, one in the middle of each quarter of the frame
+WINDOW = 192  # px, side of the windows in which the denoiser is tested, one in the middle of each quarter of the frame
 MOST_LOOKS = 256  # frames of a clip in which motion and bodies are measured
 STAGE = 18  # of the random keys
 LUCK = 3.0  # a trial with this many times less raw noise than the pilot's missed rare paths by chance
@@ -189,9 +190,10 @@ def denoised_samples(
     parts = [renderer.window(crop) for crop in windows(camera)]
     times, key = pilot.exposed(t, count), renderer.key(t, STAGE)
     surfaces = [window.surfaces(times, key) for window in parts]
-    errors: dict[str, list[float]] = {quality: [] for quality in DENOISE_COST}
-    for samples in tried:
-        halves = [window.halves(times, Budget(samples, bounces), key) for window in parts]
+
+    def trial(samples: int) -> dict[str, float]:
+        """Return the error by quality, over what is allowed."""
+        halves, found = [window.halves(times, Budget(samples, bounces), key) for window in parts], {}
         noisy = _root_mean([Errors.of_halves(pair, allowed.white).plain for pair in halves])
         for quality in DENOISE_COST if samples <= MOST_FASTER * count else ["high"]:
             each = zip(halves, surfaces, strict=True)
@@ -199,13 +201,21 @@ def denoised_samples(
             at_white = _root_mean([one.error_at(allowed.white, CAREFUL) for one in mixed])
             cleaned = Errors(at_white, _root_mean([one.error for one in mixed]))
             missed = LUCK * noisy < expected(samples).plain
-            errors[quality].append(allowed.fraction(expected(samples) if missed else cleaned))
-        if errors["high"][-1] <= share:
+            found[quality] = allowed.fraction(expected(samples) if missed else cleaned)
+        return found
+
+    trials: list[dict[str, float]] = []
+    for samples in tried:
+        trials.append(trial(samples))
+        if trials[-1]["high"] <= share:
             break
+    if min(trials[0].get(quality, math.inf) for quality in ("balanced", "fast")) * RISE <= share:
+        tried, trials = [FEWEST * count, *tried], [trial(FEWEST * count), *trials]
+    errors = {quality: [one[quality] for one in trials if quality in one] for quality in DENOISE_COST}
     size = f"tried in {'' if len(parts) == 1 else 'four windows of '}frame {t}"
     options = _enough(tried, errors, share, count)
     if wanted and not options:
-        size = f"{errors['high'][-1]:.2g} times the error allowed with {samples} samples"
+        size = f"{trials[-1]['high']:.2g} times the error allowed with {tried[len(trials) - 1]} samples"
         options = [(2 * count * grid_samples(MOST_DENOISED // 2), "high")]
     chosen = min(options, key=lambda option: option[0] + DENOISE_COST[option[1]], default=None)
     if chosen is None or (not wanted and chosen[0] + DENOISE_COST[chosen[1]] >= raw):

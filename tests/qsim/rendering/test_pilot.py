@@ -67,7 +67,9 @@ def test_a_denoised_trial_with_far_less_noise_than_the_pilots_is_rejected():
 @pytest.mark.parametrize(
     ("over", "chosen"),
     [
-        (0.7, (8, "fast")),  # 8 + 5: all three reach the error
+        (0.55, (4, "fast")),  # 4 + 5: all three reach the error with the fewest samples
+        (0.63, (4, "balanced")),  # 4 + 7.5: fast needs 8
+        (0.7, (8, "fast")),  # 8 + 5: the best alone reaches it with 4, for 4 + 15
         (0.85, (8, "balanced")),  # 8 + 7.5: fast does not
         (0.95, (8, "high")),  # 8 + 15: the others do not, and high ends the trials
         (1.3, (24, "fast")),  # needs 21.1: 24 + 5, against 24 + 7.5 for 16.4 and 16 + 15 for 13.5
