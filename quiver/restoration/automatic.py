@@ -2,7 +2,8 @@
 
     sensor, bits, light -> nearest measured cell in the weights file (domain.py) -> method, and one line that says why
 
-The cells are averages over clips of several speeds. Motion is not measured in a stream, so it does not decide.
+The cells are averages over clips of several speeds. Motion does not decide: on the test clips, handing over exactly the
+clips that a classical method restores better would gain 0.06 dB in the mean (docs/results/restorer.md).
 """
 
 from __future__ import annotations
