@@ -179,7 +179,7 @@ def rendering(report: dict[str, Any]) -> str:
             f"{row['level']:g}",
             f"{row['psnr']:.1f}",
             f"{row['stated_psnr']:.1f}",
-            str(row["samples"]),
+            str(row["samples"]) + (f", {row['neighbours']} neighbours" if row.get("neighbours") else ""),
             "yes" if row["denoised"] else "no",
             str(row["bounces"]),
             f"{row['seconds']:.2f}",
@@ -189,7 +189,7 @@ def rendering(report: dict[str, Any]) -> str:
         ]
         for row in report["rows"]
     ]
-    at = [row for row in report["rows"] if row["level"] == validate_render.AT_LEVEL]
+    at = [row for row in report["rows"] if row["level"] == validate_render.AT_LEVEL and not row.get("neighbours")]
     # The squared error of independent samples is c / n, so that a PSNR x dB lower takes 10^(-x / 10) of the time.
     equal = median(row["ratio"] * 10 ** ((row["psnr"] - row["obvious_psnr"]) / 10) for row in at)
     exact = median(row["ratio"] * 10 ** ((row["level"] - row["obvious_psnr"]) / 10) for row in at)

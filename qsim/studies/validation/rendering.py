@@ -5,8 +5,9 @@
 The naive loop is `mi.render` per frame with the default integrator, the default `independent` sampler and a box filter.
 It takes the smallest power of two of samples that reaches the level. Ours is `Renderer.frame` without ground truth,
 with the budget of `choose_budget` for the level (for a clip of 21 frames); the measurement of its error is included.
-Frames that share samples are timed one after the other, when each traces one further frame. Both start from a loaded
-scene and are timed alternately. Processor seconds stand beside wall seconds, because other programs change them less.
+At AT_LEVEL a scene has a second row if frames that share samples are predicted to cost less: frames of that clip are
+timed one after the other, when each traces one further frame. Both methods start from a loaded scene and are timed
+alternately. Processor seconds stand beside wall seconds, because other programs change them less.
 Rows of short frames take up to 15 rounds, since medians of three scatter. The variance of the reference is subtracted.
 """
 
@@ -92,8 +93,8 @@ class RenderReport:
 
     @property
     def median_ratio(self) -> float:
-        """The median over the scenes at AT_LEVEL."""
-        return median(row.ratio for row in self.rows if row.level == AT_LEVEL)
+        """The median over the scenes at AT_LEVEL, frames alone."""
+        return median(row.ratio for row in self.rows if row.level == AT_LEVEL and not row.neighbours)
 
     @property
     def ok(self) -> bool:
@@ -130,12 +131,15 @@ def run(
         renderer = Renderer(scene, budget=Budget(reference_samples, fidelity.DEEPEST), seed=1000)
         halves = renderer.halves([renderer.time(FRAME)], renderer.budget, renderer.key(FRAME))
         target = Target(halves)
-        for level in levels:
+        pairs = [(level, False) for level in levels] + [(AT_LEVEL, True)]
+        for level, shares in sorted(pairs):
             if progress is not None:
-                progress(f"{name}: {level:g} dB")
+                progress(f"{name}: {level:g} dB{', frames that share samples' * shares}")
             started = time.perf_counter()
-            chosen = fidelity.choose_budget(scene, psnr=level)
+            chosen = fidelity.choose_budget(scene, psnr=level, reuse=shares)
             choosing[name] = choosing.get(name, 0.0) + time.perf_counter() - started
+            if shares and not chosen.neighbours:
+                continue
             rows.append(_compare(scene, name, level, chosen, target, rounds, most_samples))
             if progress is not None:
                 progress(f"{name}: {level:g} dB reached {rows[-1].ratio:.1f} times faster")
@@ -285,7 +289,7 @@ def figure(report: RenderReport, path: Path) -> None:
     for axes in panels[len(names) :]:
         axes.remove()
     for name, axes in zip(names, panels[: len(names)], strict=True):
-        rows = [row for row in report.rows if row.scene == name]
+        rows = [row for row in report.rows if row.scene == name and not row.neighbours]
         axes.plot([r.naive_seconds for r in rows], [r.naive_psnr for r in rows], "o-", label="naive loop")
         axes.plot([r.seconds for r in rows], [r.psnr for r in rows], "s-", label="qsim")
         axes.set(xscale="log", xlabel="seconds per frame", title=name)

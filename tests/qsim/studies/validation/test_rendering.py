@@ -52,6 +52,9 @@ def test_the_verdict_needs_the_median_and_no_scene_slower():
     assert good.ok
     assert not replace(good, rows=(*good.rows, replace(ROW, level=30.0, seconds=4.0))).ok
     assert not replace(good, rows=(replace(ROW, seconds=0.5),)).ok
+    sharing = replace(good, rows=(*good.rows, replace(ROW, seconds=0.1, neighbours=2)))
+    assert sharing.median_ratio == pytest.approx(12.0)
+    assert "32 denoised, 2 neighbours" in rendering.table(sharing)
     assert json.loads(json.dumps(good.to_dict()))["rows"][0]["ratio"] == pytest.approx(12.0)
     assert good.to_dict()["rows"][0]["obvious_samples"] == 1024
     text = rendering.table(good)
@@ -64,12 +67,27 @@ def test_levels_without_the_one_that_counts_are_refused():
         rendering.run([plate(None)], levels=(30.0,))
 
 
+@pytest.mark.parametrize("neighbours", [0, 3])
+def test_frames_that_share_samples_have_a_row_where_they_are_predicted_to_cost_less(monkeypatch, neighbours):
+    def choose(scene, *, psnr, reuse):
+        return Budget(int(psnr), neighbours=neighbours * reuse)
+
+    def compare(scene, name, level, chosen, *rest):
+        return replace(ROW, level=level, samples=chosen.samples, neighbours=chosen.neighbours)
+
+    monkeypatch.setattr(rendering.fidelity, "choose_budget", choose)
+    monkeypatch.setattr(rendering, "_compare", compare)
+    report = rendering.run([plate(None, light=SunSky())], levels=(30.0, 40.0), reference_samples=4)
+    expected = [(30.0, 0), (40.0, 0)] + [(40.0, neighbours)] * (neighbours > 0)
+    assert [(row.level, row.neighbours) for row in report.rows] == expected
+
+
 @pytest.mark.slow
 def test_a_small_run_ends_with_rows_that_reach_their_levels(tmp_path):
     report = rendering.run(
         [plate(Spin((0, 0, 1), 200.0), light=SunSky())], levels=(30.0, 40.0), reference_samples=1152, rounds=1
     )
-    assert [row.level for row in report.rows] == [30.0, 40.0]
+    assert [row.level for row in report.rows if not row.neighbours] == [30.0, 40.0]
     for row in report.rows:
         assert row.psnr >= row.level
         assert row.naive_psnr >= row.level
