@@ -34,10 +34,9 @@ from qsim.scene import Scene
 
 _INSTALLED = [sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")]
 _LEFT_OUT = tuple(
-    f"{os.path.realpath(folder)}{os.sep}"
-    for folder in (*_INSTALLED, str(Path(__file__).parents[1]), "/proc", "/sys", "/dev")
+    f"{os.path.realpath(folder)}{os.sep}" for folder in (*_INSTALLED, str(Path(__file__).parents[1]), "/proc", "/sys")
 )
-_SHARED = f"/dev/shm{os.sep}"  # memory that holds files of users
+_DEVICES, _SHARED = "/dev/", "/dev/shm/"  # the second holds files of users
 _LIBRARY = Path(scenes.__file__).resolve().parent
 _PARTS_LEFT_OUT = frozenset({".cache", "site-packages", "dist-packages"})
 
@@ -176,8 +175,8 @@ def _for_itself() -> bool:
 
 def _counts(path: Path) -> bool:
     """Return whether a file belongs to the user."""
-    outside = str(path).startswith(_LEFT_OUT) and not str(path).startswith(_SHARED)
-    if outside or not _PARTS_LEFT_OUT.isdisjoint(path.parts):
+    device = str(path).startswith(_DEVICES) and not str(path).startswith(_SHARED)
+    if device or str(path).startswith(_LEFT_OUT) or not _PARTS_LEFT_OUT.isdisjoint(path.parts):
         return False
     return "__pycache__" not in path.parts and not (path.parent == _LIBRARY and path.suffix == ".py")
 

@@ -106,6 +106,13 @@ def test_files_in_shared_memory_are_the_users():
         assert set(scene_files.load(path)[1]) == {"wheel.py", "a.txt"}
 
 
+def test_the_package_is_not_the_users_wherever_it_lies(monkeypatch):
+    """A clone in /dev/shm took its own modules for files of the scene."""
+    monkeypatch.setattr(scene_files, "_LEFT_OUT", ("/dev/shm/clone/qsim/",))
+    counted = [scene_files._counts(Path("/dev/shm/clone") / name) for name in ("qsim/files.py", "mine/wheel.py")]
+    assert counted == [False, True]
+
+
 def test_families_of_the_library_read_nothing_and_folders_everything(tmp_path: Path):
     assert scene_files.load("fan")[1] == {}
     from PIL import Image
