@@ -1,6 +1,6 @@
 """Compares what a shard was planned to cost with what it cost, and measures what its clips hold.
 
-    python docs/shard_cost.py --alone out/plan.json --reuse out/plan_reuse.json     # the page of plans alone
+    python docs/shard_cost.py --alone out/plan_alone.json --reuse out/plan.json     # the page of plans alone
     python docs/shard_cost.py --shard-plan out/plan_shard.json --data out/i2        # adds the shard: a minute
 
 Writes docs/results/i2.json, .md and .png. Parts that are not given are those that i2.json holds. Plans are the output
@@ -39,10 +39,10 @@ FORMAT = "qsim-shard-1"
 
 def variants(wanted: Recipe) -> dict[str, Recipe]:
     """Return the recipe with each frame alone and with frames that share samples, whatever it says itself."""
-    return {way: with_reuse(wanted, way == "reuse") for way in WAYS}
+    return {"alone": with_reuse(wanted, False), "reuse": with_reuse(wanted, None)}
 
 
-def with_reuse(wanted: Recipe, reuse: bool) -> Recipe:
+def with_reuse(wanted: Recipe, reuse: bool | None) -> Recipe:
     jobs = (replace(job, settings=replace(job.settings, reuse=reuse)) for job in wanted.jobs)
     return replace(wanted, jobs=tuple(jobs))
 
@@ -142,7 +142,7 @@ def gather(args: argparse.Namespace) -> dict[str, Any]:
     if args.alone is not None:
         plans["alone"] = read_plan(args.alone, {"alone": ways["alone"]}, f"{name} with reuse = false")
     if args.reuse is not None:
-        plans["reuse"] = read_plan(args.reuse, {"reuse": ways["reuse"]}, f"{name} with reuse = true")
+        plans["reuse"] = read_plan(args.reuse, {"reuse": ways["reuse"]}, f"{name} without reuse")
     if args.shard_plan is not None:
         plans["shard"] = read_plan(args.shard_plan, parts, f"shard {written} of {name}")
     made = old.get("made") if args.data is None else read_shard(args.data, parts, name)
@@ -157,8 +157,8 @@ def gather(args: argparse.Namespace) -> dict[str, Any]:
 def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recipe", default="i2_2000fps", help="a .toml file or a name (default i2_2000fps)")
-    parser.add_argument("--alone", type=Path, help="plan of the recipe with each frame alone")
-    parser.add_argument("--reuse", type=Path, help="plan of the recipe with reuse = true")
+    parser.add_argument("--alone", type=Path, help="plan of the recipe with reuse = false")
+    parser.add_argument("--reuse", type=Path, help="plan of the recipe, which may share")
     parser.add_argument("--shard-plan", type=Path, help="plan of the shard")
     parser.add_argument("--data", type=Path, help="data set folder that holds the shard")
     parser.add_argument("--shard", type=part_of, default=(1, 100), metavar="I/N", help="default 1/100")

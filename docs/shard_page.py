@@ -22,19 +22,19 @@ HEAD = """# A shard of {recipe}: planned, made and measured
 
 *Written by `python docs/shard_cost.py`. The json file beside this page holds all numbers.*
 
-`scenes/{recipe}.toml` has {clips} clips. The second recipe below differs from it in one line, `reuse = true`. Shard
+`scenes/{recipe}.toml` has {clips} clips. The other recipe below differs from it in one line, `reuse = false`. Shard
 {part} has the clips {names}.
 
 <!-- not run: plans of an hour or two, and a shard of up to an hour, on two cores -->
 ```sh
 mkdir -p out
-awk '{{print}} /^psnr = /{{print "reuse = true"}}' scenes/{recipe}.toml > out/i2_reuse.toml
-qsim plan scenes/{recipe}.toml --json > out/plan.json                 # 30 to 60 minutes on two cores
-qsim plan out/i2_reuse.toml --json > out/plan_reuse.json                # 20 to 60 minutes
-qsim plan out/i2_reuse.toml --shard {part} --json > out/plan_shard.json  # 5 to 15 minutes
-qsim generate out/i2_reuse.toml -o out/i2 --shard {part}                 # 20 to 60 minutes
-python docs/shard_cost.py --shard {part} --alone out/plan.json --reuse out/plan_reuse.json \\
-    --shard-plan out/plan_shard.json --data out/i2                      # a minute
+awk '{{print}} /^psnr = /{{print "reuse = false"}}' scenes/{recipe}.toml > out/alone.toml
+qsim plan out/alone.toml --json > out/plan_alone.json                           # 30 to 60 minutes on two cores
+qsim plan scenes/{recipe}.toml --json > out/plan.json                       # 20 to 60 minutes
+qsim plan scenes/{recipe}.toml --shard {part} --json > out/plan_shard.json  # 5 to 15 minutes
+qsim generate scenes/{recipe}.toml -o out/i2 --shard {part}                 # 20 to 60 minutes
+python docs/shard_cost.py --shard {part} --alone out/plan_alone.json --reuse out/plan.json \\
+    --shard-plan out/plan_shard.json --data out/i2                              # a minute
 ```
 
 The times are estimates. Hours are of processor time, of all threads, unless they are called wall hours. 1 GB is 10⁹

@@ -33,6 +33,7 @@ name = "tiny"
 frames = 3
 height = 16
 width = 24
+reuse = false
 
 [[scenes]]
 family = "fan"
@@ -42,7 +43,7 @@ seeds = [0, 1, 2]
 family = "drums"
 seeds = [0, 1, 2]
 """
-SHARED = RECIPE.replace("width = 24", "width = 24\nreuse = true")
+SHARED = RECIPE.replace("reuse = false\n", "")
 USED = {"drums_0000": 3240, "fan_0000": 1080}  # processor seconds of the clips of shard 1/3
 
 
@@ -67,9 +68,9 @@ def place(tmp_path, monkeypatch) -> Path:
     def measured(jobs: list[Job], folder: Path, frames: int) -> Cost:
         """3600 processor seconds for a clip of fan: 1200 before its frames, 800 each. Three times that for drums.
 
-        With reuse it is a quarter.
+        A quarter where frames may share samples.
         """
-        less = (0.25 if jobs[0].settings.reuse else 1.0) * (3 if jobs[0].stem == "drums" else 1)
+        less = (1.0 if jobs[0].settings.reuse is False else 0.25) * (3 if jobs[0].stem == "drums" else 1)
         seconds = {"setup": 1200.0, "per_frame": 700.0, "sensing": 100.0}
         clocks = {key: Seconds(value * less / 2, value * less) for key, value in seconds.items()}
         return Cost(jobs[0].stem, (16, 24), len(jobs), 3 * len(jobs), samples=(8, 12), **clocks, frame_bytes=1e6)
@@ -196,7 +197,7 @@ def test_a_tiny_shard_is_planned_made_and_measured(tmp_path, capsys):
     """With the real renderer, whose log and flow the program reads."""
     text = RECIPE.replace("width = 24", "width = 24\npsnr = 20.0")
     (tmp_path / "tiny.toml").write_text(text)
-    (tmp_path / "shared.toml").write_text(text.replace("psnr", "reuse = true\npsnr"))
+    (tmp_path / "shared.toml").write_text(text.replace("reuse = false\n", ""))
     words = ["--alone", plan(tmp_path, capsys, "tiny"), "--reuse", plan(tmp_path, capsys, "shared")]
     words += ["--shard-plan", plan(tmp_path, capsys, "shared", "--shard", "1/3"), "--data", tmp_path / "data"]
     made = ["generate", str(tmp_path / "shared.toml"), "-o", str(tmp_path / "data"), "--shard", "1/3", "-q"]
