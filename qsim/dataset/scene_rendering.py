@@ -66,8 +66,8 @@ def render(
     """
     if path is None and force:
         raise ValueError("force= replaces the clip of a folder, and no path is given; leave it out")
-    if budget is not None and reuse:
-        raise ValueError("reuse= widens the choice of a budget, and budget= replaces it; give one of them")
+    if budget is not None and reuse is not None:
+        raise ValueError("reuse= is part of the choice of a budget, and budget= replaces it; give one of them")
     if path is not None:
         target_of(path, force)  # before the pilot
     loaded, read = load_scene(scene, height, width, seed, speed, bands, camera_path, frame_rate)

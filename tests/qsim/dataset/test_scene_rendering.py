@@ -99,3 +99,10 @@ def test_only_the_process_that_made_a_temporary_folder_deletes_it():
     del folder
     gc.collect()
     assert not path.exists()
+
+
+@pytest.mark.parametrize("reuse", [True, False])
+def test_a_budget_and_a_wish_for_its_choice_are_refused(reuse):
+    """False was ignored: the budget's neighbours were used."""
+    with pytest.raises(ValueError, match="reuse= is part of the choice of a budget"):
+        render("fan", budget=Budget(neighbours=2), reuse=reuse)
