@@ -42,14 +42,14 @@ from clip_parts import meta, timed_frames
 from cycles_rows import agreement, use_only
 from numpy import ndarray as Array
 from reuse_rows import FAMILIES, decibels
-from rows import QUIET, ROOT, Watch, processor, refuse_busy
+from rows import ROOT, Watch, refuse_busy, store
 
 from qsim import scenes
 from qsim.clip.clamped_error import white_in
 from qsim.clip.motion_statistics import MOVING
 from qsim.clip.writer import ClipWriter
 from qsim.colour import bright_end, psnr
-from qsim.files import read_json, write_bytes, write_json
+from qsim.files import read_json, write_bytes
 from qsim.rendering.budget import Budget
 from qsim.rendering.fidelity import DEEPEST, choose_budget
 from qsim.rendering.renderer import Renderer
@@ -306,10 +306,7 @@ def main(words: list[str] | None = None) -> int:
         except ValueError as error:
             print(f"clip_rows: {error}", file=sys.stderr)
             return 2
-        others = watch.others()
-        quiet = others is not None and others <= QUIET
-        write_json(path, {"plan": vars(plan), "processor": processor(), "quiet": quiet, **row})
-        print(f"{path}: written", flush=True)
+        store(path, plan, watch, row)
     rows = {path.stem: read_json(path) for path in sorted(args.out.glob("*.json"))}
     write_bytes(args.out.with_suffix(".md"), page(rows).encode())
     return 0

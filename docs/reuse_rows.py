@@ -26,12 +26,12 @@ from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
-from rows import QUIET, Watch, processor, refuse_busy
+from rows import Watch, refuse_busy, store
 
 from qsim import scenes
 from qsim.clip.clamped_error import error_at, white_in
 from qsim.colour import psnr
-from qsim.files import read_json, write_bytes, write_json
+from qsim.files import read_json, write_bytes
 from qsim.rendering.budget import Budget
 from qsim.rendering.fidelity import DEEPEST, choose_budget
 from qsim.rendering.renderer import Renderer
@@ -249,10 +249,7 @@ def main(words: list[str] | None = None) -> int:
         except ValueError as error:
             print(f"reuse_rows: {error}", file=sys.stderr)
             return 2
-        others = watch.others()
-        quiet = others is not None and others <= QUIET
-        write_json(path, {"plan": vars(plan), "processor": processor(), "quiet": quiet, **row})
-        print(f"{path}: written", flush=True)
+        store(path, plan, watch, row)
     rows = {path.stem: read_json(path) for path in sorted(args.out.glob("*.json"))}
     write_bytes(args.out.with_suffix(".md"), table(rows).encode())
     return 0

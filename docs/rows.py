@@ -107,6 +107,14 @@ def processor() -> str:
     return next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.processor())
 
 
+def store(path: Path, plan: Any, watch: Watch, row: dict[str, Any]) -> None:
+    """Write a row with its plan (a record), the processor, and whether the cores were quiet since `watch`."""
+    others = watch.others()
+    quiet = others is not None and others <= QUIET
+    write_json(path, {"plan": vars(plan), "processor": processor(), "quiet": quiet, **row})
+    print(f"{path}: written", flush=True)
+
+
 def reference_convolution(threads: int) -> float:
     """Return the milliseconds of a 3 x 3 convolution of 64 channels at 128 x 128 px: the least of twenty."""
     before = torch.get_num_threads()
