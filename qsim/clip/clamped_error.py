@@ -21,6 +21,7 @@ from numpy import ndarray as Array
 from qsim.colour import bright_end, psnr
 from qsim.optics.radiometry import WHITE_PER_MEAN
 
+NEAR = 0.05  # largest relative difference of light between frames whose errors count as equal: 0.4 dB
 STEPS = tuple(2 ** (k / 2) for k in range(-3, 4))  # whites of a frame's errors, over the predicted white
 
 
@@ -81,21 +82,35 @@ def error_at(white: float, errors_at: Sequence[Sequence[float]]) -> float:
     return float(np.interp(math.log(white), np.log(whites), errors))
 
 
+def over_neighbours(errors: Sequence[float], means: Sequence[float]) -> list[float]:
+    """Return the rms error of each frame from the estimates of the frame, of the one before and of the one after it.
+
+    Estimates from few samples err by chance, and errors hardly change from frame to frame. A neighbour whose mean
+    radiance (`means`) differs by more than NEAR, as under light that flickers, does not count.
+    """
+    squares, lights = np.square(errors), np.asarray(means)
+    count, sums = np.ones_like(squares), squares.copy()
+    for here, there in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
+        near = np.abs(lights[here] - lights[there]) <= NEAR * lights[here]
+        sums[here] += np.where(near, squares[there], 0)
+        count[here] += near
+    return np.sqrt(sums / count).tolist()
+
+
 def measured(
-    mean: float, high: float, errors: Sequence[float], errors_at: Sequence[Sequence[Sequence[float]]]
+    means: Sequence[float], high: float, errors: Sequence[float], errors_at: Sequence[Sequence[Sequence[float]]]
 ) -> dict[str, Any]:
     """Return the fields of clip.json about the errors of a clip's frames.
 
-    `mean` and `high` are the mean radiance and its 99.9th percentile. `errors` holds the plain error of each frame,
-    `errors_at` its pairs (white, error). Without pairs the plain error is taken, which is never smaller.
+    `means` are the mean radiances of the frames, `high` is the 99.9th percentile of all. `errors` holds the plain error
+    of each frame, `errors_at` its pairs (white, error). Without pairs the plain error is taken, which is never smaller.
     """
-    white = white_of(mean, high)
+    white = white_of(math.fsum(means) / len(means), high)
     found: dict[str, Any] = {"error_per_frame": list(errors), "white": white}
     if white > 0:
-        found["error_at_white_per_frame"] = [
-            error_at(white, pairs) if len(pairs) else plain for plain, pairs in zip(errors, errors_at, strict=True)
-        ]
-        found["psnr_of_truth"] = _stored(psnr(white, rms(np.array(found["error_at_white_per_frame"]))))
+        own = [error_at(white, pairs) if len(pairs) else plain for plain, pairs in zip(errors, errors_at, strict=True)]
+        found["error_at_white_per_frame"] = over_neighbours(own, means)
+        found["psnr_of_truth"] = _stored(psnr(white, rms(np.array(own))))
         found["psnr_unclamped"] = _stored(psnr(white, rms(np.array(errors))))
     return found
 

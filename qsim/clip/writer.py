@@ -236,7 +236,8 @@ class ClipWriter:
         meta["software"] = _software()
         if all("error" in e for e in entries):
             errors, errors_at = [e["error"] for e in entries], [e.get("errors_at", []) for e in entries]
-            meta |= clamped_error.measured(meta["mean_radiance"], self._high(), errors, errors_at)
+            means = [e["mean_radiance"] for e in entries]
+            meta |= clamped_error.measured(means, self._high(), errors, errors_at)
         if all("fireflies" in e for e in entries):
             meta["fireflies_per_frame"] = [e["fireflies"] for e in entries]
         files.write_description(self.part / "clip.json", meta)

@@ -17,6 +17,7 @@ from qsim.clip.clamped_error import (
     error_at,
     frame_errors,
     measured,
+    over_neighbours,
     stated,
     white_in,
     white_of,
@@ -86,16 +87,41 @@ def test_an_error_is_interpolated_at_any_white(seed):
 
 def test_a_clip_states_both_figures_below_its_own_white():
     pairs = [[[1.0, 0.01], [4.0, 0.04]], [[1.0, 0.02], [4.0, 0.04]]]
-    found = measured(mean=0.4, high=5.0, errors=[0.1, 0.1], errors_at=pairs)
+    found = measured(means=[0.4, 0.4], high=5.0, errors=[0.1, 0.1], errors_at=pairs)
     assert found["white"] == pytest.approx(1.0)
-    assert found["error_at_white_per_frame"] == [0.01, 0.02]
+    assert found["error_at_white_per_frame"] == pytest.approx([math.hypot(0.01, 0.02) / math.sqrt(2)] * 2)
     assert found["psnr_of_truth"] == pytest.approx(-10 * math.log10((0.01**2 + 0.02**2) / 2))
     assert found["psnr_unclamped"] == pytest.approx(20.0)
     line = stated(found | {"mean_radiance": 0.4}).line
     assert line == "36.0 dB below white (2.5 x the mean), clamped there; 20.0 dB unclamped"
-    plain = measured(0.4, 5.0, [0.1, 0.1], [[], []])  # without clamped errors: the plain error is never smaller
+    plain = measured([0.4, 0.4], 5.0, [0.1, 0.1], [[], []])  # without clamped errors: the plain error is never smaller
     assert plain["psnr_of_truth"] == plain["psnr_unclamped"]
-    assert "psnr_of_truth" not in measured(0.0, 0.0, [0.1], [[]])
+    assert "psnr_of_truth" not in measured([0.0], 0.0, [0.1], [[]])
+
+
+def test_a_frame_states_the_mean_of_three_estimates():
+    """Under equal light the mean of the squares of a frame and its neighbours; the ends have one neighbour."""
+    found = over_neighbours([1.0, 2.0, 3.0, 4.0], [5.0] * 4)
+    assert found == pytest.approx(np.sqrt([5 / 2, 14 / 3, 29 / 3, 25 / 2]))
+    assert over_neighbours([0.3], [2.0]) == [0.3]
+
+
+def test_frames_of_other_light_do_not_count():
+    """Light that flickers changes the error with it."""
+    found = over_neighbours([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [1.0, 1.04, 1.2, 0.0, 0.0, 0.1])
+    assert found == pytest.approx([*np.sqrt([5 / 2, 5 / 2]), 3.0, *np.sqrt([41 / 2, 41 / 2]), 6.0])
+
+
+@pytest.mark.parametrize("count", [64, 4096])
+def test_chance_in_an_estimate_falls_by_the_root_of_three(count):
+    """Estimates of 1 from `count` normal numbers have a standard deviation of sqrt(2 / count); a third of it is left.
+
+    Every fourth frame is taken, so that no two share an estimate.
+    """
+    rng = np.random.default_rng(count)
+    errors = np.sqrt(np.mean(rng.standard_normal((1200, count)) ** 2, axis=1))
+    found = np.square(over_neighbours(errors, np.ones(1200)))[2:-1:4]
+    assert np.var(found) == pytest.approx(2 / count / 3, rel=critical_z() * math.sqrt(2 / len(found)))
 
 
 def test_a_clip_of_an_earlier_version_is_named_in_its_own_unit(tmp_path):
