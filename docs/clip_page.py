@@ -25,8 +25,8 @@ HEAD = """# What frames of a clip cost
 <!-- not run: needs quiet cores for an hour or two -->
 ```sh
 python docs/clip_rows.py
+python docs/clip_rows.py --motion 0.3 --reference 256
 python docs/clip_rows.py --size 512x1024 --rows plain,room,lamp
-python docs/clip_rows.py --rows i2_2000fps
 ```
 
 Processor seconds of a frame's radiance, without ground truth and writing, in one run per row: the naive loop (one
@@ -50,22 +50,14 @@ Processor seconds of a frame by part. **scene** moves bodies and rebuilds what f
 albedo and normals for the denoiser, **carrying** moves samples of neighbours, **choice** mixes, chooses and states the
 error. **truth** is flow, depth, visibility and bodies. **writing** compresses and stores.
 """
-RECIPES = """## Plans of recipes
-
-`qsim plan` of both programs, each in its own unit. Hours of processor time.
-"""
 
 
 def page(rows: dict[str, dict[str, Any]]) -> str:
     """Return the page of the rows, by name."""
-    recipes = {name: row for name, row in rows.items() if "plans" in row}
-    families = {name: row for name, row in rows.items() if "ways" in row}
     text = [HEAD] if rows else [HEAD, "No row is made yet."]
-    if families:
-        text += [*costs(families), "", *medians(families), "", AGREE, *agreements(families), "", TIME]
-        text += [*breakdown(families), ""]
-    if recipes:
-        text += [RECIPES, *plans(recipes), ""]
+    if rows:
+        text += [*costs(rows), "", *medians(rows), "", AGREE, *agreements(rows), "", TIME]
+        text += [*breakdown(rows), ""]
     if any(not row["quiet"] for row in rows.values()):
         text += [f"{MARK} made beside other programs.", ""]
     return "\n".join(text).rstrip() + "\n"
@@ -148,15 +140,3 @@ def breakdown(rows: dict[str, dict[str, Any]]) -> list[str]:
         if "parts" in row["ways"].get(way, {})
     ]
     return markdown_table(lines, ("scene", "way", *PARTS))
-
-
-def plans(rows: dict[str, dict[str, Any]]) -> list[str]:
-    """Return the table of plans of recipes."""
-    keys = ("processor_hours", "hours", "gigabytes", "peak_memory_gib")
-    lines = [
-        (marked(name, row), WAYS[way], *(f"{row['plans'][way][key]:.3g}" for key in keys))
-        for name, row in rows.items()
-        for way in WAYS
-        if way in row["plans"]
-    ]
-    return markdown_table(lines, ("recipe", "way", "processor hours", "hours", "GB", "GiB"))

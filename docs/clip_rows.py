@@ -2,7 +2,6 @@
 
     python docs/clip_rows.py                                         # nine families at 128 x 256: half an hour
     python docs/clip_rows.py --size 512x1024 --rows plain,room,lamp  # half an hour
-    python docs/clip_rows.py --rows i2_2000fps                       # the plan of that recipe, by both programs
     python docs/clip_rows.py --tiny --out out/rows                   # minutes: a test of this program
 
 A row is RESULTS/FAMILY-SIZE.json. It is written when it is complete, and made once. Only missing rows are made, and
@@ -260,24 +259,9 @@ def run_there(folder: Path, *words: str) -> str:
     return done.stdout
 
 
-# ---- Plans of recipes
-
-
-def planned(recipe: str, there: Path) -> dict[str, Any]:
-    """Return the plans of a recipe by the program in a folder, and by this one with frames alone and that share."""
-    text, found = scenes.RECIPES[recipe].read_text(), {}
-    ways = {"earlier, peak": (there, ""), "alone": (ROOT, "reuse = false\n"), "shared": (ROOT, "reuse = true\n")}
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{recipe}.toml"
-        for way, (program, line) in ways.items():
-            path.write_text(text.replace("[recipe]\n", "[recipe]\n" + line, 1))
-            found[way] = json.loads(run_there(program, "-m", "qsim", "plan", str(path), "--json", "-q"))
-    return {"recipe": recipe, "plans": found}
-
-
 def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", default=",".join(FAMILIES), help="families and recipes, separated by commas")
+    parser.add_argument("--rows", default=",".join(FAMILIES), help="families, separated by commas")
     parser.add_argument("--size", default="128x256", help="HEIGHTxWIDTH in px (default 128x256)")
     parser.add_argument("--motion", type=float, default=Plan.motion, help="px/frame (default 2)")
     parser.add_argument("--reference", type=int, help="samples of a converged picture (default 512, large frames 128)")
@@ -292,8 +276,7 @@ def main(words: list[str] | None = None) -> int:
     busy = args.busy or args.tiny
     for name in args.rows.split(","):
         fast = "" if plan.motion == Plan.motion else f"-{plan.motion:g}px"
-        recipe = name in scenes.RECIPES
-        path = args.out / (f"{name}.json" if recipe else f"{name}-{plan.height}x{plan.width}{fast}.json")
+        path = args.out / f"{name}-{plan.height}x{plan.width}{fast}.json"
         if path.exists() and (busy or read_json(path)["quiet"]):
             continue
         try:
@@ -302,7 +285,7 @@ def main(words: list[str] | None = None) -> int:
             watch = Watch.now()
             with tempfile.TemporaryDirectory() as folder:
                 unpack(Path(folder))
-                row = planned(name, Path(folder)) if recipe else measure(name, plan, Path(folder))
+                row = measure(name, plan, Path(folder))
         except ValueError as error:
             print(f"clip_rows: {error}", file=sys.stderr)
             return 2

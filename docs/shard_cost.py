@@ -4,7 +4,8 @@
     python docs/shard_cost.py --shard-plan out/plan_shard.json --data out/i2        # adds the shard: a minute
 
 Writes docs/results/i2.json, .md and .png. Parts that are not given are those that i2.json holds. Plans are the output
-of `qsim plan --json`. What a clip cost is read from its log, which its worker writes when the clip is finished.
+of `qsim plan --json`; that of commit EARLIER asks for the same number of dB below another peak. What a clip cost is
+read from its log, which its worker writes when the clip is finished.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rows import processor
 from shard_contents import contents
-from shard_page import WAYS, draw, page
+from shard_page import EARLIER, WAYS, draw, page
 
 from qsim import files
 from qsim.cli.options import part_of
@@ -63,11 +65,34 @@ def read_plan(path: Path, wanted: dict[str, Recipe], what: str) -> dict[str, Any
             {key: kind[key] for key in ("family", "clips", "samples", "neighbours")} | cost_of_clip(kind)
             for kind in plan["kinds"]
         ]
-        totals = {"processor_hours": plan["processor_hours"], "wall_hours": plan["hours"]}
-        totals |= {"gigabytes": plan["gigabytes"], "memory": plan["peak_memory_gib"] * 2**30 / 1e9}
-        return {"way": way, "engine": plan["engine"], "processor": processor(), **totals, "kinds": kinds}
+        return {"way": way, **totals_of(plan), "kinds": kinds}
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path}: lacks {error}; make it again with `qsim plan --json`") from None
+
+
+def read_earlier(path: Path, wanted: Recipe) -> dict[str, Any]:
+    """Return the totals of a plan by commit EARLIER. It does not name its recipe, so the clips of families are counted.
+
+    `ValueError` if it is another plan.
+    """
+    plan = read_json(path)
+    try:
+        clips: Counter[str] = Counter()
+        for kind in plan["kinds"]:
+            clips[kind["family"]] += kind["clips"]
+        expected = Counter(job.stem for job in wanted.jobs)
+        if "digest" in plan or clips != expected:
+            raise ValueError(f"{path}: is not the plan that commit {EARLIER} makes of {wanted.name}")
+        return totals_of(plan)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path}: lacks {error}; make it again by commit {EARLIER}") from None
+
+
+def totals_of(plan: dict[str, Any]) -> dict[str, Any]:
+    """Return the engine and the totals of a plan, and this machine."""
+    totals = {"processor_hours": plan["processor_hours"], "wall_hours": plan["hours"], "gigabytes": plan["gigabytes"]}
+    totals |= {"memory": plan["peak_memory_gib"] * 2**30 / 1e9}
+    return {"engine": plan["engine"], "processor": processor(), **totals}
 
 
 def cost_of_clip(kind: dict[str, Any]) -> dict[str, float]:
@@ -143,6 +168,8 @@ def gather(args: argparse.Namespace) -> dict[str, Any]:
         plans["alone"] = read_plan(args.alone, {"alone": ways["alone"]}, f"{name} with reuse = false")
     if args.reuse is not None:
         plans["reuse"] = read_plan(args.reuse, {"reuse": ways["reuse"]}, f"{name} without reuse")
+    if args.earlier is not None:
+        plans["earlier"] = read_earlier(args.earlier, wanted)
     if args.shard_plan is not None:
         plans["shard"] = read_plan(args.shard_plan, parts, f"shard {written} of {name}")
     made = old.get("made") if args.data is None else read_shard(args.data, parts, name)
@@ -159,6 +186,7 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--recipe", default="i2_2000fps", help="a .toml file or a name (default i2_2000fps)")
     parser.add_argument("--alone", type=Path, help="plan of the recipe with reuse = false")
     parser.add_argument("--reuse", type=Path, help="plan of the recipe, which may share")
+    parser.add_argument("--earlier", type=Path, help=f"plan of the recipe by commit {EARLIER}")
     parser.add_argument("--shard-plan", type=Path, help="plan of the shard")
     parser.add_argument("--data", type=Path, help="data set folder that holds the shard")
     parser.add_argument("--shard", type=part_of, default=(1, 100), metavar="I/N", help="default 1/100")
