@@ -34,8 +34,8 @@ from qsim.scene import Scene
 NEAR = 0.03  # relative difference of depth within one layer
 COVERAGE = 16  # rays per pixel that measure the share of its layers
 REACH = (1, 2, 3, 5)  # neighbours on each side from which pictures are made
-FINE = 2.0**20  # steps of the integers within the mean radiance
-COUNTED = 2**16  # samples that a sum can count; their number is in its lowest bits
+FINE = 2.0**17  # steps of the integers within the mean radiance; a sum can hold 2^26 times the mean
+COUNTED = 2**20  # samples that a sum can count; their number is in its lowest bits
 
 
 def unshared(scene: Scene, shutter: float, backend: str) -> str:

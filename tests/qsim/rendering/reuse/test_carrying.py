@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_scenes import CAMERA, CHEAP, plate, renderer, scene, square
+from small_scenes import CAMERA, CHEAP, RATE, plate, renderer, scene, square
 from stats import assert_mean, critical_z
 
 from qsim.optics import Lens
@@ -95,6 +95,19 @@ def test_frames_beyond_the_clip_are_not_used():
     np.testing.assert_array_equal(first[1], more[1])
     np.testing.assert_array_equal(first[1], first[-1])
     assert not np.array_equal(more[1], more[2])
+
+
+def test_samples_that_fall_into_few_pixels_are_all_counted():
+    """A plate fills the picture, and a frame later it is 2.6 px wide: 120 000 samples of each half fall into a pixel.
+
+    In even light it has the same radiance near and far.
+    """
+    away = Translation((0.0, 0.0, -24.5 * RATE))
+    made = scene(Body("plate", square(1.6, 3.5), Diffuse(0.3), away))
+    own, most = pictures(made, 1, Budget(2048, 2, neighbours=1)).mean(axis=1)
+    covered = np.s_[11:13, 16]
+    assert own[covered].max() < own[0, 0] / 2, "the plate is darker than the sky"
+    np.testing.assert_allclose(most[covered], own[covered], rtol=0.05)
 
 
 def test_an_interrupted_clip_that_shares_samples_resumes_with_the_same_bytes(tmp_path):
