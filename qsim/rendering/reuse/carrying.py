@@ -91,8 +91,11 @@ class Carrier:
     def pictures(self, t: int) -> Array:
         """Return pictures of frame t from 1, 3, 5 ... frames, float64 [n, 2 halves, H, W]; the first is its own.
 
-        The number of frames follows REACH; frames outside the clip are missing. Places the stage at frame t.
+        The number of frames follows REACH up to `neighbours`, which is the last; frames outside the clip are missing.
+        Places the stage at frame t. `ValueError` for a frame outside the clip.
         """
+        if t not in self.frames:
+            raise ValueError(f"frame {t}: the frames that share samples are {self.frames[0]} to {self.frames[-1]}")
         wanted = [s for s in range(t - self.neighbours, t + self.neighbours + 1) if s in self.frames]
         for s in set(self._kept) - set(wanted):
             del self._kept[s]
@@ -101,10 +104,10 @@ class Carrier:
                 self._kept[s] = self._traced(s)
         own = self._own(self._kept[t])
         self.stage.place(self.time(t))
-        layers = _Layers(self, t, self._kept[t], float(np.nanmean(own)))
+        layers = _Layers(self, t, self._kept[t], float(np.mean(own, where=np.isfinite(own))))
         layers.add(self._kept[t])
         found, done = [own], 0
-        for reach in (k for k in REACH if k <= self.neighbours):
+        for reach in (*(k for k in REACH if k < self.neighbours), self.neighbours):
             for s in wanted:
                 if done < abs(s - t) <= reach:
                     layers.add(self._kept[s])

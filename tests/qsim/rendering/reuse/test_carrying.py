@@ -97,6 +97,23 @@ def test_frames_beyond_the_clip_are_not_used():
     assert not np.array_equal(more[1], more[2])
 
 
+@pytest.mark.parametrize("t", [-1, 4])
+def test_a_frame_outside_the_clip_is_refused(t):
+    with pytest.raises(ValueError, match=f"frame {t}: the frames that share samples are 0 to 3"):
+        renderer(plate(None), budget=SHARED, frames=4).frame(t)
+
+
+@pytest.mark.parametrize("neighbours", [4, 7])
+def test_any_number_of_neighbours_acts(neighbours):
+    """The last picture has the samples of all of them, also between and beyond the numbers that are tried."""
+    made = plate(None, light=SunSky())
+    found = pictures(made, 8, Budget(8, 2, neighbours=neighbours))
+    fewer = pictures(made, 8, Budget(8, 2, neighbours=5 if neighbours > 5 else 3))
+    assert len(found) == len(fewer) + 1
+    np.testing.assert_array_equal(found[:-1], fewer)
+    assert not np.array_equal(found[-1], fewer[-1])
+
+
 def test_samples_that_fall_into_few_pixels_are_all_counted():
     """A plate fills the picture, and a frame later it is 2.6 px wide: 120 000 samples of each half fall into a pixel.
 
@@ -108,6 +125,22 @@ def test_samples_that_fall_into_few_pixels_are_all_counted():
     covered = np.s_[11:13, 16]
     assert own[covered].max() < own[0, 0] / 2, "the plate is darker than the sky"
     np.testing.assert_allclose(most[covered], own[covered], rtol=0.05)
+
+
+@pytest.mark.parametrize("bad", [math.inf, math.nan])
+def test_a_sample_without_a_value_spoils_its_own_pixel_only(bad):
+    one = renderer(plate(Spin((0, 0, 1), 40.0), light=SunSky()), budget=SHARED, frames=4)
+    carrier = one.carrier(SHARED, 4)
+    before = carrier.pictures(2)
+    part = carrier._kept[2].parts[0]
+    values = np.array(part.radiance)
+    values[100] = bad
+    carrier._kept[2].parts[0] = replace(part, radiance=one.mi.Float(values))
+    found = carrier.pictures(2)
+    assert np.count_nonzero(~np.isfinite(found[0])) == 1
+    assert np.isfinite(found[1:]).all()
+    changed = np.abs(found[-1] - before[-1]) > 1e-4 * before[0].mean()
+    assert np.count_nonzero(changed) <= 1
 
 
 def test_an_interrupted_clip_that_shares_samples_resumes_with_the_same_bytes(tmp_path):
