@@ -93,7 +93,9 @@ def prepare(clip: ClipFolder, sensing: Sensing) -> Draw:
     """Return the draw of a clip with these settings; `ValueError` if they do not fit the clip."""
     own = sensing.sensor_name if sensing.sensor_name.endswith(".toml") else None
     source = sensing.defects or own
-    return assemble(clip, sensing, defect_table.from_toml(source) if isinstance(source, str) else source)
+    if isinstance(source, str):
+        return assemble(clip, sensing, defect_table.from_toml(source, needed=sensing.defects is not None))
+    return assemble(clip, sensing, source)
 
 
 def filters_of(sensing: Sensing) -> ColourFilter | None:

@@ -81,10 +81,16 @@ class Defects:
         return pattern | maps | own
 
 
-def from_toml(path: str | Path) -> Defects | None:
-    """Return the table [defects] of a TOML file, None if it is missing or all of it is off; `ValueError` if invalid."""
+def from_toml(path: str | Path, *, needed: bool = False) -> Defects | None:
+    """Return the table [defects] of a sensor file, None if it is missing or all of it is off; `ValueError` if invalid.
+
+    With `needed` the file was named for its defects, and a missing table is an error.
+    """
     path = Path(path)
-    table = files.read_toml(path, "file of defects").get("defects", {})
+    tables = files.read_toml(path, "file of defects" if needed else "sensor file")
+    if needed and "defects" not in tables:
+        raise ValueError(f"{path}: has no table [defects]")
+    table = tables.get("defects", {})
     if not isinstance(table, dict):
         raise ValueError(f"{path}: [defects] must be a table, got {table!r}")
     files_of = {key: str((path.parent / table[key]).resolve()) for key in _MAPS if isinstance(table.get(key), str)}
