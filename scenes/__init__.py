@@ -97,6 +97,8 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
         raise ValueError(f"{name}: is a clip, made from a scene already; name a family, a file or a folder")
     if Path(name).is_dir():
         return asset_folder.scene(seed, speed=speed, folder=name)
+    if str(name) in RECIPES or Path(name).suffix == ".toml":
+        raise ValueError(f"{name}: is a recipe of a data set, not a scene; use `qsim generate {name}`")
     raise ValueError(
         f"no scene family {str(name)!r}{suggest(str(name), FAMILIES)}; there are {', '.join(FAMILIES)}, "
         "or give a .py, .glb, .gltf or .xml file or a folder"

@@ -146,6 +146,8 @@ def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
     named = (
         args.sensor or args.bits or args.ppp or args.lux or args.seed or args.colour
     )  # each is part of a stream's name
+    if len(known) > 1 and not args.name and not named and sensing.stream_name not in known:
+        raise ValueError(f"{clip.path}: choose one of its streams with --name: {', '.join(known)}")
     stored = clip.stream(known[0] if len(known) == 1 and not args.name and not named else sensing.stream_name)
     drawn, kept = replay(clip, stored, int(number))
     differ = int((drawn != kept).sum())

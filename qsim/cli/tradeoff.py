@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks, files
-from qsim.cli.console import bar, command, note, output, refuse_idle
+from qsim.cli.console import bar, command, note, output, refuse_existing, refuse_idle
 from qsim.cli.options import checked, frame_size, steps, whole_numbers
 
 
@@ -80,8 +80,8 @@ def _run_tradeoff(args: argparse.Namespace) -> int:
         if args.streams or args.paper_figure:
             raise ValueError("give a folder with -o, as in -o out/bits")
         refuse_idle(args, "tradeoff without --output", ["force"])
-    elif (args.output / f"{name}.json").exists() and not args.force:
-        raise FileExistsError(f"{args.output / name}.json: exists; name another folder with -o, or use --force")
+    else:
+        refuse_existing(args.output / f"{name}.json", args.force)
     args.seed = args.seed or 0
     return _tradeoff_study(args) if args.paper_figure is None else _paper_figure(args)
 

@@ -222,7 +222,7 @@ class ClipFolder:
 
 def _why_not(path: Path) -> str:
     """Return why a path is not a clip, and what to do."""
-    if path.with_name(path.name + ".part").is_dir():
+    if Path(f"{path}.part").is_dir():
         return f"{path}: unfinished (only {path.name}.part is there); run the same command again, it resumes"
     if not path.exists():
         return f"{path}: no such clip"

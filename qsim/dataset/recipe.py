@@ -92,10 +92,12 @@ def text_of(path: str | Path) -> tuple[Path, str]:
 
     `FileNotFoundError`, or `ValueError` for a file that is not text.
     """
-    from qsim.scenes import RECIPES
+    from qsim.scenes import FAMILIES, RECIPES
 
     found = Path(path)
     if not found.is_file():
+        if str(path) in FAMILIES:
+            raise FileNotFoundError(f"{path}: is a scene family, not a recipe; use `qsim render {path}`")
         if str(path) not in RECIPES:
             known = ", ".join(RECIPES)
             raise FileNotFoundError(
@@ -103,7 +105,7 @@ def text_of(path: str | Path) -> tuple[Path, str]:
             )
         found = RECIPES[str(path)]
     try:
-        return found, found.read_text(encoding="utf-8")
+        return found, found.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise ValueError(f"{path}: not a text file; a recipe is TOML in UTF-8") from None
 

@@ -66,7 +66,7 @@ def detect(path: Path) -> str:
         return _detect_npy(path)
     if suffix == ".bin":
         return _detect_raw(path)
-    raise ValueError(f"{path}: unknown kind of file; name it with --layout: {', '.join(LAYOUTS)}")
+    raise ValueError(f"{path}: unknown kind of file; name it with `qsim convert --layout`: {', '.join(LAYOUTS)}")
 
 
 def recordings(folder: Path, layout: str | None) -> list[Path]:
@@ -103,7 +103,7 @@ def _detect_folder(path: Path) -> str:
             return layout
     if any(path.rglob("*.bin")):
         return _detect_raw(raw_cameras.raw_files(path)[0], many=True)
-    raise ValueError(f"{path}: a folder of unknown kind; name it with --layout: {', '.join(LAYOUTS)}")
+    raise ValueError(f"{path}: a folder of unknown kind; name it with `qsim convert --layout`: {', '.join(LAYOUTS)}")
 
 
 def _detect_npy(path: Path) -> str:

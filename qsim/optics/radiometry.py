@@ -19,6 +19,7 @@ from numpy import ndarray as Array
 
 from qsim.optics.camera import Camera
 from qsim.optics.lens import Lens
+from qsim.structure import LARGEST, SMALLEST
 
 PLANCK = 6.62607015e-34  # J s, exact (SI)
 LIGHT_SPEED = 299792458.0  # m s^-1, exact (SI)
@@ -135,7 +136,11 @@ def ppp_factor(mean_photons: float, target: float, name: str = "clip") -> float:
         raise ValueError(
             f"{name}: mean of photons is {mean_photons:g}, no factor reaches {target:g} PPP; is the light on?"
         )
-    return target / mean_photons
+    factor = target / mean_photons
+    if not SMALLEST <= factor <= LARGEST:
+        allowed = f"{SMALLEST:g} to {LARGEST:g} times"
+        raise ValueError(f"{name}: {target:g} PPP is {factor:.3g} times its own light; allowed are {allowed}")
+    return factor
 
 
 @dataclass(frozen=True)

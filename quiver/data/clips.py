@@ -26,6 +26,8 @@ def open_clips(path: Path | str | Iterable[Path | str], split: str | None = None
     if (path / "clip.json").exists():
         return [Clip.open(path)]
     made = sorted(found.parent for found in path.glob("*/clip.json"))
+    if path.exists() and not made and not any((path / name).exists() for name in ("dataset.json", "jobs")):
+        raise FileNotFoundError(f"{path}: neither a clip nor a data set (it has no clip.json and no dataset.json)")
     if not made or (path / "dataset.json").exists():
         return Dataset.open(path).clips(split)
     return [clip for clip in map(Clip.open, made) if split in (None, clip.meta.get("split"))]

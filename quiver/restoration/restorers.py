@@ -121,6 +121,11 @@ def weights_path(name: str) -> Path:
     if (path / "settings.json").is_file():
         raise FileNotFoundError(f"{path}: a training run without best.safetensors; continue it until it has validated")
     removed.refuse_name(name)
+    if name in METHODS:
+        own = ", ".join(shipped)
+        raise ValueError(
+            f"{name}: a classical method has no weights; name {own}, a .safetensors file or a folder of `quiver train`"
+        )
     raise ValueError(
         f"no method {name!r}{suggest(name, method_names())}; known are {', '.join(method_names())}, a "
         ".safetensors file, and a folder of `quiver train`"

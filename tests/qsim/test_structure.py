@@ -4,6 +4,7 @@ import json
 import random
 import re
 import shutil
+import tomllib
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -322,3 +323,11 @@ def test_the_place_of_a_key_can_be_its_line():
     with pytest.raises(ValueError, match=r"^a\.toml:1: key 'x' is missing in it$"):
         structure({}, {"x": checks.real}, where, of="it")
     assert structure({"x": None, "z": 1}, {"x or null": checks.real}, "a", closed=False) == {"x": None, "z": 1}
+
+
+def test_a_byte_order_mark_is_skipped(tmp_path):
+    """Some editors begin a text file with one."""
+    toml = tmp_path / "a.toml"
+    toml.write_text(fakes.RECIPE, encoding="utf-8-sig")
+    assert files.read_toml(toml, "file") == tomllib.loads(fakes.RECIPE)
+    assert recipe.load(toml).jobs == recipe.parse(fakes.RECIPE, toml).jobs

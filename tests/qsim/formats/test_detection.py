@@ -50,7 +50,7 @@ def test_detection_by_name_signature_and_type(tmp_path: Path):
     kinds = {"cube": "cube", "light": "light", "counts": "light", "planes": "codes"}
     assert {name: detection.detect(tmp_path / f"{name}.npy") for name in kinds} == kinds
     (tmp_path / "x.xyz").touch()
-    with pytest.raises(ValueError, match="unknown kind of file; name it with --layout: cube, "):
+    with pytest.raises(ValueError, match="unknown kind of file; name it with `qsim convert --layout`: cube, "):
         importing.read(tmp_path / "x.xyz")
     with pytest.raises(FileNotFoundError, match="no such file"):
         importing.read(tmp_path / "none.npy")
