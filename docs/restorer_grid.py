@@ -174,8 +174,8 @@ def write_tables(out: Path, names: Sequence[str], clips: Sequence[str]) -> None:
              f"classical method: {', '.join(lost) or 'no cell'}.", ""]  # fmt: skip
     apart = np.array([gain for cell in cells for gain in by_clip(cell)])
     text += [f"By single clips: in {np.sum(apart < 0)} of {len(apart)} pairs of cell and clip the best of all "
-             f"classical methods is better, by {max(0, -apart.min()):.2f} dB at most. Who knew these pairs and gave "
-             f"them to that method would gain {np.mean(np.maximum(-apart, 0)):.2f} dB in the mean.", ""]  # fmt: skip
+             f"classical methods is better, by {max(0, -apart.min()):.2f} dB at most. Giving exactly these pairs "
+             f"to that method would gain {np.mean(np.maximum(-apart, 0)):.2f} dB in the mean.", ""]  # fmt: skip
     table = [
         (name, f"{own:.2f}", f"{best} {rival:.2f}", f"{own - rival:+.2f}", *(f"{x:+.2f}" for x in bins))
         for name, own, best, rival, bins in rows

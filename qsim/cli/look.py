@@ -128,7 +128,8 @@ def add_report(sub: Any) -> None:
         "qsim report out/fan\nqsim report out/fan out/fan.npy -o fan.html\n"
         "qsim report out/demo -o out/demo/index.html --title 'My run'",
     )  # fmt: skip
-    parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help="clips, data sets, or folders of some")
+    kinds = "clips, data sets, training runs, restored video, evaluations, or folders of some"
+    parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help=kinds)
     parser.add_argument(
         "-o", "--output", type=Path, help=".html file to write (default: NAME.html here; report.html for several paths)"
     )

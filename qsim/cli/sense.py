@@ -27,7 +27,8 @@ def add_sense(sub: Any) -> None:
         "--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default: quiver-physical)"
     )
     parser.add_argument("--bits", type=checked(checks.bits), help="bits per code (default: the sensor's own)")
-    parser.add_argument("--ppp", type=numbers, help="mean photons per pixel and code over the clip; several: 3.25,26")
+    light = "mean photons per pixel and code over the clip; several: 3.25,26 (default: the clip's own light)"
+    parser.add_argument("--ppp", type=numbers, help=light)
     parser.add_argument("--lux", type=numbers, help="faceplate lux at 555 nm instead of --ppp")
     parser.add_argument("--seed", type=checked(checks.seed), default=0, help="seed of the noise (default 0)")
     parser.add_argument("-o", "--name", help="name of the stream (default: made from sensor, bits and light)")
@@ -56,7 +57,7 @@ def add_sense(sub: Any) -> None:
         "--row-delay", type=checked(checks.positive), help="seconds from one row to the next (default: all at once)"
     )
     parser.add_argument(
-        "--row-order", choices=checks.ROW_ORDERS, help="rows from the top (down, the default), columns from the left..."
+        "--row-order", choices=checks.ROW_ORDERS, help="direction of rows (down, the default, or up) or of columns"
     )
     parser.add_argument(
         "--exposures",
