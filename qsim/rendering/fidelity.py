@@ -81,11 +81,14 @@ def choose_budget(
     denoises if Open Image Denoise is installed and cheaper at the same measured error. `reuse` None lets neighbouring
     frames share samples where that is predicted to cost less and the trial costs little against the clip; True tries
     it at any length, False renders each frame alone. The result depends only on the arguments and the installed
-    software: an interrupted clip resumes with the same budget. `ValueError` for a `psnr` outside 10 to 80 dB and for a
-    scene without light.
+    software: an interrupted clip resumes with the same budget. `ValueError` for a `psnr` outside 10 to 80 dB, for
+    another value of `denoise` or `reuse`, and for a scene without light.
     """
     if not 10 <= psnr <= 80:
         raise ValueError(f"psnr: expected 10 to 80 dB, got {psnr!r}")
+    for name, wish in (("denoise", denoise), ("reuse", reuse)):
+        if not isinstance(wish, bool | None):
+            raise ValueError(f"{name}: expected True, False or None, got {wish!r}")
     pilot = Pilot.of(scene, frame_rate, shutter, frames, seed)
     full = pilot.mean(COUNTS[1], DEEPEST)
     if not full.mean() > 0:

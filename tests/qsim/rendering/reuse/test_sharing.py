@@ -111,3 +111,11 @@ def test_the_finding_says_why_frames_are_rendered_alone(options, why):
     about = next(finding for finding in chosen.findings if finding.effect == NAME)
     assert chosen.neighbours == 0
     assert about.size == why
+
+
+@pytest.mark.parametrize("name", ["denoise", "reuse"])
+@pytest.mark.parametrize("wish", [0, 1, "no"])
+def test_a_wish_is_true_false_or_none(name, wish):
+    """0 was taken as no wish for False: frames could be denoised, and share samples."""
+    with pytest.raises(ValueError, match=f"{name}: expected True, False or None, got {wish!r}"):
+        choose_budget(plate(None), **{name: wish})
