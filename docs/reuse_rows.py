@@ -100,7 +100,8 @@ class Clip:
             apart[t] = np.minimum(self.images[t], white) - np.minimum(references[t], white)
         reached = {t: decibels(white, float(np.mean(d[0] * d[1]))) for t, d in apart.items()}
         means = [float(self.images[t].mean()) for t in range(plan.frames)]
-        errors = over_neighbours([error_at(white, self.errors[t]) for t in range(plan.frames)], means)
+        own = [error_at(white, self.errors[t]) for t in range(plan.frames)]
+        errors = over_neighbours(own, means, budget.neighbours > 0)
         stated = {t: psnr(white, errors[t]) for t in plan.judged}
         followed = np.stack([apart[t] for t in range(plan.first, plan.first + plan.count)], axis=1)
         steady = [self.seconds[t] for t in steady_frames(plan, budget.neighbours)]

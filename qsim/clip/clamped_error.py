@@ -82,34 +82,42 @@ def error_at(white: float, errors_at: Sequence[Sequence[float]]) -> float:
     return float(np.interp(math.log(white), np.log(whites), errors))
 
 
-def over_neighbours(errors: Sequence[float], means: Sequence[float]) -> list[float]:
+def over_neighbours(errors: Sequence[float], means: Sequence[float], shares: bool = False) -> list[float]:
     """Return the rms error of each frame from the estimates of the frame, of the one before and of the one after it.
 
     Estimates from few samples err by chance, and errors hardly change from frame to frame. A neighbour whose mean
-    radiance (`means`) differs by more than NEAR, as under light that flickers, does not count.
+    radiance (`means`) differs by more than NEAR, as under light that flickers, does not count. Where frames share
+    samples (`shares`), the first and the last have those of one side only, and err more: they count for themselves.
     """
     squares, lights = np.square(errors), np.asarray(means)
     count, sums = np.ones_like(squares), squares.copy()
     for here, there in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
         near = np.abs(lights[here] - lights[there]) <= NEAR * lights[here]
+        if shares:
+            near[:1] = near[-1:] = False
         sums[here] += np.where(near, squares[there], 0)
         count[here] += near
     return np.sqrt(sums / count).tolist()
 
 
 def measured(
-    means: Sequence[float], high: float, errors: Sequence[float], errors_at: Sequence[Sequence[Sequence[float]]]
+    means: Sequence[float],
+    high: float,
+    errors: Sequence[float],
+    errors_at: Sequence[Sequence[Sequence[float]]],
+    shares: bool = False,
 ) -> dict[str, Any]:
     """Return the fields of clip.json about the errors of a clip's frames.
 
     `means` are the mean radiances of the frames, `high` is the 99.9th percentile of all. `errors` holds the plain error
     of each frame, `errors_at` its pairs (white, error). Without pairs the plain error is taken, which is never smaller.
+    `shares` states whether the frames share samples.
     """
     white = white_of(math.fsum(means) / len(means), high)
     found: dict[str, Any] = {"error_per_frame": list(errors), "white": white}
     if white > 0:
         own = [error_at(white, pairs) if len(pairs) else plain for plain, pairs in zip(errors, errors_at, strict=True)]
-        found["error_at_white_per_frame"] = over_neighbours(own, means)
+        found["error_at_white_per_frame"] = over_neighbours(own, means, shares)
         found["psnr_of_truth"] = _stored(psnr(white, rms(np.array(own))))
         found["psnr_unclamped"] = _stored(psnr(white, rms(np.array(errors))))
     return found

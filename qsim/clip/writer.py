@@ -237,7 +237,8 @@ class ClipWriter:
         if all("error" in e for e in entries):
             errors, errors_at = [e["error"] for e in entries], [e.get("errors_at", []) for e in entries]
             means = [e["mean_radiance"] for e in entries]
-            meta |= clamped_error.measured(means, self._high(), errors, errors_at)
+            shares = bool(self.meta.get("render", {}).get("neighbours"))
+            meta |= clamped_error.measured(means, self._high(), errors, errors_at, shares)
         if all("fireflies" in e for e in entries):
             meta["fireflies_per_frame"] = [e["fireflies"] for e in entries]
         files.write_description(self.part / "clip.json", meta)

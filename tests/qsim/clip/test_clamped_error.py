@@ -112,6 +112,14 @@ def test_frames_of_other_light_do_not_count():
     assert found == pytest.approx([*np.sqrt([5 / 2, 5 / 2]), 3.0, *np.sqrt([41 / 2, 41 / 2]), 6.0])
 
 
+def test_the_ends_of_a_clip_whose_frames_share_samples_count_for_themselves():
+    """They share with one side only; clip.json of such a clip says so in `neighbours`."""
+    found = over_neighbours([4.0, 1.0, 2.0, 3.0, 5.0], [1.0] * 5, True)
+    assert found == pytest.approx([4.0, *np.sqrt([5 / 2, 14 / 3, 13 / 2]), 5.0])
+    assert over_neighbours([0.3], [2.0], True) == [0.3]
+    assert over_neighbours([0.3, 0.4], [2.0, 2.0], True) == pytest.approx([0.3, 0.4])
+
+
 @pytest.mark.parametrize("count", [64, 4096])
 def test_chance_in_an_estimate_falls_by_the_root_of_three(count):
     """Estimates of 1 from `count` normal numbers have a standard deviation of sqrt(2 / count); a third of it is left.

@@ -10,6 +10,7 @@ import pytest
 from small_scenes import CAMERA, CHEAP, RATE, plate, renderer, scene, square
 from stats import assert_mean, critical_z
 
+from qsim.clip.clamped_error import error_at
 from qsim.optics import Lens
 from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
@@ -158,6 +159,9 @@ def test_an_interrupted_clip_that_shares_samples_resumes_with_the_same_bytes(tmp
     assert resumed.meta["checksums"] == whole.meta["checksums"]
     assert resumed.meta["error_per_frame"] == whole.meta["error_per_frame"]
     assert whole.meta["render"]["neighbours"] == 2
+    ends = [renderer(made, budget=budget, frames=4).frame(t).errors_at for t in (0, 3)]
+    stated = whole.meta["error_at_white_per_frame"]
+    assert [stated[0], stated[-1]] == [error_at(whole.meta["white"], errors) for errors in ends]
 
 
 def test_an_edge_keeps_its_mixture_where_a_neighbour_hides_one_side():
