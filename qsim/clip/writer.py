@@ -256,7 +256,8 @@ class ClipWriter:
 def target_of(path: str | os.PathLike[str], force: bool) -> Path:
     """Return the folder that a clip of this path is written to: a symbolic link stays, and its target is written.
 
-    `FileExistsError` for a folder that may not be replaced, `NotADirectoryError` for a path below a file.
+    `FileExistsError` for a folder that may not be replaced, `NotADirectoryError` for a path below a file,
+    `PermissionError` for one below a folder that cannot be written.
     """
     found = Path(path)
     check_name(found.name)
@@ -273,6 +274,8 @@ def target_of(path: str | os.PathLike[str], force: bool) -> Path:
     above = next(parent for parent in found.absolute().parents if parent.exists())
     if not above.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(found))
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise PermissionError(f"{found}: no permission to write into {above}; name another with -o")
     return found
 
 

@@ -392,13 +392,21 @@ def test_a_full_disk(folder, tmp_path, monkeypatch, capsys, line, target):
     assert not Path(target).exists()
 
 
-def test_a_folder_that_is_not_ours(folder, monkeypatch, capsys):
-    """A page that has no place to go is not drawn first."""
+@pytest.mark.parametrize(
+    ("line", "work"),
+    [
+        ("qsim report lit -o empty/deep/x.html", "qsim.report.report.build_page"),
+        ("qsim render fan -o empty/deep/x", "qsim.dataset.scene_rendering.choose_budget"),
+    ],
+)
+def test_a_folder_that_is_not_ours(folder, monkeypatch, capsys, line, work):
+    """A page or a clip that has no place to go is not made first."""
     monkeypatch.chdir(folder)
-    monkeypatch.setattr("qsim.report.report.build_page", lambda *_, **__: 1 / 0)
-    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != Path("empty"))
-    said = told(capsys, "qsim report lit -o empty/deep/x.html")
-    assert "no permission to write into empty; name another with -o" in said
+    monkeypatch.setattr(work, lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "empty")
+    said = told(capsys, line)
+    assert "no permission to write into " in said
+    assert "empty; name another with -o" in said
 
 
 def test_no_gpu(folder, monkeypatch, capsys):
