@@ -196,7 +196,7 @@ def rendering(report: dict[str, Any]) -> str:
     exact = median(row["ratio"] * 10 ** ((row["level"] - row["obvious_psnr"]) / 10) for row in at)
     wanted = "reached" if report["ok"] else "**not reached**"
     size = (
-        f"Frames of {report['height']} × {report['width']}; the median scene at 40 dB is {report['median_ratio']:.3f} "
+        f"Frames of {report['height']} × {report['width']}; the median scene at 40 dB is {report['median_ratio']:.1f} "
         f"times faster; the required speed (10 times there, and nowhere slower) is {wanted} in this run. The "
         "loop uses powers of two of samples and overshoots (**naive [dB]**). If it could stop at the PSNR that ours "
         f"reached, the median would be {equal:.1f}; if at exactly 40 dB, with ours unchanged, {exact:.1f}."
