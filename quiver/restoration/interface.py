@@ -14,7 +14,7 @@ from quiver.restoration.domain import Scope
 from quiver.restoration.mosaics import fill_mosaic
 
 DEFAULT_METHOD = "auto"  # of `quiver restore` and `quiver.restore`: see automatic.py
-DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory beside the weights
+DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory
 # Presets of the controls and the compared networks; each exists as NAME-1m too (quiver/model/equal_cost.py).
 COMPARED = ("unet", "fastdvdnet", "student-teacher", "bit2bit", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")
 MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/model/schedules.py

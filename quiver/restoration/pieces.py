@@ -51,6 +51,7 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int) -> Pieces
     """Return the cut of a frame for a network and `memory` bytes. `ValueError` if they do not hold a small tile."""
     from quiver.model.quiver import QUIVER
 
+    memory = max(memory - weight_bytes(model), 0)
     pixels = memory // bytes_per_pixel(model)
     if height * width <= pixels:
         return Pieces(cut_tiles(height, width, height * width, 0))
@@ -58,14 +59,24 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int) -> Pieces
     if reach is not None:
         return Pieces(cut_tiles(height, width, pixels, reach, int(model.multiple)))  # type: ignore[arg-type]
     if takes_clips(model):  # recurrent, or aligned along any motion: no overlap makes tiles exact
-        needed = bytes_per_pixel(model) * height * width
+        needed = bytes_needed(model, height, width)
         return Pieces(cut_tiles(height, width, pixels, BLENDED, STEP, blend=True), False, needed)
     multiple = int(model.multiple)  # type: ignore[arg-type]
     if not isinstance(model, QUIVER):
         return Pieces(cut_tiles(height, width, pixels, BLENDED, multiple, blend=True), exact=False)
-    needed = bytes_per_pixel(model) * height * width
+    needed = bytes_needed(model, height, width)
     step, pixels = max(multiple, model.stride), max(memory - TILING, 0) // bytes_per_pixel(model)
     return Pieces(cut_tiles(height, width, pixels, BLENDED, step, blend=True), False, needed)
+
+
+def bytes_needed(model: nn.Module, height: int, width: int) -> int:
+    """Return the working memory of a network for a tile, beside its weights."""
+    return weight_bytes(model) + bytes_per_pixel(model) * height * width
+
+
+def weight_bytes(model: nn.Module) -> int:
+    """Return the size of the weights [bytes]: convolutions hold a copy of theirs, in another order, while they run."""
+    return sum(weight.numel() * weight.element_size() for weight in model.parameters())
 
 
 def bytes_per_pixel(model: nn.Module) -> int:

@@ -22,7 +22,7 @@ from quiver.model.presets import OTHERS
 from quiver.model.weights import save
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer, wrap_network
-from quiver.restoration.pieces import bytes_per_pixel, cut_pieces
+from quiver.restoration.pieces import bytes_needed, cut_pieces
 
 FINAL_ZEROS = ("mergenet",)  # of these an untrained network changes nothing
 
@@ -98,7 +98,7 @@ def test_a_frame_beyond_the_memory_is_cut_exactly_or_with_a_word(name, monkeypat
     """Tiles change nothing, or a warning states by how much they differ and, where that is known, what avoids it."""
     monkeypatch.setattr("quiver.restoration.pieces.TILING", 0)  # a small frame would fit into it
     network, codes = lively(name), random_codes(2, 96, 130)
-    memory = bytes_per_pixel(network) * 9_000
+    memory = bytes_needed(network, 1, 9_000)
     assert len(cut_pieces(network, 96, 130, memory).tiles) > 1
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

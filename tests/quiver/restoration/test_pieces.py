@@ -20,7 +20,7 @@ from quiver.model.weights import save
 from quiver.restoration import pieces
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer, wrap_network
-from quiver.restoration.pieces import bytes_per_pixel, cut_pieces
+from quiver.restoration.pieces import bytes_needed, cut_pieces
 from quiver.restoration.restored_file import restore_to_file
 from quiver.restoration.restorers import restorer
 
@@ -71,7 +71,7 @@ def test_a_convolutional_network_does_not_see_the_tiles():
     rng, cut = np.random.default_rng(0), 0
     for seed in range(8):
         height, width = (int(n) for n in rng.integers(90, 200, 2))
-        memory = bytes_per_pixel(model) * int(rng.integers(9_000, 30_000))
+        memory = bytes_needed(model, 1, int(rng.integers(9_000, 30_000)))
         codes = moving(1, height, width, seed)
         tiled, whole = (quiet(wrap_network(model, "u", "", RestoreOptions(memory=m)), codes) for m in (memory, 10**10))
         cut += len(cut_pieces(model, height, width, memory).tiles) > 1
@@ -89,7 +89,7 @@ def test_no_preset_changes_its_answer_unsaid(preset):
         height, width = (int(n) for n in rng.integers(96, 130, 2))
         codes = moving(1, height, width, seed)
         whole = wrap_network(model, preset, "", RestoreOptions(memory=10**12)).restore(codes)
-        memory = pieces.TILING + bytes_per_pixel(model) * int(rng.integers(8000, height * width))
+        memory = pieces.TILING + bytes_needed(model, 1, int(rng.integers(8000, height * width)))
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             tiled = wrap_network(model, preset, "", RestoreOptions(memory=memory)).restore(codes)
@@ -103,7 +103,7 @@ def test_a_frame_that_memory_does_not_hold_is_cut_with_a_word(tmp_path, monkeypa
     path, codes = tmp_path / "w.safetensors", moving(1, 104, 120)
     network = lively(SMALL, torch.float32)
     save(network, SMALL, path)
-    memory = bytes_per_pixel(network) * 9_000
+    memory = bytes_needed(network, 1, 9_000)
     cut = cut_pieces(network, 104, 120, memory)
     assert not cut.exact
     assert all(tile.y % 16 == tile.x % 16 == 0 for tile in cut.tiles)
