@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from qsim.checks import suggest
+from qsim.cli.options import refuse_empty
 from qsim.files import FULL, Progress, wording
 from qsim.process import peak_memory
 
@@ -150,9 +151,9 @@ def command(
 
     With `threads`, the help of the option, the command has --threads.
     """
-    parser: argparse.ArgumentParser = sub.add_parser(
-        name, help=what, description=what, epilog="example:\n" + "".join(f"  {line}\n" for line in example.split("\n"))
-    )
+    epilog = "example:\n" + "".join(f"  {line}\n" for line in example.split("\n"))
+    parser: argparse.ArgumentParser = sub.add_parser(name, help=what, description=what, epilog=epilog)
+    refuse_empty(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, for programs")
     loudness = parser.add_mutually_exclusive_group()
     loudness.add_argument("-q", "--quiet", action="store_true", help="print the result only, no progress, no warnings")
@@ -319,8 +320,7 @@ def bar(label: str, unit: str = "frame", first: str = "") -> Iterator[Progress]:
     """
     from tqdm import tqdm
 
-    interval = 0.2 if sys.stderr.isatty() else 10.0
-    silent = quiet.get()
+    interval, silent = 0.2 if sys.stderr.isatty() else 10.0, quiet.get()
     with tqdm(
         desc=label, unit=unit, delay=2, mininterval=interval, dynamic_ncols=True, file=sys.stderr, disable=silent
     ) as shown:

@@ -8,7 +8,20 @@ from __future__ import annotations
 import argparse
 import contextlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
+
+
+def refuse_empty(parser: argparse.ArgumentParser) -> None:
+    """Let a command refuse empty texts and paths: `Path("")` is the present folder, which nobody named."""
+
+    def given(text: str) -> str:
+        if not text:
+            raise argparse.ArgumentTypeError("got an empty text; is a variable of the shell not set?")
+        return text
+
+    parser.register("type", None, given)
+    parser.register("type", Path, lambda text: Path(given(text)))
 
 
 def checked(check: Callable[[Any], Any]) -> Callable[[str], Any]:
