@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from qsim import checks
 from qsim.checks import suggest
 from qsim.scene import Scene
 from qsim.scene.animated.gltf_body import GLTF_SUFFIXES
@@ -72,9 +73,13 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
 
     `asset_folder.py` states what a folder may hold, `gltf_file.py` what becomes of an animated .glb or .gltf. An XML
     scene stands still and has no seed: a Python file that calls `qsim.read_mitsuba` moves its shapes.
-    `FileNotFoundError` for a missing file; `ValueError` for a name that is none of these, and for a speed other than 1
-    that changes no motion of a .py or .xml scene.
+    `FileNotFoundError` for a missing file; `ValueError` for a name that is none of these, for a speed outside 0.001
+    to 1000, and for one other than 1 that changes no motion of a .py or .xml scene.
     """
+    try:
+        checks.speed(float(speed))
+    except ValueError as error:
+        raise ValueError(f"speed: {error}") from None
     if str(name) in FAMILIES:
         return FAMILIES[str(name)](seed, speed=speed)
     if str(name).endswith(".py"):

@@ -40,7 +40,7 @@ def add_render(sub: Any) -> None:
     parser.add_argument(
         "--seed", type=checked(checks.seed), default=0, help="seed of the scene and its samples (default 0)"
     )
-    parser.add_argument("--speed", type=checked(checks.positive), default=1.0, help="factor on all motions (default 1)")
+    parser.add_argument("--speed", type=checked(checks.speed), default=1.0, help="factor on all motions (default 1)")
     parser.add_argument("--frames", type=whole, default=21, help="number of frames (default 21)")
     parser.add_argument("--height", type=whole, default=128, help="pixels (default 128)")
     parser.add_argument("--width", type=whole, default=128, help="pixels (default 128)")

@@ -82,6 +82,8 @@ MISTAKES = [
     ("qsim render fan -o x --width 12.5", "--width: expected a whole number from 1 to 100000, got 12.5"),
     ("qsim render fan -o x --seed -1", "--seed: expected a whole number from 0 to 2^31 - 1, got -1"),
     ("qsim render fan -o x --speed nan", "--speed: expected a number above 0, got nan"),
+    ("qsim render fan -o x --speed 1e300", "--speed: expected a factor on all motions from 0.001 to 1000, got 1e+300"),
+    ("qsim tradeoff fan -o x --speed 1e300", "speed: expected a factor on all motions from 0.001 to 1000, got 1e+300"),
     ("qsim render fan -o x --bands cmyk", "unknown argument --bands 'cmyk'; there are: rgb"),
     ("qsim render fan -o x --camera-path none.json", "none.json: no such file"),
     ("qsim render fan -o x --camera-path text.txt", "text.txt: not readable as JSON"),
