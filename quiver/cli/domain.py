@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from qsim import checks
 from qsim.cli.console import bar, output
-from qsim.cli.options import memory_size, numbers, whole_numbers, words
+from qsim.cli.options import checked, memory_size, numbers, whole_numbers, words
 from quiver.cli.options import add_running, command, running_options, use_threads
 
 MEMORY = "2GB"  # as in other commands
@@ -33,7 +34,7 @@ def add_domain(sub: Any) -> None:
     parser.add_argument(
         "--methods", type=words, help="classical methods, comma-separated (default all but `likelihood`)"
     )
-    parser.add_argument("--seed", type=int, help="seed of the noise (default 0)")
+    parser.add_argument("--seed", type=checked(checks.seed), help="seed of the noise (default 0)")
     add_running(parser)
     parser.set_defaults(memory=None)  # None: not given
     parser.add_argument("--force", action="store_true", help="measure existing cells again")

@@ -9,8 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from qsim import checks
 from qsim.cli.console import bar, note, output
-from qsim.cli.options import count, frame_size, positive, words
+from qsim.cli.options import checked, count, frame_size, positive, words
 from qsim.files import write_bytes, write_json
 from quiver.cli.options import (
     add_light,
@@ -53,7 +54,9 @@ def add_evaluate(sub: Any) -> None:
     parser.add_argument("--split", choices=("train", "val", "test", "all"), help="split of a data set (default test)")
     parser.add_argument("--stream", help="score this stored stream of every clip, instead of sensing the clip now")
     add_light(parser, several=True)
-    parser.add_argument("--seed", type=int, help="seed of the test noise or of the random splits (default 0)")
+    parser.add_argument(
+        "--seed", type=checked(checks.seed), help="seed of the test noise or of the random splits (default 0)"
+    )
     parser.add_argument("--published", action="store_true", help="expose, scale and score every window separately")
     parser.add_argument(
         "--protocol",

@@ -7,8 +7,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from qsim import checks
 from qsim.cli.console import bar, note, output
-from qsim.cli.options import count, positive
+from qsim.cli.options import checked, count, positive
 from quiver.cli.options import (
     add_light,
     add_running,
@@ -51,7 +52,9 @@ def add_restore(sub: Any) -> None:
     )
     parser.add_argument("--stream", help="stream of a clip to restore (default: the only one)")
     add_light(parser, several=False)
-    parser.add_argument("--seed", type=int, help="seed of the noise, if a clip is sensed now (default 0)")
+    parser.add_argument(
+        "--seed", type=checked(checks.seed), help="seed of the noise, if a clip is sensed now (default 0)"
+    )
     parser.add_argument("--width", type=count, help="bare array: packed binary planes of this many pixels per row")
     parser.add_argument(
         "--planes", type=count, help="packed planes and cubes: 2^b - 1 are summed to one code (default 1)"

@@ -12,8 +12,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from qsim import checks
 from qsim.cli.console import note, output
-from qsim.cli.options import count, nonnegative, positive
+from qsim.cli.options import checked, count, nonnegative, positive
 from qsim.files import sha256
 from quiver.cli.options import (
     NETWORKS,
@@ -83,7 +84,7 @@ def add_train(sub: Any) -> None:
         "--precision", choices=("auto", "float32", "bfloat16"), help="precision (default auto: bfloat16 on CUDA)"
     )
     parser.add_argument("--device", default="auto", choices=DEVICES, help="device (default auto)")
-    parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
+    parser.add_argument("--seed", type=checked(checks.seed), help="of weights, samples and noise (default 0)")
     parser.add_argument("--force", action="store_true", help="replace an existing run")
 
 
@@ -239,7 +240,7 @@ def add_ablate(sub: Any) -> None:
     parser.add_argument(
         "--split", default="test", choices=("train", "val", "test"), help="split to score on (default test)"
     )
-    parser.add_argument("--seed", type=int, help="of weights, samples and noise (default 0)")
+    parser.add_argument("--seed", type=checked(checks.seed), help="of weights, samples and noise (default 0)")
     add_running(parser)
 
 
