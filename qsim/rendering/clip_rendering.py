@@ -11,6 +11,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.manifest import PHYSICAL
 from qsim.clip.writer import ClipWriter
 from qsim.rendering.budget import Budget
+from qsim.rendering.engine import free_memory
 from qsim.rendering.renderer import Crop, Renderer
 from qsim.scene import Scene, describe
 
@@ -39,6 +40,7 @@ def render_clip(
     renderer = Renderer(
         scene, frame_rate=frame_rate, shutter=shutter, seed=seed, budget=budget, crop=crop, frames=frames
     )
+    free_memory(renderer.engine)  # that of the clip before and of the budget's trials
     y, x, height, width = renderer.crop
     meta = {
         "shape": [frames, height, width],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -67,6 +68,16 @@ def errors_only(mi: Any) -> Iterator[None]:
         yield
     finally:
         mi.set_log_level(level)
+
+
+def free_memory(engine: RenderEngine) -> None:
+    """Give the memory of unused arrays back to the system; Dr.Jit keeps it for new arrays of equal size."""
+    if engine.backend == "scalar":
+        return
+    import drjit as dr
+
+    gc.collect()
+    dr.flush_malloc_cache()
 
 
 def opaque(value: Any) -> Any:
