@@ -59,6 +59,7 @@ def _run_generate(args: argparse.Namespace) -> int:
     with bar(wanted.name, first=PILOT) as progress, generation.watching(folder, chosen, progress):
         summary = generation.generate(wanted, folder, options, run=_cluster(args))
     lines = [f"{folder}: {summary.done} of {summary.jobs} clips done, {summary.made} made now{_defaults(wanted)}"]
+    lines += _empty(wanted, chosen)
     lines += [f"repaired {problem}" for problem in summary.repaired]
     lines += [f"FAILED {name}: {why}" for name, why in sorted(summary.failed.items())]
     lines += [f"SHARED {problem}" for problem in summary.shared]
@@ -67,6 +68,11 @@ def _run_generate(args: argparse.Namespace) -> int:
         lines.append("run again with --retry after removing the cause")
     output(args, {"dataset": str(folder)} | dataclasses.asdict(summary), lines)
     return 0 if summary.done == summary.jobs and not summary.shared else 1
+
+
+def _empty(wanted: Recipe, chosen: Sequence[Job]) -> list[str]:
+    """Return a line for a shard without clips, which is no mistake of an array of jobs."""
+    return [] if chosen else [f"this shard holds none of the {len(wanted.jobs)} clips of {wanted.name}"]
 
 
 def _defaults(wanted: Recipe) -> str:
@@ -135,7 +141,7 @@ def _run_plan(args: argparse.Namespace) -> int:
         found = cost_forecast.forecast(wanted, frames=args.frames, progress=progress)
     facts = {"recipe": wanted.name, "digest": wanted.digest, "machines": args.machines}
     facts["hours_each"] = found.hours / args.machines
-    output(args, facts | found.to_dict(), found.lines(args.machines))
+    output(args, facts | found.to_dict(), found.lines(args.machines) if wanted.jobs else _empty(whole, ()))
     return 0
 
 

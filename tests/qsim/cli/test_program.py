@@ -394,3 +394,14 @@ def test_a_preview_of_a_damaged_clip_names_the_check(tmp_path, capsys):
     code, _, err = run(capsys, "preview", clip, "--frame", 1, "-o", tmp_path / "a.png")
     assert code == 2
     assert "the clip is damaged, run `qsim check" in err
+
+
+@pytest.mark.parametrize("command", ["plan", "generate"])
+def test_a_shard_without_clips_says_so(command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    """An array of jobs may have more parts than clips: no mistake."""
+    (tmp_path / "r.toml").write_text(fakes.RECIPE)
+    count = len(recipe.load(tmp_path / "r.toml").jobs)
+    folder = ["-o", tmp_path / "d"] if command == "generate" else []
+    code, out, err = run(capsys, command, tmp_path / "r.toml", *folder, "--shard", f"{count + 1}/{count + 1}")
+    assert (code, err) == (0, "")
+    assert out.endswith(f"this shard holds none of the {count} clips of small\n")
