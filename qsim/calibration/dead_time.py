@@ -17,7 +17,7 @@ from math import sqrt
 import numpy as np
 from numpy import ndarray as Array
 
-from qsim.calibration.frame_statistics import FrameStatistics, measure
+from qsim.calibration.frame_statistics import FrameStatistics, alike, measure
 from qsim.calibration.results import Calibration, Value, normal_interval
 from qsim.sensor.counting import CountingSPAD
 
@@ -142,7 +142,8 @@ def calibrate_static(
 ) -> Calibration:
     """Estimate the effective dead time [s] and the Fano factor of every class, from counts [T, H, W] of a static scene.
 
-    `exposure` in seconds. `ValueError` for fewer than two frames, or if no class has enough pixels.
+    `exposure` in seconds. `ValueError` for fewer than two frames, for frames that are all alike, and if no
+    class has enough pixels.
     """
     counts = np.asarray(counts)
     if counts.ndim != 3 or len(counts) < 2:
@@ -152,6 +153,10 @@ def calibrate_static(
     stacks = classes_of(counts, bits=bits, exposure=exposure, edges=edges)
     if not stacks:
         raise ValueError(f"calibrate: no class of light has {LEAST_PIXELS} pixels; use a larger part of the scene")
+    if all(alike(stack) for stack in stacks):
+        raise ValueError(
+            "calibrate: all frames are alike, which determines no dead time; are they copies of one, or saturated?"
+        )
     found = fitted_dead_time(stacks, bits, paralyzable)
     ratio = found.value if found else 0.0
     values = {f"fano_at_{stack.mean:.3g}": fano(stack) for stack in stacks}

@@ -193,6 +193,27 @@ def _as_values(block: Array, top: int, what: str, name: str, frame: int) -> Arra
     return block.astype(np.int64)
 
 
+def check_noise(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics]) -> None:
+    """`ValueError` for stacks that determine nothing: flats without a count, and frames that are all alike.
+
+    Dark frames may be alike if a pixel counts nothing: that bounds the dark counts.
+    """
+    for kind, stacks, bounds in (("dark", darks, True), ("flat", flats, False)):
+        for i, stack in enumerate(stacks):
+            if not bounds and not stack.total.any():
+                raise ValueError(f"calibrate: flat {i} holds no count at all; is it a dark stack, or without light?")
+            if alike(stack) and (stack.total.all() or not bounds):
+                raise ValueError(
+                    f"calibrate: all frames of {kind} {i} are alike, which determines nothing; are they copies of one "
+                    "frame, or saturated?"
+                )
+
+
+def alike(stack: FrameStatistics) -> bool:
+    """Return whether every pixel has the same code in all of two or more frames."""
+    return stack.frames > 1 and not stack.pixel_variance.any()
+
+
 def check_stacks(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatistics]) -> None:
     """`ValueError` unless there are stacks, all of one size."""
     if not darks and not flats:

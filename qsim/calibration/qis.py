@@ -14,7 +14,7 @@ from math import exp, isfinite, sqrt
 import numpy as np
 
 from qsim.calibration.flat_fields import qis_flats
-from qsim.calibration.frame_statistics import FrameStatistics, check_stacks
+from qsim.calibration.frame_statistics import FrameStatistics, check_noise, check_stacks
 from qsim.calibration.histogram_fit import HistogramFit, best_fit, goodness, sensor_at
 from qsim.calibration.photon_transfer import photon_transfer, spread_of_means
 from qsim.calibration.prnu import measure_pattern
@@ -27,7 +27,7 @@ def calibrate_qis(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatist
     """Estimate gain, offset, read noise, dark current, PRNU and, if the flats' photons are known, QE of a QIS.
 
     Values named `..._transfer` come from means and variances, the others from the histograms. `ValueError` if there is
-    no dark or no flat stack, or if a stack is constant.
+    no dark or no flat stack, or if a stack is constant or its frames are all alike.
     """
     check_stacks(darks, flats)
     if bits < 2:
@@ -46,6 +46,7 @@ def calibrate_qis(darks: Sequence[FrameStatistics], flats: Sequence[FrameStatist
                 f"calibrate: every code of {where} is {code}; calibration needs codes that vary: change the light or "
                 "the exposure"
             )
+    check_noise(darks, flats)
     warnings = _advice(darks, flats)
     transfer = photon_transfer(darks, flats)
     if not (isfinite(transfer.gain) and transfer.gain > 1e-8):

@@ -19,7 +19,7 @@ from numpy import ndarray as Array
 
 from qsim.calibration.dead_time import fitted_dead_time, matched_variance
 from qsim.calibration.flat_fields import Response, dark_rates, spad_flats
-from qsim.calibration.frame_statistics import FrameStatistics, check_stacks
+from qsim.calibration.frame_statistics import FrameStatistics, check_noise, check_stacks
 from qsim.calibration.histogram_fit import NODES, WEIGHTS, goodness
 from qsim.calibration.prnu import BY_FLAT, HOT, measure_pattern
 from qsim.calibration.results import Z95, Calibration, Value, normal_interval, odd_efficiency
@@ -40,9 +40,10 @@ def calibrate_spad(
     """Estimate DCR (and its map), PDE x fill, PRNU, afterpulsing and, for counts of more than one bit, dead time.
 
     `dead_time=False` assumes Poisson counts; the p-value shows whether that holds. Without `darks` the DCR is assumed
-    to be 0, with a warning. `flats` may be missing; `ValueError` if both are.
+    to be 0, with a warning. `flats` may be missing; `ValueError` if both are, and for stacks that determine nothing.
     """
     check_stacks(darks, flats)
+    check_noise(darks, flats)
     warnings = _dispersed([*darks, *flats])
     values: dict[str, Value] = {}
     maps: dict[str, Array] = {}

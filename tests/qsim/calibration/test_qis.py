@@ -27,8 +27,11 @@ def test_all_zero_darks_of_a_qis_are_refused():
 def test_saturated_flats_are_refused_or_announced():
     with pytest.raises(ValueError, match="every code of flat 0 is 7"):
         calibrate_qis([statistics_of(noise(top=3))], [statistics_of(noise() * 0 + 7, photons=None)], bits=3)
-    dark, flat = statistics_of(noise(40, 2) * 0, 1), statistics_of(noise(40, 2) * 0 + 1, 1, 3.0)
-    found = calibrate_spad([dark], [flat], bits=1)
+    dark, full, planes = statistics_of(noise(40, 2) * 0, 1), noise(40, 2) * 0 + 1, noise(40, 2) % 2
+    with pytest.raises(ValueError, match="all frames of flat 0 are alike"):
+        calibrate_spad([dark], [statistics_of(full, 1, 3.0)], bits=1)
+    planes[:, :3] = 1
+    found = calibrate_spad([dark], [statistics_of(planes, 1, 3.0)], bits=1)
     assert any("saturated in every frame" in words for words in found.warnings)
     assert np.isfinite(found.values["pde_fill"].value)
 

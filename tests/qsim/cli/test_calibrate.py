@@ -1,6 +1,7 @@
 """Tests `qsim calibrate`: sums of planes from every kind of file, and options without effect."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -88,6 +89,52 @@ def test_options_that_cannot_act_are_refused(folder, capsys, words, message):
     assert message in error
     assert error.count("\n") == 1
     assert not (folder / "x.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--bits 8 --static same.npy 1e-5", "all frames are alike, which determines no dead time; are they copies"),
+        ("--bits 4 --static full.npy 1e-5", "all frames are alike, which determines no dead time"),
+        ("--bits 4 --static none.npy 1e-5", "no pixel has a mean above 1 counts; more light is needed"),
+        ("--bits 4 --static one.npy 1e-5", "of at least 2 frames, got [1, 40, 40]"),
+        ("--model spad --bits 8 --dark none.npy 1e-5 --flat same.npy 1e-5 9", "all frames of flat 0 are alike"),
+        ("--model spad --bits 4 --dark none.npy 1e-5 --flat full.npy 1e-5", "all frames of flat 0 are alike"),
+        ("--model spad --bits 4 --dark full.npy 1e-5", "all frames of dark 0 are alike"),
+        ("--model spad --bits 1 --dark none.npy 1e-5 --flat ones.npy 1e-5 1", "all frames of flat 0 are alike"),
+        ("--planes 15 --dark full.npy 1e-5", "all frames of dark 0 are alike"),
+        ("--model spad --bits 8 --dark noise.npy 1e-5 --flat none.npy 1e-5", "flat 0 holds no count at all"),
+        ("--bits 8 --dark noise.npy 1e-5 --flat same.npy 1e-5", "all frames of flat 0 are alike, which determines"),
+        ("--bits 8 --dark same.npy 1e-5 --flat same.npy 1e-5", "all frames of dark 0 are alike, which determines"),
+        ("--bits 8 --dark noise.npy 1e-5 --flat one.npy 1e-5", "a stack of one frame cannot tell noise"),
+    ],
+)
+def test_frames_that_determine_nothing_are_refused(tmp_path, monkeypatch, capsys, words, message):
+    """Copies of one frame gave a dead time of 180 us +- 0.5 %, saturated ones 0 +- 2e147 s, without a warning."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(5)
+    one = rng.integers(2, 14, (1, 40, 40), np.uint8)
+    stacks = {"one": one, "same": one.repeat(5, axis=0), "noise": rng.integers(0, 4, (5, 40, 40), np.uint8)}
+    stacks |= {name: np.full((5, 40, 40), code, np.uint8) for name, code in (("full", 15), ("ones", 1), ("none", 0))}
+    for name, stack in stacks.items():
+        np.save(f"{name}.npy", stack)
+    assert main(["calibrate", *words.split(), "-o", "x.toml"]) == 2
+    assert message in capsys.readouterr().err
+    assert not Path("x.toml").exists()
+
+
+def test_dark_frames_without_a_count_bound_the_dark_counts(tmp_path, monkeypatch, capsys):
+    """They are alike, and determine an upper bound; one pixel that always counts changes nothing in that."""
+    monkeypatch.chdir(tmp_path)
+    stuck = np.zeros((5, 40, 40), np.uint8)
+    np.save("none.npy", stuck)
+    stuck[:, 3, 4] = 1
+    np.save("stuck.npy", stuck)
+    highest = [
+        calibrated(capsys, f"--model spad --bits 1 --dark {name}.npy 1e-5 -o {name}.toml")["dark_count_rate"]["high"]
+        for name in ("none", "stuck")
+    ]
+    assert 0 < highest[0] < highest[1]
 
 
 def test_each_option_changes_the_answer(folder, capsys):
