@@ -8,7 +8,7 @@ from typing import Any
 
 from qsim import checks, files
 from qsim.cli.console import bar, command, output, refuse_idle
-from qsim.cli.options import count
+from qsim.cli.options import checked, count, nonnegative, positive
 from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream
 from qsim.dataset.dataset import Dataset
@@ -40,26 +40,26 @@ def add_convert(sub: Any) -> None:
     )
     reading = parser.add_argument_group("what a foreign file may not state")
     reading.add_argument("--layout", help=f"kind of the input: {', '.join(detection.LAYOUTS)}")
-    reading.add_argument("--frame-rate", type=float, help="frames per second of the capture (not of a video file)")
-    reading.add_argument("--exposure", type=float, help="seconds of light per frame (default: the full frame time)")
+    reading.add_argument("--frame-rate", type=positive, help="frames per second of the capture (not of a video file)")
+    reading.add_argument("--exposure", type=positive, help="seconds of light per frame (default: the full frame time)")
     reading.add_argument("--transfer", help=f"how pictures code light: {', '.join(TRANSFERS)} (also for writing)")
-    reading.add_argument("--height", type=int, help="pixels")
-    reading.add_argument("--width", type=int, help="pixels per row, before packing")
-    reading.add_argument("--bits", type=int, help="the input holds codes of this many bits")
+    reading.add_argument("--height", type=count, help="pixels")
+    reading.add_argument("--width", type=count, help="pixels per row, before packing")
+    reading.add_argument("--bits", type=checked(checks.bits), help="the input holds codes of this many bits")
     reading.add_argument("--stretched", action="store_true", help="codes were stretched to 0..255")
-    reading.add_argument("--channel", type=int, help="channel of a colour cube to read: 0, 1 or 2")
+    reading.add_argument("--channel", type=nonnegative, help="channel of a colour cube to read: 0, 1 or 2")
     reading.add_argument(
         "--flip",
         choices=("none", "lr", "ud", "both"),
         default="none",
         help="mirror the frames: left-right, up-down or both",
     )
-    reading.add_argument("--columns", type=int, help="keep only the first columns (Vidar dumps: 400 of 416)")
+    reading.add_argument("--columns", type=count, help="keep only the first columns (Vidar dumps: 400 of 416)")
     reading.add_argument("--variable", help="array of a .mat file (default: OUTPUT, or the only one)")
     reading.add_argument(
         "--sensor", help="sensor that made the codes, by name or file (default: an ideal binary counter)"
     )
-    reading.add_argument("--ppp", type=float, help="light level for which the sensor's gain was set")
+    reading.add_argument("--ppp", type=positive, help="light level for which the sensor's gain was set")
     reading.add_argument("--split", choices=SPLITS, help="split to store in the clips")
     writing = parser.add_argument_group("writing for others")
     writing.add_argument(
@@ -78,7 +78,7 @@ def add_convert(sub: Any) -> None:
         "--lossy", action="store_true", help="write mp4 with FFmpeg's default settings, which lose noise"
     )
     parser.add_argument(
-        "--white", type=float,
+        "--white", type=positive,
         help="reading: pixel value at which the camera saturates, as in 4095 (default: the largest that whole numbers "
         "hold); writing pictures: light that becomes full scale (default: the 99.9th percentile)",
     )  # fmt: skip

@@ -9,7 +9,7 @@ from typing import Any
 
 from qsim import checks, files
 from qsim.cli.console import bar, command, note, output, refuse_existing, refuse_idle
-from qsim.cli.options import checked, frame_size, steps, whole_numbers
+from qsim.cli.options import checked, count, frame_size, positive, steps, whole_numbers
 
 
 def add_tradeoff(sub: Any) -> None:
@@ -29,7 +29,7 @@ def add_tradeoff(sub: Any) -> None:
     )
     parser.add_argument("--paper-figure", type=int, choices=(1, 2), help="draw a figure of the QUIVER paper")
     parser.add_argument("--size", type=frame_size, help="ROWSxCOLUMNS (default 240x320, rendered scenes 96x128)")
-    parser.add_argument("--base-fps", type=float, help="planes per second (default 10000; a clip has its own)")
+    parser.add_argument("--base-fps", type=positive, help="planes per second (default 10000; a clip has its own)")
     parser.add_argument("--read-noise", type=float, help="table: e- rms per read (default 0.2)")
     bits = "comma-separated (default 1,2,3,4,5, then up to 7 while the deepest is best; table 1,3,5,7,9)"
     parser.add_argument("--bits", type=whole_numbers, help=bits)
@@ -45,8 +45,8 @@ def add_tradeoff(sub: Any) -> None:
     parser.add_argument(
         "--plane-sensor", help="sensor of a binary plane (default: a clocked SPAD of the same efficiency)"
     )
-    parser.add_argument("--instants", type=int, help="frames drawn and scored per depth (default 8)")
-    parser.add_argument("--frames", type=int, help="frames of a rendered scene (default: enough for the instants)")
+    parser.add_argument("--instants", type=count, help="frames drawn and scored per depth (default 8)")
+    parser.add_argument("--frames", type=count, help="frames of a rendered scene (default: enough for the instants)")
     seed = checked(checks.seed)
     parser.add_argument("--seed", type=seed, help="seed of the noise and of a rendered scene (default 0)")
     parser.add_argument("--streams", action="store_true", help="write clips and streams of each depth, for restorers")

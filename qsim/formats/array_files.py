@@ -173,6 +173,8 @@ def _count_files(folder: Path, enough: int) -> int:
 def read_visionsim(path: Path, hints: Hints) -> Recording:
     """Read visionsim: transforms.json with frames.npy [T, H, bytes, C] (0.1) or shards 0000.npy, ... (later)."""
     description = path / "transforms.json"
+    if not description.is_file():
+        raise FileNotFoundError(f"{path}: has no transforms.json; a recording of visionsim is a folder with one")
     with decoding_errors(description, "JSON"):
         info = json.loads(description.read_text("utf-8"))
         width, channels = int(info["w"]), int(info.get("c", 1))

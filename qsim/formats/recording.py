@@ -130,7 +130,7 @@ def with_stated_layout(recording: Recording, bit_order: str, orientation: str) -
 def reoriented(recording: Recording, hints: Hints) -> Recording:
     """Return the recording with the user's flips and columns; `orientation` states a flip."""
     frames, height, width = recording.shape
-    columns = hints.columns or width
+    columns = width if hints.columns is None else hints.columns
     if not 0 < columns <= width:
         raise ValueError(f"--columns {columns}: the frames have {width} columns")
     if hints.flip not in ("none", "lr", "ud", "both"):

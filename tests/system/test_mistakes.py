@@ -193,6 +193,13 @@ MISTAKES = [
     ("qsim generate good.toml --workers -1", "--workers: expected 0 (in this process) or more, got -1"),
     # Foreign files
     ("qsim convert light.npy x", "files do not state the capture rate; add --frame-rate, as in 2000"),
+    ("qsim convert light.npy x --frame-rate 0", "--frame-rate: expected a number above 0, got '0'"),
+    ("qsim convert light.npy x --frame-rate 9 --exposure 0", "--exposure: expected a number above 0, got '0'"),
+    ("qsim convert light.npy x --frame-rate 9 --columns 0", "--columns: expected a whole number of at least 1, got"),
+    ("qsim convert codes.npy x --frame-rate 9 --layout codes --bits 0", "--bits: expected 1 to 16 bits per code"),
+    ("qsim tradeoff fan -o x --frames 0", "--frames: expected a whole number of at least 1, got '0'"),
+    ("qsim convert text.txt x --frame-rate 9 --layout visionsim", "text.txt: has no transforms.json; a recording of"),
+    ("qsim convert empty x --frame-rate 9 --layout visionsim", "empty: has no transforms.json; a recording of"),
     ("qsim convert none.npy x --frame-rate 9", "none.npy: no such file"),
     ("qsim convert nan.npy x --frame-rate 9", "nan.npy: value nan at (t, y, x) = (0, 0, 0) is not a light level"),
     ("qsim convert negative.npy x --frame-rate 9", "is not a light level: expected finite and >= 0"),
