@@ -8,7 +8,7 @@ from typing import Any
 
 from qsim import checks, files
 from qsim.cli.console import bar, command, output, refuse_idle
-from qsim.cli.options import checked, count, nonnegative, positive
+from qsim.cli.options import check_free, checked, count, nonnegative, positive
 from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream
 from qsim.dataset.dataset import Dataset
@@ -133,6 +133,7 @@ def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
         opened = Stream.open(args.input) if args.input.suffix == ".json" else Clip.open(args.input)
         return [exporting.described(opened, args.output, wanted, force=args.force)]
     suffix = {"cube": ".npy", "mp4": ".mp4", "zarr": ".zarr", "spike": ".dat", "photons": ".npz"}.get(kind, "")
+    check_free(args.output)
     made = []
     clips = Dataset.open(args.input).clips()
     for clip in clips:
@@ -174,6 +175,8 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
     capture = importing.Import(args.frame_rate, args.exposure, args.sensor, args.ppp, args.split)
     found = detection.recordings(args.input, args.layout)
     pairs = [(source, args.output / files.check_name(_flat_name(source, args.input))) for source in found]
+    if pairs:
+        check_free(args.output)
     made = []
     with bar("converting") as progress:
         for source, target in pairs or [(args.input, args.output)]:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from qsim.cli.console import OPTIONAL, RESUMES, command, output
+from qsim.cli.options import check_free
 
 MEASUREMENTS = Path(__file__).parents[1] / "measurements"
 MINUTES = "2"  # of training
@@ -40,6 +41,7 @@ def add_demo(sub: Any) -> None:
 def _run_demo(args: argparse.Namespace) -> int:
     from qsim.process import peak_memory_of_children
 
+    check_free(args.folder)
     for package in OPTIONAL["networks"][0]:
         if not find_spec(package):
             raise ModuleNotFoundError(f"No module named {package!r}", name=package)

@@ -1,4 +1,4 @@
-"""Converts the texts of options to values, for the commands of qsim and quiver.
+"""Converts the texts of options to values, and checks folders of results, for qsim and quiver.
 
 Every type raises `argparse.ArgumentTypeError`, which becomes one line that names the option.
 """
@@ -22,6 +22,17 @@ def refuse_empty(parser: argparse.ArgumentParser) -> None:
 
     parser.register("type", None, given)
     parser.register("type", Path, lambda text: Path(given(text)))
+
+
+def check_free(folder: Path) -> None:
+    """Raise `FileExistsError` for a clip, a folder in a clip, or a data set: no other results are stored there."""
+    for place, mark, kind in (
+        (folder, "clip.json", "is a clip"),
+        (folder.parent, "clip.json", "is part of a clip"),
+        (folder, "dataset.json", "is a data set"),
+    ):
+        if (place / mark).is_file():
+            raise FileExistsError(f"{folder}: {kind}, which holds nothing else; name another folder")
 
 
 def checked(check: Callable[[Any], Any]) -> Callable[[str], Any]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from qsim import checks, files
 from qsim.cli.console import bar, command, note, output, refuse_existing, refuse_idle
-from qsim.cli.options import checked, count, frame_size, positive, steps, whole_numbers
+from qsim.cli.options import check_free, checked, count, frame_size, positive, steps, whole_numbers
 
 
 def add_tradeoff(sub: Any) -> None:
@@ -81,6 +81,7 @@ def _run_tradeoff(args: argparse.Namespace) -> int:
             raise ValueError("give a folder with -o, as in -o out/bits")
         refuse_idle(args, "tradeoff without --output", ["force"])
     else:
+        check_free(args.output)
         refuse_existing(args.output / f"{name}.json", args.force)
     args.seed = args.seed or 0
     return _tradeoff_study(args) if args.paper_figure is None else _paper_figure(args)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from qsim import checks
 from qsim.cli.console import bar, note, output
-from qsim.cli.options import checked, count, frame_size, positive, words
+from qsim.cli.options import check_free, checked, count, frame_size, positive, words
 from qsim.files import write_bytes, write_json
 from quiver.cli.options import (
     add_light,
@@ -142,6 +142,7 @@ def _published_test(args: argparse.Namespace) -> Comparison:
     from quiver.evaluation.comparison import CLIPS, Comparison
 
     refuse_published(args)
+    check_free(args.output)
     which, folder = TEST_SETS[args.protocol], args.output / CLIPS
     if args.force and args.output.exists():
         renew(args.output, "plan.json", OURS)
@@ -230,6 +231,8 @@ def _run_bench(args: argparse.Namespace) -> int:
 
     if args.output is None and args.force:
         raise ValueError("--force: replaces a result in -o FOLDER, which is not given; leave it out")
+    if args.output is not None:
+        check_free(args.output)
     if args.output is not None and (args.output / "bench.json").exists() and not args.force:
         raise FileExistsError(
             f"{args.output / 'bench.json'}: exists; name another with -o, or use --force to replace it"

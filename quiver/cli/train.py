@@ -14,7 +14,7 @@ from typing import Any
 
 from qsim import checks
 from qsim.cli.console import note, output
-from qsim.cli.options import checked, count, nonnegative, positive
+from qsim.cli.options import check_free, checked, count, nonnegative, positive
 from qsim.files import sha256
 from quiver.cli.options import (
     NETWORKS,
@@ -251,6 +251,7 @@ def _run_ablate(args: argparse.Namespace) -> int:
     from quiver.model.presets import ABLATIONS
     from quiver.training.ablation import markdown, one_noise, run_ablation
 
+    check_free(Path(args.output))
     args.precision, precision = None, args.precision  # for restoring; training has another default
     settings = _settings(args)
     args.precision = precision

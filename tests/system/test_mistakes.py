@@ -176,6 +176,17 @@ MISTAKES = [
     ("qsim render lit -o x", "lit: is a clip, made from a scene already"),
     ("qsim render raises.py -o x", "raises.py:2: ZeroDivisionError: division by zero"),
     ("quiver restore text.txt -o x.npy", "text.txt: not a stream, clip folder or .npy array"),
+    ("qsim demo lit", "lit: is a clip, which holds nothing else; name another folder"),
+    ("qsim demo data", "data: is a data set, which holds nothing else; name another folder"),
+    ("qsim demo data/clips/fan_0000/streams", "streams: is part of a clip, which holds nothing else"),
+    ("qsim demo light.npy", "light.npy: is a file where a folder is needed"),
+    ("qsim tradeoff fan -o lit", "lit: is a clip, which holds nothing else; name another folder"),
+    ("qsim convert data lit --to mp4", "lit: is a clip, which holds nothing else; name another folder"),
+    ("qsim convert pictures lit --frame-rate 9 --transfer srgb", "lit: is a clip, which holds nothing else"),
+    ("quiver bench -o lit", "lit: is a clip, which holds nothing else; name another folder"),
+    ("quiver bench -o data", "data: is a data set, which holds nothing else; name another folder"),
+    ("quiver ablate data -o lit", "lit: is a clip, which holds nothing else; name another folder"),
+    ("quiver evaluate empty -o lit --protocol x4k1000fps", "lit: is a clip, which holds nothing else"),
     # Recipes
     ("qsim generate none.toml", "none.toml: no such recipe"),
     ("qsim generate bad.toml -o x", "bad.toml:1: not valid TOML"),
@@ -309,6 +320,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from PIL import Image
 
     Image.fromarray(np.zeros((8, 10), np.uint8)).save(top / "grey.png")
+    for name in ("first", "second"):
+        (top / "pictures" / name).mkdir(parents=True)
+        shutil.copy(top / "grey.png", top / "pictures" / name / "0.png")
     sensor = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 1.6\nread_noise = 0.2\nbits = 3\n'
     texts = {
         "text.txt": "words\n",
