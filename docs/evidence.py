@@ -63,15 +63,8 @@ used while the choice of budgets was written and are not shown. No constant was 
 seed, except the deepest bounce that is tested: glass lacked light without it, and is slower with it. **asked** is the
 requested PSNR. **reached** is the PSNR of a frame against the reference. **stated** is the PSNR by its measured noise
 and the bounces that the pilot omits. **naive** is a loop of one `mi.render` per frame, with the power of two of samples
-that reaches the same PSNR.
-"""
-
-EARLIER = """\
-The PSNRs of this table have the earlier unit, dB below the 99.9th percentile without a clamp. `--psnr` now means dB
-below [white](fidelity.md), clamped there. [Another table](results/clips.md) has these scenes at 40 dB in both units,
-beside the program of that time, and frames that share samples. At equal numbers of dB a frame of
-these scenes now takes 1.12 times the processor time at 36 dB and 1.21 times at 40 dB (median of nine, 128 × 256). The
-range is 0.95 to 2.0 times, but 4 to 5 times for glossy: in the earlier unit its highlights hid errors below white.
+that reaches the same PSNR. All are in dB below [white](fidelity.md), clamped there. Lines with neighbours are of frames
+that share samples. [Another table](results/clips.md) has these scenes at 40 dB beside the program of commit 5c22140.
 """
 
 LIGHT = """### Error and light
@@ -202,8 +195,7 @@ def rendering(report: dict[str, Any]) -> str:
         f"reached, the median would be {equal:.1f}; if at exactly 40 dB, with ours unchanged, {exact:.1f}."
     )
     picture = f"![Seconds per frame against PSNR]({FIGURE.relative_to(HERE).as_posix()})"
-    unit = [] if "unit" in report else [EARLIER]
-    return "\n".join([RENDERING, *unit, _table(header, rows), "", size, "", picture, ""])
+    return "\n".join([RENDERING, _table(header, rows), "", size, "", picture, ""])
 
 
 def light(report: dict[str, Any]) -> str:
