@@ -26,7 +26,7 @@ HEAD = """# What frames of a clip cost
 ```sh
 python docs/clip_rows.py
 python docs/clip_rows.py --motion 0.3 --reference 256
-python docs/clip_rows.py --size 512x1024 --rows plain,room,lamp
+python docs/clip_rows.py --size 512x1024 --rows plain,room,lamp,fence,shadow
 ```
 
 Processor seconds of a frame's radiance, without ground truth and writing, in one run per row: the naive loop (one

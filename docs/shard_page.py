@@ -222,14 +222,16 @@ def draw(clips: dict[str, Any], path: Path) -> None:
     figure = new_figure(9.0, 3.6)
     left, right = figure.subplots(1, 2)
     edges = np.array(EDGES[:-1])
-    middle = np.sqrt(RINGS[1:] * RINGS[:-1])
+    middle, fastest = np.sqrt(RINGS[1:] * RINGS[:-1]), MOTION[1]
     for name, clip in clips.items():
         counts = np.array(clip["motion"]["counts"][:-1], float)
+        fastest = max(fastest, *edges[1:][counts > 0])
         left.stairs(100 * counts / np.diff(edges) / max(sum(clip["motion"]["counts"]), 1), edges, label=name)
         power = np.array([np.nan if value is None else value for value in clip["spectrum"]], float)
         exponent = "" if clip["slope"] is None else f", f^{clip['slope']:.2f}"
         right.loglog(middle, power, marker=".", label=f"{name}{exponent}")
     left.axvspan(*MOTION, color="0.9", zorder=0, label="the paper")
+    left.set_xlim(0, fastest + 0.5)
     left.set_xlabel("motion [px/frame]")
     left.set_ylabel("moving pixels [% per px/frame]")
     left.legend(fontsize="small")
