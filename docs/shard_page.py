@@ -24,8 +24,9 @@ HEAD = """# A shard of {recipe}: planned, made and measured
 *Written by `python docs/shard_cost.py`. The json file beside this page holds all numbers.*
 
 `scenes/{recipe}.toml` has {clips} clips. The other recipe below differs from it in one line, `reuse = false`. Shard
-{part} has the clips {names}. Commit {earlier} is the program before frames shared samples; its plan asks for the same
-number of dB below the 99.9th percentile, without a clamp.
+{part} has the clips {names}.
+Commit {earlier} is the program before frames shared samples. Its plan asks for the same number of dB below the 99.9th
+percentile, without a clamp.
 
 <!-- not run: plans of an hour or two, and a shard of up to an hour, on two cores -->
 ```sh
