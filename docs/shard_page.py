@@ -143,7 +143,7 @@ def costs(found: dict[str, Any]) -> list[str]:
             known = made is not None and len(values) > 1 and values[-2] > 0
             ratio = f"{values[-1] / values[-2]:.2f}" if known else "–"
             rows.append((name, unit, *(f"{value:.3f}" for value in values), ratio))
-    text = [f"With {WAYS[way]}. A clip's wall hours are those of one worker beside whatever else ran.", ""]
+    text = [f"With {WAYS[way]}. Wall hours are those of one worker beside whatever else ran, planned ones too.", ""]
     text += [*markdown_table(rows, ("clip", "unit", *columns, "used over planned")), ""] if columns else []
     if "shard" not in plans:
         text += [f"The plan of the shard is {MISSING}.", ""]
