@@ -226,7 +226,7 @@ def draw(clips: dict[str, Any], path: Path) -> None:
     middle, fastest = np.sqrt(RINGS[1:] * RINGS[:-1]), MOTION[1]
     for name, clip in clips.items():
         counts = np.array(clip["motion"]["counts"][:-1], float)
-        fastest = max(fastest, *edges[1:][counts > 0])
+        fastest = max([fastest, *edges[1:][counts > 0]])
         left.stairs(100 * counts / np.diff(edges) / max(sum(clip["motion"]["counts"]), 1), edges, label=name)
         power = np.array([np.nan if value is None else value for value in clip["spectrum"]], float)
         exponent = "" if clip["slope"] is None else f", f^{clip['slope']:.2f}"
