@@ -80,6 +80,8 @@ def load(name: str | Path, seed: int = 0, speed: float = 1.0) -> Scene:
         checks.speed(float(speed))
     except ValueError as error:
         raise ValueError(f"speed: {error}") from None
+    if name == "":
+        raise ValueError("scene '': name a family, a file or a folder; '.' is the present folder")
     if str(name) in FAMILIES:
         return FAMILIES[str(name)](seed, speed=speed)
     if str(name).endswith(".py"):

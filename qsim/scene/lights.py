@@ -10,6 +10,7 @@ import numpy as np
 from qsim.optics.camera import Pose, Vector
 from qsim.scene.bands import Colour, largest, numbers
 from qsim.scene.flicker import Flicker, check_flicker
+from qsim.scene.motion import check_numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +89,7 @@ class EnvironmentImage:
     flicker: Flicker | None = None  # None: steady
 
     def __post_init__(self) -> None:
+        check_light(self)
         check_flicker(self)
 
 
@@ -110,6 +112,8 @@ def strength(light: Light) -> float:
 
 
 def check_light(light: Any, *names: str) -> None:
+    """Raise `ValueError` for places and numbers that are not finite, and for strengths below 0 under these names."""
+    check_numbers(light)
     for name in names:
         found = getattr(light, name)
         if min(numbers(found), default=-1) < 0:

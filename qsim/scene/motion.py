@@ -288,6 +288,8 @@ def check_numbers(record: Any) -> None:
                 vector(value)
             elif field.type == "float" and not np.isfinite(value):
                 raise ValueError(f"expected a finite number, got {value!r}")
+        except TypeError:
+            raise ValueError(f"{type(record).__name__}.{field.name}: expected numbers, got {value!r}") from None
         except ValueError as error:
             raise ValueError(f"{type(record).__name__}.{field.name}: {error}") from None
 

@@ -10,6 +10,7 @@ import pytest
 
 from qsim.optics.camera import Camera
 from qsim.scene import (
+    AreaLamp,
     Body,
     Constant,
     Diffuse,
@@ -18,6 +19,7 @@ from qsim.scene import (
     Mesh,
     PointLight,
     Scene,
+    Spin,
     SunSky,
     Texture,
     Translation,
@@ -53,6 +55,22 @@ def test_a_scene_without_light_is_refused_and_a_glowing_body_is_light():
         with pytest.raises(ValueError, match="no light and no glowing body"):
             scene(lights)
     assert scene((), (Body("lamp", TRIANGLE, Glow(1.0)),)).emits()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: PointLight(Spin((0, 1, 0), 1.0), 20.0), r"PointLight.position: expected numbers, got Spin"),
+        (lambda: PointLight((0, 1), 20.0), r"PointLight.position: expected three finite numbers"),
+        (lambda: AreaLamp((0, 1, 0), (0, 0, np.nan), 1, 1, 1.0), r"AreaLamp.target: expected three finite numbers"),
+        (lambda: AreaLamp((0, 1, 0), (0, 0, 0), np.inf, 1, 1.0), r"AreaLamp.width: expected a finite number"),
+        (lambda: SunSky(elevation="0.8"), r"SunSky.elevation: expected numbers, got '0.8'"),
+        (lambda: EnvironmentImage("sky.exr", rotation=np.nan), r"EnvironmentImage.rotation: expected a finite number"),
+    ],
+)
+def test_a_light_of_wrong_numbers_is_refused_by_name(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
 
 
 def test_only_one_light_may_surround_the_scene():
