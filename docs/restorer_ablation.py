@@ -185,7 +185,7 @@ def draw(kind: str, split: str, args: argparse.Namespace, size: Size, folder: Pa
 
 
 def still(pyramid: Any, offsets: Any, codes: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
-    """Return paths of no motion: `quiver.baselines.motion_paths.paths` otherwise."""
+    """Return paths of no motion: `quiver.baselines.paths.motion_paths.paths` otherwise."""
     nothing = torch.zeros(2, *(2 * side for side in codes.shape[1:]))
     return nothing, nothing
 

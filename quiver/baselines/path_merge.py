@@ -1,6 +1,6 @@
 """Restores by merging frames along smooth paths: each pixel is a mean of the frames that agree, and knows how many.
 
-    codes -> phi of pooled codes at scales 8, 4, 2 -> paths (motion_paths.py) -> moved codes -> weights ->
+    codes -> phi of pooled codes at scales 8, 4, 2 -> paths (paths/motion_paths.py) -> moved codes -> weights ->
     mean code, count
 
 Frames beside the reference are compared with it; farther ones, in pairs, with the mean of the nearest three. Two
@@ -29,7 +29,8 @@ from torch import Tensor
 
 from qsim.sensor.sensor import Sensor
 from quiver.baselines.information_domain import FLOOR, InformationDomain, information_domain
-from quiver.baselines.motion_paths import SCALES, box_mean, displacement, enlarged, look, paths
+from quiver.baselines.paths.motion_paths import paths
+from quiver.baselines.paths.moved_frames import SCALES, box_mean, displacement, enlarged, look
 from quiver.baselines.sliding_window import check_codes, check_window, in_units, look_ahead
 
 # (cells of 2 x 2 px beside the own one whose mean difference is squared, and over which squares are averaged; statistic

@@ -15,8 +15,8 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from quiver.baselines.information_domain import FLOOR, InformationDomain, information_domain
-from quiver.baselines.motion_paths import box_mean
 from quiver.baselines.path_merge import Merged, stream
+from quiver.baselines.paths.moved_frames import box_mean
 from quiver.data.codes import Codes
 
 LOCAL = 8  # px: half the side of the squares whose mean code tells the local level

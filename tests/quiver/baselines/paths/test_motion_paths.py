@@ -6,7 +6,9 @@ import torch
 from scipy.ndimage import gaussian_filter, map_coordinates
 from stats import assert_mean
 
-from quiver.baselines import motion_paths as mp
+from quiver.baselines.paths import motion_paths as mp
+from quiver.baselines.paths import moved_frames as mf
+from quiver.baselines.paths import path_search as ps
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -19,7 +21,7 @@ def test_box_means_are_means(seed):
     expected = [
         [[one[y : y + side, x : x + side].mean() for x in range(width)] for y in range(height)] for one in grown
     ]
-    found = mp.box_mean(torch.from_numpy(image), radius).numpy()
+    found = mf.box_mean(torch.from_numpy(image), radius).numpy()
     assert found == pytest.approx(np.array(expected), abs=1e-12)
 
 
@@ -29,48 +31,50 @@ def test_looking_is_linear_interpolation(seed):
     height, width = (int(n) for n in rng.integers(1, 14, 2))
     image, moved = rng.normal(size=(height, width)), rng.uniform(-6, 6, (2, height, width))
     place = np.mgrid[:height, :width] + moved
-    seen, inside = mp.look(torch.from_numpy(image), torch.from_numpy(moved))
+    seen, inside = mf.look(torch.from_numpy(image), torch.from_numpy(moved))
     expected = map_coordinates(image, place, order=1, mode="nearest")
     assert seen.numpy() == pytest.approx(expected, abs=1e-6)
     limits = np.array([height, width])[:, None, None] - 0.5
     assert np.array_equal(inside.numpy() == 1, ((place >= -0.5) & (place <= limits)).all(0))
 
 
+@pytest.mark.parametrize(("scale", "speed"), [(8, mp.SPEED), (4, mp.SLOW)])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_search_tries_every_velocity(seed):
+def test_the_search_tries_every_velocity(seed, scale, speed):
     """Costs of all velocities in plain loops; the least must be the one found, or tie with it."""
     rng = np.random.default_rng(seed)
     offsets = [(0, 1), (-2, 0, 2), (-1, 0, 3), (-4, -3, 0)][seed]
     height, width = (int(n) for n in rng.integers(3, 8, 2))
     frames = rng.normal(0, 0.2, (len(offsets), height, width)).astype(np.float32)
-    found = mp.search(torch.from_numpy(frames), offsets).numpy() / (mp.STEP * 8)
-    most, reference = round(mp.SPEED / 8 / mp.STEP), frames[offsets.index(0)]
+    found = ps.search(torch.from_numpy(frames), offsets, scale, speed).numpy() / (ps.STEP * scale)
+    most, reference = round(speed / scale / ps.STEP), frames[offsets.index(0)]
     steps = np.arange(-most, most + 1)
     sums, counts = np.zeros((2, len(steps), len(steps), height, width))
     for i, v in enumerate(steps):
         for j, u in enumerate(steps):
             for frame, offset in zip(frames, offsets, strict=True):
                 if offset:
-                    place = np.mgrid[:height, :width] + offset * mp.STEP * np.array([v, u])[:, None, None]
+                    place = np.mgrid[:height, :width] + offset * ps.STEP * np.array([v, u])[:, None, None]
                     whole = np.floor(place)
                     inside = ((whole >= 0) & (whole < np.array([height, width])[:, None, None])).all(0)
                     moved = map_coordinates(frame, place, order=1, mode="nearest")
                     share = np.prod((place - whole) ** 2 + (1 - place + whole) ** 2, axis=0)
-                    size = 8 * np.abs(moved - reference)
-                    huber = np.where(size < mp.FITS, size**2, mp.FITS * (2 * size - mp.FITS))
+                    size = scale * np.abs(moved - reference)
+                    huber = np.where(size < ps.FITS, size**2, ps.FITS * (2 * size - ps.FITS))
                     sums[i, j] += np.where(inside, huber - (1 + share), 0)
                     counts[i, j] += inside
 
     def block(x, radius):
-        return mp.box_mean(torch.from_numpy(x).flatten(0, 1), radius).view(x.shape).numpy()
+        return mf.box_mean(torch.from_numpy(x).flatten(0, 1), radius).view(x.shape).numpy()
 
-    below = [block(counts, radius) for radius in (1, 3)]
-    above = [block(sums, radius) * (2 * radius + 1) ** 2 for radius in (1, 3)]
+    radii = (8 // scale, 24 // scale)
+    below = [block(counts, radius) for radius in radii]
+    above = [block(sums, radius) * (2 * radius + 1) ** 2 for radius in radii]
     cost = np.mean([x / np.maximum(y, 1e-6) for x, y in zip(above, below, strict=True)], 0) * (len(offsets) - 1)
     outside = 1 - np.mean(below, 0) / (len(offsets) - 1)
-    flat = np.where(outside <= 0.5 + 1e-4, cost + mp.OUTSIDE * outside, mp.NEVER)
-    pace = 8 * mp.STEP * (np.abs(steps)[:, None] + np.abs(steps))[..., None, None]
-    flat = flat + mp.MOVES * (pace > 0) + mp.FASTER * np.log1p(pace)
+    flat = np.where(outside <= 0.5 + 1e-4, cost + ps.OUTSIDE * outside, ps.NEVER)
+    pace = scale * ps.STEP * (np.abs(steps)[:, None] + np.abs(steps))[..., None, None]
+    flat = flat + ps.MOVES * (pace > 0) + ps.FASTER * np.log1p(pace)
     least = flat.min((0, 1))
     at = np.rint(found).astype(int) + most  # the parabola moves by half a step at most
     y, x = np.mgrid[:height, :width]
@@ -87,8 +91,8 @@ def test_interpolation_keeps_the_stated_share_of_the_noise():
     for _ in range(6):
         noise, move = rng.normal(size=(300, 300)), rng.uniform(-3, 3, 2)
         moved = torch.from_numpy(np.broadcast_to(move[:, None, None], (2, 300, 300)).copy())
-        seen = mp.look(torch.from_numpy(noise), moved)[0].numpy()[8:-8:2, 8:-8:2]  # neighbours share pixels
-        assert_mean(seen**2, float(mp.kept_noise(moved)[0, 0]), 2 * float(mp.kept_noise(moved)[0, 0]) ** 2)
+        seen = mf.look(torch.from_numpy(noise), moved)[0].numpy()[8:-8:2, 8:-8:2]  # neighbours share pixels
+        assert_mean(seen**2, float(mf.kept_noise(moved)[0, 0]), 2 * float(mf.kept_noise(moved)[0, 0]) ** 2)
 
 
 @pytest.mark.parametrize("level", [0.0, 3.0])
@@ -97,7 +101,7 @@ def test_noise_moves_nothing(level):
     shares = []
     for seed in range(6):
         frames, still = (window((0, 0), (0, 0), noise, seed) for noise in (1.0, 0.0))
-        found = {scale: frames[scale] - still[scale] + level / 40 * still[scale] for scale in mp.SCALES}
+        found = {scale: frames[scale] - still[scale] + level / 40 * still[scale] for scale in mf.SCALES}
         v, a = found_paths(found, list(range(-5, 6)))
         shares.append(float(((v != 0) | (a != 0)).any(0).float().mean()))
     assert np.mean(shares) < (0.02 if level == 0 else 0.003)  # four deviations above the means of 24 other seeds
@@ -107,7 +111,7 @@ def test_corrections_converge():
     """More corrections of a texture without noise never make its paths worse, as means with a negative lobe did."""
     pyramid, offsets = window((0.4, -0.7), (0, 0), 0.05, seed=3), list(range(-5, 6))
     truth = torch.tensor([0.4, -0.7])[:, None, None]
-    v = mp.enlarged(mp.search(pyramid[8], offsets), pyramid[2].shape[1:])
+    v = mf.enlarged(ps.search(pyramid[8], offsets, 8, mp.SPEED), pyramid[2].shape[1:])
     a, errors = torch.zeros_like(v), []
     for _ in range(9):
         v, a = mp.correct(pyramid[2], offsets, v, a, 2, 4)
@@ -126,7 +130,7 @@ def window(velocity, acceleration, noise, seed, offsets=range(-5, 6), side=96):
         dy, dx = (v * k + a * k * k / 2 for v, a in zip(velocity, acceleration, strict=True))
         frames.append(map_coordinates(texture, [y - dy, x - dx], order=3) + noise * rng.normal(size=(side, side)))
     full = torch.tensor(np.array(frames), dtype=torch.float32)
-    return {scale: torch.nn.functional.avg_pool2d(full[:, None], scale)[:, 0] for scale in mp.SCALES}
+    return {scale: torch.nn.functional.avg_pool2d(full[:, None], scale)[:, 0] for scale in mf.SCALES}
 
 
 def found_paths(pyramid, offsets):
@@ -142,7 +146,7 @@ def test_paths_follow_a_moving_texture(velocity, acceleration):
     inner = (slice(None), slice(12, -12), slice(12, -12))
     truth = [torch.tensor(x, dtype=torch.float32)[:, None, None] for x in (velocity, acceleration)]
     for offset in (-4, 4):
-        apart = mp.displacement(v, a, offset)[inner] - mp.displacement(*truth, offset)
+        apart = mf.displacement(v, a, offset)[inner] - mf.displacement(*truth, offset)
         limit = 0.2 + 0.08 * np.hypot(*velocity)  # measured: 0.06, 0.09, 0.2 and 1.2 px from still to 16 px/frame
         assert float(apart.square().sum(0).sqrt().median()) < limit, "px, after four frames"
 
@@ -155,7 +159,7 @@ def test_windows_may_be_short_and_one_sided(length):
     if length == 1:
         assert not v.any()
     if length == 5:
-        found = mp.displacement(v, a, 4)[:, 8:-8, 8:-8].flatten(1).median(1).values
+        found = mf.displacement(v, a, 4)[:, 8:-8, 8:-8].flatten(1).median(1).values
         assert found.tolist() == pytest.approx([4, 8], abs=0.3)
 
 
@@ -165,3 +169,21 @@ def test_time_has_no_direction():
     forward, backward = (found_paths(frames, list(range(-5, 6))) for frames in (pyramid, back))
     apart = (forward[0] + backward[0]).abs()  # ties of the search may fall differently at single cells
     assert float(apart.median()) < 1e-3
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_paths_follow_fine_stripes(seed):
+    """Stripes of 8 to 14 px vanish in cells of 8 px; slow paths find them, up to a move along the stripes."""
+    rng = np.random.default_rng(seed)
+    period, turn, speed = rng.uniform(8, 14), rng.uniform(0, np.pi), rng.uniform(0.7, 1.5)
+    across = np.array([np.sin(turn), np.cos(turn)])
+    y, x = np.mgrid[:96, :96]
+    frames = []
+    for k in range(-5, 6):
+        phase = (across[0] * y + across[1] * x - speed * k) * (2 * np.pi / period)
+        frames.append(1.5 * np.sign(np.sin(phase)) + rng.normal(size=(96, 96)))
+    full = torch.tensor(np.array(frames), dtype=torch.float32)
+    pyramid = {scale: torch.nn.functional.avg_pool2d(full[:, None], scale)[:, 0] for scale in mf.SCALES}
+    v, _ = found_paths(pyramid, list(range(-5, 6)))
+    found = np.tensordot(across, v[:, 12:-12, 12:-12].numpy(), 1)
+    assert np.mean(np.abs(found - speed) < 0.15) > 0.5  # px/frame; without slow paths four of these six fail
