@@ -34,7 +34,7 @@ def search(frames: Tensor, offsets: Sequence[int], scale: int, speed: float) -> 
     most = round(speed / scale / STEP)
     count = 2 * most + 1
     misfits, inside = torch.zeros(2, count, count, *reference.shape).unbind()
-    voters = [(frame, offset) for frame, offset in zip(frames, offsets, strict=True) if 0 < abs(offset) <= FAR]
+    voters = _voters(frames, offsets)
     if not voters:
         return torch.zeros(2, *reference.shape)
     for frame, offset in voters:
@@ -65,7 +65,7 @@ def neighbours(frames: Tensor, offsets: Sequence[int], velocity: Tensor, scale: 
 def misfits_of(frames: Tensor, offsets: Sequence[int], path: Path, scale: int, radius: int) -> Tensor:
     """Return the cost [h, w] of a path over blocks of this radius in cells."""
     reference = frames[offsets.index(0)]
-    voters = [(frame, offset) for frame, offset in zip(frames, offsets, strict=True) if 0 < abs(offset) <= FAR]
+    voters = _voters(frames, offsets)
     misfits, inside = torch.zeros(2, 1, *reference.shape).unbind()
     for frame, offset in voters:
         moved = displacement(*path, offset, scale)
@@ -73,6 +73,11 @@ def misfits_of(frames: Tensor, offsets: Sequence[int], path: Path, scale: int, r
         misfits += misfit((seen - reference) * scale, 1 + kept_noise(moved)) * there
         inside += there
     return _cost(misfits, inside, len(voters), (radius,))[0]
+
+
+def _voters(frames: Tensor, offsets: Sequence[int]) -> list[tuple[Tensor, int]]:
+    """Return the frames [h, w] that vote, and their offsets."""
+    return [(frame, offset) for frame, offset in zip(frames, offsets, strict=True) if 0 < abs(offset) <= FAR]
 
 
 def _cost(misfits: Tensor, inside: Tensor, voters: int, radii: Sequence[int]) -> Tensor:
