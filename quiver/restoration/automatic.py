@@ -3,7 +3,7 @@
     sensor, bits, light -> nearest measured cell in the weights file (domain.py) -> method, and one line that says why
 
 The cells are averages over clips of several speeds. Motion does not decide: on the test clips, handing over exactly the
-clips that a classical method restores better would gain 0.06 dB in the mean (docs/results/restorer.md).
+clips that a classical method restores better would gain 0.02 dB in the mean (docs/results/restorer.md).
 """
 
 from __future__ import annotations

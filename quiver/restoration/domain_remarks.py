@@ -11,7 +11,7 @@ from quiver.restoration.domain import NEAR, OperatingPoint, Scope, place_of
 from quiver.restoration.interface import Restorer
 
 DARK = 0.1  # dark counts over the events of the mean light, above which a stream is unlike all cells
-FRAMES = 4  # of the shortest stream that is like them: one frame was up to 16 % too bright, four less than 2 %
+FRAMES = 4  # of the shortest stream that is like them: one frame is 9 % too bright, four are right within 1 %
 
 
 def remark(name: str, scope: Scope, codes: Codes) -> str | None:
