@@ -61,10 +61,9 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int) -> Pieces
     if takes_clips(model):  # recurrent, or aligned along any motion: no overlap makes tiles exact
         needed = bytes_needed(model, height, width)
         return Pieces(cut_tiles(height, width, pixels, BLENDED, STEP, blend=True), False, needed)
-    multiple = int(model.multiple)  # type: ignore[arg-type]
+    multiple, needed = int(model.multiple), bytes_needed(model, height, width)  # type: ignore[arg-type]
     if not isinstance(model, QUIVER):
-        return Pieces(cut_tiles(height, width, pixels, BLENDED, multiple, blend=True), exact=False)
-    needed = bytes_needed(model, height, width)
+        return Pieces(cut_tiles(height, width, pixels, BLENDED, multiple, blend=True), False, needed)
     step, pixels = max(multiple, model.stride), max(memory - TILING, 0) // bytes_per_pixel(model)
     return Pieces(cut_tiles(height, width, pixels, BLENDED, step, blend=True), False, needed)
 

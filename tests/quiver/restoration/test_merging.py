@@ -1,6 +1,7 @@
 """Restoring by MergeNet: the path from codes to photons, any size, tiles within memory, ranges of frames."""
 
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -18,6 +19,7 @@ from quiver.data.codes import array_codes
 from quiver.model.mergenet import MergeNet, MergeNetConfig
 from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.networks import wrap_network
+from quiver.restoration.pieces import cut_pieces
 from quiver.restoration.restorers import restorer
 
 SENSOR, EXPOSURE = QIS(0.8, 1.6, 0.2, 3), 5e-4
@@ -62,8 +64,10 @@ def test_little_memory_cuts_tiles_and_says_so():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         whole = method().restore(codes, 0, 1)
-    with pytest.warns(UserWarning, match="cut into 2 tiles"):
+    with pytest.warns(UserWarning, match=r"cut into 2 tiles.*; --memory \d+MB avoids the cut") as caught:
         cut = method(memory=1_500 * 16 * 180).restore(codes, 0, 1)
+    enough = int(re.search(r"--memory (\d+)MB", str(caught[0].message))[1]) * 10**6
+    assert cut_pieces(MergeNet(MergeNetConfig(4)), 16, 264, enough).exact
     assert np.sqrt(np.mean((cut - whole) ** 2)) < 0.4 * whole.std()  # codes of pure noise have arbitrary paths
 
 
