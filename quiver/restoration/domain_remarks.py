@@ -24,7 +24,9 @@ def remark(name: str, scope: Scope, codes: Codes) -> str | None:
     cell = scope.domain.nearest(place)
     if cell is None:
         best = scope.domain.best_classical
-        return f"{name} was never measured near {stream}; where it was, {best} is mostly the best classical method"
+        text = f"{name} was never measured near {stream}; where it was, {best} is mostly the best classical method"
+        dark = _dark_share(codes, ppp)
+        return text if dark <= DARK else f"{text}; {_dark_text(dark)}, and dark places may become too bright"
     if not cell.wins:
         return f"{name} is worse than {cell.classical} on {stream}: {cell.scores} at {cell.name}"
     return _unlike_cells(name, codes, ppp)
@@ -32,16 +34,25 @@ def remark(name: str, scope: Scope, codes: Codes) -> str | None:
 
 def _unlike_cells(name: str, codes: Codes, ppp: float) -> str | None:
     """Return the remark on a stream whose dark counts or frames are unlike those of all cells."""
-    share = codes.sensor.dark_rate * codes.exposure / (ppp * codes.sensor.efficiency)
-    if share > DARK:
+    dark = _dark_share(codes, ppp)
+    if dark > DARK:
         return (
-            f"{name} was never measured where dark counts are {100 * share:.0f} % of the mean light, and makes dark "
-            "places too bright there; compare with qbp-bm3d"
+            f"{name} was never measured where {_dark_text(dark)}, and makes dark places too bright there; "
+            "compare with qbp-bm3d"
         )
     if codes.shape[0] < FRAMES:
         frames = "one frame" if codes.shape[0] == 1 else f"{codes.shape[0]} frames"
         return f"{name} was never measured on {frames}, and its brightness may be wrong by several percent"
     return None
+
+
+def _dark_share(codes: Codes, ppp: float) -> float:
+    """Return the dark counts over the events of the mean light [photons]."""
+    return codes.sensor.dark_rate * codes.exposure / (ppp * codes.sensor.efficiency)
+
+
+def _dark_text(share: float) -> str:
+    return f"dark counts are {100 * share:.0f} % of the mean light"
 
 
 def remarks(methods: Iterable[Restorer], codes: Codes) -> list[str]:

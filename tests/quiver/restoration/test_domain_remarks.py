@@ -164,6 +164,10 @@ def test_dark_counts_and_few_frames_are_told():
     assert "never measured where dark counts are 20 % of the mean light" in str(
         domain_remarks.remark("mine", scope, noisy)
     )
+    far = str(domain_remarks.remark("mine", scope, stream("quiver-published", 1.0)))  # 1.6 dark electrons, 0.8 of light
+    assert "was never measured near quiver-published, 3 bit, 1 PPP" in far
+    assert far.endswith("dark counts are 200 % of the mean light, and dark places may become too bright")
+    assert "dark" not in str(domain_remarks.remark("mine", scope, stream(ppp=100.0)))
     for frames, words in ((1, "one frame,"), (3, "3 frames,")):
         few = replace(plain, shape=(frames, *plain.shape[1:]))
         assert f"never measured on {words}" in str(domain_remarks.remark("mine", scope, few))
