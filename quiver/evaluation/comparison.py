@@ -26,7 +26,7 @@ from qsim.files import read_json, write_json
 from qsim.process import peak_memory, reset_peak
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import Codes, Stream, array_codes, sensed, stored, windows_sensed
-from quiver.data.illumination import Illumination
+from quiver.data.illumination import Illumination, read_sensor
 from quiver.evaluation import breakdown, metrics
 from quiver.restoration.interface import Restorer
 
@@ -250,6 +250,11 @@ def evaluate(
     for clip in clips:
         if not scored_frames(len(clip), comparison.published):
             raise ValueError(f"clip {clip.name}: {len(clip)} frames are too few; published windows have 11")
+    for light in comparison.lights:
+        if comparison.published and light.sensor.endswith(".toml") and read_sensor(light.sensor, light.bits)[1]:
+            raise ValueError(
+                f"--published: draws windows without defects, and {light.sensor} has a table [defects]; leave it out"
+            )
     known = {row.key: row for row in begin(comparison, out, clips)} if out is not None else {}
     rows: list[ComparisonRow] = []
     total = len(comparison.lights) * len(clips) * len(methods)

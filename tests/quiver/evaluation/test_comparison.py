@@ -245,6 +245,22 @@ def test_published_protocol_forces_every_window(tiny_dataset):
         )
 
 
+def test_published_windows_of_a_sensor_with_defects_are_refused(tiny_dataset, tmp_path):
+    """They are drawn without defects; nothing is written."""
+    text = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 1.6\nread_noise = 0.2\nbits = 3\n'
+    (tmp_path / "clean.toml").write_text(text)
+    (tmp_path / "worn.toml").write_text(text + "[defects]\ndead = 0.1\n")
+    clean, worn = (
+        Comparison(str(tiny_dataset), lights=(Illumination(str(tmp_path / name), 3.25, None),), published=True)
+        for name in ("clean.toml", "worn.toml")
+    )
+    assert evaluate(clean, [restorer("naive")])[0].failure is None
+    with pytest.raises(ValueError, match=r"worn\.toml has a table \[defects\]"):
+        evaluate(worn, [restorer("naive")], tmp_path / "table")
+    assert not (tmp_path / "table").exists()
+    assert evaluate(replace(worn, published=False), [restorer("naive")])[0].failure is None
+
+
 def test_stored_streams_are_scored(tiny_dataset, make_clip: ClipMaker):
     from qsim.clip.sensing import Sensing, sense
 
