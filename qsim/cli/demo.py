@@ -23,7 +23,7 @@ from qsim.cli.options import check_free
 
 MEASUREMENTS = Path(__file__).parents[1] / "measurements"
 MINUTES = "2"  # of training
-RATE = "3e-4"  # a fifth of the protocol's: the weights are trained already
+RATE = "3e-4"  # a tenth of the protocol's: the weights are trained already
 LIGHT = ("--ppp", "3.25", "--bits", "3")
 NETWORK = "mergenet"  # also the name of the weights that ship with the package
 METHODS = ("naive:1", "naive:11", "moment:3", "qbp-bm3d", NETWORK)
