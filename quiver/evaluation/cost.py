@@ -34,7 +34,7 @@ from quiver.device import PeakMemory, pick_device
 from quiver.evaluation import metrics
 from quiver.restoration.interface import COMPARED, MODES, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer, wrap_network
-from quiver.restoration.restorers import restorer, weights_path
+from quiver.restoration.restorers import restorer, shipped_names, weights_path
 
 EXPOSURE = 5e-4  # s
 MODAL = ("quiver-s", "quiver", "quiver-s-1m")  # presets that have several modes
@@ -213,7 +213,7 @@ def cases_of(methods: Sequence[str], modes: Sequence[str], precisions: Sequence[
 
 
 def _has_one_mode(network: str) -> bool:
-    return network in PRESETS and network not in MODAL
+    return network not in MODAL and network in (*PRESETS, *shipped_names())
 
 
 def checked_cases(
