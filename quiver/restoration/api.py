@@ -40,9 +40,10 @@ def restore(
     classical method (naive, moment, likelihood, transform-denoise, qbp, qbp-bm3d, path-merge), the weights that ship
     (mergenet), a .safetensors file or a folder of `quiver train`. `device` (auto, cpu, cuda) and `mode` (exact,
     streaming, windows) are for networks. `auto` takes mergenet, or a classical method where that was measured to be
-    better. `defects` [H, W] is true at hot and dead pixels, which are filled from their neighbours, as are those that a
-    stream's description states. A network outside of what it was measured for warns; with `strict` it is a
-    `ValueError`. `ValueError` or `FileNotFoundError` where the arguments do not fit together.
+    better, and `likelihood` for codes of different exposures. `defects` [H, W] is true at hot and dead pixels, which
+    are filled from their neighbours, as are those that a stream's description states. A network outside of what it was
+    measured for warns; with `strict` it is a `ValueError`. `ValueError` or `FileNotFoundError` where the arguments do
+    not fit together.
 
         video = quiver.restore(stream)
     """
