@@ -13,7 +13,7 @@ from torch import Tensor
 
 from quiver.model.config import Config
 from quiver.model.quiver import QUIVER
-from quiver.model.weights import read_safetensors, read_torch, save
+from quiver.model.weights import FORMAT, load, read_safetensors, read_torch, save
 
 WRAPPERS = ("state_dict", "model_state_dict", "model", "params", "net")  # around a state dict
 
@@ -164,7 +164,11 @@ def _read_foreign(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such checkpoint")
     if path.suffix == ".safetensors":
-        return read_safetensors(path)[0]
+        state, metadata = read_safetensors(path)
+        if metadata.get("format") == FORMAT:
+            load(path)  # raises for those of a network that was removed
+            raise ValueError(f"{path}: holds weights of this program; they need no conversion")
+        return state
     try:
         content = read_torch(path)
     except ValueError as error:

@@ -16,7 +16,7 @@ from quiver.cli.program import main
 from quiver.evaluation.cost import checked_cases
 from quiver.model.presets import build
 from quiver.model.removed import LAST_COMMIT, RemovedError, refuse_run
-from quiver.model.weights import EARLIER, load
+from quiver.model.weights import EARLIER, load, save
 
 # The configuration with which nano was written, last as FoldedQUIVER, before as QUIVER with earlier names of fields.
 SIZES = {"channels": 4, "deformable_groups": 1, "deformable_kernel": 1, "denoiser_growth": 4, "denoiser_passes": 1,
@@ -145,3 +145,15 @@ def test_calls_from_python_refuse_it(tmp_path):
         with pytest.raises(RemovedError) as told:
             call()
         assert one_line(str(told.value))
+
+
+def test_converting_it_is_refused_as_are_weights_that_need_none(capsys, tmp_path):
+    path = write_weights(tmp_path / "w.safetensors")
+    words = ["convert-weights", str(path), "-o", str(tmp_path / "new.safetensors")]
+    assert main(words) == 2
+    assert one_line(capsys.readouterr().err)
+    network = build("unet-1m")
+    save(network, network.config, path)
+    assert main(words) == 2
+    assert "holds weights of this program; they need no conversion" in capsys.readouterr().err
+    assert not (tmp_path / "new.safetensors").exists()
