@@ -23,6 +23,8 @@ def pick_device(wanted: str) -> str:
 
     if wanted == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
+    if wanted not in DEVICES:
+        raise ValueError(f"device {wanted!r}; known are {', '.join(DEVICES)}")
     if wanted == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda: torch finds no CUDA device here; use --device cpu")
     return wanted

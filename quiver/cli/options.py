@@ -17,7 +17,7 @@ from qsim.cli.options import count, memory_size, numbers, positive, whole_number
 from qsim.files import check_ours
 from quiver.device import DEVICES
 from quiver.model.removed import RemovedError, refuse_name
-from quiver.restoration.interface import COMPARED, MODES
+from quiver.restoration.interface import AUTO, COMPARED, MODES
 
 QUIVERS = ("quiver-s", "quiver")  # see quiver/model/presets.py
 NETWORKS = (
@@ -31,12 +31,12 @@ LEVELS = 16  # of a range of light in training: from 0.3 to 100 photons they are
 PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see quiver/training/settings.py
 
 
-def add_light(parser: argparse.ArgumentParser, several: bool) -> None:
-    """Add --sensor, --ppp and --bits; `several` allows lists of light levels and bits."""
+def add_light(parser: argparse.ArgumentParser, several: bool, default: str = "3.25") -> None:
+    """Add --sensor, --ppp and --bits; `several` allows lists of light levels and bits, `default` is that of --ppp."""
     kind, many = (numbers, "; several: 3.25,9.75,26") if several else (positive, "")
     whole = whole_numbers if several else count
     parser.add_argument("--sensor", help="a name of `qsim doctor --devices`, or a .toml file (default quiver-physical)")
-    parser.add_argument("--ppp", type=kind, help=f"mean photons per pixel and exposure (default 3.25){many}")
+    parser.add_argument("--ppp", type=kind, help=f"mean photons per pixel and exposure (default {default}){many}")
     parser.add_argument("--bits", type=whole, help="bits per code (default 3)")
 
 
@@ -126,7 +126,7 @@ def check_domain(args: argparse.Namespace, methods: Sequence[Any], streams: Iter
     for codes in streams:
         found += [text for text in remarks(methods, codes) if text not in found]
         if args.strict:
-            refuse_outside(methods, found)
+            refuse_outside(methods, found, "--strict", named=getattr(args, "method", None) != AUTO)
         if args.verbose:
             for text in filter(None, (measured_at(method, codes) for method in methods)):
                 note(f"quiver: {text}")

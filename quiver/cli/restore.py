@@ -51,7 +51,7 @@ def add_restore(sub: Any) -> None:
         f"that was measured to be better at this sensor, depth and light (default {DEFAULT_METHOD})",
     )
     parser.add_argument("--stream", help="stream of a clip to restore (default: the only one)")
-    add_light(parser, several=False)
+    add_light(parser, several=False, default="that of the stored stream")
     parser.add_argument(
         "--seed", type=checked(checks.seed), help="seed of the noise, if a clip is sensed now (default 0)"
     )

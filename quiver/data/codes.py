@@ -50,6 +50,7 @@ BLOCK_PIXELS = 1 << 22  # codes that `frame_reader` reads at a time: 4 MB
 DIGEST_BYTES = 1 << 24  # of an array, hashed at a time
 LIGHT_FRAMES = 11  # spread over a stream, from which its light is estimated where it is not stated
 POOLED = 4  # px, side of the squares whose mean code is inverted for it: of single codes the inverse is not the light
+DARKEST = 1e-9  # of white: the light that is returned where codes tell none
 START = 0.01  # of the rise of the mean code, whose slope holds below that of a dark pixel, too
 WINDOW_STAGE = 1000  # of the random keys of published test windows, + frame; 0 is `qsim sense`
 
@@ -142,7 +143,7 @@ def light_of(codes: Codes) -> float:
 
     The estimate is the mean of the moment inverse of squares of POOLED pixels, negative below the mean code of a dark
     pixel, so that noise adds no light; where codes do not determine the light, the mean code in units of white.
-    Saturated pixels make it too low: no code tells how bright they are.
+    Saturated pixels make it too low: no code tells how bright they are. At least DARKEST of white.
     """
     if codes.ppp is not None and codes.ppp > 0:
         return float(codes.ppp)
@@ -158,7 +159,7 @@ def light_of(codes: Codes) -> float:
         found = float(np.average(light, weights=pixels))
     except ValueError:
         found = float(mean.mean()) / (codes.sensor.levels - 1) * codes.white
-    return max(found, 1e-9 * codes.white)
+    return max(found, DARKEST * codes.white)
 
 
 def _pooled(image: Array) -> tuple[Array, Array]:

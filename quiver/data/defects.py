@@ -110,10 +110,14 @@ def of_stream(stream: Stream) -> Array | None:
 
 def read_map(path: Path) -> Array:
     """Return a map of defective pixels, bool [H, W], from a .npy of booleans or of 0 and 1. `ValueError` otherwise."""
-    array = files.load_array(path)
+    return check_map(files.load_array(path), str(path))
+
+
+def check_map(array: Array, name: str) -> Array:
+    """Return a map of defective pixels, bool [H, W], of booleans or of 0 and 1. `ValueError` otherwise."""
     if array.ndim != 2 or not array.size or array.dtype.kind not in "bui" or not np.isin(array, (0, 1)).all():
         raise ValueError(
-            f"{path}: a map of defective pixels is [H, W] of booleans, or of 0 and 1, and this is {array.dtype} "
+            f"{name}: a map of defective pixels is [H, W] of booleans, or of 0 and 1, and this is {array.dtype} "
             f"{list(array.shape)}; compare measured dark counts with a limit first"
         )
     return np.asarray(array, bool)

@@ -11,10 +11,11 @@ from numpy import ndarray as Array
 
 from quiver.data.clips import Clip
 from quiver.data.codes import Codes, LazyArray, Sensor, Stream, array_codes, filled, open_stream, sensed, stream_codes
+from quiver.data.defects import check_map
 from quiver.data.illumination import Illumination
 from quiver.restoration.automatic import chosen
 from quiver.restoration.domain_remarks import refuse_outside, remarks
-from quiver.restoration.interface import DEFAULT_METHOD, RestoreOptions
+from quiver.restoration.interface import AUTO, DEFAULT_METHOD, RestoreOptions
 from quiver.restoration.sources import refuse_idle
 
 Source = Stream | Clip | str | os.PathLike[str] | Array
@@ -48,12 +49,15 @@ def restore(
         video = quiver.restore(stream)
     """
     source = np.asarray(source) if isinstance(source, LazyArray) else source
-    codes = filled(_codes(source, sensor, exposure, ppp), None if defects is None else np.asarray(defects, bool))
+    if not isinstance(method, str):
+        raise ValueError(f"method= is a name, a weights file or a run folder as text, got {method!r}")
+    bad = None if defects is None else check_map(np.asarray(defects), "defects=")
+    codes = filled(_codes(source, sensor, exposure, ppp), bad)
     runner, _ = chosen(method, codes, RestoreOptions(device=device or "auto", mode=mode or "exact"))
-    refuse_idle({"device": device, "mode": mode}, [runner])
+    refuse_idle({"device": device, "mode": mode, "method": method}, [runner])
     found = remarks([runner], codes)
     if strict:
-        refuse_outside([runner], found)
+        refuse_outside([runner], found, "strict=", named=method != AUTO)
     for text in found:
         warnings.warn(text, stacklevel=2)
     return runner.restore(codes)
@@ -65,11 +69,17 @@ def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: f
             raise ValueError("an array of codes has no sensor and no exposure; give sensor= and exposure= in seconds")
         if ppp is not None:
             raise ValueError("ppp= is for a clip that is sensed now, and an array holds codes already; leave it out")
+        if not isinstance(sensor, Sensor):
+            raise ValueError(f"sensor= is a sensor, as qsim.load_sensor(NAME, ...) returns it, got {sensor!r}")
+        if not 0 < exposure < float("inf"):
+            raise ValueError(f"exposure= is in seconds and above 0, got {exposure!r}")
         return array_codes(source, sensor, exposure)
     if sensor is not None or exposure is not None:
         raise ValueError("sensor= and exposure= are for arrays, and a clip or a stream has its own; leave them out")
     if isinstance(source, str | os.PathLike):
         path = Path(source)
+        if path.suffix == ".npy" and path.is_file() and not path.with_suffix(".json").is_file():
+            raise ValueError(f"{path}: a bare array; give numpy.load of it with sensor= and exposure= in seconds")
         source = Clip.open(path) if path.is_dir() or not path.exists() else open_stream(path)
     if isinstance(source, Stream):
         if ppp is not None:

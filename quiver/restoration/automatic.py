@@ -11,10 +11,9 @@ from __future__ import annotations
 from quiver.data.codes import Codes
 from quiver.restoration.domain import place_of
 from quiver.restoration.domain_remarks import light_of
-from quiver.restoration.interface import RestoreOptions, Restorer
+from quiver.restoration.interface import AUTO, RestoreOptions, Restorer
 from quiver.restoration.restorers import restorer
 
-AUTO = "auto"
 NETWORK = "mergenet"
 WITHOUT = "qbp-bm3d"  # without the packages of networks
 

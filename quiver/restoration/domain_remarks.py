@@ -5,18 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from quiver.data.codes import Codes, light_of
+from quiver.data.codes import DARKEST, Codes, light_of
 from quiver.data.illumination import Illumination
+from quiver.data.light_change import light_change
 from quiver.restoration.domain import NEAR, OperatingPoint, Scope, place_of
 from quiver.restoration.interface import Restorer
 
 DARK = 0.1  # dark counts over the events of the mean light, above which a stream is unlike all cells
-FRAMES = 4  # of the shortest stream that is like them: one frame is 9 % too bright, four are right within 1 %
+CHANGE = 0.08  # of the light within eleven frames, above which a stream is unlike all cells: they reach 0.05
+FRAMES, BINARY_FRAMES = 4, 11  # of the shortest stream that is like them, of more bits and of one: restorer_limits.md
 
 
 def remark(name: str, scope: Scope, codes: Codes) -> str | None:
     """Return one line where a network is outside of what it was measured for; None inside."""
     ppp = light_of(codes)
+    if ppp <= DARKEST * codes.white:
+        return f"{name} was never measured in such darkness: the codes tell no light"
     place = place_of(codes.sensor, codes.exposure, ppp)
     stream = f"{codes.sensor_name or place.model}, {place.bits} bit, {ppp:.3g} PPP"
     if scope.domain is None:
@@ -33,17 +37,29 @@ def remark(name: str, scope: Scope, codes: Codes) -> str | None:
 
 
 def _unlike_cells(name: str, codes: Codes, ppp: float) -> str | None:
-    """Return the remark on a stream whose dark counts or frames are unlike those of all cells."""
+    """Return the remark on a stream whose dark counts, changes of light or frames are unlike those of all cells."""
     dark = _dark_share(codes, ppp)
     if dark > DARK:
         return (
             f"{name} was never measured where {_dark_text(dark)}, and makes dark places too bright there; "
             "compare with qbp-bm3d"
         )
-    if codes.shape[0] < FRAMES:
-        frames = "one frame" if codes.shape[0] == 1 else f"{codes.shape[0]} frames"
-        return f"{name} was never measured on {frames}, and its brightness may be wrong by several percent"
-    return None
+    change = light_change(codes)
+    if change > CHANGE:
+        return (
+            f"{name} was never trained on light that changes, here by at least {100 * change:.0f} % within eleven "
+            "frames; compare with qbp-bm3d"
+        )
+    return _too_short(name, codes.shape[0], codes.sensor.bits)
+
+
+def _too_short(name: str, frames: int, bits: int) -> str | None:
+    """Return the remark on a stream of few frames: by how much a flat field was wrong, at 0.3 to 3.25 PPP."""
+    if frames >= (BINARY_FRAMES if bits == 1 else FRAMES):
+        return None
+    stream = "one frame" if frames == 1 else f"{frames} frames"
+    off = 30 if frames == 1 else 12 if bits == 1 else 5
+    return f"{name} was never trained on {stream} of {bits} bit, and its brightness may be wrong by up to {off} %"
 
 
 def _dark_share(codes: Codes, ppp: float) -> float:
@@ -69,13 +85,16 @@ def measured_at(method: Restorer, codes: Codes) -> str | None:
     return None if cell is None else f"{method.name} was measured at {cell.name}: {cell.scores}"
 
 
-def refuse_outside(methods: Sequence[Restorer], found: Sequence[str]) -> None:
-    """Raise `ValueError` for `strict`: with the first remark, or where no method is a network."""
-    if not any(method.learned for method in methods):
+def refuse_outside(methods: Sequence[Restorer], found: Sequence[str], option: str, *, named: bool = True) -> None:
+    """Raise `ValueError` for `strict`, the name of whose option is given: with the first remark, or without a network.
+
+    Methods that were not `named` are the choice of `auto`: a classical one is no mistake.
+    """
+    if named and not any(method.learned for method in methods):
         names = ", ".join(method.name for method in methods)
-        raise ValueError(f"strict: acts on networks, and {names} is classical; leave it out")
+        raise ValueError(f"{option}: acts on networks, and {names} is classical; leave it out")
     if found:
-        raise ValueError(f"{found[0]}; leave out strict to run it nevertheless")
+        raise ValueError(f"{found[0]}; leave out {option} to run it nevertheless")
 
 
 def _unmeasured(name: str, trained: Sequence[Illumination], codes: Codes, place: OperatingPoint, stream: str) -> str:

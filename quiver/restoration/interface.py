@@ -13,7 +13,8 @@ from quiver.data.codes import Codes
 from quiver.restoration.domain import Scope
 from quiver.restoration.mosaics import fill_mosaic
 
-DEFAULT_METHOD = "auto"  # of `quiver restore` and `quiver.restore`: see automatic.py
+AUTO = "auto"  # chooses the method of a stream: see automatic.py
+DEFAULT_METHOD = AUTO  # of `quiver restore` and `quiver.restore`
 DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory
 # Presets of the controls and the compared networks; each exists as NAME-1m too (quiver/model/equal_cost.py).
 COMPARED = ("unet", "fastdvdnet", "student-teacher", "bit2bit", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")

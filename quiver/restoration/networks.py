@@ -36,7 +36,7 @@ def network_restorer(path: Path, options: RestoreOptions) -> Restorer:
     model = load(path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     name = path.parent.name if path.name == "best.safetensors" else path.stem
-    description = f"{network_title(model)}, weights {digest[:12]}, {options.mode}"
+    description = f"{network_title(model)}, weights {digest[:12]}"
     method = wrap_network(model, name, description, options, weights_sha256=digest)
     return replace(method, scope=read_scope(path, metadata_of(path)))
 
@@ -61,7 +61,8 @@ def wrap_network(
     from quiver.model.quiver import QUIVER
     from quiver.restoration.merging import fill_merged
 
-    mode = options.mode if isinstance(model, QUIVER) else "windows"  # other networks have one way to share work
+    mode = options.mode if isinstance(model, QUIVER) else None  # other networks have one way to share work
+    description = description if mode is None else f"{description}, {mode}"
     model.to(pick_device(options.device)).eval()
     run: RestoreNetwork = fill_network
     window, look_ahead, together = WINDOW, RADIUS, 1

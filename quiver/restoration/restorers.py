@@ -24,7 +24,7 @@ from quiver.baselines import METHODS, exposures
 from quiver.baselines.sliding_window import look_ahead
 from quiver.data.codes import Codes
 from quiver.model import removed
-from quiver.restoration.interface import RestoreInto, RestoreOptions, Restorer
+from quiver.restoration.interface import AUTO, RestoreInto, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"  # weights that ship with the package
@@ -121,6 +121,11 @@ def weights_path(name: str) -> Path:
     if (path / "settings.json").is_file():
         raise FileNotFoundError(f"{path}: a training run without best.safetensors; continue it until it has validated")
     removed.refuse_name(name)
+    if name.partition(":")[0] == AUTO:
+        raise ValueError(
+            f"{name}: `auto` chooses the method of one stream, for `quiver restore`, and has no window; name one of "
+            f"{', '.join(method_names())}"
+        )
     if name in METHODS:
         own = ", ".join(shipped)
         raise ValueError(

@@ -16,6 +16,7 @@ from quiver.data.codes import Codes, filled, light_of, open_stream, sensed, stre
 from quiver.data.defects import behind, defective, read_map
 from quiver.data.illumination import Illumination, follows_light, read_sensor
 from quiver.data.photon_cubes import cube_codes
+from quiver.restoration.interface import AUTO
 
 if TYPE_CHECKING:
     from quiver.restoration.interface import Restorer
@@ -33,13 +34,18 @@ def refuse(args: argparse.Namespace, names: Sequence[str], why: str) -> None:
 
 
 def refuse_idle(asked: Mapping[str, Any], methods: Sequence[Restorer]) -> None:
-    """Raise `ValueError` for a mode, precision or device that none of the methods uses."""
+    """Raise `ValueError` for a mode, precision or device that none of the methods uses.
+
+    A classical method that `auto` chose lets the precision and the device pass: they were meant for its network.
+    """
     names = ", ".join(method.name for method in methods)
     for option in ("mode", "precision", "device"):
         value = asked.get(option)
         if value is None:
             continue
         if not any(method.learned for method in methods):
+            if asked.get("method") == AUTO and option != "mode":
+                continue
             raise ValueError(f"--{option}: acts on networks, and {names} is classical; leave it out")
         if option == "mode" and not any(method.identity.get("mode") == value for method in methods):
             raise ValueError(f"--mode {value}: {names} shares no work between frames, it has one mode; leave it out")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from qsim.sensor.devices import quiver_physical
+from quiver.cli.program import main
 from quiver.data.codes import array_codes
 from quiver.restoration import automatic
 from quiver.restoration.domain import Cell, Domain, Scope, place_of
@@ -65,3 +66,18 @@ def test_shipped_weights_decide_by_what_was_measured(ppp):
     cell = next(c for c in cells if (c.sensor, c.place.bits, c.ppp) == ("quiver-physical", 3, ppp))
     assert method.name == ("mergenet" if cell.network >= cell.classical_psnr else cell.classical)
     assert f"measured at quiver-physical, 3 bit, {ppp:g} PPP" in line
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "restore c.npy --sensor quiver-paper -o r.npy --method auto:5",
+        "evaluate D -o e --methods naive,auto",
+        "bench -o b --methods auto --size 16x16",
+    ],
+)
+def test_other_commands_say_what_auto_is_for(capsys, tiny_dataset, tmp_path, monkeypatch, command):  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    np.save("c.npy", np.zeros((3, 16, 16), np.uint8))
+    assert main(command.replace("D", str(tiny_dataset)).split()) == 2
+    assert "`auto` chooses the method of one stream, for `quiver restore`" in capsys.readouterr().err

@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from clips import ClipMaker
-from domains import MEASURED, run, stream, weights
+from domains import MEASURED, cell, run, stream, weights
 
 import quiver
+from qsim.clip.sensing import Sensing, sense
+from qsim.keys import Key
 from qsim.sensor import devices
 from qsim.sensor.qis import QIS
 from quiver.baselines import METHODS
@@ -20,7 +22,7 @@ from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise
 from quiver.model.weights import metadata_of
 from quiver.restoration import domain, domain_remarks
-from quiver.restoration.domain import Scope
+from quiver.restoration.domain import Domain, Scope
 
 
 def test_inside_nothing_is_said_and_outside_the_better_method():
@@ -99,7 +101,29 @@ def test_restore_warns_in_one_line_and_refuses_with_strict(capsys, tiny_dataset,
     assert "small was measured at quiver-physical, 3 bit, 3.25 PPP: qbp-bm3d 20.0 dB, network 25.0 dB" in err
     code, _, err = run(capsys, "restore", clip, "-o", tmp_path / "s.npy", "--method", "naive", "--ppp", 3, "--strict")
     assert code == 2
-    assert "strict: acts on networks, and naive is classical" in err
+    assert "--strict: acts on networks, and naive is classical" in err
+
+
+def test_strict_lets_a_classical_method_pass_that_auto_chose(capsys, tmp_path, make_clip: ClipMaker):
+    """With the options of networks too: a script that gives them always does not depend on the stream."""
+    bracketed = sense(
+        make_clip(frames=4, height=16, width=16), Sensing("quiver-physical", bits=3, ppp=3.25, exposures=(1.0, 0.25))
+    )[0]
+    words = (
+        "restore",
+        bracketed.path,
+        "-o",
+        tmp_path / "r.npy",
+        "--strict",
+        "--device",
+        "cpu",
+        "--precision",
+        "float32",
+    )
+    code, _, err = run(capsys, *words)
+    assert code == 0, err
+    assert "auto: likelihood" in err
+    assert run(capsys, *words, "--force", "--mode", "exact")[0] == 2
 
 
 def test_restore_checks_a_bare_array_with_its_sensor(capsys, tmp_path):
@@ -143,7 +167,7 @@ def test_the_call_in_python_warns_and_refuses_with_strict(tmp_path, make_clip: C
         quiver.restore(array, str(path), strict=True, **known)
     inside = stream()
     quiver.restore(inside.read(0, 12), str(path), strict=True, sensor=inside.sensor, exposure=5e-4)
-    with pytest.raises(ValueError, match="strict: acts on networks"):
+    with pytest.raises(ValueError, match="strict=: acts on networks"):
         quiver.restore(array, "naive", strict=True, **known)
 
 
@@ -154,6 +178,25 @@ def test_a_sensor_whose_codes_tell_no_light_still_has_a_remark():
     with pytest.raises(ValueError, match="does not"):
         METHODS["moment"].restore(codes.read(0, 3), sensor, 5e-4)
     assert light_of(codes) > 0
+
+
+def test_darkness_is_told_without_a_number():
+    dark = array_codes(
+        np.zeros((5, 32, 32), np.uint8), devices.load("quiver-physical", ppp=3.25, bits=3, exposure=5e-4), 5e-4
+    )
+    for scope in (Scope(MEASURED), Scope()):
+        assert domain_remarks.remark("mine", scope, dark) == (
+            "mine was never measured in such darkness: the codes tell no light"
+        )
+
+
+def test_light_that_changes_is_told():
+    device = devices.load("quiver-physical", ppp=3.25, bits=3, exposure=5e-4)
+    for change, said in ((0.0, False), (0.5, True)):
+        light = 3.25 * (1 + change * np.linspace(-0.5, 0.5, 11))[:, None, None] * np.ones((1, 64, 64))
+        codes = replace(array_codes(device.sample(light, 5e-4, key=Key(1, 1)), device, 5e-4), ppp=3.25)
+        text = str(domain_remarks.remark("mine", Scope(MEASURED), codes))
+        assert ("mine was never trained on light that changes, here by at least " in text) == said
 
 
 def test_dark_counts_and_few_frames_are_told():
@@ -168,7 +211,15 @@ def test_dark_counts_and_few_frames_are_told():
     assert "was never measured near quiver-published, 3 bit, 1 PPP" in far
     assert far.endswith("dark counts are 200 % of the mean light, and dark places may become too bright")
     assert "dark" not in str(domain_remarks.remark("mine", scope, stream(ppp=100.0)))
-    for frames, words in ((1, "one frame,"), (3, "3 frames,")):
+    for frames, words in (
+        (1, "one frame of 3 bit, and its brightness may be wrong by up to 30 %"),
+        (3, "3 frames of 3"),
+    ):
         few = replace(plain, shape=(frames, *plain.shape[1:]))
-        assert f"never measured on {words}" in str(domain_remarks.remark("mine", scope, few))
+        assert f"never trained on {words}" in str(domain_remarks.remark("mine", scope, few))
     assert domain_remarks.remark("mine", scope, replace(plain, shape=(4, *plain.shape[1:]))) is None
+    binary = Scope(Domain((cell(1.0, 25.0, bits=1, sensor="spad-320x240"),), {}))
+    for frames, words in ((1, "30 %"), (4, "12 %"), (10, "12 %"), (11, None)):
+        few = stream("spad-320x240", 1.0, 1)
+        text = domain_remarks.remark("mine", binary, replace(few, shape=(frames, *few.shape[1:])))
+        assert text is None if words is None else text is not None and text.endswith(words)
