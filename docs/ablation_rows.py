@@ -12,6 +12,8 @@ missing parts, so all six have as many parameters. Busy cores are refused (rows.
 from __future__ import annotations
 
 import argparse
+import shlex
+import subprocess
 import sys
 from functools import partial
 from pathlib import Path
@@ -26,7 +28,7 @@ from qsim.tables import markdown_table
 from quiver.model.config import Config
 from quiver.model.presets import ABLATIONS, ablated, parameter_count
 from quiver.model.quiver import QUIVER
-from quiver.training.loop import train
+from quiver.training.loop import Diverged, train
 from quiver.training.settings import PROTOCOLS, Settings
 
 FORMAT = "quiver-ablation-1"
@@ -51,11 +53,25 @@ def main(words: list[str] | None = None) -> int:
                 check_row(args.out / f"{name}-{seed}.json", budget, args.data)
         for name, seed in todo:
             make = partial(network, name, seed, args, budget)
-            make_row(args.out / f"{name}-{seed}.json", budget, args.data, make, busy=args.busy or args.tiny)
+            sessions = args.work / f"{name}-{seed}_sessions.json"
+            make_row(
+                args.out / f"{name}-{seed}.json",
+                budget,
+                args.data,
+                make,
+                busy=args.busy or args.tiny,
+                sessions=sessions,
+            )
             write_table(args.out)
     except (ValueError, OSError) as error:
         print(f"ablation_rows: {error}", file=sys.stderr)
         return 2
+    except Diverged as error:
+        print(f"ablation_rows: {error}", file=sys.stderr)
+        return 1
+    except subprocess.CalledProcessError as failed:
+        print(f"ablation_rows: stopped at '{shlex.join(failed.cmd[2:])}'; the same command resumes", file=sys.stderr)
+        return failed.returncode
     return 0
 
 

@@ -6,11 +6,13 @@
 
 A row is RESULTS/NAME.json. It is written when it is complete and made once; an interrupted one resumes from WORK. Per
 row: two short trials choose the learning rate on validation clips, one run uses it, and its weights are scored on test
-clips at four light levels. The row of classical methods needs no training. Busy cores are refused (rows.py); --busy
-makes rows there, which are marked. To make a marked row again, delete it and its folder in WORK.
+clips at four light levels. All train by Adam. The row of classical methods needs no training. A row that fails does
+not stop the others. Busy cores are refused (rows.py); --busy makes rows there, which are marked. To make a marked row
+again, delete it and all in WORK that bears its name.
 
-The multiply-adds of record are those of the design: one more frame of a long clip (quiver/evaluation/macs.py). A second
-column has those of restoring, as `quiver bench` counts them, with the frames around each part of a stream.
+The table of record has the networks whose design takes about a million multiply-adds per pixel of one more frame of a
+long clip (NAME-1m, quiver/evaluation/macs.py). A second column has those of restoring, as `quiver bench` counts them:
+QUIVER restores the published windows, and others restore the frames around each part of a stream again.
 """
 
 from __future__ import annotations
@@ -30,17 +32,20 @@ from qsim.figures import new_figure, write_figure
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
 from quiver.cli.options import NETWORKS
+from quiver.cli.train import DIVERGED
 from quiver.evaluation.breakdown import bin_names
 
-FORMAT = "quiver-equal-budget-2"
+FORMAT = "quiver-equal-budget-3"
 CLASSICAL = ("moment:3", "moment", "transform-denoise", "qbp", "qbp-bm3d", "path-merge")
 FLOOR = "moment:3"  # a network below it is given no rank
 RATES = {"mergenet": ("5e-4", "1.5e-3")}
 RATES_OF_OTHERS = ("3e-4", "1e-3")
-DIVERGED = 1  # exit code of a training whose loss became NaN or infinite
-RECORD = (0.8e6, 1.2e6)  # multiply-accumulates per pixel and frame of the table of record
+RECORD = "-1m"  # ends the names of the networks in the table of record
+INTERRUPTED = 130  # exit code of a command that was stopped from outside
 LIMITS = """Thirty minutes cannot tell which network is best after days of training. Large networks make fewer steps in
-the same time, and recurrent ones learn late. A row states what a design gives for this budget on these clips."""
+the same time, and recurrent ones learn late. A row states what a design gives for this budget on these clips. All
+networks are trained by Adam, mergenet too, whose own protocol has Muon. bit2bit trains on the stream that it restores
+and has no row."""
 
 
 def main(words: list[str] | None = None) -> int:
@@ -60,17 +65,30 @@ def main(words: list[str] | None = None) -> int:
         for name in names:  # all that exist are checked before any is made
             if (args.out / f"{name}.json").exists():
                 check_row(args.out / f"{name}.json", budget, args.data)
-        for name in names:
-            make = partial(classical, args, budget) if name == "classical" else partial(network, name, args, budget)
-            make_row(args.out / f"{name}.json", budget, args.data, make, busy=args.busy or args.tiny)
-            write_tables(args.out)
+        failures = [failure for name in names if (failure := made(name, args, budget))]
     except (ValueError, OSError) as error:
         print(f"equal_budget: {error}", file=sys.stderr)
         return 2
+    except subprocess.CalledProcessError as stopped:
+        print(f"equal_budget: stopped at '{shlex.join(stopped.cmd[2:])}'; the same command resumes", file=sys.stderr)
+        return stopped.returncode
+    for failure in failures:
+        print(f"equal_budget: {failure}", file=sys.stderr)
+    return 1 if failures else 0
+
+
+def made(name: str, args: argparse.Namespace, budget: Budget) -> str | None:
+    """Make a row and the tables; return a sentence if one of its commands failed, None otherwise."""
+    make = partial(classical, args, budget) if name == "classical" else partial(network, name, args, budget)
+    sessions = args.work / f"{name}_sessions.json"
+    try:
+        make_row(args.out / f"{name}.json", budget, args.data, make, busy=args.busy or args.tiny, sessions=sessions)
     except subprocess.CalledProcessError as failed:
-        print(f"equal_budget: stopped at '{shlex.join(failed.cmd[2:])}'; the same command resumes", file=sys.stderr)
-        return failed.returncode
-    return 0
+        if failed.returncode == INTERRUPTED:
+            raise
+        return f"{name} has no row: '{shlex.join(failed.cmd[2:])}' failed with {failed.returncode}"
+    write_tables(args.out)
+    return None
 
 
 def parser() -> argparse.ArgumentParser:
@@ -87,33 +105,37 @@ def parser() -> argparse.ArgumentParser:
 
 def network(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
     """Return the row of a network: trials, one run, scores and costs."""
-    trials = {}
+    trials: dict[str, dict[str, Any]] = {}
     for rate in RATES.get(name.removesuffix("-1m"), RATES_OF_OTHERS):
         folder = args.work / f"{name}_trial_{rate}"
         trials[rate] = trial(name, rate, folder, args.data, budget)
-    rate = max(trials, key=lambda key: trials[key])
+    rate = max(trials, key=lambda key: trials[key]["psnr"] or -math.inf)
     folder = args.work / name
     train(name, rate, budget.minutes, folder, args.data, budget)
     found = read_json(folder / "history.json")
     scored = scores([str(folder)], args.work / f"{name}_scores", args.data, LIGHTS, budget)
     row = {"format": FORMAT, "name": name, "kind": "network", "rate": float(rate)}
-    row |= {"trials": {key: value if math.isfinite(value) else None for key, value in trials.items()}}
-    row |= {"settings": found["settings"], "curve": found["history"], "steps": found["history"][-1]["step"]}
+    row |= {
+        "trials": trials,
+        "settings": found["settings"],
+        "curve": found["history"],
+        "steps": found["history"][-1]["step"],
+    }
     design = of_design(folder / "best.safetensors")
     spent = cost(str(folder), args.work / f"{name}_bench", budget)
     return row | design | {"scores": scored[name], "cost": spent}
 
 
-def trial(name: str, rate: str, folder: Path, data: Path, budget: Budget) -> float:
-    """Return the PSNR [dB] of the last validation of a short run; minus infinity for one that diverged."""
+def trial(name: str, rate: str, folder: Path, data: Path, budget: Budget) -> dict[str, Any]:
+    """Return the PSNR [dB] of the last validation of a short run, None if it diverged, and its curve."""
     try:
         train(name, rate, budget.trial_minutes, folder, data, budget)
     except subprocess.CalledProcessError as failed:
         if failed.returncode != DIVERGED:
             raise
-        return -math.inf
-    history = read_json(folder / "history.json")["history"]
-    return float(history[-1]["psnr_matched"]) if history else -math.inf
+        return {"psnr": None, "curve": []}
+    curve = read_json(folder / "history.json")["history"]
+    return {"psnr": float(curve[-1]["psnr_matched"]), "curve": curve}
 
 
 def classical(args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
@@ -123,13 +145,17 @@ def classical(args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
 
 
 def of_design(weights: Path) -> dict[str, Any]:
-    """Return the number of parameters of a weights file, and the multiply-accumulates per pixel of its design."""
+    """Return the parameters that restore with a weights file, the multiply-accumulates per pixel, and the frames."""
     from quiver.evaluation.macs import design_macs
+    from quiver.model.rivals.student_teacher import StudentTeacher
     from quiver.model.weights import load
+    from quiver.restoration.restorers import restorer
 
-    found = load(weights)
-    count = sum(parameter.numel() for parameter in found.parameters())
-    return {"parameters": count, "macs_per_pixel": design_macs(found.config)}
+    found, method = load(weights), restorer(str(weights))
+    restoring = found.student if isinstance(found, StudentTeacher) else found
+    count = sum(parameter.numel() for parameter in restoring.parameters())
+    frames = {"window": method.window, "look_ahead": method.look_ahead}
+    return {"parameters": count, "macs_per_pixel": design_macs(found.config)} | frames
 
 
 # ---- Commands
@@ -144,7 +170,8 @@ def train(name: str, rate: str, minutes: float, folder: Path, data: Path, budget
     }
     quiver(
         *("train", data, "-o", folder, "--preset", name, "--protocol", *own.get(name.removesuffix("-1m"), ["quick"])),
-        *("--minutes", minutes, "--learning-rate", rate, "--crop", budget.crop, "--batch", budget.batch),
+        *("--minutes", minutes, "--optimiser", "adam", "--learning-rate", rate),
+        *("--crop", budget.crop, "--batch", budget.batch),
         *("--sensor", "quiver-physical", "--ppp", LIGHTS[0], "--bits", 3, "-q"),
         budget=budget,
     )  # fmt: skip
@@ -179,45 +206,99 @@ def write_tables(out: Path) -> None:
     """Write OUT.md and OUT.png from the rows that exist."""
     rows = [read_json(path) for path in sorted(out.glob("*.json"))]
     networks = [row for row in rows if row["kind"] == "network"]
-    scores = ("PSNR matched", "SSIM matched", *(f"{name} px" for name in bin_names()))
-    header = ("network", "MACs/px", "restoring", "parameters", "steps", *scores, "s/frame", "MB")
     at = f"{float(LIGHTS[0]):g} PPP, 3 bit"
-    floor = next(
-        (row["scores"][FLOOR][at]["scores"]["psnr_matched"]["mean"] for row in rows if row["name"] == "classical"),
-        -math.inf,
-    )
-    record = [row for row in networks if RECORD[0] <= row["macs_per_pixel"] <= RECORD[1]]
-    others = [row for row in networks if row not in record]
+    known: dict[str, Any] = next((row["scores"] for row in rows if row["kind"] == "classical"), {})
+    methods = [(name, found[at]) for name, found in known.items()]
+    floor = mean_of(known[FLOOR][at]) if FLOOR in known else -math.inf
     text = ["# Every network after the same time", "", "    python docs/equal_budget.py DATA", "", LIMITS, ""]
-    for title, part in (("About one million multiply-adds per pixel and frame", record), ("Other sizes", others)):
-        ranked = sorted(part, key=lambda row: -psnr(row, at))
-        text += [f"## {title}, {at}", "", *markdown_table([cells(row, at) for row in ranked], header), ""]
-        below = [row["name"] for row in ranked if psnr(row, at) < floor]
-        text += [f"Below {FLOOR}, so without a rank: {', '.join(below)}.", ""] if below else []
+    text += [f"![Validation PSNR over minutes of training]({out.name}.png)", ""]
+    text += [f"## About one million multiply-adds per pixel and frame, {at}", ""]
+    record = [row for row in networks if row["name"].endswith(RECORD)]
+    text += [*markdown_table(ranked(record, methods, floor, at), HEADER), "", RANKS, ""]
+    text += ["## Published widths", "", f"Scores of networks that beat {FLOOR} at {at}.", ""]
+    widths = [row for row in networks if row not in record]
+    header = (
+        "network",
+        "MACs/px",
+        "parameters",
+        "steps",
+        "rate",
+        "last validation [dB]",
+        "PSNR matched",
+        "seconds/frame",
+        "MB",
+    )
+    text += [*markdown_table([width_cells(row, floor, at) for row in widths], header), ""]
     text += ["## The same weights at other light levels, matched PSNR [dB]", ""]
     text += [*markdown_table(light_cells(rows), ("method", *(f"{light} PPP" for light in LIGHTS))), ""]
     text += notes_on(rows)
     write_bytes(out.with_suffix(".md"), "\n".join(text).encode())
-    curves(networks, out.with_suffix(".png"))
+    curves((record, widths), out.with_suffix(".png"))
 
 
-def psnr(row: dict[str, Any], light: str) -> float:
-    """Return the matched PSNR [dB] of a network; minus infinity if it failed."""
-    found = row["scores"][light]["scores"]["psnr_matched"]["mean"]
-    return -math.inf if found is None else float(found)
+RANKS = f"Networks below {FLOOR} have no rank. Frames: those of which one is restored, and how many of them lie ahead."
+HEADER = (
+    *("rank", "method", "frames", "MACs/px", "restoring", "parameters", "steps", "rate", "PSNR matched", "PSNR"),
+    *("SSIM matched", *(f"{name} px" for name in bin_names()), "seconds/frame", "MB", "convolution [ms]"),
+)  # fmt: skip
 
 
-def cells(row: dict[str, Any], light: str) -> list[str]:
-    """Return the cells of a network; a star marks one that was made on busy cores."""
-    found, spent = row["scores"][light], row["cost"]
-    motion = ["" if value is None else f"{value:.2f}" for value in found["psnr_by_motion"]]
+def ranked(
+    networks: list[dict[str, Any]], methods: list[tuple[str, dict[str, Any]]], floor: float, at: str
+) -> list[list[str]]:
+    """Return the rows of the table of record, best first: networks with a rank, and classical methods without."""
+    lines = [(mean_of(found), ["", name, *[""] * 6, *score_cells(found), f"{found['seconds_per_frame']:.3g}", "", ""])
+             for name, found in methods]  # fmt: skip
+    order = sorted(networks, key=lambda row: -mean_of(row["scores"][at]))
+    for rank, row in enumerate(order, 1):
+        found = row["scores"][at]
+        place = str(rank) if mean_of(found) >= floor else "none"
+        speed = f"{min(row['reference_convolution_ms']):.2f}"
+        cells = [place, starred(row), f"{row['window']}, {row['look_ahead']}", *size_cells(row), *score_cells(found)]
+        lines.append((mean_of(found), [*cells, *cost_cells(row), speed]))
+    return [cells for _, cells in sorted(lines, key=lambda line: -line[0])]
+
+
+def width_cells(row: dict[str, Any], floor: float, at: str) -> list[str]:
+    """Return the cells of a network of published width, whose score stands there if it is above the floor."""
+    found = row["scores"][at]
+    score = interval(found["scores"]["psnr_matched"], 2) if mean_of(found) >= floor else "below"
+    macs, _, *others = size_cells(row)
+    return [starred(row), macs, *others, f"{row['curve'][-1]['psnr_matched']:.2f}", score, *cost_cells(row)]
+
+
+def mean_of(found: dict[str, Any]) -> float:
+    """Return the matched PSNR [dB] of a method at a light; minus infinity if it failed."""
+    value = found["scores"]["psnr_matched"]["mean"]
+    return -math.inf if value is None else float(value)
+
+
+def starred(row: dict[str, Any]) -> str:
+    """Return the name of a row; a star marks one that was made on busy cores."""
+    return str(row["name"]) + ("" if row["quiet"] else r"\*")
+
+
+def size_cells(row: dict[str, Any]) -> list[str]:
+    """Return multiply-accumulates per pixel of design and restoring, parameters, steps and rate."""
+    macs = (row["macs_per_pixel"], row["cost"]["restoring_macs_per_pixel"])
     return [
-        *(row["name"] + ("" if row["quiet"] else r"\*"), f"{row['macs_per_pixel'] / 1e6:.3g} M"),
-        *(f"{spent['restoring_macs_per_pixel'] / 1e6:.3g} M", f"{row['parameters']:,}", str(row["steps"])),
-        *(interval(found["scores"]["psnr_matched"], 2), interval(found["scores"]["ssim_matched"], 3)),
-        *(motion or [""] * len(bin_names())),
-        *(f"{spent['seconds_per_frame']:.3g}", f"{spent['peak_bytes'] / 1e6:.0f}"),
+        *(f"{count / 1e6:.3g} M" for count in macs),
+        f"{row['parameters']:,}",
+        str(row["steps"]),
+        f"{row['rate']:g}",
     ]
+
+
+def score_cells(found: dict[str, Any]) -> list[str]:
+    """Return scores with intervals, and the PSNR by motion."""
+    motion = ["" if value is None else f"{value:.2f}" for value in found["psnr_by_motion"]]
+    kinds = (("psnr_matched", 2), ("psnr", 2), ("ssim_matched", 3))
+    return [*(interval(found["scores"][kind], digits) for kind, digits in kinds), *(motion or [""] * len(bin_names()))]
+
+
+def cost_cells(row: dict[str, Any]) -> list[str]:
+    """Return seconds and megabytes of a restored frame."""
+    return [f"{row['cost']['seconds_per_frame']:.3g}", f"{row['cost']['peak_bytes'] / 1e6:.0f}"]
 
 
 def light_cells(rows: list[dict[str, Any]]) -> list[list[str]]:
@@ -231,18 +312,20 @@ def light_cells(rows: list[dict[str, Any]]) -> list[list[str]]:
     ]
 
 
-def curves(networks: list[dict[str, Any]], path: Path) -> None:
-    """Draw validation PSNR over minutes."""
-    figure = new_figure(7, 4.5)
-    axes = figure.subplots()
-    for i, row in enumerate(networks):
-        minutes = [entry["elapsed"] / 60 for entry in row["curve"]]
-        values = [entry["psnr_matched"] for entry in row["curve"]]
-        axes.plot(minutes, values, marker=".", color=f"C{i % 10}", ls=("-", "--")[i // 10 % 2], label=row["name"])
-    axes.set_xlabel("minutes of training")
-    axes.set_ylabel("validation PSNR after the best factor [dB]")
-    if networks:
-        figure.legend(fontsize="small", loc="outside right upper")
+def curves(parts: tuple[list[dict[str, Any]], list[dict[str, Any]]], path: Path) -> None:
+    """Draw validation PSNR over minutes: the table of record, and published widths."""
+    figure = new_figure(10, 4.5)
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, rows, title in zip(axes, parts, ("a million multiply-adds", "published widths"), strict=True):
+        for i, row in enumerate(rows):
+            minutes = [entry["elapsed"] / 60 for entry in row["curve"]]
+            values = [entry["psnr_matched"] for entry in row["curve"]]
+            axis.plot(minutes, values, marker=".", color=f"C{i % 10}", ls=("-", "--")[i // 10], label=row["name"])
+        axis.set_title(title)
+        axis.set_xlabel("minutes of training")
+        if rows:
+            axis.legend(fontsize="x-small")
+    axes[0].set_ylabel("validation PSNR after the best factor [dB]")
     write_figure(figure, path)
 
 

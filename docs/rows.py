@@ -22,7 +22,7 @@ from typing import Any
 
 import torch
 
-from qsim.files import VERSION, read_json, write_json
+from qsim.files import VERSION, read_json, sha256, to_json, write_json
 
 ROOT = Path(__file__).parents[1]
 LIGHTS = ("3.25", "1", "9.75", "26")  # photons per pixel; training is at the first
@@ -38,8 +38,8 @@ class Budget:
     minutes: float = 30.0
     trial_minutes: float = 5.0
     threads: int = 2
-    crop: int = 96  # px; a multiple of 16
-    batch: int = 4
+    crop: int = 80  # px; a multiple of 16
+    batch: int = 2  # the published RVRT takes 8 GB a window; more windows leave slow networks too few steps
     size: str = "128x128"  # of the frames whose cost is measured
 
 
@@ -133,24 +133,36 @@ def reference_convolution(threads: int) -> float:
 # ---- Rows
 
 
-def make_row(path: Path, budget: Budget, data: Path, make: Callable[[], dict[str, Any]], *, busy: bool) -> None:
+def make_row(
+    path: Path, budget: Budget, data: Path, make: Callable[[], dict[str, Any]], *, busy: bool, sessions: Path
+) -> None:
     """Write one row, unless it exists. `make` returns what is its own; the rest is budget, machine and its speed.
 
     `ValueError` if it exists with another budget or data set, and on busy cores unless `busy`. A row states the cores
-    that others used, and the convolution before and after.
+    that others used, and the convolution before and after. The file `sessions` holds the cores that others used in
+    every session that worked on the row: a row that was resumed is as quiet as the loudest of them, and not quiet if
+    one was killed, whose load is not known.
     """
     if path.exists():
         check_row(path, budget, data)
         return
     if not busy:
         refuse_busy()
+    earlier = read_json(sessions)["cores_of_others"] if sessions.exists() else []
+    sessions.parent.mkdir(parents=True, exist_ok=True)
+    write_json(sessions, {"cores_of_others": [*earlier, None]})  # until this session ends
     watch, before = Watch.now(), reference_convolution(budget.threads)
-    own = make()
-    others = watch.others()
+    try:
+        own = make()
+    finally:
+        loads = [*earlier, watch.others()]
+        write_json(sessions, {"cores_of_others": loads})
+    others = None if None in loads else max(loads)
     row = {
         "quiver": VERSION,
         "budget": asdict(budget),
         "data": data.name,
+        "recipe_sha256": recipe_digest(data),
         "machine": machine(),
         "reference_convolution_ms": [before, reference_convolution(budget.threads)],
         "cores_of_others": others,
@@ -165,10 +177,16 @@ def make_row(path: Path, budget: Budget, data: Path, make: Callable[[], dict[str
 def check_row(path: Path, budget: Budget, data: Path) -> None:
     """Raise `ValueError` if a row was made with another budget or on another data set."""
     found = read_json(path)
-    wanted = {"budget": asdict(budget), "data": data.name}
+    wanted = {"budget": asdict(budget), "data": data.name, "recipe_sha256": recipe_digest(data)}
     for name, value in wanted.items():
         if found.get(name) != value:
             raise ValueError(f"{path}: was made with {name} {found.get(name)}; now it is {value}; choose another --out")
+
+
+def recipe_digest(data: Path) -> str | None:
+    """Return the SHA-256 of the recipe of a data set: machines of other kinds give it other last bits of radiance."""
+    path = data / "dataset.json"
+    return sha256(to_json(read_json(path)["recipe"])) if path.exists() else None
 
 
 def notes_on(rows: list[dict[str, Any]]) -> list[str]:

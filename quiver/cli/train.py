@@ -33,6 +33,8 @@ from quiver.device import DEVICES
 
 # train
 
+DIVERGED = 3  # exit code of a run whose loss became NaN or infinite
+
 
 def add_train(sub: Any) -> None:
     parser = command(
@@ -129,7 +131,7 @@ def _run_train(args: argparse.Namespace) -> int:
             )
     except Diverged as error:
         print(f"quiver: {error}", file=sys.stderr)
-        return 1
+        return DIVERGED
     if leads:
         draw_curve(folder, state.history)
         output(args, *_summary(folder, state))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 import subprocess
 import sys
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from quiver.model.presets import ABLATIONS, parameter_count
+from quiver.model.presets import ABLATIONS, build, parameter_count
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "support"))
@@ -41,15 +40,15 @@ def test_an_unknown_row_is_one_sentence(program, known, capsys):
 
 
 def test_a_trial_that_diverges_is_the_worst(tmp_path, monkeypatch):
-    """Other failures end the program."""
-    for code, known in ((1, True), (130, False), (2, False)):
+    """Other failures leave the row without a trial: a program that ran out of memory has not diverged."""
+    for code, known in ((3, True), (1, False), (130, False), (2, False)):
 
         def fail(*words, code=code, **options):
             raise subprocess.CalledProcessError(code, ["python", "-m", "quiver"])
 
         monkeypatch.setattr(equal_budget, "quiver", fail)
         if known:
-            assert equal_budget.trial("emvd", "1e-3", tmp_path, tmp_path, rows.TINY) == -math.inf
+            assert equal_budget.trial("emvd", "1e-3", tmp_path, tmp_path, rows.TINY) == {"psnr": None, "curve": []}
             continue
         with pytest.raises(subprocess.CalledProcessError):
             equal_budget.trial("emvd", "1e-3", tmp_path, tmp_path, rows.TINY)
@@ -74,7 +73,8 @@ def clock(monkeypatch, busy: float) -> None:
 
 def made(path: Path, seconds: float, *, busy: bool) -> dict[str, object]:
     """A row that takes so long, made by the program's own function."""
-    rows.make_row(path, rows.TINY, Path("a/data"), lambda: rows.time.sleep(seconds) or {"name": "x"}, busy=busy)
+    work = {"busy": busy, "sessions": path.parent / "work" / "x_sessions.json"}
+    rows.make_row(path, rows.TINY, Path("a/data"), lambda: rows.time.sleep(seconds) or {"name": "x"}, **work)
     return json.loads(path.read_text())
 
 
@@ -85,11 +85,16 @@ def test_quiet_cores_make_a_row_once(tmp_path, monkeypatch, capsys):
     assert found["quiet"] is True
     assert found["cores_of_others"] == pytest.approx(0.04)
     assert found["reference_convolution_ms"] == [3.0, 3.0]
-    rows.make_row(path, rows.TINY, Path("b/data"), lambda: pytest.fail("made twice"), busy=False)
+    once = {"busy": False, "sessions": tmp_path / "work" / "x_sessions.json"}
+    rows.make_row(path, rows.TINY, Path("b/data"), lambda: pytest.fail("made twice"), **once)
     with pytest.raises(ValueError, match="was made with data data; now it is other"):
-        rows.make_row(path, rows.TINY, Path("other"), dict, busy=False)
+        rows.make_row(path, rows.TINY, Path("other"), dict, **once)
     with pytest.raises(ValueError, match="was made with budget"):
-        rows.make_row(path, rows.Budget(), Path("data"), dict, busy=False)
+        rows.make_row(path, rows.Budget(), Path("data"), dict, **once)
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data/dataset.json").write_text('{"recipe": {"frames": 24}, "complete": true}')
+    with pytest.raises(ValueError, match="was made with recipe_sha256 None; now it is "):
+        rows.make_row(path, rows.TINY, tmp_path / "data", dict, **once)
     assert capsys.readouterr().out == f"{path}: written\n"
     assert rows.notes_on([found])[0].startswith("Machine: ")
 
@@ -104,6 +109,43 @@ def test_busy_cores_are_refused_or_marked(tmp_path, monkeypatch, capsys):
     assert found["quiet"] is False
     assert "marked: other programs used 1.3 cores" in capsys.readouterr().out
     assert rows.notes_on([found])[0] == r"\* made beside other programs: x."
+
+
+def test_a_resumed_row_is_as_quiet_as_its_loudest_session(tmp_path, monkeypatch):
+    """One session fails beside other programs, one is killed: its load is not known."""
+    clock(monkeypatch, 1.3)
+    sessions = tmp_path / "work" / "x_sessions.json"
+
+    def stop() -> dict[str, object]:
+        rows.time.sleep(60)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        rows.make_row(tmp_path / "x.json", rows.TINY, Path("a/data"), stop, busy=True, sessions=sessions)
+    clock(monkeypatch, 0.02)
+    found = made(tmp_path / "x.json", 60.0, busy=False)
+    assert found["cores_of_others"] == pytest.approx(1.3)
+    assert found["quiet"] is False
+    (tmp_path / "x.json").unlink()
+    sessions.write_text('{"cores_of_others": [0.0, null]}')
+    found = made(tmp_path / "x.json", 60.0, busy=False)
+    assert (found["cores_of_others"], found["quiet"]) == (None, False)
+
+
+def test_a_row_that_fails_does_not_stop_the_others(tmp_path, monkeypatch, capsys):
+    done = []
+
+    def make(path, *words, **options):
+        done.append(path.stem)
+        if path.stem == "emvd":
+            raise subprocess.CalledProcessError(-9, ["python", "-m", "quiver", "train"])
+
+    monkeypatch.setattr(equal_budget, "make_row", make)
+    monkeypatch.setattr(equal_budget, "write_tables", lambda out: None)
+    words = [str(tmp_path), "--tiny", "--out", str(tmp_path / "rows"), "--rows", "classical,emvd,unet"]
+    assert equal_budget.main(words) == 1
+    assert done == ["classical", "emvd", "unet"]
+    assert capsys.readouterr().err == "equal_budget: emvd has no row: 'quiver train' failed with -9\n"
 
 
 def test_a_system_that_states_no_times_marks_its_rows(tmp_path, monkeypatch, capsys):
@@ -165,23 +207,30 @@ def test_rows_are_made_once_and_shown(tmp_path):
     row = json.loads((out / "unet.json").read_text())
     assert set(row["scores"]) == {f"{ppp} PPP, 3 bit" for ppp in ("3.25", "1", "9.75", "26")}
     assert row["rate"] in (3e-4, 1e-3)
-    assert row["trials"][f"{row['rate']:g}".replace("0.0003", "3e-4").replace("0.001", "1e-3")] == max(
-        row["trials"].values()
-    )
+    trials = {float(rate): found for rate, found in row["trials"].items()}
+    assert trials[row["rate"]]["psnr"] == max(found["psnr"] for found in trials.values())
+    assert trials[row["rate"]]["psnr"] == trials[row["rate"]]["curve"][-1]["psnr_matched"]
+    assert row["settings"]["optimiser"] == "adam"
+    assert (row["window"], row["look_ahead"]) == (11, 5)
     assert row["steps"] == row["curve"][-1]["step"] > 0
     assert row["parameters"] == 911_841
     assert row["macs_per_pixel"] == pytest.approx(127_400, rel=0.01)
     assert row["cost"]["restoring_macs_per_pixel"] > 1e5
     assert min(row["reference_convolution_ms"]) > 0
     written = (out / "unet.json").stat().st_mtime_ns
-    second = run(*common, "--rows", "classical,unet,emvd")
+    second = run(*common, "--rows", "classical,unet,emvd,student-teacher-1m")
     assert second.returncode == 0, second.stderr
+    students = json.loads((out / "student-teacher-1m.json").read_text())
+    assert students["parameters"] == sum(weight.numel() for weight in build("student-teacher-1m").student.parameters())
     assert (out / "unet.json").stat().st_mtime_ns == written
     assert "--preset unet" not in second.stdout
     table = out.with_suffix(".md").read_text()
-    assert re.search(r"\| unet(\\\*)? \| 0\.127 M \|", table)
-    assert re.search(r"\| emvd(\\\*)? \| 0\.0056\d? M \|", table)
-    assert "| qbp-bm3d |" in table
+    record, widths = table.split("## Published widths")
+    assert re.search(r"\| unet(\\\*)? \| 0\.127 M \|", widths)
+    assert re.search(r"\| emvd(\\\*)? \| 0\.0056\d? M \|", widths)
+    assert re.search(r"\| (1|none) \| student-teacher-1m(\\\*)? \| 11, 5 \|", record)
+    assert "|  | qbp-bm3d |" in record
+    assert "(rows.png)" in table
     assert out.with_suffix(".png").stat().st_size > 1000
     other = run(*common, "--rows", "unet", "--budget-seconds", "9")
     assert (other.returncode, other.stderr.count("\n")) == (2, 1)
