@@ -1,6 +1,6 @@
-"""Measures the restorer that ships where its grid does not reach: flat fields, dark counts, few frames, faulty pixels.
+"""Measures the restorer that ships where its grid does not reach: flat fields, few frames, faults, light that changes.
 
-    python docs/restorer_limits.py                            # five minutes; docs/results/restorer_limits.md, .json
+    python docs/restorer_limits.py                            # ten minutes; docs/results/restorer_limits.md, .json
     python docs/restorer_limits.py --draws 2 --size 48 --out out/limits
 
 Every number is a mean over draws with its standard error. Draws differ in the sensor's noise and, where something
@@ -26,6 +26,7 @@ from qsim.keys import Key
 from qsim.tables import markdown_table
 from quiver.data.codes import Codes, array_codes, filled
 from quiver.data.illumination import Illumination
+from quiver.data.light_change import light_change
 from quiver.evaluation import metrics
 from quiver.restoration.restorers import restorer, weights_path
 
@@ -38,11 +39,21 @@ LEVELS = (0.5, 3.25, 26.0, 100.0)  # PPP that the gain is set for
 SHARES = (0.1, 1.0, 2.0)  # light of a flat field over that level
 PLANES = (1.0, 5.0)  # PPP on one binary SPAD plane
 DARK = (1.0, 3.25)  # PPP beside the dark counts of the published sensor
-SHORT = (1, 2, 3, 4, 11)  # frames of a stream
+SHORT = (1, 2, 3, 4, 6, 11)  # frames of a stream
+SEEN = (("quiver-physical", 3.25, 3), ("quiver-physical", 0.5, 3), ("spad-320x240", 1.0, 1))  # by short streams
 MOTION = (0.0, 2.0, 6.0)  # px/frame
 LIGHTS = (3.25, 26.0)  # PPP of what moves, 3 bits
 DEFECTIVE = 0.13  # share of the pixels; half of them dead, half with the top code
 FAULTS = ("black", "white")  # frames
+CHANGES = (0.0, 0.1, 0.2, 0.4, 0.8)  # of the light from the first to the last of eleven frames, over its mean
+SLOW = (0.0, 2.0)  # px/frame of what moves in light that changes
+CLASSICAL = ("moment", "qbp", "qbp-bm3d")  # beside which patterns and points are restored
+CONTRAST = 0.8  # of patterns
+CHECKS = (1, 2)  # px, side of a square of a still checkerboard
+STRIPES = (2, 4)  # px, width of a stripe
+SPEEDS = (0, 1, 3)  # px/frame of stripes and points
+POINTS = ((0.5, 20.0), (3.0, 8.0))  # photons of the ground, and what single pixels add to it
+RARE = 0.01  # share of such pixels
 
 
 # ---- Streams
@@ -55,15 +66,39 @@ def flat(light: Illumination, ppp: float, size: int, draw: int, frames: int = FR
     return replace(array_codes(drawn, sensor, EXPOSURE), ppp=ppp, sensor_name=light.sensor)
 
 
-def moving(motion: float, ppp: float, size: int, draw: int, frames: int = FRAMES) -> tuple[Codes, Array]:
-    """Return 3-bit codes of photographs that slide, and the light [size, size] of the frame in their middle."""
+def moving(
+    motion: float, ppp: float, size: int, draw: int, frames: int = FRAMES, change: float = 0.0
+) -> tuple[Codes, Array]:
+    """Return 3-bit codes of photographs that slide, and the light [size, size] of the frame in their middle.
+
+    Their light rises from the first to the last frame by `change` of its mean.
+    """
     parts = scene(draw, size, motion)
     middle = frames // 2
     light = np.stack([frame(parts, (size, size), float(t - middle))[0] for t in range(frames)])
-    light *= ppp / light.mean()
+    light *= (ppp / light.mean() * (1 + change * np.linspace(-0.5, 0.5, frames)))[:, None, None]
+    return codes_of(light, ppp, draw), light[middle]
+
+
+def codes_of(light: Array, ppp: float, draw: int) -> Codes:
+    """Return 3-bit codes of light [T, H, W] seen by the sensor whose gain is that of `ppp`."""
     sensor = Illumination("quiver-physical", ppp, 3).device(EXPOSURE)
     codes = array_codes(sensor.sample(light, EXPOSURE, key=Key(draw, 1)), sensor, EXPOSURE)
-    return replace(codes, ppp=ppp), light[middle]
+    return replace(codes, ppp=ppp)
+
+
+def sliding(picture: Array, speed: int) -> Array:
+    """Return frames of a picture [H, W] that slides round by whole pixels, in place in the middle."""
+    return np.stack([np.roll(picture, speed * (t - MIDDLE), axis=1) for t in range(FRAMES)])
+
+
+def patterns(size: int) -> dict[str, Array]:
+    """Return name -> frames of checkerboards and stripes, of mean 1."""
+    y, x = np.mgrid[:size, :size]
+    found = {f"checkerboard of {k} px, still": sliding((y // k + x // k) % 2, 0) for k in CHECKS}
+    for width in STRIPES:
+        found |= {f"stripes of {width} px, {v} px/frame": sliding(x // width % 2, v) for v in SPEEDS}
+    return {name: 1 + CONTRAST * (2.0 * frames - 1) for name, frames in found.items()}
 
 
 def exchanged(codes: Codes, values: Array) -> Codes:
@@ -123,15 +158,18 @@ def dark(draws: int, size: int) -> dict[str, list[float]]:
     }
 
 
-def short(draws: int, size: int) -> dict[str, dict[str, list[float]]]:
-    """Return, by frames of the stream, brightness of a flat field and the gain over the rival [dB] on what moves."""
-    light = Illumination(ppp=3.25, bits=3)
+def short(draws: int, size: int) -> dict[str, dict[str, Any]]:
+    """Return, by frames of the stream, brightness of flat fields and the gain over the rival [dB] on what moves."""
+    lights = [Illumination(*seen) for seen in SEEN]
     found = {}
     for frames in SHORT:
         streams = [moving(2.0, 3.25, size, n, frames) for n in range(draws)]
         t = frames // 2
         apart = [psnr(NAME, codes, target, t) - psnr(RIVAL, codes, target, t) for codes, target in streams]
-        bright = [brightness(NAME, flat(light, 3.25, size, n, frames), 3.25) for n in range(draws)]
+        bright = [
+            [brightness(NAME, flat(light, light.ppp or 0, size, n, frames), light.ppp or 0) for n in range(draws)]
+            for light in lights
+        ]
         found[f"{frames}"] = {"brightness": bright, "gain": apart}
     return found
 
@@ -168,6 +206,39 @@ def faults(draws: int, size: int) -> dict[str, list[float]]:
     return found
 
 
+def changing(draws: int, size: int) -> dict[str, dict[str, list[float]]]:
+    """Return, by light, motion and change of light, the gain over the rival [dB] and the change that is found."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for ppp in LIGHTS:
+        for motion in SLOW:
+            for change in CHANGES:
+                streams = [moving(motion, ppp, size, n, change=change) for n in range(draws)]
+                gain = [psnr(NAME, codes, target) - psnr(RIVAL, codes, target) for codes, target in streams]
+                found[f"{ppp:g} PPP, {motion:g} px/frame, {100 * change:g} %"] = {
+                    "gain": gain,
+                    "found": [light_change(codes) for codes, _ in streams],
+                }
+    return found
+
+
+def details(draws: int, size: int) -> dict[str, dict[str, list[float]]]:
+    """Return PSNR [dB] by method of fine patterns, and of points on a dark ground."""
+    cases = {
+        f"{name}, {ppp:g} PPP": [(ppp * frames, ppp)] * draws
+        for ppp in LIGHTS for name, frames in patterns(size).items()
+    }  # fmt: skip
+    for ground, more in POINTS:
+        for speed in SPEEDS:
+            rare = [np.random.default_rng(n).random((size, size)) < RARE for n in range(draws)]
+            seen = [sliding(ground + more * places, speed) for places in rare]
+            cases[f"points of {more:g} on {ground:g} photons, {speed} px/frame"] = [(x, float(x.mean())) for x in seen]
+    found: dict[str, dict[str, list[float]]] = {}
+    for name, lights in cases.items():
+        streams = [(codes_of(light, ppp, n), light[MIDDLE]) for n, (light, ppp) in enumerate(lights)]
+        found[name] = {method: [psnr(method, *stream) for stream in streams] for method in (NAME, *CLASSICAL)}
+    return found
+
+
 # ---- The page
 
 
@@ -190,9 +261,10 @@ def page(found: dict[str, Any]) -> str:
     text += ["", "## Dark counts", "", "A flat field seen by `quiver-published` at 3 bits.", ""]
     text += markdown_table([(k, told(v, 3)) for k, v in found["dark"].items()], ("method, light", "brightness"))
     text += ["", "## Few frames", "",
-             f"3.25 PPP, 3 bits. The gain is over {RIVAL}, at 2 px/frame.", ""]  # fmt: skip
-    rows = [(k, told(v["brightness"], 3), told(v["gain"], 2)) for k, v in found["short"].items()]
-    text += markdown_table(rows, ("frames", "brightness of a flat field", "gain [dB]"))
+             f"The gain is over {RIVAL}, at 3.25 PPP, 3 bits, 2 px/frame.", ""]  # fmt: skip
+    rows = [(k, *(told(x, 3) for x in v["brightness"]), told(v["gain"], 2)) for k, v in found["short"].items()]
+    header = ("frames", *(f"brightness, {sensor}, {bits} bit, {ppp:g} PPP" for sensor, ppp, bits in SEEN), "gain [dB]")
+    text += markdown_table(rows, header)
     text += ["", "## Hot and dead pixels", "",
              f"{100 * DEFECTIVE:g} % of the pixels, half of them without codes, half with the top code, "
              "3 bits: dB that they cost.", ""]  # fmt: skip
@@ -206,6 +278,18 @@ def page(found: dict[str, Any]) -> str:
         "",
     ]
     text += markdown_table([(k, told(v, 2)) for k, v in found["faults"].items()], ("fault, light", "cost [dB]"))
+    text += ["", "## Light that changes", "",
+             f"3 bits; the light rises steadily over {FRAMES} frames. The gain is over {RIVAL}. The change that is "
+             "found in the codes alone leaves out what noise may explain (quiver/data/light_change.py).",
+             ""]  # fmt: skip
+    rows = [(k, told(v["gain"], 2), f"{100 * np.mean(v['found']):.0f} %") for k, v in found["changing"].items()]
+    text += markdown_table(rows, ("light, motion, change", "gain [dB]", "change found"))
+    text += ["", "## Fine patterns and points", "",
+             f"3 bits; patterns of contrast {CONTRAST:g}, points in {100 * RARE:g} % of the pixels. PSNR in dB.",
+             ""]  # fmt: skip
+    methods = (NAME, *CLASSICAL)
+    rows = [(k, *(told(v[method], 1) for method in methods)) for k, v in found["details"].items()]
+    text += markdown_table(rows, ("picture", *methods))
     return "\n".join([*text, ""])
 
 
@@ -220,8 +304,8 @@ def main(words: list[str] | None = None) -> int:
     if args.draws < 2 or not 4 * EDGE <= args.size <= 256:
         print(f"restorer_limits: give --draws of at least 2 and --size of {4 * EDGE} to 256", file=sys.stderr)
         return 2
-    parts = (fields, planes, dark, short, defects, faults)
-    found = {"format": "quiver-restorer-limits-1", "quiver": VERSION, "weights": sha256(weights_path(NAME))}
+    parts = (fields, planes, dark, short, defects, faults, changing, details)
+    found = {"format": "quiver-restorer-limits-2", "quiver": VERSION, "weights": sha256(weights_path(NAME))}
     found |= {"draws": args.draws, "size": args.size}
     found |= {part.__name__: part(args.draws, args.size) for part in parts}
     args.out.parent.mkdir(parents=True, exist_ok=True)

@@ -36,6 +36,24 @@ def test_what_moves_has_its_light_and_its_middle(frames: int):
     assert codes.shape == (frames, 48, 48)
 
 
+def test_light_that_changes_has_its_middle_frame():
+    """The frame that is scored is as in constant light; the first and the last are 40 % darker and brighter."""
+    (_, constant), (codes, target) = (restorer_limits.moving(0.0, 26.0, 48, 2, change=c) for c in (0.0, 0.8))
+    np.testing.assert_allclose(target, constant, rtol=1e-12)
+    means = codes.read(0, 11).mean(axis=(1, 2))
+    assert 0.5 < means[0] / means[5] < 0.7  # 0.6 but for noise
+    assert means[10] > means[5]
+
+
+def test_patterns_slide_round_and_have_a_mean_of_one():
+    for name, frames in restorer_limits.patterns(48).items():
+        assert frames.shape == (11, 48, 48)
+        assert frames.mean() == pytest.approx(1.0)
+        assert set(np.round(np.unique(frames), 9)) == {0.2, 1.8}
+        speed = 0 if "still" in name else int(name.split(", ")[1].split(" ")[0])
+        np.testing.assert_array_equal(frames[6], np.roll(frames[5], speed, axis=1))
+
+
 def test_a_method_without_bias_is_bright_as_the_field():
     codes = restorer_limits.flat(Illumination(ppp=3.25, bits=7), 3.25, 64, 3)
     table = codes.sensor.response(codes.exposure)
@@ -56,6 +74,14 @@ def test_the_program_writes_page_and_numbers(tmp_path, monkeypatch):
     monkeypatch.setattr(restorer_limits, "MOTION", (2.0,))
     monkeypatch.setattr(restorer_limits, "LIGHTS", (26.0,))
     monkeypatch.setattr(restorer_limits, "RIVAL", "moment")
+    monkeypatch.setattr(restorer_limits, "SEEN", (("spad-320x240", 1.0, 1),))
+    monkeypatch.setattr(restorer_limits, "CHANGES", (0.8,))
+    monkeypatch.setattr(restorer_limits, "SLOW", (0.0,))
+    monkeypatch.setattr(restorer_limits, "CLASSICAL", ("moment",))
+    monkeypatch.setattr(restorer_limits, "CHECKS", (2,))
+    monkeypatch.setattr(restorer_limits, "STRIPES", ())
+    monkeypatch.setattr(restorer_limits, "POINTS", ((3.0, 8.0),))
+    monkeypatch.setattr(restorer_limits, "SPEEDS", (0,))
     words = ["--draws", "2", "--size", "48", "--out", str(tmp_path / "limits")]
     assert restorer_limits.main(words) == 0
     found = json.loads((tmp_path / "limits.json").read_text())
@@ -65,6 +91,9 @@ def test_the_program_writes_page_and_numbers(tmp_path, monkeypatch):
     text = (tmp_path / "limits.md").read_text()
     for name in ("3 bit, gain of 3.25 PPP", "moment, 1 PPP", "26 PPP, 2 px/frame", "black, 26 PPP", "| 2 |"):
         assert name in text
+    for name in ("0 px/frame, 80 %", "checkerboard of 2 px, still, 26 PPP", "points of 8 on 3 photons, 0 px/frame"):
+        assert name in text
+    assert min(found["changing"]["26 PPP, 0 px/frame, 80 %"]["found"]) > 0.2
 
 
 @pytest.mark.parametrize("words", [["--draws", "1"], ["--size", "31"], ["--size", "257"]])
