@@ -15,7 +15,7 @@ from quiver.data.codes import Codes
 
 FRAMES = 11  # in the middle of the stream
 SIDE = 16  # px of a square, less where the picture is small
-FEWEST = 9  # squares, below which nothing is said
+FEWEST = 9  # squares, below which the answer is 0
 CERTAIN = 6.0  # standard errors that a change exceeds: motion makes neighbouring squares alike
 MEDIAN = 1.2533  # standard error of a median over that of a mean, of normal numbers
 DEVIATION = 1.4826  # standard deviation over the median distance from the median, of normal numbers
