@@ -26,8 +26,8 @@ from qsim.keys import Key
 from qsim.tables import markdown_table
 from quiver.data.codes import Codes, array_codes, filled
 from quiver.data.illumination import Illumination
-from quiver.data.light_change import light_change
 from quiver.evaluation import metrics
+from quiver.restoration.domain_remarks import light_change
 from quiver.restoration.restorers import restorer, weights_path
 
 ROOT = Path(__file__).parents[1]
@@ -280,7 +280,7 @@ def page(found: dict[str, Any]) -> str:
     text += markdown_table([(k, told(v, 2)) for k, v in found["faults"].items()], ("fault, light", "cost [dB]"))
     text += ["", "## Light that changes", "",
              f"3 bits; the light rises steadily over {FRAMES} frames. The gain is over {RIVAL}. The change that is "
-             "found in the codes alone leaves out what noise may explain (quiver/data/light_change.py).",
+             "found in the codes alone leaves out what noise may explain (quiver/restoration/domain_remarks.py).",
              ""]  # fmt: skip
     rows = [(k, told(v["gain"], 2), f"{100 * np.mean(v['found']):.0f} %") for k, v in found["changing"].items()]
     text += markdown_table(rows, ("light, motion, change", "gain [dB]", "change found"))

@@ -5,15 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+from numpy import ndarray as Array
+
 from quiver.data.codes import DARKEST, Codes, light_of
 from quiver.data.illumination import Illumination
-from quiver.data.light_change import light_change
 from quiver.restoration.domain import NEAR, OperatingPoint, Scope, place_of
 from quiver.restoration.interface import Restorer
 
 DARK = 0.1  # dark counts over the events of the mean light, above which a stream is unlike all cells
 CHANGE = 0.08  # of the light within eleven frames, above which a stream is unlike all cells: they reach 0.05
 FRAMES, BINARY_FRAMES = 4, 11  # of the shortest stream that is like them, of more bits and of one: restorer_limits.md
+LOOKED_AT = 11  # frames in the middle of the stream, in which a change of light is looked for
+SIDE = 16  # px of a square, less where the picture is small
+FEWEST = 9  # squares, below which the answer is 0
+CERTAIN = 6.0  # standard errors that a change exceeds: motion makes neighbouring squares alike
+MEDIAN = 1.2533  # standard error of a median over that of a mean, of normal numbers
+DEVIATION = 1.4826  # standard deviation over the median distance from the median, of normal numbers
 
 
 def remark(name: str, scope: Scope, codes: Codes) -> str | None:
@@ -119,3 +127,42 @@ def _same(light: Illumination, codes: Codes, place: OperatingPoint) -> bool:
     except (ValueError, OSError):  # the sensor's file is missing
         return False
     return seen.like(place) and abs(math.log(seen.light / place.light)) <= math.log(NEAR)
+
+
+# ---- Light that changes
+
+
+def light_change(codes: Codes) -> float:
+    """Return the least change of light, largest minus smallest over the mean, that noise and motion do not explain.
+
+    Light that changes brightens all squares of a picture alike. Things that move brighten some and darken others, so
+    that the median over squares stays; the mean does not: it changes by up to 23 % in scenes of constant light.
+    0 for constant light, and where the codes do not tell: few squares, darkness, saturation, different exposures.
+    """
+    length, height, width = codes.shape
+    side = max(4, min(SIDE, height // 6, width // 6))
+    rows, columns = height // side, width // side
+    if rows * columns < 2 * FEWEST or length < 2 or codes.shares is not None:
+        return 0.0
+    first = max(0, (length - LOOKED_AT) // 2)
+    frames = codes.read(first, min(length, first + LOOKED_AT))[:, : rows * side, : columns * side]
+    means = frames.reshape(len(frames), rows, side, columns, side).mean(axis=(2, 4)).reshape(len(frames), -1)
+    try:
+        light = codes.sensor.response(codes.exposure).invert(means, side * side)
+    except ValueError:
+        return 0.0
+    return _change(np.asarray(light, float))
+
+
+def _change(light: Array) -> float:
+    """Return the change of the light [T, squares], from the brighter half of the squares."""
+    mean = light.mean(axis=0)
+    bright = light[:, (mean >= np.median(mean)) & (mean > 0)]
+    if bright.shape[1] < FEWEST:
+        return 0.0
+    ratios = bright / bright.mean(axis=0)
+    factors = np.median(ratios, axis=1)
+    spread = DEVIATION * np.median(np.abs(ratios - factors[:, None]), axis=1)
+    errors = MEDIAN * spread / np.sqrt(bright.shape[1])
+    low, high = int(factors.argmin()), int(factors.argmax())
+    return float(max(0.0, factors[high] - factors[low] - CERTAIN * np.hypot(errors[low], errors[high])))

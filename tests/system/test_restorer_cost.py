@@ -16,11 +16,12 @@ import restorer_cost  # noqa: E402  (docs are not a package)
 
 def test_the_ratio_is_that_of_the_medians():
     found = {"old": [(6.0, 1e9), (9.0, 1e9), (6.6, 1e9)], "own": [(2.0, 5e8), (2.2, 5e8), (8.0, 5e8)]}
-    text = restorer_cost.page(found, "512x1024", busy=False)
+    text = restorer_cost.page(found, 950_000_000, "512x1024", busy=False)
+    assert "takes 950 MB" in text
     assert "Ratio of the medians: 3.00." in text
     assert "| own | 2.20 | 2.00 2.20 8.00 | 500 MB |" in text
     assert "beside other programs" not in text
-    assert "Measured beside other programs." in restorer_cost.page(found, "512x1024", busy=True)
+    assert "Measured beside other programs." in restorer_cost.page(found, 1, "512x1024", busy=True)
 
 
 def test_mistakes_are_one_sentence(tmp_path, monkeypatch, capsys):
@@ -33,6 +34,11 @@ def test_mistakes_are_one_sentence(tmp_path, monkeypatch, capsys):
         assert " ".join(words) + ": give" in told
         assert told.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_the_memory_of_the_command_is_that_of_its_process():
+    """At least what Python and torch take, and more than this process adds for a small frame."""
+    assert 1e8 < restorer_cost.command_memory((16, 16)) < 2e9
 
 
 @pytest.mark.slow
