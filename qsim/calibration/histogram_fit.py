@@ -172,7 +172,8 @@ def goodness(
 
 def _pooled(observed: Array, expected: Array, least: float = 5.0) -> tuple[Array, Array]:
     """Join neighbouring bins until each expects at least `least`; return observed and expected counts."""
-    group = np.minimum(np.floor(np.cumsum(expected) / least), max(np.floor(expected.sum() / least) - 1, 0)).astype(int)
+    last = max(observed.sum() // least - 1, 0)  # whole counts: rounding of the expected sum must not join two bins
+    group = np.minimum(np.floor(np.cumsum(expected) / least), last).astype(int)
     _, group = np.unique(group, return_inverse=True)
     return np.bincount(group, observed), np.bincount(group, expected)
 
