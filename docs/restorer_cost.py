@@ -33,21 +33,31 @@ from qsim.tables import markdown_table
 ROOT = Path(__file__).parents[1]
 OLD = "5c22140"
 FRAMES = 11
+MEMORY = ROOT / "qsim" / "process.py"  # of this commit, for the older program too
+COMMAND = """
+import sys
+from qsim.process import peak_memory
+from quiver.cli.program import main
+code = main(sys.argv[1:])
+print(peak_memory())
+sys.exit(code)
+"""
 
 LIGHT = """
-import resource, sys, time
+import runpy, sys, time
 import numpy as np
 from skimage import data
-height, width, frames = (int(word) for word in sys.argv[1:])
+height, width, frames = (int(word) for word in sys.argv[2:])
 picture = np.hstack([data.camera().astype(float)] * 2)[:height, :width]
 photons = np.stack([np.roll(picture, 2 * t, axis=1) for t in range(frames)]) * (3.25 / picture.mean())
 from qsim.keys import Key
+peak_memory = runpy.run_path(sys.argv[1])["peak_memory"]
 """
 LOOP = """
 for _ in sys.stdin:
     started = time.perf_counter()
     once()
-    print(time.perf_counter() - started, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, flush=True)
+    print(time.perf_counter() - started, peak_memory(), flush=True)
 """
 QBP = """
 from qsim.devices import quiver_physical
@@ -82,7 +92,7 @@ class Program:
     """One program that runs once for every line on its input."""
 
     def __init__(self, text: str, folder: Path, size: tuple[int, int], frames: int) -> None:
-        words = [sys.executable, "-W", "ignore", "-c", LIGHT + text + LOOP, *map(str, (*size, frames))]
+        words = [sys.executable, "-W", "ignore", "-c", LIGHT + text + LOOP, *map(str, (MEMORY, *size, frames))]
         self.process = subprocess.Popen(
             words, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment(folder)
         )
@@ -169,12 +179,11 @@ def command_memory(size: tuple[int, int]) -> int:
         codes, out = Path(folder) / "codes.npy", Path(folder) / "restored.npy"
         np.save(codes, sensor.sample(photons, 5e-4, key=Key(0, 0)))
         words = ["restore", codes, "--ppp", "3.25", "--method", "mergenet", "-q", "-o", out]
-        process = subprocess.Popen([sys.executable, "-m", "quiver", *map(str, words)], cwd=ROOT)
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise ValueError(f"quiver restore ended with exit code {process.returncode}; its message stands above")
-    return used.ru_maxrss * 1024
+        program = [sys.executable, "-c", COMMAND, *map(str, words)]
+        done = subprocess.run(program, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode:
+        raise ValueError(f"quiver restore ended with exit code {done.returncode}; its message stands above")
+    return int(done.stdout.splitlines()[-1])
 
 
 def page(found: dict[str, list[tuple[float, float]]], memory: int, size: str, busy: bool) -> str:

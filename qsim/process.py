@@ -17,7 +17,10 @@ def peak_memory() -> int:
 
 
 def peak_memory_of_children() -> int:
-    """Return the resident memory of the largest child process that has ended [bytes]; 0 without one."""
+    """Return the resident memory of the largest child process that has ended [bytes]; 0 without one.
+
+    Linux gives a child at least the memory that this process had when it started the child (getrusage(2)).
+    """
     return _peak_of(resource.RUSAGE_CHILDREN)
 
 
