@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from rows import LIGHTS, TINY, Budget, check_row, interval, make_row, notes_on, options, quiver, scores
+from stream_rows import stream_network
 
 from qsim.figures import new_figure, write_figure
 from qsim.files import read_json, write_bytes
@@ -44,8 +45,9 @@ RECORD = "-1m"  # ends the names of the networks in the table of record
 INTERRUPTED = 130  # exit code of a command that was stopped from outside
 LIMITS = """Thirty minutes cannot tell which network is best after days of training. Large networks make fewer steps in
 the same time, and recurrent ones learn late. A row states what a design gives for this budget on these clips. All
-networks are trained by Adam, mergenet too, whose own protocol has Muon. bit2bit trains on the stream that it restores
-and has no row."""
+networks are trained by Adam, mergenet too, whose own protocol has Muon. bit2bit trains on the streams that it restores
+and stands apart."""
+APART = "bit2bit"  # begins the names of networks that learn from the streams they restore
 
 
 def main(words: list[str] | None = None) -> int:
@@ -80,6 +82,8 @@ def main(words: list[str] | None = None) -> int:
 def made(name: str, args: argparse.Namespace, budget: Budget) -> str | None:
     """Make a row and the tables; return a sentence if one of its commands failed, None otherwise."""
     make = partial(classical, args, budget) if name == "classical" else partial(network, name, args, budget)
+    if name.startswith(APART):
+        make = partial(apart, name, args, budget)
     sessions = args.work / f"{name}_sessions.json"
     try:
         make_row(args.out / f"{name}.json", budget, args.data, make, busy=args.busy or args.tiny, sessions=sessions)
@@ -93,8 +97,7 @@ def made(name: str, args: argparse.Namespace, budget: Budget) -> str | None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the options of this program."""
-    left_out = ("bit2bit", "bit2bit-1m")  # trained on the stream that they restore
-    names = ["classical", *(n for n in NETWORKS if n not in left_out and not n.endswith("-as-published"))]
+    names = ["classical", *(n for n in NETWORKS if not n.endswith("-as-published"))]
     made = options(__doc__, "equal_budget", names)
     made.add_argument("--budget-seconds", type=float, help="another budget than 30 minutes, for trying this program")
     return made
@@ -124,6 +127,15 @@ def network(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, An
     design = of_design(folder / "best.safetensors")
     spent = cost(str(folder), args.work / f"{name}_bench", budget)
     return row | design | {"scores": scored[name], "cost": spent}
+
+
+def apart(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
+    """Return the row of a network that learns from each test stream, for a share of the time."""
+    found = stream_network(name, RATES_OF_OTHERS, args, budget)
+    folder = Path(found.pop("folder"))
+    spent = cost(str(folder), args.work / f"{name}_bench", budget)
+    row = {"format": FORMAT, "name": name, "kind": "stream"}
+    return row | found | of_design(folder / "best.safetensors") | {"cost": spent}
 
 
 def trial(name: str, rate: str, folder: Path, data: Path, budget: Budget) -> dict[str, Any]:
@@ -218,17 +230,15 @@ def write_tables(out: Path) -> None:
     text += ["## Published widths", "", f"Scores of networks that beat {FLOOR} at {at}.", ""]
     widths = [row for row in networks if row not in record]
     header = (
-        "network",
-        "MACs/px",
-        "parameters",
-        "steps",
-        "rate",
-        "last validation [dB]",
-        "PSNR matched",
-        "seconds/frame",
-        "MB",
+        *("network", "MACs/px", "parameters", "steps", "rate", "last validation [dB]", "PSNR matched"),
+        *("seconds/frame", "MB"),
     )
     text += [*markdown_table([width_cells(row, floor, at) for row in widths], header), ""]
+    streams = [row for row in rows if row["kind"] == "stream"]
+    text += [f"## Learned from the test streams themselves, {at}", "", STREAMS, ""]
+    header = ("network", "MACs/px", "restoring", "parameters", "steps", "rate", *HEADER[8:-1])
+    cells = [[starred(row), *size_cells(row), *score_cells(row["scores"][at]), *cost_cells(row)] for row in streams]
+    text += [*markdown_table(cells, header), ""]
     text += ["## The same weights at other light levels, matched PSNR [dB]", ""]
     text += [*markdown_table(light_cells(rows), ("method", *(f"{light} PPP" for light in LIGHTS))), ""]
     text += notes_on(rows)
@@ -236,6 +246,8 @@ def write_tables(out: Path) -> None:
     curves((record, widths), out.with_suffix(".png"))
 
 
+STREAMS = """The test clips share the thirty minutes: every clip is restored by weights that learned from its own codes
+alone. Sharp frames of a validation clip choose the rate."""
 RANKS = f"Networks below {FLOOR} have no rank. Frames: those of which one is restored, and how many of them lie ahead."
 HEADER = (
     *("rank", "method", "frames", "MACs/px", "restoring", "parameters", "steps", "rate", "PSNR matched", "PSNR"),
@@ -305,7 +317,8 @@ def light_cells(rows: list[dict[str, Any]]) -> list[list[str]]:
     """Return the cells of all methods at all light levels."""
     found: dict[str, Any] = {}
     for row in rows:
-        found |= row["scores"] if row["kind"] == "classical" else {row["name"]: row["scores"]}
+        if row["kind"] != "stream":
+            found |= row["scores"] if row["kind"] == "classical" else {row["name"]: row["scores"]}
     lights = [f"{float(light):g} PPP, 3 bit" for light in LIGHTS]
     return [
         [name, *(interval(own[light]["scores"]["psnr_matched"], 2) for light in lights)] for name, own in found.items()

@@ -229,9 +229,14 @@ def scores(methods: list[str], folder: Path, data: Path, lights: tuple[str, ...]
     )
     found: dict[str, Any] = {}
     for line in read_json(folder / "evaluation.json")["table"]:
-        kept = ("scores", "psnr_by_motion", "psnr_matched_per_frame", "seconds_per_frame", "failures")
-        found.setdefault(line["method"], {})[line["light"]] = {key: line[key] for key in kept}
+        found.setdefault(line["method"], {})[line["light"]] = kept_scores(line)
     return found
+
+
+def kept_scores(line: dict[str, Any]) -> dict[str, Any]:
+    """Return what a row keeps of a line of an evaluation's table."""
+    kept = ("scores", "psnr_by_motion", "psnr_matched_per_frame", "seconds_per_frame", "failures")
+    return {key: line[key] for key in kept}
 
 
 def interval(found: dict[str, Any], digits: int) -> str:

@@ -218,14 +218,21 @@ def test_rows_are_made_once_and_shown(tmp_path):
     assert row["cost"]["restoring_macs_per_pixel"] > 1e5
     assert min(row["reference_convolution_ms"]) > 0
     written = (out / "unet.json").stat().st_mtime_ns
-    second = run(*common, "--rows", "classical,unet,emvd,student-teacher-1m")
+    second = run(*common, "--rows", "classical,unet,emvd,student-teacher-1m,bit2bit-1m")
     assert second.returncode == 0, second.stderr
     students = json.loads((out / "student-teacher-1m.json").read_text())
     assert students["parameters"] == sum(weight.numel() for weight in build("student-teacher-1m").student.parameters())
     assert (out / "unet.json").stat().st_mtime_ns == written
     assert "--preset unet" not in second.stdout
+    alone = json.loads((out / "bit2bit-1m.json").read_text())
+    assert set(alone["scores"]) == {"3.25 PPP, 3 bit"}
+    assert alone["scores"]["3.25 PPP, 3 bit"]["scores"]["psnr_matched"]["scenes"] == 2
+    assert alone["steps"] >= 2  # one run for each test clip
     table = out.with_suffix(".md").read_text()
     record, widths = table.split("## Published widths")
+    widths, streams = widths.split("## Learned from the test streams themselves")
+    assert re.search(r"\| bit2bit-1m(\\\*)? \| 0\.999 M \|", streams)
+    assert "| bit2bit" not in record + widths.partition("## ")[0] + streams.partition("## ")[2]
     assert re.search(r"\| unet(\\\*)? \| 0\.127 M \|", widths)
     assert re.search(r"\| emvd(\\\*)? \| 0\.0056\d? M \|", widths)
     assert re.search(r"\| (1|none) \| student-teacher-1m(\\\*)? \| 11, 5 \|", record)
