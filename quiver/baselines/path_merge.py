@@ -79,18 +79,15 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
         codes = torch.stack([functional.avg_pool2d(frame.codes[None], SCALES[-1])[0] for frame in window])
         deviation = variance_of(box_mean(codes.mean(0)[None], 2)[0], domain).sqrt()
         velocity, acceleration = paths(pyramid, offsets, codes, deviation)
-        shape = window[0].codes.shape
-        seen = [
-            look(frame.codes, displacement(velocity, acceleration, offset))
-            if offset
-            else (frame.codes, torch.ones(shape))
-            for frame, offset in zip(window, offsets, strict=True)
-        ]
-        moved = torch.stack([codes for codes, _ in seen])
-        inside = torch.stack([there for _, there in seen])
+        moved = torch.empty(len(window), *window[0].codes.shape)
+        inside = torch.ones_like(moved)
+        for i, (frame, offset) in enumerate(zip(window, offsets, strict=True)):
+            moved[i] = frame.codes
+            if offset:
+                moved[i], inside[i] = look(frame.codes, displacement(velocity, acceleration, offset))
         weight = weights(moved, inside, offsets, domain)
         near = [i for i, offset in enumerate(offsets) if abs(offset) <= 1]
-        still = torch.stack([frame.codes for frame in window]).mean(0)
+        still = sum((frame.codes for frame in window[1:]), window[0].codes) / len(window)
         alone = window[offsets.index(0)].codes.numpy()
         groups = [[i for i, offset in enumerate(offsets) if offset in group] for group in GROUPS]
         counts = torch.stack([inside[group].sum(0) for group in groups])
