@@ -42,6 +42,7 @@ FLOOR = "moment:3"  # a network below it is given no rank
 RATES = {"mergenet": ("5e-4", "1.5e-3")}
 RATES_OF_OTHERS = ("3e-4", "1e-3")
 RECORD = "-1m"  # ends the names of the networks in the table of record
+ROWS = ("classical", *(name for name in NETWORKS if not name.endswith("-as-published")))
 INTERRUPTED = 130  # exit code of a command that was stopped from outside
 LIMITS = """Thirty minutes cannot tell which network is best after days of training. Large networks make fewer steps in
 the same time, and recurrent ones learn late. A row states what a design gives for this budget on these clips. All
@@ -53,12 +54,9 @@ APART = "bit2bit"  # begins the names of networks that learn from the streams th
 def main(words: list[str] | None = None) -> int:
     args = parser().parse_args(words)
     budget, names = TINY if args.tiny else Budget(), args.rows.split(",")
-    unknown = sorted(set(names) - {"classical", *NETWORKS})
+    unknown = sorted(set(names) - set(ROWS))
     if unknown:
-        print(
-            f"equal_budget: no row is called {unknown[0]!r}; known are classical, {', '.join(NETWORKS)}",
-            file=sys.stderr,
-        )
+        print(f"equal_budget: no row is called {unknown[0]!r}; known are {', '.join(ROWS)}", file=sys.stderr)
         return 2
     if args.budget_seconds:
         budget = Budget(args.budget_seconds / 60, args.budget_seconds / 240, budget.threads, budget.crop, budget.batch)
@@ -97,8 +95,7 @@ def made(name: str, args: argparse.Namespace, budget: Budget) -> str | None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the options of this program."""
-    names = ["classical", *(n for n in NETWORKS if not n.endswith("-as-published"))]
-    made = options(__doc__, "equal_budget", names)
+    made = options(__doc__, "equal_budget", ROWS)
     made.add_argument("--budget-seconds", type=float, help="another budget than 30 minutes, for trying this program")
     return made
 
@@ -227,20 +224,20 @@ def write_tables(out: Path) -> None:
     text += [f"## About one million multiply-adds per pixel and frame, {at}", ""]
     record = [row for row in networks if row["name"].endswith(RECORD)]
     text += [*markdown_table(ranked(record, methods, floor, at), HEADER), "", RANKS, ""]
-    text += ["## Published widths", "", f"Scores of networks that beat {FLOOR} at {at}.", ""]
     widths = [row for row in networks if row not in record]
-    header = (
-        *("network", "MACs/px", "parameters", "steps", "rate", "last validation [dB]", "PSNR matched"),
-        *("seconds/frame", "MB"),
-    )
-    text += [*markdown_table([width_cells(row, floor, at) for row in widths], header), ""]
+    if widths:
+        text += ["## Published widths", "", f"Scores of networks that beat {FLOOR} at {at}.", ""]
+        text += [*markdown_table([width_cells(row, floor, at) for row in widths], WIDTHS), ""]
     streams = [row for row in rows if row["kind"] == "stream"]
-    text += [f"## Learned from the test streams themselves, {at}", "", STREAMS, ""]
-    header = ("network", "MACs/px", "restoring", "parameters", "steps", "rate", *HEADER[8:-1])
-    cells = [[starred(row), *size_cells(row), *score_cells(row["scores"][at]), *cost_cells(row)] for row in streams]
-    text += [*markdown_table(cells, header), ""]
+    if streams:
+        text += [f"## Learned from the test streams themselves, {at}", "", STREAMS, ""]
+        header = ("network", "MACs/px", "restoring", "parameters", "steps", "rate", *HEADER[8:-1])
+        cells = [[starred(row), *size_cells(row), *score_cells(row["scores"][at]), *cost_cells(row)] for row in streams]
+        text += [*markdown_table(cells, header), ""]
     text += ["## The same weights at other light levels, matched PSNR [dB]", ""]
     text += [*markdown_table(light_cells(rows), ("method", *(f"{light} PPP" for light in LIGHTS))), ""]
+    missing = ", ".join(name for name in ROWS if name not in {row["name"] for row in rows})
+    text += [f"Rows that are not made yet: {missing}.", ""] if missing else []
     text += notes_on(rows)
     write_bytes(out.with_suffix(".md"), "\n".join(text).encode())
     curves((record, widths), out.with_suffix(".png"))
@@ -249,6 +246,10 @@ def write_tables(out: Path) -> None:
 STREAMS = """The test clips share the thirty minutes: every clip is restored by weights that learned from its own codes
 alone. Sharp frames of a validation clip choose the rate."""
 RANKS = f"Networks below {FLOOR} have no rank. Frames: those of which one is restored, and how many of them lie ahead."
+WIDTHS = (
+    *("network", "MACs/px", "parameters", "steps", "rate", "last validation [dB]", "PSNR matched", "seconds/frame"),
+    "MB",
+)
 HEADER = (
     *("rank", "method", "frames", "MACs/px", "restoring", "parameters", "steps", "rate", "PSNR matched", "PSNR"),
     *("SSIM matched", *(f"{name} px" for name in bin_names()), "seconds/frame", "MB", "convolution [ms]"),
