@@ -219,7 +219,14 @@ def write_tables(out: Path) -> None:
     known: dict[str, Any] = next((row["scores"] for row in rows if row["kind"] == "classical"), {})
     methods = [(name, found[at]) for name, found in known.items()]
     floor = mean_of(known[FLOOR][at]) if FLOOR in known else -math.inf
-    text = ["# Every network after the same time", "", "    python docs/equal_budget.py DATA", "", LIMITS, ""]
+    text = [
+        "# Every network after the same time",
+        "",
+        "Made by `python docs/equal_budget.py out/starter`.",
+        "",
+        LIMITS,
+        "",
+    ]
     text += [f"![Validation PSNR over minutes of training]({out.name}.png)", ""]
     text += [f"## About one million multiply-adds per pixel and frame, {at}", ""]
     record = [row for row in networks if row["name"].endswith(RECORD)]
