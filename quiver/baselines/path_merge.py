@@ -82,9 +82,10 @@ def merge(window: Sequence[Prepared], offsets: Sequence[int], domain: Informatio
         moved = torch.empty(len(window), *window[0].codes.shape)
         inside = torch.ones_like(moved)
         for i, (frame, offset) in enumerate(zip(window, offsets, strict=True)):
-            moved[i] = frame.codes
             if offset:
                 moved[i], inside[i] = look(frame.codes, displacement(velocity, acceleration, offset))
+            else:
+                moved[i] = frame.codes
         weight = weights(moved, inside, offsets, domain)
         near = [i for i, offset in enumerate(offsets) if abs(offset) <= 1]
         still = sum((frame.codes for frame in window[1:]), window[0].codes) / len(window)
