@@ -131,12 +131,8 @@ def write_table(out: Path) -> None:
         table.append([*cells, ", ".join(f"{row['seed']}" + ("" if row["quiet"] else r"\*") for row in own)])
     header = ("pre-denoiser", "flow", "multi-scale", "parameters", "steps", "PSNR matched", "SSIM matched", "seeds")
     text = [
-        *(
-            "# The paper's ablation with a million parameters",
-            "",
-            "Made by `python docs/ablation_rows.py out/starter`.",
-            "",
-        ),
+        *("# The paper's ablation with a million parameters", ""),
+        *("Made by `python docs/ablation_rows.py out/starter`.", ""),
         *(LIMITS, "", *markdown_table(table, header), "", *notes_on(rows)),
     ]
     write_bytes(out.with_suffix(".md"), "\n".join(text).encode())

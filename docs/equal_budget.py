@@ -26,14 +26,26 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rows import LIGHTS, TINY, Budget, check_row, interval, make_row, notes_on, options, quiver, scores
+from rows import (
+    LIGHTS,
+    TINY,
+    Budget,
+    best_rate,
+    check_row,
+    converged,
+    interval,
+    make_row,
+    notes_on,
+    options,
+    quiver,
+    scores,
+)
 from stream_rows import stream_network
 
 from qsim.figures import new_figure, write_figure
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
 from quiver.cli.options import NETWORKS
-from quiver.cli.train import DIVERGED
 from quiver.evaluation.breakdown import bin_names
 
 FORMAT = "quiver-equal-budget-3"
@@ -79,9 +91,10 @@ def main(words: list[str] | None = None) -> int:
 
 def made(name: str, args: argparse.Namespace, budget: Budget) -> str | None:
     """Make a row and the tables; return a sentence if one of its commands failed, None otherwise."""
-    make = partial(classical, args, budget) if name == "classical" else partial(network, name, args, budget)
-    if name.startswith(APART):
-        make = partial(apart, name, args, budget)
+    if name == "classical":
+        make = partial(classical, args, budget)
+    else:
+        make = partial(apart if name.startswith(APART) else network, name, args, budget)
     sessions = args.work / f"{name}_sessions.json"
     try:
         make_row(args.out / f"{name}.json", budget, args.data, make, busy=args.busy or args.tiny, sessions=sessions)
@@ -109,7 +122,7 @@ def network(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, An
     for rate in RATES.get(name.removesuffix("-1m"), RATES_OF_OTHERS):
         folder = args.work / f"{name}_trial_{rate}"
         trials[rate] = trial(name, rate, folder, args.data, budget)
-    rate = max(trials, key=lambda key: trials[key]["psnr"] or -math.inf)
+    rate = best_rate(trials)
     folder = args.work / name
     train(name, rate, budget.minutes, folder, args.data, budget)
     found = read_json(folder / "history.json")
@@ -128,8 +141,7 @@ def network(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, An
 
 def apart(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
     """Return the row of a network that learns from each test stream, for a share of the time."""
-    found = stream_network(name, RATES_OF_OTHERS, args, budget)
-    folder = Path(found.pop("folder"))
+    found, folder = stream_network(name, RATES_OF_OTHERS, args, budget)
     spent = cost(str(folder), args.work / f"{name}_bench", budget)
     row = {"format": FORMAT, "name": name, "kind": "stream"}
     return row | found | of_design(folder / "best.safetensors") | {"cost": spent}
@@ -137,11 +149,7 @@ def apart(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, Any]
 
 def trial(name: str, rate: str, folder: Path, data: Path, budget: Budget) -> dict[str, Any]:
     """Return the PSNR [dB] of the last validation of a short run, None if it diverged, and its curve."""
-    try:
-        train(name, rate, budget.trial_minutes, folder, data, budget)
-    except subprocess.CalledProcessError as failed:
-        if failed.returncode != DIVERGED:
-            raise
+    if not converged(partial(train, name, rate, budget.trial_minutes, folder, data, budget)):
         return {"psnr": None, "curve": []}
     curve = read_json(folder / "history.json")["history"]
     return {"psnr": float(curve[-1]["psnr_matched"]), "curve": curve}
@@ -189,20 +197,8 @@ def train(name: str, rate: str, minutes: float, folder: Path, data: Path, budget
 def cost(method: str, folder: Path, budget: Budget) -> dict[str, Any]:
     """Return seconds, memory and multiply-accumulates per frame."""
     again = ["--force"] if (folder / "bench.json").exists() else []
-    quiver(
-        "bench",
-        "--methods",
-        method,
-        "--modes",
-        "exact",
-        "--size",
-        budget.size,
-        "-o",
-        folder,
-        *again,
-        "-q",
-        budget=budget,
-    )
+    words = ("--methods", method, "--modes", "exact", "--size", budget.size, "-o", folder, *again, "-q")
+    quiver("bench", *words, budget=budget)
     found: dict[str, Any] = read_json(folder / "bench.json")["costs"][0]
     height, width = (int(side) for side in budget.size.split("x"))
     return found | {"restoring_macs_per_pixel": 1e9 * (found["gmac_per_frame"] or math.nan) / (height * width)}
@@ -219,14 +215,8 @@ def write_tables(out: Path) -> None:
     known: dict[str, Any] = next((row["scores"] for row in rows if row["kind"] == "classical"), {})
     methods = [(name, found[at]) for name, found in known.items()]
     floor = mean_of(known[FLOOR][at]) if FLOOR in known else -math.inf
-    text = [
-        "# Every network after the same time",
-        "",
-        "Made by `python docs/equal_budget.py out/starter`.",
-        "",
-        LIMITS,
-        "",
-    ]
+    text = ["# Every network after the same time", "", "Made by `python docs/equal_budget.py out/starter`.", ""]
+    text += [LIMITS, ""]
     text += [f"![Validation PSNR over minutes of training]({out.name}.png)", ""]
     text += [f"## About one million multiply-adds per pixel and frame, {at}", ""]
     record = [row for row in networks if row["name"].endswith(RECORD)]
@@ -247,16 +237,15 @@ def write_tables(out: Path) -> None:
     text += [f"Rows that are not made yet: {missing}.", ""] if missing else []
     text += notes_on(rows)
     write_bytes(out.with_suffix(".md"), "\n".join(text).encode())
-    curves((record, widths), out.with_suffix(".png"))
+    curves(record, widths, out.with_suffix(".png"))
 
 
 STREAMS = """The test clips share the thirty minutes: every clip is restored by weights that learned from its own codes
-alone. Sharp frames of a validation clip choose the rate."""
+alone, and scored at this light only. A step has one window of 16 frames. Sharp frames of a validation clip choose the
+rate."""
 RANKS = f"Networks below {FLOOR} have no rank. Frames: those of which one is restored, and how many of them lie ahead."
-WIDTHS = (
-    *("network", "MACs/px", "parameters", "steps", "rate", "last validation [dB]", "PSNR matched", "seconds/frame"),
-    "MB",
-)
+WIDTHS = ("network", "MACs/px", "parameters", "steps", "rate", "last validation [dB]", "PSNR matched",
+          "seconds/frame", "MB")  # fmt: skip
 HEADER = (
     *("rank", "method", "frames", "MACs/px", "restoring", "parameters", "steps", "rate", "PSNR matched", "PSNR"),
     *("SSIM matched", *(f"{name} px" for name in bin_names()), "seconds/frame", "MB", "convolution [ms]"),
@@ -333,11 +322,12 @@ def light_cells(rows: list[dict[str, Any]]) -> list[list[str]]:
     ]
 
 
-def curves(parts: tuple[list[dict[str, Any]], list[dict[str, Any]]], path: Path) -> None:
-    """Draw validation PSNR over minutes: the table of record, and published widths."""
-    figure = new_figure(10, 4.5)
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, rows, title in zip(axes, parts, ("a million multiply-adds", "published widths"), strict=True):
+def curves(record: list[dict[str, Any]], widths: list[dict[str, Any]], path: Path) -> None:
+    """Draw validation PSNR over minutes: the table of record and, once they have rows, the published widths."""
+    parts = [("a million multiply-adds", record)] + [("published widths", widths)] * bool(widths)
+    figure = new_figure(5 * len(parts), 4.5)
+    axes = figure.subplots(1, len(parts), sharey=True, squeeze=False)[0]
+    for axis, (title, rows) in zip(axes, parts, strict=True):
         for i, row in enumerate(rows):
             minutes = [entry["elapsed"] / 60 for entry in row["curve"]]
             values = [entry["psnr_matched"] for entry in row["curve"]]

@@ -9,6 +9,7 @@ so busy cores are refused before a row begins, and a row states how many cores o
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import platform
 import shlex
@@ -23,6 +24,7 @@ from typing import Any
 import torch
 
 from qsim.files import VERSION, read_json, sha256, to_json, write_json
+from quiver.cli.train import DIVERGED
 
 ROOT = Path(__file__).parents[1]
 LIGHTS = ("3.25", "1", "9.75", "26")  # photons per pixel; training is at the first
@@ -231,6 +233,22 @@ def scores(methods: list[str], folder: Path, data: Path, lights: tuple[str, ...]
     for line in read_json(folder / "evaluation.json")["table"]:
         found.setdefault(line["method"], {})[line["light"]] = kept_scores(line)
     return found
+
+
+def best_rate(trials: dict[str, dict[str, Any]]) -> str:
+    """Return the rate whose trial has the highest PSNR; trials without one, which diverged, are last."""
+    return max(trials, key=lambda rate: -math.inf if trials[rate]["psnr"] is None else trials[rate]["psnr"])
+
+
+def converged(run: Callable[[], None]) -> bool:
+    """Run a training; return False if it diverged. Other failures are raised: `CalledProcessError`."""
+    try:
+        run()
+    except subprocess.CalledProcessError as failed:
+        if failed.returncode != DIVERGED:
+            raise
+        return False
+    return True
 
 
 def kept_scores(line: dict[str, Any]) -> dict[str, Any]:

@@ -8,17 +8,15 @@ training.
 from __future__ import annotations
 
 import argparse
-import math
+import json
 import shutil
-import subprocess
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from rows import LIGHTS, Budget, kept_scores, quiver
+from rows import LIGHTS, Budget, best_rate, converged, kept_scores, quiver
 
 from qsim.clip.sensing import sense
-from quiver.cli.train import DIVERGED
 from quiver.data.clips import Clip, open_clips
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
@@ -32,42 +30,58 @@ FRAMES = 16  # of a training window at most; a multiple of 8
 BATCH = 1  # as published: a window has 16 frames
 
 
-def stream_network(name: str, rates: tuple[str, ...], args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
-    """Return what the row of a network states that learns from the stream it restores: trials, scores and steps."""
-    clips = open_clips(args.data, "test")
-    first = open_clips(args.data, "val")[0]
+def stream_network(
+    name: str, rates: tuple[str, ...], args: argparse.Namespace, budget: Budget
+) -> tuple[dict[str, Any], Path]:
+    """Return what the row of a network states that learns from the stream it restores, and one of its runs.
+
+    `ValueError` for a data set without validation or test clips.
+    """
+    clips, first = clips_of(args.data, "test"), clips_of(args.data, "val")[0]
     trials = {rate: {"psnr": trial(name, rate, first, args, budget)} for rate in rates}
-    rate = max(trials, key=lambda key: trials[key]["psnr"] or -math.inf)
-    results = [learned(name, rate, budget.minutes / len(clips), clip, args, budget) for clip in clips]
-    line = json_safe(asdict(summarise([replace(row, method=name) for row, _ in results])[0]))
-    return {
+    rate = best_rate(trials)
+    minutes = budget.minutes / len(clips)
+    runs = [learned(name, rate, minutes, clip, args, budget) for clip in clips]
+    rows = [replace(restored(run, clip, args.data), method=name) for run, clip in zip(runs, clips, strict=True)]
+    line = json_safe(asdict(summarise(rows)[0]))
+    notes = [metadata_of(run / "best.safetensors") for run in runs]
+    found = {
         "rate": float(rate),
         "trials": trials,
-        "minutes_per_clip": budget.minutes / len(clips),
-        "steps": sum(int(metadata_of(folder / "best.safetensors")["step"]) for _, folder in results),
-        "folder": str(results[0][1]),
+        "settings": json.loads(notes[0]["settings"]),  # those of the first clip
+        "minutes_per_clip": minutes,
+        "steps": sum(int(note["step"]) for note in notes),
         "scores": {line["light"]: kept_scores(line)},
     }
+    return found, runs[0]
+
+
+def clips_of(data: Path, split: str) -> list[Clip]:
+    """Return the clips of a split. `ValueError` if there are none."""
+    found = open_clips(data, split)
+    if not found:
+        raise ValueError(f"{data}: no clip in the split {split}, which this row needs; give a data set that has one")
+    return found
 
 
 def trial(name: str, rate: str, clip: Clip, args: argparse.Namespace, budget: Budget) -> float | None:
-    """Return the matched PSNR [dB] of a clip after a short run on its stream; None if it diverged or failed."""
-    try:
-        score = learned(name, rate, budget.trial_minutes, clip, args, budget)[0].score
-    except subprocess.CalledProcessError as failed:
-        if failed.returncode != DIVERGED:
-            raise
+    """Return the matched PSNR [dB] of a clip after a short run on its stream; None if it diverged.
+
+    `ValueError` if the clip cannot be restored.
+    """
+    runs: list[Path] = []
+    if not converged(lambda: runs.append(learned(name, rate, budget.trial_minutes, clip, args, budget))):
         return None
-    return None if score is None else score.psnr_matched
+    row = restored(runs[0], clip, args.data)
+    if row.score is None:
+        raise ValueError(f"{clip.name}, restored by {name}: {row.failure}")
+    return row.score.psnr_matched
 
 
-def learned(
-    name: str, rate: str, minutes: float, clip: Clip, args: argparse.Namespace, budget: Budget
-) -> tuple[ComparisonRow, Path]:
-    """Train on the stream of one clip, restore it, and return its scores and the folder of the run."""
+def learned(name: str, rate: str, minutes: float, clip: Clip, args: argparse.Namespace, budget: Budget) -> Path:
+    """Train on the stream of one clip, unless it is done, and return the folder of the run."""
     copy, folder = args.work / f"{name}_clips" / clip.name, args.work / f"{name}_{clip.name}_{rate}"
-    if not copy.exists():
-        shutil.copytree(clip.path, copy)
+    shutil.copytree(clip.path, copy, dirs_exist_ok=True)
     sense(Clip.open(copy), LIGHT.sensing(0))
     frames = min(FRAMES, len(clip) // 8 * 8)
     quiver(
@@ -75,6 +89,10 @@ def learned(
         *("--learning-rate", rate, "--crop", budget.crop, "--batch", BATCH, "--frames", frames, "-q"),
         budget=budget,
     )
+    return folder
+
+
+def restored(run: Path, clip: Clip, data: Path) -> ComparisonRow:
+    """Return the scores of a clip restored by the weights of a run, from the codes that the run learned from."""
     codes, factor = sensed(clip, LIGHT)
-    comparison = Comparison(str(args.data), lights=(LIGHT,))
-    return restore_clip(restorer(str(folder)), clip, LIGHT, comparison, codes, factor), folder
+    return restore_clip(restorer(str(run)), clip, LIGHT, Comparison(str(data), lights=(LIGHT,)), codes, factor)

@@ -19,6 +19,7 @@ sys.path.insert(0, str(ROOT / "docs"))
 import ablation_rows  # noqa: E402
 import equal_budget  # noqa: E402
 import rows  # noqa: E402
+import stream_rows  # noqa: E402
 
 
 def run(*words: object, program: str = "equal_budget") -> subprocess.CompletedProcess[str]:
@@ -52,6 +53,20 @@ def test_a_trial_that_diverges_is_the_worst(tmp_path, monkeypatch):
             continue
         with pytest.raises(subprocess.CalledProcessError):
             equal_budget.trial("emvd", "1e-3", tmp_path, tmp_path, rows.TINY)
+
+
+def test_a_rate_whose_trial_diverged_is_not_chosen():
+    assert rows.best_rate({"1e-3": {"psnr": None}, "3e-4": {"psnr": -2.0}}) == "3e-4"
+    assert rows.best_rate({"1e-3": {"psnr": 0.0}, "3e-4": {"psnr": -2.0}}) == "1e-3"
+
+
+def test_streams_need_validation_and_test_clips(tmp_path):
+    from clips import write_dataset
+
+    data = write_dataset(tmp_path / "data", {"train": 1, "test": 1})
+    assert len(stream_rows.clips_of(data, "test")) == 1
+    with pytest.raises(ValueError, match="no clip in the split val"):
+        stream_rows.clips_of(data, "val")
 
 
 # ---- Busy cores
