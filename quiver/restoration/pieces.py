@@ -97,7 +97,7 @@ def bytes_per_pixel(model: nn.Module) -> int:
 # Bytes per pixel that restoring a part of a clip takes at published width: measured with one frame, and more for each.
 CLIP_BYTES = {
     "Bit2Bit": (2000, 700),
-    "EMVD": (650, 40),
+    "EMVD": (650, 20),
     "FastDVDnet": (2000, 30),
     "FloRNN": (10_000, 60),
     "MemDeblur": (2000, 90),

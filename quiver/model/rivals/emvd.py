@@ -92,8 +92,8 @@ class EMVD(nn.Module):
         table, state, restored = table_of(variance, frames), None, []
         for image in self.packed(pad_space(frames, self.multiple)).unbind(1):
             output, state = self.step(state, image, table)
-            restored.append(output)
-        return self.unpacked(torch.stack(restored, dim=1))[..., : frames.shape[-2], : frames.shape[-1]]
+            restored.append(self.unpacked(output))
+        return torch.stack(restored, dim=1)[..., : frames.shape[-2], : frames.shape[-1]]
 
     def packed(self, frames: Tensor) -> Tensor:
         """[B, T, 1, H, W] -> images [B, T, 4, h, w]; h, w = H, W or half of them."""
@@ -101,11 +101,11 @@ class EMVD(nn.Module):
             return F.pixel_unshuffle(frames, 2)
         return frames.expand(-1, -1, IMAGE, -1, -1)
 
-    def unpacked(self, images: Tensor) -> Tensor:
-        """Images [B, T, 4, h, w] -> frames [B, T, 1, H, W]."""
+    def unpacked(self, image: Tensor) -> Tensor:
+        """Image [B, 4, h, w] -> frame [B, 1, H, W]."""
         if self.config.space_to_depth:
-            return F.pixel_shuffle(images, 2)
-        return images.mean(dim=2, keepdim=True)
+            return F.pixel_shuffle(image, 2)
+        return image.mean(dim=1, keepdim=True)
 
     def step(self, state: Tensor | None, image: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
         """Image [N, 4, h, w], noise table [N, n] -> (restored image, next state); the first state is None.

@@ -128,9 +128,9 @@ class FloRNN(nn.Module):
                 raise ValueError(f"flows must be {needed} forward and backward, got {found}; give one per pair")
             flows = Flows(*(pad_space(flow, 1, LEAST_SIDE) for flow in flows)) if count > 1 else self.flows(frames)
         order = reflected(0, count + self.look_ahead, count)
-        images = frames.expand(-1, -1, self.config.image_channels, -1, -1)
+        images = frames[:, order].expand(-1, -1, self.config.image_channels, -1, -1)
         noise = self.noise(frames, variance)[:, order]
-        restored = self.restore(images[:, order], noise, reflected_flows(flows, self.look_ahead))
+        restored = self.restore(images, noise, reflected_flows(flows, self.look_ahead))
         return restored.mean(dim=2, keepdim=True)[..., :height, :width]
 
     def flows(self, frames: Tensor) -> Flows:

@@ -37,7 +37,7 @@ class Means(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.unused = nn.Parameter(torch.zeros(1))
-        self.longest = 0
+        self.longest = self.computed = 0
 
     def forward(self, frames: Tensor) -> Tensor:
         count = frames.shape[1]
@@ -54,6 +54,7 @@ class Sums(Means):
 
     def forward(self, frames: Tensor) -> Tensor:
         self.longest = max(self.longest, frames.shape[1])
+        self.computed += frames.shape[1]
         return frames.cumsum(dim=1)
 
 
@@ -92,6 +93,13 @@ def test_a_range_of_frames_is_that_of_the_complete_stream():
             first, last = sorted(int(n) for n in rng.integers(0, 61, 2))
             if first < last:
                 np.testing.assert_array_equal(restored(network, codes, None, first, last), whole[first:last])
+
+
+@pytest.mark.parametrize(("frames", "computed"), [(1, 1), (24, 24), (32, 32), (33, 32 + 11), (96, 32 + 42 + 42)])
+def test_a_recurrent_network_computes_only_the_past_of_parts_again(frames, computed):
+    network, codes = Sums(), random_codes(frames, 3, 4)
+    restored(network, codes)
+    assert network.computed == computed
 
 
 @pytest.mark.parametrize("name", [name for name in CLIPS if hasattr(tiny(name), "windows")])
