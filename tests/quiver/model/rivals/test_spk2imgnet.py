@@ -37,6 +37,18 @@ def test_every_stage_equals_the_published_one():
     assert found["output"] < 1e-12
 
 
+def test_two_windows_of_another_size_equal_the_published_numbers():
+    codes = np.random.default_rng(32).integers(0, 8, (2, 10, 20, 36))
+    found = golden_spk2imgnet.stages({"codes": codes}, weights_by_table(TABLE))
+    wanted = {
+        "output": (0.0255789003, 0.0415459985, 0.0401262717),
+        "estimates": (-0.1278755178, 0.3001407764, 0.1372021017),  # of group 4
+    }
+    for key, array in (("output", found["output"].detach()), ("estimates", found["estimates"][:, 4].detach())):
+        ours = (array.mean(), array.std(correction=0), array.flatten()[-1])
+        assert ours == pytest.approx(wanted[key], abs=1e-10), key
+
+
 def test_stages_of_other_widths_batches_and_sizes():
     weights = golden_spk2imgnet.small().state_dict()
     large = golden_spk2imgnet.stages(codes(3, 10, 12, 16), weights)
