@@ -33,6 +33,7 @@ from rows import (
     best_rate,
     check_row,
     converged,
+    cost,
     interval,
     make_row,
     notes_on,
@@ -126,17 +127,28 @@ def network(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, An
     folder = args.work / name
     train(name, rate, budget.minutes, folder, args.data, budget)
     found = read_json(folder / "history.json")
-    scored = scores([str(folder)], args.work / f"{name}_scores", args.data, LIGHTS, budget)
-    row = {"format": FORMAT, "name": name, "kind": "network", "rate": float(rate)}
-    row |= {
-        "trials": trials,
-        "settings": found["settings"],
-        "curve": found["history"],
-        "steps": found["history"][-1]["step"],
-    }
+    curve, lights = found["history"], lights_of(name, args, budget, found["history"][-1]["psnr_matched"])
+    scored = {name: {}}
+    if lights:
+        scored = scores([str(folder)], args.work / f"{name}_scores", args.data, lights, budget)
+    row = {"format": FORMAT, "name": name, "kind": "network", "rate": float(rate), "trials": trials}
+    row |= {"settings": found["settings"], "curve": curve, "steps": curve[-1]["step"]}
     design = of_design(folder / "best.safetensors")
     spent = cost(str(folder), args.work / f"{name}_bench", budget)
     return row | design | {"scores": scored[name], "cost": spent}
+
+
+def lights_of(name: str, args: argparse.Namespace, budget: Budget, validation: float) -> tuple[str, ...]:
+    """Return the light levels at which a network is scored.
+
+    One of published width is scored at the light of training alone, and only if its last validation [dB] is above
+    that of FLOOR: the largest take hours for what has no rank.
+    """
+    if name.endswith(RECORD):
+        return LIGHTS
+    words = ([FLOOR], args.work / f"{name}_floor", args.data, LIGHTS[:1], budget, "val")
+    floor = next(iter(scores(*words)[FLOOR].values()))
+    return LIGHTS[:1] if validation > mean_of(floor) else ()
 
 
 def apart(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
@@ -194,16 +206,6 @@ def train(name: str, rate: str, minutes: float, folder: Path, data: Path, budget
     )  # fmt: skip
 
 
-def cost(method: str, folder: Path, budget: Budget) -> dict[str, Any]:
-    """Return seconds, memory and multiply-accumulates per frame."""
-    again = ["--force"] if (folder / "bench.json").exists() else []
-    words = ("--methods", method, "--modes", "exact", "--size", budget.size, "-o", folder, *again, "-q")
-    quiver("bench", *words, budget=budget)
-    found: dict[str, Any] = read_json(folder / "bench.json")["costs"][0]
-    height, width = (int(side) for side in budget.size.split("x"))
-    return found | {"restoring_macs_per_pixel": 1e9 * (found["gmac_per_frame"] or math.nan) / (height * width)}
-
-
 # ---- Tables
 
 
@@ -223,7 +225,7 @@ def write_tables(out: Path) -> None:
     text += [*markdown_table(ranked(record, methods, floor, at), HEADER), "", RANKS, ""]
     widths = [row for row in networks if row not in record]
     if widths:
-        text += ["## Published widths", "", f"Scores of networks that beat {FLOOR} at {at}.", ""]
+        text += ["## Published widths", "", f"Test clips of networks that beat {FLOOR}, on validation clips first.", ""]
         text += [*markdown_table([width_cells(row, floor, at) for row in widths], WIDTHS), ""]
     streams = [row for row in rows if row["kind"] == "stream"]
     if streams:
@@ -270,8 +272,8 @@ def ranked(
 
 def width_cells(row: dict[str, Any], floor: float, at: str) -> list[str]:
     """Return the cells of a network of published width, whose score stands there if it is above the floor."""
-    found = row["scores"][at]
-    score = interval(found["scores"]["psnr_matched"], 2) if mean_of(found) >= floor else "below"
+    found = row["scores"].get(at)
+    score = interval(found["scores"]["psnr_matched"], 2) if found and mean_of(found) >= floor else "below"
     macs, _, *others = size_cells(row)
     return [starred(row), macs, *others, f"{row['curve'][-1]['psnr_matched']:.2f}", score, *cost_cells(row)]
 
@@ -314,8 +316,10 @@ def light_cells(rows: list[dict[str, Any]]) -> list[list[str]]:
     """Return the cells of all methods at all light levels."""
     found: dict[str, Any] = {}
     for row in rows:
-        if row["kind"] != "stream":
-            found |= row["scores"] if row["kind"] == "classical" else {row["name"]: row["scores"]}
+        if row["kind"] == "classical":
+            found |= row["scores"]
+        elif row["name"].endswith(RECORD) and row["kind"] == "network":
+            found[row["name"]] = row["scores"]
     lights = [f"{float(light):g} PPP, 3 bit" for light in LIGHTS]
     return [
         [name, *(interval(own[light]["scores"]["psnr_matched"], 2) for light in lights)] for name, own in found.items()

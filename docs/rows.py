@@ -223,10 +223,13 @@ def quiver(*words: object, budget: Budget) -> None:
     subprocess.run([sys.executable, "-m", "quiver", *line], check=True)
 
 
-def scores(methods: list[str], folder: Path, data: Path, lights: tuple[str, ...], budget: Budget) -> dict[str, Any]:
-    """Return the scores on test clips by method and light."""
+def scores(
+    methods: list[str], folder: Path, data: Path, lights: tuple[str, ...], budget: Budget, split: str = "test"
+) -> dict[str, Any]:
+    """Return the scores on the clips of a split by method and light."""
     quiver(
-        *("evaluate", data, "-o", folder, "--methods", ",".join(methods), "--ppp", ",".join(lights), "-q"),
+        *("evaluate", data, "-o", folder, "--methods", ",".join(methods), "--ppp", ",".join(lights)),
+        *("--split", split, "-q"),
         budget=budget,
     )
     found: dict[str, Any] = {}
@@ -249,6 +252,16 @@ def converged(run: Callable[[], None]) -> bool:
             raise
         return False
     return True
+
+
+def cost(method: str, folder: Path, budget: Budget) -> dict[str, Any]:
+    """Return seconds, memory and multiply-accumulates per frame."""
+    again = ["--force"] if (folder / "bench.json").exists() else []
+    words = ("--methods", method, "--modes", "exact", "--size", budget.size, "-o", folder, *again, "-q")
+    quiver("bench", *words, budget=budget)
+    found: dict[str, Any] = read_json(folder / "bench.json")["costs"][0]
+    height, width = (int(side) for side in budget.size.split("x"))
+    return found | {"restoring_macs_per_pixel": 1e9 * (found["gmac_per_frame"] or math.nan) / (height * width)}
 
 
 def kept_scores(line: dict[str, Any]) -> dict[str, Any]:
