@@ -6,8 +6,11 @@ import math
 import time
 
 import numpy as np
+import pytest
 
+from quiver.evaluation import cost as costs
 from quiver.evaluation.cost import CostCase, CostRow, CostSettings, cases_of, fixed_clip, markdown, measure
+from quiver.restoration.interface import Restorer
 
 
 def test_the_clip_is_fixed_and_as_bright_as_asked():
@@ -35,6 +38,22 @@ def test_a_classical_case_has_seconds_and_a_score():
     assert 0 < 3 * cost.seconds_per_frame < time.perf_counter() - started
     assert cost.psnr_matched > 10
     assert math.isnan(cost.gmac_per_frame)
+
+
+@pytest.mark.parametrize(("together", "long", "runs"), [(1, 0.0, [2, 16]), (4, 10.0, [4, 4]), (4, 0.0, [4])])
+def test_a_long_part_is_run_once(together, long, runs, monkeypatch):
+    done = []
+
+    def fill(codes, out, first, progress):
+        done.append(len(out))
+        out += codes.read(first, first + len(out))
+
+    method = Restorer("n", 1, 0, False, "", fill, together=together)
+    monkeypatch.setattr(costs, "method_of", lambda case, device: (method, True))
+    monkeypatch.setattr(costs, "LONG", long)
+    cost = measure(CostCase("n"), CostSettings(16, 16))
+    assert done == runs
+    assert 0 < cost.seconds_per_frame < 1
 
 
 def test_the_table_names_what_failed():
