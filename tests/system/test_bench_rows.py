@@ -1,0 +1,57 @@
+"""The program of the page of costs: rows are made once, and the page holds what they hold."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from quiver.cli.options import NETWORKS
+from quiver.evaluation.cost import checked_cases
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
+import bench_rows
+
+
+def test_rows_are_made_once_and_shown(tmp_path, capfd):
+    out = tmp_path / "rows"
+    words = ["--tiny", "--out", str(out), "--rows", "moment,emvd"]
+    assert bench_rows.main(words) == 0
+    capfd.readouterr()
+    assert bench_rows.main(words) == 0
+    assert capfd.readouterr().out == ""
+    page = out.with_suffix(".md").read_text()
+    row = json.loads((out / "emvd.json").read_text())["costs"][0]
+    taken, memory, macs = row["seconds_per_frame"], row["peak_bytes"] / 1e6, row["gmac_per_frame"]
+    line = re.search(r"\| emvd(?:\\\*)? \| ([^|]+) \| ([^|]+) \| ([^|]+) \| ([^|]+) \|", page)
+    assert line is not None
+    assert line.groups() == (f"{taken:.3g}", f"{1 / taken:.3g}", f"{memory:.0f}", f"{macs:.3g}")
+    assert "Frames of 32 x 32 px" in page
+    assert "not made yet: transform-denoise" in page
+    assert bench_rows.main([*words[1:], "--busy"]) == 2  # of another size
+    assert "was made with other options" in capfd.readouterr().err
+
+
+def test_every_network_has_a_row_whose_options_are_known():
+    assert {name for name in NETWORKS if name.endswith("-1m")} <= {*bench_rows.ROWS}
+    for name in bench_rows.ROWS:
+        plan = bench_rows.plan_of(name, tiny=False)
+        modes, precisions = (text and text.split(",") for text in (plan.modes, plan.precisions))
+        found = checked_cases(plan.methods.split(","), modes, precisions, None)
+        assert len(found) == (6 if name == "modes" else 1)
+
+
+@pytest.mark.parametrize("cost", [None, "out of memory"])
+def test_a_failed_method_stands_last(cost):
+    row = {"seconds_per_frame": None if cost else 2.0, "gmac_per_frame": None, "psnr_matched": None, "peak_bytes": 0}
+    found = bench_rows.cells(row | {"failure": cost})
+    assert found == (["failed: out of memory", *[""] * 4] if cost else ["2", "0.5", "0", "", ""])
+    assert bench_rows.seconds({"costs": [row]}) == (float("inf") if cost else 2.0)
+
+
+def test_an_unknown_row_is_one_sentence(capsys):
+    assert bench_rows.main(["--rows", "mergnet"]) == 2
+    assert capsys.readouterr().err.startswith("bench_rows: no row is called 'mergnet'; known are moment,")
