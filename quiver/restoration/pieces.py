@@ -98,7 +98,7 @@ def bytes_per_pixel(model: nn.Module) -> int:
 CLIP_BYTES = {
     "Bit2Bit": (2000, 700),
     "EMVD": (650, 20),
-    "FastDVDnet": (2000, 30),
+    "FastDVDnet": (1000, 30),
     "FloRNN": (10_000, 60),
     "MemDeblur": (2000, 90),
     "RVRT": (4400, 1280),
