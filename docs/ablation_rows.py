@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from rows import LIGHTS, TINY, Budget, check_row, make_row, notes_on, options, scores
+from rows import LIGHTS, TINY, Budget, check_row, make_row, notes_on, options, scores, starred
 
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
@@ -128,7 +128,7 @@ def write_table(out: Path) -> None:
         for key, digits in (("psnr_matched", 2), ("ssim_matched", 3)):
             found = [row["scores"][key]["mean"] for row in own]
             cells.append("n/a" if None in found else f"{np.mean(found):.{digits}f} ± {np.ptp(found) / 2:.{digits}f}")
-        table.append([*cells, ", ".join(f"{row['seed']}" + ("" if row["quiet"] else r"\*") for row in own)])
+        table.append([*cells, ", ".join(starred(row, row["seed"]) for row in own)])
     header = ("pre-denoiser", "flow", "multi-scale", "parameters", "steps", "PSNR matched", "SSIM matched", "seeds")
     text = [
         *("# The paper's ablation with a million parameters", ""),

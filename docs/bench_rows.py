@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rows import ROOT, Budget, Watch, machine, quiver, refuse_busy, store
+from rows import ROOT, Budget, Watch, machine, missing_rows, notes_on, quiver, refuse_busy, starred, store
 
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
@@ -31,6 +31,7 @@ CLASSICAL = ("moment", "transform-denoise", "qbp", "qbp-bm3d", "path-merge")
 SMALL = ("emvd", "unet", "fastdvdnet", "student-teacher")  # of published width, with fewer multiply-adds than a million
 EQUAL = tuple(f"{name}-1m" for name in ("mergenet", "quiver-s", *COMPARED))
 MODES = "modes"
+RESULTS = ROOT / "docs" / "results" / "bench"
 ROWS = (*CLASSICAL, "mergenet", *SMALL, *EQUAL, MODES)
 HEADER = ("method", "seconds/frame", "frames/s", "memory [MB]", "GMAC/frame", "PSNR matched [dB]")
 
@@ -59,7 +60,7 @@ def plan_of(name: str, *, tiny: bool) -> Plan:
 def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rows", default=",".join(ROWS), help="comma-separated (default all)")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "bench", help="folder of the rows")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the rows")
     parser.add_argument("--tiny", action="store_true", help="frames of 32x32 px, on any cores")
     parser.add_argument("--busy", action="store_true", help="make rows on busy cores too, and mark them")
     args = parser.parse_args(words)
@@ -67,6 +68,9 @@ def main(words: list[str] | None = None) -> int:
     unknown = sorted(set(names) - set(ROWS))
     if unknown:
         print(f"bench_rows: no row is called {unknown[0]!r}; known are {', '.join(ROWS)}", file=sys.stderr)
+        return 2
+    if args.tiny and args.out == RESULTS:
+        print("bench_rows: --tiny makes rows of 32x32 px, which do not belong on the page; give --out", file=sys.stderr)
         return 2
     try:
         for name in names:
@@ -115,35 +119,21 @@ def write_page(out: Path) -> None:
         found = [[cost["mode"], cost["precision"], *cells(cost)[:-1]] for cost in modes["costs"]]
         text += [*markdown_table(found, ("mode", "precision", *HEADER[1:-1])), ""]
     known = [row for row in (*rows.values(), modes) if row is not None]
-    missing = ", ".join(name for name in ROWS if name not in {row["name"] for row in known})
-    text += [f"Rows that are not made yet: {missing}.", ""] if missing else []
-    loud = ", ".join(row["name"] for row in known if not row["quiet"])
-    text += [f"\\* made beside other programs: {loud}.", ""] if loud else []
-    text += [f"Machine: {'; '.join(sorted({described(row) for row in known}))}.", ""]
+    text += [*missing_rows(ROWS, known), *notes_on(known)]
     write_bytes(out.with_suffix(".md"), "\n".join(text).encode())
 
 
 NOTES = """The fixed clip of `quiver bench` at 3.25 PPP and 3 bits. Memory is what restoring adds to the process.
 Networks of a million multiply-adds per pixel and frame end in `-1m`; their weights are random, so that they have no
-PSNR. Those that restore a clip in parts are charged with the frames around a part, too. A frame that takes more than
-2 GB is cut into tiles."""
+PSNR. Those that restore a clip in parts are charged with the frames around a part, too. Methods that search motion take
+another time on other clips."""
 MODE_NOTES = "`exact` shares work between windows and gives the numbers of `windows`; `streaming` keeps its state."
-
-
-def described(row: dict[str, Any]) -> str:
-    """Return the machine of a row, and its threads."""
-    return f"{row['machine']}, threads: {row['plan']['threads']}"
 
 
 def seconds(row: dict[str, Any]) -> float:
     """Return the seconds per frame of a row, infinite where it failed."""
     found = row["costs"][0]["seconds_per_frame"]
     return math.inf if found is None else float(found)
-
-
-def starred(row: dict[str, Any]) -> str:
-    """Return the name of a row; a star marks one that was made on busy cores."""
-    return str(row["name"]) + ("" if row["quiet"] else r"\*")
 
 
 def cells(cost: dict[str, Any]) -> list[str]:

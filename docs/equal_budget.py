@@ -36,10 +36,12 @@ from rows import (
     cost,
     interval,
     make_row,
+    missing_rows,
     notes_on,
     options,
     quiver,
     scores,
+    starred,
 )
 from stream_rows import stream_network
 
@@ -127,8 +129,8 @@ def network(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, An
     folder = args.work / name
     train(name, rate, budget.minutes, folder, args.data, budget)
     found = read_json(folder / "history.json")
-    curve, lights = found["history"], lights_of(name, args, budget, found["history"][-1]["psnr_matched"])
-    scored = {name: {}}
+    curve, scored = found["history"], {name: {}}
+    lights = lights_of(name, args, budget, curve[-1]["psnr_matched"])
     if lights:
         scored = scores([str(folder)], args.work / f"{name}_scores", args.data, lights, budget)
     row = {"format": FORMAT, "name": name, "kind": "network", "rate": float(rate), "trials": trials}
@@ -225,7 +227,7 @@ def write_tables(out: Path) -> None:
     text += [*markdown_table(ranked(record, methods, floor, at), HEADER), "", RANKS, ""]
     widths = [row for row in networks if row not in record]
     if widths:
-        text += ["## Published widths", "", f"Test clips of networks that beat {FLOOR}, on validation clips first.", ""]
+        text += ["## Published widths", "", SCORED, ""]
         text += [*markdown_table([width_cells(row, floor, at) for row in widths], WIDTHS), ""]
     streams = [row for row in rows if row["kind"] == "stream"]
     if streams:
@@ -235,9 +237,7 @@ def write_tables(out: Path) -> None:
         text += [*markdown_table(cells, header), ""]
     text += ["## The same weights at other light levels, matched PSNR [dB]", ""]
     text += [*markdown_table(light_cells(rows), ("method", *(f"{light} PPP" for light in LIGHTS))), ""]
-    missing = ", ".join(name for name in ROWS if name not in {row["name"] for row in rows})
-    text += [f"Rows that are not made yet: {missing}.", ""] if missing else []
-    text += notes_on(rows)
+    text += [*missing_rows(ROWS, rows), *notes_on(rows)]
     write_bytes(out.with_suffix(".md"), "\n".join(text).encode())
     curves(record, widths, out.with_suffix(".png"))
 
@@ -246,6 +246,7 @@ STREAMS = """The test clips share the thirty minutes: every clip is restored by 
 alone, and scored at this light only. A step has one window of 16 frames. Sharp frames of a validation clip choose the
 rate."""
 RANKS = f"Networks below {FLOOR} have no rank. Frames: those of which one is restored, and how many of them lie ahead."
+SCORED = f"A network above {FLOOR} on the validation clips is scored on test clips; a score below it there is left out."
 WIDTHS = ("network", "MACs/px", "parameters", "steps", "rate", "last validation [dB]", "PSNR matched",
           "seconds/frame", "MB")  # fmt: skip
 HEADER = (
@@ -282,11 +283,6 @@ def mean_of(found: dict[str, Any]) -> float:
     """Return the matched PSNR [dB] of a method at a light; minus infinity if it failed."""
     value = found["scores"]["psnr_matched"]["mean"]
     return -math.inf if value is None else float(value)
-
-
-def starred(row: dict[str, Any]) -> str:
-    """Return the name of a row; a star marks one that was made on busy cores."""
-    return str(row["name"]) + ("" if row["quiet"] else r"\*")
 
 
 def size_cells(row: dict[str, Any]) -> list[str]:

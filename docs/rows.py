@@ -191,11 +191,23 @@ def recipe_digest(data: Path) -> str | None:
     return sha256(to_json(read_json(path)["recipe"])) if path.exists() else None
 
 
+def starred(row: dict[str, Any], name: object = None) -> str:
+    """Return the name of a row, or what stands for it; a star marks one that was made beside other programs."""
+    return str(row["name"] if name is None else name) + ("" if row["quiet"] else r"\*")
+
+
+def missing_rows(names: Iterable[str], rows: list[dict[str, Any]]) -> list[str]:
+    """Return lines below a table that name the rows that are not made yet; none if all are."""
+    missing = ", ".join(name for name in names if name not in {row["name"] for row in rows})
+    return [f"Rows that are not made yet: {missing}.", ""] if missing else []
+
+
 def notes_on(rows: list[dict[str, Any]]) -> list[str]:
-    """Return lines below a table: which rows were made beside other programs, and the machines."""
+    """Return lines below a table: which rows were made beside other programs, the machines and their speed if known."""
     loud = [row["name"] for row in rows if not row["quiet"]]
-    machines = sorted({f"{row['machine']}, {row['budget']['threads']} threads" for row in rows})
-    speeds = [speed for row in rows for speed in row["reference_convolution_ms"]]
+    threads = [(row.get("budget") or row["plan"])["threads"] for row in rows]
+    machines = sorted({f"{row['machine']}, {count} threads" for row, count in zip(rows, threads, strict=True)})
+    speeds = [speed for row in rows for speed in row.get("reference_convolution_ms", ())]
     text = [f"\\* made beside other programs: {', '.join(loud)}.", ""] if loud else []
     span = f" Reference convolution: {min(speeds):.2f} to {max(speeds):.2f} ms." if speeds else ""
     return [*text, f"Machine: {'; '.join(machines)}.{span}", ""]

@@ -45,11 +45,18 @@ def test_every_network_has_a_row_whose_options_are_known():
 
 
 @pytest.mark.parametrize("cost", [None, "out of memory"])
-def test_a_failed_method_stands_last(cost):
+def test_a_failed_method_states_why_and_counts_as_slowest(cost):
     row = {"seconds_per_frame": None if cost else 2.0, "gmac_per_frame": None, "psnr_matched": None, "peak_bytes": 0}
     found = bench_rows.cells(row | {"failure": cost})
     assert found == (["failed: out of memory", *[""] * 4] if cost else ["2", "0.5", "0", "", ""])
     assert bench_rows.seconds({"costs": [row]}) == (float("inf") if cost else 2.0)
+
+
+def test_tiny_rows_stay_away_from_the_results(capsys):
+    before = sorted(bench_rows.RESULTS.iterdir())
+    assert bench_rows.main(["--tiny", "--rows", "moment"]) == 2
+    assert capsys.readouterr().err.endswith("give --out\n")
+    assert sorted(bench_rows.RESULTS.iterdir()) == before
 
 
 def test_an_unknown_row_is_one_sentence(capsys):
