@@ -140,14 +140,16 @@ def make_row(
 ) -> None:
     """Write one row, unless it exists. `make` returns what is its own; the rest is budget, machine and its speed.
 
-    `ValueError` if it exists with another budget or data set, and on busy cores unless `busy`. A row states the cores
-    that others used, and the convolution before and after. The file `sessions` holds the cores that others used in
-    every session that worked on the row: a row that was resumed is as quiet as the loudest of them, and not quiet if
-    one was killed, whose load is not known.
+    `ValueError` if it exists with another budget or data set, and on busy cores unless `busy`; `FileNotFoundError`
+    without the data set. A row states the cores that others used, and the convolution before and after. The file
+    `sessions` holds the cores that others used in every session that worked on the row: a row that was resumed is as
+    quiet as the loudest of them, and not quiet if one was killed, whose load is not known.
     """
     if path.exists():
         check_row(path, budget, data)
         return
+    if not data.is_dir():
+        raise FileNotFoundError(f"{data}: no such data set")
     if not busy:
         refuse_busy()
     earlier = read_json(sessions)["cores_of_others"] if sessions.exists() else []

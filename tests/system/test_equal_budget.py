@@ -41,6 +41,14 @@ def test_an_unknown_row_is_one_sentence(program, known, capsys):
     assert {*known} <= {*told}
 
 
+@pytest.mark.parametrize("program", [equal_budget, ablation_rows], ids=str)
+def test_a_missing_data_set_is_one_sentence(program, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert program.main(["none", "--rows", "all" if program is ablation_rows else "unet", "--tiny", "--out", "r"]) == 2
+    assert capsys.readouterr().err == f"{program.__name__}: none: no such data set\n"
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
 def test_a_trial_that_diverges_is_the_worst(tmp_path, monkeypatch):
     """Other failures leave the row without a trial: a program that ran out of memory has not diverged."""
     for code, known in ((3, True), (1, False), (130, False), (2, False)):
