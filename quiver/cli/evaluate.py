@@ -209,7 +209,11 @@ def add_bench(sub: Any) -> None:
         "quiver bench --methods moment,mergenet,quiver-s --modes exact,streaming,windows --size 128x128 -o out/bench",
     )  # fmt: skip
     parser.add_argument(
-        "--methods", type=words, default="moment,unet,mergenet", help="comma-separated (default moment,unet,mergenet)"
+        "--methods",
+        type=words,
+        default="moment,unet,mergenet",
+        help="methods, weights, folders of runs, and presets, with random weights unless some ship; comma-separated "
+        "(default moment,unet,mergenet)",
     )
     parser.add_argument("--modes", type=words, help="modes of networks (default exact,streaming)")
     parser.add_argument(

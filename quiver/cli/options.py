@@ -17,16 +17,8 @@ from qsim.cli.options import count, memory_size, numbers, positive, whole_number
 from qsim.files import check_ours
 from quiver.device import DEVICES
 from quiver.model.removed import RemovedError, refuse_name
-from quiver.restoration.interface import AUTO, COMPARED, MODES
+from quiver.restoration.interface import AUTO, MODES
 
-QUIVERS = ("quiver-s", "quiver")  # see quiver/model/presets.py
-NETWORKS = (
-    *QUIVERS,
-    "mergenet",
-    *COMPARED,
-    *(f"{name}-as-published" for name in ("emvd", "flornn", "memdeblur", "spk2imgnet")),
-    *(f"{name}-1m" for name in ("quiver-s", "mergenet", *COMPARED)),
-)
 LEVELS = 16  # of a range of light in training: from 0.3 to 100 photons they are a factor 1.47 apart
 PROTOCOLS = ("quick", "control", "published", "paper", "spad-sum")  # see quiver/training/settings.py
 

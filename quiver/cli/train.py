@@ -17,9 +17,7 @@ from qsim.cli.console import note, output
 from qsim.cli.options import check_free, checked, count, nonnegative, positive
 from qsim.files import sha256
 from quiver.cli.options import (
-    NETWORKS,
     PROTOCOLS,
-    QUIVERS,
     add_noise,
     add_preset,
     add_running,
@@ -30,6 +28,7 @@ from quiver.cli.options import (
     use_threads,
 )
 from quiver.device import DEVICES
+from quiver.restoration.interface import NETWORKS, QUIVERS
 
 # train
 

@@ -32,14 +32,13 @@ from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import Illumination
 from quiver.device import PeakMemory, pick_device
 from quiver.evaluation import metrics
-from quiver.restoration.interface import COMPARED, MODES, RestoreOptions, Restorer
+from quiver.restoration.interface import MODES, NETWORKS, QUIVERS, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer, wrap_network
 from quiver.restoration.restorers import restorer, shipped_names, weights_path
 
 EXPOSURE = 5e-4  # s
 LONG = 10.0  # s; the first run of a process took 7 % longer than the second at 2.5 s, and no longer at 17 s
-MODAL = ("quiver-s", "quiver", "quiver-s-1m")  # presets that have several modes
-PRESETS = (*MODAL, *COMPARED, *(f"{name}-1m" for name in ("mergenet", *COMPARED)))
+MODAL = (*QUIVERS, "quiver-s-1m")  # presets that have several modes
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ def method_of(case: CostCase, device: str) -> tuple[Restorer, bool]:
     try:
         path = weights_path(case.method)
     except ValueError:
-        if case.method not in PRESETS:
+        if case.method not in NETWORKS:
             raise
         torch.manual_seed(0)
         return wrap_network(build(case.method), case.method, "random weights", options), False
@@ -223,7 +222,7 @@ def cases_of(methods: Sequence[str], modes: Sequence[str], precisions: Sequence[
 
 
 def _has_one_mode(network: str) -> bool:
-    return network not in MODAL and network in (*PRESETS, *shipped_names())
+    return network not in MODAL and network in (*NETWORKS, *shipped_names())
 
 
 def checked_cases(
@@ -236,7 +235,7 @@ def checked_cases(
     for method in methods:
         if method not in networks:
             restorer(method)
-        elif method not in PRESETS:
+        elif method not in NETWORKS:
             load(weights_path(method))
     for option, given, known in (("modes", modes, MODES), ("precisions", precisions, ("float32", "bfloat16"))):
         for name in given or ():

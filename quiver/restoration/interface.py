@@ -16,8 +16,16 @@ from quiver.restoration.mosaics import fill_mosaic
 AUTO = "auto"  # chooses the method of a stream: see automatic.py
 DEFAULT_METHOD = AUTO  # of `quiver restore` and `quiver.restore`
 DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory
-# Presets of the controls and the compared networks; each exists as NAME-1m too (quiver/model/equal_cost.py).
+# Presets: see quiver/model/presets.py. Those of equal cost: quiver/model/equal_cost.py.
+QUIVERS = ("quiver-s", "quiver")
 COMPARED = ("unet", "fastdvdnet", "student-teacher", "bit2bit", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")
+NETWORKS = (
+    *QUIVERS,
+    "mergenet",
+    *COMPARED,
+    *(f"{name}-as-published" for name in ("emvd", "flornn", "memdeblur", "spk2imgnet")),
+    *(f"{name}-1m" for name in ("quiver-s", "mergenet", *COMPARED)),
+)
 MODES = ("exact", "streaming", "windows")  # how a network shares work between frames, see quiver/model/schedules.py
 
 # Adds the photons of frames `first` ... to zeros [t, H, W]; called with (codes, zeros, first, progress)

@@ -24,7 +24,7 @@ from quiver.baselines import METHODS, exposures
 from quiver.baselines.sliding_window import look_ahead
 from quiver.data.codes import Codes
 from quiver.model import removed
-from quiver.restoration.interface import AUTO, RestoreInto, RestoreOptions, Restorer
+from quiver.restoration.interface import AUTO, NETWORKS, RestoreInto, RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"  # weights that ship with the package
@@ -131,9 +131,14 @@ def weights_path(name: str) -> Path:
         raise ValueError(
             f"{name}: a classical method has no weights; name {own}, a .safetensors file or a folder of `quiver train`"
         )
+    if name in NETWORKS:
+        raise ValueError(
+            f"{name}: a network without shipped weights; train it with `quiver train DATA -o FOLDER --preset {name}` "
+            "and name FOLDER"
+        )
     raise ValueError(
-        f"no method {name!r}{suggest(name, method_names())}; known are {', '.join(method_names())}, a "
-        ".safetensors file, and a folder of `quiver train`"
+        f"no method {name!r}{suggest(name, (*method_names(), *NETWORKS))}; known are {', '.join(method_names())}, a "
+        ".safetensors file, a folder of `quiver train`, and in `quiver bench` its presets"
     )
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from quiver.cli.options import NETWORKS
 from quiver.evaluation.cost import checked_cases
+from quiver.restoration.interface import NETWORKS
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 import bench_rows

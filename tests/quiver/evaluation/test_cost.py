@@ -9,8 +9,17 @@ import numpy as np
 import pytest
 
 from quiver.evaluation import cost as costs
-from quiver.evaluation.cost import CostCase, CostRow, CostSettings, cases_of, fixed_clip, markdown, measure
-from quiver.restoration.interface import Restorer
+from quiver.evaluation.cost import (
+    CostCase,
+    CostRow,
+    CostSettings,
+    cases_of,
+    checked_cases,
+    fixed_clip,
+    markdown,
+    measure,
+)
+from quiver.restoration.interface import NETWORKS, Restorer
 
 
 def test_the_clip_is_fixed_and_as_bright_as_asked():
@@ -29,6 +38,15 @@ def test_only_cases_that_differ_are_run():
     for network in ("unet", "mergenet"):  # the weights that ship have one mode, too
         assert [c.mode for c in cases if c.method == network] == ["exact", "exact"]
     assert len([c for c in cases if c.method == "quiver-s"]) == 4
+
+
+def test_every_preset_is_a_case():
+    assert {case.method for case in checked_cases(NETWORKS, None, None, None)} == {*NETWORKS}
+    with pytest.raises(ValueError, match=r"no method 'fastdvd'.* and in `quiver bench` its presets"):
+        checked_cases(("fastdvd",), None, None, None)
+    cost = measure(CostCase("emvd-as-published"), CostSettings(16, 16, frames=5, restored=3))
+    assert not cost.trained
+    assert cost.gmac_per_frame > 0
 
 
 def test_a_classical_case_has_seconds_and_a_score():

@@ -86,6 +86,11 @@ def test_weights_are_found_by_file_folder_and_name(tmp_path):
         restorer(str(tmp_path / "none.safetensors"))
     with pytest.raises(ValueError, match=r"no method 'momnt' \(did you mean 'moment'\?\); known are naive, "):
         restorer("momnt")
+    with pytest.raises(ValueError, match=r"no method 'fastdvd' \(did you mean 'fastdvdnet'\?\)"):
+        restorer("fastdvd")
+    for name in ("unet", "emvd-1m", "rvrt"):
+        with pytest.raises(ValueError, match=rf"^{name}: a network without shipped weights; train it with .* {name}`"):
+            restorer(name)
     (tmp_path / "young").mkdir()
     (tmp_path / "young/settings.json").write_text("{}")
     with pytest.raises(FileNotFoundError, match=r"a training run without best\.safetensors"):

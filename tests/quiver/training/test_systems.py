@@ -15,7 +15,6 @@ from runs import TINY, same_weights, settings, tiny, tiny_settings
 from torch import Tensor
 
 from qsim.clip.sensing import Sensing, sense
-from quiver.cli.options import NETWORKS, QUIVERS
 from quiver.data.clips import open_clips
 from quiver.data.codes import Codes
 from quiver.data.noise import noise_table
@@ -25,7 +24,7 @@ from quiver.model.presets import OTHERS, PRESETS, build
 from quiver.model.rivals.flornn import FloRNN, FloRNNConfig
 from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
 from quiver.model.weights import load
-from quiver.restoration.interface import RestoreOptions
+from quiver.restoration.interface import NETWORKS, QUIVERS, RestoreOptions
 from quiver.restoration.networks import wrap_network
 from quiver.training import loop as training
 from quiver.training.loop import train
