@@ -113,7 +113,9 @@ def clock(monkeypatch, busy: float) -> None:
 def made(path: Path, seconds: float, *, busy: bool) -> dict[str, object]:
     """A row that takes so long, made by the program's own function."""
     work = {"busy": busy, "sessions": path.parent / "work" / "x_sessions.json"}
-    rows.make_row(path, rows.TINY, Path("a/data"), lambda: rows.time.sleep(seconds) or {"name": "x"}, **work)
+    data = path.parent / "a/data"
+    data.mkdir(parents=True, exist_ok=True)
+    rows.make_row(path, rows.TINY, data, lambda: rows.time.sleep(seconds) or {"name": "x"}, **work)
     return json.loads(path.read_text())
 
 
@@ -160,7 +162,7 @@ def test_a_resumed_row_is_as_quiet_as_its_loudest_session(tmp_path, monkeypatch)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        rows.make_row(tmp_path / "x.json", rows.TINY, Path("a/data"), stop, busy=True, sessions=sessions)
+        rows.make_row(tmp_path / "x.json", rows.TINY, tmp_path, stop, busy=True, sessions=sessions)
     clock(monkeypatch, 0.02)
     found = made(tmp_path / "x.json", 60.0, busy=False)
     assert found["cores_of_others"] == pytest.approx(1.3)
