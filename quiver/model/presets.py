@@ -38,7 +38,7 @@ OTHERS: dict[str, Any] = {
     "flornn": FloRNNConfig(),
     "flornn-as-published": FloRNNConfig(as_published=True),
     "memdeblur": MemDeblurConfig(),
-    "memdeblur-as-published": MemDeblurConfig(as_published=True),
+    "memdeblur-as-published": MemDeblurConfig(group_norm=False, as_published=True),
     "rvrt": RVRTConfig(),
     "spk2imgnet": Spk2ImgNetConfig(),
     "spk2imgnet-as-published": Spk2ImgNetConfig(as_published=True),

@@ -92,7 +92,7 @@ SYSTEMS: dict[type[nn.Module], System] = {
         check=rivals.check_flornn,
     ),
     MemDeblur: System(
-        *("memdeblur", rivals.memdeblur_loss, rivals.centre_frame, _protocols({}, learning_rate=3e-4)),
+        *("memdeblur", rivals.memdeblur_loss, rivals.centre_frame, _protocols({})),
         multiple=16,
         check=rivals.check_memdeblur,
     ),

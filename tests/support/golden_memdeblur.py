@@ -33,6 +33,7 @@ def built(weights: Mapping[str, Tensor]) -> MemDeblur:
         width=len(weights["fusion.weight"]),
         forward_blocks=sum(name.startswith("forward_resblocks.") for name in weights) // 4,
         backward_blocks=sum(name.startswith("backward_resblocks.main.2.") for name in weights) // 4,
+        group_norm=False,
         as_published=True,
     )
     network = MemDeblur(config).double().eval()

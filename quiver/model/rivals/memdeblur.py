@@ -12,7 +12,8 @@ nearest entries, and a memory keeps the latest five keys' worth. The mode of the
 
 Our reading: the three output channels share one target, so their mean is the restored frame. The article centres its
 input at 0.5, the port does not; we do, and `as_published` does not. Nothing begins with weights of ImageNet. Batch
-normalisation as published sees one frame at a time; `group_norm` is ours, for small crops and batches.
+normalisation, as published, sees one frame at a time: a few values per channel in small crops, whose mean statistics do
+not fit single frames afterwards. We normalise groups of channels of each frame instead.
 """
 
 from dataclasses import asdict, dataclass
@@ -42,7 +43,7 @@ class MemDeblurConfig:
     width: int = 64  # hidden channels; all other sizes but the 48 features of a frame scale with it
     forward_blocks: int = 30
     backward_blocks: int = 10
-    group_norm: bool = False  # ours: group instead of batch normalisation in the memory's encoders
+    group_norm: bool = True  # in the memory's encoders; False: batch normalisation, as published
     as_published: bool = False  # input in 0 ... 1, not centred
 
     def __post_init__(self) -> None:

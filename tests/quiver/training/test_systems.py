@@ -22,6 +22,7 @@ from quiver.data.windows import Windows, WindowSettings
 from quiver.model.presets import NETWORKS as KINDS
 from quiver.model.presets import OTHERS, PRESETS, build
 from quiver.model.rivals.flornn import FloRNN, FloRNNConfig
+from quiver.model.rivals.memdeblur import MemDeblur, MemDeblurConfig
 from quiver.model.rivals.rvrt import RVRT, RVRTConfig
 from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
 from quiver.model.weights import load
@@ -326,7 +327,6 @@ def test_every_preset_has_a_system_and_a_quick_protocol():
         ("spk2imgnet", {"frames": 9}, "at least 10"),
         ("emvd", {"crop": 36}, "--crop 36: this network needs a multiple of 8"),
         ("memdeblur", {"crop": 24}, "multiple of 16"),
-        ("memdeblur", {"batch": 1}, "give --batch 2"),
         ("rvrt", {"loss": "l1"}, "--loss l1: rvrt is trained with own; leave --loss out"),
         ("unet", {"loss": "own"}, "trained with published or paper or l1 or scales-l1"),
     ],
@@ -338,6 +338,17 @@ def test_settings_that_do_not_fit_are_refused_before_anything_is_written(
     with pytest.raises(ValueError, match=message):
         train(network, tiny_settings(network, tiny_dataset, tmp_path / "r", **changes), progress=False)
     assert not (tmp_path / "r").exists()
+
+
+def test_batch_normalisation_of_memdeblur_needs_two_small_crops(tiny_dataset, tmp_path):
+    config = MemDeblurConfig(width=8, forward_blocks=1, backward_blocks=1, group_norm=False)
+    network = MemDeblur(config)
+    with pytest.raises(ValueError, match="give --batch 2"):
+        train(network, tiny_settings(network, tiny_dataset, tmp_path / "r", batch=1), progress=False)
+    assert not (tmp_path / "r").exists()
+    network = MemDeblur(replace(config, group_norm=True))
+    once = {"steps": 1, "validate_every": 1, "validation_windows": 1, "crop": 32, "batch": 1}
+    assert train(network, tiny_settings(network, tiny_dataset, tmp_path / "r", **once), progress=False).step == 1
 
 
 def test_flornn_needs_its_look_ahead_and_a_flow(tiny_dataset, tmp_path):
