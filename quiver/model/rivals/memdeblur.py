@@ -13,7 +13,8 @@ nearest entries, and a memory keeps the latest five keys' worth. The mode of the
 Our reading: the three output channels share one target, so their mean is the restored frame. The article centres its
 input at 0.5, the port does not; we do, and `as_published` does not. Nothing begins with weights of ImageNet. Batch
 normalisation, as published, sees one frame at a time: a few values per channel in small crops, whose mean statistics do
-not fit single frames afterwards. We normalise groups of channels of each frame instead.
+not fit single frames afterwards. We normalise groups of channels of each frame instead; the preset
+`memdeblur-as-published` keeps batch normalisation.
 """
 
 from dataclasses import asdict, dataclass
