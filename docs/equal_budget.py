@@ -62,7 +62,8 @@ INTERRUPTED = 130  # exit code of a command that was stopped from outside
 LIMITS = """Thirty minutes cannot tell which network is best after days of training. Large networks make fewer steps in
 the same time, and recurrent ones learn late. A row states what a design gives for this budget on these clips. All
 networks are trained by Adam, mergenet too, whose own protocol has Muon. bit2bit trains on the streams that it restores
-and stands apart."""
+and stands apart. The speed of the machine differed from row to row: one with a slower reference convolution made fewer
+steps than it could."""
 APART = "bit2bit"  # begins the names of networks that learn from the streams they restore
 
 
