@@ -6,7 +6,7 @@ from typing import Self
 from qsim.checks import shown
 from qsim.structure import make
 
-_FLOW_LAYERS = 8  # at most, of one level
+FLOW_LAYERS = 8  # at most, of one level
 
 
 def whole_number(name: str, value: object, least: int, most: int) -> None:
@@ -49,9 +49,9 @@ class Config:
             whole_number("Config.cell_growth", self.cell_growth, 1, 8192)
         for name in ("pre_denoiser", "flow", "multi_scale"):
             flag(f"Config.{name}", getattr(self, name))
-        if not isinstance(self.flow_channels, tuple) or not 1 <= len(self.flow_channels) <= _FLOW_LAYERS:
+        if not isinstance(self.flow_channels, tuple) or not 1 <= len(self.flow_channels) <= FLOW_LAYERS:
             found = shown(self.flow_channels)
-            raise ValueError(f"Config.flow_channels must be 1 to {_FLOW_LAYERS} widths, got {found}")
+            raise ValueError(f"Config.flow_channels must be 1 to {FLOW_LAYERS} widths, got {found}")
         for value in self.flow_channels:
             whole_number("Config.flow_channels", value, 1, 1024)
         if self.channels % 2 or self.channels % self.deformable_groups:

@@ -15,6 +15,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_safetensors
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from qsim.files import write_bytes
 from quiver.model.config import Config
@@ -108,16 +109,13 @@ def load(path: Path) -> nn.Module:
         if len(metadata["config"]) > MAX_CONFIG:
             raise ValueError(f"a configuration of {len(metadata['config'])} characters")
         values = json.loads(metadata["config"])
-        with torch.device("meta"):
+        with torch.device("meta"), _WithoutValues():
             network = _build(metadata["network"], values)
         tensors = current_names(tensors)
         for name, value in network.state_dict().items():
             if name in tensors and tensors[name].dtype != value.dtype:
                 raise ValueError(f"{name} holds {tensors[name].dtype}, the network {value.dtype}")
         network.load_state_dict(tensors, assign=True)
-        if any(buffer.is_meta for buffer in network.buffers()):  # constants that are not stored
-            network = _build(metadata["network"], values)
-            network.load_state_dict(tensors)
     except RemovedError as error:
         raise RemovedError(f"{path}: {error}") from None
     except DAMAGE as error:
@@ -137,6 +135,20 @@ def annotate(path: Path, notes: Mapping[str, str]) -> None:
     if metadata.get("format") != FORMAT:
         raise ValueError(f"{path}: not weights of this program (no format {FORMAT!r}); see `quiver convert-weights`")
     write_bytes(path, to_safetensors(tensors, metadata | dict(notes)))
+
+
+class _WithoutValues(TorchFunctionMode):
+    """Makes layers without first values, which a file replaces: every function that works in place does nothing.
+
+    On "meta", the first of some of these functions imports for two seconds.
+    """
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        if func.__name__.endswith("_") and not func.__name__.endswith("__"):
+            return args[0] if args else (kwargs or {})["tensor"]  # the latter for functions of torch.nn.init
+        return func(*args, **(kwargs or {}))
 
 
 def _build(kind: str, values: dict[str, object]) -> nn.Module:

@@ -245,7 +245,8 @@ class Synthesis(nn.Module):
 
 
 def _haar() -> Tensor:
-    return torch.tensor([[1.0, 1.0], [1.0, -1.0]]) / 2**0.5
+    tap = 2**-0.5
+    return torch.tensor([[tap, tap], [tap, -tap]])
 
 
 def _colour(last: float) -> Tensor:

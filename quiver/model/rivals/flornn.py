@@ -32,7 +32,7 @@ from torch import Tensor, nn
 
 from qsim.structure import make
 from quiver.model.blocks import FlowNetwork
-from quiver.model.config import flag, real_number, whole_number
+from quiver.model.config import FLOW_LAYERS, flag, real_number, whole_number
 from quiver.model.deformable import warp
 from quiver.model.ops.splatting import average_splat
 from quiver.model.rivals.edges import check_frames, pad_space, reflected
@@ -65,8 +65,11 @@ class FloRNNConfig:
         whole_number("FloRNNConfig.flow_kernel", self.flow_kernel, 1, 15)
         if not self.flow_kernel % 2:
             raise ValueError(f"FloRNNConfig.flow_kernel must be odd, got {self.flow_kernel}")
-        if not isinstance(self.flow_channels, list | tuple):
-            raise ValueError("FloRNNConfig.flow_channels must be a list of widths; give [] for a flow that is given")
+        if not isinstance(self.flow_channels, list | tuple) or len(self.flow_channels) > FLOW_LAYERS:
+            raise ValueError(
+                f"FloRNNConfig.flow_channels must be a list of at most {FLOW_LAYERS} widths; give [] for a flow that "
+                "is given"
+            )
         for channels in self.flow_channels:
             whole_number("FloRNNConfig.flow_channels", channels, 1, 1024)
         object.__setattr__(self, "flow_channels", tuple(self.flow_channels))

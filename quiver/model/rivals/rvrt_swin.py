@@ -3,6 +3,7 @@
 Tensors are [N, D, C, H, W] outside, N clips of D frames; inside a stack they are [N, D, H, W, C].
 """
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -147,11 +148,10 @@ class SwinStack(nn.Module):
 
 def relative_positions(frames: int) -> Tensor:
     """Return rows [n, n] of the bias table for query and key, n = frames * 64 pixels in order (time, row, column)."""
-    axes = [torch.arange(side) for side in (frames, WINDOW, WINDOW)]
-    places = torch.cartesian_prod(*axes)
-    difference = places[:, None] - places[None, :] + torch.tensor([frames - 1, WINDOW - 1, WINDOW - 1])
+    places = np.indices((frames, WINDOW, WINDOW)).reshape(3, -1).T
+    difference = places[:, None] - places[None, :] + np.array([frames - 1, WINDOW - 1, WINDOW - 1])
     side = 2 * WINDOW - 1
-    return (difference[..., 0] * side + difference[..., 1]) * side + difference[..., 2]
+    return torch.from_numpy((difference[..., 0] * side + difference[..., 1]) * side + difference[..., 2])
 
 
 def _regions(shape: torch.Size, shift: list[int], device: torch.device) -> Tensor:

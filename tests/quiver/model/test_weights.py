@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 import random
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -100,6 +102,25 @@ def test_a_noise_table_of_an_earlier_version_is_left_out(tmp_path: Path):
     back = load(tmp_path / "w.safetensors")
     assert isinstance(back, EMVD)
     assert back.config == network.config
+
+
+def test_every_network_is_read_with_equal_values_and_without_slow_imports(tmp_path: Path):
+    """A layer made without values imported a package of two seconds for its first random numbers."""
+    for name, make in EVERY.items():
+        network = make()
+        save(network, network.config, tmp_path / f"{name}.safetensors")
+        back = load(tmp_path / f"{name}.safetensors").state_dict()
+        assert list(back) == list(network.state_dict())
+        for key, value in network.state_dict().items():
+            assert torch.equal(back[key], value), (name, key)
+    code = (
+        "import sys; from pathlib import Path; from quiver.model.weights import load\n"
+        "before = {*sys.modules}; [load(Path(name)) for name in sys.argv[1:]]\n"
+        "print(*({'sympy', 'torch._dynamo'} & ({*sys.modules} - before)))"
+    )
+    files = [str(tmp_path / f"{name}.safetensors") for name in EVERY]
+    done = subprocess.run([sys.executable, "-c", code, *files], capture_output=True, text=True, check=True)
+    assert done.stdout == "\n"
 
 
 def test_the_shipped_weights_are_those_of_the_preset():

@@ -205,6 +205,7 @@ def test_a_configuration_survives_json():
         ("border", -0.1, "FloRNNConfig.border must be a number from 0"),
         ("flow_kernel", 4, "FloRNNConfig.flow_kernel must be odd"),
         ("flow_channels", 8, "FloRNNConfig.flow_channels must be a list"),
+        ("flow_channels", [8] * 9, "FloRNNConfig.flow_channels must be a list of at most 8 widths"),
         ("flow_channels", (0,), "FloRNNConfig.flow_channels must be a whole number"),
         ("as_published", 1, "FloRNNConfig.as_published must be true or false"),
     ],
