@@ -10,7 +10,10 @@ while frames and streams stayed. Only names that survive every move are used: th
 
 data/unchanged.json has checksums (of codes: SHA-256, no code may differ), data/unchanged.npz numbers: light within
 1e-6 of its mean, video within 1e-5, other numbers as each section says. Clips are stored as halves, so light within
-1e-6 is the same half; one pixel of 200 may be rounded to the next one.
+1e-6 is the same half. Processors differ in last bits, for one in the approximate reciprocal root with which Dr.Jit
+begins to normalise a vector, so that a path may take another way at an edge: one pixel of 200 may be off by 2 % of
+the mean, and the estimates of the error by 1e-3 (an AMD EPYC of the third generation: one pixel of 768 by 0.15 %, and
+1.7e-4).
 
 Rendered light is the same for any number of threads, and was only ever compared on the versions of NumPy, Mitsuba,
 Dr.Jit and LLVM that data/unchanged.json names: with others, sections that render are skipped, but for the digests of
@@ -49,8 +52,8 @@ class Near:
     """Numbers, and how far others may be from them: `tolerance` times their mean size, or that of each."""
 
     values: Array
-    tolerance: float
-    of: str = "mean"  # "mean", "each" (at least 1e-6), or "half": as "mean", but 1 of 200 may be the next half
+    tolerance: float | Array  # one for all, or one for each
+    of: str = "mean"  # "mean", "each" (at least 1e-6), or "light": as "mean", but 1 of 200 may be off by 2 %
 
     def differs(self, found: Array) -> str | None:
         """What is wrong with these numbers, as text; None if they are near."""
@@ -60,11 +63,12 @@ class Near:
         finite = np.isfinite(wanted)
         if not np.array_equal(wanted[~finite], found[~finite], equal_nan=True):
             return "other numbers are infinite or not numbers"
+        tolerance = np.broadcast_to(self.tolerance, wanted.shape)[finite]
         wanted, found = wanted[finite], found[finite]
         size = np.maximum(np.abs(wanted), 1e-6) if self.of == "each" else np.mean(np.abs(wanted))
-        off = ~(np.abs(found - wanted) <= self.tolerance * size)
-        if self.of == "half" and np.mean(off) <= 1 / 200:
-            off &= ~(np.abs(found - wanted) <= np.maximum(np.abs(wanted), 2.0**-14) / 1024)
+        off = ~(np.abs(found - wanted) <= tolerance * size)
+        if self.of == "light" and np.mean(off) <= 1 / 200:
+            off &= ~(np.abs(found - wanted) <= 0.02 * size)
         if not off.any():
             return None
         return f"{off.sum()} of {off.size} differ, by up to {np.abs(found - wanted).max():.3g}, mean {np.mean(wanted)}"
@@ -309,16 +313,17 @@ def _rendered(path: Path, line: str) -> Results:
     clip = Clip.open(path)
     for t in range(len(clip)):
         cut = slice(None, None, -(-clip.shape[1] // 32)), slice(None, None, -(-clip.shape[2] // 32))
-        yield f"{line}, radiance {t}", Near(clip.radiance(t)[cut], 1e-6, "half")
+        yield f"{line}, radiance {t}", Near(clip.radiance(t)[cut], 1e-6, "light")
         if t == 0:
-            yield f"{line}, sharp", Near(clip.sharp(t)[cut], 1e-6, "half")
+            yield f"{line}, sharp", Near(clip.sharp(t)[cut], 1e-6, "light")
             truth = np.stack([*clip.flow(t), *clip.flow_back(t)])[:, 1::3, 1::3]
             yield f"{line}, flow", Near(truth, 1e-5)
             yield f"{line}, depth", Near(clip.depth(t)[1::2, 1::2], 1e-6)
             yield f"{line}, bodies", checksum(clip.body_id(t).astype(np.int16))
             yield f"{line}, valid", checksum(clip.valid(t))
     about = [clip.mean_radiance, clip.mean_photons, *clip.meta["error_per_frame"], clip.meta["psnr_of_truth"]]
-    yield f"{line}, numbers", Near(np.array(about), 1e-6, "each")
+    tolerance = np.array([1e-5, 1e-5] + [1e-3] * (len(about) - 2))
+    yield f"{line}, numbers", Near(np.array(about), tolerance, "each")
     yield f"{line}, budget", json.dumps([clip.meta["render"][key] for key in ("samples", "bounces", "denoise")])
 
 
@@ -626,11 +631,14 @@ def test_a_difference_is_seen():
         step[0] = size
         assert Near(light, 1e-6, of).differs(light + step / 2) is None
         assert Near(light, 1e-6, of).differs(light + 2 * step) == f"1 of 1000 differ, by up to {2 * size:.3g}, mean 1.0"
-    step[0] = 1 / 4096  # half of a half's step at 0.5
-    assert Near(light, 1e-6, "half").differs(light + step) is None
-    assert Near(light, 1e-6, "half").differs(light + 4 * step) is not None
-    step[:6] = 1 / 4096
-    assert Near(light, 1e-6, "half").differs(light + step) is not None
+    step[0] = 0.019
+    assert Near(light, 1e-6, "light").differs(light + step) is None
+    assert Near(light, 1e-6, "light").differs(light + 2 * step) is not None
+    step[:6] = 0.001
+    assert Near(light, 1e-6, "light").differs(light + step) is not None
+    each = Near(np.array([1.0, 1.0]), np.array([1e-2, 1e-5]), "each")
+    assert each.differs(np.array([1.009, 1.0])) is None
+    assert each.differs(np.array([1.0, 1.009])) is not None
     assert Near(light, 1e-6).differs(light[1:]) is not None
     assert Near(np.array([1.0, np.inf]), 1e-6).differs(np.array([1.0, 2.0])) is not None
 
