@@ -20,9 +20,9 @@ def names(sizes: Sizes) -> list[str]:
 
 def learned() -> list[str]:
     """Return the networks of the project that restore: those that are trained here, and those of `quiver bench`."""
-    from quiver.evaluation.cost import PRESETS
+    from quiver.restoration.interface import NETWORKS
 
-    return list(dict.fromkeys([*networks(), *PRESETS]))
+    return list(dict.fromkeys([*networks(), *(name for name in NETWORKS if not name.endswith("-as-published"))]))
 
 
 def measure(job: Job) -> list[dict[str, Any]]:

@@ -6,6 +6,8 @@ Every import counts, also those inside functions and under TYPE_CHECKING. They a
 from __future__ import annotations
 
 import ast
+import importlib
+import importlib.util
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -223,3 +225,15 @@ def test_importing_quiver_loads_torch_only_when_needed():
     code = "import quiver, quiver.cli.program, sys; print('torch' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert found.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "docs").rglob("*.py")), ids=lambda path: path.name)
+def test_programs_of_the_pages_import_names_that_exist(path):
+    """Imports inside functions fail only where the function runs: some of these programs run for hours."""
+    if path.name == "clip_earlier.py":
+        pytest.skip("of the program at an earlier commit")
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] in ("qsim", "quiver"):
+            module = importlib.import_module(str(node.module))
+            for name in (alias.name for alias in node.names):
+                assert hasattr(module, name) or importlib.util.find_spec(f"{node.module}.{name}"), (node.module, name)
