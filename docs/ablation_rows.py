@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from rows import LIGHTS, TINY, Budget, check_row, make_row, notes_on, options, scores, starred
+from rows import LIGHTS, TINY, Budget, check_row, keep_apart, make_row, notes_on, options, scores, starred
 
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
@@ -48,6 +48,7 @@ def main(words: list[str] | None = None) -> int:
         return 2
     todo = [(name, seed) for seed in SEEDS for name in names]
     try:
+        args.work = keep_apart("ablation_rows", args.out, args.work, trial=args.tiny)
         for name, seed in todo:  # all that exist are checked before any is made
             if (args.out / f"{name}-{seed}.json").exists():
                 check_row(args.out / f"{name}-{seed}.json", budget, args.data)

@@ -21,7 +21,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rows import ROOT, Budget, Watch, machine, missing_rows, notes_on, quiver, refuse_busy, starred, store
+from rows import (
+    ROOT,
+    Budget,
+    Watch,
+    is_made,
+    keep_apart,
+    machine,
+    missing_rows,
+    notes_on,
+    quiver,
+    refuse_busy,
+    starred,
+    store,
+)
 
 from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
@@ -69,10 +82,8 @@ def main(words: list[str] | None = None) -> int:
     if unknown:
         print(f"bench_rows: no row is called {unknown[0]!r}; known are {', '.join(ROWS)}", file=sys.stderr)
         return 2
-    if args.tiny and args.out == RESULTS:
-        print("bench_rows: --tiny makes rows of 32x32 px, which do not belong on the page; give --out", file=sys.stderr)
-        return 2
     try:
+        keep_apart("bench", args.out, trial=args.tiny)
         for name in names:
             make(args.out / f"{name}.json", plan_of(name, tiny=args.tiny), busy=args.busy or args.tiny)
             write_page(args.out)
@@ -87,9 +98,7 @@ def main(words: list[str] | None = None) -> int:
 
 def make(path: Path, plan: Plan, *, busy: bool) -> None:
     """Write a row, unless it exists. `ValueError` if it exists with other options, and on busy cores unless `busy`."""
-    if path.exists():
-        if read_json(path)["plan"] != vars(plan):
-            raise ValueError(f"{path}: was made with other options; choose another --out")
+    if is_made(path, plan):
         return
     if not busy:
         refuse_busy()
@@ -97,7 +106,7 @@ def make(path: Path, plan: Plan, *, busy: bool) -> None:
     given = ((f"--{name}", value) for name, value in vars(plan).items() if value is not None and name != "threads")
     with tempfile.TemporaryDirectory() as folder:
         words = (word for pair in given for word in pair)
-        quiver("bench", *words, "-o", folder, "-q", budget=Budget(threads=plan.threads))
+        quiver("bench", *words, "-o", folder, "-q", budget=Budget(threads=plan.threads), problems=True)
         costs = read_json(Path(folder) / "bench.json")["costs"]
     path.parent.mkdir(parents=True, exist_ok=True)
     store(path, plan, watch, {"name": path.stem, "machine": machine(), "costs": costs})

@@ -41,7 +41,7 @@ from clip_parts import meta, timed_frames
 from cycles_rows import agreement, use_only
 from numpy import ndarray as Array
 from reuse_rows import FAMILIES, decibels
-from rows import ROOT, Watch, refuse_busy, store
+from rows import ROOT, Watch, is_made, keep_apart, refuse_busy, store
 
 from qsim import scenes
 from qsim.clip.clamped_error import white_in
@@ -272,26 +272,26 @@ def main(words: list[str] | None = None) -> int:
     height, width = map(int, args.size.split("x"))
     plan = TINY if args.tiny else plan_of(height, width, args.motion, args.reference)
     use_only(plan.threads)
-    args.out.mkdir(parents=True, exist_ok=True)
     busy = args.busy or args.tiny
-    for name in args.rows.split(","):
-        fast = "" if plan.motion == Plan.motion else f"-{plan.motion:g}px"
-        path = args.out / f"{name}-{plan.height}x{plan.width}{fast}.json"
-        if path.exists() and (busy or read_json(path)["quiet"]):
-            continue
-        try:
-            if not busy:
-                refuse_busy()
-            watch = Watch.now()
-            with tempfile.TemporaryDirectory() as folder:
-                unpack(Path(folder))
-                row = measure(name, plan, Path(folder))
-        except ValueError as error:
-            print(f"clip_rows: {error}", file=sys.stderr)
-            return 2
-        store(path, plan, watch, row)
-    rows = {path.stem: read_json(path) for path in sorted(args.out.glob("*.json"))}
-    write_bytes(args.out.with_suffix(".md"), page(rows).encode())
+    fast = "" if plan.motion == Plan.motion else f"-{plan.motion:g}px"
+    try:
+        keep_apart("clips", args.out, trial=args.tiny)
+        args.out.mkdir(parents=True, exist_ok=True)
+        for name in args.rows.split(","):
+            path = args.out / f"{name}-{plan.height}x{plan.width}{fast}.json"
+            if not is_made(path, plan) or not (busy or read_json(path)["quiet"]):
+                if not busy:
+                    refuse_busy()
+                watch = Watch.now()
+                with tempfile.TemporaryDirectory() as folder:
+                    unpack(Path(folder))
+                    row = measure(name, plan, Path(folder))
+                store(path, plan, watch, row)
+            rows = {path.stem: read_json(path) for path in sorted(args.out.glob("*.json"))}
+            write_bytes(args.out.with_suffix(".md"), page(rows).encode())
+    except ValueError as error:
+        print(f"clip_rows: {error}", file=sys.stderr)
+        return 2
     return 0
 
 

@@ -32,7 +32,7 @@ import numpy as np
 from cycles_page import page
 from numpy import ndarray as Array
 from reuse_rows import decibels, steady_frames
-from rows import ROOT, Watch, refuse_busy, store
+from rows import ROOT, Watch, is_made, keep_apart, refuse_busy, store
 
 from qsim import scenes
 from qsim.clip.clamped_error import white_in
@@ -61,8 +61,8 @@ class Plan:
     level: float = 40.0  # asked, dB below white
     scene_seed: int = 4
     seed: int = 61  # of our samples
-    reference: int = 512  # samples per pixel of each half of a converged picture
-    rounds: int = 2
+    reference: int = 256  # samples per pixel of each half of a converged picture
+    rounds: int = 1
     threads: int = 2
     most: int = SAMPLES[-1]  # samples of Cycles
 
@@ -233,24 +233,23 @@ def main(words: list[str] | None = None) -> int:
     if args.tiny:
         plan = Plan(32, 48, frames=4, judged=(1, 2), level=25.0, reference=args.reference, rounds=1, most=2)
     use_only(plan.threads)
-    args.out.mkdir(parents=True, exist_ok=True)
     busy = args.busy or args.tiny
-    for family in args.rows.split(","):
-        path = args.out / f"{family}-{plan.height}x{plan.width}.json"
-        if path.exists() and (busy or read_json(path)["quiet"]):
-            continue
-        try:
-            check(args.cycles)
-            if not busy:
-                refuse_busy()
-            watch = Watch.now()
-            row = measure(family, plan, args.cycles)
-        except (ValueError, OSError) as error:
-            print(f"cycles_rows: {error}", file=sys.stderr)
-            return 2
-        store(path, plan, watch, row)
-    rows = {path.stem: read_json(path) for path in sorted(args.out.glob("*.json"))}
-    write_bytes(args.out.with_suffix(".md"), page(rows).encode())
+    try:
+        keep_apart("cycles", args.out, trial=args.tiny)
+        args.out.mkdir(parents=True, exist_ok=True)
+        for family in args.rows.split(","):
+            path = args.out / f"{family}-{plan.height}x{plan.width}.json"
+            if not is_made(path, plan) or not (busy or read_json(path)["quiet"]):
+                check(args.cycles)
+                if not busy:
+                    refuse_busy()
+                watch = Watch.now()
+                store(path, plan, watch, measure(family, plan, args.cycles))
+            rows = {path.stem: read_json(path) for path in sorted(args.out.glob("*.json"))}
+            write_bytes(args.out.with_suffix(".md"), page(rows).encode())
+    except (ValueError, OSError) as error:
+        print(f"cycles_rows: {error}", file=sys.stderr)
+        return 2
     return 0
 
 

@@ -35,6 +35,7 @@ from rows import (
     converged,
     cost,
     interval,
+    keep_apart,
     make_row,
     missing_rows,
     notes_on,
@@ -74,10 +75,11 @@ def main(words: list[str] | None = None) -> int:
     if unknown:
         print(f"equal_budget: no row is called {unknown[0]!r}; known are {', '.join(ROWS)}", file=sys.stderr)
         return 2
-    if args.budget_seconds:
+    if args.budget_seconds is not None:
         budget = Budget(args.budget_seconds / 60, args.budget_seconds / 240, budget.threads, budget.crop, budget.batch)
-    args.out.mkdir(parents=True, exist_ok=True)
     try:
+        args.work = keep_apart("equal_budget", args.out, args.work, trial=args.tiny or args.budget_seconds is not None)
+        args.out.mkdir(parents=True, exist_ok=True)
         for name in names:  # all that exist are checked before any is made
             if (args.out / f"{name}.json").exists():
                 check_row(args.out / f"{name}.json", budget, args.data)
@@ -217,15 +219,15 @@ def write_tables(out: Path) -> None:
     rows = [read_json(path) for path in sorted(out.glob("*.json"))]
     networks = [row for row in rows if row["kind"] == "network"]
     at = f"{float(LIGHTS[0]):g} PPP, 3 bit"
-    known: dict[str, Any] = next((row["scores"] for row in rows if row["kind"] == "classical"), {})
-    methods = [(name, found[at]) for name, found in known.items()]
+    classical = next((row for row in rows if row["kind"] == "classical"), {"scores": {}})
+    known: dict[str, Any] = classical["scores"]
     floor = mean_of(known[FLOOR][at]) if FLOOR in known else -math.inf
     text = ["# Every network after the same time", "", "Made by `python docs/equal_budget.py out/starter`.", ""]
     text += [LIMITS, ""]
     text += [f"![Validation PSNR over minutes of training]({out.name}.png)", ""]
     text += [f"## About one million multiply-adds per pixel and frame, {at}", ""]
     record = [row for row in networks if row["name"].endswith(RECORD)]
-    text += [*markdown_table(ranked(record, methods, floor, at), HEADER), "", RANKS, ""]
+    text += [*markdown_table(ranked(record, classical, floor, at), HEADER), "", RANKS, ""]
     widths = [row for row in networks if row not in record]
     if widths:
         text += ["## Published widths", "", SCORED, ""]
@@ -233,8 +235,9 @@ def write_tables(out: Path) -> None:
     streams = [row for row in rows if row["kind"] == "stream"]
     if streams:
         text += [f"## Learned from the test streams themselves, {at}", "", STREAMS, ""]
-        header = ("network", "MACs/px", "restoring", "parameters", "steps", "rate", *HEADER[8:-1])
-        cells = [[starred(row), *size_cells(row), *score_cells(row["scores"][at]), *cost_cells(row)] for row in streams]
+        header = ("network", "MACs/px", "restoring", "parameters", "steps", "rate", *HEADER[8:])
+        cells = [[starred(row), *size_cells(row), *score_cells(row["scores"][at]), *cost_cells(row), speed(row)]
+                 for row in streams]  # fmt: skip
         text += [*markdown_table(cells, header), ""]
     text += ["## The same weights at other light levels, matched PSNR [dB]", ""]
     text += [*markdown_table(light_cells(rows), ("method", *(f"{light} PPP" for light in LIGHTS))), ""]
@@ -246,29 +249,31 @@ def write_tables(out: Path) -> None:
 STREAMS = """The test clips share the thirty minutes: every clip is restored by weights that learned from its own codes
 alone, and scored at this light only. A step has one window of 16 frames. Sharp frames of a validation clip choose the
 rate."""
-RANKS = f"Networks below {FLOOR} have no rank. Frames: those of which one is restored, and how many of them lie ahead."
+RANKS = f"""Networks below {FLOOR} have no rank. Frames: those of which one is restored, and how many of them lie ahead.
+Convolution: the reference convolution on the machine of a row, whose seconds compare with those of rows alike. Seconds
+of classical methods are those of the evaluation."""
 SCORED = f"A network above {FLOOR} on the validation clips is scored on test clips; a score below it there is left out."
 WIDTHS = ("network", "MACs/px", "parameters", "steps", "rate", "last validation [dB]", "PSNR matched",
-          "seconds/frame", "MB")  # fmt: skip
+          "seconds/frame", "MB", "convolution [ms]")  # fmt: skip
 HEADER = (
     *("rank", "method", "frames", "MACs/px", "restoring", "parameters", "steps", "rate", "PSNR matched", "PSNR"),
     *("SSIM matched", *(f"{name} px" for name in bin_names()), "seconds/frame", "MB", "convolution [ms]"),
 )  # fmt: skip
 
 
-def ranked(
-    networks: list[dict[str, Any]], methods: list[tuple[str, dict[str, Any]]], floor: float, at: str
-) -> list[list[str]]:
+def ranked(networks: list[dict[str, Any]], classical: dict[str, Any], floor: float, at: str) -> list[list[str]]:
     """Return the rows of the table of record, best first: networks with a rank, and classical methods without."""
-    lines = [(mean_of(found), ["", name, *[""] * 6, *score_cells(found), f"{found['seconds_per_frame']:.3g}", "", ""])
-             for name, found in methods]  # fmt: skip
+    lines = []
+    for name, lights in classical["scores"].items():
+        found = lights[at]
+        spent = [f"{found['seconds_per_frame']:.3g}", "", speed(classical)]
+        lines.append((mean_of(found), ["", name, *[""] * 6, *score_cells(found), *spent]))
     order = sorted(networks, key=lambda row: -mean_of(row["scores"][at]))
     for rank, row in enumerate(order, 1):
         found = row["scores"][at]
         place = str(rank) if mean_of(found) >= floor else "none"
-        speed = f"{min(row['reference_convolution_ms']):.2f}"
         cells = [place, starred(row), f"{row['window']}, {row['look_ahead']}", *size_cells(row), *score_cells(found)]
-        lines.append((mean_of(found), [*cells, *cost_cells(row), speed]))
+        lines.append((mean_of(found), [*cells, *cost_cells(row), speed(row)]))
     return [cells for _, cells in sorted(lines, key=lambda line: -line[0])]
 
 
@@ -277,7 +282,7 @@ def width_cells(row: dict[str, Any], floor: float, at: str) -> list[str]:
     found = row["scores"].get(at)
     score = interval(found["scores"]["psnr_matched"], 2) if found and mean_of(found) >= floor else "below"
     macs, _, *others = size_cells(row)
-    return [starred(row), macs, *others, f"{row['curve'][-1]['psnr_matched']:.2f}", score, *cost_cells(row)]
+    return [starred(row), macs, *others, f"{row['curve'][-1]['psnr_matched']:.2f}", score, *cost_cells(row), speed(row)]
 
 
 def mean_of(found: dict[str, Any]) -> float:
@@ -307,6 +312,11 @@ def score_cells(found: dict[str, Any]) -> list[str]:
 def cost_cells(row: dict[str, Any]) -> list[str]:
     """Return seconds and megabytes of a restored frame."""
     return [f"{row['cost']['seconds_per_frame']:.3g}", f"{row['cost']['peak_bytes'] / 1e6:.0f}"]
+
+
+def speed(row: dict[str, Any]) -> str:
+    """Return the milliseconds of the reference convolution when the row was made."""
+    return f"{min(row['reference_convolution_ms']):.2f}"
 
 
 def light_cells(rows: list[dict[str, Any]]) -> list[list[str]]:

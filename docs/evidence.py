@@ -59,18 +59,20 @@ SENSOR = """## Sensors
 RENDERING = """## Rendering
 
 Radiance is compared with a converged reference of the same scene. fan, tumble, gears, flag, crowd, drums and text were
-used while the choice of budgets was written and are not shown, nor is macro, whose lens distorts. No constant was chosen on the other scenes
-or their seed, except the deepest bounce that is tested: glass lacked light without it, and is slower with it. **asked** is the
-requested PSNR. **reached** is the PSNR of a frame against the reference. **stated** is the PSNR by its measured noise
-and the bounces that the pilot omits. **naive** is a loop of one `mi.render` per frame, with the power of two of samples
-that reaches the same PSNR. All are in dB below [white](fidelity.md), clamped there. Lines with neighbours are of frames
-that share samples. [Another table](results/clips.md) has these scenes at 40 dB beside the program of commit 5c22140.
+used while the choice of budgets was written and are not shown, nor is macro, whose lens distorts. No constant was
+chosen on the other scenes or their seed, except the deepest bounce that is tested: glass lacked light without it, and
+is slower with it. **asked** is the requested PSNR. **reached** is the PSNR of a frame against the reference. **stated**
+is the PSNR by its measured noise and the bounces that the pilot omits. **naive** is a loop of one `mi.render` per
+frame, with the power of two of samples that reaches the same PSNR. All are in dB below [white](fidelity.md), clamped
+there. Lines with neighbours are of frames that share samples. [Another table](results/clips.md) has these scenes, but
+mains and walker, at 40 dB beside the program of commit 5c22140.
 One frame states 3.1 dB too little error: glossy at 30 dB, where eight samples miss rare bright paths.
 """
 
 LIGHT = """### Error and light
 
-The scenes above, each rendered with the budget of the requested error and compared with converged frames.
+Scenes of the table above, but mains and walker, each rendered with the budget of the requested error and compared with
+converged frames.
 **reached** and **stated** are in dB below white, with picture and truth clamped there; **without clamp** refers
 to the same white.
 **light** is the difference of the mean light of three frames from the converged ones. **announced** is the loss by the
@@ -103,7 +105,7 @@ TESTS = """## Which test checks which claim
 |---|---|
 | photons are computed correctly: worked numbers, EMVA formula, laws | `tests/qsim/optics/test_radiometry.py` |
 | radiance of a closed box and of a Lambertian plane | `test_renderer.py`, `test_mitsuba_scene.py` |
-| stated error of a frame agrees with its true error | `test_renderer.py`, `test_fidelity.py`, `test_fidelity_white.py` |
+| stated error of a frame agrees with the true one | `test_renderer.py`, `test_fidelity.py`, `test_fidelity_white.py` |
 | mean light agrees with a converged frame's within the announced error | `test_idle_options.py`, `test_denoiser.py` |
 | compiled and reference engine agree over 10 000 random sensors | `tests/qsim/sensor/compiled/test_codes_search.py` |
 | codes have the exact distribution: tails, ties, dead times | `tests/qsim/sensor/test_qis.py`, `test_counting.py` |
@@ -220,8 +222,8 @@ def light(report: dict[str, Any]) -> str:
     wrong = [row["scene"] for row in report["rows"] if not row["ok"]]
     verdict = f"**not** in {', '.join(wrong)}" if wrong else "everywhere"
     size = (
-        f"Frames of {report['height']} × {report['width']}. The error is within 0.5 dB of the request, and the light within "
-        f"4.5 standard errors of the announced loss, {verdict}."
+        f"Frames of {report['height']} × {report['width']}. The error is within 0.5 dB of the request, and the light "
+        f"within 4.5 standard errors of the announced loss, {verdict}."
     )
     return "\n".join([LIGHT, _table(header, rows), "", size, ""])
 

@@ -25,6 +25,7 @@ from unittest import mock
 import numpy as np
 import torch
 from numpy import ndarray as Array
+from rows import keep_apart
 from torch import Tensor
 from torch.utils.data import DataLoader
 
@@ -39,7 +40,7 @@ from quiver.training import merge_training
 from quiver.training.optimiser import Optimiser
 
 ROOT = Path(__file__).parents[1]
-FORMAT = "quiver-restorer-ablation-1"
+FORMAT = "quiver-restorer-ablation-2"  # 1: frames merged as before commit 47251c1
 SEEDS = (0, 1)
 PROTOCOL = merge_training.PROTOCOLS["quick"]
 TEST_LIGHTS = tuple(Illumination("quiver-physical", ppp, bits) for bits in (1, 3, 7) for ppp in (0.5, 3.25, 26.0))
@@ -98,6 +99,7 @@ def main(words: list[str] | None = None) -> int:
     size, names = TINY if args.tiny else Size(), args.rows.split(",")
     torch.set_num_threads(1)
     try:
+        args.work = keep_apart("restorer_ablation", args.out, args.work, trial=args.tiny)
         for name in names:
             if name not in VARIANTS:
                 raise ValueError(f"no row is called {name!r}; known are {', '.join(VARIANTS)}")
@@ -108,6 +110,8 @@ def main(words: list[str] | None = None) -> int:
                 args.out.mkdir(parents=True, exist_ok=True)
                 write_json(path, {"format": FORMAT, "quiver": VERSION, "name": name, "size": vars(size)} | row)
                 print(f"{path}: written", flush=True)
+            elif read_json(path)["format"] != FORMAT:
+                raise ValueError(f"{path}: was made from other merged frames by an earlier program; give --out")
             elif read_json(path)["size"] != vars(size):
                 raise ValueError(f"{path}: was made with another size; choose another --out, or remove it")
             write_table(args.out)
@@ -125,7 +129,7 @@ def options() -> argparse.ArgumentParser:
     parser.add_argument("--rows", default=",".join(VARIANTS), help="comma-separated (default all)")
     results = ROOT / "docs" / "results" / "restorer_ablation"
     parser.add_argument("--out", type=Path, default=results, help="folder of the rows")
-    parser.add_argument("--work", type=Path, default=Path("out/restorer_ablation"), help="windows; can be deleted")
+    parser.add_argument("--work", type=Path, help="windows, which can be deleted (default out/restorer_ablation)")
     parser.add_argument("--workers", type=int, default=2, help="processes that draw windows (default 2)")
     parser.add_argument("--tiny", action="store_true", help="seconds for each row, on tiny windows")
     return parser

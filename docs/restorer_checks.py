@@ -84,15 +84,15 @@ def shifts(clips: Sequence[Clip], names: Sequence[str]) -> dict[str, dict[str, d
 
 def brightness(counts: Counts, names: Sequence[str], bits: int) -> dict[str, list[float]]:
     """Return the mean of each method's frame over that of the truth, both clamped at the peak, by split."""
-    rng, peak = np.random.default_rng(0), peak_of(counts.light)
-    found: dict[str, list[float]] = {name: [] for name in names}
+    rng, peak, methods = np.random.default_rng(0), peak_of(counts.light), restorers(names)
+    found: dict[str, list[float]] = {method.name: [] for method in methods}
     for _ in range(SPLITS):
         given = np.sort(rng.choice(len(counts.frames), WINDOW, replace=False))
         target, _ = reference(counts, np.setdiff1d(np.arange(len(counts.frames)), given))
         codes, share = counted(counts, bits, given), float(counts.shares[given].mean())
-        for name in names:
-            light = restorer(name).restore(codes, WINDOW // 2, WINDOW // 2 + 1)[0] / share
-            found[name].append(float(light.clip(0, peak).mean() / target.clip(0, peak).mean()))
+        for method in methods:
+            light = method.restore(codes, WINDOW // 2, WINDOW // 2 + 1)[0] / share
+            found[method.name].append(float(light.clip(0, peak).mean() / target.clip(0, peak).mean()))
     return found
 
 
@@ -190,10 +190,11 @@ def main(words: list[str] | None = None) -> int:
             },
             "shown": args.shown,
         }
+        text, picture = page(found), crops(shown[0], args.restorer)
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        crops(shown[0], args.restorer).save(args.out.with_suffix(".jpg"), quality=QUALITY)
+        picture.save(args.out.with_suffix(".jpg"), quality=QUALITY)
         write_json(args.out.with_suffix(".json"), found)
-        write_bytes(args.out.with_suffix(".md"), page(found).encode())
+        write_bytes(args.out.with_suffix(".md"), text.encode())
     except (ValueError, OSError) as error:
         print(f"restorer_checks: {error}", file=sys.stderr)
         return 2

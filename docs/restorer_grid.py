@@ -74,7 +74,9 @@ def main(words: list[str] | None = None) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
         for name in names:
             grow(args.out / f"{name}.json", every[name], clips, args)
-        write_tables(args.out, names, [clip.name for clip in clips])
+        weights = sha256(weights_path(args.restorer))
+        known = [name for name in every if measured_with(args.out / f"{name}.json", weights)]
+        write_tables(args.out, known, [clip.name for clip in clips])
     except (ValueError, OSError) as error:
         print(f"restorer_grid: {error}", file=sys.stderr)
         return 2
@@ -92,6 +94,13 @@ def options() -> argparse.ArgumentParser:
 
 
 # ---- One cell
+
+
+def measured_with(path: Path, weights: str) -> bool:
+    """Return whether a cell exists whose restorer has these weights in every clip."""
+    found = read_json(path) if path.exists() else {}
+    clips = found.get("scores", {}).values()
+    return found.get("weights") == weights and all("restorer" in clip for clip in clips)
 
 
 def grow(path: Path, place: Place, clips: Sequence[Clip], args: argparse.Namespace) -> None:

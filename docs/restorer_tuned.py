@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from restorer_grid import FRAMES, Place, measured, places
+from rows import keep_apart
 
 from qsim.clip.clip import Clip
 from qsim.files import VERSION, read_json, sha256, write_bytes, write_json
@@ -52,6 +53,7 @@ def main(words: list[str] | None = None) -> int:
     args = options().parse_args(words)
     size, known = TINY if args.tiny else Size(), {place.name: place for place in places()}
     try:
+        args.work = keep_apart("restorer_tuned", args.out, args.work, trial=args.tiny)
         for name in args.cells.split(","):
             if name not in known:
                 raise ValueError(f"no cell is called {name!r}; known are {', '.join(known)}")
@@ -90,7 +92,7 @@ def options() -> argparse.ArgumentParser:
     parser.add_argument("--cells", default=",".join(CELLS), help="comma-separated cells of the grid")
     results = ROOT / "docs" / "results" / "restorer_tuned"
     parser.add_argument("--out", type=Path, default=results, help="folder of the rows")
-    parser.add_argument("--work", type=Path, default=Path("out/restorer_tuned"), help="runs; can be deleted")
+    parser.add_argument("--work", type=Path, help="runs, which can be deleted (default out/restorer_tuned)")
     parser.add_argument("--workers", type=int, default=2, help="processes that draw windows (default 2)")
     parser.add_argument("--tiny", action="store_true", help="seconds for each row")
     return parser

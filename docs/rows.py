@@ -9,6 +9,7 @@ so busy cores are refused before a row begins, and a row states how many cores o
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import platform
@@ -30,6 +31,7 @@ ROOT = Path(__file__).parents[1]
 LIGHTS = ("3.25", "1", "9.75", "26")  # photons per pixel; training is at the first
 QUIET = 0.1  # cores that other programs may use
 WATCH = 3.0  # s, before a row begins
+PATIENCE = 300.0  # s, for which a row waits for quiet cores
 REFERENCE_RUNS = 20
 
 
@@ -83,16 +85,23 @@ def everybodys_seconds() -> float | None:
     return (user + nice + system + interrupts + soft) / os.sysconf("SC_CLK_TCK")
 
 
-def refuse_busy(seconds: float = WATCH) -> None:
-    """Raise `ValueError` if other programs use more than QUIET cores now."""
-    watch = Watch.now()
-    time.sleep(seconds)
-    others = watch.others()
-    if others is not None and others > QUIET:
-        raise ValueError(
-            f"other programs use {others:.1f} cores, and a row needs quiet ones: at most {QUIET}; stop them, or give "
-            "--busy for rows that are marked"
-        )
+def refuse_busy() -> None:
+    """Wait until other programs use at most QUIET cores; `ValueError` if they still use more after PATIENCE."""
+    started, told = time.monotonic(), False
+    while True:
+        watch = Watch.now()
+        time.sleep(WATCH)
+        others = watch.others()
+        if others is None or others <= QUIET:
+            return
+        if time.monotonic() - started > PATIENCE:
+            raise ValueError(
+                f"other programs use {others:.1f} cores, and a row needs quiet ones: at most {QUIET}; stop them, or "
+                "give --busy for rows that are marked"
+            )
+        if not told:
+            print(f"other programs use {others:.1f} cores; waiting up to {PATIENCE:.0f} s for quiet ones", flush=True)
+            told = True
 
 
 def machine() -> str:
@@ -107,6 +116,15 @@ def processor() -> str:
     except OSError:
         return platform.processor()
     return next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.processor())
+
+
+def is_made(path: Path, plan: Any) -> bool:
+    """Return whether a row that `store` wrote exists; `ValueError` if it was made with another plan."""
+    if not path.exists():
+        return False
+    if read_json(path)["plan"] != json.loads(json.dumps(vars(plan))):
+        raise ValueError(f"{path}: was made with other options; choose another --out")
+    return True
 
 
 def store(path: Path, plan: Any, watch: Watch, row: dict[str, Any]) -> None:
@@ -224,17 +242,29 @@ def options(text: str | None, folder: str, names: Iterable[str]) -> argparse.Arg
     parser.add_argument("data", type=Path, help="data set with splits train, val and test")
     parser.add_argument("--rows", default=",".join(names), help="comma-separated (default all)")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / folder, help="folder of the rows")
-    parser.add_argument("--work", type=Path, default=Path("out") / folder, help="folder of runs, which can be deleted")
+    parser.add_argument("--work", type=Path, help=f"folder of runs, which can be deleted (default out/{folder})")
     parser.add_argument("--tiny", action="store_true", help="seconds for each row, on tiny crops and any cores")
     parser.add_argument("--busy", action="store_true", help="make rows on busy cores too, and mark them")
     return parser
 
 
-def quiver(*words: object, budget: Budget) -> None:
-    """Print and run one command of `quiver` in its own process."""
+def keep_apart(folder: str, out: Path, work: Path | None = None, *, trial: bool) -> Path:
+    """Return the folder of runs, one of its own for trial rows; `ValueError` if these would stand on the page."""
+    if trial and out == ROOT / "docs" / "results" / folder:
+        raise ValueError("trial rows do not belong on the page; give --out")
+    return work or Path("out") / (f"{folder}_trial" if trial else folder)
+
+
+def quiver(*words: object, budget: Budget, problems: bool = False) -> None:
+    """Print and run one command of `quiver` in its own process; `CalledProcessError` if it fails.
+
+    With `problems`, exit code 1 is no failure: the command finished, and its results state what failed.
+    """
     line = [str(word) for word in (*words, "--threads", budget.threads)]
     print(f"\n$ quiver {shlex.join(line)}", flush=True)
-    subprocess.run([sys.executable, "-m", "quiver", *line], check=True)
+    done = subprocess.run([sys.executable, "-m", "quiver", *line], check=False)
+    if not (problems and done.returncode == 1):
+        done.check_returncode()
 
 
 def scores(
@@ -245,6 +275,7 @@ def scores(
         *("evaluate", data, "-o", folder, "--methods", ",".join(methods), "--ppp", ",".join(lights)),
         *("--split", split, "-q"),
         budget=budget,
+        problems=True,
     )
     found: dict[str, Any] = {}
     for line in read_json(folder / "evaluation.json")["table"]:

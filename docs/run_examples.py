@@ -25,21 +25,26 @@ LARGEST_PNG = 60_000  # bytes; larger pictures are stored as JPEG
 
 def main(names: list[str]) -> None:
     examples.RESULTS.mkdir(exist_ok=True)
-    for path in sorted(examples.FOLDER.glob("*.py")):
+    paths = sorted(examples.FOLDER.glob("*.py"))
+    unknown = sorted({*names} - {path.stem for path in paths})
+    if unknown:
+        sys.exit(f"run_examples: no example is called {unknown[0]!r}; known are {', '.join(p.stem for p in paths)}")
+    for path in paths:
         name, source = path.stem, path.read_text(encoding="utf-8")
         code = examples.digest(source)
         if name in names or (not names and examples.stored(name).get("code") != code):
             print(name, flush=True)
-            for old in examples.RESULTS.glob(f"{name}_[0-9]*"):
-                old.unlink()
-            found = {"code": code, "cells": run(name, source)}
-            text = json.dumps(found, indent=1, ensure_ascii=False) + "\n"
+            earlier = {*examples.RESULTS.glob(f"{name}_[0-9]*")}
+            cells = run(name, source)
+            text = json.dumps({"code": code, "cells": cells}, indent=1, ensure_ascii=False) + "\n"
             (examples.RESULTS / f"{name}.json").write_text(text, encoding="utf-8")
+            for old in earlier - {examples.RESULTS / str(picture) for _, pictures in cells for picture in pictures}:
+                old.unlink()
 
 
-def run(name: str, source: str) -> list[list[object]]:
+def run(name: str, source: str) -> list[tuple[str, list[str]]]:
     """Run the cells of an example in an empty folder; return what each printed and the names of its pictures."""
-    found: list[list[object]] = []
+    found: list[tuple[str, list[str]]] = []
     space: dict[str, object] = {"__name__": "__main__"}
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         for number, cell in enumerate(examples.cells(source)):
@@ -47,7 +52,7 @@ def run(name: str, source: str) -> list[list[object]]:
             with contextlib.redirect_stdout(printed):
                 exec(compile(examples.shown(cell.code), f"{name}, cell {number}", "exec", dont_inherit=True), space)
             text = printed.getvalue().replace(os.path.realpath(folder), "").replace(folder, "")
-            found.append([text, save_figures(f"{name}_{number}")])
+            found.append((text, save_figures(f"{name}_{number}")))
     return found
 
 

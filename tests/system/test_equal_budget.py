@@ -152,6 +152,29 @@ def test_busy_cores_are_refused_or_marked(tmp_path, monkeypatch, capsys):
     assert rows.notes_on([found])[0] == r"\* made beside other programs: x."
 
 
+def test_a_row_waits_for_quiet_cores(tmp_path, monkeypatch, capsys):
+    """Others use 1.3 cores for a minute: less than a row waits."""
+    clock(monkeypatch, 1.3)
+    busy = rows.everybodys_seconds
+    monkeypatch.setattr(rows, "everybodys_seconds", lambda: busy() - 1.3 * max(0.0, rows.time.monotonic() - 60))
+    assert made(tmp_path / "x.json", 600.0, busy=False)["quiet"] is True
+    assert rows.time.monotonic() < 60 + 2 * rows.WATCH + 600
+    assert capsys.readouterr().out.count("waiting up to 300 s for quiet ones") == 1
+
+
+@pytest.mark.parametrize("code", [0, 1, 2, 3])
+def test_a_command_that_finished_with_problems_is_no_failure_where_they_are_kept(monkeypatch, code):
+    monkeypatch.setattr(rows.subprocess, "run", lambda line, check: subprocess.CompletedProcess(line, code))
+    if code < 2:
+        rows.quiver("bench", budget=rows.TINY, problems=True)
+    else:
+        with pytest.raises(subprocess.CalledProcessError):
+            rows.quiver("bench", budget=rows.TINY, problems=True)
+    if code:
+        with pytest.raises(subprocess.CalledProcessError):
+            rows.quiver("train", budget=rows.TINY)
+
+
 def test_a_resumed_row_is_as_quiet_as_its_loudest_session(tmp_path, monkeypatch):
     """One session fails beside other programs, one is killed: its load is not known."""
     clock(monkeypatch, 1.3)

@@ -17,7 +17,7 @@ import restorer_checks
 
 from quiver.data.clips import open_clips
 from quiver.data.photon_counts import Counts
-from quiver.restoration.restorers import restorer
+from quiver.restoration.restorers import restorer, weights_path
 
 
 def test_methods_of_single_pixels_do_not_depend_on_the_grid(tmp_path):
@@ -46,6 +46,15 @@ def test_the_program_writes_page_numbers_and_crops(tmp_path, monkeypatch):
     with Image.open(tmp_path / "checks.jpg") as picture:
         clip = open_clips(tmp_path / "data", "test")[0]
         assert picture.size == (4 * clip.shape[2], 2 * (clip.shape[1] + restorer_checks.CAPTION))
+
+
+def test_a_run_folder_has_its_brightness_under_the_name_of_the_method(tmp_path):
+    """Its name in scores is that of the folder, without the folders above."""
+    weights = tmp_path / "mine" / "best.safetensors"
+    weights.parent.mkdir()
+    weights.write_bytes(weights_path("mergenet").read_bytes())
+    counts = Counts(np.ones((13, 16, 16), np.uint8), np.ones(13), "ones")
+    assert list(restorer_checks.brightness(counts, [str(weights.parent)], 3)) == [restorer(str(weights.parent)).name]
 
 
 def test_brightness_is_that_of_the_truth():

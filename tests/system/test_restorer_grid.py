@@ -109,6 +109,10 @@ def test_only_what_is_missing_is_measured(tmp_path, monkeypatch, capsys):
     path = tmp_path / "grid" / "qis-3-3.25.json"
     first = json.loads(path.read_text())["scores"]
     assert [names for _, names in calls] == [["restorer", "naive"]] * 2
+    other = json.loads(path.read_text()) | {"name": "qis-1-0.5"}
+    (path.parent / "qis-1-0.5.json").write_text(json.dumps(other))
+    assert restorer_grid.main(words) == 0
+    assert "Mean over 2 cells" in (tmp_path / "grid.md").read_text()  # --cells chooses what is measured, not the page
     monkeypatch.setattr(restorer_grid, "CLASSICAL", ("naive", "moment:3"))
     assert restorer_grid.main(words) == 0
     assert [names for _, names in calls[2:]] == [["moment:3"]] * 2
@@ -117,6 +121,7 @@ def test_only_what_is_missing_is_measured(tmp_path, monkeypatch, capsys):
     assert [names for _, names in calls[4:]] == [["restorer"]] * 2
     told = json.loads(path.read_text())
     assert told["weights"] == "1" * 64
+    assert "Mean over 1 cells" in (tmp_path / "grid.md").read_text()  # the other cell has other weights
     assert all(told["scores"][name][method] == row for name, rows in first.items() for method, row in rows.items())
     assert restorer_grid.main(words) == 0
     assert len(calls) == 6

@@ -41,7 +41,7 @@ ROUNDS = 7  # of timing; the medians count
 # Name -> sensor, photons per pixel of timing and histogram, wanted speed in times NumPy's (0: none)
 MODELS: dict[str, tuple[Sensor, float, float]] = {
     "QIS 3 bits, gain 1": (QIS(0.8, 1.6, 0.2, 3), 3.25, 25.0),
-    "QIS 3 bits, gain 1.077": (quiver_physical(3.25), 3.25, 25.0),
+    "QIS 3 bits, gain 1.077": (QIS(0.8, 1.6, 0.2, 3, gain=3.5 / 3.25), 3.25, 25.0),
     "QIS 3 bits, gain 0.135": (quiver_physical(26.0), 26.0, 8.0),
     "QIS 5 bits, gain 1": (QIS(0.8, 1.6, 0.2, 5), 16.0, 0.0),
     "QIS 3 bits, no read noise": (QIS(0.8, 1.6, 0.0, 3), 3.25, 0.0),

@@ -14,6 +14,7 @@ from qsim.sensor.spad import BinarySPAD
 from qsim.studies.validation import sensors
 
 PIXELS = 1 << 16
+MODELS = {**sensors.MODELS}  # all; the report below has two
 
 
 @pytest.fixture(scope="module")
@@ -126,3 +127,12 @@ def test_too_few_pixels_are_refused():
 def test_the_complete_report_is_within_bounds():
     report = sensors.run(1 << 18)
     assert report.ok, "\n".join(sensors.table(report))
+
+
+def test_a_name_states_the_gain_of_its_sensor():
+    """A QIS beside others must be another sensor: one had the gain 1 of its neighbour."""
+    named = {name: sensor for name, (sensor, *_) in MODELS.items() if "gain" in name}
+    assert len(named) == 4
+    for name, sensor in named.items():
+        assert sensor.gain == pytest.approx(float(name.split("gain ")[1]), rel=1e-3)
+    assert len(set(named.values())) == len(named)

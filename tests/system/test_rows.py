@@ -1,0 +1,66 @@
+"""What the programs of stored rows share: trial rows stay apart, and rows of other options are not taken for ours."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "docs"))
+import ablation_rows  # noqa: E402
+import clip_rows  # noqa: E402
+import cycles_rows  # noqa: E402
+import equal_budget  # noqa: E402
+import restorer_ablation  # noqa: E402
+import restorer_tuned  # noqa: E402
+import reuse_rows  # noqa: E402
+import rows  # noqa: E402
+
+
+@pytest.mark.parametrize(
+    ("program", "words"),
+    [
+        (equal_budget, ["data", "--tiny"]),
+        (equal_budget, ["data", "--budget-seconds", "5"]),
+        (ablation_rows, ["data", "--tiny"]),
+        (reuse_rows, ["--tiny"]),
+        (clip_rows, ["--tiny"]),
+        (cycles_rows, ["--tiny", "--cycles", "python"]),
+        (restorer_ablation, ["data", "data", "data", "--tiny"]),
+        (restorer_tuned, ["data", "data", "data", "data", "--tiny"]),
+    ],
+    ids=lambda value: getattr(value, "__name__", None) or " ".join(value),
+)
+def test_trial_rows_stay_away_from_the_page_and_from_the_runs_of_true_ones(capsys, monkeypatch, program, words):
+    monkeypatch.setattr(program, "use_only", lambda threads: None, raising=False)
+    before = sorted((ROOT / "docs" / "results").rglob("*"))
+    assert program.main(words) == 2
+    assert capsys.readouterr().err.endswith("trial rows do not belong on the page; give --out\n")
+    assert sorted((ROOT / "docs" / "results").rglob("*")) == before
+    assert rows.keep_apart("x", Path("rows"), trial=True) != rows.keep_apart("x", Path("rows"), trial=False)
+    assert rows.keep_apart("x", Path("rows"), Path("w"), trial=True) == Path("w")
+
+
+def test_a_stored_row_of_other_options_is_refused(tmp_path):
+    plan = cycles_rows.Plan()
+    assert not rows.is_made(tmp_path / "x.json", plan)
+    rows.store(tmp_path / "x.json", plan, rows.Watch.now(), {})
+    assert rows.is_made(tmp_path / "x.json", plan)
+    with pytest.raises(ValueError, match="was made with other options; choose another --out"):
+        rows.is_made(tmp_path / "x.json", cycles_rows.Plan(reference=1))
+
+
+@pytest.mark.parametrize(
+    ("folder", "plan"),
+    [("reuse", reuse_rows.Plan()), ("cycles", cycles_rows.Plan()), ("clips", clip_rows.Plan())],
+    ids=["reuse", "cycles", "clips"],
+)
+def test_rows_of_the_page_have_the_options_of_the_program(folder, plan):
+    """Those whose size, motion and seed are the usual ones."""
+    usual = json.loads(json.dumps(vars(plan)))
+    stored = [rows.read_json(path)["plan"] for path in (ROOT / "docs" / "results" / folder).glob("*-128x256.json")]
+    assert stored
+    assert all(plan == usual for plan in stored)
