@@ -65,7 +65,10 @@ def _add_convert_weights(sub: Any) -> None:
 def _run_convert_weights(args: argparse.Namespace) -> int:
     from quiver.model.published_weights import convert_weights
 
+    if args.output.suffix != ".safetensors":
+        raise ValueError(f"{args.output}: weights are written as .safetensors; name a .safetensors file with -o")
     if args.force and args.output.exists():
+        _check_ours(args.output)
         fresh = args.output.with_name(f".{args.output.stem}.new.safetensors")
         fresh.unlink(missing_ok=True)
         network = convert_weights(args.source, fresh)
@@ -76,3 +79,17 @@ def _run_convert_weights(args: argparse.Namespace) -> int:
     found = {"weights": str(args.output), "channels": network.config.channels, "parameters": parameters}
     output(args, found, f"{args.output}: {network.config.channels} channels, {parameters:,} parameters")
     return 0
+
+
+def _check_ours(path: Path) -> None:
+    """Raise `FileExistsError` for a file that does not hold weights of this program."""
+    from quiver.model.weights import FORMAT, metadata_of
+
+    try:
+        ours = metadata_of(path).get("format") == FORMAT
+    except (OSError, ValueError):
+        ours = False
+    if not ours:
+        raise FileExistsError(
+            f"{path}: does not hold weights of this program, and --force replaces nothing else; name another with -o"
+        )

@@ -76,6 +76,11 @@ def defective(
     return bad if bad.any() else None
 
 
+def as_measured(defects: Defects | None, sensor: Sensor, shape: tuple[int, int]) -> Sensor:
+    """Return a sensor with the mean dark rate of its measured map for frames [H, W]; the same without a map."""
+    return sensor if defects is None else PixelArray.of(defects, sensor, *shape).sensor
+
+
 def behind(bad: Array | None, defects: Defects | None, sensor: Sensor) -> Sensor:
     """Return the sensor of filled codes: its dark rate is the mean of the good pixels, bool [H, W] `bad` being false.
 

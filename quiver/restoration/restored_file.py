@@ -26,6 +26,7 @@ from quiver.restoration.interface import Restorer
 
 FORMAT = "quiver-restored-1"
 BLOCK_FRAMES = 256  # restored between two entries of the journal
+ZEROS = 1 << 24  # bytes written at a time where disk space is reserved by writing it
 WHAT_CHANGED = {  # key of the description -> its name in the message that a restoration starts again
     "codes_sha256": "the codes",
     "colour": "the colour filters",
@@ -63,7 +64,7 @@ def restore_to_file(
     part, journal = path.with_name(path.name + ".part"), path.with_name(path.name + ".part.json")
     with _only_writer(path):
         _finish_naming(path, part, journal)
-        _check_target(path, force)
+        _check_target(path, journal, force)
         meta = {
             "format": FORMAT,
             "quiver": VERSION,
@@ -114,14 +115,19 @@ def _only_writer(path: Path) -> Iterator[None]:
 
 def _finish_naming(path: Path, part: Path, journal: Path) -> None:
     """Rename the description if a writer was killed after it renamed the video."""
-    if journal.exists() and path.exists() and not (part.exists() or path.with_suffix(".json").exists()):
-        with contextlib.suppress(ValueError):
-            if "seconds_per_frame" in read_json(journal):
-                os.replace(journal, path.with_suffix(".json"))
+    if path.exists() and not (part.exists() or path.with_suffix(".json").exists()) and _complete(journal):
+        os.replace(journal, path.with_suffix(".json"))
 
 
-def _check_target(path: Path, force: bool) -> None:
-    """Raise `FileExistsError` if there is a result that may not be replaced."""
+def _complete(journal: Path) -> bool:
+    """Return whether a journal describes a complete video: its writer was killed during the renames."""
+    with contextlib.suppress(FileNotFoundError, ValueError):
+        return "seconds_per_frame" in read_json(journal)
+    return False
+
+
+def _check_target(path: Path, journal: Path, force: bool) -> None:
+    """Raise `FileExistsError` if there is a file that may not be replaced."""
     if path.is_dir():
         raise FileExistsError(f"{path}: is a folder; name a file with -o")
     for file in (path, path.with_suffix(".json")):
@@ -131,6 +137,11 @@ def _check_target(path: Path, force: bool) -> None:
     if description.exists() and read_json(description).get("format") != FORMAT:
         raise FileExistsError(
             f"{description}: does not describe restored video, and --force replaces nothing else; name another with -o"
+        )
+    if path.exists() and not description.exists() and not _complete(journal):  # complete: killed while it replaced
+        raise FileExistsError(
+            f"{path}: has no .json that describes restored video, and --force replaces nothing else; name another "
+            "with -o"
         )
 
 
@@ -179,7 +190,13 @@ def _reserve(part: Path, shape: tuple[int, ...]) -> None:
         header = {"descr": np.lib.format.dtype_to_descr(np.dtype(np.float32)), "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)
         file.flush()
-        os.posix_fallocate(file.fileno(), 0, file.tell() + 4 * int(np.prod(shape, dtype=np.int64)))
+        start = file.tell()
+        stop = start + 4 * int(np.prod(shape, dtype=np.int64))
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, stop)
+        else:  # macOS
+            for written in range(start, stop, ZEROS):
+                file.write(bytes(min(ZEROS, stop - written)))
 
 
 def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, str]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from quiver.data.clips import Clip, open_clips
 from quiver.data.codes import Codes, filled, light_of, open_stream, sensed, stream_codes
-from quiver.data.defects import behind, defective, read_map
+from quiver.data.defects import as_measured, behind, defective, read_map
 from quiver.data.illumination import Illumination, follows_light, read_sensor
 from quiver.data.photon_cubes import cube_codes
 from quiver.restoration.interface import AUTO
@@ -106,6 +106,7 @@ def _of_array(path: Path, args: argparse.Namespace) -> Codes:
         raise ValueError(f"{path}: would be replaced by what is made from it; name another with -o")
     codes = cube_codes(path, light, args.frame_rate or FRAME_RATE, planes=args.planes, width=args.width)
     found = read_sensor(sensor)[1] if sensor.endswith(".toml") else None
+    codes = replace(codes, sensor=as_measured(found, codes.sensor, codes.shape[1:]))
     bad = defective(found, codes.sensor, codes.exposure, light_of(codes), codes.shape[1:])
     return filled(replace(codes, sensor=behind(bad, found, codes.sensor)), bad)
 

@@ -9,6 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from golden import published_state
+from safetensors.torch import save_file
 
 from qsim.cli.options import memory_size
 from quiver.cli.program import main
@@ -201,6 +204,11 @@ def test_nothing_is_overwritten_without_force(capsys, tmp_path, tiny_dataset, cl
     words = ["restore", clip, "-o", video, "--method", "moment", "--ppp", 3.25]
     assert "exists; name another with -o, or use --force" in mistake(capsys, *words)
     assert video.read_text() == "mine"
+    assert "has no .json that describes restored video" in mistake(capsys, *words, "--force")
+    assert video.read_text() == "mine"
+    video.unlink()
+    assert run(capsys, *words)[0] == 0
+    assert "exists; name another with -o, or use --force" in mistake(capsys, *words)
     assert run(capsys, *words, "--force")[0] == 0
     assert np.load(video).shape == (14, 36, 44)
     for name in ("v", "v.mp4"):
@@ -234,6 +242,26 @@ def test_a_checkpoint_that_is_none_is_refused(capsys, tmp_path):
     (tmp_path / "a.pth").write_bytes(b"\x80\x04not a checkpoint")
     assert "a.pth" in mistake(capsys, "convert-weights", tmp_path / "a.pth", "-o", tmp_path / "a.safetensors")
     assert not (tmp_path / "a.safetensors").exists()
+
+
+def test_converted_weights_replace_weights_only(capsys, tmp_path):
+    """Not the checkpoint that is converted, nor another file: only weights of this program, with --force."""
+    theirs, named, notes = (tmp_path / name for name in ("their.pth", "their.safetensors", "notes.safetensors"))
+    torch.save(published_state(), theirs)
+    save_file({name: value.clone() for name, value in published_state().items()}, named)
+    notes.write_text("mine")
+    held = {path: path.read_bytes() for path in (theirs, named, notes)}
+    for source, output, message in (
+        (theirs, theirs, "their.pth: weights are written as .safetensors"),
+        (named, named, "their.safetensors: does not hold weights of this program"),
+        (theirs, notes, "notes.safetensors: does not hold weights of this program"),
+    ):
+        assert message in mistake(capsys, "convert-weights", source, "-o", output, "--force")
+    assert {path: path.read_bytes() for path in held} == held
+    words = ["convert-weights", theirs, "-o", tmp_path / "ours.safetensors"]
+    assert run(capsys, *words)[0] == 0
+    assert "exists" in mistake(capsys, *words)
+    assert run(capsys, *words, "--force")[0] == 0
 
 
 @pytest.mark.parametrize(("text", "bytes_"), [("2GB", 2e9), ("500MB", 5e8), ("1.5GiB", 1.5 * 2**30), ("4096", 4096)])

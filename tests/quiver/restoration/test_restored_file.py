@@ -145,19 +145,29 @@ def test_damaged_notes_are_no_obstacle(tmp_path, blocks_of_four):
         assert "starting again" in said[0]
 
 
-def test_killed_anywhere_it_ends_whole(tmp_path, blocks_of_four):
-    """SIGKILL before each event of the file system in turn: the same call ends with the same bytes, nothing is left."""
+@pytest.mark.parametrize("replaces", [False, True])
+def test_killed_anywhere_it_ends_whole(tmp_path, blocks_of_four, replaces):
+    """SIGKILL before each event of the file system in turn, with or without an earlier video of this name: the same
+    call ends with the same bytes, nothing is left.
+    """
     codes, moment = random_codes(), restorer("moment")
     path, expected = tmp_path / "r.npy", restorer("moment").restore(random_codes())
+
+    def earlier() -> None:
+        if replaces:
+            restore_to_file(codes, restorer("naive"), path)
+
     step = 1
-    while killed_at(step, tmp_path, lambda: restore_to_file(codes, moment, path, force=False)):
+    earlier()
+    while killed_at(step, tmp_path, lambda: restore_to_file(codes, moment, path, force=replaces)):
         with contextlib.suppress(FileExistsError):  # killed after it had its name: it is there
-            restore_to_file(codes, moment, path, force=False)
+            restore_to_file(codes, moment, path, force=replaces)
         np.testing.assert_array_equal(np.load(path), expected)
         assert json.loads((tmp_path / "r.json").read_text())["method"] == "moment"
         for file in tmp_path.iterdir():
             assert file.name in ("r.npy", "r.json", "r.npy.lock") or ".tmp-" in file.name, file
             file.unlink()
+        earlier()
         step += 1
     assert step > 15
 
@@ -221,23 +231,36 @@ def test_many_writers_of_one_video(tmp_path):
 
 
 def test_force_replaces_restored_video_only(tmp_path, make_clip, capsys):
-    """Not a stream, whose json lies where the video's would, and not the array that is being restored."""
+    """Not a stream, whose json lies where the video's would, not the array that is being restored, nor another."""
     stream, _ = sense(make_clip(frames=3), Sensing("quiver-physical", bits=3, ppp=3.25, name="mine"))
     np.save(tmp_path / "a.npy", random_codes().read(0, 10))
-    held = {path: path.read_bytes() for path in (stream.path, stream.path.with_suffix(".json"), tmp_path / "a.npy")}
+    np.save(tmp_path / "cube.npy", random_codes(seed=1).read(0, 10))
+    own = (stream.path, stream.path.with_suffix(".json"), tmp_path / "a.npy", tmp_path / "cube.npy")
+    held = {path: path.read_bytes() for path in own}
     words = ["--method", "naive", "--force"]
     assert main(["restore", str(stream.path), "-o", str(stream.path), *words]) == 2
     assert "does not describe restored video" in capsys.readouterr().err
     array = ["restore", str(tmp_path / "a.npy"), "--sensor", "quiver-paper"]
     assert main([*array, "-o", str(tmp_path / "." / "a.npy"), *words]) == 2
     assert "would be replaced by what is made from it" in capsys.readouterr().err
+    assert main([*array, "-o", str(tmp_path / "cube.npy"), *words]) == 2
+    assert "cube.npy: has no .json that describes restored video" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in held} == held
+    assert [path.name for path in tmp_path.glob("cube.*")] == ["cube.npy"]
     (tmp_path / "d.npy").mkdir()
     assert main([*array, "-o", str(tmp_path / "d.npy"), *words]) == 2
     assert "d.npy: is a folder" in capsys.readouterr().err
 
 
 # A full disk
+
+
+@pytest.fixture(params=["posix_fallocate", "zeros"])
+def reserving(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reserve disk space as on Linux, or as on macOS, which has no posix_fallocate: in pieces of 1000 bytes."""
+    if request.param == "zeros":
+        monkeypatch.delattr(os, "posix_fallocate", raising=False)
+        monkeypatch.setattr(restored_file, "ZEROS", 1000)
 
 
 @pytest.fixture
@@ -260,7 +283,7 @@ def restore_words(source: Path, target: Path, method: str) -> list[str]:
     return ["restore", str(source), "-o", str(target), "--method", method, "--sensor", "quiver-paper", "-q"]
 
 
-def test_a_disk_that_fills_up(small_disk, tmp_path, capsys):
+def test_a_disk_that_fills_up(small_disk, tmp_path, capsys, reserving):
     """A disk of every number of pages up to one that holds all: one line and nothing left, or the complete video."""
     source = array_file(tmp_path)
     words, whole = restore_words(source, small_disk / "r.npy", "moment"), []
@@ -282,7 +305,7 @@ def test_a_disk_that_fills_up(small_disk, tmp_path, capsys):
     assert whole[-1]
 
 
-def test_a_file_that_may_not_grow(tmp_path, capsys):
+def test_a_file_that_may_not_grow(tmp_path, capsys, reserving):
     """RLIMIT_FSIZE at the header, in the middle, a byte short and just enough: no signal, one line or the video."""
     source = array_file(tmp_path)
     size = 128 + 4 * 9 * 24 * 31

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from sensor_files import SPAD, sensor_file
 
 from quiver.cli.program import main
 from quiver.restoration.interface import RestoreOptions
@@ -141,6 +142,21 @@ def test_two_lines_say_what_was_chosen_and_assumed(inputs, tmp_path, capsys):
         assert part in said
     assert main(["restore", str(inputs["clip"]), "-o", str(tmp_path / "q.npy"), "-q", "--method", "naive"]) == 0
     assert capsys.readouterr().err == ""
+
+
+def test_the_dark_rate_of_an_array_is_that_of_the_measured_map(inputs, tmp_path):
+    """A uniform map, in which no pixel is hot: the video of a sensor that states this rate, not that of the file."""
+    np.save(tmp_path / "rates.npy", np.full((6, 7), 80.0))  # 1/s
+    videos = []
+    dark_map = 'dark_map = "rates.npy"\n'
+    for name, rate, table in (("mapped", "0.0", dark_map), ("stated", "80.0", ""), ("dark", "0.0", "")):
+        sensor = sensor_file(tmp_path, SPAD.replace("200.0", rate) + table, bits=3, name=f"{name}.toml")
+        words = ["restore", inputs["array"], "-o", tmp_path / "r.npy", "--sensor", sensor, "--method", "moment"]
+        assert main([str(word) for word in [*words, "--force", "-q"]]) == 0
+        videos.append(np.load(tmp_path / "r.npy"))
+    mapped, stated, dark = videos
+    np.testing.assert_array_equal(mapped, stated)
+    assert mapped.mean() < dark.mean()
 
 
 def test_a_mode_of_a_network_that_has_one_is_refused(inputs, tmp_path, capsys):
