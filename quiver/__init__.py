@@ -2,7 +2,8 @@
 
     video = quiver.restore(stream)
     quiver.score(video, stream).psnr
-    loader = DataLoader(quiver.windows("out/starter", split="train"), batch_size=8)
+    data = quiver.windows("out/starter", split="train")
+    loader = DataLoader(data, batch_sampler=Batches(8, first=0, last=1000))  # Batches: quiver.data.windows
 
 Torch is imported with the first network or window, not with the package.
 """

@@ -1,11 +1,12 @@
 """
 # Windows for your own PyTorch loop
 
-Training windows are a plain `torch` data set: codes, truth and light, with new noise in every epoch.
+Training windows are a plain `torch` data set: codes, truth and light, with new noise in every window.
 """
 
 # %%
-# `quiver.windows` takes a clip, a stream, or the folder of a data set.
+# `quiver.windows` takes a clip, a stream, or the folder of a data set. `Batches` numbers the windows of all steps, and
+# every number has its own noise. A loader without it repeats the first epoch with the same noise.
 
 import matplotlib.pyplot as plt
 import torch
@@ -13,13 +14,14 @@ from torch.utils.data import DataLoader
 
 import qsim
 import quiver
+from quiver.data.windows import Batches
 
 side = 96  # tests: 32
-epochs = 12  # tests: 1
+steps = 24  # tests: 2
 clip = qsim.render("plain", frames=12, height=side, width=side, speed=3, psnr=28)
 stream = clip.sense("quiver-physical", bits=3, ppp=3.25)
-windows = quiver.windows(stream, frames=5, crop=32, repeats=16)
-loader = DataLoader(windows, batch_size=8)
+windows = quiver.windows(stream, frames=5, crop=32)
+loader = DataLoader(windows, batch_sampler=Batches(8, first=0, last=steps))
 batch = next(iter(loader))
 print({name: tuple(value.shape) for name, value in batch.items() if torch.is_tensor(value)})
 
@@ -34,14 +36,13 @@ network = torch.nn.Sequential(
 )  # fmt: skip
 optimiser = torch.optim.Adam(network.parameters(), 3e-3)
 losses = []
-for _ in range(epochs):
-    for batch in loader:
-        codes, target = batch["codes"][:, :, 0], batch["target"][:, 2]
-        loss = torch.nn.functional.mse_loss(network(codes), target)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        losses.append(loss.item())
+for batch in loader:
+    codes, target = batch["codes"][:, :, 0], batch["target"][:, 2]
+    loss = torch.nn.functional.mse_loss(network(codes), target)
+    optimiser.zero_grad()
+    loss.backward()
+    optimiser.step()
+    losses.append(loss.item())
 print(f"loss {losses[0]:.4f} -> {losses[-1]:.4f}")
 
 # %%

@@ -29,7 +29,9 @@ def add_domain(sub: Any) -> None:
     )
     parser.add_argument("--split", choices=("train", "val", "test", "all"), help="split of data sets (default test)")
     parser.add_argument("--sensor", type=words, help="names or .toml files, comma-separated (default quiver-physical)")
-    parser.add_argument("--bits", type=whole_numbers, help="bits per code, comma-separated (default 3)")
+    parser.add_argument(
+        "--bits", type=whole_numbers, help="bits per code, comma-separated (default 3; of a .toml file its own)"
+    )
     parser.add_argument("--ppp", type=numbers, help="mean photons per pixel and code, comma-separated (default 3.25)")
     parser.add_argument(
         "--methods", type=words, help="classical methods, comma-separated (default all but `likelihood`)"
@@ -84,7 +86,7 @@ def _settings(args: argparse.Namespace) -> Any:
     lights = tuple(
         Illumination(sensor, ppp, bits)
         for sensor in args.sensor or ("quiver-physical",)
-        for bits in args.bits or (3,)
+        for bits in args.bits or (_own_bits(sensor),)
         for ppp in args.ppp or (3.25,)
     )
     if args.split is not None and all((clips / "clip.json").exists() for clips in args.clips):
@@ -93,3 +95,10 @@ def _settings(args: argparse.Namespace) -> Any:
         )
     clips = clips_of(args.clips, None if args.split == "all" else args.split or "test")
     return DomainSettings(clips, lights, args.methods or CLASSICAL, args.seed or 0)
+
+
+def _own_bits(sensor: str) -> int:
+    """Return the bits of a sensor file, else 3."""
+    from quiver.data.illumination import read_sensor
+
+    return read_sensor(sensor)[0].bits if sensor.endswith(".toml") else 3

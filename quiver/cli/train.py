@@ -82,7 +82,9 @@ def add_train(sub: Any) -> None:
     parser.add_argument("--workers", type=nonnegative, help="processes that draw samples (default 0: this one)")
     add_threads(parser)
     parser.add_argument(
-        "--precision", choices=("auto", "float32", "bfloat16"), help="precision (default auto: bfloat16 on CUDA)"
+        "--precision",
+        choices=("auto", "float32", "bfloat16"),
+        help="precision (default auto: bfloat16 on CUDA; published protocols: float32)",
     )
     parser.add_argument("--device", default="auto", choices=DEVICES, help="device (default auto)")
     parser.add_argument("--seed", type=checked(checks.seed), help="of weights, samples and noise (default 0)")
@@ -149,6 +151,8 @@ def _settings(args: argparse.Namespace) -> Any:
     given = {field.name: getattr(args, field.name, None) for field in fields(Settings)}
     given |= {"data": args.data, "out": args.output, "network": args.preset}
     defaults = dict(protocol(system_named(args.preset), args.protocol))
+    if any(sensor.endswith(".toml") for sensor in args.sensor or ()):
+        defaults.pop("bits", None)  # a sensor file states its own; a named sensor beside it has those of the streams
     return Settings(**defaults | {name: value for name, value in given.items() if value is not None})
 
 

@@ -42,7 +42,7 @@ def choose(
     """
     asked = bool(sensors or ppp or bits)
     streams = _streams(clips)
-    if sensors and ppp and bits:  # the streams decide nothing
+    if sensors and ppp and (bits or all(map(_is_file, sensors))):  # the streams decide nothing
         single = [stream for stream in streams if (stream.meta.get("planes_per_code") or 1) == 1]
         streams = [stream for stream in single if stream.rows is stream.shares is None]
     found = _sorted(streams)
@@ -64,6 +64,11 @@ def _streams(clips: Sequence[Clip]) -> list[Stream]:
     return [clip.stream(name) for clip in clips for name in clip.streams]
 
 
+def _is_file(sensor: str) -> bool:
+    """Return whether a sensor is a file, which states its bits."""
+    return sensor.endswith(".toml")
+
+
 def _unique(noises: Iterable[Noise]) -> tuple[Noise, ...]:
     return tuple(dict.fromkeys(noises))
 
@@ -76,8 +81,8 @@ def _sorted(streams: Iterable[Stream]) -> tuple[Noise, ...]:
 
 def _changed(noise: Noise, sensor: str | None, ppp: float | None, bits: int | None) -> Noise:
     """Return a noise with the requested changes."""
-    if sensor is not None and (sensor != noise.sensor or sensor.endswith(".toml")):
-        depth = bits if bits is not None or sensor.endswith(".toml") else noise.bits
+    if sensor is not None and (sensor != noise.sensor or _is_file(sensor)):
+        depth = bits if bits is not None or _is_file(sensor) else noise.bits
         fresh = Noise.of(Illumination(sensor, noise.ppp, depth))
         noise = replace(fresh, lux=noise.lux, diffraction=noise.diffraction)
     if ppp is not None:

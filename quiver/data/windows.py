@@ -4,10 +4,12 @@
 
 Sample n is a function of (seed, n) alone: its clip, place, turn, light level and every bit of its noise. So 0, 1 or 8
 workers give the same bytes, and a killed run resumes with the next sample. Sample n + e * len(windows) is sample n of
-epoch e, with new noise. Dr.Jit, which does not survive a fork, is not used. Sensor, light and defects are those of the
-clips' streams unless the settings name others (noise.py). Dead and hot pixels are filled as before restoration.
+epoch e, with new noise; `Batches` counts on from epoch to epoch, a loader without it repeats epoch 0, noise included.
+Dr.Jit, which does not survive a fork, is not used. Sensor, light and defects are those of the clips' streams unless the
+settings name others (noise.py). Dead and hot pixels are filled as before restoration.
 
-    loader = DataLoader(windows("out/starter", split="train", crop=64), batch_size=8, shuffle=True)
+    data = windows("out/starter", split="train", crop=64)
+    loader = DataLoader(data, batch_sampler=Batches(8, first=0, last=1000))
 """
 
 from __future__ import annotations
@@ -66,9 +68,9 @@ class WindowSettings:
 
 
 class Windows(Dataset[dict[str, Any]]):
-    """Windows of `frames` frames from the clips of a folder, with new noise in every epoch: a `torch` data set.
+    """Windows of `frames` frames from the clips of a folder: a `torch` data set.
 
-    An item holds:
+    Numbers from `len` on are windows, too: those of the next epochs, with new noise. An item holds:
 
         codes    float32 [T, 1, h, w] in [0, 1]
         target   float32 [T, 1, h, w], sharp photons / white, up to `ceiling` or the peak
@@ -155,6 +157,14 @@ class Windows(Dataset[dict[str, Any]]):
         key = Key(seed=settings.seed, clip=index, stage=VALIDATION)
         return WindowPlace(clip, start, y, x, (0, 0), index // len(self.clips), 0, False, key)
 
+    def spread(self, count: int) -> list[int]:
+        """Return the numbers of at most `count` fixed windows, spread over the clips and over the light levels."""
+        if self.length <= count:
+            return list(range(self.length))
+        clips, lights = len(self.clips), len(self.noise.noises)
+        order = np.random.default_rng(0).permutation(clips)  # so that the light does not follow the order of clips
+        return [n * lights // count * clips + int(order[n % clips]) for n in range(count)]
+
     def __getitem__(self, n: int) -> dict[str, Any]:
         place = self.place(n)
         clip, noise = self.clips[place.clip], self.noise.noises[place.light]
@@ -238,12 +248,12 @@ def windows(
     seed: int = 0,
     repeats: int = 1,
 ) -> Windows:
-    """Return training windows for a `torch.utils.data.DataLoader`: codes, truth and light, with new noise per epoch.
+    """Return training windows for a `torch.utils.data.DataLoader`: codes, truth and light. Each number has its noise.
 
     `source` is a stream (its sensor and light), a clip, some clips, or the folder of a clip or a data set, of which
     `split` names a part (train, val, test). A window has `frames` frames of `crop` x `crop` px; an epoch holds
-    `repeats` windows of every clip. `Windows` states the items; `WindowSettings` has more settings. `ValueError` where
-    no window fits.
+    `repeats` windows of every clip, and `Batches` gives a loader the numbers of all epochs. `Windows` states the items;
+    `WindowSettings` has more settings. `ValueError` where no window fits.
     """
     settings = WindowSettings(frames=frames, crop=crop, seed=seed)
     if isinstance(source, str | os.PathLike):

@@ -36,7 +36,7 @@ from quiver.training.run_folder import Run
 from quiver.training.schedule import State, learning_rate, note_plateau, share_used, time_is_up, validation_due
 from quiver.training.self_supervised import make_stream_windows
 from quiver.training.settings import Settings, settled
-from quiver.training.system import Batch, Loss, System
+from quiver.training.system import Batch, Objective, System
 from quiver.training.systems import OURS, system_of
 
 AnyWindows = Windows | StreamWindows
@@ -67,12 +67,12 @@ class Process:
         if self.world > 1:
             torch.distributed.barrier()
 
-    def from_leader(self, number: int) -> int:
+    def from_leader(self, number: float) -> float:
         """Return the leader's number in every process."""
-        value = torch.tensor(number, device=self.device)
+        value = torch.tensor(number, dtype=torch.float64, device=self.device)
         if self.world > 1:
             torch.distributed.broadcast(value, 0)
-        return int(value)
+        return float(value)
 
     def any(self, condition: bool) -> bool:
         """Return in every process whether the condition holds in any of them."""
@@ -122,7 +122,7 @@ def make_windows(
     side = min(VALIDATION_SIDE, *(min(clip.shape[1:]) for clip in validation)) // multiple * multiple
     middle = replace(window, drift=0, frames=frames or system.frames, crop=max(side, multiple), ceiling=math.inf)
     fixed = Windows(validation, middle, fixed=True, prepare=system.prepare)
-    return windows, Subset(fixed, range(0, len(fixed), -(-len(fixed) // settings.validation_windows)))
+    return windows, Subset(fixed, fixed.spread(settings.validation_windows))
 
 
 def batches(windows: AnyWindows, settings: Settings, state: State, process: Process) -> Iterator[dict[str, Any]]:
@@ -197,18 +197,6 @@ class Board:
         self.writer.close()
 
 
-class Objective(nn.Module):
-    """A network with its loss: one module, so that processes share the gradients of all that the loss computes."""
-
-    def __init__(self, network: nn.Module, loss: Loss, settings: Settings) -> None:
-        super().__init__()
-        self.network, self.loss, self.settings = network, loss, settings
-
-    def forward(self, batch: Batch, share: float) -> Tensor:
-        """Return the loss of a batch, a scalar; `share` of the run is over."""
-        return self.loss(self.network, batch, self.settings, share)
-
-
 class Trainer:
     """Training of one model: steps, validations when they are due, and checkpoints."""
 
@@ -245,7 +233,7 @@ class Trainer:
         if self.process.any(not math.isfinite(self.loss + norm)):
             self._fail(batch, norm)
         self.optimiser.step(self.rate)
-        state.step, state.elapsed = state.step + 1, time.monotonic() - self.started
+        state.step, state.elapsed = state.step + 1, self.process.from_leader(time.monotonic() - self.started)
         if self.board is not None:
             self.board.step(state, self.loss, norm, self.rate)
 
@@ -275,7 +263,7 @@ class Trainer:
             score, picture = validate(self.model, self.fixed, self.process.device, self.system)
             self.board.validation(state, score, picture)
             self._record(score)
-        state.halvings = self.process.from_leader(state.halvings)
+        state.halvings = int(self.process.from_leader(state.halvings))
         self.validation = time.monotonic() - began
 
     def _record(self, score: metrics.Score) -> None:
@@ -283,7 +271,8 @@ class Trainer:
         state = self.state
         entry = {"step": state.step, "elapsed": state.elapsed, "loss": self.loss, "learning_rate": self.rate}
         state.history.append(entry | score.to_dict())
-        note_plateau(self.run.settings.patience, state, score.psnr_matched)
+        if share_used(self.run.settings, state) >= self.system.begins(self.model):
+            note_plateau(self.run.settings.patience, state, score.psnr_matched)
         if score.psnr_matched > state.best:
             state.best = score.psnr_matched
             self.run.save_weights("best", self.model, state)

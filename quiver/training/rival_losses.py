@@ -78,8 +78,9 @@ def emvd_loss(network: Any, batch: Batch, settings: Settings, share: float) -> T
     colour, back = (mix.net1.weight.flatten(1) for mix in (network.ct, network.cti))
     taps = network.ft.net1["weight"].view(2, 2)
     inverse = torch.stack([network.fti.net1["weight"].flatten(), network.fti.net2["weight"].flatten()])
-    product = taps @ inverse if network.config.as_published else taps.T @ inverse
-    return error + _from_identity(colour @ back) + _from_identity(product)
+    with torch.autocast(error.device.type, enabled=False):
+        product = taps @ inverse if network.config.as_published else taps.T @ inverse
+        return error + _from_identity(colour @ back) + _from_identity(product)
 
 
 def _from_identity(product: Tensor) -> Tensor:
@@ -156,19 +157,26 @@ def check_memdeblur(network: Any, settings: Settings) -> None:
 TEACHING = 0.3  # share of a run for each teacher
 
 
+def student_begins(network: Any) -> float:
+    """Return the share of a run after which the student learns: at once without teachers."""
+    return 2 * TEACHING if network.config.distil else 0.0
+
+
 def student_teacher_loss(network: Any, batch: Batch, settings: Settings, share: float) -> Tensor:
     """Return the loss of the part that learns now: motion teacher, noise teacher, then the student.
 
     The motion teacher sees the sharp frames, the noise teacher noisy copies of the centre frame. Without teachers the
     student learns all the time.
     """
-    sharp = batch["target"][:, :WINDOW, 0]
+    first = batch["codes"].shape[1] // 2 - RADIUS  # `still` rests as in the middle frame of the window
+    part = slice(first, first + WINDOW)
+    sharp = batch["target"][:, part, 0]
     centre = sharp[:, RADIUS : RADIUS + 1]
     teachers = (network.motion_teacher, sharp), (network.noise_teacher, batch["still"][:, :WINDOW, 0])
-    if network.config.distil and share < 2 * TEACHING:
+    if share < student_begins(network):
         teacher, seen = teachers[share >= TEACHING]
         return functional.mse_loss(teacher(seen).restored.float(), centre)
-    taught = network.student(batch["codes"][:, :WINDOW, 0])
+    taught = network.student(batch["codes"][:, part, 0])
     if not network.config.distil:
         return functional.mse_loss(taught.restored.float(), centre)
     with torch.no_grad():

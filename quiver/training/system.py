@@ -24,6 +24,11 @@ def nothing_to_refuse(network: nn.Module, settings: Settings) -> None:
     """Accept all settings."""
 
 
+def at_once(network: nn.Module) -> float:
+    """Return 0: the network learns from the first step on."""
+    return 0.0
+
+
 @dataclass(frozen=True)
 class System:
     """How networks of one kind are trained: functions without state, and numbers."""
@@ -38,6 +43,7 @@ class System:
     prepare: Prepare | None = None  # computes more inputs where samples are drawn
     still: bool = False  # samples also hold noisy copies of the centre frame
     of_stream: bool = False  # learns from the frames of one stored stream, without truth or validation
+    begins: Callable[[nn.Module], float] = at_once  # share of a run after which the scored part learns
     check: Callable[[nn.Module, Settings], None] = nothing_to_refuse  # ValueError for settings that do not fit
 
     def window(self, network: nn.Module) -> int:
@@ -60,6 +66,18 @@ class System:
                 f"--loss {settings.loss}: {self.name} is trained with {' or '.join(self.losses)}; leave --loss out"
             )
         self.check(network, settings)
+
+
+class Objective(nn.Module):
+    """A network with its loss: one module, so that processes share the gradients of all that the loss computes."""
+
+    def __init__(self, network: nn.Module, loss: Loss, settings: Settings) -> None:
+        super().__init__()
+        self.network, self.loss, self.settings = network, loss, settings
+
+    def forward(self, batch: Batch, share: float) -> Tensor:
+        """Return the loss of a batch, a scalar; `share` of the run is over."""
+        return self.loss(self.network, batch, self.settings, share)
 
 
 def protocol(system: System, name: str) -> Mapping[str, Any]:

@@ -42,9 +42,11 @@ _PORT: dict[str, Any] = {
     "batch": 4,
     "steps": 63_000,
     "loss": "own",
+    "precision": "float32",
 }
 _FASTDVDNET = {"sensor": "quiver-published", "ppp": (3.25,), "bits": (3,), "force_exposure": True, "reverse": False,
-               "schedule": "plateau", "warmup": 0, "crop": 96, "batch": 64, "steps": 320_000}  # fmt: skip
+               "schedule": "plateau", "warmup": 0, "crop": 96, "batch": 64, "steps": 320_000,
+               "precision": "float32"}  # fmt: skip
 _STREAM: dict[str, Any] = {"frames": 32, "batch": 1, "learning_rate": 2e-4, "clip_norm": 1.0, "loss": "own"}
 _QUICK: dict[str, Any] = {"learning_rate": 1e-3, "loss": "own"}
 
@@ -105,6 +107,7 @@ SYSTEMS: dict[type[nn.Module], System] = {
     StudentTeacher: System(
         *("student-teacher", rivals.student_teacher_loss, rivals.windows_restored, _protocols({}, learning_rate=3e-4)),
         still=True,
+        begins=rivals.student_begins,
     ),
     Bit2Bit: System(
         *("bit2bit", split_loss, rivals.every_frame),

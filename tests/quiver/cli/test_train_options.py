@@ -8,12 +8,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from clips import ClipMaker
+from domains import weights
 from safetensors.torch import load_file
+from sensor_files import FILES, sensor_file
 
 from quiver.cli.program import main
+from quiver.evaluation import domain_measurement
 from quiver.evaluation.cost import checked_cases
 from quiver.evaluation.metrics import Score
-from quiver.training import loop
+from quiver.training import ablation, loop
 from quiver.training.run_folder import alone_in
 
 FAST = ("--steps", "2", "--crop", "16", "--batch", "1", "--preset", "unet", "--protocol", "control")
@@ -84,6 +88,46 @@ def test_an_option_changes_the_weights(tiny_dataset, tmp_path, words):
     plain = trained(tiny_dataset, tmp_path / "a")
     other = trained(tiny_dataset, tmp_path / "b", *words)
     assert any(not torch.equal(plain[name], other[name]) for name in plain)
+
+
+def one_bit_file(folder: Path) -> str:
+    """A sensor file of one bit."""
+    return sensor_file(folder, f"[sensor]\n{FILES['SPAD']}bits = {{bits}}\n", 1)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [(), ("--preset", "unet", "--protocol", "spad-sum")],
+    ids=["default", "spad-sum"],
+)
+def test_a_sensor_file_is_trained_with_its_bits(tiny_dataset, tmp_path, words):
+    """Each of these protocols states bits, of its own sensors."""
+    asked = ["train", str(tiny_dataset), "-o", str(tmp_path / "r"), "--sensor", one_bit_file(tmp_path), "--ppp", "3"]
+    asked += ["--steps", "1", "--crop", "16", "--batch", "1", *words, "-q"]
+    assert main(asked) == 0
+    (noise,) = json.loads((tmp_path / "r/settings.json").read_text())["noise"]
+    assert (noise["record"]["bits"], noise["bits"]) == (1, 1)
+    assert main(asked) == 0
+
+
+def test_a_sensor_file_is_ablated_with_its_bits(tiny_dataset, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(ablation, "run_ablation", lambda settings, *_, **__: asked.append(settings.noise))
+    words = ("--protocol", "spad-sum", "--sensor", one_bit_file(tmp_path), "--steps", "1", "-q")
+    assert main(["ablate", str(tiny_dataset), "-o", str(tmp_path / "six"), *words]) == 130  # as after Ctrl-C
+    assert [noise.bits for noise in asked[0]] == [1]
+
+
+def test_a_sensor_file_is_measured_with_its_bits(capsys, make_clip: ClipMaker, tmp_path, monkeypatch):
+    """Its cell is found again, so that the same command measures nothing."""
+    words = ["domain", weights(tmp_path), make_clip().path, "--sensor", f"{one_bit_file(tmp_path)},quiver-physical"]
+    words += ["--ppp", "1", "--methods", "naive", "--device", "cpu", "--json"]
+    assert main([str(word) for word in words]) == 0
+    found = capsys.readouterr().out
+    assert sorted(cell["place"]["bits"] for cell in json.loads(found)["domain"]["cells"]) == [1, 3]
+    monkeypatch.setattr(domain_measurement, "measure_cell", None)
+    assert main([str(word) for word in words]) == 0
+    assert capsys.readouterr().out == found
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,8 @@ def test_what_windows_cannot_have_is_refused(make_clip: ClipMaker, tmp_path):
     with pytest.raises(ValueError, match="a code takes 3 clip frames, a training window one for each; give --sensor"):
         choose([sums])
     assert choose([sums], ["spad-320x240"], [1.0], [2]).lines[0].startswith("noise: spad-320x240, 2 bits, 1 PPP")
+    own = sensor_file(tmp_path, QIS, 4)
+    assert choose([sums], [own], [1.0]).lines[0].startswith("noise: mine, 4 bits, 1 PPP")  # a file states its bits
 
 
 def test_every_window_is_normalised_by_its_own_sensor(make_clip: ClipMaker):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from quiver.data.clips import open_clips
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
 from quiver.data.windows import Batches, Windows, WindowSettings, windows
+
+ROOT = Path(__file__).parents[3]
 
 
 def three_clips(make_clip: ClipMaker, **settings: object) -> Windows:
@@ -169,6 +172,30 @@ def test_validation_windows_never_change(make_clip: ClipMaker):
     assert (data.place(0).start, data.place(0).y, data.place(0).x) == (1, 10, 14)
 
 
+@pytest.mark.parametrize("count", [1, 2, 7, 15, 30, 59, 60, 100])
+def test_fixed_windows_are_chosen_from_every_clip_and_all_light(make_clip: ClipMaker, count: int):
+    """Of 3 clips at 20 levels: distinct, every clip equally often, levels at equal steps; all are in their order."""
+    clips = [make_clip(f"clip_{i}", seed=i) for i in range(3)]
+    lights = tuple(Illumination(ppp=1.0 + i) for i in range(20))
+    data = Windows(clips, WindowSettings(lights, crop=16), fixed=True)
+    chosen = data.spread(count)
+    places = [data.place(n) for n in chosen]
+    assert len(set(chosen)) == len(chosen) == min(count, 60)
+    taken = np.bincount([place.clip for place in places], minlength=3)
+    assert taken.max() - taken.min() <= 1
+    assert [place.light for place in places] == [n * 20 // len(chosen) for n in range(len(chosen))]
+    if count >= 60:
+        assert chosen == list(range(60))
+
+
+def test_of_more_clips_than_windows_each_gives_one_at_most(make_clip: ClipMaker):
+    """Of 24 clips at one level 16 distinct ones, of 16 all in their order."""
+    clips = [make_clip()] * 24
+    many, few = (Windows(some, WindowSettings(crop=16), fixed=True) for some in (clips, clips[:16]))
+    assert len({many.place(n).clip for n in many.spread(16)}) == 16
+    assert few.spread(16) == list(range(16))
+
+
 def test_clips_that_hold_no_window_are_named(make_clip: ClipMaker):
     with pytest.raises(ValueError, match="clip short is 5 x 36 x 44; a window needs 11 frames of 16 x 16 px"):
         Windows([make_clip("short", frames=5)], WindowSettings(crop=16))
@@ -214,3 +241,11 @@ def test_a_plain_loader_batches_and_shuffles_windows(make_clip: ClipMaker):
     batches = list(DataLoader(data, batch_size=2, shuffle=True, generator=torch.Generator().manual_seed(0)))
     assert [batch["codes"].shape for batch in batches] == [(2, 11, 1, 16, 16)] * 2
     assert sorted(int(n) for batch in batches for n in batch["sample"]) == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("file", ["quiver/__init__.py", "quiver/data/windows.py", "docs/examples/pytorch.py"])
+def test_loaders_of_the_pages_draw_new_noise_in_every_epoch(file: str):
+    """A loader that is given no numbers repeats those of the first epoch: pages and docstrings give it `Batches`."""
+    made = [line for line in (ROOT / file).read_text().splitlines() if "DataLoader(" in line]
+    assert len(made) == 1
+    assert "batch_sampler=Batches(8, first=0, last=" in made[0]

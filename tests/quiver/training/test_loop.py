@@ -25,7 +25,9 @@ from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNetConfig
 from quiver.model.weights import load
 from quiver.training import loop as training
-from quiver.training.loop import Diverged, make_windows, train
+from quiver.training.loop import Diverged, Process, Trainer, make_windows, train
+from quiver.training.run_folder import Run
+from quiver.training.schedule import State, learning_rate
 from quiver.training.settings import settled
 from quiver.training.systems import system_of
 
@@ -179,6 +181,16 @@ def test_several_folders_train_and_validate_on_all_their_clips(tmp_path):
         train(small_network(), settings(one, tmp_path / "r", steps=1), progress=False)
 
 
+def test_validation_takes_every_clip_over_the_whole_range_of_light(tiny_dataset, tmp_path):
+    """Two clips at six levels: six windows hold every level once and each clip three times."""
+    levels = tuple(float(n) for n in range(1, 7))
+    asked = settings(tiny_dataset, tmp_path / "r", ppp=levels, validation_windows=6)
+    fixed = make_windows(settled(asked)[0], 4)[1]
+    places = [fixed.dataset.place(n) for n in fixed.indices]
+    assert [place.light for place in places] == [0, 1, 2, 3, 4, 5]
+    assert sorted(place.clip for place in places) == [0, 0, 0, 1, 1, 1]
+
+
 def test_without_validation_clips_the_training_clips_serve(tmp_path):
     data = write_dataset(tmp_path / "d", {"train": 1})
     with pytest.warns(UserWarning, match="no clip in split 'val'; validating on training clips"):
@@ -194,32 +206,73 @@ def test_bfloat16_trains_with_float32_losses(tiny_dataset, tmp_path):
     assert abs(a - b) < a * 2**-8
 
 
+def two_processes(folder: Path, program: str) -> None:
+    """Run a program as torchrun would, as rank 0 and rank 1, to its end."""
+    (folder / "run.py").write_text(program)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    shared = os.environ | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
+    words = [sys.executable, str(folder / "run.py")]
+    workers = [subprocess.Popen(words, cwd=ROOT, env=shared | {"RANK": str(i), "LOCAL_RANK": str(i)}) for i in (0, 1)]
+    assert [process.wait(timeout=300) for process in workers] == [0, 0]
+
+
 @pytest.mark.slow
 def test_two_processes_train_as_one_with_twice_the_batch(tiny_dataset, tmp_path):
     """torchrun with gloo averages gradients over both shares: weights agree with a batch of four to rounding."""
     alone = small_network()
     train(alone, settings(tiny_dataset, tmp_path / "a", batch=4, steps=3), progress=False)
-    program = tmp_path / "run.py"
-    program.write_text(
+    two_processes(
+        tmp_path,
         "import torch\n"
         "from quiver.training.settings import Settings\nfrom quiver.training.loop import train\n"
         "from quiver.model.unet import UNet, UNetConfig\n"
         "torch.set_num_threads(1)\ntorch.manual_seed(0)\n"
         f"train(UNet(UNetConfig(4)), Settings({str(tiny_dataset)!r}, {str(tmp_path / 'b')!r}, steps=3, crop=16,"
-        " batch=2, validate_every=4, warmup=2, validation_windows=2), progress=False)\n"
+        " batch=2, validate_every=4, warmup=2, validation_windows=2), progress=False)\n",
     )
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    shared = os.environ | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
-    workers = [
-        subprocess.Popen([sys.executable, str(program)], cwd=ROOT, env=shared | {"RANK": str(i), "LOCAL_RANK": str(i)})
-        for i in (0, 1)
-    ]
-    assert [process.wait(timeout=300) for process in workers] == [0, 0]
     together = load(tmp_path / "b/last.safetensors")
     for ours, theirs in zip(alone.state_dict().values(), together.state_dict().values(), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_processes_whose_clocks_differ_stay_equal(tiny_dataset, tmp_path):
+    """The clock of rank 1 runs at a tenth of the speed: with a time limit both still have one learning rate."""
+    two_processes(
+        tmp_path,
+        "import hashlib, os, time, torch\n"
+        "from pathlib import Path\nfrom types import SimpleNamespace\n"
+        "from quiver.training import loop\nfrom quiver.training.settings import Settings\n"
+        "from quiver.model.unet import UNet, UNetConfig\n"
+        "torch.set_num_threads(1)\ntorch.manual_seed(0)\n"
+        "rank = os.environ['RANK']\nspeed = (1.0, 0.1)[int(rank)]\n"
+        "loop.time = SimpleNamespace(monotonic=lambda: speed * time.monotonic())\n"
+        "network = UNet(UNetConfig(4))\n"
+        f"loop.train(network, Settings({str(tiny_dataset)!r}, {str(tmp_path / 'r')!r}, minutes=0.05, crop=16, batch=1,"
+        " warmup=2, validation_windows=1), progress=False)\n"
+        "values = b''.join(value.numpy().tobytes() for value in network.state_dict().values())\n"
+        f"(Path({str(tmp_path)!r}) / f'{{rank}}.txt').write_text(hashlib.sha256(values).hexdigest())\n",
+    )
+    assert (tmp_path / "0.txt").read_text() == (tmp_path / "1.txt").read_text()
+
+
+def test_the_leader_tells_how_much_time_has_passed(tiny_dataset, tmp_path):
+    class Follower(Process):
+        """A process whose leader is half a minute into the run."""
+
+        def from_leader(self, number: float) -> float:
+            return 30.0
+
+    network = small_network()
+    run = settled(settings(tiny_dataset, tmp_path / "r", steps=None, minutes=1.0))[0]
+    windows, fixed = make_windows(run, 4)
+    trainer = Trainer(network, Run(run), fixed, Follower(1, 1, torch.device("cpu")), system_of(network))
+    for n in range(2):
+        trainer.step(torch.utils.data.default_collate([windows[n]]))
+    assert trainer.state.elapsed == 30.0
+    assert trainer.rate == learning_rate(run, State(step=1, elapsed=30.0))
 
 
 def test_validation_has_one_peak_for_every_sensor(tiny_dataset, tmp_path):

@@ -281,6 +281,19 @@ def test_windows_bring_the_noise_of_their_sensor(tiny_dataset, tmp_path, name):
         assert not torch.equal(system.restored(network, batch)[0], system.restored(network, other)[0])
 
 
+def test_the_rate_is_kept_until_the_student_learns(tiny_dataset, tmp_path):
+    """Three of five steps are the teachers', and their validations, all of the same student, halve nothing."""
+    network = tiny("student-teacher")
+    plateau = {"schedule": "plateau", "patience": 0, "warmup": 0, "steps": 5, "validate_every": 1}
+    run = tiny_settings(network, tiny_dataset, tmp_path / "r", **plateau, batch=1, validation_windows=1)
+    rates = [entry["learning_rate"] for entry in train(network, run, progress=False).history]
+    assert rates[:4] == [run.learning_rate] * 4
+    begins = system_of(network).begins
+    alone = StudentTeacher(StudentTeacherConfig(width=4, blocks=1, distil=False))
+    assert (begins(network), begins(alone)) == (0.6, 0.0)
+    assert system_of(tiny("unet")).begins(tiny("unet")) == 0.0
+
+
 # ---- Settings
 
 
