@@ -249,7 +249,7 @@ def options(text: str | None, folder: str, names: Iterable[str]) -> argparse.Arg
 
 
 def keep_apart(folder: str, out: Path, work: Path | None = None, *, trial: bool) -> Path:
-    """Return the folder of runs, one of its own for trial rows; `ValueError` if these would stand on the page."""
+    """Return the folder of runs, another for trial rows; `ValueError` if these would stand on the page."""
     if trial and out == ROOT / "docs" / "results" / folder:
         raise ValueError("trial rows do not belong on the page; give --out")
     return work or Path("out") / (f"{folder}_trial" if trial else folder)

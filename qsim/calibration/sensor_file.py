@@ -66,7 +66,9 @@ def _blocks(path: Path, bits: int, width: int | None, variable: str | None) -> I
         if width is not None:
             raise ValueError(f"{path}: --width acts on packed planes, and a .mat has one value per pixel; leave it out")
         return _array_blocks(mat_array(path, variable))
-    recording = importing.read(path, Hints(bits=min(bits, 16), width=width, variable=variable), compared=("bits",))
+    layout = "cube" if path.suffix == ".npy" else None  # --width states it: dark planes could be several layouts
+    hints = Hints(layout=layout, bits=min(bits, 16), width=width, variable=variable)
+    recording = importing.read(path, hints, compared=("bits",))
     if recording.is_light or recording.bits != bits:
         raise ValueError(f"{path}: holds {recording.source}, not values of {bits} bits")
     return (block for _, block in importing.blocks(recording))
@@ -165,15 +167,19 @@ def figure(found: Calibration) -> bytes:
     return figure_png(drawing)
 
 
+def beside(path: Path) -> tuple[Path, Path, Path]:
+    """Return the files beside a sensor file: its values, the plot of residuals, and the map of dark counts."""
+    return path.with_suffix(".json"), path.with_suffix(".png"), path.with_name(f"{path.stem}_dark.npy")
+
+
 def write(found: Calibration, path: Path, title: str) -> list[Path]:
     """Write all files of a calibration, the sensor file last; return their paths."""
-    written = [path.with_suffix(".json"), path.with_suffix(".png")]
-    dark_map = path.with_name(f"{path.stem}_dark.npy") if "dark_count_rate" in found.maps else None
-    files.write_json(written[0], as_dict(found))
-    files.write_bytes(written[1], figure(found))
-    if dark_map is not None:
-        written.append(dark_map)
+    values, plot, dark_map = beside(path)
+    files.write_json(values, as_dict(found))
+    files.write_bytes(plot, figure(found))
+    rates = found.maps.get("dark_count_rate")
+    if rates is not None:
         with files.replacing(dark_map) as file:
-            np.save(file, found.maps["dark_count_rate"].astype(np.float32))
-    files.write_bytes(path, to_toml(found, title, dark_map.name if dark_map else None).encode())
-    return [*written, path]
+            np.save(file, rates.astype(np.float32))
+    files.write_bytes(path, to_toml(found, title, None if rates is None else dark_map.name).encode())
+    return [values, plot, *([] if rates is None else [dark_map]), path]

@@ -58,7 +58,7 @@ def _run_calibrate(args: argparse.Namespace) -> int:
     if args.output.suffix != ".toml":
         raise ValueError(f"{args.output}: the sensor file is a .toml, as in -o my_sensor.toml")
     model, bits = _calibration_kind(args)
-    refuse_existing(args.output, args.force)
+    _check_outputs(args, model)
     darks = [_stack(words, args, bits, dark=True) for words in args.dark]
     flats = [_stack(words, args, bits, dark=False) for words in args.flat]
     if args.static:
@@ -79,6 +79,20 @@ def _run_calibrate(args: argparse.Namespace) -> int:
     text += ["written: " + ", ".join(str(path) for path in written)]
     output(args, sensor_file.as_dict(found) | {"assumed": assumed, "files": [str(path) for path in written]}, text)
     return 0
+
+
+def _check_outputs(args: argparse.Namespace, model: str) -> None:
+    """Raise an `OSError` if a file to write exists without --force, or is an input."""
+    from qsim.calibration.sensor_file import beside
+
+    values, plot, dark_map = beside(args.output)
+    stacks = [*args.dark, *args.flat, *([args.static] if args.static else [])]
+    for path in (args.output, values, plot, *([dark_map] if model == "spad" and args.dark else [])):
+        places = (path, *path.resolve().parents) if path.exists() else ()
+        for given in (Path(words[0]) for words in stacks):
+            if given.exists() and any(place.samefile(given) for place in places):
+                raise FileExistsError(f"{path}: would replace a file of the input {given}; name another with -o")
+        refuse_existing(path, args.force)
 
 
 COUNTS = 8  # bits; larger codes of a SPAD may be sums of planes, which the user must state

@@ -246,9 +246,9 @@ def sense(
     draw = prepare(clip, sensing)
     meta = describe(clip, sensing, draw)
     efficiency = draw.sensor.efficiency
-    line = light_line(draw.level, draw.planes * efficiency)
+    whole = dataclasses.replace(draw.level, ppp=draw.level.ppp * draw.planes)  # of a code, not of a clip frame
+    line = light_line(whole, efficiency if draw.colour is None else draw.colour.mean_efficiency(efficiency))
     if draw.colour is not None:
-        line = light_line(draw.level, draw.planes * draw.colour.mean_efficiency(efficiency))
         line += f"; {_colours(draw.colour, efficiency)}"
     if draw.rows is not None:
         line += f"; {draw.rows}"

@@ -11,6 +11,7 @@ from pathlib import Path
 from qsim import files
 from qsim.clip.sensing import Sensing
 from qsim.files import to_json
+from qsim.sensor.defects import defect_table
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,10 @@ class Job:
         Without any, it is the digest of earlier versions, whose psnr was in dB below the 99.9th percentile.
         """
         described = dataclasses.asdict(self) | {"family": Path(self.family).stem}
-        described["streams"] = [stream | {"sensor": Path(stream["sensor"]).name} for stream in described["streams"]]
+        described["streams"] = [
+            stream | {key: Path(stream[key]).name for key in ("sensor", "colour") if isinstance(stream[key], str)}
+            for stream in described["streams"]
+        ]
         described["settings"] = {
             key: value
             for key, value in described["settings"].items()
@@ -81,23 +85,45 @@ class Job:
                     del stream[key]
         named = (self.family, self.settings.camera_path or "", *(stream.sensor_name for stream in self.streams))
         own = [path for path in named if Path(path).is_absolute()]
+        own += [path for stream in self.streams for path in _read_by(stream)]
         if own:  # the content of a file decides, not its name
             described["own"] = [_contents(path) for path in own]
         return hashlib.sha256(to_json(described | more)).hexdigest()
 
 
+State = tuple[tuple[str, tuple[int, ...]], ...]  # of files: name and what changes with the content
+
+
+def _read_by(stream: Sensing) -> list[str]:
+    """Return the files that a stream reads beside its sensor's: colour filters, and maps that the sensor's names."""
+    filters = [stream.colour] if isinstance(stream.colour, str) and Path(stream.colour).is_absolute() else []
+    sensor = stream.sensor_name
+    return [*filters, *(_maps(sensor, _state(sensor)) if Path(sensor).is_absolute() else ())]
+
+
+@functools.lru_cache(maxsize=64)
+def _maps(path: str, state: State) -> tuple[str, ...]:
+    """Return the measured maps of a sensor file in its `state`."""
+    found = defect_table.from_toml(path)
+    return () if found is None else tuple(found.maps.values())
+
+
 def _contents(path: str) -> str:
-    """Return the SHA-256 of a scene or sensor file, or of all files in a folder with their names."""
+    """Return the SHA-256 of a file, or of all files in a folder with their names."""
+    return _read_contents(path, _state(path))
+
+
+def _state(path: str) -> State:
+    """Return the state of a file, or of all files in a folder."""
     root = Path(path)
     parts = sorted(part for part in root.rglob("*") if part.is_file()) if root.is_dir() else [root]
     # The state includes the time of the inode's last change, which no program can set back.
     states = [(str(part.relative_to(root)), part.stat()) for part in parts]
-    state = tuple((name, (of.st_mtime_ns, of.st_ctime_ns, of.st_ino, of.st_size)) for name, of in states)
-    return _read_contents(path, state)
+    return tuple((name, (of.st_mtime_ns, of.st_ctime_ns, of.st_ino, of.st_size)) for name, of in states)
 
 
 @functools.lru_cache(maxsize=64)
-def _read_contents(path: str, state: tuple[tuple[str, tuple[int, ...]], ...]) -> str:
+def _read_contents(path: str, state: State) -> str:
     """Return the same; the files are read again only after `state` has changed."""
     listed = [(name, files.sha256(Path(path) / name)) for name, _ in state]
     return files.sha256(to_json(listed))

@@ -8,9 +8,10 @@ exceeds TOLERANCE; otherwise the closed form draws.
 
 The pixel is gated: between exposures it detects nothing, but dead times and trapped carriers continue in real time.
 A counted avalanche leaves, with probability `afterpulse`, one trapped carrier. It is released after an exponential
-delay of mean `afterpulse_delay`. A release while the pixel is dead, or between exposures, is not counted, but it
-restarts the dead time of a paralyzable pixel. A release while the pixel is live is counted as any other avalanche, and
-may leave a carrier as well.
+delay of mean `afterpulse_delay`. A release while the pixel is dead is not counted, but it restarts the dead time of
+a paralyzable pixel; a release between exposures does nothing. A release while the pixel is live is counted as any other
+avalanche, and may leave a carrier as well. Crosstalk is added to the counts of all pixels in the end, as to those of
+the closed form: its avalanches have no times.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from numpy import ndarray as Array
 
 from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.defects.correlated_noise import CorrelatedNoise
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.fixed_pattern import lit
 from qsim.sensor.defects.pixel_array import PixelArray
@@ -247,7 +249,10 @@ def _lit(array: PixelArray, photons: Array, row: int, exposure: float) -> tuple[
 def follow(
     array: PixelArray, light: IncidentLight, shape: tuple[int, int, int], exposure: float, frame_time: float, key: Key
 ) -> Array:
-    """Return codes of a clip of `shape` (T, H, W), each pixel followed photon by photon from the first frame."""
+    """Return codes of a clip of `shape` (T, H, W), each pixel followed photon by photon from the first frame.
+
+    Crosstalk is drawn after that, between the pixels of each frame.
+    """
     codes = np.empty(shape, array.sensor.dtype)
     memory = memory_of(array.defects)
     for y, sensor, photons in _strips(array, light, shape, exposure):
@@ -255,7 +260,8 @@ def follow(
         codes[:, rows] = _follow_pixels(sensor, photons, exposure, frame_time, memory, key, (y, 0))
     if array.maps.dead is not None:
         codes[:, array.maps.dead] = 0
-    return codes
+    noise = CorrelatedNoise(crosstalk=array.defects.crosstalk)
+    return noise.disturb(None, codes, array.sensor.levels - 1, key, array.maps.dead, (0, 0))[0]
 
 
 def trace(
@@ -263,8 +269,10 @@ def trace(
 ) -> Iterator[tuple[Array, Array]]:
     """Yield the events behind the codes of `follow`, pixel by pixel, row by row: times [n] in s, kinds uint8 [n].
 
-    A kind is the sum of DETECTED and RELEASED. Dead pixels have no events.
+    A kind is the sum of DETECTED and RELEASED. Dead pixels have no events. `ValueError` for pixels with crosstalk.
     """
+    if array.defects.crosstalk:
+        raise ValueError("crosstalk: its detections have no times; leave it out of [defects] and sense the clip again")
     memory = memory_of(array.defects)
     for first, sensor, photons in _strips(array, light, shape, exposure):
         for y, x in np.ndindex(photons.shape[2:]):

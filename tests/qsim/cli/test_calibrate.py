@@ -160,3 +160,52 @@ def test_an_efficiency_that_cannot_be_is_not_written_without_a_word(folder, caps
     assert main(["calibrate", *line.format("flat.npy", "dark.npy", 0.9).split()]) == 2
     assert "hold no more counts than the dark frames; are --dark and --flat swapped" in capsys.readouterr().err
     assert not (folder / "e.toml").exists()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("force", [[], ["--force"]])
+@pytest.mark.parametrize(
+    ("dark", "output", "replaced"),
+    [
+        ("spad_dark.npy", "spad.toml", "spad_dark.npy"),
+        ("link.npy", "spad.toml", "spad_dark.npy"),
+        ("frames", "frames/one.toml", "frames/one.png"),
+    ],
+)
+def test_a_recording_is_never_replaced(folder, capsys, dark, output, replaced, force):
+    """The map of dark counts took the place of the dark frames spad_dark.npy."""
+    Path("dark_planes.npy").rename("spad_dark.npy")
+    Path("link.npy").symlink_to("spad_dark.npy")
+    Path("frames").mkdir()
+    Path("frames/one.png").touch()
+    before = contents(folder)
+    words = f"--model spad --bits 1 --dark {dark} 1e-5 --flat flat_planes.npy 1e-5 0.9 -o {output}"
+    assert main(["calibrate", *words.split(), *force]) == 2
+    error = capsys.readouterr().err
+    assert f"{replaced}: would replace a file of the input" in error
+    assert error.count("\n") == 1
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize("name", ["a.json", "a.png", "a_dark.npy"])
+def test_files_beside_the_sensor_file_are_replaced_with_force_only(folder, capsys, name):
+    Path(name).touch()
+    words = "calibrate --model spad --bits 1 --dark dark_planes.npy 1e-5 --flat flat_planes.npy 1e-5 0.9 -o a.toml"
+    before = contents(folder)
+    assert main(words.split()) == 2
+    assert f"{name}: exists; name another with -o, or use --force to replace it" in capsys.readouterr().err
+    assert contents(folder) == before
+    assert main([*words.split(), "--force"]) == 0
+    assert Path(name).stat().st_size > 0
+
+
+def test_packed_planes_without_a_count_are_read_by_their_width(folder, capsys):
+    """They are alike in every layout of uint8, and the error named an option that the command does not have."""
+    np.save("none.npy", np.zeros((5, H, W), np.uint8))
+    np.save("packed.npy", np.packbits(np.load("none.npy"), axis=-1))
+    words = "--model spad --bits 1 --dark"
+    plain = calibrated(capsys, f"{words} none.npy 1e-5 -o a.toml")
+    assert calibrated(capsys, f"{words} packed.npy 1e-5 --width {W} -o b.toml") == plain

@@ -8,6 +8,9 @@ from tiny_clip import FRAMES, write
 
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.photons import clip_photons, light_level, light_line
+from qsim.clip.sensing import Sensing, sense
+from qsim.sensor.qis import QIS
+from qsim.sensor.spad import BinarySPAD
 
 
 def test_photons_of_a_crop_are_the_crop_of_the_photons(tmp_path: Path):
@@ -38,3 +41,15 @@ def test_relative_radiance_needs_a_target(tmp_path: Path):
     level = light_level(clip, ppp=3.25)
     mean = np.mean([clip_photons(clip, t, level.factor).mean() for t in range(FRAMES)])
     assert mean == pytest.approx(3.25, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "sensing",
+    [
+        Sensing(BinarySPAD(0.5, 0.0, 2), ppp=6.0, group=True),
+        Sensing(QIS(0.5, 0.0, 0.2, 3), ppp=6.0, slices=3),
+    ],
+)
+def test_the_line_counts_photons_and_electrons_of_one_code(tmp_path: Path, sensing: Sensing):
+    """With three clip frames per code it was 2 photons/pixel (3 e-)."""
+    assert "to 6 photons/pixel (3 e-" in sense(write(tmp_path / "a"), sensing)[1]

@@ -101,7 +101,7 @@ def one_bit_file(folder: Path) -> str:
     ids=["default", "spad-sum"],
 )
 def test_a_sensor_file_is_trained_with_its_bits(tiny_dataset, tmp_path, words):
-    """Each of these protocols states bits, of its own sensors."""
+    """Each of these protocols states bits, of other sensors."""
     asked = ["train", str(tiny_dataset), "-o", str(tmp_path / "r"), "--sensor", one_bit_file(tmp_path), "--ppp", "3"]
     asked += ["--steps", "1", "--crop", "16", "--batch", "1", *words, "-q"]
     assert main(asked) == 0

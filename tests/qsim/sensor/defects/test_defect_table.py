@@ -128,6 +128,17 @@ def test_light_that_changes_inside_an_exposure_is_followed_photon_by_photon(tmp_
     np.testing.assert_array_equal(*replay(clip, stream, 1))
 
 
+def test_followed_photons_have_crosstalk_too(clip, tmp_path):
+    """It was stated as applied, and no code had it."""
+    plain = drawn(clip, device(tmp_path, COUNTING), follow=True)[0].codes()
+    stream, line = drawn(clip, device(tmp_path, COUNTING, "crosstalk = 0.2"), follow=True)
+    assert "defects: crosstalk" in line
+    assert stream.meta["drawn_by"] == "events"
+    assert (stream.codes() >= plain).all()
+    assert stream.codes().mean() > 1.2 * plain.mean()
+    np.testing.assert_array_equal(*replay(clip, stream, 3))
+
+
 def test_effects_below_the_tolerance_take_the_closed_form(tmp_path):
     clip = write_clip(tmp_path / "still", radiance=np.ones((6, 4, 5)))
     sensor = device(tmp_path, COUNTING.replace("5e-5", "1e-9"), "carry_dead_time = true")

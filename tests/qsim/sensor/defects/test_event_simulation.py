@@ -9,7 +9,17 @@ from stats import assert_histogram, assert_mean, assert_share
 from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.defect_table import Defects
-from qsim.sensor.defects.event_simulation import Effects, Memory, State, effects, expose, follow, sample, simulate
+from qsim.sensor.defects.event_simulation import (
+    Effects,
+    Memory,
+    State,
+    effects,
+    expose,
+    follow,
+    sample,
+    simulate,
+    trace,
+)
 from qsim.sensor.defects.fixed_pattern import Maps
 from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.spad import BinarySPAD
@@ -60,6 +70,8 @@ def test_trapped_carriers_fire_when_they_are_released_unless_the_pixel_is_dead_o
     assert exposed(sensor, [0.4], State(trapped=(0.5,)))[0] == 1
     assert exposed(sensor, [], State(trapped=(-0.5,)))[0] == 0
     assert exposed(sensor, [], State(trapped=(1.5,))) == (0, State(trapped=(1.5,)))
+    restarted = CountingSPAD(1, 0, 0.3, 5, paralyzable=True)
+    assert exposed(restarted, [0.1], State(trapped=(-0.1,)))[0] == 1, "a closed shutter: no avalanche, no dead time"
 
 
 # ---- The closed forms
@@ -233,3 +245,22 @@ def test_dead_pixels_of_counters_stay_dead_when_followed():
     counts = follow(array, lambda t, y, rows: np.full((1, rows, 5), 20.0), (3, 4, 5), 5e-4, 5e-4, Key(0, 0))
     assert not counts[:, maps.dead].any()
     assert counts[:, ~maps.dead].all()
+
+
+def test_followed_counts_have_crosstalk_as_those_of_the_closed_form():
+    """Every count sends Binomial(1, c) to each of four neighbours: inside, the mean grows by 4 c; dead pixels stay."""
+    c, mean, shape = 0.05, 3.0, (4, 30, 31)
+    maps = Maps(dead=np.zeros(shape[1:], bool))
+    maps.dead[0, 7] = True
+    array = PixelArray(CountingSPAD(1.0, 0.0, 0.0, 8), maps, Defects(crosstalk=c))
+    codes = follow(array, lambda t, y, rows: np.full((1, rows, 31), mean), shape, EXPOSURE, EXPOSURE, KEY)
+    total = mean * (1 + 4 * c)
+    assert_mean(codes[:, 2:-1, 1:-1].astype(float), total, total * (1 + 8 * c + 12 * c**2))
+    assert not codes[:, 0, 7].any()
+
+
+def test_events_of_pixels_with_crosstalk_are_refused():
+    array = PixelArray(counter(0.1), defects=Defects(crosstalk=0.1))
+    events = trace(array, lambda t, y, rows: np.ones((1, rows, 3)), (1, 2, 3), EXPOSURE, EXPOSURE, KEY)
+    with pytest.raises(ValueError, match="crosstalk: its detections have no times; leave it out"):
+        next(events)
