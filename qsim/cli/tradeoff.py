@@ -51,7 +51,7 @@ def add_tradeoff(sub: Any) -> None:
     parser.add_argument("--seed", type=seed, help="seed of the noise and of a rendered scene (default 0)")
     parser.add_argument("--streams", action="store_true", help="write clips and streams of each depth, for restorers")
     parser.add_argument("-o", "--output", type=Path, help="folder for numbers, figures, clips")
-    parser.add_argument("--force", action="store_true", help="replace existing numbers and figures")
+    parser.add_argument("--force", action="store_true", help="replace existing numbers, figures and streams")
 
 
 TABLE_ONLY = ("read_noise", "motion")
@@ -114,6 +114,9 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
         raise ValueError("--streams: writes a clip at its own speed; leave out --speed and --px, or name a scene")
     if first.camera is None and not args.ppp:
         raise ValueError(f"{first.path}: its radiance is relative; give the light with --ppp, as in --ppp 0.65")
+    if args.streams:  # refused before the study, not after it
+        for depth in range(1, WIDEST + 1) if widen else settings.bits:
+            study_clips.stream_clip(first, args.output / "streams", depth, args.force)
     with bar("drawing", "study") as progress:
         if swept:
             ppps = args.ppp or [first.mean_photons]
@@ -132,7 +135,7 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
         result["px_asked"], result["speeds_found"] = args.px, speeds
     if args.streams:
         lit = replace(settings, ppp=levels[0])
-        made = study_clips.write_streams(first, args.output / "streams", lit)
+        made = study_clips.write_streams(first, args.output / "streams", lit, force=args.force)
         result["streams"] = [str(path) for path in made]
         text += [f"streams 'planes' and 'multibit': {path}" for path in made]
     if args.output is not None:

@@ -26,6 +26,7 @@ MAGIC = bytes((0x76, 0x2F, 0x31, 0x01)) + struct.pack("<i", 2)
 _PIXEL_TYPES = {np.dtype("<u4"): 0, np.dtype("<f2"): 1, np.dtype("<f4"): 2}
 _ZIP_ROWS = 16  # rows per chunk of the ZIP method
 HALF_MAX = 65504.0
+SMALLEST = 2.0**-16  # halves are 2^-24 apart here: light up to it has 256 steps
 
 
 def encode(channels: dict[str, Array], *, compress: bool = False) -> bytes:

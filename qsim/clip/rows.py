@@ -68,11 +68,13 @@ class Rows:
     def shifts(self, height: int, width: int, frame_rate: float) -> Array:
         """Return the delay of each row [H] or column [W], in frame times of a clip of this rate, float64."""
         lines = np.arange((height, width)[self.axis], dtype=np.float64)
-        return (lines if self.order in ("down", "right") else lines[::-1]) * (self.delay * frame_rate)
+        found = (lines if self.order in ("down", "right") else lines[::-1]) * (self.delay * frame_rate)
+        whole = np.rint(found)
+        return np.where(np.abs(found - whole) < 1e-9, whole, found)  # 100 x 0.55 is 55, not 55 + 7e-15
 
     def reach(self, height: int, width: int, frame_rate: float) -> int:
         """Return how many clip frames after its own the last line still needs."""
-        return math.ceil(float(self.shifts(height, width, frame_rate).max()) - 1e-9)
+        return math.ceil(float(self.shifts(height, width, frame_rate).max()))
 
     def check(self, height: int, width: int, frame_rate: float, planes: int, name: str) -> None:
         """Raise `ValueError` if a frame of `planes` clip frames is over before its lines are read."""

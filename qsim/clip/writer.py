@@ -33,7 +33,7 @@ class ClipWriter:
     exposure and radiance_unit, and camera (a dict) unless the unit is relative. A writer with the same meta resumes
     where an interrupted one stopped: `has(t)` is true for its finished frames. `FileExistsError` if the clip exists and
     `force` is not set, or if the folder is not a clip. `ValueError` if PATH.part holds files of another origin, or,
-    without `force`, frames of a clip with other meta.
+    without `force`, frames of a clip with other meta; at the end also for light too small for half floats.
     """
 
     def __init__(self, path: str | os.PathLike[str], meta: dict[str, Any], *, force: bool = False) -> None:
@@ -127,6 +127,7 @@ class ClipWriter:
             "t": t,
             "checksums": checksums,
             "mean_radiance": float(stored.mean()),
+            "largest": float(radiance.max()),
             "clipped": clipped,
         }
         if saturated is not None:
@@ -156,8 +157,7 @@ class ClipWriter:
             if kind is None:
                 self._finish()
             elif not (self._frames or self._complete):
-                self._clear()
-                shutil.rmtree(self.part)
+                self._remove()
         finally:
             self._lock.release()
 
@@ -187,6 +187,10 @@ class ClipWriter:
             if item.name not in ("lock", "begun.json"):
                 shutil.rmtree(item) if item.is_dir() else item.unlink()
 
+    def _remove(self) -> None:
+        self._clear()
+        shutil.rmtree(self.part)
+
     def _encode(self, t: int, folder: str, image: Array, contents: dict[str, bytes]) -> tuple[Array, int]:
         """Add the image [H, W] of frame t as EXR to `contents`; return it in half precision, and its clipped pixels."""
         _, height, width = self.meta["shape"]
@@ -214,6 +218,7 @@ class ClipWriter:
                 f"{self.path}: frame {missing[0]} was never written ({len(missing)} of {frames} are missing)"
             )
         if not self._complete:
+            self._check_light(frames)
             self._write_meta(frames)
         for name in ("begun.json", "journal.jsonl", "lock"):
             (self.part / name).unlink(missing_ok=True)
@@ -221,6 +226,16 @@ class ClipWriter:
             files.remove_folder(self.path)
         os.replace(self.part, self.path)
         files.sync_folder(self.path.parent)
+
+    def _check_light(self, frames: int) -> None:
+        """Delete the frames and raise `ValueError` if halves hold their light in too few steps."""
+        largest = max(float(self._frames[t].get("largest", exr.SMALLEST)) for t in range(frames))
+        if 0 < largest < exr.SMALLEST:
+            self._remove()
+            raise ValueError(
+                f"{self.path}: its largest light is {largest:.3g}, of which half floats keep fewer than 256 steps; "
+                "multiply recorded light by a factor, as to a largest of 1, or brighten the scene"
+            )
 
     def _write_meta(self, frames: int) -> None:
         """Write clip.json: the requested fields and the measured ones (MEASURED)."""

@@ -166,6 +166,10 @@ def _png(path: Path) -> Array:
     with decoding_errors(path, "PNG"), Image.open(path, formats=["PNG"]) as opened:
         check_shape(path, (1, opened.height, opened.width))
         if opened.mode in ("RGB", "RGBA", "P", "LA"):
+            if any(str(tile[3]).endswith(";16B") for tile in opened.tile):  # the library keeps the upper 8 bits
+                raise ValueError(
+                    f"{path}: colour of 16 bits per channel would lose 8; store it as TIFF, or with 8 bits"
+                )
             return np.asarray(opened.convert("RGB"))
         if opened.mode not in ("1", "L", "I;16", "I"):
             raise ValueError(f"{path}: pixels of mode {opened.mode}; 1-, 8- and 16-bit pictures are read")

@@ -159,7 +159,7 @@ def to_stream(
     if capture.ppp is not None and capture.sensor is None:
         raise ValueError(f"{path}: --ppp sets the gain of a named sensor; name it with --sensor, or leave --ppp out")
     stem = path.with_suffix("") if path.suffix in (".npy", ".json") else path
-    npy, description = stem.with_suffix(".npy"), stem.with_suffix(".json")
+    npy, description = (stem.with_name(f"{stem.name}{end}") for end in (".npy", ".json"))  # a stem may hold dots
     for file in (npy, description):
         if file.exists() and not force:
             raise FileExistsError(f"{file}: exists; name another, or use --force to replace it")

@@ -13,7 +13,7 @@ from qsim.clip.clip import Clip
 from qsim.clip.photons import light_level
 from qsim.clip.sensing import Sensing, describe, sense, write_stream
 from qsim.clip.simulation import Draw
-from qsim.clip.writer import ClipWriter
+from qsim.clip.writer import ClipWriter, target_of
 from qsim.files import Progress
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.bit_depth.clip_study import check_clip
@@ -88,7 +88,14 @@ def clips_for(
         yield MovingClip(v, render(source, path, shape, speed=v, progress=progress))
 
 
-def write_streams(clip: Clip, folder: Path, settings: StudySettings) -> list[Path]:
+def stream_clip(clip: Clip, folder: Path, bits: int, force: bool) -> Path:
+    """Return the clip that `write_streams` writes for a depth; `FileExistsError` if it may not be replaced."""
+    path = folder / f"{clip.name}_{bits}bit"
+    target_of(path, force)
+    return path
+
+
+def write_streams(clip: Clip, folder: Path, settings: StudySettings, *, force: bool = False) -> list[Path]:
     """Write one clip per bit depth, FOLDER/NAME_3bit, with the streams `planes` and `multibit`; return their paths.
 
     Their frames are means of 2^b - 1 frames of `clip`, and their sharp frames are the middle ones. So
@@ -102,28 +109,31 @@ def write_streams(clip: Clip, folder: Path, settings: StudySettings) -> list[Pat
     made = []
     for bits in settings.bits:
         m = 2**bits - 1
-        path = folder / f"{clip.name}_{bits}bit"
-        grouped = group(clip, path, m)
+        path = stream_clip(clip, folder, bits, force)
+        grouped = group(clip, path, m, force=force)
         read = Sensing(settings.sensor, bits, ppp=m * level.ppp, seed=settings.seed, name="multibit")
         sense(grouped, read)
         key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))
         draw = Draw(replace(plane, bits=bits), plane, level, key, m, False)
-        meta = describe(clip, replace(read, name="planes"), draw) | {"planes_of": str(clip.path)}
-        meta |= {"ppp_target": m * level.ppp, "sensor_name": "planes"}
+        # A code is one frame of `grouped`: its exposure is m times longer, which relative light does not know.
+        more, before = (m, 1) if clip.camera is None else (1, m)
+        of_code = replace(level, factor=more * level.factor, ppp=m * level.ppp, mean_before=before * level.mean_before)
+        meta = describe(grouped, replace(read, sensor=draw.sensor), replace(draw, level=of_code, planes=1))
+        meta |= {"planes_of": str(clip.path), "drawn_by": draw.law, "seed": None}  # `grouped` cannot draw it again
         frames = (draw.frames(clip, t, t + 1) for t in range(len(grouped)))
         write_stream(grouped, "planes", frames, draw.sensor, meta)
         made.append(path)
     return made
 
 
-def group(clip: Clip, path: Path, m: int) -> Clip:
+def group(clip: Clip, path: Path, m: int, *, force: bool = False) -> Clip:
     """Write a clip whose frames are means of m frames (m odd) and whose sharp frames are the middle ones."""
     kept = ("radiance_unit", "camera", "scene", "split", "origin", "seed", "render")
     meta = {key: clip.meta[key] for key in kept if key in clip.meta}
     frames, height, width = clip.shape
     meta |= {"shape": [frames // m, height, width], "frame_rate": clip.frame_rate / m, "exposure": clip.exposure * m}
     meta |= {"shutter": 1.0, "grouped": {"from": clip.name, "frames": m}}
-    with ClipWriter(path, meta) as writer:
+    with ClipWriter(path, meta, force=force) as writer:
         for t in range(frames // m):
             mean = np.stack([clip.radiance(t * m + i) for i in range(m)]).mean(axis=0, dtype=np.float64)
             writer.add(t, np.asarray(mean, np.float32), clip.sharp(t * m + m // 2) if m > 1 else None)

@@ -9,6 +9,7 @@ from waves import SIZE, wave_clip
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
 from qsim.clip.sensing import replay
+from qsim.studies.bit_depth import clip_study
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +39,31 @@ def test_command_writes_numbers_figure_and_streams(clip, tmp_path, capsys):
     assert mean == pytest.approx(7 * 0.65, rel=2e-2)
     assert main(words) == 2
     assert "--force" in capsys.readouterr().err
+
+
+def test_streams_are_replaced_with_force_and_refused_before_the_study_without(clip, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "out"
+    words = [
+        "tradeoff",
+        str(clip.path),
+        "--ppp",
+        "0.65",
+        "--bits",
+        "1,2",
+        "--instants",
+        "2",
+        "-o",
+        str(out),
+        "--streams",
+    ]
+    for extra in ([], ["--force", "--seed", "1"]):
+        assert main([*words, *extra]) == 0
+    assert Clip.open(out / "streams" / "wave_2bit").stream("multibit").meta["seed"] == 1
+    (out / "tradeoff.json").unlink()
+    monkeypatch.setattr(clip_study, "study", lambda *_, **__: pytest.fail("was studied first"))
+    capsys.readouterr()
+    assert main(words) == 2
+    assert "wave_1bit: exists; name another with -o, or use --force to replace it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

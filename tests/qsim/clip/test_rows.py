@@ -160,3 +160,24 @@ def test_readouts_that_cannot_be_are_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             make()
+
+
+def test_rows_read_no_frame_beyond_their_reach(tmp_path):
+    """Delays that are whole but for rounding, as 100 x 0.55 = 55 + 7e-15, and random ones."""
+    clip = write_clip(tmp_path / "clip", frames=111, height=101, width=2)
+    draw = prepare(clip, Sensing(COUNTER, ppp=1.0, slices=56, rows=Rows(2.75e-4)))
+    assert draw.count(clip) == 1
+    assert draw.frames(clip, 0, 1).shape == (1, 101, 2)
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        rows, rate = Rows(int(rng.integers(1, 500)) * 1e-6), float(rng.choice([500, 2000, 30000, 96800]))
+        height = int(rng.integers(1, 300))
+        frames = []
+
+        def read(t: int, part: tuple[int, ...], frames: list[int] = frames) -> np.ndarray:
+            frames.append(t)
+            return np.ones(part[2:])
+
+        light = rows.delayed(read, 0, (0, 0, height, 1), rows.shifts(height, 1, rate))
+        np.testing.assert_allclose(light, 1.0, rtol=1e-12)
+        assert max(frames) == rows.reach(height, 1, rate)

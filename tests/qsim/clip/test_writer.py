@@ -180,3 +180,20 @@ def test_a_missing_frame_is_not_a_clip(tmp_path: Path):
         writer.__exit__(None, None, None)
     with pytest.raises(FileNotFoundError):
         Clip.open(tmp_path / "a")
+
+
+def test_light_too_small_for_half_floats_is_refused_and_can_be_scaled(tmp_path: Path):
+    """Values of 1e-8 would become 0, and values of 1e-6 have 17 levels; one bright frame is enough."""
+
+    def write_light(name: str, largest: float, others: float) -> Clip:
+        with ClipWriter(tmp_path / name, meta()) as writer:
+            for t in range(FRAMES):
+                writer.add(t, np.full((HEIGHT, WIDTH), largest if t == 1 else others, np.float32))
+        return Clip.open(tmp_path / name)
+
+    for largest in (1e-8, 1e-6, 1.5e-5):
+        with pytest.raises(ValueError, match=rf"its largest light is {largest:.3g}, .* 256 steps; multiply"):
+            write_light("a", largest, largest / 2)
+        assert list(tmp_path.iterdir()) == []  # the same settings with other light start again
+    assert write_light("a", 1.6e-5, 1e-9).radiance(1).max() == pytest.approx(1.6e-5, rel=2e-3)
+    assert write_light("dark", 0.0, 0.0).mean_radiance == 0.0

@@ -1,5 +1,7 @@
 """Tests pictures as light and as codes: PNG and TIFF."""
 
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +37,33 @@ def test_colour_becomes_luminance(tmp_path: Path):
     Image.fromarray(colour).save(tmp_path / "a.png")
     expected = to_linear(colour, "gamma 2.2", 255) @ np.array([0.2126, 0.7152, 0.0722])
     np.testing.assert_allclose(everything(tmp_path / "a.png", transfer="gamma 2.2")[0], expected, rtol=1e-5)
+
+
+def test_colour_of_16_bits_is_read_in_full_or_refused(tmp_path: Path):
+    """TIFF keeps all bits; a PNG would lose the lower eight, in colour and in grey with opacity."""
+    import tifffile
+
+    colour = np.random.default_rng(0).integers(0, 65535, (9, 7, 3)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "a.tif", colour, photometric="rgb")
+    expected = to_linear(colour, "linear", 65535) @ np.array([0.2126, 0.7152, 0.0722])
+    np.testing.assert_allclose(everything(tmp_path / "a.tif", transfer="linear")[0], expected, rtol=1e-6)
+    for kind, channels in ((2, 3), (4, 2), (6, 4)):  # colour, grey with opacity, colour with opacity
+        (tmp_path / "a.png").write_bytes(png_16(np.resize(colour, (9, 7, channels)), kind))
+        with pytest.raises(ValueError, match=r"a\.png: colour of 16 bits per channel would lose 8; store it as TIFF"):
+            everything(tmp_path / "a.png", transfer="linear")
+    (tmp_path / "a.png").write_bytes(png_16(colour[..., :1], 0))
+    grey = everything(tmp_path / "a.png", transfer="linear")[0]
+    np.testing.assert_array_equal(grey, to_linear(colour[..., 0], "linear", 65535))
+
+
+def png_16(pixels: np.ndarray, kind: int) -> bytes:
+    """Return a PNG of uint16 [H, W, channels]; the library writes grey only."""
+    height, width, _ = pixels.shape
+    raw = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
+    header = struct.pack(">IIBBBBB", width, height, 16, kind, 0, 0, 0)
+    parts = ((b"IHDR", header), (b"IDAT", zlib.compress(raw)), (b"IEND", b""))
+    chunks = (struct.pack(">I", len(b)) + name + b + struct.pack(">I", zlib.crc32(name + b)) for name, b in parts)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
 def test_codes_in_pictures(tmp_path: Path):

@@ -72,6 +72,19 @@ def test_a_stream_is_named_by_its_codes_too(tmp_path: Path):
     assert (tmp_path / "from.npy.npy").read_bytes() == (tmp_path / "from.json.npy").read_bytes()
 
 
+def test_a_stream_keeps_a_name_with_dots(tmp_path: Path):
+    """Names of two light levels are two streams, with and without .npy and .json."""
+    np.save(tmp_path / "p.npy", random_planes(4, 6, 16).astype(bool))
+    codes = importing.read(tmp_path / "p.npy")
+    for given, name in [("spad_4.9ppp", "spad_4.9ppp"), ("spad_4.1ppp.npy", "spad_4.1ppp"), ("s.2.json", "s.2")]:
+        stream = importing.to_stream(codes, tmp_path / "out" / given, CAPTURE)
+        assert stream.path == tmp_path / "out" / f"{name}.npy"
+        assert Stream.open(tmp_path / "out" / f"{name}.json").verify() == []
+        with pytest.raises(FileExistsError, match=rf"{name}\.npy: exists"):
+            importing.to_stream(codes, tmp_path / "out" / name, CAPTURE)
+    assert len(list((tmp_path / "out").iterdir())) == 6
+
+
 def test_streams_survive_an_interrupted_conversion(tmp_path: Path):
     np.save(tmp_path / "p.npy", np.ones((4, 6, 16), bool))
 

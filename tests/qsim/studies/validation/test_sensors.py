@@ -134,5 +134,5 @@ def test_a_name_states_the_gain_of_its_sensor():
     named = {name: sensor for name, (sensor, *_) in MODELS.items() if "gain" in name}
     assert len(named) == 4
     for name, sensor in named.items():
-        assert sensor.gain == pytest.approx(float(name.split("gain ")[1]), rel=1e-3)
+        assert sensor.gain == pytest.approx(float(name.split("gain ")[1]), abs=5e-4)
     assert len(set(named.values())) == len(named)
