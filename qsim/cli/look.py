@@ -14,6 +14,7 @@ from qsim import files
 from qsim.cli.console import bar, command, output, refuse_existing, refuse_idle
 
 PREVIEWS = (".mp4", ".gif", ".png")
+FASTEST_GIF = 50  # frames per second; viewers slow down faster ones
 
 
 def add_preview(sub: Any) -> None:
@@ -58,9 +59,14 @@ def _run_preview(args: argparse.Namespace) -> int:
     if target is not None:
         if target.suffix not in PREVIEWS:
             raise ValueError(f"{target}: a preview is a {', '.join(PREVIEWS)} file, as in -o {target.stem}.mp4")
+        if target.suffix == ".gif" and (args.fps or 0) > FASTEST_GIF:
+            raise ValueError(
+                f"--fps {args.fps:g}: a GIF plays at most {FASTEST_GIF} frames per second; write {target.stem}.mp4, "
+                f"or give --fps {FASTEST_GIF} or less"
+            )
         refuse_existing(target, args.force)
-    if args.fps is not None and not 0 < args.fps <= 1000:
-        raise ValueError(f"--fps: expected frames per second between 0 and 1000, got {args.fps:g}")
+    if args.fps is not None and not 0.01 <= args.fps <= 1000:
+        raise ValueError(f"--fps: expected frames per second between 0.01 and 1000, got {args.fps:g}")
     if args.scale is not None and not 1 <= args.scale <= 64:
         raise ValueError(f"--scale: expected a whole factor of 1 to 64, got {args.scale}")
     if args.play and target is not None:

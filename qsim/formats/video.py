@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -61,9 +62,8 @@ def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossl
         stream: Any = None
         for image in frames:
             if stream is None:
-                stream = container.add_stream(
-                    "libx264", rate=round(frame_rate), options={"qp": "0"} if lossless else {}
-                )
+                rate = Fraction(frame_rate).limit_denominator(1001)  # 30000/1001 is a usual rate
+                stream = container.add_stream("libx264", rate=rate, options={"qp": "0"} if lossless else {})
                 stream.height, stream.width = image.shape[:2]
                 stream.codec_context.pix_fmt = "gray" if lossless else "yuv420p"
                 if not lossless and (image.shape[0] % 2 or image.shape[1] % 2):

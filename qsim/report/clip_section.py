@@ -49,7 +49,7 @@ def motion(clip: Clip, frames: Sequence[int]) -> tuple[float | None, float]:
 
 def clip_section(clip: Clip) -> page.Section:
     """Return light, streams and ground truth of a clip, its motion, modelled effects, and the error of its frames."""
-    frames = chosen_frames(len(clip))
+    frames = chosen_frames(*clip.shape)
     truth = truth_stack(clip, frames)
     lines = [light_line(clip), *(stream_line(clip.stream(name)) for name in clip.streams)]
     figures = [_light_histogram(truth, clip)]
@@ -81,7 +81,7 @@ def _players(clip: Clip, frames: range, truth: Photons) -> list[Markup]:
         if len(stream) == len(clip):
             panels += stream_panels(stream, frames, truth_photons(clip, stream, frames))
         else:
-            others.append(page.player(stream_panels(stream, chosen_frames(len(stream))), right=1, left=0))
+            others.append(page.player(stream_panels(stream, chosen_frames(*stream.shape)), right=1, left=0))
     left = 1 if len(panels) > 1 else 0
     return [page.player(panels, left=left), *others]
 
@@ -231,7 +231,7 @@ def unexpected(clip: Clip, stream: Stream) -> str | None:
         return "every row sees its own part of two frames of the clip"
     if stream.shares is not None:
         return "its codes have different exposures"
-    if int(stream.meta.get("planes_per_code", 1)) > 1 or len(stream) != len(clip):
+    if int(stream.meta.get("planes_per_code", 1)) > 1 or "planes_of" in stream.meta or len(stream) != len(clip):
         return "a code sums planes of several frames of the clip"
     if stream.meta["ppp_factor"] is None:
         return "its light is unknown"

@@ -125,11 +125,8 @@ def number_text(value: object) -> str:
     if not isinstance(value, float):
         return str(value)
     if value and 1e-4 <= abs(value) < 1e7:
-        return (
-            f"{value:.{max(3 - floor(log10(abs(value))), 0)}f}".rstrip("0").rstrip(".")
-            if abs(value) < 1e4
-            else f"{value:.0f}"
-        )
+        shown = f"{value:.{max(3 - floor(log10(abs(value))), 0)}f}"
+        return shown.rstrip("0").rstrip(".") if "." in shown else shown
     return f"{value:.4g}"
 
 

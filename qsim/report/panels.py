@@ -32,15 +32,23 @@ _GOLDEN = 0.6180339887  # turns between the hues of successive bodies
 Photons = NDArray[np.floating]  # [T, H, W] photons; of colour clips [T, 3, H, W]
 
 
-def chosen_frames(count: int) -> range:
-    """Return at most FRAMES frames from the start, without gaps, which would change the motion."""
-    return range(min(count, FRAMES))
+def chosen_frames(count: int, height: int, width: int) -> range:
+    """Return at most FRAMES frames from the start, without gaps, which would change the motion.
+
+    Of tall pictures they are fewer: a panel holds its frames below each other, at most MAX_STRIP rows.
+    """
+    rows = -(-height // _step(width))
+    return range(min(count, FRAMES, max(page.MAX_STRIP // rows, 1)))
 
 
 def fit(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return every n-th row and column of [T, H, W] or [T, H, W, 3], so that a panel has at most WIDTH columns."""
-    step = -(-frames.shape[2] // WIDTH)
+    step = _step(frames.shape[2])
     return frames[:, ::step, ::step]
+
+
+def _step(width: int) -> int:
+    return -(-width // WIDTH)
 
 
 def toned(light: Photons, white: float) -> NDArray[np.uint8]:

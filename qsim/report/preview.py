@@ -122,8 +122,9 @@ def _write_gif(path: Path, frames: Iterator[Picture], fps: float) -> None:
 
     images = [Image.fromarray(frame).quantize(256) for frame in frames]
     with files.replacing(path) as file:
-        duration = max(20, round(1000 / fps))
-        images[0].save(file, format="gif", save_all=True, append_images=images[1:], duration=duration, loop=0)
+        ends = np.rint(np.arange(len(images) + 1) * (100 / fps)).astype(int)  # a GIF counts in hundredths of a second
+        durations = (10 * np.diff(ends)).tolist()  # ms
+        images[0].save(file, format="gif", save_all=True, append_images=images[1:], duration=durations, loop=0)
 
 
 # Terminals

@@ -129,7 +129,8 @@ def _kind(path: Path) -> str | None:
 # Kinds of files without a format field, and the keys that identify them
 _KEYS = (
     ("bench", {"setting", "costs"}),
-    ("validation", {"rows", "ok"}),
+    ("validation", {"rows", "ok", "pixels"}),  # of sensors
+    ("validation", {"rows", "ok", "median_ratio"}),  # of rendering; those of light and engines have no section
     ("reading", {"clip_processor", "mp4_processor"}),
     ("study", {"rows", "structure_function"}),
     ("study", {"cells", "studies"}),
@@ -183,7 +184,7 @@ def restored_section(path: Path) -> page.Section:
     """
     video = Restored.open(path)
     meta, restored = video.meta, video.frames()
-    frames = chosen_frames(len(restored))
+    frames = chosen_frames(len(restored), *restored.shape[-2:])
     shown = np.asarray(restored[: len(frames)])
     clip, stream = _source(meta)
     name, truth = str(meta["method"]), None
@@ -192,7 +193,7 @@ def restored_section(path: Path) -> page.Section:
         truth = truth_photons(clip, stream, frames)
     white = colour.peak(shown if truth is None else truth)
     own = page.Panel(f"restored by {name}", fit(toned(shown, white)), score(shown, truth))
-    wheel, lines = None, [f"{meta['description']}; {page.seconds_text(meta['seconds_per_frame'])} per frame."]
+    wheel, lines = None, [f"{meta.get('description', name)}; {page.seconds_text(meta['seconds_per_frame'])} per frame."]
     if clip is None or stream is None or truth is None:
         panels = [own]
     else:

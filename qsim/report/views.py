@@ -7,8 +7,9 @@ One white and one colour scale apply to all frames (measured on at most SAMPLES 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -88,14 +89,38 @@ def _clip_source(clip: Clip, chosen: str | None) -> Source:
     views = {"sharp": _light_view("sharp", "sharp radiance", unit, len(clip), clip.sharp)}
     if any(name.startswith("sharp/") for name in clip.meta["checksums"]):
         views["radiance"] = _light_view("radiance", "radiance of the exposure", unit, len(clip), clip.radiance)
+    length = len(clip)
     if chosen is not None or clip.streams:
-        views |= _stream_source(clip.stream(chosen or clip.streams[0])).views
+        length, held = _held_views(clip, clip.stream(chosen or clip.streams[0]))
+        views |= held
     if clip.has_truth:
         views |= {"flow": _flow_view(clip), "depth": _depth_view(clip)}
-    shortest = len(clip)
-    if "codes" in views:
-        shortest = min(shortest, len(clip.stream(chosen or clip.streams[0])))
-    return Source(clip.name, shortest, clip.frame_rate, views)
+    return Source(clip.name, length, clip.frame_rate, views)
+
+
+def _held_views(clip: Clip, stream: Stream) -> tuple[int, dict[str, View]]:
+    """Return how many clip frames have a code, and views that show at each of them the code exposed at that time.
+
+    Where rows have their own time, the middle of the readout counts.
+    """
+    per = int(stream.meta.get("planes_per_code") or 1)
+    if len(stream) * per > len(clip):  # of a bit-depth study: the planes are those of another clip
+        per = 1
+    views = _stream_source(stream).views
+    if per == 1:
+        return min(len(clip), len(stream)), views
+    late = 0.0 if stream.rows is None else float(stream.rows.shifts(*stream.shape[1:], clip.frame_rate).mean())
+    held = {kind: _held(view, per, late) for kind, view in views.items()}
+    return min(len(clip), len(stream) * per + math.floor(late)), held
+
+
+def _held(view: View, per: int, late: float) -> View:
+    """Return the view by clip frames of codes over `per` frames each; the first begins `late` frames after the clip."""
+    return replace(
+        view,
+        declared=f"{view.declared}; each over {per} frames of the clip",
+        picture=lambda t: view.picture(max(math.floor((t + 0.5 - late) / per), 0)),
+    )
 
 
 def _stream_source(stream: Stream) -> Source:

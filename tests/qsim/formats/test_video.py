@@ -1,6 +1,7 @@
 """Tests video: lossless grey is exact, and colour follows the standard in its file."""
 
 import json
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from qsim.colour import code_levels, from_linear
 from qsim.formats import exporting, importing
 from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints
+from qsim.formats.video import write_video
 
 
 def test_lossless_video_is_bit_exact_and_ordinary_video_is_not(tmp_path: Path):
@@ -149,3 +151,11 @@ def test_colour_video_becomes_linear_luminance(tmp_path: Path, matrix: str, full
     for wrong in (colours[..., ::-1], weighted_first, other_matrix):
         light = luminance(wrong, transfer)
         assert ((light < low) | (light > high)).any()
+
+
+def test_a_video_has_the_rates_of_television(tmp_path: Path):
+    av = pytest.importorskip("av")
+    rate = Fraction(30000, 1001)
+    write_video(tmp_path / "a.mp4", iter(np.zeros((3, 16, 16), np.uint8)), float(rate), lossless=True)
+    with av.open(str(tmp_path / "a.mp4")) as film:
+        assert film.streams.video[0].average_rate == rate

@@ -91,6 +91,14 @@ def test_numbers_have_four_digits(value, shown):
     assert number_text(value) == shown
 
 
+def test_a_number_reads_back_as_itself_to_four_digits():
+    rng = np.random.default_rng(0)
+    values = 10 ** rng.uniform(-7, 10, 2000) * rng.choice([-1.0, 1.0], 2000)
+    for value in (*values.tolist(), 1000.0, 1250.3, 2000.0, 9999.7, 1e4, 1e6):
+        assert float(number_text(value)) == pytest.approx(value, rel=5.1e-4), value
+    assert number_text(1250.3) == "1250"
+
+
 @pytest.mark.parametrize(
     ("seconds", "shown"), [(6.502e-5, "65 µs"), (0.3568, "357 ms"), (2.1, "2.1 s"), (0.0, "0 s"), (None, None)]
 )

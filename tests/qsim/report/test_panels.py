@@ -144,3 +144,11 @@ def test_a_stream_behind_one_filter_is_shown_in_grey(tmp_path, name):
     assert mean.score.endswith("dB")
     average = views.open_source(stream.path.with_suffix(".json")).views["average"]
     assert ("demosaiced" in average.declared) == (name == "rggb")
+
+
+def test_tall_pictures_show_as_many_frames_as_browsers_draw():
+    """A panel holds its frames below each other; wide pictures are reduced before that."""
+    assert panels.chosen_frames(60, 24, 33) == range(48)
+    assert panels.chosen_frames(60, 768, 512) == range(41)
+    assert panels.chosen_frames(60, 1536, 1024) == range(41)
+    assert panels.chosen_frames(5, 768, 512) == range(5)

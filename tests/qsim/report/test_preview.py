@@ -5,6 +5,7 @@ import os
 import pty
 import subprocess
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,34 @@ def test_gif_and_mp4_have_every_frame(clip, tmp_path):
     page = preview.sheet(choose(open_source(clip.path), None))
     for t, frame in enumerate(decoded):
         assert np.abs(frame.astype(int) - page.frame(t)).mean() < 6, "lossy, but this frame"
+
+
+@pytest.mark.parametrize("rate", [12, 30, 40])
+def test_a_gif_plays_at_the_rate_asked_for(clip, tmp_path, rate):
+    """A GIF counts in hundredths of a second: its frames last 2 or 3 of them, 2.5 on average."""
+    assert main(["preview", str(clip.path), "-o", str(tmp_path / "a.gif"), "--what", "sharp", "--fps", str(rate)]) == 0
+    with Image.open(tmp_path / "a.gif") as gif:
+        durations = [(gif.seek(t), gif.info["duration"])[1] for t in range(gif.n_frames)]
+    assert len(durations) == 5
+    assert sum(durations) == pytest.approx(5 * 1000 / rate, abs=5)
+
+
+def test_a_gif_of_one_frame(tmp_path):
+    np.save(tmp_path / "one.npy", np.ones((1, 4, 5)))
+    assert main(["preview", str(tmp_path / "one.npy"), "-o", str(tmp_path / "a.gif"), "--fps", "10"]) == 0
+    with Image.open(tmp_path / "a.gif") as gif:
+        assert gif.n_frames == 1
+
+
+@pytest.mark.parametrize("rate", ["0.01", "0.4", "23.976"])
+def test_a_film_plays_at_the_rate_asked_for(clip, tmp_path, rate):
+    import av
+
+    assert main(["preview", str(clip.path), "-o", str(tmp_path / "a.mp4"), "--what", "sharp", "--fps", rate]) == 0
+    with av.open(str(tmp_path / "a.mp4")) as film:
+        assert film.streams.video[0].average_rate == Fraction(rate)
+        assert sum(1 for _ in film.decode(video=0)) == 5
+    assert json.loads((tmp_path / "a.mp4.json").read_text())["shown_fps"] == float(rate)
 
 
 def test_legends_follow_their_pictures():
@@ -139,7 +168,11 @@ def test_json_declares_without_drawing(clip, capsys):
         ("{clip} --frame 5", "--frame 5: odd has frames 0..4"),
         ("{clip} --what radiance", "odd: has no view 'radiance'; it has: sharp, codes, average, flow, depth"),
         ("{clip} --what sharpp", "unknown picture 'sharpp'; there are: sharp, radiance"),
-        ("{clip} --fps 0", "--fps: expected frames per second between 0 and 1000, got 0"),
+        ("{clip} --fps 0", "--fps: expected frames per second between 0.01 and 1000, got 0"),
+        (
+            "{clip} -o a.gif --fps 60",
+            "--fps 60: a GIF plays at most 50 frames per second; write a.mp4, or give --fps 50 or",
+        ),
         ("{clip} --scale 0", "--scale: expected a whole factor of 1 to 64, got 0"),
         ("{clip} --stream other", "no stream 'other'; there are: mine"),
         ("codes.npy", "codes.npy: whole numbers are codes or packed planes; add --bits 3, or --width 320"),

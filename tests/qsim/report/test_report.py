@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 from browser import browser, needs_chromium
-from clips import write_dataset
+from clips import write_clip, write_dataset
 
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
@@ -107,6 +107,19 @@ def test_a_data_set_is_a_table_and_a_clip_of_each_split(tmp_path):
     assert "Data set tiny has 4 clips (1 test, 2 train, 1 val) with 56 frames in all." in page
     assert re.findall(r"<h2>(.*?)</h2>", page) == ["Data set tiny", "Clip test_0", "Clip train_0", "Clip val_0"]
     assert "4 clips; motion in the middle frame" in page
+
+
+def test_a_portrait_of_many_frames_has_a_page(tmp_path):
+    """A clip, its codes, and restored video of 48 frames with 768 rows: 41 of them fit into a picture."""
+    clip = write_clip(tmp_path / "tall", radiance=np.full((48, 768, 2), 0.5), relative=True)
+    stream = clip.sense(ppp=3.25, bits=3)
+    np.save(tmp_path / "v.npy", np.full((48, 3, 768, 2), 3.25, np.float32))
+    about = {"format": "quiver-restored-1", "method": "moment", "seconds_per_frame": 0.1}
+    (tmp_path / "v.json").write_text(json.dumps(about))
+    page = report.build_page(clip.path, tmp_path / "v.npy")
+    assert page.count('data-frames="41"') == page.count('class="player"') == 2
+    assert stream.name in page
+    assert "moment; 100 ms per frame." in page, "a description is optional"
 
 
 def look(selector: str) -> str:

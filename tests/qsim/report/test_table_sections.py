@@ -6,7 +6,10 @@ import pytest
 
 from qsim.report import report
 from qsim.report.table_sections import training_section
+from qsim.studies.validation.backends import BackendReport, BackendRow
+from qsim.studies.validation.light import LightReport, LightRow
 from qsim.studies.validation.reading import ReadingReport
+from qsim.studies.validation.sensors import SensorReport, SensorRow
 
 
 def test_an_evaluation_defines_its_scores(folder):
@@ -101,3 +104,17 @@ def test_studies_costs_and_validations_have_their_sections(tmp_path):
     assert "windows of 11 × 128 × 128 in a clip of 65 × 512 × 1024: as fast as wanted (100/s, 5 times)" in page
     assert "250.5" in page
     assert "<td>ties</td><td>right</td><td>wrong</td>" in page
+
+
+def test_validations_without_a_section_are_left_out(tmp_path):
+    """The JSON of `validate light` and `validate engines` beside that of the sensors; alone, they are nothing known."""
+    light = LightReport(8, 10, "llvm", (LightRow("fan", 36.0, 37.0, 37.1, 36.5, 36.6, 16, 4, False, 0.0, 0.0, 0.001),))
+    engines = BackendReport(8, 10, 32, (BackendRow("scalar", "fan", 0.5, None, 1.0, 0.01),), {"cuda": "no driver"})
+    row = SensorRow("QIS", "fast", 99.5, times_numpy=25.0, cdf_error=1e-7)
+    sensors = SensorReport([row], [], 9)
+    for name, content in (("light", light), ("engines", engines), ("sensors", sensors)):
+        (tmp_path / f"{name}.json").write_text(json.dumps(content.to_dict()))
+    assert report.build_page(tmp_path).count("<h2>Validation") == 1
+    for name in ("light", "engines"):
+        with pytest.raises(ValueError, match="nothing to report"):
+            report.build_page(tmp_path / f"{name}.json")

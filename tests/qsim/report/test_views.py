@@ -6,8 +6,12 @@ import numpy as np
 from clips import write_clip
 
 from qsim import colour as pictures
-from qsim.report.views import open_source
+from qsim.clip.photons import clip_photons
+from qsim.clip.rows import Rows
+from qsim.clip.stream import Stream, write_packed
+from qsim.report.views import Source, open_source
 from qsim.sensor import packing
+from qsim.sensor.qis import QIS
 
 
 def test_views_are_the_declared_functions_of_the_numbers(clip):
@@ -48,3 +52,52 @@ def test_packed_planes_are_unpacked(tmp_path):
 def test_a_clip_without_streams_shows_its_light(tmp_path):
     clip = write_clip(tmp_path / "plain", frames=3)
     assert list(open_source(clip.path).views) == ["sharp"]
+
+
+def slow_codes(source: Source, stream: Stream) -> list[int]:
+    """Return the number of the code that a source shows at each of its frames; all codes differ."""
+    codes = [np.rint(code * 255.0 / (2**stream.bits - 1)) for code in stream.codes()]
+    shown = [source.views["codes"].picture(t)[..., 0] for t in range(source.length)]
+    return [next(n for n, code in enumerate(codes) if np.array_equal(code, picture)) for picture in shown]
+
+
+def test_codes_of_several_clip_frames_stand_beside_the_light_of_their_exposure(tmp_path):
+    """Codes of seven planes: clip frames 0 ... 6 have code 0; the last clip frame of 22 has none."""
+    clip = write_clip(tmp_path / "c", frames=22, height=9, width=11)
+    stream = clip.sense("spad-320x240", ppp=3.0, bits=3, group=True)
+    source = open_source(clip.path)
+    assert (len(stream), source.length) == (3, 21)
+    assert slow_codes(source, stream) == [0] * 7 + [1] * 7 + [2] * 7
+    assert source.views["codes"].declared.endswith("; each over 7 frames of the clip")
+    white = source.views["sharp"].scale["white"]
+    assert np.array_equal(source.views["sharp"].picture(20)[..., 1], pictures.tone(clip.sharp(20), white))
+    assert slow_codes(open_source(stream.path), stream) == [0, 1, 2], "a stream alone is shown code by code"
+
+
+def test_codes_of_rows_at_their_own_time_stand_beside_the_middle_of_the_readout(tmp_path):
+    """Eight rows of 7/8 of a clip frame each: the middle of the readout is 3.06 frames late."""
+    clip = write_clip(tmp_path / "c", frames=28, height=8, width=11)
+    stream = clip.sense(QIS(0.8, 1.6, 0.2, 3), ppp=3.0, slices=7, rows=Rows(7 / 8 / clip.frame_rate))
+    source = open_source(clip.path)
+    shown = slow_codes(source, stream)
+    assert (len(stream), len(shown)) == (3, 24)
+    assert shown == [0] * 10 + [1] * 7 + [2] * 7
+    middle = [stream.truth(t, t + 1, at="frame")[0] for t in range(3)]
+    for n, truth in enumerate(middle):
+        at = 7 * n + 6
+        np.testing.assert_allclose(clip_photons(clip, at, 7 * stream.photons_factor, sharp=True), truth)
+        assert shown[at] == n
+
+
+def test_planes_of_another_clip_are_one_code_per_frame(tmp_path):
+    """Bit-depth studies state planes of their fast clip in the streams of its grouped one."""
+    clip = write_clip(tmp_path / "c", frames=3, height=9, width=11)
+    stream = clip.sense(ppp=3.0, bits=3, name="planes")
+    write_packed(stream.path, [stream.packed], stream.sensor, about(stream.meta) | {"planes_per_code": 7})
+    source = open_source(clip.path)
+    assert slow_codes(source, stream) == [0, 1, 2]
+    assert "each over" not in source.views["codes"].declared
+
+
+def about(meta: dict) -> dict:
+    return {key: value for key, value in meta.items() if key not in ("checksum", "sha256")}
