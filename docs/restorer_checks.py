@@ -28,7 +28,7 @@ from quiver.data.clips import mean_light, open_clips, peak_of, truth
 from quiver.data.codes import Codes, array_codes, sensed
 from quiver.data.illumination import Illumination
 from quiver.data.photon_counts import Counts, read_counts
-from quiver.evaluation.static_object import counted, evaluate_static, reference
+from quiver.evaluation.static_object import counted, evaluate_static, reference, seen_by
 from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer, restorers, weights_path
 
@@ -89,8 +89,9 @@ def brightness(counts: Counts, names: Sequence[str], bits: int) -> dict[str, lis
     for _ in range(SPLITS):
         given = np.sort(rng.choice(len(counts.frames), WINDOW, replace=False))
         target, _ = reference(counts, np.setdiff1d(np.arange(len(counts.frames)), given))
-        codes, share = counted(counts, bits, given), float(counts.shares[given].mean())
+        codes = counted(counts, bits, given)
         for method in methods:
+            share = float(counts.shares[given[seen_by(method, WINDOW // 2)]].mean())
             light = method.restore(codes, WINDOW // 2, WINDOW // 2 + 1)[0] / share
             found[method.name].append(float(light.clip(0, peak).mean() / target.clip(0, peak).mean()))
     return found

@@ -23,7 +23,7 @@ from quiver.baselines.sliding_window import check_codes, check_window, in_units,
 
 GRID = 1024  # levels of light; a parabola through the best three errs by less than 1e-3 of the light
 DARKEST = 1e-5  # of the brightest light: the first level above darkness
-CHUNK = 1 << 22  # likelihoods held at a time
+CHUNK = 1 << 22  # likelihoods, and entries of histograms, held at a time
 
 Estimate = Callable[[Array, Array, Sensor, float], Array]  # codes [window, N], their shares, ... -> photons [N]
 
@@ -82,20 +82,32 @@ def likelihood(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> 
     """Return the most likely photons [N] of codes [window, N]; saturated codes count as what they are."""
     distinct, kinds = np.unique(shares, return_inverse=True)
     light = levels(tuple(distinct), sensor, exposure)
-    tables = [_log_pmf(tuple(distinct), share, sensor, exposure) for share in distinct]
-    bins = np.zeros((codes.shape[1], len(distinct), sensor.levels), np.int32)
+    table = np.concatenate([_log_pmf(tuple(distinct), share, sensor, exposure) for share in distinct], axis=1)
+    found = np.empty(codes.shape[1])
+    step = max(1, CHUNK // table.shape[1])
+    for start in range(0, len(found), step):
+        found[start : start + step] = _most_likely(codes[:, start : start + step], kinds, table, light)
+    saturated = (codes == sensor.levels - 1).all(axis=0)
+    top = np.full((len(shares), 1), sensor.levels - 1)
+    bright = moment(top, shares, sensor, exposure)[0]
+    return np.where(saturated, bright, np.minimum(found, bright))
+
+
+def _most_likely(codes: Array, kinds: Array, table: Array, light: Array) -> Array:
+    """Return the most likely `light` [N] of codes [window, N] of these kinds of exposure; equal outcomes count once.
+
+    `table` [GRID, kinds x levels] holds the logarithms of probabilities.
+    """
+    pixels = np.arange(codes.shape[1])
+    bins = np.zeros((len(pixels), kinds.max() + 1, table.shape[1] // (kinds.max() + 1)), np.int32)
     for code, kind in zip(codes, kinds, strict=True):
-        bins[np.arange(codes.shape[1]), kind, code] += 1
+        bins[pixels, kind, code] += 1
     outcomes, where = np.unique(bins.reshape(len(bins), -1), axis=0, return_inverse=True)
-    table = np.concatenate(tables, axis=1)  # [GRID, kinds x levels]
     found = np.empty(len(outcomes))
     step = max(1, CHUNK // len(light))
     for start in range(0, len(outcomes), step):
         found[start : start + step] = _peak(outcomes[start : start + step] @ table.T, light)
-    saturated = (codes == sensor.levels - 1).all(axis=0)
-    top = np.full((len(shares), 1), sensor.levels - 1)
-    bright = moment(top, shares, sensor, exposure)[0]
-    return np.where(saturated, bright, np.minimum(found[where.ravel()], bright))
+    return found[where.ravel()]
 
 
 METHODS: dict[str, Estimate] = {"naive": naive, "moment": moment, "likelihood": likelihood}

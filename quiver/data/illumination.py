@@ -42,14 +42,19 @@ class Illumination:
         return prepare(clip, self.sensing(seed))
 
     @property
-    def label(self) -> str:
-        """Return the text of tables: `3.25 PPP, 3 bit`."""
+    def level(self) -> str:
+        """Return light and bits as text: `3.25 PPP, 3 bit`."""
         return ", ".join(
             (
                 "own light" if self.ppp is None else f"{self.ppp:g} PPP",
                 "own bits" if self.bits is None else f"{self.bits} bit",
             )
         )
+
+    @property
+    def label(self) -> str:
+        """Return the text of tables: `3.25 PPP, 3 bit`."""
+        return self.level
 
 
 def read_sensor(source: str | Mapping[str, Any], bits: int | None = None) -> tuple[Sensor, Defects | None]:

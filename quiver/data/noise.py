@@ -7,7 +7,8 @@ exact law of the sensor. One table serves training windows and restored streams 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 from typing import Any
@@ -19,6 +20,8 @@ from qsim.clip.clip import Clip
 from qsim.clip.sensing import Sensing, assemble
 from qsim.clip.simulation import Draw
 from qsim.clip.stream import Stream
+from qsim.files import sha256, to_json
+from qsim.sensor import colour_filter
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.defect_table import from_dict as read_defects
 from qsim.sensor.sensor import Sensor
@@ -113,10 +116,14 @@ class Noise(Illumination):
         return asdict(self) | {name: None if text is None else json.loads(text) for name, text in texts.items()}
 
     @property
+    def level(self) -> str:
+        """Return light and bits as text: `3.25 PPP, 3 bit`, `10 lx, 3 bit`."""
+        return super().level if self.lux is None else f"{self.lux:g} lx, {self.bits} bit"
+
+    @property
     def label(self) -> str:
         """Return the text of tables: `3.25 PPP, 3 bit, spad-320x240`."""
-        light = super().label if self.lux is None else f"{self.lux:g} lx, {self.bits} bit"
-        return light if self.sensor == Illumination.sensor else f"{light}, {short_name(self.sensor)}"
+        return self.level if self.sensor == Illumination.sensor else f"{self.level}, {short_name(self.sensor)}"
 
     @property
     def simple(self) -> Illumination:
@@ -168,6 +175,45 @@ def stored_defects(text: str) -> Defects:
 def short_name(sensor: str) -> str:
     """Return the name of a device, or of a file without folder and suffix."""
     return sensor.rpartition("/")[2].removesuffix(".toml")
+
+
+def labels(lights: Iterable[Illumination]) -> dict[Illumination, str]:
+    """Return the text of tables for each light: its label, and where several have one label, what tells them apart.
+
+    That is the sensor's name, the path of its file, or diffraction and defects. `ValueError` where none of it does.
+    """
+    found = {light: light.label for light in lights}
+    for form in (short_name, _in_its_folder, str):
+        found |= {light: f"{light.level}, {form(light.sensor)}" for light in _of_one_label(found)}
+    for light in _of_one_label(found):
+        effects = [name for name in ("diffraction", "defects") if getattr(light, name, None)]
+        found[light] = ", ".join([found[light], *effects])
+    for light in _of_one_label(found):
+        raise ValueError(f"two different lights are both called {found[light]!r} in tables; leave one of them out")
+    return found
+
+
+def _in_its_folder(sensor: str) -> str:
+    return "/".join(sensor.split("/")[-2:])
+
+
+def _of_one_label(labels: Mapping[Illumination, str]) -> list[Illumination]:
+    times = Counter(labels.values())
+    return [light for light, text in labels.items() if times[text] > 1]
+
+
+def file_digests(lights: Iterable[Illumination]) -> dict[str, str]:
+    """Return the SHA-256 of what each sensor file of the lights states, with the maps of its defects.
+
+    A `Noise` states its sensor itself.
+    """
+    found: dict[str, str] = {}
+    for path in dict.fromkeys(light.sensor for light in lights if not isinstance(light, Noise)):
+        if path.endswith(".toml"):
+            (sensor, defects), colour = read_sensor(path), colour_filter.from_toml(path)
+            tables = (sensor.to_dict(), defects and defects.to_dict(), colour and colour.to_dict())
+            found[path] = sha256(to_json(tables))
+    return found
 
 
 @lru_cache(maxsize=64)

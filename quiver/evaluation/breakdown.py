@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from numpy import ndarray as Array
 from qsim.figures import new_figure, write_figure
 from qsim.files import load_array, replacing
 from quiver.data.clips import Clip
+from quiver.data.codes import Codes
 from quiver.evaluation import metrics
 
 EDGES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, math.inf)  # px/frame
@@ -88,6 +89,18 @@ def save_crop(path: Path, picture: Array) -> None:
     path.parent.mkdir(exist_ok=True)
     with replacing(path) as file:
         np.save(file, np.minimum(picture, 2).astype(np.float16))
+
+
+def keep_crops(out: Path, light: str, clip: Clip, codes: Codes, frames: range, stacks: Mapping[str, Array]) -> None:
+    """Store the part of the middle frame with most motion, from each [T, H, W] stack and from the codes, under
+    OUT/crops.
+    """
+    middle = len(frames) // 2
+    part = place(clip, frames[middle])
+    pictures = {name: stack[middle][..., *part] for name, stack in stacks.items()}
+    pictures["codes"] = codes.read(frames[middle], frames[middle] + 1)[0][part] / (codes.sensor.levels - 1)
+    for name, picture in pictures.items():
+        save_crop(crop_file(out, light, clip.name, name), picture)
 
 
 def sheet(out: Path, light: str, clips: Sequence[str], methods: Sequence[str], target: Path) -> bool:

@@ -27,8 +27,10 @@ from qsim.process import peak_memory, reset_peak
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import Codes, Stream, array_codes, sensed, stored, windows_sensed
 from quiver.data.illumination import Illumination, read_sensor
+from quiver.data.noise import file_digests, labels
 from quiver.evaluation import breakdown, metrics
-from quiver.restoration.interface import Restorer
+from quiver.restoration.interface import RestoreOptions, Restorer
+from quiver.restoration.networks import settings_of
 
 FORMAT = "quiver-evaluation-2"  # 1: peak = the sensor's white, factor of the least unclamped error
 PLAN_FORMAT = "quiver-plan-2"
@@ -50,6 +52,13 @@ class Comparison:
     stream: str | None = None  # score this stored stream instead of sensing at `lights`
     peak: float | None = None  # of the scores, photons per pixel; None = 2.5 x mean light (published: sensor's white)
     test_set: str | None = None  # of the paper, in its own layout: the truth is grey / 255, its peak 1
+
+    def __post_init__(self) -> None:
+        labels(self.lights)  # `ValueError` where two would have one name
+
+    def label(self, light: Illumination) -> str:
+        """Return the text of tables of one of the lights, or of the stored stream."""
+        return self.stream or labels(self.lights)[light]
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
@@ -74,11 +83,13 @@ class ComparisonRow:
     motion_pixels: tuple[int, ...] = ()  # per bin of breakdown.EDGES; empty where the clip has no flow
     motion_squares: tuple[float, ...] = ()  # squared error summed over them, matched, in units of the peak
     failure: str | None = None
+    precision: str = RestoreOptions.precision
+    cut: str | None = None  # tiles of a frame where they change the answer, else empty; None: not recorded earlier
 
     @property
-    def key(self) -> tuple[str, str, str, str]:
+    def key(self) -> tuple[str, str, str, str, str, str | None]:
         """Return what must agree for an old result to count."""
-        return self.method, self.description, self.light, self.clip
+        return self.method, self.description, self.light, self.clip, self.precision, self.cut
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, which has no NaN and no infinity: they become null."""
@@ -181,7 +192,8 @@ def restore_clip(
 
     A failure becomes the reason in the row.
     """
-    row = ComparisonRow(method.name, method.description, comparison.stream or light.label, clip.name, scene_of(clip))
+    name, (precision, cut) = comparison.label(light), settings_of(method, codes)
+    row = ComparisonRow(method.name, method.description, name, clip.name, scene_of(clip), precision=precision, cut=cut)
     frames = scored_frames(len(clip), comparison.published)
     white = peak_in_photons(comparison, clip, codes, factor)
     target, valid = truth(clip, factor, frames.start, frames.stop) / white, known(clip, frames.start, frames.stop)
@@ -189,23 +201,24 @@ def restore_clip(
     before, started = reset_peak(), time.perf_counter()
     try:
         if comparison.published:
-            pieces = [method.restore(window, PUBLISHED_EDGE, PUBLISHED_EDGE + 1) for window in windows]
-            restored = np.concatenate(pieces)
+            restored = np.concatenate([method.restore(one, PUBLISHED_EDGE, PUBLISHED_EDGE + 1) for one in windows])
         else:
             restored = method.restore(codes)
         seconds = (time.perf_counter() - started) / len(frames)
         peak = peak_memory() - before
         unit = codes.white if comparison.test_set else white  # networks learn photons / white, the target is grey / 255
-        score = metrics.score(restored / np.float32(unit), target, per_frame_scale=comparison.published, valid=valid)
+        score, factors = metrics.score_and_factors(
+            restored / np.float32(unit), target, per_frame_scale=comparison.published, valid=valid
+        )
     except Exception as error:  # a method's failure is recorded as its result
         return replace(row, failure=f"{type(error).__name__}: {' '.join(str(error).split())}")
-    matched = restored * np.float32(score.scale / unit)
+    matched = restored * (factors / unit).astype(np.float32).reshape(-1, *(1,) * (restored.ndim - 1))
     speed = breakdown.speeds(clip, frames)
     if speed is not None and valid is not None:
         speed = np.where(valid, speed, math.nan)
     pixels, squares = ((), ()) if speed is None else breakdown.by_motion(matched, target, speed)
     if out is not None:
-        keep_crops(out, row, clip, codes, frames, {row.method: matched, "truth": target})
+        breakdown.keep_crops(out, row.light, clip, codes, frames, {row.method: matched, "truth": target})
     return replace(
         row,
         score=score,
@@ -216,20 +229,6 @@ def restore_clip(
         motion_pixels=pixels,
         motion_squares=squares,
     )
-
-
-def keep_crops(
-    out: Path, row: ComparisonRow, clip: Clip, codes: Codes, frames: range, stacks: dict[str, Array]
-) -> None:
-    """Store the part of the middle frame with most motion, from each [T, H, W] stack and from the codes, under
-    OUT/crops.
-    """
-    middle = len(frames) // 2
-    part = breakdown.place(clip, frames[middle])
-    pictures = {name: stack[middle][..., *part] for name, stack in stacks.items()}
-    pictures["codes"] = codes.read(frames[middle], frames[middle] + 1)[0][part] / (codes.sensor.levels - 1)
-    for name, picture in pictures.items():
-        breakdown.save_crop(breakdown.crop_file(out, row.light, row.clip, name), picture)
 
 
 def evaluate(
@@ -263,10 +262,12 @@ def evaluate(
             drawn, factor = (
                 sensed(clip, light, comparison.seed) if comparison.stream is None else stored(clip, comparison.stream)
             )
-            label = comparison.stream or light.label
+            label = comparison.label(light)
             codes: Codes | None = None
             for method in methods:
-                key = (method.name, method.description, label, clip.name)
+                asked = (method.name, method.description, label, clip.name, *settings_of(method, drawn))
+                earlier = (*asked[:-1], None)
+                key = earlier if earlier in known else asked
                 if progress is not None:
                     progress(f"{method.name}, {clip.name}, {label}", len(rows), total)
                 if key not in known:
@@ -294,28 +295,32 @@ def in_memory(codes: Codes) -> Codes:
     return replace(codes, read=array_codes(codes.read(0, codes.shape[0]), codes.sensor, codes.exposure).read)
 
 
-def content_digest(comparison: Comparison, clips: Sequence[Clip]) -> str:
-    """Return the SHA-256 of the scored content: the descriptions of clips and stored stream, with checksums."""
+def content_of(comparison: Comparison, clips: Sequence[Clip]) -> dict[str, Any]:
+    """Return the SHA-256 of the scored content: the descriptions of clips and stored stream, and the sensor files."""
     described = [
         [clip.meta, None if comparison.stream is None else clip.stream(comparison.stream).meta] for clip in clips
     ]
-    return hashlib.sha256(json.dumps(described, sort_keys=True, default=str).encode()).hexdigest()
+    found = {"content_sha256": hashlib.sha256(json.dumps(described, sort_keys=True, default=str).encode()).hexdigest()}
+    files = file_digests(comparison.lights)
+    return found | ({"sensors_sha256": files} if files else {})
 
 
 def begin(comparison: Comparison, out: Path, clips: Sequence[Clip]) -> list[ComparisonRow]:
     """Create the folder of an evaluation, or return the finished rows of an interrupted one of the same content."""
     path = out / "plan.json"
-    wanted = {"format": PLAN_FORMAT} | comparison.to_dict() | {"content_sha256": content_digest(comparison, clips)}
+    content = content_of(comparison, clips)
+    wanted = {"format": PLAN_FORMAT} | comparison.to_dict() | content
     if not path.exists():
         if out.exists() and (not out.is_dir() or any(path.name != CLIPS for path in out.iterdir())):
             raise FileExistsError(f"{out} exists and is not an evaluation; choose another -o")
         out.mkdir(parents=True, exist_ok=True)
         write_json(path, wanted)
     elif (found := read_json(path)) != wanted:
-        same = {key: value for key, value in found.items() if key != "content_sha256"}
-        changed = {"content_sha256": wanted["content_sha256"]} | same == wanted
-        what = "rows of clips or streams that were changed since" if changed else "another evaluation"
-        raise FileExistsError(f"{out} holds {what}; choose another -o, or start again with --force")
+        if "content_sha256" not in found or content | found != wanted:
+            changed = found | content == wanted
+            what = "rows of clips, streams or sensors that were changed since" if changed else "another evaluation"
+            raise FileExistsError(f"{out} holds {what}; choose another -o, or start again with --force")
+        write_json(path, wanted)  # an earlier version did not record the sensor files
     rows = out / "rows.jsonl"
     if not rows.exists():
         return []

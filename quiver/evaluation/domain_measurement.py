@@ -22,6 +22,7 @@ from qsim.locks import Lock
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
+from quiver.data.noise import file_digests
 from quiver.evaluation import metrics
 from quiver.evaluation.comparison import in_memory
 from quiver.model.weights import annotate, metadata_of
@@ -31,6 +32,8 @@ from quiver.restoration.networks import network_restorer
 from quiver.restoration.restorers import restorers
 
 CLASSICAL = ("naive", "moment:3", "transform-denoise", "qbp", "qbp-bm3d")
+SENSOR = "sensor file "  # + its name: the key of its SHA-256
+CUT = "tiles of a frame"  # key of those that change results
 
 
 @dataclass(frozen=True)
@@ -86,10 +89,10 @@ def measure(
     network = network_restorer(weights, options)
     if any(method.learned for method in methods):
         raise ValueError(f"a network is measured against classical methods, got {', '.join(settings.methods)}")
-    shared = settings.to_dict()
+    shared = settings.to_dict() | _run_of(network, settings.clips) | _sensor_files(settings.lights)
     before = read_scope(weights, metadata_of(weights)).domain
-    if before is not None and dict(before.measured) != shared and not force:
-        changed = ", ".join(key for key, value in shared.items() if before.measured.get(key) != value)
+    if before is not None and (changes := _changes(before.measured, shared)) and not force:
+        changed = ", ".join(changes)
         raise ValueError(
             f"{weights}: holds {len(before.cells)} cells that were measured otherwise (not the same: {changed}); "
             "measure into a copy of the file, or use --force to replace them"
@@ -102,21 +105,51 @@ def measure(
             continue
         cell = measure_cell(network, methods, settings, light)
         with _one_at_a_time(weights):
-            cells = merged(stored_cells(weights, shared), [cell])
-            annotate(weights, {KEY: Domain(cells, shared).to_json()})
+            old = stored(weights, shared)
+            annotate(weights, {KEY: Domain(merged(old.cells, [cell]), old.measured).to_json()})
     if progress is not None:
         progress(len(todo), max(1, len(todo)))
-    return Domain(stored_cells(weights, shared), shared)
+    return stored(weights, shared)
 
 
-def stored_cells(weights: Path, shared: Mapping[str, object]) -> tuple[Cell, ...]:
-    """Return the cells in a weights file that were measured with these settings."""
+def stored(weights: Path, shared: Mapping[str, object]) -> Domain:
+    """Return the cells in a weights file that were measured with these settings, and the settings of all of them."""
     domain = read_scope(weights, metadata_of(weights)).domain
-    return domain.cells if domain is not None and dict(domain.measured) == shared else ()
+    if domain is None or _changes(domain.measured, shared):
+        return Domain((), shared)
+    return Domain(domain.cells, {**domain.measured, **shared})
+
+
+def _run_of(network: Restorer, clips: Sequence[Clip]) -> dict[str, object]:
+    """Return how a network runs as far as it changes results: mode and precision, if not the usual ones, and tiles."""
+    usual = {"mode": RestoreOptions.mode, "precision": RestoreOptions.precision}
+    given = {name: network.identity.get(name) or default for name, default in usual.items()}
+    cuts = {network.cut(*clip.shape[1:]) for clip in clips} - {""}
+    return {name: value for name, value in given.items() if value != usual[name]} | {CUT: ", ".join(sorted(cuts))}
+
+
+def _sensor_files(lights: Sequence[Illumination]) -> dict[str, object]:
+    """Return the SHA-256 of each sensor file. `ValueError` for different files of one name."""
+    found: dict[str, object] = {}
+    for sensor, digest in file_digests(lights).items():
+        name = f"{SENSOR}{Path(sensor).name}"
+        if found.setdefault(name, digest) != digest:
+            raise ValueError(f"{sensor}: another sensor file has the same name, by which cells are stored; rename one")
+    return found
+
+
+def _changes(measured: Mapping[str, object], shared: Mapping[str, object]) -> list[str]:
+    """Return the settings that differ. Sensor files and tiles that only one side states are no difference."""
+    one_sided = {key for key in measured.keys() ^ shared.keys() if key.startswith((SENSOR, CUT))}
+    return [
+        key
+        for key in dict.fromkeys((*shared, *measured))
+        if key not in one_sided and measured.get(key) != shared.get(key)
+    ]
 
 
 def _known(weights: Path, shared: Mapping[str, object], light: Illumination) -> bool:
-    return any(_measures(cell, light) for cell in stored_cells(weights, shared))
+    return any(_measures(cell, light) for cell in stored(weights, shared).cells)
 
 
 @contextlib.contextmanager

@@ -217,6 +217,13 @@ def score(
     error. It is 1 where the mean over frames would fall or a frame would lose its score, so matched scores are never
     below raw ones.
     """
+    return score_and_factors(output, target, per_frame_scale=per_frame_scale, valid=valid)[0]
+
+
+def score_and_factors(
+    output: np.ndarray, target: np.ndarray, *, per_frame_scale: bool = False, valid: np.ndarray | None = None
+) -> tuple[Score, np.ndarray]:
+    """Return the same score, and the factor of every frame [T] behind its matched numbers."""
     one, two = _pair(output, target)
     keep = _kept(valid, two)
     raw = psnr(one, two, keep)
@@ -238,7 +245,7 @@ def score(
     scales, matched = np.where(worse, 1.0, scales), np.where(worse | np.isnan(raw), raw, matched)
     scaled = one * scales.reshape(-1, *(1,) * (one.ndim - 1))
     hidden = np.isnan(raw)
-    return Score(
+    found = Score(
         psnr=_mean(raw),
         psnr_matched=_mean(matched),
         ssim=_mean(np.where(hidden, nan, ssim(one, two, keep))),
@@ -248,6 +255,7 @@ def score(
         frames=int(np.count_nonzero(~hidden)),
         above_peak=above_peak(two, keep),
     )
+    return found, scales
 
 
 def mean_score(scores: Sequence[Score]) -> Score:

@@ -2,10 +2,10 @@
 
     counts [N, H, W] -> codes of 11 frames (clipped to b bits) -> restored centre frame; the other N - 11 are the truth
 
-Real light flickers from frame to frame: every frame is divided by its share of the light. The reference is a mean of
-Poisson counts with a known variance r / sum(shares). Its contribution to the squared error is subtracted, with the
-clamp at the peak taken into account (`metrics.clamped_variance`). The peak is 2.5 times the mean count, as for clips.
-The frames are split at random, several times.
+Real light flickers from frame to frame: a restored frame is divided by the mean share of the light of the frames that
+its method sees. The reference is a mean of Poisson counts with a known variance r / sum(shares). Its contribution to
+the squared error is subtracted, with the clamp at the peak taken into account (`metrics.clamped_variance`). The peak is
+2.5 times the mean count, as for clips. The frames are split at random, several times.
 """
 
 from __future__ import annotations
@@ -80,9 +80,10 @@ def score_split(
 
     `given` are the frames to restore from, `peak` is in photons.
     """
-    centre = len(given) // 2
-    restored = method.restore(counted(counts, bits, given), centre, centre + 1)[0]
-    output = restored / (peak * float(counts.shares[given].mean()))
+    centre, codes = len(given) // 2, counted(counts, bits, given)
+    first, last = (centre, centre + 1) if method.seamless else (0, len(given))  # a state needs the complete stream
+    restored = method.restore(codes, first, last)[centre - first]
+    output = restored / (peak * float(counts.shares[given[seen_by(method, centre)]].mean()))
     others = np.setdiff1d(np.arange(len(counts.frames)), given)
     target, variance = reference(counts, others)
     target, noise = target / peak, variance / peak**2
@@ -94,6 +95,12 @@ def score_split(
         scale,
         metrics.above_peak(target),
     )
+
+
+def seen_by(method: Restorer, frame: int) -> slice:
+    """Return the frames that a method sees, at most, to restore one frame of a stream."""
+    last = frame + method.look_ahead + 1
+    return slice(max(0, last - method.window) if method.seamless else 0, last)
 
 
 def evaluate_static(

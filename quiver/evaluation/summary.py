@@ -13,7 +13,7 @@ from qsim.files import write_bytes, write_json
 from qsim.tables import markdown_table
 from quiver import threads
 from quiver.evaluation import breakdown, metrics
-from quiver.evaluation.comparison import FORMAT, Comparison, ComparisonRow, json_safe
+from quiver.evaluation.comparison import FORMAT, PUBLISHED_EDGE, Comparison, ComparisonRow, json_safe
 from quiver.evaluation.metrics import Interval, over_scenes
 from quiver.restoration.interface import Restorer
 
@@ -141,7 +141,7 @@ def markdown(
         "",
     ]
     lines = summarise(rows)
-    text += markdown_table([_cells(line, by_name[line.method]) for line in lines], COLUMNS)
+    text += markdown_table([_cells(line, by_name[line.method], comparison.published) for line in lines], COLUMNS)
     text += ["", *_caveats(lines, rows), *[f"{remark}\n" for remark in remarks]]
     text += [MEMORY, ""]
     failures = [f"- {line.method}, {line.light}, {reason}" for line in lines for reason in line.failures]
@@ -158,8 +158,20 @@ def peak_name(comparison: Comparison) -> str:
     return "the sensor's white, as published" if comparison.published else "2.5 x the stream's mean light"
 
 
-def _cells(line: SummaryLine, method: Restorer) -> list[str]:
-    cells = [line.method, f"{method.window} ({method.look_ahead})", line.light]
+def frames_of(method: Restorer, *, published: bool) -> tuple[int | None, int]:
+    """Return how many frames a restored one takes, None for all earlier ones, and how many of them are future ones.
+
+    A published window holds PUBLISHED_EDGE frames on each side.
+    """
+    past, future = method.window - 1 - method.look_ahead, method.look_ahead
+    if published:
+        past, future = min(past, PUBLISHED_EDGE), min(future, PUBLISHED_EDGE)
+    return past + 1 + future if published or method.seamless else None, future
+
+
+def _cells(line: SummaryLine, method: Restorer, published: bool) -> list[str]:
+    count, future = frames_of(method, published=published)
+    cells = [line.method, f"{'all earlier' if count is None else count} ({future})", line.light]
     if line.failures and line.scores["psnr"].scenes == 0:
         cells += [f"failed: {line.failures[0]}", *[""] * 9]
     else:
@@ -233,7 +245,12 @@ def as_dict(
             "remarks": list(remarks),
             "threads": threads.current(),
             "methods": [
-                {"name": m.name, "frames": m.window, "future": m.look_ahead, "learned": m.learned, "is": m.description}
+                {
+                    "name": m.name,
+                    **dict(zip(("frames", "future"), frames_of(m, published=comparison.published), strict=True)),
+                    "learned": m.learned,
+                    "is": m.description,
+                }
                 for m in methods
             ],
             "table": [asdict(line) for line in summarise(rows)],
@@ -275,7 +292,7 @@ def write(
     """
     one_per_scene = list({row.scene: row.clip for row in reversed(rows)}.values())[::-1]
     for light in dict.fromkeys(row.light for row in rows):
-        target = out / f"crops_{light.replace(', ', '_').replace(' ', '')}.png"
+        target = out / f"crops_{light.replace(', ', '_').replace(' ', '').replace('/', '-')}.png"
         breakdown.sheet(out, light, one_per_scene, [method.name for method in methods], target)
     write_bytes(out / "evaluation.md", markdown(comparison, methods, rows, remarks).encode())
     figure(rows, out / "evaluation.png")

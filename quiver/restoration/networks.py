@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +36,7 @@ def network_restorer(path: Path, options: RestoreOptions) -> Restorer:
 
     model = load(path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    name = path.parent.name if path.name == "best.safetensors" else path.stem
+    name = Path(os.path.abspath(path)).parent.name if path.name == "best.safetensors" else path.stem
     description = f"{network_title(model)}, weights {digest[:12]}"
     method = wrap_network(model, name, description, options, weights_sha256=digest)
     return replace(method, scope=read_scope(path, metadata_of(path)))
@@ -59,6 +60,7 @@ def wrap_network(
     from quiver.model.blocks import RADIUS, WINDOW
     from quiver.model.mergenet import MergeNet
     from quiver.model.quiver import QUIVER
+    from quiver.model.schedules import REACH
     from quiver.restoration.merging import fill_merged
 
     mode = options.mode if isinstance(model, QUIVER) else None  # other networks have one way to share work
@@ -66,6 +68,8 @@ def wrap_network(
     model.to(pick_device(options.device)).eval()
     run: RestoreNetwork = fill_network
     window, look_ahead, together = WINDOW, RADIUS, 1
+    if mode == "streaming":  # features reach further, and the state back to the first frame
+        window, look_ahead = WINDOW + REACH, RADIUS + REACH
     if isinstance(model, MergeNet):
         run = fill_merged
     elif takes_clips(model):
@@ -82,6 +86,16 @@ def wrap_network(
         return cut_pieces(model, height, width, options.memory).text
 
     return Restorer(name, window, look_ahead, True, description, fill, mode != "streaming", identity, cut, together)
+
+
+def settings_of(method: Restorer, codes: Codes) -> tuple[str, str]:
+    """Return the precision, and the tiles of a frame where they change the answer, else an empty text."""
+    rows, columns = (1, 1) if codes.colour is None else codes.colour.tile  # each place of a mask is a frame
+    try:
+        cut = method.cut(-(-codes.shape[1] // rows), -(-codes.shape[2] // columns))
+    except ValueError:
+        cut = "no tile fits"  # restoring states the reason
+    return str(method.identity.get("precision", RestoreOptions.precision)), cut
 
 
 def fill_network(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -106,3 +108,29 @@ def test_a_method_without_exposures_is_refused():
     codes = np.zeros((3, 2, 2), np.uint8)
     with pytest.raises(ValueError, match="method 'qbp': takes equal exposures only; use naive, moment, likelihood"):
         exposures.restore(codes, SENSORS["QIS"], EXPOSURE, np.ones(3), method="qbp")
+
+
+@pytest.mark.parametrize("kind", SENSORS)
+def test_the_likelihood_in_parts_is_the_same(kind, monkeypatch):
+    """One chunk, chunks of several pixels, and of one."""
+    sensor, shares = SENSORS[kind], np.resize(SCHEDULE, 6)
+    codes = drawn(sensor, 10 ** np.random.default_rng(7).uniform(-1.5, 3, 70), shares, 5)[:, 0]
+    whole = exposures.likelihood(codes, shares, sensor, EXPOSURE)
+    for pixels in (16, 1):
+        monkeypatch.setattr(exposures, "CHUNK", pixels * len(SCHEDULE) * sensor.levels)
+        np.testing.assert_allclose(exposures.likelihood(codes, shares, sensor, EXPOSURE), whole, rtol=1e-12)
+
+
+def test_the_memory_of_the_likelihood_does_not_grow_with_pixels_times_codes(monkeypatch):
+    """7 bits, 3 exposures, 4000 pixels: a table of all outcomes has 6 MB, and sorting it takes several of them."""
+    sensor = QIS(0.8, 200.0, 0.2, 7)
+    monkeypatch.setattr(exposures, "CHUNK", 1 << 16)
+    light = np.random.default_rng(8).uniform(0, 200, 4000)
+    codes = drawn(sensor, light, SCHEDULE, 6)[:, 0]
+    exposures.likelihood(codes[:, :10], SCHEDULE, sensor, EXPOSURE)  # responses are kept
+    tracemalloc.start()
+    try:
+        exposures.likelihood(codes, SCHEDULE, sensor, EXPOSURE)
+        assert tracemalloc.get_traced_memory()[1] < 6e6  # 3 MB are the logarithms of all probabilities
+    finally:
+        tracemalloc.stop()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,40 @@ from sensor_files import QIS, sensor_file
 
 from qsim.clip.sensing import Sensing, sense
 from quiver.data.clips import open_clips
+from quiver.data.illumination import Illumination
+from quiver.data.noise import Noise, labels
 from quiver.model.unet import UNet, UNetConfig
 from quiver.restoration.restorers import restorer
 from quiver.training.loop import train
 from quiver.training.settings import Settings
+
+# Names in tables
+
+
+def test_lights_of_one_label_get_names_that_tell_them_apart():
+    """Lights of one sensor keep their names, and so do those of a mixture that differ already."""
+
+    def named(*lights: Illumination) -> list[str]:
+        return list(labels(lights).values())
+
+    plain, spad = Illumination(), Illumination("spad-320x240")
+    assert named(plain, Illumination(ppp=9.75)) == ["3.25 PPP, 3 bit", "9.75 PPP, 3 bit"]
+    assert named(spad) == ["3.25 PPP, 3 bit"]
+    assert named(plain, Noise.of(spad)) == ["3.25 PPP, 3 bit", "3.25 PPP, 3 bit, spad-320x240"]
+    assert named(plain, spad, Illumination(ppp=1.0)) == [
+        *("3.25 PPP, 3 bit, quiver-physical", "3.25 PPP, 3 bit, spad-320x240", "1 PPP, 3 bit")
+    ]
+    assert named(*(Illumination(f"{folder}/my.toml", 1.0, None) for folder in "ab")) == [
+        *("1 PPP, own bits, a/my.toml", "1 PPP, own bits, b/my.toml")
+    ]
+    noise = Noise("spad-320x240", lux=10.0)
+    assert named(noise, replace(noise, diffraction=True), replace(noise, defects="{}")) == [
+        f"10 lx, 3 bit, spad-320x240{effects}" for effects in ("", ", diffraction", ", defects")
+    ]
+    with pytest.raises(ValueError, match="two different lights are both called '10 lx, 3 bit, spad-320x240, defects'"):
+        labels((replace(noise, defects="{}"), replace(noise, defects='{"prnu": 0.1}')))
+    assert labels(()) == {}
+
 
 # From streams and options to a mixture
 

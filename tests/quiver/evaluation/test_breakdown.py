@@ -7,7 +7,12 @@ import math
 import numpy as np
 import pytest
 from clips import ClipMaker
+from methods import method
+from numpy import ndarray as Array
 
+from quiver.data.clips import truth
+from quiver.data.codes import Codes, sensed
+from quiver.data.illumination import Illumination
 from quiver.evaluation import breakdown, metrics, summary
 from quiver.evaluation.comparison import Comparison, evaluate
 from quiver.restoration.restorers import restorer
@@ -48,6 +53,27 @@ def test_a_clip_with_flow_has_its_error_in_the_bin_of_its_motion(make_clip: Clip
     assert line.psnr_by_motion[2] == pytest.approx(line.scores["psnr_matched"].mean, abs=0.1)  # pooled or by frames
     text = summary.markdown(comparison, methods, rows)
     assert f"| moment:3 | 3.25 PPP, 3 bit | - | - | {line.psnr_by_motion[2]:.2f} | - | - | - |" in text
+
+
+def test_windows_with_a_factor_each_are_matched_by_their_own(make_clip: ClipMaker, tmp_path):
+    """An exact answer that flickers, in published windows: after the factor of each no error is left, nor in crops."""
+    clip = make_clip(flow=np.full((2, 36, 44), 1.0, np.float32))
+    comparison = Comparison(str(clip.path), None, (Illumination("quiver-published"),), published=True)
+    exact = truth(clip, sensed(clip, comparison.lights[0])[1], 0, len(clip))
+
+    def restore(codes: Codes) -> Array:
+        t = int(codes.name.rpartition(" ")[2])
+        return np.repeat(exact[t : t + 1] * (0.8 + 0.05 * t), codes.shape[0], axis=0)
+
+    row = evaluate(comparison, [method("flicker", restore)], tmp_path / "t")[0]
+    assert row.score.scale_spread > 0.03
+    assert row.score.psnr_matched > 100
+    assert sum(row.motion_pixels) == 4 * 36 * 44
+    assert sum(row.motion_squares) / sum(row.motion_pixels) < 1e-10
+    crop, whole = (
+        np.load(breakdown.crop_file(tmp_path / "t", row.light, clip.name, name)) for name in ("flicker", "truth")
+    )
+    np.testing.assert_allclose(crop, whole, rtol=2e-3)
 
 
 def test_crops_show_where_most_moves(make_clip: ClipMaker, tmp_path):

@@ -12,6 +12,7 @@ import pytest
 from clips import ClipMaker
 from methods import broken, method
 from numpy import ndarray as Array
+from sensor_files import QIS, sensor_file
 
 from qsim import files
 from qsim.clip.clip import Clip
@@ -103,6 +104,90 @@ def test_an_interrupted_evaluation_goes_on(tiny_dataset, tmp_path):
         evaluate(replace(comparison, seed=1), [method("slow", count)], out)
     with pytest.raises(FileExistsError, match="is not an evaluation"):
         begin(comparison, tmp_path, open_clips(str(tiny_dataset), "test"))
+
+
+def test_rows_of_another_precision_or_cut_are_not_taken(make_clip: ClipMaker, tmp_path):
+    """Those of a folder of an earlier version, which did not record them, count as float32 with any cut."""
+    comparison, out = Comparison(str(make_clip(frames=4, height=12, width=16).path), None), tmp_path / "t"
+    calls: list[str] = []
+
+    def network(precision: str = "float32", cut: str = "") -> Restorer:
+        def restore(codes: Codes) -> Array:
+            calls.append(f"{precision} {cut}")
+            return np.ones(codes.shape)
+
+        found = method("net", restore, learned=True)
+        return replace(found, identity={"precision": precision}, cut=lambda height, width: cut)
+
+    evaluate(comparison, [network()], out)
+    lines = (out / "rows.jsonl").read_text().splitlines()
+    assert (json.loads(lines[0])["precision"], json.loads(lines[0])["cut"]) == ("float32", "")
+    runs = [{}, {"precision": "bfloat16"}, {"cut": "4 tiles of at most 9 x 12"}, {"precision": "bfloat16"}, {}]
+    rows = [evaluate(comparison, [network(**run)], out)[0] for run in runs]
+    assert calls == ["float32 ", "bfloat16 ", "float32 4 tiles of at most 9 x 12"]
+    assert [row.precision for row in rows] == ["float32", "bfloat16", "float32", "bfloat16", "float32"]
+
+    earlier = {name: value for name, value in json.loads(lines[0]).items() if name not in ("precision", "cut")}
+    (out / "rows.jsonl").write_text(json.dumps(earlier) + "\n")
+    calls.clear()
+    for run in runs:
+        evaluate(comparison, [network(**run)], out)
+    assert calls == ["bfloat16 "]
+
+
+def test_a_run_without_memory_for_a_tile_is_a_failure(make_clip: ClipMaker):
+    def no_tile(height: int, width: int) -> str:
+        raise ValueError("raise --memory")
+
+    def restore(codes: Codes) -> Array:
+        raise ValueError("raise --memory")
+
+    row = evaluate(Comparison(str(make_clip(frames=4).path), None), [replace(method("net", restore), cut=no_tile)])[0]
+    assert row.failure == "ValueError: raise --memory"
+
+
+def test_rows_of_an_edited_sensor_file_are_not_mixed(make_clip: ClipMaker, tmp_path):
+    """Its numbers and maps count, not its comments. A plan of an earlier version did not record them."""
+    np.save(tmp_path / "gain.npy", np.full((36, 44), 1.1))
+    file = sensor_file(tmp_path, QIS + 'gain_map = "gain.npy"\n', 3)
+    comparison = Comparison(str(make_clip(frames=4).path), None, (Illumination(file, 3.25, None),))
+    methods, out = [restorer("moment:1")], tmp_path / "t"
+    rows = evaluate(comparison, methods, out)
+    plan = json.loads((out / "plan.json").read_text())
+    assert list(plan.pop("sensors_sha256")) == [file]
+    files.write_json(out / "plan.json", plan)
+    sensor_file(tmp_path, QIS + '# measured on a Monday\ngain_map = "gain.npy"\n', 3)
+    assert evaluate(comparison, methods, out) == rows
+    assert "sensors_sha256" in json.loads((out / "plan.json").read_text())
+    before = (out / "rows.jsonl").read_bytes()
+    for edited in ("number", "map"):
+        if edited == "number":
+            sensor_file(tmp_path, QIS.replace("0.8", "0.7") + 'gain_map = "gain.npy"\n', 3)
+        else:
+            sensor_file(tmp_path, QIS + 'gain_map = "gain.npy"\n', 3)
+            np.save(tmp_path / "gain.npy", np.full((36, 44), 1.2))
+        with pytest.raises(FileExistsError, match="rows of clips, streams or sensors that were changed since"):
+            evaluate(comparison, [*methods, restorer("naive")], out)
+    assert (out / "rows.jsonl").read_bytes() == before
+
+
+def test_two_sensors_at_one_light_level_are_both_scored(make_clip: ClipMaker, tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    noisy = QIS.replace("read_noise = 0.2", "read_noise = 0.9")
+    one, two = sensor_file(tmp_path / "a", QIS, 3), sensor_file(tmp_path / "b", noisy, 3)
+    clip = make_clip(frames=4)
+    for sensors, named in ((("quiver-physical", "spad-320x240"),) * 2, ((one, two), ("a/mine.toml", "b/mine.toml"))):
+        lights = tuple(Illumination(sensor, 3.25, 3) for sensor in sensors)
+        comparison, out = Comparison(str(clip.path), None, lights), tmp_path / Path(sensors[1]).stem
+        rows = evaluate(comparison, [restorer("moment")], out)
+        assert [row.light for row in rows] == [f"3.25 PPP, 3 bit, {name}" for name in named]
+        assert rows[0].score != rows[1].score
+        assert [line.light for line in summary.summarise(rows)] == [row.light for row in rows]
+        summary.write(out, comparison, [restorer("moment")], rows)
+        assert len(list(out.glob("crops_*.png"))) == 2
+    with pytest.raises(ValueError, match=r"two different lights are both called '3\.25 PPP, 3 bit, quiver-physical'"):
+        Comparison(str(clip.path), None, (Illumination(), Illumination(ppp=3.25000001)))
 
 
 @pytest.mark.parametrize("changed", ["codes", "light"])

@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+from golden import SMALL
 
 from quiver.evaluation import cost as costs
 from quiver.evaluation.cost import (
@@ -19,6 +20,9 @@ from quiver.evaluation.cost import (
     markdown,
     measure,
 )
+from quiver.model.quiver import QUIVER
+from quiver.model.unet import UNet, UNetConfig
+from quiver.model.weights import save
 from quiver.restoration.interface import NETWORKS, Restorer
 
 
@@ -38,6 +42,19 @@ def test_only_cases_that_differ_are_run():
     for network in ("unet", "mergenet"):  # the weights that ship have one mode, too
         assert [c.mode for c in cases if c.method == network] == ["exact", "exact"]
     assert len([c for c in cases if c.method == "quiver-s"]) == 4
+
+
+def test_weights_of_a_folder_have_the_modes_of_their_network(tmp_path):
+    for name, network in (("u", UNet(UNetConfig(2))), ("q", QUIVER(SMALL))):
+        (tmp_path / name).mkdir()
+        save(network, network.config, tmp_path / name / "best.safetensors")
+    unet, quiver = str(tmp_path / "u"), str(tmp_path / "q")
+    cases = checked_cases((unet, quiver, "moment"), None, None, "cpu")
+    assert [(case.method, case.mode) for case in cases] == [
+        *((unet, "exact"), (quiver, "exact"), (quiver, "streaming"), ("moment", "exact"))
+    ]
+    with pytest.raises(ValueError, match=r"--modes: acts on QUIVER, .*/u has one mode; leave it out"):
+        checked_cases((unet,), ("streaming",), None, "cpu")
 
 
 def test_every_preset_is_a_case():

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from domains import run, tensors_digest, weights
+from domains import cell, run, tensors_digest, weights
+from golden import SMALL
+from sensor_files import QIS, sensor_file
 
 from quiver.data.clips import open_clips
 from quiver.data.illumination import Illumination
 from quiver.evaluation import domain_measurement
-from quiver.model.weights import metadata_of
+from quiver.evaluation.domain_measurement import DomainSettings
+from quiver.model.quiver import QUIVER
+from quiver.model.weights import annotate, metadata_of, save
 from quiver.restoration import domain
-from quiver.restoration.interface import RestoreOptions
+from quiver.restoration.domain import Cell, Domain
+from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import network_restorer
 from quiver.restoration.restorers import restorer
 
@@ -61,6 +67,70 @@ def test_cells_are_measured_stored_and_kept(tiny_dataset, tmp_path, monkeypatch)
         domain_measurement.measure(path, replace(settings, methods=("mergenet",)), RestoreOptions(device="cpu"))
     with pytest.raises(ValueError, match="unknown split 'none'"):
         domain_measurement.clips_of([tiny_dataset], "none")
+
+
+def cells_without_measuring(monkeypatch: pytest.MonkeyPatch) -> list[Illumination]:
+    """Let cells cost nothing; return the list that collects their lights."""
+    asked: list[Illumination] = []
+
+    def at_once(network: Restorer, methods: object, settings: object, light: Illumination) -> Cell:
+        asked.append(light)
+        place = domain.place_of(light.device(5e-4), 5e-4, light.ppp)
+        return Cell(Path(light.sensor).name, light.ppp, place, 20.0, "naive", 19.0)
+
+    monkeypatch.setattr(domain_measurement, "measure_cell", at_once)
+    return asked
+
+
+def test_cells_of_another_mode_precision_or_cut_are_not_taken(tiny_dataset, tmp_path, monkeypatch):
+    """Cells of an earlier version, which did not record them, are those of the usual mode and precision."""
+    path, asked = tmp_path / "small.safetensors", cells_without_measuring(monkeypatch)
+    save(QUIVER(SMALL), SMALL, path)
+    settings = DomainSettings(domain_measurement.clips_of([tiny_dataset], "test"), (Illumination(),), ("naive",))
+    usual = RestoreOptions(device="cpu")
+    earlier = Domain((cell(3.25, 21.0),), settings.to_dict())
+    annotate(path, {domain.KEY: earlier.to_json()})
+    assert domain_measurement.measure(path, settings, usual).cells == earlier.cells
+    assert not asked
+    for name, options in (
+        ("mode", replace(usual, mode="streaming")),
+        ("precision", replace(usual, precision="bfloat16")),
+    ):
+        with pytest.raises(ValueError, match=rf"measured otherwise \(not the same: {name}\)"):
+            domain_measurement.measure(path, settings, options)
+        found = domain_measurement.measure(path, settings, options, force=True)
+        assert found.measured[name] == getattr(options, name)
+        assert domain_measurement.measure(path, settings, options) == found
+        with pytest.raises(ValueError, match=rf"measured otherwise \(not the same: {name}\)"):
+            domain_measurement.measure(path, settings, usual)
+        domain_measurement.measure(path, settings, usual, force=True)
+    assert len(asked) == 4
+
+    def in_tiles(*given: object) -> Restorer:
+        return replace(network_restorer(*given), cut=lambda height, width: "4 tiles of at most 30 x 30")
+
+    monkeypatch.setattr(domain_measurement, "network_restorer", in_tiles)
+    with pytest.raises(ValueError, match=r"measured otherwise \(not the same: tiles of a frame\)"):
+        domain_measurement.measure(path, settings, usual)
+
+
+def test_cells_of_an_edited_sensor_file_are_not_taken(tiny_dataset, tmp_path, monkeypatch):
+    path, asked = weights(tmp_path), cells_without_measuring(monkeypatch)
+    light, usual = Illumination(sensor_file(tmp_path, QIS, 3), 3.25, 3), RestoreOptions(device="cpu")
+    settings = DomainSettings(domain_measurement.clips_of([tiny_dataset], "test"), (light,), ("naive",))
+    domain_measurement.measure(path, settings, usual)
+    named = replace(settings, lights=(Illumination(),))
+    assert len(domain_measurement.measure(path, named, usual).cells) == 2  # a named device, too
+    domain_measurement.measure(path, settings, usual)
+    assert asked == [light, Illumination()]
+    sensor_file(tmp_path, QIS.replace("read_noise = 0.2", "read_noise = 0.4"), 3)
+    with pytest.raises(ValueError, match=r"measured otherwise \(not the same: sensor file mine\.toml\)"):
+        domain_measurement.measure(path, settings, usual)
+    domain_measurement.measure(path, named, usual)
+    (tmp_path / "other").mkdir()
+    both = (light, Illumination(sensor_file(tmp_path / "other", QIS, 3), 3.25, 3))
+    with pytest.raises(ValueError, match="another sensor file has the same name"):
+        domain_measurement.measure(path, replace(settings, lights=both), usual)
 
 
 def test_a_classical_method_that_fails_does_not_compete(tiny_dataset, tmp_path):

@@ -186,6 +186,9 @@ def test_one_factor_per_frame_follows_a_flicker_that_one_per_clip_cannot():
     assert per_frame.psnr_matched > 200 > 30 > per_clip.psnr_matched
     assert per_clip.scale_spread == 0.0
     assert per_frame.scale_spread == pytest.approx(np.std([1 / 0.6, 1 / 1.1, 1 / 1.4]))
+    found, factors = metrics.score_and_factors(flicker, target, per_frame_scale=True)
+    assert found == per_frame
+    np.testing.assert_allclose(factors, [1 / 0.6, 1 / 1.1, 1 / 1.4], rtol=1e-6)
 
 
 def test_bad_input_names_the_place():

@@ -11,10 +11,11 @@ import pytest
 from methods import broken, method
 from numpy import ndarray as Array
 
-from quiver.data.codes import array_codes
+from quiver.data.codes import Codes, array_codes
 from quiver.data.illumination import ideal_counter
 from quiver.data.photon_counts import Counts, read_counts
 from quiver.evaluation.static_object import evaluate_static, markdown, mean_square, reference
+from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer, restorers
 
 HAZELNUT = Path(__file__).parents[2] / "data" / "hazelnut_gates6.npz"
@@ -48,6 +49,34 @@ def test_flicker_is_divided_out():
     assert found.scale == pytest.approx(1.0, abs=0.05)
     flat = evaluate_static(replace(counts, shares=np.ones(30)), [restorer("moment")], splits=4)[0]
     assert flat.psnr < found.psnr
+
+
+@pytest.mark.parametrize("name", ["moment:1", "moment:3", "state"])
+def test_a_frame_is_divided_by_the_light_of_the_frames_that_its_method_sees(name):
+    """Much light, so that the best factor is that of the brightness; frames differ by a factor of two."""
+    counts, _ = static_counts(100.0, np.tile([4 / 3, 2 / 3], 15))
+
+    def fill(codes: Codes, out: Array, first: int, progress: object) -> None:  # the mean of all frames up to t + 1
+        seen = codes.read(0, codes.shape[0]).astype(float)
+        out += np.stack([seen[: t + 2].mean(axis=0) for t in range(first, first + len(out))])
+
+    method = Restorer(name, 3, 1, True, "", fill, seamless=False) if name == "state" else restorer(name)
+    for seed in range(4):
+        found = evaluate_static(counts, [method], splits=1, bits=8, seed=seed)[0]
+        assert found.scale == pytest.approx(1, abs=0.03)
+
+
+def test_a_method_with_a_state_restores_the_complete_stream():
+    counts, _ = static_counts(5.0, np.ones(30))
+    restored: list[tuple[int, int]] = []
+
+    def fill(codes: Codes, out: Array, first: int, progress: object) -> None:
+        restored.append((first, len(out)))
+        out += codes.read(first, first + len(out))
+
+    method = Restorer("m", 1, 0, True, "", fill)
+    evaluate_static(counts, [method, replace(method, seamless=False)], splits=1)
+    assert restored == [(5, 1), (0, 11)]
 
 
 def test_real_photons():

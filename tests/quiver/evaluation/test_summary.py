@@ -45,6 +45,17 @@ def test_the_table_holds_what_was_promised(tiny_dataset, tmp_path):
         assert (tmp_path / "t" / picture).read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_method_with_a_state_uses_all_earlier_frames(make_clip: ClipMaker):
+    comparison = Comparison(str(make_clip(frames=4).path), None)
+    streaming = replace(method("state", lambda codes: np.ones(codes.shape)), window=13, look_ahead=7, seamless=False)
+    rows = evaluate(comparison, [streaming, restorer("moment:3")])
+    text = summary.markdown(comparison, [streaming, restorer("moment:3")], rows)
+    assert "| state | all earlier (7) | 3.25 PPP, 3 bit |" in text
+    assert "| moment:3 | 3 (1) | 3.25 PPP, 3 bit |" in text
+    found = summary.as_dict(comparison, [streaming, restorer("moment:3")], rows)["methods"]
+    assert [(one["frames"], one["future"]) for one in found] == [(None, 7), (3, 1)]
+
+
 def test_a_one_bit_sensor_in_much_light_is_not_perfect(make_clip: ClipMaker):
     """At 10 PPP every pixel lies above the white of a 1-bit code: with that as peak, every guess would be perfect."""
     comparison = Comparison(
@@ -95,3 +106,19 @@ def test_scores_near_the_truth_are_marked(make_clip: ClipMaker):
     assert f"{near.scores['psnr'].mean:.2f} † |" in text
     assert f"{far.scores['psnr'].mean:.2f} |" in text
     assert "† In one clip or more within 3 dB of the noise floor of the ground truth" in text
+
+
+@pytest.mark.parametrize(
+    ("window", "future", "seamless", "stated", "published"),
+    [
+        (11, 5, True, (11, 5), (11, 5)),
+        (3, 1, True, (3, 1), (3, 1)),
+        (42, 0, True, (42, 0), (6, 0)),  # EMVD
+        (51, 9, True, (51, 9), (11, 5)),  # FloRNN
+        (13, 7, False, (None, 7), (11, 5)),  # QUIVER with its state
+    ],
+)
+def test_frames_of_a_method_lie_in_the_published_window(window, future, seamless, stated, published):
+    method = Restorer("x", window, future, True, "", lambda *given: None, seamless)
+    assert summary.frames_of(method, published=False) == stated
+    assert summary.frames_of(method, published=True) == published

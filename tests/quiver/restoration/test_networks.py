@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
 from quiver.restoration.interface import RestoreOptions
-from quiver.restoration.networks import fill_network, network_title
+from quiver.restoration.networks import fill_network, network_title, pictures, wrap_network
 from quiver.restoration.pieces import bytes_needed, cut_pieces
 from quiver.restoration.restorers import restorer
 
@@ -95,6 +96,24 @@ def test_modes_of_the_network():
     assert np.isfinite(run(model, codes, RestoreOptions(mode="streaming"))).all()
     low = run(model, codes, RestoreOptions(mode="windows", precision="bfloat16"))
     assert 0 < np.abs(low - windows).max() < 0.1 * codes.white
+
+
+@pytest.mark.parametrize(("mode", "ahead"), [("exact", 5), ("windows", 5), ("streaming", 7)])
+def test_the_stated_look_ahead_is_that_of_the_mode(mode, ahead):
+    """The first restored frame is number 5: it needs frames up to 5 + look-ahead, and no others are read before it."""
+    model, read = QUIVER(SMALL).eval(), []
+    method = wrap_network(model, "q", "", RestoreOptions(mode=mode, device="cpu"))
+
+    def frames() -> Iterator[Tensor]:
+        for t in range(20):
+            read.append(t)
+            yield torch.rand(1, 1, 16, 16)
+
+    with torch.inference_mode():
+        next(pictures(model, frames(), mode))
+    assert method.look_ahead == read[-1] - 5 == ahead
+    assert method.window == 5 + 1 + ahead
+    assert method.seamless == (mode != "streaming")  # its state reaches back to the first frame
 
 
 @pytest.mark.parametrize(

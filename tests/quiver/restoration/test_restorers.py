@@ -97,6 +97,15 @@ def test_weights_are_found_by_file_folder_and_name(tmp_path):
         restorer(str(tmp_path / "young"))
 
 
+def test_a_run_has_the_name_of_its_folder_from_any_folder(tmp_path, monkeypatch):
+    network = UNet(UNetConfig(2))
+    save(network, network.config, tmp_path / "best.safetensors")
+    (tmp_path / "logs").mkdir()
+    for place, given in (("", "."), ("", "best.safetensors"), ("logs", ".."), ("logs", "../best.safetensors")):
+        monkeypatch.chdir(tmp_path / place)
+        assert restorer(given, RestoreOptions(device="cpu")).name == tmp_path.name
+
+
 def test_a_restored_file_says_what_it_is(tmp_path):
     codes, path = random_codes(5, 6, 7), tmp_path / "video.npy"
     meta = restore_to_file(codes, restorer("moment"), path)
