@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -192,12 +193,16 @@ def _in_own_process(case: CostCase, settings: CostSettings) -> CostRow:
     process = context.Process(target=_child, args=(theirs, case, settings), daemon=True)
     process.start()
     theirs.close()
+    found: CostRow | str
+    told: list[str] = []
     try:
-        found: CostRow | str = ours.recv()
+        found, told = ours.recv()
     except EOFError:
         process.join()
         found = f"its process crashed (exit code {process.exitcode}); check its memory"
     process.join()
+    for text in dict.fromkeys(told):
+        warnings.warn(f"{case.method}: {text}", stacklevel=3)
     if isinstance(found, CostRow):
         return found
     return CostRow(**asdict(case), trained=False, seconds_per_frame=math.nan, peak_bytes=0, gmac_per_frame=math.nan,
@@ -205,10 +210,13 @@ def _in_own_process(case: CostCase, settings: CostSettings) -> CostRow:
 
 
 def _child(pipe: Any, case: CostCase, settings: CostSettings) -> None:
-    try:
-        pipe.send(measure(case, settings))
-    except Exception as error:  # a failure is recorded as its result
-        pipe.send(f"{type(error).__name__}: {' '.join(str(error).split())}")
+    found: CostRow | str
+    with warnings.catch_warnings(record=True) as told:
+        try:
+            found = measure(case, settings)
+        except Exception as error:  # a failure is recorded as its result
+            found = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    pipe.send((found, [str(warning.message) for warning in told]))
 
 
 def cases_of(methods: Sequence[str], modes: Sequence[str], precisions: Sequence[str]) -> list[CostCase]:

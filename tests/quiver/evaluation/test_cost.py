@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 import time
+import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -94,3 +97,32 @@ def test_a_long_part_is_run_once(together, long, runs, monkeypatch):
 def test_the_table_names_what_failed():
     bad = CostRow("mergenet", "exact", "float32", False, math.nan, 0, math.nan, math.nan, failure="out of memory")
     assert "| mergenet | exact | float32 | failed: out of memory" in markdown([bad], CostSettings())
+
+
+class InThisProcess:
+    """Stands for a spawned process: it runs at once, here."""
+
+    exitcode = 0
+
+    def __init__(self, target, args, daemon: bool):
+        self.start = lambda: target(*args)
+
+    def join(self) -> None:
+        """Do nothing: it has ended."""
+
+
+def test_a_warning_of_a_case_names_the_method_and_not_a_place_in_the_source(monkeypatch):
+    """Its process printed it with a path; here it is the command's, which prints one line."""
+
+    def told(case: CostCase, settings: CostSettings) -> CostRow:
+        for _ in range(2):
+            warnings.warn("2000 MB hold no frame; it is cut", stacklevel=1)
+        raise ValueError("no light")
+
+    context = SimpleNamespace(Pipe=multiprocessing.Pipe, Process=InThisProcess)
+    monkeypatch.setattr(costs.multiprocessing, "get_context", lambda kind: context)
+    monkeypatch.setattr(costs, "measure", told)
+    with pytest.warns(UserWarning, match=r"^unet: 2000 MB hold no frame; it is cut$") as found:
+        rows = costs.bench([CostCase("unet", "exact", "float32")], CostSettings(16, 16))
+    assert len(found) == 1
+    assert rows[0].failure == "ValueError: no light"
