@@ -234,7 +234,7 @@ class ClipWriter:
             self._remove()
             raise ValueError(
                 f"{self.path}: its largest light is {largest:.3g}, of which half floats keep fewer than 256 steps; "
-                "multiply recorded light by a factor, as to a largest of 1, or brighten the scene"
+                "multiply recorded light until its largest value is about 1, or brighten the scene"
             )
 
     def _write_meta(self, frames: int) -> None:

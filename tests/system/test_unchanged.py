@@ -10,10 +10,10 @@ while frames and streams stayed. Only names that survive every move are used: th
 
 data/unchanged.json has checksums (of codes: SHA-256, no code may differ), data/unchanged.npz numbers: light within
 1e-6 of its mean, video within 1e-5, other numbers as each section says. Clips are stored as halves, so light within
-1e-6 is the same half. Processors differ in last bits, for one in the approximate reciprocal root with which Dr.Jit
-begins to normalise a vector, so that a path may take another way at an edge: one pixel of 200 may be off by 2 % of
-the mean, and the estimates of the error by 1e-3 (an AMD EPYC of the third generation: one pixel of 768 by 0.15 %, and
-1.7e-4).
+1e-6 is the same half. Processors differ in last bits (the approximate reciprocal root of Dr.Jit is one suspect), and a
+path may take another way at an edge: one pixel of 200 may be off by 2 % of the mean, about one of its 72 samples, and
+the estimates of the error by 1e-3. Measured on an AMD EPYC of the third generation: one pixel of 768 by 0.15 %, and
+1.7e-4.
 
 Rendered light is the same for any number of threads, and was only ever compared on the versions of NumPy, Mitsuba,
 Dr.Jit and LLVM that data/unchanged.json names: with others, sections that render are skipped, but for the digests of
