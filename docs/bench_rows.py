@@ -31,9 +31,9 @@ from rows import (
     missing_rows,
     notes_on,
     quiver,
-    refuse_busy,
     starred,
     store,
+    wait_for_quiet,
 )
 
 from qsim.files import read_json, write_bytes
@@ -101,7 +101,7 @@ def make(path: Path, plan: Plan, *, busy: bool) -> None:
     if is_made(path, plan):
         return
     if not busy:
-        refuse_busy()
+        wait_for_quiet()
     watch = Watch.now()
     given = ((f"--{name}", value) for name, value in vars(plan).items() if value is not None and name != "threads")
     with tempfile.TemporaryDirectory() as folder:

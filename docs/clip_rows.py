@@ -31,6 +31,7 @@ import tarfile
 import tempfile
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -41,14 +42,13 @@ from clip_parts import meta, timed_frames
 from cycles_rows import agreement, use_only
 from numpy import ndarray as Array
 from reuse_rows import FAMILIES, decibels
-from rows import ROOT, Watch, is_made, keep_apart, refuse_busy, store
+from rows import ROOT, grow, keep_apart
 
 from qsim import scenes
 from qsim.clip.clamped_error import white_in
 from qsim.clip.motion_statistics import MOVING
 from qsim.clip.writer import ClipWriter
 from qsim.colour import bright_end, psnr
-from qsim.files import read_json, write_bytes
 from qsim.rendering.budget import Budget
 from qsim.rendering.fidelity import DEEPEST, choose_budget
 from qsim.rendering.renderer import Renderer
@@ -249,6 +249,13 @@ def unpack(folder: Path) -> None:
         archive.extractall(folder, filter="data")
 
 
+def beside_earlier(name: str, plan: Plan) -> dict[str, Any]:
+    """Return the row of a family, with the earlier program unpacked to a folder that is then deleted."""
+    with tempfile.TemporaryDirectory() as folder:
+        unpack(Path(folder))
+        return measure(name, plan, Path(folder))
+
+
 def run_there(folder: Path, *words: str) -> str:
     """Return what Python prints with the program in a folder; `ValueError` with the last line of its error."""
     line, env = [sys.executable, *words], os.environ | {"PYTHONPATH": str(folder)}
@@ -279,16 +286,7 @@ def main(words: list[str] | None = None) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
         for name in args.rows.split(","):
             path = args.out / f"{name}-{plan.height}x{plan.width}{fast}.json"
-            if not is_made(path, plan) or not (busy or read_json(path)["quiet"]):
-                if not busy:
-                    refuse_busy()
-                watch = Watch.now()
-                with tempfile.TemporaryDirectory() as folder:
-                    unpack(Path(folder))
-                    row = measure(name, plan, Path(folder))
-                store(path, plan, watch, row)
-            rows = {path.stem: read_json(path) for path in sorted(args.out.glob("*.json"))}
-            write_bytes(args.out.with_suffix(".md"), page(rows).encode())
+            grow(path, plan, partial(beside_earlier, name, plan), page, busy=busy, marked_again=True)
     except ValueError as error:
         print(f"clip_rows: {error}", file=sys.stderr)
         return 2

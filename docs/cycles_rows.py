@@ -24,6 +24,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +33,10 @@ import numpy as np
 from cycles_page import page
 from numpy import ndarray as Array
 from reuse_rows import decibels, steady_frames
-from rows import ROOT, Watch, is_made, keep_apart, refuse_busy, store
+from rows import ROOT, grow, keep_apart
 
 from qsim import scenes
 from qsim.clip.clamped_error import white_in
-from qsim.files import read_json, write_bytes
 from qsim.rendering.budget import Budget
 from qsim.rendering.fidelity import DEEPEST, choose_budget
 from qsim.rendering.renderer import Renderer
@@ -239,18 +239,17 @@ def main(words: list[str] | None = None) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
         for family in args.rows.split(","):
             path = args.out / f"{family}-{plan.height}x{plan.width}.json"
-            if not is_made(path, plan) or not (busy or read_json(path)["quiet"]):
-                check(args.cycles)
-                if not busy:
-                    refuse_busy()
-                watch = Watch.now()
-                store(path, plan, watch, measure(family, plan, args.cycles))
-            rows = {path.stem: read_json(path) for path in sorted(args.out.glob("*.json"))}
-            write_bytes(args.out.with_suffix(".md"), page(rows).encode())
+            grow(path, plan, partial(beside_cycles, family, plan, args.cycles), page, busy=busy, marked_again=True)
     except (ValueError, OSError) as error:
         print(f"cycles_rows: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def beside_cycles(family: str, plan: Plan, python: str) -> dict[str, Any]:
+    """Return the row of a family; `ValueError` if this is not the Python of an environment with bpy."""
+    check(python)
+    return measure(family, plan, python)
 
 
 def check(python: str) -> None:

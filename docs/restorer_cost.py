@@ -130,7 +130,7 @@ def main(words: list[str] | None = None) -> int:
         if args.runs < 1:
             raise ValueError(f"--runs {args.runs}: give at least 1")
         if not args.busy:
-            rows.refuse_busy()
+            rows.wait_for_quiet()
         with tempfile.TemporaryDirectory() as folder:
             unpack(OLD, Path(folder))
             found = measured(Path(folder), size, args.runs)

@@ -22,18 +22,18 @@ import argparse
 import sys
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
-from rows import Watch, is_made, keep_apart, refuse_busy, store
+from rows import grow, keep_apart
 
 from qsim import scenes
 from qsim.clip.clamped_error import error_at, over_neighbours, white_in
 from qsim.colour import psnr
-from qsim.files import read_json, write_bytes
 from qsim.rendering.budget import Budget
 from qsim.rendering.fidelity import DEEPEST, choose_budget
 from qsim.rendering.renderer import Renderer
@@ -252,13 +252,7 @@ def main(words: list[str] | None = None) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
         for family in args.rows.split(","):
             path = args.out / f"{family}-{plan.height}x{plan.width}{fast}{other}.json"
-            if not is_made(path, plan):
-                if not args.busy and not args.tiny:
-                    refuse_busy()
-                watch = Watch.now()
-                store(path, plan, watch, measure(family, plan))
-            rows = {path.stem: read_json(path) for path in sorted(args.out.glob("*.json"))}
-            write_bytes(args.out.with_suffix(".md"), table(rows).encode())
+            grow(path, plan, partial(measure, family, plan), table, busy=args.busy or args.tiny)
     except ValueError as error:
         print(f"reuse_rows: {error}", file=sys.stderr)
         return 2

@@ -24,7 +24,7 @@ from typing import Any
 
 import torch
 
-from qsim.files import VERSION, read_json, sha256, to_json, write_json
+from qsim.files import VERSION, read_json, sha256, to_json, write_bytes, write_json
 from quiver.cli.train import DIVERGED
 
 ROOT = Path(__file__).parents[1]
@@ -85,7 +85,7 @@ def everybodys_seconds() -> float | None:
     return (user + nice + system + interrupts + soft) / os.sysconf("SC_CLK_TCK")
 
 
-def refuse_busy() -> None:
+def wait_for_quiet() -> None:
     """Wait until other programs use at most QUIET cores; `ValueError` if they still use more after PATIENCE."""
     started, told = time.monotonic(), False
     while True:
@@ -125,6 +125,29 @@ def is_made(path: Path, plan: Any) -> bool:
     if read_json(path)["plan"] != json.loads(json.dumps(vars(plan))):
         raise ValueError(f"{path}: was made with other options; choose another --out")
     return True
+
+
+def grow(
+    path: Path,
+    plan: Any,
+    make: Callable[[], dict[str, Any]],
+    page: Callable[[dict[str, Any]], str],
+    *,
+    busy: bool,
+    marked_again: bool = False,
+) -> None:
+    """Write a row unless it exists, then the page of all rows beside it, from their contents by name.
+
+    With `marked_again`, a row that was made beside other programs is made again where the cores must be quiet.
+    `ValueError` as `is_made` and, unless `busy`, as `wait_for_quiet`.
+    """
+    if not is_made(path, plan) or (marked_again and not busy and not read_json(path)["quiet"]):
+        if not busy:
+            wait_for_quiet()
+        watch = Watch.now()
+        store(path, plan, watch, make())
+    rows = {row.stem: read_json(row) for row in sorted(path.parent.glob("*.json"))}
+    write_bytes(path.parent.with_suffix(".md"), page(rows).encode())
 
 
 def store(path: Path, plan: Any, watch: Watch, row: dict[str, Any]) -> None:
@@ -169,7 +192,7 @@ def make_row(
     if not data.is_dir():
         raise FileNotFoundError(f"{data}: no such data set")
     if not busy:
-        refuse_busy()
+        wait_for_quiet()
     earlier = read_json(sessions)["cores_of_others"] if sessions.exists() else []
     sessions.parent.mkdir(parents=True, exist_ok=True)
     write_json(sessions, {"cores_of_others": [*earlier, None]})  # until this session ends

@@ -39,6 +39,7 @@ sys.path.insert(0, str(ROOT / "docs"))
 import cycles_page  # noqa: E402
 import cycles_rows  # noqa: E402
 import cycles_scene  # noqa: E402
+import rows  # noqa: E402
 
 TIMES = (0.0, 0.0005, 0.002)
 
@@ -271,11 +272,11 @@ def test_rows_are_made_once_and_marked_ones_again_on_quiet_cores(monkeypatch, tm
     own = {key: value for key, value in row().items() if key in ("agreement", "ours", "cycles")}
     monkeypatch.setattr(cycles_rows, "check", lambda python: None)
     monkeypatch.setattr(cycles_rows, "use_only", lambda threads: None)
-    monkeypatch.setattr(cycles_rows, "refuse_busy", lambda: None)
+    monkeypatch.setattr(rows, "wait_for_quiet", lambda: None)
     monkeypatch.setattr(cycles_rows, "measure", lambda family, plan, python: made.append(family) or own)
     line = ["--cycles", "python", "--rows", "plain", "--out", str(tmp_path / "rows")]
     for cores, words, count in ((1.0, ["--busy"], 1), (1.0, ["--busy"], 1), (0.0, [], 2), (0.0, [], 2)):
-        monkeypatch.setattr(cycles_rows.Watch, "others", lambda self, cores=cores: cores)
+        monkeypatch.setattr(rows.Watch, "others", lambda self, cores=cores: cores)
         assert cycles_rows.main([*line, *words]) == 0
         assert len(made) == count
         stored = json.loads((tmp_path / "rows" / "plain-128x256.json").read_text())
