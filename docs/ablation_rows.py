@@ -2,11 +2,13 @@
 
     python docs/ablation_rows.py out/starter                       # 20 minutes for each row that is missing
     python docs/ablation_rows.py out/starter --rows all,none       # these networks alone, with both seeds
+    python docs/ablation_rows.py out/starter --steps 1500          # equal steps, all missing rows at once: on a GPU
     python docs/ablation_rows.py out/tiny --tiny --out out/rows    # seconds for each row: a test of this program
 
 A row is RESULTS/NAME-SEED.json: one of the six networks of the paper's Table 4, with one seed of weights and windows.
 It is written when it is complete and made once; an interrupted one resumes from WORK. A wider recurrent cell stands for
-missing parts, so all six have as many parameters. Busy cores are refused (rows.py); --busy marks such rows.
+missing parts, so all six have as many parameters. Rows of equal time need quiet cores (rows.py); --busy marks others.
+Rows of equal steps do not: other programs make them late, and change nothing in them.
 """
 
 from __future__ import annotations
@@ -15,16 +17,33 @@ import argparse
 import shlex
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from rows import LIGHTS, TINY, Budget, check_row, keep_apart, make_row, notes_on, options, scores, starred
+from rows import (
+    LIGHTS,
+    TINY,
+    Budget,
+    check_row,
+    keep_apart,
+    machine,
+    make_row,
+    notes_on,
+    options,
+    recipe_digest,
+    scores,
+    starred,
+)
 
-from qsim.files import read_json, write_bytes
+from qsim.files import VERSION, read_json, write_bytes, write_json
 from qsim.tables import markdown_table
+from quiver.device import pick_device
 from quiver.model.config import Config
 from quiver.model.presets import ABLATIONS, ablated, parameter_count
 from quiver.model.quiver import QUIVER
@@ -35,13 +54,28 @@ FORMAT = "quiver-ablation-1"
 MILLION = Config(channels=4, deformable_groups=4, denoiser_growth=8, flow_channels=(20, 40, 20, 10))
 SEEDS = (0, 1)
 RATE = 3e-4  # the lower one of docs/equal_budget.py: the same for all six
-LIMITS = """Twenty minutes show which parts help at once, not which help after days of training. The spread of two seeds
-is the only measure of chance here: differences within it mean nothing."""
+STEPS_BATCH = 8  # windows of a step where steps are given: a GPU takes them in the time of one
+LIMITS = """So short a training shows which parts help at once, not which help after days. The spread of two seeds is
+the only measure of chance here: differences within it mean nothing."""
+
+
+@dataclass(frozen=True)
+class Steps(Budget):
+    """What every row gets where all make the same number of steps."""
+
+    minutes: float = 0.0  # not limited
+    threads: int = 1
+    batch: int = STEPS_BATCH
+    steps: int = 0
 
 
 def main(words: list[str] | None = None) -> int:
-    args = options(__doc__, "ablation_rows", ABLATIONS).parse_args(words)
+    parser = options(__doc__, "ablation_rows", ABLATIONS)
+    parser.add_argument("--steps", type=count, help="steps of every row, all rows at once (default: 20 minutes each)")
+    args = parser.parse_args(words)
     budget, names = TINY if args.tiny else Budget(minutes=20.0), args.rows.split(",")
+    if args.steps:
+        budget = Steps(crop=budget.crop, steps=args.steps)
     unknown = sorted(set(names) - set(ABLATIONS))
     if unknown:
         print(f"ablation_rows: no row is called {unknown[0]!r}; known are {', '.join(ABLATIONS)}", file=sys.stderr)
@@ -52,6 +86,8 @@ def main(words: list[str] | None = None) -> int:
         for name, seed in todo:  # all that exist are checked before any is made
             if (args.out / f"{name}-{seed}.json").exists():
                 check_row(args.out / f"{name}-{seed}.json", budget, args.data)
+        if isinstance(budget, Steps):
+            return together(todo, args, budget)
         for name, seed in todo:
             make = partial(network, name, seed, args, budget)
             sessions = args.work / f"{name}-{seed}_sessions.json"
@@ -76,6 +112,45 @@ def main(words: list[str] | None = None) -> int:
     return 0
 
 
+def count(text: str) -> int:
+    """Return a number of steps, for argparse: its message names the option."""
+    if not text.isdigit() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
+    return int(text)
+
+
+def together(todo: list[tuple[str, int]], args: argparse.Namespace, budget: Steps) -> int:
+    """Make the rows that are missing, each in a process and all at the same time; return 1 if one failed."""
+    missing = [(name, seed) for name, seed in todo if not (args.out / f"{name}-{seed}.json").exists()]
+    if missing and not args.data.is_dir():
+        raise FileNotFoundError(f"{args.data}: no such data set")
+    if not missing:
+        write_table(args.out)
+        return 0
+    failed = 0
+    with ProcessPoolExecutor(len(missing), mp_context=get_context("spawn")) as pool:
+        made = {pool.submit(network, name, seed, args, budget): f"{name}-{seed}" for name, seed in missing}
+        for future in as_completed(made):
+            try:
+                own = future.result()
+            except (Diverged, subprocess.CalledProcessError) as error:  # the other rows are made
+                print(f"ablation_rows: {made[future]}: {error}", file=sys.stderr)
+                failed = 1
+                continue
+            head = {"quiver": VERSION, "budget": asdict(budget), "data": args.data.name, "machine": on_what()}
+            head |= {"recipe_sha256": recipe_digest(args.data), "quiet": True}  # others change nothing in equal steps
+            args.out.mkdir(parents=True, exist_ok=True)
+            write_json(args.out / f"{made[future]}.json", head | own)
+            print(f"{args.out / made[future]}.json: written", flush=True)
+            write_table(args.out)
+    return failed
+
+
+def on_what() -> str:
+    """Return the machine with its GPU, if there is one."""
+    return machine() + (f", {torch.cuda.get_device_name()}" if pick_device("auto") == "cuda" else "")
+
+
 def network(name: str, seed: int, args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
     """Return the row of one network: a run and its scores. It is trained in this process."""
     config = variant(name)
@@ -84,7 +159,6 @@ def network(name: str, seed: int, args: argparse.Namespace, budget: Budget) -> d
         str(args.data),
         str(folder),
         network=f"quiver of {parameter_count(config):,} parameters, {name}",
-        minutes=budget.minutes,
         sensor="quiver-physical",
         ppp=(float(LIGHTS[0]),),
         bits=(3,),
@@ -92,10 +166,12 @@ def network(name: str, seed: int, args: argparse.Namespace, budget: Budget) -> d
         batch=budget.batch,
         seed=seed,
         threads=budget.threads,
+        precision="float32",
         **PROTOCOLS["control"] | {"learning_rate": RATE, "loss": "published"},
+        **how_long(budget),
     )
     torch.manual_seed(seed)
-    train(QUIVER(config), settings, progress=False)
+    train(QUIVER(config), settings, device=pick_device("auto"), progress=False)
     history = read_json(folder / "history.json")["history"]
     scored = scores([str(folder)], args.work / f"{name}-{seed}_scores", args.data, LIGHTS[:1], budget)
     return {
@@ -109,6 +185,13 @@ def network(name: str, seed: int, args: argparse.Namespace, budget: Budget) -> d
         "curve": history,
         "scores": next(iter(scored[folder.name].values()))["scores"],
     }
+
+
+def how_long(budget: Budget) -> dict[str, Any]:
+    """Return the settings that end a training: its minutes, or its steps with a validation after every fifth."""
+    if not isinstance(budget, Steps):
+        return {"minutes": budget.minutes}
+    return {"steps": budget.steps, "validate_every": max(1, budget.steps // 5), "workers": 1}
 
 
 def variant(name: str) -> Config:
@@ -131,9 +214,10 @@ def write_table(out: Path) -> None:
             cells.append("n/a" if None in found else f"{np.mean(found):.{digits}f} ± {np.ptp(found) / 2:.{digits}f}")
         table.append([*cells, ", ".join(starred(row, row["seed"]) for row in own)])
     header = ("pre-denoiser", "flow", "multi-scale", "parameters", "steps", "PSNR matched", "SSIM matched", "seeds")
+    steps = rows[0]["budget"].get("steps") if rows else None
     text = [
         *("# The paper's ablation with a million parameters", ""),
-        *("Made by `python docs/ablation_rows.py out/starter`.", ""),
+        *(f"Made by `python docs/ablation_rows.py out/starter{f' --steps {steps}' if steps else ''}`.", ""),
         *(LIMITS, "", *markdown_table(table, header), "", *notes_on(rows)),
     ]
     write_bytes(out.with_suffix(".md"), "\n".join(text).encode())

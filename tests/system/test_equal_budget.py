@@ -243,12 +243,13 @@ def test_the_six_networks_of_the_ablation_have_a_million_parameters():
 
 
 @pytest.mark.slow
-def test_rows_of_the_ablation_are_made_once_and_shown(tmp_path):
+@pytest.mark.parametrize("length", [(), ("--steps", 2)], ids=["equal time", "equal steps"])
+def test_rows_of_the_ablation_are_made_once_and_shown(tmp_path, length):
     from clips import write_dataset
 
     data = write_dataset(tmp_path / "data", {"train": 2, "val": 1, "test": 2})
     out = tmp_path / "rows"
-    words = (data, "--tiny", "--out", out, "--work", tmp_path / "work", "--rows", "none")
+    words = (data, "--tiny", "--out", out, "--work", tmp_path / "work", "--rows", "none", *length)
     first = run(*words, program="ablation_rows")
     assert first.returncode == 0, first.stderr
     assert sorted(path.name for path in out.iterdir()) == ["none-0.json", "none-1.json"]
@@ -257,6 +258,12 @@ def test_rows_of_the_ablation_are_made_once_and_shown(tmp_path):
     table = out.with_suffix(".md").read_text()
     assert "| no | no | no | 981,390 |" in table
     assert table.count("±") == 2
+    if length:
+        assert "| 2, 2 |" in table
+        assert "`python docs/ablation_rows.py out/starter --steps 2`" in table
+        other = run(*words[:-1], 3, program="ablation_rows")
+        assert (other.returncode, other.stdout) == (2, "")
+        assert "was made with budget" in other.stderr
 
 
 @pytest.mark.slow
