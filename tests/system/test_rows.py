@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -64,3 +65,9 @@ def test_rows_of_the_page_have_the_options_of_the_program(folder, plan):
     stored = [rows.read_json(path)["plan"] for path in (ROOT / "docs" / "results" / folder).glob("*-128x256.json")]
     assert stored
     assert all(plan == usual for plan in stored)
+
+
+def test_the_page_of_the_ablation_holds_its_rows(tmp_path):
+    shutil.copytree(ROOT / "docs" / "results" / "ablation_rows", tmp_path / "rows")
+    ablation_rows.write_table(tmp_path / "rows")
+    assert (tmp_path / "rows.md").read_text() == (ROOT / "docs" / "results" / "ablation_rows.md").read_text()
