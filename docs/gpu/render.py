@@ -14,10 +14,9 @@ ENGINES, SEED = ("cuda", "llvm"), 3
 
 
 def names(sizes: Sizes) -> list[str]:
-    """Return for each scene: all engines together; then by engine, the validation and the time of a frame."""
-    return [f"engines-{family}" for family in sizes.families] + [
-        f"{what}-{engine}-{family}" for what in ("frame", "validate") for engine in ENGINES for family in sizes.families
-    ]
+    """Return scene by scene: all engines together; then by engine, the validation and the time of a frame."""
+    parts = ("engines", *(f"{what}-{engine}" for what in ("frame", "validate") for engine in ENGINES))
+    return [f"{part}-{family}" for family in sizes.families for part in parts]
 
 
 def measure(job: Job) -> list[dict[str, Any]]:
