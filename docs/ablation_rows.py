@@ -83,9 +83,10 @@ def main(words: list[str] | None = None) -> int:
     todo = [(name, seed) for seed in SEEDS for name in names]
     try:
         args.work = keep_apart("ablation_rows", args.out, args.work, trial=args.tiny)
-        for name, seed in todo:  # all that exist are checked before any is made
-            if (args.out / f"{name}-{seed}.json").exists():
-                check_row(args.out / f"{name}-{seed}.json", budget, args.data)
+        if args.steps:
+            args.work = args.work / f"{args.steps}_steps"
+        for path in sorted(args.out.glob("*.json")):  # they share a table
+            check_row(path, budget, args.data)
         if isinstance(budget, Steps):
             return together(todo, args, budget)
         for name, seed in todo:
@@ -133,22 +134,17 @@ def together(todo: list[tuple[str, int]], args: argparse.Namespace, budget: Step
         for future in as_completed(made):
             try:
                 own = future.result()
-            except (Diverged, subprocess.CalledProcessError) as error:  # the other rows are made
-                print(f"ablation_rows: {made[future]}: {error}", file=sys.stderr)
+            except Exception as error:  # whatever it was, the other rows are made
+                print(f"ablation_rows: {made[future]}: {type(error).__name__}: {error}", file=sys.stderr)
                 failed = 1
                 continue
-            head = {"quiver": VERSION, "budget": asdict(budget), "data": args.data.name, "machine": on_what()}
+            head = {"quiver": VERSION, "budget": asdict(budget), "data": args.data.name, "machine": machine()}
             head |= {"recipe_sha256": recipe_digest(args.data), "quiet": True}  # others change nothing in equal steps
             args.out.mkdir(parents=True, exist_ok=True)
             write_json(args.out / f"{made[future]}.json", head | own)
             print(f"{args.out / made[future]}.json: written", flush=True)
             write_table(args.out)
     return failed
-
-
-def on_what() -> str:
-    """Return the machine with its GPU, if there is one."""
-    return machine() + (f", {torch.cuda.get_device_name()}" if pick_device("auto") == "cuda" else "")
 
 
 def network(name: str, seed: int, args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
@@ -171,7 +167,7 @@ def network(name: str, seed: int, args: argparse.Namespace, budget: Budget) -> d
         **how_long(budget),
     )
     torch.manual_seed(seed)
-    train(QUIVER(config), settings, device=pick_device("auto"), progress=False)
+    train(QUIVER(config), settings, device=pick_device("auto" if isinstance(budget, Steps) else "cpu"), progress=False)
     history = read_json(folder / "history.json")["history"]
     scored = scores([str(folder)], args.work / f"{name}-{seed}_scores", args.data, LIGHTS[:1], budget)
     return {

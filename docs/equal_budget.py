@@ -204,7 +204,7 @@ def train(name: str, rate: str, minutes: float, folder: Path, data: Path, budget
     }
     quiver(
         *("train", data, "-o", folder, "--preset", name, "--protocol", *own.get(name.removesuffix("-1m"), ["quick"])),
-        *("--minutes", minutes, "--optimiser", "adam", "--learning-rate", rate),
+        *("--device", "cpu", "--minutes", minutes, "--optimiser", "adam", "--learning-rate", rate),
         *("--crop", budget.crop, "--batch", budget.batch),
         *("--sensor", "quiver-physical", "--ppp", LIGHTS[0], "--bits", 3, "-q"),
         budget=budget,

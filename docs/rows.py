@@ -105,8 +105,9 @@ def wait_for_quiet() -> None:
 
 
 def machine() -> str:
-    """Return system, processor and version of torch."""
-    return f"{platform.system()} {platform.machine()}, {processor()}, torch {torch.__version__}"
+    """Return system, processor, version of torch, and the GPU if there is one."""
+    gpu = f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
+    return f"{platform.system()} {platform.machine()}, {processor()}, torch {torch.__version__}{gpu}"
 
 
 def processor() -> str:
@@ -323,9 +324,9 @@ def converged(run: Callable[[], None]) -> bool:
 
 
 def cost(method: str, folder: Path, budget: Budget) -> dict[str, Any]:
-    """Return seconds, memory and multiply-accumulates per frame."""
+    """Return seconds, memory and multiply-accumulates per frame; of QUIVER those of the first mode, exact."""
     again = ["--force"] if (folder / "bench.json").exists() else []
-    words = ("--methods", method, "--modes", "exact", "--size", budget.size, "-o", folder, *again, "-q")
+    words = ("--methods", method, "--device", "cpu", "--size", budget.size, "-o", folder, *again, "-q")
     quiver("bench", *words, budget=budget)
     found: dict[str, Any] = read_json(folder / "bench.json")["costs"][0]
     height, width = (int(side) for side in budget.size.split("x"))

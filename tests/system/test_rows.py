@@ -20,6 +20,9 @@ import restorer_tuned  # noqa: E402
 import reuse_rows  # noqa: E402
 import rows  # noqa: E402
 
+from quiver.cli.program import parser  # noqa: E402
+from quiver.evaluation.cost import checked_cases  # noqa: E402
+
 
 @pytest.mark.parametrize(
     ("program", "words"),
@@ -71,3 +74,17 @@ def test_the_page_of_the_ablation_holds_its_rows(tmp_path):
     shutil.copytree(ROOT / "docs" / "results" / "ablation_rows", tmp_path / "rows")
     ablation_rows.write_table(tmp_path / "rows")
     assert (tmp_path / "rows.md").read_text() == (ROOT / "docs" / "results" / "ablation_rows.md").read_text()
+
+
+@pytest.mark.parametrize("method", ["fastdvdnet", "quiver-s", "mergenet-1m"])
+def test_costs_are_asked_for_as_the_command_takes_them(tmp_path, monkeypatch, method):
+    """Networks with one mode refuse --modes; of QUIVER the first cost is that of the mode exact."""
+
+    def asked(*words: object, budget: rows.Budget) -> None:
+        args = parser().parse_args([str(word) for word in words])
+        first = checked_cases(args.methods, args.modes, args.precisions, args.device)[0]
+        assert first.mode == "exact"
+        rows.write_json(tmp_path / "bench.json", {"costs": [{"gmac_per_frame": 1.0, "method": first.method}]})
+
+    monkeypatch.setattr(rows, "quiver", asked)
+    assert rows.cost(method, tmp_path, rows.TINY)["method"] == method
