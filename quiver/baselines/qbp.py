@@ -15,7 +15,8 @@ The window slides over the clip, so its frames are aligned again for each restor
 
 The denoising step uses the stabiliser and the unbiased inverse of vst.py in place of the binomial Anscombe transform.
 Where the Wiener merge gives a frame a low weight, fewer than `window` codes are averaged: `excess` is the deviation of
-the noise over that of a full average.
+the noise over that of a full average. Near the ends of a clip reflected frames count several times: the deviation and
+the inverse are those of such a mean.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from qsim.sensor.estimation import Response
 from qsim.sensor.sensor import Sensor
 from quiver.baselines import bm3d, patch_alignment
 from quiver.baselines.arrays import add_at, mixed, single, whole, xp, zeros
-from quiver.baselines.sliding_window import check_codes, check_window, in_units, window_frames
+from quiver.baselines.sliding_window import check_codes, check_window, frame_times, in_units, window_frames
 from quiver.baselines.vst import stabiliser
 
 if TYPE_CHECKING:
@@ -79,14 +80,14 @@ def restore(
     check_codes(codes, sensor)
     check_window(window)
     table = sensor.response(exposure)
-    transform = None if excess is None else stabiliser(sensor, exposure, window)
     frames = range(len(codes)) if frames is None else frames
     restored = np.empty((len(frames), *codes.shape[1:]), np.float32)
     for i, frame in enumerate(frames):
         merged = merge(codes, frame, table, window, settings)
-        if transform is None or excess is None:
+        if excess is None:
             restored[i] = table.invert(merged, window)
         else:
+            transform = stabiliser(sensor, exposure, frame_times(frame, window, len(codes)))
             stable = transform.forward(merged)
             restored[i] = transform.inverse(bm3d.denoise(stable, excess * transform.deviation, peak=transform.peak))
     return in_units(restored, photons_per_unit)

@@ -54,6 +54,16 @@ def window_frames(frame: int, window: int, length: int) -> Array:
     return reflect(np.arange(frame - window // 2, frame + look_ahead(window) + 1), length)
 
 
+def frame_times(frame: int, window: int, length: int) -> tuple[int, ...]:
+    """Return how often each different frame counts in the window around `frame`, in falling order.
+
+    These are `window` ones away from the ends of a clip. A mean of codes that count n times each has the deviation of
+    one code times sqrt(sum of n^2) / window, which is more than 1 / sqrt(window) where frames are reflected.
+    """
+    counts = np.unique(window_frames(frame, window, length), return_counts=True)[1]
+    return tuple(sorted((int(count) for count in counts), reverse=True))
+
+
 def window_sums(codes: Array, window: int, top: int) -> Iterator[Array]:
     """Yield the sum of the codes over the window around each frame: T unsigned arrays [H, W], 0 ... window * top.
 

@@ -5,7 +5,8 @@
 
 A denoiser estimates the expectation of f, not f at the expectation. So the algebraic inverse f^-1 would be biased; D^-1
 is not (Makitalo and Foi, IEEE TIP 2011, for Poisson; here for any sensor, by the exact distribution of a sum of n
-codes). Saturation reduces V towards 0, so f grows steeply there and ends at the top.
+codes). Where a frame counts several times, as near the ends of a clip, that sum has another distribution and a larger
+deviation: both are taken into account. Saturation reduces V towards 0, so f grows steeply there and ends at the top.
 
 Other stabilisers, for comparison: `binomial` (Chan, Elgendy, Wang, Sensors 16(11), 2016: Anscombe's arcsine for a sum
 of binary samples; wrong for a counting pixel) and `poisson` (Anscombe's square root of the electron count; ignores
@@ -14,7 +15,10 @@ clipping).
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache, reduce
 from typing import Literal
 
 import numpy as np
@@ -38,11 +42,12 @@ class Stabiliser:
     stabilised: Array  # [M], f on that grid
     photons: Array  # [G]
     expected: Array  # [G], D: the expectation of f at these photons, rising
+    excess: float = 1.0  # deviation of the mean over that of `samples` independent codes
 
     @property
     def deviation(self) -> float:
         """Return the nominal deviation of the stabilised mean code."""
-        return self.samples**-0.5
+        return self.excess * self.samples**-0.5
 
     @property
     def peak(self) -> float:
@@ -58,25 +63,40 @@ class Stabiliser:
         return np.interp(stabilised, self.expected, self.photons).astype(np.float32)
 
 
-def sum_pmf(pmf: Array, samples: int) -> Array:
-    """Return the distribution of a sum of independent codes: [G, levels] -> [G, samples * (levels - 1) + 1]."""
-    size = samples * (pmf.shape[1] - 1) + 1
+def sum_pmf(pmf: Array, times: Sequence[int]) -> Array:
+    """Return the distribution of a sum of independent codes, each taken `times` times: [G, levels] -> [G, values].
+
+    Values are 0 ... sum(times) * (levels - 1).
+    """
+    size = sum(times) * (pmf.shape[1] - 1) + 1
     if size <= 512:  # direct: exact tails
         total = np.ones((len(pmf), 1))
-        for _ in range(samples):
-            grown = np.zeros((len(pmf), total.shape[1] + pmf.shape[1] - 1))
+        for count in times:
+            grown = np.zeros((len(pmf), total.shape[1] + count * (pmf.shape[1] - 1)))
             for code in range(pmf.shape[1]):
-                grown[:, code : code + total.shape[1]] += pmf[:, code : code + 1] * total
+                grown[:, count * code : count * code + total.shape[1]] += pmf[:, code : code + 1] * total
             total = grown
         return total
-    spectrum = np.fft.rfft(pmf, 2 ** int(np.ceil(np.log2(size))), axis=1) ** samples
-    return np.maximum(np.fft.irfft(spectrum, axis=1)[:, :size], 0)
+    points = 2 ** int(np.ceil(np.log2(size)))
+    parts = [np.fft.rfft(_spread(pmf, count), points, axis=1) ** n for count, n in Counter(times).items()]
+    return np.maximum(np.fft.irfft(reduce(np.multiply, parts), axis=1)[:, :size], 0)
 
 
-def stabiliser(sensor: Sensor, exposure: float, samples: int, kind: Kind = "table") -> Stabiliser:
-    """Return the tables for the mean of `samples` codes of this sensor. `ValueError` for an unknown kind."""
+def _spread(pmf: Array, count: int) -> Array:
+    """Return the distribution of a code taken `count` times, [G, count * (levels - 1) + 1]."""
+    spread = np.zeros((len(pmf), count * (pmf.shape[1] - 1) + 1))
+    spread[:, ::count] = pmf
+    return spread
+
+
+@lru_cache(maxsize=8)
+def stabiliser(sensor: Sensor, exposure: float, times: tuple[int, ...], kind: Kind = "table") -> Stabiliser:
+    """Return the tables for the mean of codes of this sensor, each taken `times` times. `ValueError` for unknown kinds.
+
+    Codes of different frames are taken once each; a frame that is reflected is taken several times.
+    """
     table = sensor.response(exposure)
-    top = sensor.levels - 1
+    top, samples = sensor.levels - 1, sum(times)
     mean_code = np.linspace(0, top, max(4096, samples * top + 1))
     match kind:
         case "table":
@@ -95,8 +115,9 @@ def stabiliser(sensor: Sensor, exposure: float, samples: int, kind: Kind = "tabl
     photons = np.linspace(0, np.sqrt(table.cap(samples)), POINTS) ** 2
     lattice = np.interp(np.arange(samples * top + 1) / samples, mean_code, stabilised)
     expected = np.concatenate(
-        [sum_pmf(np.exp(sensor.log_pmf(part, exposure)), samples) @ lattice for part in pieces(photons, len(lattice))]
+        [sum_pmf(np.exp(sensor.log_pmf(part, exposure)), times) @ lattice for part in pieces(photons, len(lattice))]
     )
     expected = np.maximum.accumulate(expected)
     rising = np.concatenate([[True], np.diff(expected) > 0])
-    return Stabiliser(samples, mean_code, stabilised, photons[rising], expected[rising])
+    excess = (sum(count * count for count in times) / samples) ** 0.5
+    return Stabiliser(samples, mean_code, stabilised, photons[rising], expected[rising], excess)

@@ -11,7 +11,8 @@ from scipy.ndimage import shift as moved_by
 from qsim.keys import Key
 from qsim.sensor.devices import quiver_physical
 from qsim.sensor.spad import BinarySPAD
-from quiver.baselines import METHODS, moment, patch_alignment, qbp
+from quiver.baselines import METHODS, bm3d, moment, patch_alignment, qbp
+from quiver.baselines.vst import stabiliser
 
 EXPOSURE = 5e-4
 BALL = Path(__file__).parents[2] / "data" / "ball_12bit.npz"
@@ -170,6 +171,27 @@ def test_a_scene_at_rest_is_nearly_averaged():
     truth = sensor.mean(light[5], EXPOSURE)
     ratio = np.std(merged - truth) / np.std(codes.mean(axis=0) - truth)
     assert 0.7 < ratio < 1.3
+
+
+@pytest.mark.parametrize("name", ["qbp-bm3d", "transform-denoise"])
+def test_one_frame_is_denoised_as_one(name):
+    """Reflected, it fills the window: its noise was taken for that of as many independent frames, and was left."""
+    sensor = quiver_physical(3.25)
+    codes = sensor.sample(np.full((1, 48, 56), 3.25), EXPOSURE, key=Key(8, 2), engine="reference")
+    restored = METHODS[name].restore(codes, sensor, EXPOSURE)
+    assert restored.std() < 0.4 * moment.restore(codes, sensor, EXPOSURE, window=1).std()
+    assert restored.mean() == pytest.approx(3.25, rel=0.05)
+
+
+def test_a_frame_with_a_complete_window_has_the_noise_of_independent_codes():
+    """Bit for bit the result that it had before frames near the ends were told from it."""
+    sensor = quiver_physical(3.25)
+    codes = sensor.sample(moving(3.25, 11, 1.0), EXPOSURE, key=Key(8, 3), engine="reference")
+    transform = stabiliser(sensor, EXPOSURE, (1,) * 11)
+    stable = transform.forward(qbp.merge(codes, 5, sensor.response(EXPOSURE), 11))
+    expected = transform.inverse(bm3d.denoise(stable, 11**-0.5, peak=transform.peak))
+    found = METHODS["qbp-bm3d"].restore(codes, sensor, EXPOSURE, frames=range(5, 6))[0]
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_the_other_frames_are_not_trusted_where_they_differ():

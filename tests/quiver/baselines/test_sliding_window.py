@@ -5,7 +5,7 @@ import pytest
 
 from qsim.sensor.devices import quiver_physical
 from quiver.baselines import moment, naive_mean
-from quiver.baselines.sliding_window import look_ahead, reflect, window_frames, window_sums
+from quiver.baselines.sliding_window import frame_times, look_ahead, reflect, window_frames, window_sums
 
 EXPOSURE = 5e-4
 
@@ -23,6 +23,15 @@ def test_running_sums_are_sums_over_reflected_windows(window, length):
 
 def test_reflection_goes_on_and_on():
     np.testing.assert_array_equal(reflect(np.arange(-5, 8), 3), [1, 0, 1, 2, 1, 0, 1, 2, 1, 0, 1, 2, 1])
+
+
+def test_frames_near_the_ends_count_several_times():
+    for window in (1, 3, 4, 11):
+        assert frame_times(20, window, 50) == (1,) * window
+    assert frame_times(0, 11, 50) == frame_times(49, 11, 50) == (2, 2, 2, 2, 2, 1)
+    assert frame_times(0, 4, 50) == (2, 1, 1)  # one frame more of the past
+    assert frame_times(0, 11, 1) == (11,)
+    assert frame_times(1, 11, 2) == (6, 5)
 
 
 def test_wrong_codes_and_windows_are_named():
