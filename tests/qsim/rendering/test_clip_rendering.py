@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from small_scenes import CHEAP, mirrored_sun, plate, renderer
 
@@ -10,18 +12,20 @@ from qsim.backend import choose
 from qsim.process import resident_memory
 from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
-from qsim.scene import Spin
+from qsim.scene import Constant, Spin
+
+
+class Stop(Exception):
+    pass
+
+
+def stop(done, frames):
+    if done == 2:
+        raise Stop
 
 
 def test_an_interrupted_clip_resumes_with_the_same_bytes(tmp_path):
     made = plate(Spin((0, 0, 1), 200.0))
-
-    class Stop(Exception):
-        pass
-
-    def stop(done, frames):
-        if done == 2:
-            raise Stop
 
     whole = render_clip(made, tmp_path / "whole", frames=4, budget=CHEAP)
     with pytest.raises(Stop):
@@ -33,6 +37,19 @@ def test_an_interrupted_clip_resumes_with_the_same_bytes(tmp_path):
     assert resumed.flow(1).shape == (2, 24, 33)
     with pytest.raises(ValueError, match="at least one frame"):
         render_clip(made, tmp_path / "none", frames=0, budget=CHEAP)
+
+
+def test_an_interrupted_clip_does_not_resume_with_another_scene(tmp_path):
+    made = plate(Spin((0, 0, 1), 200.0))
+    with pytest.raises(Stop):
+        render_clip(made, tmp_path / "clip", frames=3, budget=CHEAP, progress=stop)
+    others = [plate(Spin((0, 0, 1), 300.0)), replace(made, lights=(Constant(0.8),))]
+    for other in others:
+        with pytest.raises(ValueError, match="2 frames exist, begun with other settings"):
+            render_clip(other, tmp_path / "clip", frames=3, budget=CHEAP)
+    clip = render_clip(plate(Spin((0, 0, 1), 200.0)), tmp_path / "clip", frames=3, budget=CHEAP)
+    assert len(clip.meta["scene_sha256"]) == 64
+    assert clip.meta["scene"] == {"family": "test", "seed": 0, "speed": 1.0}
 
 
 def test_a_clip_counts_its_fireflies(tmp_path):

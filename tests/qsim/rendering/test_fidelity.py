@@ -181,6 +181,28 @@ def test_a_psnr_out_of_range_is_refused(psnr):
         choose_budget(plate(None), psnr=psnr)
 
 
+@pytest.mark.parametrize("ppp", [0.0, -1.0, math.nan, math.inf])
+def test_a_light_level_that_no_sensor_sees_is_refused(ppp):
+    with pytest.raises(ValueError, match="ppp: expected photons per pixel above 0, or None"):
+        choose_budget(plate(None), ppp=ppp)
+
+
+@pytest.mark.parametrize("efficiency", [0.0, -0.5, 1.2, math.nan])
+def test_an_efficiency_that_no_sensor_has_is_refused(efficiency):
+    with pytest.raises(ValueError, match="quantum_efficiency: expected a number above 0, at most 1"):
+        choose_budget(plate(None), ppp=3.0, quantum_efficiency=efficiency)
+
+
+def test_the_surroundings_count_in_the_largest_blur_circle():
+    """The body is in focus, 4 m away; what is at infinity is not."""
+    camera = replace(CAMERA, f_number=0.5, aperture_blur=True)
+    circle = float(camera.circle_of_confusion(np.array(1e9)))
+    depth_of_field = fidelity.effects_left_out(camera, [{"depth": np.array([[4.0, np.inf]])}])[0]
+    assert f"largest blur circle {circle:.2g} px" in depth_of_field.size
+    near = fidelity.effects_left_out(camera, [{"depth": np.array([[4.0, 4.0]])}])[0]
+    assert "largest blur circle 0 px" in near.size
+
+
 def test_effects_left_out_are_listed_with_their_size():
     text = explain(choose_budget(plate(None), psnr=25, denoise=False).findings)
     for word in ("depth of field", "diffraction", "Airy disk", "bounces", "samples", "motion blur"):

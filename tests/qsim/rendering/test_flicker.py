@@ -11,7 +11,7 @@ from small_scenes import CAMERA, CHEAP, plate, renderer, scene, square
 from qsim.clip.clamped_error import stated
 from qsim.rendering.budget import Budget, blur_left, instants, light_windows
 from qsim.rendering.clip_rendering import render_clip
-from qsim.rendering.fidelity import choose_budget
+from qsim.rendering.fidelity import choose_budget, flickering
 from qsim.rendering.pilot import Pilot
 from qsim.scene import (
     AreaLamp,
@@ -129,6 +129,19 @@ def test_the_budget_knows_that_flashes_spoil_the_average_of_instants():
     assert loaded.unevenness(9) == pytest.approx(np.sqrt(3), rel=1e-6)
     assert loaded.unevenness(3) == pytest.approx(1)
     assert Pilot.of(plate(None), 2000.0, 1.0, 5, 0).unevenness(9) == 1
+
+
+def test_motion_within_three_instants_of_flickering_light_is_listed():
+    """No stated error counts it: the plate moves 3 px in an exposure of K instants, 9 / K px in three of them."""
+    made = plate(Translation((600.0, 0.0, 0.0)), Constant(0.7, PulseWidth(2000.0, 1 / 9)))
+    chosen = choose_budget(made, shutter=1.0, frames=2, psnr=25, denoise=False)
+    found = next(f for f in chosen.findings if f.effect == "flicker and motion")
+    assert found.chosen == f"light averaged over 3 of {chosen.sub_frames} instants"
+    assert float(found.size.split(" px ")[0].split()[-1]) == pytest.approx(9 / chosen.sub_frames, rel=0.1)
+    assert "not counted in the stated error" in found.size
+    strengths = {"light0": np.ones(2)}
+    assert [f.effect for f in flickering(strengths, np.zeros((1, 2, 2)), 1)] == ["flicker"]
+    assert flickering({}, np.ones((1, 2, 2)), 9) == ()
 
 
 def test_steady_light_has_no_entry(tmp_path):

@@ -11,6 +11,7 @@ from qsim.optics.radiometry import RGB
 from qsim.rendering.budget import Budget
 from qsim.rendering.clip_rendering import render_clip
 from qsim.rendering.fidelity import choose_budget
+from qsim.rendering.renderer import fireflies_in
 from qsim.scene import AreaLamp, Body, Constant, Diffuse, EnvironmentImage, Glow, Scene, Spin, SunSky, Texture
 
 PAINT = np.random.default_rng(3).random((5, 7, 3)).astype(np.float32)
@@ -77,6 +78,16 @@ def test_a_window_and_thinned_pixels_have_three_bands():
     assert crop.shape == (3, 5, 7)
     assert thin.halves([0.0], Budget(8, 2), thin.key(0)).shape == (2, 3, 6, 9)
     assert thin.window((1, 2, 3, 5)).halves([0.0], Budget(8, 2), thin.key(0)).shape == (2, 3, 3, 5)
+
+
+def test_a_firefly_in_three_bands_is_one_pixel():
+    halves = np.zeros((2, 3, 24, 33))
+    halves[0, :, 2, 3] = halves[0, 1, 5, 7] = 1.0
+    broken = np.zeros((3, 24, 33), bool)
+    broken[0, 9, 9] = broken[2, 9, 9] = True
+    found = fireflies_in(halves, broken)
+    assert sorted(map(tuple, np.argwhere(found).tolist())) == [(2, 3), (5, 7), (9, 9)]
+    np.testing.assert_array_equal(fireflies_in(halves[:, 1], broken[0]), found)
 
 
 @pytest.mark.slow

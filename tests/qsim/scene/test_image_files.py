@@ -21,3 +21,39 @@ def test_texture_files_become_linear_light(tmp_path):
     path.write_bytes(b"text")
     with pytest.raises(ValueError, match="not a readable image"):
         Texture(str(path)).pixels()
+
+
+def test_grey_pictures_of_16_bits_are_read_in_full(tmp_path):
+    """A code of 8 bits times 257 is the same light in either order of bytes; neighbouring codes differ."""
+    import tifffile
+    from PIL import Image
+
+    rng = np.random.default_rng(0)
+    codes = rng.integers(0, 256, (5, 7)).astype(np.uint8)
+    Image.fromarray(codes).save(tmp_path / "8.png")
+    expected, wide = Texture(str(tmp_path / "8.png")), codes.astype(np.uint16) * 257
+    Image.fromarray(wide).save(tmp_path / "16.png")
+    Image.fromarray(wide).save(tmp_path / "16.tif")
+    tifffile.imwrite(tmp_path / "big.tif", wide, byteorder=">")
+    Image.fromarray(wide.astype(np.int32)).save(tmp_path / "32.tif")
+    for name in ("16.png", "16.tif", "big.tif", "32.tif"):
+        found = Texture(str(tmp_path / name))
+        np.testing.assert_array_equal(found.pixels(), expected.pixels(), err_msg=name)
+        np.testing.assert_array_equal(found.colours(), expected.colours(), err_msg=name)
+    Image.fromarray(np.array([[30000, 30001]], np.uint16)).save(tmp_path / "near.png")
+    assert np.diff(Texture(str(tmp_path / "near.png")).pixels()) > 0
+
+
+def test_pictures_without_a_known_white_and_too_large_ones_are_refused(tmp_path, monkeypatch):
+    from PIL import Image
+
+    Image.fromarray(np.full((2, 3), 0.5, np.float32)).save(tmp_path / "float.tif")
+    with pytest.raises(ValueError, match=r"float.tif: holds floating-point numbers, .* array of linear values"):
+        Texture(str(tmp_path / "float.tif")).pixels()
+    Image.fromarray(np.full((2, 3), 65536, np.int32)).save(tmp_path / "high.tif")
+    with pytest.raises(ValueError, match=r"high.tif: values of 0 to 65535 are read, found 65536 to 65536"):
+        Texture(str(tmp_path / "high.tif")).pixels()
+    Image.fromarray(np.zeros((9, 9), np.uint8)).save(tmp_path / "large.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 4)
+    with pytest.raises(ValueError, match=r"large\.png: not a readable image"):
+        Texture(str(tmp_path / "large.png")).pixels()

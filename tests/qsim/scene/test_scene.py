@@ -12,11 +12,13 @@ from qsim.optics.camera import Camera
 from qsim.scene import (
     AreaLamp,
     Body,
+    Bump,
     Constant,
     Diffuse,
     EnvironmentImage,
     Glow,
     Mesh,
+    NormalMap,
     PointLight,
     Scene,
     Spin,
@@ -27,6 +29,7 @@ from qsim.scene import (
 )
 
 TRIANGLE = Mesh(np.eye(3), np.array([[0, 1, 2]]))
+MAPPED = Mesh(TRIANGLE.vertices, TRIANGLE.faces, np.eye(3)[:, :2])
 CAMERA = Camera(focal_length=8e-3, f_number=2.8, pixel_pitch=1e-5, height=7, width=10)
 
 
@@ -98,7 +101,7 @@ def test_a_motion_without_a_pose_names_the_body():
 
 
 def test_a_description_is_json_and_distinguishes_textures():
-    bodies = [Body("a", TRIANGLE, Diffuse(Texture(np.full((5, 5), v))), Translation((1, 0, 0))) for v in (0.1, 0.2)]
+    bodies = [Body("a", MAPPED, Diffuse(Texture(np.full((5, 5), v))), Translation((1, 0, 0))) for v in (0.1, 0.2)]
     texts = [json.dumps(scene(bodies=(body,)).to_dict()) for body in bodies]
     assert texts[0] != texts[1]
     assert describe(np.float32(2)) == 2.0
@@ -107,3 +110,18 @@ def test_a_description_is_json_and_distinguishes_textures():
 def test_a_black_environment_does_not_count_as_light():
     with pytest.raises(ValueError, match="no light"):
         scene((EnvironmentImage(np.zeros((4, 8))),))
+
+
+@pytest.mark.parametrize(
+    "material",
+    [
+        Diffuse(Texture(np.full((5, 5), 0.5))),
+        Diffuse(0.5, Bump(Texture(np.full((5, 5), 0.5)))),
+        Diffuse(0.5, NormalMap(np.full((5, 5, 3), 0.5))),
+    ],
+    ids=["texture", "bump", "normal map"],
+)
+def test_a_picture_needs_texture_coordinates(material):
+    with pytest.raises(ValueError, match=r"body a: its material shows a picture, .* give Mesh uv=, or build it with"):
+        Body("a", TRIANGLE, material)
+    assert Body("a", MAPPED, material).mesh is MAPPED

@@ -80,9 +80,11 @@ def test_clocks_run_repeat_and_hold():
     assert Clock(2.0, 0.25).at(3.0) == 6.25
     repeated, held = Clock(2.0, 0.25, 0.5), Clock(2.0, 0.25, 0.5, repeat=False)
     for t in np.linspace(-2, 2, 41).tolist():
-        assert repeated.at(t) == pytest.approx((0.25 + 2 * t) % 0.5)
+        assert repeated.at(t) == pytest.approx((0.25 + 2 * t) % 0.5 if t >= 0 else max(0.25 + 2 * t, 0.0))
         assert held.at(t) == np.clip(0.25 + 2 * t, 0, 0.5)
     assert Clock(-1.0, 0.0, 1.0).at(0.25) == 0.75  # backwards
+    assert Clock(-1.0, 0.8, 1.0).at(-0.5) == 1.0  # before t = 0 no clock jumps to the other end
+    assert Clock(1.0, 2.3, 1.0).at(-0.1) == pytest.approx(0.2)
     assert Clock(length=0.0).at(0.7) == 0.0  # a single key
 
 
