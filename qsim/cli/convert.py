@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks, files
-from qsim.cli.console import bar, command, output, refuse_idle
+from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, command, output, refuse_idle
 from qsim.cli.options import check_free, checked, count, nonnegative, positive
 from qsim.clip.clip import Clip
 from qsim.clip.stream import Stream
@@ -134,6 +134,7 @@ def _export(args: argparse.Namespace) -> list[tuple[Path, str]]:
         return [exporting.described(opened, args.output, wanted, force=args.force)]
     suffix = {"cube": ".npy", "mp4": ".mp4", "zarr": ".zarr", "spike": ".dat", "photons": ".npz"}.get(kind, "")
     check_free(args.output)
+    args.after_interrupt = MAKES_AGAIN
     made = []
     clips = Dataset.open(args.input).clips()
     for clip in clips:
@@ -167,26 +168,30 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
     restored = _restored(args.input)
     args.frame_rate = args.frame_rate or restored.get("frame_rate")
     args.exposure = args.exposure or restored.get("exposure")
-    if args.frame_rate is None:
-        raise ValueError(f"{args.input}: files do not state the capture rate; add --frame-rate, as in 2000")
     transfer = args.transfer or ("linear" if restored else None)
     hints = Hints(args.layout, args.height, args.width, args.bits, transfer, args.channel, args.flip, args.columns,
                   args.stretched, args.variable, args.white)  # fmt: skip
-    capture = importing.Import(args.frame_rate, args.exposure, args.sensor, args.ppp, args.split)
     found = detection.recordings(args.input, args.layout)
     pairs = [(source, args.output / files.check_name(_flat_name(source, args.input))) for source in found]
     if pairs:
+        _check_names(args.input, pairs)
         check_free(args.output)
+        args.after_interrupt = MAKES_AGAIN
     made = []
     with bar("converting") as progress:
         for source, target in pairs or [(args.input, args.output)]:
             recording = importing.read(source, hints)
+            rate = args.frame_rate or recording.frame_rate
+            if rate is None:
+                raise ValueError(f"{args.input}: files do not state the capture rate; add --frame-rate, as in 2000")
+            capture = importing.Import(rate, args.exposure, args.sensor, args.ppp, args.split)
             if recording.is_light:
                 if target.suffix in _SUFFIXES:
                     raise ValueError(
                         f"{target}: light is read into a clip, a folder; name it without {target.suffix}, or write a "
                         "film with `qsim preview`"
                     )
+                args.after_interrupt = args.after_interrupt if pairs else RESUMES
                 clip = importing.to_clip(recording, target, capture, force=args.force, progress=progress)
                 made.append(
                     (clip.path, f"{_size(clip)}, light of {recording.source}; {importing.saturation_line(clip)}")
@@ -195,6 +200,15 @@ def _import(args: argparse.Namespace) -> list[tuple[Path, str]]:
             stream = importing.to_stream(recording, target, capture, force=args.force, progress=progress)
             made.append((stream.path, f"{_size(stream)}, {stream.bits}-bit codes, {recording.source}"))
     return made
+
+
+def _check_names(folder: Path, pairs: list[tuple[Path, Path]]) -> None:
+    """Raise `ValueError` if two recordings of a folder become one output."""
+    taken: dict[Path, Path] = {}
+    for source, target in pairs:
+        other = taken.setdefault(target, source)
+        if other != source:
+            raise ValueError(f"{folder}: {other} and {source} would both become {target}; rename one of them")
 
 
 def _restored(source: Path) -> dict[str, Any]:

@@ -4,7 +4,7 @@
     radiance/000000.exr  Y, or B G R of a colour clip, half, uncompressed: mean over the exposure
     sharp/000000.exr     the same at mid-exposure, only if it differs
     truth/000000.exr     u v bu bv valid Z id: flow to the next and the previous frame, validity, depth, body; zipped
-    saturated/000000.exr 1 where the camera of an imported video was saturated, only for frames with such pixels; zipped
+    saturated/000000.exr 1 where light is a lower bound (see `Clip.saturated`), only for frames with such pixels; zipped
     streams/NAME.npy     codes, and NAME.json (stream.py)
 
 A clip is written to NAME.part and renamed when complete; an interrupted run resumes there (writer.py).
@@ -168,8 +168,9 @@ class ClipFolder:
         return self._truth(t, "id").view(np.int32)
 
     def saturated(self, t: int, crop: Crop | None = None) -> Array:
-        """Return bool [h, w]: True where the radiance of frame t is a lower bound, because the camera was saturated.
+        """Return bool [h, w]: True where the light of frame t is a lower bound.
 
+        The camera of an imported video was saturated, or light was above 65504, the largest half.
         `meta["saturated_pixels"]` counts them over all frames; `meta["saturation"]` holds the pixel value.
         """
         self._check_frame(t)

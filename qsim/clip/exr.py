@@ -48,10 +48,15 @@ def encode(channels: dict[str, Array], *, compress: bool = False) -> bytes:
     return b"".join([header, offsets.astype("<u8").tobytes(), *chunks])
 
 
-def to_half(image: Array) -> tuple[Array, int]:
-    """Return a half-precision copy of an image [..., H, W], and the values clipped to the largest half, 65504."""
-    clipped = int(np.count_nonzero(image > HALF_MAX))
-    return np.minimum(image, HALF_MAX).astype("<f2"), clipped
+def to_half(image: Array) -> Array:
+    """Return a half-precision copy of an image [..., H, W]; values above the largest half, 65504, become that."""
+    return np.minimum(image, HALF_MAX).astype("<f2")
+
+
+def above_half(image: Array) -> Array:
+    """Return bool [H, W]: True where an image [H, W], or a band of one [3, H, W], is above the largest half."""
+    found: Array = image > HALF_MAX
+    return found if found.ndim == 2 else np.asarray(found.any(axis=0))
 
 
 def read_half(path: Path, height: int, width: int, crop: Crop | None = None, *, colour: bool = False) -> Array:

@@ -105,9 +105,9 @@ def filters_of(sensing: Sensing) -> ColourFilter | None:
     return colour_filter.from_toml(sensing.sensor_name) if sensing.sensor_name.endswith(".toml") else None
 
 
-def _fitting_filters(clip: ClipFolder, sensing: Sensing) -> ColourFilter | None:
+def _fitting_filters(clip: ClipFolder, sensing: Sensing, recorded: bool) -> ColourFilter | None:
     """Return the same from the clip's first pixel on; `ValueError` for a colour clip without filters, and reverse."""
-    found = filters_of(sensing)
+    found = None if recorded and sensing.colour is None else filters_of(sensing)
     if (found is None) == (clip.bands is None):
         return None if found is None else found.shifted(*clip.origin)
     if found is None:
@@ -117,8 +117,8 @@ def _fitting_filters(clip: ClipFolder, sensing: Sensing) -> ColourFilter | None:
 
 
 def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sensor | None = None) -> Draw:
-    """Return the draw of a clip as `prepare`, with given defects and, if given, the sensor `own`."""
-    filters = _fitting_filters(clip, sensing)
+    """Return the draw of a clip as `prepare`, with given defects. A given sensor `own` has no file and no filters."""
+    filters = _fitting_filters(clip, sensing, own is not None)
     planes = sensing.planes
     if sensing.group:
         if sensing.depth is None:

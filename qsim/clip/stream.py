@@ -137,7 +137,7 @@ class Stream:
         return np.stack([self._at_mid_exposure(sharp, t, at) for t in frames])
 
     def known(self) -> Array | None:
-        """Return bool [T, H, W], False where a saturated camera cut off the light of `truth`; None if all is known."""
+        """Return bool [T, H, W], False where light of `truth` is cut off (`Clip.saturated`); None if all is known."""
         if not self.clip.meta.get("saturated_pixels"):
             return None
         return ~np.stack([self._at_mid_exposure(self.clip.saturated, t) for t in range(len(self))])

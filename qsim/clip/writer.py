@@ -100,23 +100,31 @@ class ClipWriter:
 
         Images of a clip with `bands` are [3, H, W].
 
-        `saturated` [H, W] is True where the camera was saturated: the radiance there is a lower bound. It is stored if
-        any pixel is saturated, together with pixels above the largest half, and counted in clip.json.
+        `saturated` [H, W] is True where the camera was saturated: the radiance there is a lower bound. So it is where
+        light is above the largest half. These pixels are counted in clip.json and, of a clip of one band, stored.
+
+        A frame that an earlier writer stored with the same bytes is kept.
 
         `ValueError` for radiance that is negative or not finite; it names frame and pixel.
         """
         if not 0 <= t < self.meta["shape"][0]:
             raise ValueError(f"{self.path}: frame {t} does not belong to a clip of {self.meta['shape'][0]} frames")
         contents: dict[str, bytes] = {}
-        half, clipped = self._encode(t, "radiance", radiance, contents)
+        half = self._encode(t, "radiance", radiance, contents)
+        lower = exr.above_half(radiance) if saturated is None else saturated | exr.above_half(radiance)
         if sharp is not None:
             self._encode(t, "sharp", sharp, contents)
+            lower |= exr.above_half(sharp)
         if truth:
             contents[f"truth/{t:06d}.exr"] = exr.encode(_truth_channels(truth), compress=True)
-        if saturated is not None and saturated.any():
-            mask = saturated | (radiance > exr.HALF_MAX)
-            clipped = int(np.count_nonzero(mask))
-            contents[f"saturated/{t:06d}.exr"] = exr.encode({"saturated": mask.astype("<u4")}, compress=True)
+        mask = f"saturated/{t:06d}.exr"
+        if lower.any() and self.meta.get("bands") is None:
+            contents[mask] = exr.encode({"saturated": lower.astype("<u4")}, compress=True)
+        else:
+            (self.part / mask).unlink(missing_ok=True)  # of an earlier writer
+        earlier = self._frames.get(t)
+        if earlier and earlier["checksums"] == {name: files.sha256(content) for name, content in contents.items()}:
+            return
         checksums = {}
         for relative, content in contents.items():
             target = self.part / relative
@@ -128,10 +136,10 @@ class ClipWriter:
             "checksums": checksums,
             "mean_radiance": float(stored.mean()),
             "largest": float(radiance.max()),
-            "clipped": clipped,
+            "clipped": int(np.count_nonzero(lower)),
         }
-        if saturated is not None:
-            entry["saturated"] = int(np.count_nonzero(saturated))
+        if saturated is not None or mask in contents:
+            entry["saturated"] = entry["clipped"]
         if error is not None:
             entry["error"] = float(error)
             entry["errors_at"] = [[float(value) for value in pair] for pair in errors_at]
@@ -191,8 +199,8 @@ class ClipWriter:
         self._clear()
         shutil.rmtree(self.part)
 
-    def _encode(self, t: int, folder: str, image: Array, contents: dict[str, bytes]) -> tuple[Array, int]:
-        """Add the image [H, W] of frame t as EXR to `contents`; return it in half precision, and its clipped pixels."""
+    def _encode(self, t: int, folder: str, image: Array, contents: dict[str, bytes]) -> Array:
+        """Add the image [H, W] of frame t as EXR to `contents`; return it in half precision."""
         _, height, width = self.meta["shape"]
         expected = (height, width) if self.meta.get("bands") is None else (3, height, width)
         if image.shape != expected:
@@ -204,10 +212,10 @@ class ClipWriter:
                 f"{self.path}: {folder} of frame {t} is {float(image[bad][0])!r} at (y, x) = ({y}, {x}); "
                 "radiance must be finite and not negative"
             )
-        half, clipped = exr.to_half(image)
+        half = exr.to_half(image)
         channels = {"Y": half} if half.ndim == 2 else dict(zip("RGB", half, strict=True))
         contents[f"{folder}/{t:06d}.exr"] = exr.encode(channels)
-        return half, clipped
+        return half
 
     def _finish(self) -> None:
         """Write clip.json and rename the folder; `ValueError` if a frame is missing."""

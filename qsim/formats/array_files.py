@@ -32,6 +32,7 @@ from qsim.formats.recording import (
     white_of,
 )
 from qsim.sensor import packing
+from qsim.structure import is_whole, list_of
 
 _LARGEST_CHUNK = 1 << 29  # bytes of a zarr chunk in memory; one of quanta-spad-sim has up to 200 MB
 _LARGEST_METADATA = 1 << 22  # bytes
@@ -44,7 +45,8 @@ _CODECS = {"blosc", "bytes", "crc32c", "delta", "gzip", "lz4", "packbits", "shar
 def read_cube(path: Path, hints: Hints) -> Recording:
     """Read a photon cube: uint8 [T, H, ceil(W/8)], rows padded, most significant bit first; [.., C] needs a channel.
 
-    Without a given width every bit of the last byte is a pixel. `ValueError` for another array.
+    Without a given width, that of our description beside it counts; else every bit of the last byte is a pixel.
+    `ValueError` for another array.
     """
     array = load_array(path)
     if array.ndim == 4:
@@ -54,7 +56,7 @@ def read_cube(path: Path, hints: Hints) -> Recording:
     if array.dtype != np.uint8 or array.ndim != 3:
         raise ValueError(f"{path}: a photon cube is uint8 [T, H, bytes], found {array.dtype} {list(array.shape)}")
     frames, height, columns = check_shape(path, array.shape)
-    width = hints.width if hints.width is not None else 8 * columns
+    width = hints.width if hints.width is not None else written_width(path) or 8 * columns
     if not 8 * (columns - 1) < width <= 8 * columns:
         raise ValueError(f"{path}: {columns} bytes per row hold {8 * columns - 7} to {8 * columns} pixels, not {width}")
 
@@ -62,6 +64,17 @@ def read_cube(path: Path, hints: Hints) -> Recording:
         return np.unpackbits(np.asarray(array[start:stop]), axis=-1, count=width)
 
     return Recording((frames, height, width), read, "photon cube", 1, meta={"bit_order": "msb"})
+
+
+def written_width(path: Path) -> int | None:
+    """Return the width in NAME.npy.json, if `qsim convert` wrote it beside a photon cube; else None."""
+    try:
+        found = files.read_json(path.with_name(f"{path.name}.json"))
+    except (OSError, ValueError):
+        return None
+    software, shape = found.get("software"), found.get("shape")
+    ours = isinstance(software, dict) and "qsim" in software and list_of(is_whole, 3)(shape)
+    return int(found["shape"][2]) if ours else None
 
 
 def read_codes_npy(path: Path, hints: Hints) -> Recording:
@@ -179,6 +192,7 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
         info = json.loads(description.read_text("utf-8"))
         width, channels = int(info["w"]), int(info.get("c", 1))
         packed = bool(info.get("bitpack", "bitpack_dim" in info or info.get("bitplanes", 1) == 1))
+        planes = None if info.get("bitplanes") is None else int(info["bitplanes"])
         if packed and int(info.get("bitpack_dim", 2)) != 2:
             raise ValueError(f"{description}: planes packed along axis {info['bitpack_dim']}; only axis 2 (W) is known")
     shards = [path / "frames.npy"] if (path / "frames.npy").is_file() else numbered(list(path.glob("[0-9]*.npy")))
@@ -197,9 +211,10 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
         if array.shape[2] != (-(-width // 8) if packed else width):
             raise ValueError(f"{shard}: {array.shape[2]} columns do not hold the width {width} of transforms.json")
         parts.append(array[..., channel])
-    bits = 1 if packed else hints.bits or int(info.get("bitplanes", 1)).bit_length()
-    if not 1 <= bits <= 16:
-        raise ValueError(f"{description}: sums of {info['bitplanes']!r:.40} bitplanes; 1 to 65535 are read")
+    if packed:
+        bits = 1
+    else:
+        bits = hints.bits or 1 if planes is None else _bits_of_sums(description, planes, hints.bits)
     ends = np.cumsum([len(part) for part in parts])
     shape = check_shape(path, (int(ends[-1]), parts[0].shape[1], width))
 
@@ -213,6 +228,18 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
 
     model = "binary_sum" if packed else "binary_sum_static"
     return Recording(shape, read, "visionsim", bits, model, {"bit_order": "msb"})
+
+
+def _bits_of_sums(path: Path, planes: int, bits: int | None) -> int:
+    """Return the bits of sums of bitplanes; `ValueError` unless a clocked SPAD sums as many, and of other `bits`."""
+    found = planes.bit_length()
+    if not 1 <= found <= 16 or planes != 2**found - 1:
+        raise ValueError(
+            f"{path}: sums of {planes!r:.40} bitplanes; read are 2^b - 1 of them, as 3, 7 or 15, up to 65535"
+        )
+    if bits is not None and bits != found:
+        raise ValueError(f"{path}: sums of {planes} bitplanes have {found} bits, not {bits}; leave --bits out")
+    return found
 
 
 def _checked_light(path: Path, values: Array, first: int) -> Array:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from numpy import ndarray as Array
 
 from qsim.files import load_array
 from qsim.formats import array_files, images, mat_files, photon_times, raw_cameras, video
@@ -49,8 +50,11 @@ PARTS = (*PICTURES, ".json", ".db", ".mat", ".bin", ".npy")  # kinds of files th
 _SMALL = 8_388_608  # bytes that three raw layouts share
 
 
-def detect(path: Path) -> str:
-    """Return the name of the layout; `ValueError` lists the candidates if there are several or none."""
+def detect(path: Path, hints: Hints | None = None) -> str:
+    """Return the name of the layout; `ValueError` lists the candidates if there are several or none.
+
+    Of an array, hints that only one layout has decide.
+    """
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file")
     if path.is_dir():
@@ -63,7 +67,7 @@ def detect(path: Path) -> str:
     if suffix in VIDEOS:
         return "video"
     if suffix == ".npy":
-        return _detect_npy(path)
+        return _detect_npy(path, hints or Hints())
     if suffix == ".bin":
         return _detect_raw(path)
     raise ValueError(f"{path}: unknown kind of file; name it with `qsim convert --layout`: {', '.join(LAYOUTS)}")
@@ -106,22 +110,39 @@ def _detect_folder(path: Path) -> str:
     raise ValueError(f"{path}: a folder of unknown kind; name it with `qsim convert --layout`: {', '.join(LAYOUTS)}")
 
 
-def _detect_npy(path: Path) -> str:
+def _detect_npy(path: Path, hints: Hints) -> str:
     array = load_array(path)
     if array.dtype == bool:
         return "codes"
+    if hints.transfer is not None or hints.white is not None:
+        return "light"
+    if hints.bits is not None and array.dtype.kind == "u":
+        return "codes"
     if array.dtype != np.uint8:
         return "light"
-    if array.ndim == 4:
+    if array.ndim == 4 or hints.width is not None or array_files.written_width(path) is not None:
         return "cube"
     top = max((int(array[t].max()) for t in range(len(array)) if array[t].size), default=0)
-    bits = (top + 1).bit_length() - 1
-    if top + 1 == 1 << bits and bits < 8:
+    bits = max(top.bit_length(), 1)
+    if bits < 8:  # every eighth column of packed planes would be dark
         raise ValueError(
             f"{path}: uint8 up to {top}: codes of {bits} bits, packed planes or dark pictures; choose with "
-            f"--layout codes (and --bits {max(bits, 1)}), --layout cube or --layout light"
+            f"--layout codes (and --bits {bits}), --layout cube or --layout light"
+        )
+    if _smooth(array):
+        raise ValueError(
+            f"{path}: uint8 up to {top}, much alike along rows: pictures or packed planes; choose with --layout light "
+            "(and --transfer) or --layout cube"
         )
     return "cube"
+
+
+def _smooth(array: Array) -> bool:
+    """Return whether neighbours along the rows of uint8 [T, H, W] agree, as pixels do and bytes of planes do not."""
+    if array.ndim != 3 or array.shape[2] < 2 or array.size == 0:
+        return False
+    values = array[:8].astype(np.float64)
+    return bool(np.mean(np.diff(values, axis=2) ** 2) < 0.2 * values.var())  # their correlation is above 0.9
 
 
 def _detect_raw(path: Path, many: bool = False) -> str:

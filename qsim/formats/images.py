@@ -6,6 +6,7 @@ pixel, or stretched to 0 ... 255). Colour becomes linear luminance (Rec. 709). M
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -178,10 +179,20 @@ def _png(path: Path) -> Array:
 
 
 def _tiff_pages(path: Path) -> int:
+    """Return the number of pages; `ValueError` if frames lie behind them that no page describes."""
     import tifffile
 
     with decoding_errors(path, "TIFF"), tifffile.TiffFile(path) as opened:
-        return len(opened.pages)  # the library refuses a chain of pages in a circle
+        count = len(opened.pages)  # the library refuses a chain of pages in a circle
+        own = not (opened.is_ome or opened.is_micromanager)  # these name further files, which are not opened
+        if opened.is_shaped or (opened.is_imagej and own):
+            frame = math.prod(opened.pages.first.shape)
+            if any(math.prod(series.shape) > count * frame for series in opened.series):
+                raise ValueError(
+                    f"{path}: holds more frames than the {count} that its pages describe, as large stacks of ImageJ "
+                    "do; save it with a page for each frame, or as a folder of TIFFs"
+                )
+        return count
 
 
 def _tiff(path: Path, page: int) -> Array:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,6 +19,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim import files
+from qsim.clip import exr
 from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
 from qsim.clip.stream import Stream, write_packed
@@ -26,7 +27,9 @@ from qsim.clip.writer import ClipWriter
 from qsim.files import Progress
 from qsim.formats.detection import ASSUMED, LAYOUTS, detect
 from qsim.formats.recording import Hints, Marked, Recording, reoriented, with_stated_layout
-from qsim.sensor import devices, packing
+from qsim.sensor import colour_filter, devices, packing
+from qsim.sensor.defects import defect_table
+from qsim.sensor.defects.pixel_array import PixelArray
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
 
@@ -37,7 +40,7 @@ def read(path: Path, hints: Hints | None = None, *, compared: tuple[str, ...] = 
     `ValueError` for a hint without effect on this file, except those that the caller `compared` with it.
     """
     hints = hints or Hints()
-    layout = hints.layout or detect(path)
+    layout = hints.layout or detect(path, hints)
     if layout not in LAYOUTS:
         raise ValueError(f"layout {layout!r}: known are {', '.join(LAYOUTS)}")
     if not path.exists():
@@ -91,7 +94,10 @@ class Import:
 def to_clip(
     recording: Recording, path: Path, capture: Import, *, force: bool = False, progress: Progress | None = None
 ) -> Clip:
-    """Write light as a clip of relative radiance; `ValueError` for codes."""
+    """Write light as a clip of relative radiance; `ValueError` for codes.
+
+    All frames are read, also those that an interrupted import stored: the recording may be another one.
+    """
     if not recording.is_light:
         raise ValueError(
             f"{path}: {recording.source} holds codes, not light; name a stream to make, as in out/capture.npy"
@@ -115,8 +121,7 @@ def to_clip(
     with ClipWriter(path, meta, force=force) as writer:
         for start, stop in _ranges(recording):
             for t, image, mask in zip(range(start, stop), *marked(start, stop), strict=True):
-                if not writer.has(t):
-                    writer.add(t, image, saturated=mask)
+                writer.add(t, image, saturated=mask)
             if progress is not None:
                 progress(stop, frames)
     return Clip.open(path)
@@ -136,11 +141,15 @@ def saturation_line(clip: Clip) -> str:
     """Return a line about the saturation of an imported clip: its white and the share of saturated pixels."""
     known = clip.meta.get("saturation") or {"white": None, "assumed": True}
     white, count = known["white"], int(clip.meta.get("saturated_pixels") or 0)
+    share = f"{100 * count / math.prod(clip.shape):.3g} % of pixels"
+    cut = f"; light above {exr.HALF_MAX:g}, the most a clip holds, is cut off and counts as saturated: {share}"
     if white is None:
-        return "saturation not known: floats have no largest value; give it with --white"
+        return "saturation not known: floats have no largest value; give it with --white" + (cut if count else "")
     said = f"white {white:g}{' assumed' if known['assumed'] else ''}"
     if count:
-        return f"{said}: {100 * count / math.prod(clip.shape):.3g} % of pixels saturated"
+        above = white > exr.HALF_MAX and not known["assumed"]  # of floats; whole numbers become light of at most 1
+        above = above and any(clip.radiance(t).max() >= exr.HALF_MAX for t in range(len(clip)))
+        return f"{said}: {share} saturated" + (cut if above else "")
     return f"{said}: no pixel reaches it" + (
         "; if the camera saturates below it, give --white" if known["assumed"] else ""
     )
@@ -149,7 +158,10 @@ def saturation_line(clip: Clip) -> str:
 def to_stream(
     recording: Recording, path: Path, capture: Import, *, force: bool = False, progress: Progress | None = None
 ) -> Stream:
-    """Write codes as a stream without a clip: PATH.npy and PATH.json. The default sensor is an ideal counter."""
+    """Write codes as a stream without a clip: PATH.npy and PATH.json. The default sensor is an ideal counter.
+
+    Tables [defects] and [colour] of a sensor's file are stored: they belong to the frames as they are written.
+    """
     if recording.bits is None:
         raise ValueError(
             f"{path}: {recording.source} holds light, not codes; name a clip folder to make, as in out/clip"
@@ -168,7 +180,9 @@ def to_stream(
                 f"{file}: is not a stream, which is all that --force replaces; move it away, or name another"
             )
     frames, height, width = recording.shape
-    sensor = _sensor(recording, capture)
+    capture = _as_stated(path, recording, capture)
+    sensor, tables = _tables(capture, _sensor(recording, capture), height, width)
+    model = recording.code_model if isinstance(sensor, BinarySPAD) else sensor.code_model
     npy.parent.mkdir(parents=True, exist_ok=True)
 
     def packed() -> Iterator[Array]:
@@ -180,8 +194,8 @@ def to_stream(
     meta = {
         "shape": [frames, height, width],
         "orientation": recording.meta.get("orientation", "unknown"),  # upright only if a reader states it
-        "code_model": recording.code_model,
-        "planes_per_code": 2**recording.bits - 1 if recording.code_model == "binary_sum" else 1,
+        "code_model": model,
+        "planes_per_code": 2**recording.bits - 1 if model == "binary_sum" else 1,
         "frame_rate": capture.frame_rate,
         "exposure": capture.seconds,
         "sensor_name": capture.sensor,
@@ -192,7 +206,19 @@ def to_stream(
         "seed": None,
         "source": {"format": recording.source} | recording.meta,
     }
-    return write_packed(npy, packed(), sensor, meta)
+    return write_packed(npy, packed(), sensor, meta | tables)
+
+
+def _as_stated(path: Path, recording: Recording, capture: Import) -> Import:
+    """Return the capture with the exposure that the recording states; `ValueError` for rates that contradict it."""
+    rate, exposure = recording.frame_rate, recording.exposure
+    if rate is None or exposure is None:
+        return capture
+    given = (("frame-rate", capture.frame_rate, rate), ("exposure", capture.exposure or exposure, exposure))
+    for name, value, stated in given:
+        if not math.isclose(value, stated, rel_tol=1e-6):
+            raise ValueError(f"{path}: --{name} {value:g}: {recording.source} state {stated:g}; leave it out")
+    return replace(capture, exposure=exposure)
 
 
 def blocks(recording: Recording) -> Iterator[tuple[int, Array]]:
@@ -213,3 +239,14 @@ def _sensor(recording: Recording, capture: Import) -> Sensor:
     if capture.sensor is not None:
         return devices.load(capture.sensor, ppp=capture.ppp, bits=recording.bits, exposure=capture.seconds)
     return BinarySPAD(pde=1.0, dark_count_rate=0.0, bits=recording.bits or 1)
+
+
+def _tables(capture: Import, sensor: Sensor, height: int, width: int) -> tuple[Sensor, dict[str, Any]]:
+    """Return the sensor with the dark rate of its measured map, and the other tables of its file, for a description."""
+    if capture.sensor is None or not capture.sensor.endswith(".toml"):
+        return sensor, {}
+    defects, filters = defect_table.from_toml(capture.sensor), colour_filter.from_toml(capture.sensor)
+    found: dict[str, Any] = {} if filters is None else {"colour": filters.to_dict()}
+    if defects is None:
+        return sensor, found
+    return PixelArray.of(defects, sensor, height, width).sensor, found | {"defects": defects.to_dict()}

@@ -153,7 +153,8 @@ def read_photons(path: Path, hints: Hints) -> Recording:
     planes = 2**bits - 1
     fired = photons.clocked(planes).reshape(-1, planes, *photons.shape[1:])
     codes = fired.sum(axis=1, dtype=np.uint8)
-    return Recording(photons.shape, lambda a, b: codes[a:b], "photon times", bits)
+    rate, exposure = photons.frame_rate, photons.exposure
+    return Recording(photons.shape, lambda a, b: codes[a:b], "photon times", bits, frame_rate=rate, exposure=exposure)
 
 
 def _arrays(path: Path) -> dict[str, Array]:

@@ -34,6 +34,8 @@ class Recording:
     marked: Marked | None = None  # light, and bool [t, H, W]: True where the camera was saturated
     white: float | None = None  # pixel value at which the camera saturates; None: not known
     white_assumed: bool = False  # it is the largest value that the pixels can hold
+    frame_rate: float | None = None  # Hz, if the file states it
+    exposure: float | None = None  # s, if the file states it
 
     @property
     def is_light(self) -> bool:
@@ -156,12 +158,19 @@ def reoriented(recording: Recording, hints: Hints) -> Recording:
 
 
 def checked_codes(path: Path, values: Array, bits: int, first: int) -> Array:
-    """Return codes as uint8 (uint16 above 8 bits); `ValueError` with frame and pixel of one above 2^bits - 1."""
+    """Return codes as uint8 (uint16 above 8 bits).
+
+    `ValueError` with frame and pixel of the first that is not a whole number 0 ... 2^bits - 1.
+    """
     top = 2**bits - 1
-    if values.dtype != bool and values.size and int(values.max()) > top:
-        t, y, x = (int(i) for i in np.argwhere(values > top)[0])
+    wrong = values > top
+    if values.dtype.kind in "if":
+        wrong |= ~(values >= 0) | (values != np.floor(values))
+    if wrong.any():
+        t, y, x = (int(i) for i in np.argwhere(wrong)[0])
+        cure = "give the right --bits, or --stretched" if values[t, y, x] > top else "codes are whole numbers from 0 on"
         raise ValueError(
-            f"{path}: value {int(values[t, y, x])} at (t, y, x) = ({first + t}, {y}, {x}) is not a {bits}-bit code "
-            f"(0..{top}); give the right --bits, or --stretched"
+            f"{path}: value {values[t, y, x]} at (t, y, x) = ({first + t}, {y}, {x}) is not a {bits}-bit code "
+            f"(0..{top}); {cure}"
         )
     return values.astype(np.uint8 if bits <= 8 else np.uint16)

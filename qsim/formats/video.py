@@ -33,25 +33,25 @@ _CONTAINERS = (
 
 
 def read_video(path: Path, hints: Hints) -> Recording:
-    """Read a video as light; the container's frame rate is not the capture rate.
+    """Read a video as light of full depth; the container's frame rate is not the capture rate.
 
     Frames are decoded in order and not kept: reading backwards decodes from the start again.
     """
     transfer = need_transfer(path, hints)
     with decoding_errors(path, "video"):
-        frames, height, width = _video_shape(path)
+        frames, height, width, full = _video_shape(path)
     shape = check_shape(path, (frames, height, width))
-    decoder = _Decoder(path, height, width)
+    decoder = _Decoder(path, (height, width), full)
 
-    white, _ = white_of(path, hints, 255)
+    white, _ = white_of(path, hints, full)
 
     def marked(start: int, stop: int) -> tuple[Array, Array]:
         with decoding_errors(path, "video"):
             found = decoder.frames(start, stop)
-            light = np.stack([to_luminance(f, transfer, 255, f.ndim == 3) for f in found])
+            light = np.stack([to_luminance(f, transfer, full, f.ndim == 3) for f in found])
             return light, np.stack([reached(f, white, f.ndim == 3) for f in found])
 
-    return light_recording(path, shape, marked, "video", {"transfer": transfer}, hints, 255)
+    return light_recording(path, shape, marked, "video", {"transfer": transfer}, hints, full)
 
 
 def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossless: bool) -> None:
@@ -80,24 +80,29 @@ def write_video(path: Path, frames: Iterator[Array], frame_rate: float, *, lossl
 
 
 def read_frames(path: Path) -> Iterator[Array]:
-    """Yield the frames of a video as they are stored: grey of 8 bits [H, W], or red, green and blue [H, W, 3]."""
+    """Yield the frames of a video as they are stored: grey of 8 bits [H, W], or red, green and blue [H, W, 3].
+
+    `ValueError` for a video of more bits.
+    """
     with decoding_errors(path, "video"):
-        _, height, width = _video_shape(path)
+        _, height, width, full = _video_shape(path)
         check_shape(path, (1, height, width))
-        yield from _decoded(path, (height, width))
+        if full > 255:
+            raise ValueError(f"{path}: pixels of more than 8 bits")
+        yield from _decoded(path, (height, width), full)
 
 
 class _Decoder:
     """Decodes frames in order; an earlier frame starts again at the first."""
 
-    def __init__(self, path: Path, height: int, width: int) -> None:
-        self.path, self.size = path, (height, width)
+    def __init__(self, path: Path, size: tuple[int, int], full: int) -> None:
+        self.path, self.size, self.full = path, size, full
         self.next = 0
         self.source: Iterator[Array] | None = None
 
     def frames(self, start: int, stop: int) -> list[Array]:
         if self.source is None or start < self.next:
-            self.source, self.next = _decoded(self.path, self.size), 0
+            self.source, self.next = _decoded(self.path, self.size, self.full), 0
         found = []
         while self.next < stop:
             frame = next(self.source, None)
@@ -111,15 +116,35 @@ class _Decoder:
         return found
 
 
-def _decoded(path: Path, size: tuple[int, int]) -> Iterator[Array]:
+def _decoded(path: Path, size: tuple[int, int], full: int) -> Iterator[Array]:
     with _open_video(path) as container:
         for frame in container.decode(video=0):
-            if (frame.height, frame.width) != size:
-                raise ValueError(f"{path}: a frame of {frame.height} x {frame.width} among {size}")
-            if frame.format.name.startswith("gray"):
-                yield frame.to_ndarray(format="gray")
+            if (frame.height, frame.width) != size or _full(path, frame.format) != full:
+                kind = f"{frame.height} x {frame.width} pixels as {frame.format.name}"
+                raise ValueError(f"{path}: a frame of {kind} among {size} with values up to {full}")
+            if _is_grey(frame.format):
+                yield frame.to_ndarray(format="gray" if full == 255 else frame.format.name)
             else:
-                yield frame.to_ndarray(format="rgb24", interpolation=EXACT)
+                yield frame.to_ndarray(format="rgb24" if full == 255 else "rgb48le", interpolation=EXACT)
+
+
+def _is_grey(pixels: Any) -> bool:
+    return bool(pixels.name.startswith("gray"))
+
+
+def _full(path: Path, pixels: Any) -> int:
+    """Return the largest value of decoded pixels of FFmpeg's format: of grey, or of red, green and blue.
+
+    `ValueError` for luma and chroma of more than 8 bits: FFmpeg's 16-bit colour of them has no stated white.
+    """
+    bits = max(component.bits for component in pixels.components)
+    if bits <= 8:
+        return 255
+    if bits > 16 or not (_is_grey(pixels) or pixels.is_rgb):
+        raise ValueError(
+            f"{path}: colour of {bits} bits ({pixels.name}) would lose the lower ones; store it as TIFF, or with 8 bits"
+        )
+    return 2**bits - 1 if _is_grey(pixels) else 65535
 
 
 def _open_video(path: Path) -> Any:
@@ -132,7 +157,8 @@ def _open_video(path: Path) -> Any:
     return container
 
 
-def _video_shape(path: Path) -> tuple[int, int, int]:
+def _video_shape(path: Path) -> tuple[int, int, int, int]:
+    """Return frames, height, width, and the largest value of a pixel."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     with _open_video(path) as container:
@@ -140,5 +166,6 @@ def _video_shape(path: Path) -> tuple[int, int, int]:
             raise ValueError(f"{path}: has no video stream")
         stream = container.streams.video[0]
         height, width = stream.codec_context.height, stream.codec_context.width
+        full = _full(path, stream.codec_context.format)
         frames = sum(1 for packet in container.demux(stream) if packet.size)
-    return frames, height, width
+    return frames, height, width, full

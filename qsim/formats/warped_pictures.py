@@ -8,7 +8,7 @@ They cost a thousandth of a rendered clip, and have no shading and no blur. Pict
 and are shrunk to half of their size at least, which removes most of their noise. Every clip draws its largest motion
 from 0 to `motion` px/frame; its layers translate, sway, rotate and zoom up to that. A pixel is the mean of 3 x 3
 bilinear samples; flow follows from the motion in closed form. Clip n is a function of the pictures, `seed` and n. An
-existing clip is kept, so the same command resumes. The folder holds one clip folder per number, and the licence.
+existing clip is kept, so the same command resumes. The folder holds one clip folder per number, and the licences.
 """
 
 from __future__ import annotations
@@ -225,7 +225,7 @@ def make(folder: Path, pictures: Path, licence: Path, args: argparse.Namespace) 
     if not licence.is_file():
         raise FileNotFoundError(f"{licence}: no such file; name the file that states the licence of the pictures")
     folder.mkdir(parents=True, exist_ok=True)
-    files.write_bytes(folder / "LICENCE.txt", licence.read_bytes())
+    _copy_licence(licence, folder)
     digests = [f"texture {files.sha256(path)}" for path in paths]
     made = 0
     for n in range(args.first, args.first + args.clips):
@@ -247,6 +247,14 @@ def make(folder: Path, pictures: Path, licence: Path, args: argparse.Namespace) 
         write_clip(path, layers(lights, size, args.motion, rng), size, meta)
         made += 1
     return made
+
+
+def _copy_licence(licence: Path, folder: Path) -> None:
+    """Copy a licence as LICENCE.txt; another one that is there stays, and this one is named by its checksum."""
+    text, copy = licence.read_bytes(), folder / "LICENCE.txt"
+    if copy.is_file() and copy.read_bytes() != text:
+        copy = folder / f"LICENCE-{files.sha256(text)[:8]}.txt"
+    files.write_bytes(copy, text)
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -11,7 +11,7 @@ from qsim.cli import main
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
 from qsim.clip.rows import Rows
-from qsim.clip.sensing import Sensing, prepare, replay
+from qsim.clip.sensing import Sensing, assemble, prepare, replay
 from qsim.clip.simulation import stored
 from qsim.dataset.redraw import redraw
 from qsim.keys import Key, hash_name
@@ -56,6 +56,14 @@ def test_a_stream_is_one_mosaic_that_can_be_drawn_again(place):
     assert stream.truth().shape == (3, 3, 7, 9)
     assert stream.truth().mean() == pytest.approx(4.0, rel=1e-3)
     assert clip.sense("mine.toml", ppp=4.0).meta == stream.meta, "kept, not drawn again"
+
+
+def test_a_given_sensor_needs_no_file(place):
+    """Neither for its parameters nor for colour filters, of which it has none."""
+    clip, own = write_clip(place / "g"), QIS(0.8, 1.6, 0.2, 3)
+    for file in ("gone.toml", "mine.toml"):
+        draw = assemble(clip, Sensing(file, ppp=3.0), None, own)
+        assert (draw.sensor, draw.colour) == (own, None)
 
 
 def test_crops_keep_the_phase_of_the_mask(place):

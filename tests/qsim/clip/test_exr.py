@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from clips import RGB, write_clip
 from tiny_clip import meta
 
 from qsim.clip import exr
@@ -17,6 +18,32 @@ def test_the_largest_half_is_kept_and_counted(tmp_path: Path):
     clip = Clip.open(tmp_path / "a")
     assert clip.meta["clipped_pixels"] == 2
     assert clip.radiance(0).max() == 65504
+
+
+def test_light_above_the_largest_half_is_a_lower_bound(tmp_path: Path):
+    """A sun in the picture, or in the sharp picture alone: its light is not known, and scores leave it out."""
+    low = np.ones((2, 3), np.float32)
+    sun, glint = (low + 1e6 * (np.arange(6).reshape(2, 3) == n) for n in (0, 4))
+    with ClipWriter(tmp_path / "a", meta(shape=[3, 2, 3])) as writer:
+        writer.add(0, sun, sharp=glint)
+        writer.add(1, low, sharp=glint)
+        writer.add(2, low, sharp=low)
+    clip = Clip.open(tmp_path / "a")
+    found = np.stack([clip.saturated(t) for t in range(3)])
+    np.testing.assert_array_equal(found[:2], np.stack([(sun > 1) | (glint > 1), glint > 1]))
+    assert not found[2].any()
+    assert clip.meta["saturated_pixels"] == clip.meta["clipped_pixels"] == 3
+    assert not (clip.path / "saturated" / "000002.exr").exists()
+    assert clip.verify() == []
+    np.testing.assert_array_equal(clip.sense("quiver-physical", ppp=3.0).known(), ~found)
+
+
+def test_colour_clips_count_such_pixels_only(tmp_path: Path):
+    """Scores of colours know no marks of pixels, so none are stored."""
+    clip = write_clip(tmp_path / "a", radiance=np.full((2, 3, 4, 5), 1e5), bands=list(RGB))
+    assert clip.meta["clipped_pixels"] == 40
+    assert "saturated_pixels" not in clip.meta
+    assert not clip.saturated(0).any()
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (8, 10), (17, 33), (16, 7), (33, 128)])

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from recordings import CAPTURE, SIZES, everything, one, random_planes
 
-from qsim.formats import array_files, importing
+from qsim.formats import array_files, exporting, importing
+from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints, numbered
 
 
@@ -79,6 +80,30 @@ def test_visionsim_folders(tmp_path: Path, width: int, sharded: bool):
         importing.read(tmp_path, Hints(channel=0))
 
 
+def test_sums_of_visionsim_are_those_of_a_clocked_sensor(tmp_path: Path):
+    """Sums of 7 planes have 3 bits; of 5 planes no sensor here has the law, and --bits would state another one."""
+    sums = np.random.default_rng(0).integers(0, 6, (2, 5, 7, 1)).astype(np.uint8)
+    np.save(tmp_path / "frames.npy", sums)
+    info = {"w": 7, "h": 5, "c": 1, "bitpack": False}
+    for planes, hints, message in [
+        (7, {}, None),
+        (7, {"bits": 3}, None),
+        (5, {}, r"transforms\.json: sums of 5 bitplanes; read are 2\^b - 1 of them"),
+        (5, {"bits": 3}, "sums of 5 bitplanes"),
+        (0, {}, "sums of 0 bitplanes"),
+        (2**17 - 1, {}, "sums of 131071 bitplanes"),
+        (7, {"bits": 4}, "sums of 7 bitplanes have 3 bits, not 4; leave --bits out"),
+        (None, {"bits": 4}, None),  # not stated: --bits says it
+    ]:
+        stated = {} if planes is None else {"bitplanes": planes}
+        (tmp_path / "transforms.json").write_text(json.dumps(info | stated))
+        if message is None:
+            np.testing.assert_array_equal(everything(tmp_path, **hints), sums[..., 0])
+        else:
+            with pytest.raises(ValueError, match=message):
+                everything(tmp_path, **hints)
+
+
 @pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.parametrize("root", [False, True])
 def test_zarr_of_both_versions(tmp_path: Path, version: int, root: bool):
@@ -122,6 +147,19 @@ def test_gzipped_cubes(tmp_path: Path):
     np.save(tmp_path / "a.npy", np.packbits(expected, axis=-1))
     (tmp_path / "a.npy.gz").write_bytes(gzip.compress((tmp_path / "a.npy").read_bytes()))
     np.testing.assert_array_equal(everything(tmp_path / "a.npy.gz"), expected)
+
+
+@pytest.mark.parametrize("width", [10, 16])
+def test_a_cube_that_we_wrote_comes_back_with_its_width(tmp_path: Path, width: int):
+    """The description beside it states kind and width; another one beside a cube does not count."""
+    expected = random_planes(4, 6, width)
+    np.save(tmp_path / "p.npy", expected.astype(bool))
+    stream = importing.to_stream(importing.read(tmp_path / "p.npy"), tmp_path / "s", CAPTURE)
+    cube = exporting.export(stream, tmp_path / "cube.npy", Export("cube"))
+    np.testing.assert_array_equal(everything(cube), expected)
+    for foreign in ("[]", '{"shape": [4, 6, 9]}', "\xff"):
+        (tmp_path / "cube.npy.json").write_text(foreign, encoding="latin-1")
+        assert everything(cube, layout="cube").shape == (4, 6, 16)
 
 
 def test_our_one_bit_stream_is_a_photon_cube_for_others(tmp_path: Path):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import raw_planes
-from recordings import clip_of
+from recordings import clip_of, everything
 
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
@@ -33,13 +33,51 @@ def test_three_raw_layouts_of_one_size_are_not_guessed(tmp_path: Path):
     assert detection.detect(tmp_path / "acq_000.bin") == "spad512s"
 
 
-@pytest.mark.parametrize("top", [1, 3, 7, 15, 127])
+@pytest.mark.parametrize("top", [1, 3, 5, 7, 15, 100, 127])
 def test_counts_that_look_like_a_cube_are_asked_about(tmp_path: Path, top: int):
     array = np.zeros((3, 5, 7), np.uint8)
     array[1, 2, 3] = top
     np.save(tmp_path / "a.npy", array)
     with pytest.raises(ValueError, match=rf"uint8 up to {top}: codes of .* choose with --layout codes"):
         importing.read(tmp_path / "a.npy")
+
+
+def test_given_hints_decide_what_an_array_holds(tmp_path: Path):
+    """Codes, pictures and packed planes of uint8: each hint belongs to one of them."""
+    array = np.random.default_rng(0).integers(0, 8, (3, 5, 7)).astype(np.uint8)
+    np.save(tmp_path / "a.npy", array)
+    np.testing.assert_array_equal(everything(tmp_path / "a.npy", bits=3), array)
+    np.testing.assert_array_equal(everything(tmp_path / "a.npy", transfer="linear"), to_linear(array, "linear", 255))
+    np.testing.assert_array_equal(everything(tmp_path / "a.npy", width=50), np.unpackbits(array, axis=2, count=50))
+    with pytest.raises(ValueError, match="does not state its transfer curve"):
+        everything(tmp_path / "a.npy", white=7)
+    np.save(tmp_path / "b.npy", array.astype(np.uint16) * 100)
+    np.testing.assert_array_equal(everything(tmp_path / "b.npy", bits=10), array.astype(np.uint16) * 100)
+
+
+def test_pictures_that_look_like_a_cube_are_asked_about(tmp_path: Path):
+    """Neighbours in a row agree in pictures; bytes of packed planes differ, also at the edge of a bright square."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:40, :64] / 64
+    pictures = 128 + 100 * np.sin(6 * x + 4 * y) + rng.normal(0, 3, (4, 40, 64))
+    np.save(tmp_path / "pictures.npy", pictures.astype(np.uint8))
+    with pytest.raises(ValueError, match=r"uint8 up to 2\d\d, much alike along rows: pictures or packed"):
+        importing.read(tmp_path / "pictures.npy")
+    bright = 0.05 + 0.8 * ((x > 0.3) & (y > 0.2))
+    np.save(tmp_path / "planes.npy", np.packbits(rng.random((4, 40, 64)) < bright, axis=2))
+    assert detection.detect(tmp_path / "planes.npy") == "cube"
+
+
+@pytest.mark.parametrize("force", [[], ["--force"]])
+def test_recordings_of_one_name_are_refused_before_any_is_read(tmp_path: Path, capsys, force: list[str]):
+    for name in ("a b", "a_b", "other"):
+        (tmp_path / "in" / name).mkdir(parents=True)
+        images.write_png(tmp_path / "in" / name, iter(np.zeros((1, 9, 7), np.uint8)))
+    options = ["--frame-rate", "1000", "--transfer", "srgb", *force]
+    assert main(["convert", str(tmp_path / "in"), str(tmp_path / "out"), *options]) == 2
+    both, target = f"{tmp_path / 'in' / 'a b'} and {tmp_path / 'in' / 'a_b'}", tmp_path / "out" / "a_b"
+    assert f"{both} would both become {target}; rename one" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_detection_by_name_signature_and_type(tmp_path: Path):

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from recordings import everything, random_planes
 
+from qsim.calibration.sensor_file import read_stack
 from qsim.colour import code_levels, to_linear
 from qsim.formats import images, importing
+from qsim.formats.recording import Hints
 
 
 def test_png_and_tiff_pictures_of_light(tmp_path: Path):
@@ -85,6 +87,38 @@ def test_codes_in_pictures(tmp_path: Path):
     images.write_png(tmp_path / "lossy", iter(lossy))
     with pytest.raises(ValueError, match=r"\(t, y, x\) = \(1, 2, 3\).*compressed with loss"):
         everything(tmp_path / "lossy", bits=3, stretched=True)
+
+
+@pytest.mark.parametrize("imagej", [False, True])
+def test_a_stack_behind_a_single_page_is_refused(tmp_path: Path, imagej: bool):
+    """As ImageJ writes stacks above 4 GB: one page, and all frames behind it. With a page per frame all are read."""
+    import tifffile
+
+    frames = np.random.default_rng(0).integers(0, 256, (5, 9, 7)).astype(np.uint8)
+    for truncate in (False, True):
+        tifffile.imwrite(tmp_path / "a.tif", frames, imagej=imagej, truncate=truncate, photometric="minisblack")
+        if truncate:
+            with pytest.raises(ValueError, match=r"a\.tif: holds more frames than the 1 that its pages describe"):
+                importing.read(tmp_path / "a.tif", Hints(bits=8))
+        else:
+            np.testing.assert_array_equal(everything(tmp_path / "a.tif", bits=8), frames)
+
+
+@pytest.mark.parametrize("wrong", [np.float32(2.5), np.float64(np.nan), np.int16(-1), np.int32(8)])
+def test_numbers_that_are_no_codes_are_named(tmp_path: Path, wrong: np.generic):
+    """A fraction was cut off, and -1 became 255: in imports, and in the frames of a calibration."""
+    import tifffile
+
+    frames = np.full((2, 5, 6), 7, wrong.dtype)
+    tifffile.imwrite(tmp_path / "a.tif", frames, photometric="minisblack")
+    np.testing.assert_array_equal(everything(tmp_path / "a.tif", bits=3), frames)
+    frames[1, 2, 3] = wrong
+    tifffile.imwrite(tmp_path / "a.tif", frames, photometric="minisblack")
+    message = rf"a\.tif: value {wrong} at \(t, y, x\) = \(1, 2, 3\) is not a 3-bit code \(0\.\.7\); "
+    with pytest.raises(ValueError, match=message):
+        everything(tmp_path / "a.tif", bits=3)
+    with pytest.raises(ValueError, match=message):
+        read_stack(tmp_path / "a.tif", bits=3, exposure=1e-3, photons=0.0)
 
 
 def test_one_bit_tiff_of_both_polarities(tmp_path: Path):

@@ -10,11 +10,14 @@ from recordings import CAPTURE, random_planes
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
 from qsim.clip.manifest import RELATIVE
+from qsim.clip.sensing import Sensing, sense
 from qsim.clip.stream import Stream
+from qsim.clip.writer import ClipWriter
 from qsim.formats import exporting, importing, video
 from qsim.formats.exporting import Export
 from qsim.formats.importing import Import
 from qsim.formats.recording import Hints
+from qsim.sensor.colour_filter import MASKS, ColourFilter
 
 
 def test_the_ball_becomes_a_clip_of_relative_light(tmp_path: Path):
@@ -94,6 +97,69 @@ def test_streams_survive_an_interrupted_conversion(tmp_path: Path):
     with pytest.raises(KeyboardInterrupt):
         importing.to_stream(importing.read(tmp_path / "p.npy"), tmp_path / "s", CAPTURE, progress=stop)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["p.npy"]
+
+
+def test_an_interrupted_import_is_not_finished_with_another_recording(tmp_path: Path, monkeypatch):
+    """Of equal settings: every frame, mark and sum is of the second recording, as if there had been no first one."""
+    rng = np.random.default_rng(0)
+    for name in ("first", "second"):
+        np.save(tmp_path / f"{name}.npy", rng.uniform(0, 0.8, (4, 5, 6)).astype(np.float32) + (name == "first"))
+    first, second = (importing.read(tmp_path / f"{name}.npy", Hints(white=0.9)) for name in ("first", "second"))
+    add, begun = ClipWriter.add, tmp_path / "clip.part" / "radiance" / "000000.exr"
+
+    def stop(writer: ClipWriter, t: int, *images: np.ndarray, **more: np.ndarray) -> None:
+        if t == 2:
+            raise KeyboardInterrupt
+        add(writer, t, *images, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ClipWriter, "add", stop)
+        stored = []
+        for _ in range(2):  # the same recording keeps what is stored
+            with pytest.raises(KeyboardInterrupt):
+                importing.to_clip(first, tmp_path / "clip", CAPTURE)
+            stored.append(begun.stat().st_ino)
+        assert stored[0] == stored[1]
+    clip = importing.to_clip(second, tmp_path / "clip", CAPTURE)
+    alone = importing.to_clip(second, tmp_path / "alone" / "clip", CAPTURE)
+    found, expected = ({p.name: p.read_bytes() for p in c.path.rglob("*") if p.is_file()} for c in (clip, alone))
+    assert found == expected
+    assert clip.verify() == []
+    assert str(tmp_path) not in (clip.path / "clip.json").read_text()
+
+
+def test_light_that_a_clip_cannot_hold_is_told_and_counts_as_saturated(tmp_path: Path, capsys):
+    light = np.random.default_rng(0).random((2, 5, 8)).astype(np.float32)
+    light[1, 2, :2] = 1e5, 70000
+    np.save(tmp_path / "light.npy", light)
+    for white, said in [([], "saturation not known"), (["--white", "80000"], "white 80000: 2.5 % of pixels saturated")]:
+        line = ["convert", str(tmp_path / "light.npy"), str(tmp_path / "clip"), "--frame-rate", "1000", "--force"]
+        assert main([*line, *white]) == 0
+        out = capsys.readouterr().out
+        assert said in out
+        assert "light above 65504, the most a clip holds, is cut off and counts as saturated: 2.5 % of pixels" in out
+        clip = Clip.open(tmp_path / "clip")
+        np.testing.assert_array_equal(clip.saturated(1), light[1] > 65504)
+        assert not clip.saturated(0).any()
+        stream, _ = sense(clip, Sensing("quiver-physical", ppp=3.25))
+        np.testing.assert_array_equal(stream.known(), light <= 65504)
+        assert (stream.codes()[1, 2, :2] == stream.sensor.levels - 1).all()  # still the brightest there is
+    np.save(tmp_path / "deep.npy", np.full((2, 5, 8), 65530, np.uint16))
+    line = ["convert", str(tmp_path / "deep.npy"), str(tmp_path / "deep"), "--frame-rate", "9", "--transfer", "linear"]
+    assert main([*line, "--white", "65520"]) == 0
+    assert "cut off" not in capsys.readouterr().out
+
+
+def test_codes_of_a_named_sensor_have_its_law(tmp_path: Path):
+    """Counts of a QIS or a counting SPAD are no sums of planes; those of a clocked SPAD are."""
+    np.save(tmp_path / "codes.npy", np.random.default_rng(0).integers(0, 8, (2, 5, 6)).astype(np.uint8))
+    recording = importing.read(tmp_path / "codes.npy", Hints(bits=3))
+    for name, ppp, model, planes in [
+        (None, None, "binary_sum", 7), ("spad-320x240", None, "binary_sum", 7), ("quiver-physical", 3.25, "multibit", 1)
+    ]:  # fmt: skip
+        stream = importing.to_stream(recording, tmp_path / str(name), Import(1000.0, sensor=name, ppp=ppp))
+        assert (stream.meta["code_model"], stream.meta["planes_per_code"]) == (model, planes)
+        assert stream.sensor.code_model == model
 
 
 def test_opening_an_unfinished_stream(tmp_path: Path):
@@ -191,3 +257,23 @@ def test_light_is_not_read_into_a_folder_that_is_named_like_a_file(tmp_path: Pat
     assert main([*words, "--frame-rate", "9"]) == 2
     assert f"without {suffix}" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["light.npy"]
+
+
+def test_a_stream_states_the_defects_and_the_filters_of_its_sensor(tmp_path: Path):
+    """As streams that `qsim sense` draws: tables of the file, and the mean dark rate of the measured map."""
+    np.save(tmp_path / "p.npy", random_planes(4, 6, 16).astype(bool))
+    np.save(tmp_path / "rates.npy", np.full((6, 16), 80.0))
+    sensor = '[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 20.0\nbits = 1\n'
+    (tmp_path / "plain.toml").write_text(sensor)
+    (tmp_path / "my.toml").write_text(f'{sensor}[defects]\ndark_map = "rates.npy"\n[colour]\nmask = "quad"\n')
+    codes = importing.read(tmp_path / "p.npy")
+    plain, mine = (
+        importing.to_stream(codes, tmp_path / name, Import(1000, sensor=str(tmp_path / f"{name}.toml")))
+        for name in ("plain", "my")
+    )
+    assert not {"defects", "colour"} & plain.meta.keys()
+    assert plain.sensor.dark_rate == 20.0
+    assert mine.colour_filter == ColourFilter(MASKS["quad"])
+    assert list(mine.meta["defects"]) == ["dark_map"]
+    assert mine.sensor.dark_rate == 80.0
+    np.testing.assert_array_equal(mine.codes(0, 4), plain.codes(0, 4))

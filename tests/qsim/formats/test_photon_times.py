@@ -127,6 +127,24 @@ def test_one_command_writes_times_and_another_reads_clocked_codes(tmp_path, caps
     assert "1 to 8 are made of photon times" in capsys.readouterr().err
 
 
+def test_rates_in_the_file_are_used_and_none_may_contradict(tmp_path, capsys):
+    meta = {"format": photon_times.FORMAT, "shape": [2, 4, 4], "exposure": 4e-4, "frame_rate": 1e3}
+    text, kind = np.frombuffer(json.dumps(meta).encode(), np.uint8), np.ones(16, np.uint8)
+    np.savez(tmp_path / "p.npz", times=np.linspace(0, 3e-4, 16), kind=kind, first=np.arange(17), meta=text)
+    words = ["convert", str(tmp_path / "p.npz"), str(tmp_path / "clocked"), "--bits", "2", "--force"]
+    for agreeing in ([], ["--frame-rate", "1000"], ["--exposure", "4e-4", "--frame-rate", "1e3"]):
+        assert main([*words, *agreeing]) == 0
+        assert "at 1000 per second, exposure 400 us" in capsys.readouterr().out
+        stream = Stream.open(tmp_path / "clocked.json")
+        assert (stream.meta["frame_rate"], stream.exposure) == (1e3, 4e-4)
+    for other, said in [
+        (["--frame-rate", "2000"], "--frame-rate 2000: photon times state 1000; leave it out"),
+        (["--exposure", "1e-3"], "--exposure 0.001: photon times state 0.0004; leave it out"),
+    ]:
+        assert main([*words, *other]) == 2
+        assert said in capsys.readouterr().err
+
+
 def test_damaged_files_are_refused_in_one_line(tmp_path):
     clip = moving(tmp_path / "c")
     photon_times.write(followed(clip, CountingSPAD(0.5, 10.0, 1e-6, 4), 5.0), tmp_path / "p.npz")

@@ -10,11 +10,12 @@ from recordings import CAPTURE, clip_of, everything
 
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
-from qsim.colour import code_levels, from_linear
+from qsim.colour import code_levels, from_linear, to_linear
+from qsim.colour import luminance as linear_luminance
 from qsim.formats import exporting, importing
 from qsim.formats.exporting import Export
 from qsim.formats.recording import Hints
-from qsim.formats.video import write_video
+from qsim.formats.video import read_frames, write_video
 
 
 def test_lossless_video_is_bit_exact_and_ordinary_video_is_not(tmp_path: Path):
@@ -43,6 +44,47 @@ def test_odd_sizes_of_video(tmp_path: Path):
     with pytest.raises(ValueError, match=r"lossy H\.264 needs even sizes"):
         exporting.export(clip, tmp_path / "l.mp4", Export("mp4", lossless=False))
     assert not (tmp_path / "l.mp4").exists()
+
+
+@pytest.mark.parametrize("kind", ["gray10le", "gray12le", "gray16le", "gbrp12le", "rgb48le"])
+def test_video_keeps_more_than_eight_bits(tmp_path: Path, kind: str):
+    """All bits of grey and of colour; white is the largest value of the pixels. Eight-bit readers refuse it."""
+    pytest.importorskip("av")
+    full = 65535 if kind == "rgb48le" else 2 ** int(kind[4:6]) - 1
+    rng = np.random.default_rng(0)
+    stored = rng.integers(0, full, (3, 16, 24) if kind.startswith("gray") else (3, 16, 24, 3)).astype(np.uint16)
+    stored[1, 2, 3] = full
+    write_deep_video(tmp_path / "a.mkv", stored, kind)
+    recording = importing.read(tmp_path / "a.mkv", Hints(transfer="linear"))
+    light = to_linear(stored, "linear", full)
+    found, mask = recording.marked(0, 3)
+    expected = light if light.ndim == 3 else linear_luminance(light)
+    np.testing.assert_allclose(found, expected, atol=2e-5 if kind == "gbrp12le" else 1e-6)  # a step of 16 bits
+    white = full if light.ndim == 3 else 65535
+    assert (recording.white, np.argwhere(mask).tolist()) == (white, [[1, 2, 3]])
+    with pytest.raises(ValueError, match=r"a\.mkv: pixels of more than 8 bits"):
+        next(read_frames(tmp_path / "a.mkv"))
+
+
+def test_colour_that_would_lose_bits_is_refused(tmp_path: Path):
+    """FFmpeg makes 16-bit colour of luma and chroma, but its white is 65283, 65472 or another number."""
+    pytest.importorskip("av")
+    write_deep_video(tmp_path / "a.mkv", np.full((1, 24, 96), 512, np.uint16), "yuv420p10le", height=16)
+    with pytest.raises(ValueError, match=r"a\.mkv: colour of 10 bits \(yuv420p10le\) would lose the lower ones; store"):
+        importing.read(tmp_path / "a.mkv", Hints(transfer="linear"))
+
+
+def write_deep_video(path: Path, stored: np.ndarray, kind: str, height: int | None = None) -> None:
+    """Arrays [T, H, W] or [T, H, W, 3] of more than 8 bits as FFmpeg's `kind` of frames, without loss."""
+    import av
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=30)
+        stream.height, stream.width = height or stored.shape[1], stored.shape[2]
+        stream.codec_context.pix_fmt = kind
+        for image in stored:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format=kind)))
+        container.mux(stream.encode())
 
 
 COLOURS = np.array([(200, 30, 40), (30, 180, 60), (40, 50, 220), (210, 200, 50), (60, 190, 200), (120, 120, 120)])

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
+from qsim import files
 from qsim.clip.clip import Clip
 from qsim.formats import warped_pictures
 from qsim.formats.warped_pictures import Layer, Path2D, frame, layers
@@ -85,6 +86,17 @@ def test_a_repeat_gives_the_same_bytes_and_keeps_what_is_there(pictures, tmp_pat
     assert [clip.name for clip in open_clips(tmp_path / "again", "train")] == ["warped_00000", "warped_00001"]
     assert [clip.name for clip in open_clips(tmp_path / "again", "val")] == ["warped_00002"]
     assert len(open_clips(tmp_path / "again")) == 3
+
+
+def test_a_second_licence_leaves_the_first_one(pictures, tmp_path):
+    """Pictures of two licences in one folder, as docs/datasets.md shows: a repeat adds no third file."""
+    texts = ["CC0", "CC BY 4.0", "CC0", "CC BY 4.0"]
+    for n, text in enumerate(texts):
+        (tmp_path / "licence.txt").write_text(text)
+        assert run(pictures, tmp_path / "out", "--clips", 1, "--first", n) == 0
+    found = {path.name: path.read_text() for path in (tmp_path / "out").glob("LICENCE*")}
+    digest = files.sha256(b"CC BY 4.0")
+    assert found == {"LICENCE.txt": "CC0", f"LICENCE-{digest[:8]}.txt": "CC BY 4.0"}
 
 
 @pytest.mark.parametrize(
