@@ -75,6 +75,14 @@ def set_random_states(states: list[Tensor]) -> None:
         torch.cuda.set_rng_state_all([state.cpu() for state in states[: torch.cuda.device_count()]])
 
 
+def out_of_memory(error: BaseException) -> bool:
+    """Return whether an error tells that memory is exhausted, of a GPU or of this machine."""
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return True
+    text = str(error).lower()
+    return isinstance(error, RuntimeError) and ("out of memory" in text or "defaultcpuallocator" in text)
+
+
 class PeakMemory:
     """Measures from its creation on the largest memory [bytes]: allocated on a GPU, else added to this process.
 
@@ -82,10 +90,10 @@ class PeakMemory:
     """
 
     def __init__(self, kind: str) -> None:
-        import torch
-
         self.gpu = kind == "cuda"
         if self.gpu:
+            import torch
+
             torch.cuda.reset_peak_memory_stats()
         else:
             reset_peak()
@@ -93,6 +101,8 @@ class PeakMemory:
 
     def bytes(self) -> int:
         """Return the peak so far."""
+        if not self.gpu:
+            return max(0, peak_memory() - self.before)
         import torch
 
-        return torch.cuda.max_memory_allocated() if self.gpu else peak_memory() - self.before
+        return torch.cuda.max_memory_allocated()

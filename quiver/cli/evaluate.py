@@ -165,7 +165,7 @@ def refuse_published(args: argparse.Namespace) -> None:
 def _run_static(args: argparse.Namespace, methods: Sequence[Any]) -> int:
     from quiver.data.clips import peak_of
     from quiver.data.photon_counts import read_counts
-    from quiver.evaluation.comparison import json_safe
+    from quiver.evaluation.json_values import json_safe
     from quiver.evaluation.static_object import FORMAT, counted, evaluate_static, markdown
 
     _refuse_for_counts(args)
@@ -229,8 +229,8 @@ def add_bench(sub: Any) -> None:
 
 def _run_bench(args: argparse.Namespace) -> int:
     from quiver import threads
-    from quiver.evaluation.comparison import json_safe
-    from quiver.evaluation.cost import CostSettings, bench, checked_cases, figure, markdown
+    from quiver.evaluation.cost import CostSettings, bench, checked_cases, device_of, figure, markdown
+    from quiver.evaluation.json_values import json_safe
     from quiver.training.run_folder import alone_in
 
     if args.output is None and args.force:
@@ -248,7 +248,7 @@ def _run_bench(args: argparse.Namespace) -> int:
         if args.output is not None:
             args.output.mkdir(parents=True, exist_ok=True)
             stack.enter_context(alone_in(args.output, "measures"))
-        device = args.device or "auto"
+        device = device_of(cases, args.device)
         settings = CostSettings(height, width, ppp=args.ppp, device=device, threads=use_threads(args))
         progress = stack.enter_context(bar("cases", "case"))
         costs = bench(cases, settings, progress)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import os
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 from qsim.cli.completion import add_completion, sensors
@@ -17,6 +18,7 @@ from quiver.cli.evaluate import add_bench, add_evaluate
 from quiver.cli.options import command, handling
 from quiver.cli.restore import add_restore
 from quiver.cli.train import add_ablate, add_train
+from quiver.device import out_of_memory
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -37,9 +39,31 @@ def parser() -> Parser:
     sub = program.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
     for add in (add_train, add_restore, add_evaluate, add_domain, add_ablate, add_bench, _add_convert_weights):
         add(sub)
+    for one in sub.choices.values():
+        one.set_defaults(run=_within_memory(one.get_default("run")))
     several = {"--methods": lambda: [*_methods(), "all"]}
     add_completion(sub, program, {"--sensor": sensors, "--method": _methods, "weights": _methods} | several)
     return program
+
+
+def _within_memory(action: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
+    """Return a command that says in one sentence that memory is exhausted; torch raises a `RuntimeError`."""
+
+    def run_command(args: argparse.Namespace) -> int:
+        try:
+            return action(args)
+        except RuntimeError as error:
+            if not out_of_memory(error):
+                raise
+            option = next((name for name in ("memory", "batch") if hasattr(args, name)), "size")
+            output = getattr(args, "output", None)
+            kept = output is not None and Path(f"{output.resolve()}.part.json").exists()
+            more = "; the finished frames are kept" if kept else ""
+            raise ValueError(
+                f"memory is exhausted ({shorten(str(error), 100)}); give a smaller --{option}{more}"
+            ) from error
+
+    return run_command
 
 
 # convert-weights

@@ -71,7 +71,7 @@ def add_restore(sub: Any) -> None:
 def _run_restore(args: argparse.Namespace) -> int:
     from quiver import threads
     from quiver.restoration.automatic import chosen
-    from quiver.restoration.restored_file import restore_to_file
+    from quiver.restoration.restored_file import restore_to_file, unnamed
     from quiver.restoration.sources import assumed, codes_to_restore, refuse_idle
 
     target: Path = args.output
@@ -81,7 +81,7 @@ def _run_restore(args: argparse.Namespace) -> int:
         raise ValueError(f"{target}: restored video is written as .npy; name a .npy file")
     codes = codes_to_restore(args)
     for path in (target, target.with_suffix(".json")):
-        if path.exists() and not args.force:
+        if path.exists() and not args.force and not unnamed(target):  # restore_to_file finishes its naming
             raise FileExistsError(f"{path}: exists; name another with -o, or use --force to replace it")
     threads.check(args.threads)
     method, why = chosen(args.method, codes, running_options(args))
@@ -115,8 +115,8 @@ def _run_restore(args: argparse.Namespace) -> int:
 
 def _restore_cubes(args: argparse.Namespace) -> int:
     """Restore cubes of the Single Photon Challenge into the zip of a submission."""
-    from quiver.data.challenge import band_codes, cubes
-    from quiver.restoration.automatic import chosen
+    from quiver.data.challenge import COLOURS, band_codes, cubes
+    from quiver.restoration.automatic import chosen_for_all
     from quiver.restoration.sources import assumed, refuse, refuse_idle
     from quiver.restoration.submission import check_target, restore_cubes
 
@@ -125,12 +125,12 @@ def _restore_cubes(args: argparse.Namespace) -> int:
     refuse(args, idle, f"{target} is a submission, whose layout states it")
     check_target(target, args.force)
     found, planes = cubes(args.source), args.planes or 1
-    first = band_codes(found[0], 1, planes)
-    method, why = chosen(args.method, first, running_options(args))
+    bands = [band_codes(cube, colour, planes) for cube in found for colour in range(len(COLOURS))]
+    method, why = chosen_for_all(args.method, bands, running_options(args))
     refuse_idle(vars(args), [method])
-    check_domain(args, [method], [first])
+    check_domain(args, [method], bands)
     use_threads(args)
-    for text in (why, assumed(first, method)):
+    for text in (why, assumed(bands[0], method)):
         if text is not None:
             note(text)
     target.parent.mkdir(parents=True, exist_ok=True)

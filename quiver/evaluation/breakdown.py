@@ -78,9 +78,9 @@ def place(clip: Clip, t: int) -> tuple[slice, slice]:
     return slice(y, y + side), slice(x, x + side)
 
 
-def crop_file(out: Path, light: str, clip: str, method: str) -> Path:
-    """Return the file of the crop of one clip by one method at one light level."""
-    words = (re.sub(r"[^A-Za-z0-9.]+", "-", word) for word in (light, clip, method))
+def crop_file(out: Path, light: str, clip: str, name: str) -> Path:
+    """Return the file of the crop of one clip of this name: truth, codes, or that of a method with its settings."""
+    words = (re.sub(r"[^A-Za-z0-9.]+", "-", word) for word in (light, clip, name))
     return out / "crops" / ("_".join(words) + ".npy")
 
 
@@ -103,10 +103,18 @@ def keep_crops(out: Path, light: str, clip: Clip, codes: Codes, frames: range, s
         save_crop(crop_file(out, light, clip.name, name), picture)
 
 
-def sheet(out: Path, light: str, clips: Sequence[str], methods: Sequence[str], target: Path) -> bool:
+def sheet(
+    out: Path,
+    light: str,
+    clips: Sequence[str],
+    methods: Sequence[str],
+    crops: Mapping[tuple[str, str], str],
+    target: Path,
+) -> bool:
     """Draw one row per clip and one column per method as PNG, peak = white, gamma 2.2.
 
-    Return False if there are no crops.
+    `crops` names the crop of each clip and method; without a name its place stays empty. Return False if there are no
+    crops.
     """
     rows = [clip for clip in clips if crop_file(out, light, clip, "truth").exists()][:SCENES_SHOWN]
     if not rows:
@@ -115,11 +123,11 @@ def sheet(out: Path, light: str, clips: Sequence[str], methods: Sequence[str], t
     drawing = new_figure(1.5 * len(columns), 1.55 * len(rows) + 0.4)
     grid = drawing.subplots(len(rows), len(columns), squeeze=False)
     for clip, line in zip(rows, grid, strict=True):
-        for column, axes in zip(columns, line, strict=True):
+        names = ["truth", "codes", *(crops.get((clip, method)) for method in methods)]
+        for column, name, axes in zip(columns, names, line, strict=True):
             axes.set_xticks([])
             axes.set_yticks([])
-            path = crop_file(out, light, clip, column)
-            if path.exists():
+            if name is not None and (path := crop_file(out, light, clip, name)).exists():
                 picture = np.clip(load_array(path).astype(np.float32), 0, 1) ** (1 / 2.2)
                 picture = picture if picture.ndim == 2 else np.moveaxis(picture, 0, -1)
                 axes.imshow(picture, cmap="gray", vmin=0, vmax=1, interpolation="nearest")

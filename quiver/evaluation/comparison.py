@@ -23,12 +23,13 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.files import read_json, write_json
-from qsim.process import peak_memory, reset_peak
 from quiver.data.clips import Clip, known, mean_light, open_clips, peak_of, truth
 from quiver.data.codes import Codes, Stream, array_codes, sensed, stored, windows_sensed
 from quiver.data.illumination import Illumination, read_sensor
 from quiver.data.noise import file_digests, labels
+from quiver.device import PeakMemory
 from quiver.evaluation import breakdown, metrics
+from quiver.evaluation.json_values import json_safe, number
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.networks import settings_of
 
@@ -77,7 +78,7 @@ class ComparisonRow:
     scene: str
     score: metrics.Score | None = None
     seconds_per_frame: float = math.nan
-    peak_bytes: int | None = None  # of memory while restoring, beyond what was in use before
+    peak_bytes: int | None = None  # of memory while restoring: on a GPU all that was allocated, else what was added
     peak: float = math.nan  # photons per pixel that the scores refer to
     truth_psnr: float | None = None  # dB; lower bound of the score of a perfect restorer
     motion_pixels: tuple[int, ...] = ()  # per bin of breakdown.EDGES; empty where the clip has no flow
@@ -91,30 +92,26 @@ class ComparisonRow:
         """Return what must agree for an old result to count."""
         return self.method, self.description, self.light, self.clip, self.precision, self.cut
 
+    @property
+    def crop(self) -> str:
+        """Return the name of the crops of this method with these settings."""
+        settings = json.dumps([self.description, self.precision, self.cut])
+        return f"{self.method} {hashlib.sha256(settings.encode()).hexdigest()[:8]}"
+
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON, which has no NaN and no infinity: they become null."""
-        return json_safe(asdict(self))
+        """Return plain values for JSON: null for NaN, and the texts inf and -inf."""
+        return json_safe(asdict(self), infinite=True)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> ComparisonRow:
         """Return the inverse of `to_dict`."""
         score = values.pop("score")
         if score is not None:
-            numbers: dict[str, Any] = {name: math.nan if v is None else v for name, v in score.items()}
-            score = metrics.Score(**numbers)
-        seconds, peak = values.pop("seconds_per_frame"), values.pop("peak")
-        values |= {name: tuple(values[name]) for name in ("motion_pixels", "motion_squares")}
-        values |= {"seconds_per_frame": math.nan if seconds is None else seconds}
-        return cls(score=score, peak=math.nan if peak is None else peak, **values)
-
-
-def json_safe(value: Any) -> Any:
-    """Return the same value with null for numbers that JSON cannot hold."""
-    if isinstance(value, dict):
-        return {name: json_safe(v) for name, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [json_safe(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+            score = metrics.Score(**{name: number(v) for name, v in score.items()})
+        values |= {name: number(values[name]) for name in ("seconds_per_frame", "peak")}
+        values |= {name: tuple(map(number, values[name])) for name in ("motion_pixels", "motion_squares")}
+        truth = values.get("truth_psnr")
+        return cls(score=score, **values | {"truth_psnr": None if truth is None else number(truth)})
 
 
 def scored_frames(length: int, published: bool) -> range:
@@ -198,14 +195,14 @@ def restore_clip(
     white = peak_in_photons(comparison, clip, codes, factor)
     target, valid = truth(clip, factor, frames.start, frames.stop) / white, known(clip, frames.start, frames.stop)
     windows = list(windows_sensed(clip, light, comparison.seed, frames)) if comparison.published else []
-    before, started = reset_peak(), time.perf_counter()
+    memory, started = PeakMemory(method.device), time.perf_counter()
     try:
         if comparison.published:
             restored = np.concatenate([method.restore(one, PUBLISHED_EDGE, PUBLISHED_EDGE + 1) for one in windows])
         else:
             restored = method.restore(codes)
         seconds = (time.perf_counter() - started) / len(frames)
-        peak = peak_memory() - before
+        peak = memory.bytes()
         unit = codes.white if comparison.test_set else white  # networks learn photons / white, the target is grey / 255
         score, factors = metrics.score_and_factors(
             restored / np.float32(unit), target, per_frame_scale=comparison.published, valid=valid
@@ -218,7 +215,7 @@ def restore_clip(
         speed = np.where(valid, speed, math.nan)
     pixels, squares = ((), ()) if speed is None else breakdown.by_motion(matched, target, speed)
     if out is not None:
-        breakdown.keep_crops(out, row.light, clip, codes, frames, {row.method: matched, "truth": target})
+        breakdown.keep_crops(out, row.light, clip, codes, frames, {row.crop: matched, "truth": target})
     return replace(
         row,
         score=score,
@@ -336,7 +333,7 @@ def finished(lines: Sequence[str]) -> Iterator[ComparisonRow]:
     for line in lines:
         try:
             row = ComparisonRow.from_dict(json.loads(line))
-        except (json.JSONDecodeError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError):
             continue
         if row.failure is None:
             yield row

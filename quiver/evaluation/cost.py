@@ -266,6 +266,12 @@ def checked_cases(
     return cases_of(methods, modes or ("exact", "streaming"), precisions or ("float32",))
 
 
+def device_of(cases: Sequence[CostCase], wanted: str | None) -> str:
+    """Return the device of the networks among the cases; without any that of classical methods."""
+    learned = any(case.method.partition(":")[0] not in METHODS for case in cases)
+    return pick_device(wanted or "auto") if learned else "cpu"
+
+
 def markdown(costs: Sequence[CostRow], settings: CostSettings) -> str:
     """Return the result as a Markdown table."""
     text = [

@@ -13,7 +13,8 @@ from qsim.files import write_bytes, write_json
 from qsim.tables import markdown_table
 from quiver import threads
 from quiver.evaluation import breakdown, metrics
-from quiver.evaluation.comparison import FORMAT, PUBLISHED_EDGE, Comparison, ComparisonRow, json_safe
+from quiver.evaluation.comparison import FORMAT, PUBLISHED_EDGE, Comparison, ComparisonRow
+from quiver.evaluation.json_values import json_safe
 from quiver.evaluation.metrics import Interval, over_scenes
 from quiver.restoration.interface import Restorer
 
@@ -34,7 +35,8 @@ COLUMNS = (
 )
 MEMORY = (
     "Memory: the largest increase while one clip was restored. Memory that an earlier method left free is not counted; "
-    "`quiver bench` measures each method in a separate process."
+    "`quiver bench` measures each method in a separate process. Of a network on a GPU: the largest memory allocated "
+    "there, with the weights of all networks of the table."
 )
 SCORES = ("psnr", "psnr_matched", "ssim", "ssim_matched")
 
@@ -249,12 +251,13 @@ def as_dict(
                     "name": m.name,
                     **dict(zip(("frames", "future"), frames_of(m, published=comparison.published), strict=True)),
                     "learned": m.learned,
+                    "device": m.device,
                     "is": m.description,
                 }
                 for m in methods
             ],
             "table": [asdict(line) for line in summarise(rows)],
-            "rows": [row.to_dict() for row in rows],
+            "rows": [asdict(row) for row in rows],
         }
     )
     return found
@@ -293,7 +296,8 @@ def write(
     one_per_scene = list({row.scene: row.clip for row in reversed(rows)}.values())[::-1]
     for light in dict.fromkeys(row.light for row in rows):
         target = out / f"crops_{light.replace(', ', '_').replace(' ', '').replace('/', '-')}.png"
-        breakdown.sheet(out, light, one_per_scene, [method.name for method in methods], target)
+        crops = {(row.clip, row.method): row.crop for row in rows if row.light == light and row.failure is None}
+        breakdown.sheet(out, light, one_per_scene, [method.name for method in methods], crops, target)
     write_bytes(out / "evaluation.md", markdown(comparison, methods, rows, remarks).encode())
     figure(rows, out / "evaluation.png")
     write_json(out / "evaluation.json", as_dict(comparison, methods, rows, remarks))

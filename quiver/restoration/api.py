@@ -16,7 +16,7 @@ from quiver.data.illumination import Illumination
 from quiver.restoration.automatic import chosen
 from quiver.restoration.domain_remarks import refuse_outside, remarks
 from quiver.restoration.interface import AUTO, DEFAULT_METHOD, RestoreOptions
-from quiver.restoration.sources import refuse_idle
+from quiver.restoration.sources import codes_of, refuse_idle
 
 Source = Stream | Clip | str | os.PathLike[str] | Array
 
@@ -84,7 +84,7 @@ def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: f
     if isinstance(source, Stream):
         if ppp is not None:
             raise ValueError("ppp= is for a clip that is sensed now, and a stream has its own light; leave it out")
-        return stream_codes(source)
+        return codes_of(source)
     if ppp is not None:
         return sensed(source, Illumination("quiver-physical", ppp, 3))[0]
     if len(source.streams) != 1:

@@ -8,6 +8,8 @@ clips that a classical method restores better would gain 0.02 dB in the mean (do
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from quiver.data.codes import Codes
 from quiver.restoration.domain import place_of
 from quiver.restoration.domain_remarks import light_of
@@ -20,18 +22,49 @@ WITHOUT = "qbp-bm3d"  # without the packages of networks
 
 def chosen(name: str, codes: Codes, options: RestoreOptions | None = None) -> tuple[Restorer, str | None]:
     """Return the method of this name for a stream; for `auto` the chosen one, and a line that says why."""
+    return chosen_for_all(name, [codes], options)
+
+
+def chosen_for_all(
+    name: str, streams: Iterable[Codes], options: RestoreOptions | None = None
+) -> tuple[Restorer, str | None]:
+    """Return the method of this name for several streams, as `chosen`, with the line of the first.
+
+    `ValueError` with the names of streams for which `auto` chooses different methods.
+    """
     if name != AUTO:
         return restorer(name, options), None
+    known: dict[str, Restorer] = {}
+    streams_of: dict[str, list[str]] = {}
+    lines = []
+    for codes in streams:
+        best, why = _best(codes, known, options)
+        streams_of.setdefault(best, []).append(codes.name)
+        lines.append(f"auto: {best}; {why}")
+    if len(streams_of) > 1:
+        found = "; ".join(f"{best} for {_listed(names)}" for best, names in streams_of.items())
+        raise ValueError(f"auto chooses different methods: {found}; name one of them with --method")
+    best = next(iter(streams_of))
+    return known.get(best) or restorer(best, options), lines[0]
+
+
+def _best(codes: Codes, known: dict[str, Restorer], options: RestoreOptions | None) -> tuple[str, str]:
+    """Return the name of the best method for a stream, and why. The network is loaded once, into `known`."""
     if codes.shares is not None:
-        return restorer("likelihood", options), "auto: likelihood; the codes have different exposures"
+        return "likelihood", "the codes have different exposures"
     try:
-        network = restorer(NETWORK, options)
+        network = known.get(NETWORK) or known.setdefault(NETWORK, restorer(NETWORK, options))
     except ModuleNotFoundError as error:
-        return restorer(WITHOUT, options), f"auto: {WITHOUT}; {NETWORK} needs the package {error.name}"
+        return WITHOUT, f"{NETWORK} needs the package {error.name}"
     ppp = light_of(codes)
     domain = None if network.scope is None else network.scope.domain
     cell = None if domain is None else domain.nearest(place_of(codes.sensor, codes.exposure, ppp))
     if cell is None:
-        return network, f"auto: {NETWORK}; nothing was measured near {codes.sensor.bits} bit, {ppp:.3g} PPP"
-    best = NETWORK if cell.wins else cell.classical
-    return (network if cell.wins else restorer(best, options)), f"auto: {best}; measured at {cell.name}: {cell.scores}"
+        return NETWORK, f"nothing was measured near {codes.sensor.bits} bit, {ppp:.3g} PPP"
+    return NETWORK if cell.wins else cell.classical, f"measured at {cell.name}: {cell.scores}"
+
+
+def _listed(names: list[str]) -> str:
+    """Return up to three names, and how many more there are."""
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(names[:3]) + more

@@ -65,7 +65,8 @@ def wrap_network(
 
     mode = options.mode if isinstance(model, QUIVER) else None  # other networks have one way to share work
     description = description if mode is None else f"{description}, {mode}"
-    model.to(pick_device(options.device)).eval()
+    device = pick_device(options.device)
+    model.to(device).eval()
     run: RestoreNetwork = fill_network
     window, look_ahead, together = WINDOW, RADIUS, 1
     if mode == "streaming":  # features reach further, and the state back to the first frame
@@ -85,7 +86,9 @@ def wrap_network(
     def cut(height: int, width: int) -> str:
         return cut_pieces(model, height, width, options.memory).text
 
-    return Restorer(name, window, look_ahead, True, description, fill, mode != "streaming", identity, cut, together)
+    return Restorer(
+        name, window, look_ahead, True, description, fill, mode != "streaming", identity, cut, together, device=device
+    )
 
 
 def settings_of(method: Restorer, codes: Codes) -> tuple[str, str]:
@@ -141,18 +144,19 @@ def fill_parts(
     device = next(network.parameters()).device
     dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
     length, height, width = codes.shape
-    part, last, done = part_of(network), first + len(out), 0
+    part, last, done, top = part_of(network), first + len(out), 0, np.float32(codes.sensor.levels - 1)
     pieces = cut_pieces(network, height, width, options.memory)
     apart, known = Disagreement.nothing(height, width), known_of(network, codes)
     for start in range(first - first % part.kept, last, part.kept):
         end = min(length, start + part.kept + part.after)
         begin = max(0, min(start - part.before, end - 1 - part.after))  # the last frames are reflected at the end
         wanted = slice(max(start, first), min(start + part.kept, last))
-        frames = codes.read(begin, end).astype(np.float32) / np.float32(codes.sensor.levels - 1)
+        frames = codes.read(begin, end)
         for tile in pieces.tiles:
             rows, columns = tile.weight.shape
             place = (slice(tile.y, tile.y + rows), slice(tile.x, tile.x + columns))
-            seen = torch.from_numpy(frames[(slice(None), *place)])[None, :, None].to(device)
+            cut = frames[(slice(None), *place)].astype(np.float32) / top  # of a tile, not of all frames
+            seen = torch.from_numpy(cut)[None, :, None].to(device)
             with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
                 result = restored_frames(network, seen, wanted.start - begin, wanted.stop - begin, **known)[0, :, 0]
             restored = result.float().cpu().numpy()

@@ -22,6 +22,7 @@ from numpy import ndarray as Array
 from qsim.files import VERSION, Progress, read_json, sealed, sha256, sync_folder, write_json
 from qsim.locks import Lock
 from quiver.data.codes import Codes
+from quiver.device import out_of_memory
 from quiver.restoration.interface import Restorer
 
 FORMAT = "quiver-restored-1"
@@ -54,41 +55,30 @@ def restore_to_file(
 
     Both appear when complete, the json last. Until then the video is PATH.npy.part, written in blocks of BLOCK_FRAMES.
     An interrupted restoration of the same codes by the same method resumes after its last block. If codes or method
-    differ, it starts again and `note` receives the reason. `threads` is recorded in the description. A failure leaves
-    nothing behind. A link is followed.
+    differ, it starts again and `note` receives the reason. `threads` is recorded in the description, and so is the
+    device. A failure leaves nothing behind, unless memory was exhausted: finished blocks are kept. A link is followed.
 
     `ValueError` while another process writes PATH. `FileExistsError` if there is a result and `force` is not set, or a
     file that is not restored video.
     """
     path = path.resolve()
-    part, journal = path.with_name(path.name + ".part"), path.with_name(path.name + ".part.json")
+    part, journal = _parts(path)
     with _only_writer(path):
-        _finish_naming(path, part, journal)
+        meta = _described(codes, method)
+        if unnamed(path):
+            os.replace(journal, path.with_suffix(".json"))
+            sync_folder(path.parent)
+            if not _done(path, path.with_suffix(".json"), meta)[2]:
+                return read_json(path.with_suffix(".json"))
         _check_target(path, journal, force)
-        meta = {
-            "format": FORMAT,
-            "quiver": VERSION,
-            "method": method.name,
-            "description": method.description,
-            "identity": dict(method.identity) | {"cut": method.cut(*_at_a_time(codes))},
-            "unit": "photons",
-            "white": codes.white,
-            "shape": list(codes.video_shape),
-            "frame_rate": codes.frame_rate,
-            "exposure": codes.exposure,
-            "sensor": codes.sensor.to_dict(),
-            "source": codes.source,
-            "codes_sha256": codes.digest(),
-        }
-        if codes.colour is not None:
-            meta["colour"] = codes.colour.to_dict() | {"bands": "R, G, B", "by": "places of the mask, then demosaicing"}
         try:
             seconds = _fill_file(codes, method, part, journal, meta, progress, note, threads)
-            meta |= {"seconds_per_frame": seconds / codes.shape[0], "threads": threads, "sha256": sha256(part)}
-            meta = sealed(meta)
+            meta |= {"seconds_per_frame": seconds / codes.shape[0], "threads": threads, "device": method.device}
+            meta = sealed(meta | {"sha256": sha256(part)})
             write_json(journal, meta)  # takes its disk space before anything is replaced
         except BaseException as error:
-            if isinstance(error, Exception) or not journal.exists():
+            resumable = not isinstance(error, Exception) or out_of_memory(error)
+            if not (resumable and journal.exists()):
                 part.unlink(missing_ok=True)
                 journal.unlink(missing_ok=True)
             if isinstance(error, OSError) and error.errno is not None and error.filename in (None, str(part)):
@@ -98,6 +88,28 @@ def restore_to_file(
         os.replace(part, path)
         os.replace(journal, path.with_suffix(".json"))
         sync_folder(path.parent)
+    return meta
+
+
+def _described(codes: Codes, method: Restorer) -> dict[str, Any]:
+    """Return what is known of a video before it is restored, and what must agree to resume it."""
+    meta: dict[str, Any] = {
+        "format": FORMAT,
+        "quiver": VERSION,
+        "method": method.name,
+        "description": method.description,
+        "identity": dict(method.identity) | {"cut": method.cut(*_at_a_time(codes))},
+        "unit": "photons",
+        "white": codes.white,
+        "shape": list(codes.video_shape),
+        "frame_rate": codes.frame_rate,
+        "exposure": codes.exposure,
+        "sensor": codes.sensor.to_dict(),
+        "source": codes.source,
+        "codes_sha256": codes.digest(),
+    }
+    if codes.colour is not None:
+        meta["colour"] = codes.colour.to_dict() | {"bands": "R, G, B", "by": "places of the mask, then demosaicing"}
     return meta
 
 
@@ -113,10 +125,16 @@ def _only_writer(path: Path) -> Iterator[None]:
         lock.delete()
 
 
-def _finish_naming(path: Path, part: Path, journal: Path) -> None:
-    """Rename the description if a writer was killed after it renamed the video."""
-    if path.exists() and not (part.exists() or path.with_suffix(".json").exists()) and _complete(journal):
-        os.replace(journal, path.with_suffix(".json"))
+def unnamed(path: Path) -> bool:
+    """Return whether a video lacks only the name of its description: its writer was killed between the two renames."""
+    path = path.resolve()
+    part, journal = _parts(path)
+    return path.exists() and not (part.exists() or path.with_suffix(".json").exists()) and _complete(journal)
+
+
+def _parts(path: Path) -> tuple[Path, Path]:
+    """Return the names of an unfinished video and of its journal."""
+    return path.with_name(path.name + ".part"), path.with_name(path.name + ".part.json")
 
 
 def _complete(journal: Path) -> bool:
@@ -172,7 +190,8 @@ def _fill_file(
         check_finite(block, method.name, first)
         out.flush()
         seconds += time.perf_counter() - started
-        write_json(journal, meta | {"done": first + len(block), "seconds": seconds, "threads": threads})
+        ran = {"done": first + len(block), "seconds": seconds, "threads": threads, "device": method.device}
+        write_json(journal, meta | ran)
     with open(part, "rb") as file:
         os.fsync(file.fileno())
     return seconds
@@ -205,7 +224,8 @@ def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, 
         return 0, 0.0, ""
     try:
         found = read_json(journal)
-        found.pop("threads", None)  # numbers agree to rounding for any number
+        for key in ("threads", "device"):  # numbers agree to rounding for any of them
+            found.pop(key, None)
         done, seconds = int(found.pop("done", 0)), float(found.pop("seconds", 0.0))
         for key in ("sha256", "checksum"):
             found.pop(key, None)

@@ -59,3 +59,14 @@ def test_the_peak_of_memory_grows_with_what_is_held(resets):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert float(done.stdout) > 0.9
+
+
+def test_errors_that_tell_of_exhausted_memory_are_known():
+    told = (
+        MemoryError(),
+        torch.OutOfMemoryError("no"),
+        RuntimeError("CUDA error: out of memory"),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:121] DefaultCPUAllocator: can't allocate memory"),
+    )
+    assert all(map(device.out_of_memory, told))
+    assert not any(map(device.out_of_memory, (RuntimeError("no road"), ValueError("out of memory"), OSError())))

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +13,14 @@ from clips import ClipMaker
 from methods import method
 from numpy import ndarray as Array
 
+from qsim.files import load_array
+from quiver.cli.evaluate import OURS
 from quiver.data.clips import truth
 from quiver.data.codes import Codes, sensed
 from quiver.data.illumination import Illumination
 from quiver.evaluation import breakdown, metrics, summary
 from quiver.evaluation.comparison import Comparison, evaluate
+from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer
 
 
@@ -71,9 +77,36 @@ def test_windows_with_a_factor_each_are_matched_by_their_own(make_clip: ClipMake
     assert sum(row.motion_pixels) == 4 * 36 * 44
     assert sum(row.motion_squares) / sum(row.motion_pixels) < 1e-10
     crop, whole = (
-        np.load(breakdown.crop_file(tmp_path / "t", row.light, clip.name, name)) for name in ("flicker", "truth")
+        np.load(breakdown.crop_file(tmp_path / "t", row.light, clip.name, name)) for name in (row.crop, "truth")
     )
     np.testing.assert_allclose(crop, whole, rtol=2e-3)
+
+
+def test_the_sheet_shows_the_crops_of_its_rows(make_clip: ClipMaker, tmp_path, monkeypatch):
+    """Other weights in the same folder have other crops, and a method that failed has none."""
+    clip, out, shown = make_clip(frames=3), tmp_path / "t", []
+    comparison = Comparison(str(clip.path), None)
+
+    def noise(seed: int) -> Restorer:
+        made = method("net", lambda codes: np.random.default_rng(seed).uniform(1, 9, codes.shape))
+        return replace(made, description=f"weights {seed}")
+
+    def load(path: Path) -> Array:
+        shown.append(path.name)
+        return load_array(path)
+
+    first, second = (evaluate(comparison, [noise(seed)], out)[0] for seed in (1, 2))
+    files = [breakdown.crop_file(out, row.light, clip.name, row.crop) for row in (first, second)]
+    assert not np.array_equal(*map(np.load, files))
+    monkeypatch.setattr(breakdown, "load_array", load)
+    resumed = evaluate(comparison, [noise(1)], out)
+    summary.write(out, comparison, [noise(1)], resumed)
+    assert files[0].name in shown
+    assert len(shown) == 3  # truth, codes, and the method
+    shown.clear()
+    summary.write(out, comparison, [noise(1)], [replace(first, failure="why", score=None)])
+    assert len(shown) == 2
+    assert all(re.fullmatch(OURS, str(path.relative_to(out))) for path in out.rglob("*") if path.is_file())
 
 
 def test_crops_show_where_most_moves(make_clip: ClipMaker, tmp_path):
@@ -88,5 +121,5 @@ def test_crops_show_where_most_moves(make_clip: ClipMaker, tmp_path):
     assert columns.stop >= 140
     still = make_clip("still", frames=3, height=120, width=40)
     assert breakdown.place(still, 1) == (slice(40, 80), slice(0, 40))
-    assert not breakdown.sheet(tmp_path, "3.25 PPP", [clip.name], ["moment"], tmp_path / "none.png")
+    assert not breakdown.sheet(tmp_path, "3.25 PPP", [clip.name], ["moment"], {}, tmp_path / "none.png")
     assert not (tmp_path / "none.png").exists()

@@ -22,7 +22,8 @@ from qsim.clip.writer import ClipWriter
 from quiver.data.clips import open_clips, truth
 from quiver.data.codes import Codes, sensed, stream_codes
 from quiver.data.illumination import Illumination
-from quiver.evaluation import summary
+from quiver.evaluation import comparison as comparison_module
+from quiver.evaluation import metrics, summary
 from quiver.evaluation.comparison import (
     Comparison,
     ComparisonRow,
@@ -402,4 +403,32 @@ def test_rows_survive_json(tmp_path):
     assert math.isnan(ComparisonRow.from_dict(json.loads((tmp_path / "rows").read_text())).seconds_per_frame)
 
 
-# Static real photons
+def test_infinite_scores_survive_json(tmp_path):
+    """An exact answer has an infinite PSNR. It was stored as null, and a resumed table had another mean."""
+    score = metrics.Score(math.inf, math.inf, 1.0, 1.0, 1.0, 0.0, frames=3, above_peak=0.0)
+    row = ComparisonRow("m", "d", "l", "c", "s", score, 0.1, 5, 8.0, truth_psnr=math.inf, motion_squares=(0.0, 1.0))
+    append(tmp_path / "rows", row)
+    append(tmp_path / "rows", replace(row, clip="low", score=replace(score, psnr=-math.inf)))
+    text = (tmp_path / "rows").read_text()
+    assert list(finished(text.splitlines())) == [row, replace(row, clip="low", score=replace(score, psnr=-math.inf))]
+    assert {"psnr": "inf", "psnr_matched": "inf"}.items() <= json.loads(text.splitlines()[0])["score"].items()
+
+
+def test_memory_is_that_of_the_device_of_the_method(make_clip: ClipMaker, monkeypatch):
+    kinds: list[str] = []
+
+    class Peak:
+        def __init__(self, kind: str) -> None:
+            kinds.append(kind)
+
+        def bytes(self) -> int:
+            return 1000 * len(kinds)
+
+    monkeypatch.setattr(comparison_module, "PeakMemory", Peak)
+    ones = method("ones", lambda codes: np.ones(codes.shape))
+    comparison = Comparison(str(make_clip(frames=3).path), None)
+    methods = [ones, replace(ones, name="on a GPU", learned=True, device="cuda")]
+    rows = evaluate(comparison, methods)
+    assert kinds == ["cpu", "cuda"]
+    assert [row.peak_bytes for row in rows] == [1000, 2000]
+    assert [one["device"] for one in summary.as_dict(comparison, methods, rows)["methods"]] == ["cpu", "cuda"]

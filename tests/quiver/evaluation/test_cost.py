@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import multiprocessing
 import time
@@ -10,8 +11,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from golden import SMALL
 
+from quiver.cli.program import main
 from quiver.evaluation import cost as costs
 from quiver.evaluation.cost import (
     CostCase,
@@ -19,6 +22,7 @@ from quiver.evaluation.cost import (
     CostSettings,
     cases_of,
     checked_cases,
+    device_of,
     fixed_clip,
     markdown,
     measure,
@@ -97,6 +101,17 @@ def test_a_long_part_is_run_once(together, long, runs, monkeypatch):
 def test_the_table_names_what_failed():
     bad = CostRow("mergenet", "exact", "float32", False, math.nan, 0, math.nan, math.nan, failure="out of memory")
     assert "| mergenet | exact | float32 | failed: out of memory" in markdown([bad], CostSettings())
+
+
+def test_a_bench_states_the_device_that_was_used(monkeypatch, capsys):
+    monkeypatch.setattr(costs, "bench", lambda cases, settings, progress: [])
+    assert main(["bench", "--methods", "moment", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["setting"]["device"] == "cpu"
+    for there, kind in ((True, "cuda"), (False, "cpu")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        assert device_of([CostCase("moment:3"), CostCase("unet")], None) == kind
+        assert device_of([CostCase("moment:3")], None) == "cpu"
+        assert device_of([CostCase("unet")], "cpu") == "cpu"
 
 
 class InThisProcess:

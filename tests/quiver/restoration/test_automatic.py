@@ -81,3 +81,13 @@ def test_other_commands_say_what_auto_is_for(capsys, tiny_dataset, tmp_path, mon
     np.save("c.npy", np.zeros((3, 16, 16), np.uint8))
     assert main(command.replace("D", str(tiny_dataset)).split()) == 2
     assert "`auto` chooses the method of one stream, for `quiver restore`" in capsys.readouterr().err
+
+
+def test_streams_with_one_best_method_share_it_and_others_are_named(measured):
+    names = {3.25: "day", 3.0: "dusk", 26.0: "noon"}
+    dim, dimmer, bright = (replace(stream(ppp), name=name) for ppp, name in names.items())
+    method, line = automatic.chosen_for_all("auto", [dim, dimmer])
+    assert (method.name, line) == ("mergenet", automatic.chosen("auto", dim)[1])
+    with pytest.raises(ValueError, match="different methods: mergenet for day, dusk; qbp for noon; name one of them"):
+        automatic.chosen_for_all("auto", [dim, bright, dimmer])
+    assert automatic.chosen_for_all("moment:3", [dim, bright])[0].name == "moment:3"

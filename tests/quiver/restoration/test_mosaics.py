@@ -107,7 +107,7 @@ def test_commands_restore_show_score_and_check(stream, tmp_path, capsys):
     row = json.loads((table / "rows.jsonl").read_text())
     assert row["failure"] is None
     assert row["score"]["psnr"] == pytest.approx(score.psnr, abs=1e-6)
-    assert np.load(next((table / "crops").glob("*moment.npy"))).shape[0] == 3
+    assert np.load(next((table / "crops").glob("*moment-*.npy"))).shape[0] == 3
 
 
 def test_small_frames_and_other_shapes_are_refused(tmp_path):
@@ -117,3 +117,27 @@ def test_small_frames_and_other_shapes_are_refused(tmp_path):
         quiver.restore(stream, "naive")
     with pytest.raises(ValueError, match=r"video has shape \[2, 3, 9\], stream \[2, 3, 3, 9\]"):
         quiver.score(np.ones((2, 3, 9)), stream)
+
+
+def test_raw_codes_of_a_sensor_with_filters_are_restored_in_colour(stream, tmp_path):
+    """A bare array, and the same codes imported: the sensor's file states the mask, and a map of dead pixels."""
+    text = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 5.0\nread_noise = 0.2\nbits = 3\n'
+    (tmp_path / "my.toml").write_text(f'{text}[defects]\ndead_map = "dead.npy"\n[colour]\nmask = "rggb"\n')
+    dead = np.zeros(stream.shape[1:], np.uint8)
+    dead[8, 10] = dead[3, 4] = 1
+    np.save(tmp_path / "dead.npy", dead)
+    np.save(tmp_path / "raw.npy", stream.codes(0, 12))
+    own = ["--sensor", str(tmp_path / "my.toml"), "--frame-rate", repr(1 / stream.exposure)]
+    words = ["convert", str(tmp_path / "raw.npy"), str(tmp_path / "imported"), *own, "--layout", "codes", "--bits", "3"]
+    assert qsim_main(words) == 0
+    expected = restorer("moment").restore(filled(stream_codes(stream), dead != 0))
+    for source, options in (("raw.npy", own), ("imported.npy", [])):
+        out = tmp_path / f"restored_{source}"
+        assert main(["restore", str(tmp_path / source), "-o", str(out), "--method", "moment", *options]) == 0
+        found = np.load(out)
+        assert found.shape == (12, 3, 17, 21)
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(quiver.restore(tmp_path / "imported.npy", "moment"), found)
+    (tmp_path / "dead.npy").unlink()
+    with pytest.warns(UserWarning, match=r"imported\.npy: its hot and dead pixels are not filled"):
+        quiver.restore(tmp_path / "imported.npy", "moment")

@@ -113,6 +113,7 @@ def test_the_stated_look_ahead_is_that_of_the_mode(mode, ahead):
         next(pictures(model, frames(), mode))
     assert method.look_ahead == read[-1] - 5 == ahead
     assert method.window == 5 + 1 + ahead
+    assert method.device == "cpu"
     assert method.seamless == (mode != "streaming")  # its state reaches back to the first frame
 
 

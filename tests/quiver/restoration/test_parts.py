@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from dataclasses import replace
 from typing import ClassVar
 
@@ -163,3 +164,20 @@ def test_presets_have_a_title(tmp_path):
     network = build("emvd")
     save(network, network.config, tmp_path / "w.safetensors")
     assert network_restorer(tmp_path / "w.safetensors", RestoreOptions()).description.startswith("EMVD (emvd), weights")
+
+
+def test_only_a_tile_of_a_part_becomes_float32():
+    """Frames of a part hold four times the bytes of their codes as float32; a tile is all that is needed at a time."""
+    network, codes = Means(), random_codes(24, 256, 256)
+    whole = restored(network, codes, None, 0, 1)
+    part = part_of(network)
+    method = wrap_network(network, "n", "", RestoreOptions(memory=40_000_000))
+    tracemalloc.start()
+    try:
+        with pytest.warns(UserWarning, match="cut into"):
+            tiled = method.restore(codes, 0, 1)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_allclose(tiled, whole, rtol=1e-5)
+    assert peak < 4 * (part.kept + part.after) * 256 * 256

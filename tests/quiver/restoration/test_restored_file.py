@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from forks import forked, killed_at
 from numpy import ndarray as Array
 
@@ -24,7 +25,7 @@ from quiver.data.illumination import Illumination
 from quiver.data.photon_cubes import cube_codes
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
-from quiver.restoration import restored_file
+from quiver.restoration import restored_file, restorers
 from quiver.restoration.interface import RestoreOptions, Restorer
 from quiver.restoration.restored_file import restore_to_file
 from quiver.restoration.restorers import restorer
@@ -170,6 +171,64 @@ def test_killed_anywhere_it_ends_whole(tmp_path, blocks_of_four, replaces):
         earlier()
         step += 1
     assert step > 15
+
+
+@pytest.mark.parametrize("said", ["CUDA out of memory. Tried to allocate 2 GiB.", "DefaultCPUAllocator: no memory"])
+def test_exhausted_memory_keeps_the_finished_blocks(tmp_path, blocks_of_four, monkeypatch, capsys, said):
+    """One sentence, exit code 2; the same call with less memory resumes after the blocks on the disk."""
+    source, target, starts = array_file(tmp_path), tmp_path / "r.npy", []
+    fill = restorers.fill_classical
+
+    def exhausted(*given: object) -> None:
+        if given[4]:
+            raise torch.OutOfMemoryError(said) if "CUDA" in said else RuntimeError(said)
+        fill(*given)
+
+    def counted(*given: object) -> None:
+        starts.append(given[4])
+        fill(*given)
+
+    monkeypatch.setattr(restorers, "fill_classical", exhausted)
+    words = restore_words(source, target, "moment")
+    assert main(words) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert f"memory is exhausted ({said}); give a smaller --memory; the finished frames are kept" in told
+    monkeypatch.setattr(restorers, "fill_classical", counted)
+    assert main([*words, "--memory", "1GB"]) == 0
+    assert starts == [4, 8]
+    assert sorted(os.listdir(tmp_path)) == ["codes.npy", "r.json", "r.npy"]
+
+
+def test_exhausted_memory_in_the_first_block_leaves_nothing(tmp_path):
+    def fill(*given: object) -> None:
+        raise MemoryError
+
+    with pytest.raises(MemoryError):
+        restore_to_file(random_codes(), replace(restorer("moment"), fill=fill), tmp_path / "r.npy")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_device_is_stated_and_may_change(tmp_path, blocks_of_four):
+    codes, moment = random_codes(), restorer("moment")
+    interrupted(codes, moment, tmp_path / "r.npy")
+    assert json.loads((tmp_path / "r.npy.part.json").read_text())["device"] == "cpu"
+    assert resumed(codes, replace(moment, device="cuda"), tmp_path / "r.npy") == ([4, 8], [])
+    assert json.loads((tmp_path / "r.json").read_text())["device"] == "cuda"
+
+
+def test_a_writer_killed_between_the_two_renames_is_finished_by_the_same_command(tmp_path, monkeypatch, capsys):
+    source, target = array_file(tmp_path), tmp_path / "r.npy"
+    words = restore_words(source, target, "moment")
+    assert main(words) == 0
+    held = (tmp_path / "r.json").read_bytes()
+    monkeypatch.setattr(restorers, "fill_classical", None)  # nothing is restored again
+    for again, code in ((words, 0), (restore_words(source, target, "naive"), 2)):
+        (tmp_path / "r.json").rename(tmp_path / "r.npy.part.json")
+        assert main(again) == code
+        assert sorted(os.listdir(tmp_path)) == ["codes.npy", "r.json", "r.npy"]
+        assert (tmp_path / "r.json").read_bytes() == held
+    assert "r.npy: exists; name another with -o, or use --force" in capsys.readouterr().err
 
 
 # One writer

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,9 @@ from PIL import Image
 
 from quiver.cli.program import main
 from quiver.data.challenge import cubes
+from quiver.data.codes import Codes
+from quiver.restoration import automatic, domain_remarks
+from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer
 from quiver.restoration.submission import picture_psnr, restore_cubes, restore_last
 
@@ -116,3 +120,24 @@ class Idle:
     """A method that is never asked."""
 
     name = "idle"
+
+
+def test_every_band_of_every_cube_decides(tmp_path, monkeypatch, capsys):
+    """`auto`, and --strict with the remark on the last band of the last cube."""
+    source, seen = static_cubes(tmp_path / "cubes", planes=21), []
+    words = ["restore", str(source), "-o", str(tmp_path / "a.zip"), "--planes", "7"]
+
+    def chosen(name: str, streams: Iterable[Codes], options: object) -> tuple[Restorer, None]:
+        seen.extend(codes.name for codes in streams)
+        return restorer("naive"), None
+
+    def remark(name: str, scope: object, codes: Codes) -> str | None:
+        return "never measured so" if codes.name == "night/000007 blue" else None
+
+    with monkeypatch.context() as patched:
+        patched.setattr(automatic, "chosen_for_all", chosen)
+        assert main(words) == 0
+    assert seen == [f"{scene}/000007 {colour}" for scene in ("day", "night") for colour in ("red", "green", "blue")]
+    monkeypatch.setattr(domain_remarks, "remark", remark)
+    assert main([*words, "--force", "--method", "mergenet", "--strict"]) == 2
+    assert "never measured so; leave out --strict" in capsys.readouterr().err
