@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks
-from qsim.cli.console import note, output
+from qsim.cli.console import failed, note, output
 from qsim.cli.options import check_free, checked, count, nonnegative, positive
 from qsim.files import sha256
 from quiver.cli.options import (
@@ -64,7 +64,7 @@ def add_train(sub: Any) -> None:
     parser.add_argument(
         "--frames",
         type=count,
-        help="frames of a training window (default: the protocol's, mostly 11; 16: six restored)",
+        help="frames of a training window (default: the protocol's, mostly 11; of 16, QUIVER restores six)",
     )
     parser.add_argument("--batch", type=count, help="windows per step and process")
     parser.add_argument("--optimiser", choices=("adam", "muon"), help="optimiser (default: the protocol's)")
@@ -95,7 +95,7 @@ def _run_train(args: argparse.Namespace) -> int:
     import torch
 
     from quiver import threads
-    from quiver.data.clips import open_clips
+    from quiver.data.clips import split_clips
     from quiver.device import pick_device
     from quiver.restoration.restorers import weights_path
     from quiver.training.loop import Diverged, train
@@ -110,7 +110,7 @@ def _run_train(args: argparse.Namespace) -> int:
     if args.validate_every is not None and settings.steps is None:
         raise ValueError("--validate-every: counts steps of a run with --steps; a run that --minutes ends is validated "
                          "after every tenth of its time; leave it out")  # fmt: skip
-    if args.validation_split is not None and not open_clips(settings.data, args.validation_split):
+    if args.validation_split is not None and not split_clips(settings.data, args.validation_split)[1]:
         raise ValueError(
             f"--validation-split {args.validation_split}: {', '.join(settings.folders)} has no clip in that split; "
             "leave it out, and without clips in `val` training clips serve"
@@ -131,8 +131,7 @@ def _run_train(args: argparse.Namespace) -> int:
                 note=note,
             )
     except Diverged as error:
-        print(f"quiver: {error}", file=sys.stderr)
-        return DIVERGED
+        return failed(f"quiver: {error}", DIVERGED, args.json and leads)
     if leads:
         draw_curve(folder, state.history)
         output(args, *_summary(folder, state))
@@ -255,6 +254,7 @@ def _run_ablate(args: argparse.Namespace) -> int:
     from quiver.evaluation.comparison import Comparison
     from quiver.model.presets import ABLATIONS
     from quiver.training.ablation import markdown, one_noise, run_ablation
+    from quiver.training.loop import Diverged
 
     check_free(Path(args.output))
     args.precision, precision = None, args.precision  # for restoring; training has another default
@@ -266,12 +266,14 @@ def _run_ablate(args: argparse.Namespace) -> int:
     for line in lines:
         note(line)
     comparison = Comparison(args.data, args.split, tuple(noise.simple for noise in settings.noise or ()), settings.seed)
-    with _signals() as interrupted:
-        options, show = running_options(args), not (args.json or args.quiet)
-        found = run_ablation(settings, comparison, options, should_stop=lambda: bool(interrupted), progress=show)
+    try:
+        with _signals() as interrupted:
+            options, show = running_options(args), not (args.json or args.quiet)
+            found = run_ablation(settings, comparison, options, should_stop=lambda: bool(interrupted), progress=show)
+    except Diverged as error:
+        return failed(f"quiver: {error}", DIVERGED, args.json)
     if found is None:
-        print("quiver: interrupted; the same command resumes where it stopped", file=sys.stderr)
-        return 130
+        return failed("quiver: interrupted; the same command resumes where it stopped", 130, args.json)
     methods, rows = found
     summary.write(Path(args.output) / "table", comparison, methods, rows)
     output(args, summary.as_dict(comparison, methods, rows), markdown(args.preset, rows))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +11,21 @@ from numpy import ndarray as Array
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
 from qsim.dataset.dataset import Dataset
+from qsim.files import sha256, to_json
 from qsim.optics.radiometry import WHITE_PER_MEAN
 
-__all__ = ["Clip", "has_sharp", "known", "mean_light", "open_clips", "peak_of", "truth"]
+__all__ = [
+    "Clip",
+    "clips_digest",
+    "has_sharp",
+    "known",
+    "mean_light",
+    "open_clips",
+    "peak_of",
+    "split_clips",
+    "truth",
+    "unfinished",
+]
 
 
 def open_clips(path: Path | str | Iterable[Path | str], split: str | None = None) -> list[Clip]:
@@ -31,6 +43,32 @@ def open_clips(path: Path | str | Iterable[Path | str], split: str | None = None
     if not made or (path / "dataset.json").exists():
         return Dataset.open(path).clips(split)
     return [clip for clip in map(Clip.open, made) if split in (None, clip.meta.get("split"))]
+
+
+def split_clips(path: Path | str | Iterable[Path | str], validation: str) -> tuple[list[Clip], list[Clip]]:
+    """Return the clips to train on, and those of the validation split that are not among them.
+
+    A clip folder is in every split, so it trains. The split `train` validates on the training clips.
+    """
+    training, validating = open_clips(path, "train"), open_clips(path, validation)
+    trained = {clip.path.resolve() for clip in training} if validation != "train" else set()
+    return training, [clip for clip in validating if clip.path.resolve() not in trained]
+
+
+def clips_digest(*groups: Sequence[Clip]) -> str:
+    """Return the SHA-256 of the names of clips and of the checksums of their files; their folders do not count."""
+    return sha256(to_json([[(clip.name, clip.meta["checksums"]) for clip in group] for group in groups]))
+
+
+def unfinished(folders: Iterable[str]) -> list[str]:
+    """Return a line for each data set of which clips are missing."""
+    missing = {path: len(Dataset.open(path).missing) for path in folders if (Path(path) / "dataset.json").exists()}
+    return [
+        f"{path}: the data set lacks {count} of its clips; a run resumes only with the clips that it began with, so "
+        "finish `qsim generate` first"
+        for path, count in missing.items()
+        if count
+    ]
 
 
 def has_sharp(clip: Clip) -> bool:

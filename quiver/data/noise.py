@@ -47,6 +47,8 @@ class Noise(Illumination):
         if not light.sensor.endswith(".toml"):
             return cls(light.sensor, light.ppp, light.bits)
         sensor, found = read_sensor(light.sensor, light.bits)
+        if colour_filter.from_toml(light.sensor) is not None:
+            raise ValueError(f"{light.sensor}: training windows have one band; leave its table [colour] out")
         return cls(
             light.sensor,
             light.ppp,

@@ -16,11 +16,14 @@ from qsim.clip.clip import Clip
 from qsim.keys import Key
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
+from qsim.sensor.spike import SpikeCamera
 from quiver.data.codes import Codes, open_stream, stream_codes
 from quiver.data.window_noise import WindowPlace
 from quiver.data.windows import WindowSettings, as_input, turned
 
 COUNTING = (0.9, 1.25)  # codes per electron at which codes of a QIS are photon counts, nearly
+BLACK = 0.1  # codes: the largest offset of such a QIS
+BLUR = 0.3  # e- rms: its largest read noise, with which nine codes in ten are the electrons
 
 
 @dataclass(frozen=True)
@@ -34,16 +37,37 @@ class Law:
 def law_of(codes: Codes) -> Law:
     """Return the law of a stream: sums of planes of a clocked SPAD array, else photon counts.
 
-    `ValueError` for a QIS whose codes are no counts: a photon cannot be taken from them.
+    `ValueError` for a stream whose codes are neither: a photon cannot be taken from them.
     """
     sensor, exposure = codes.sensor, codes.exposure
-    if isinstance(sensor, QIS) and not COUNTING[0] <= sensor.gain <= COUNTING[1]:
+    reason = _no_counts(codes)
+    if reason is not None:
         raise ValueError(
-            f"{codes.name}: its codes are {sensor.gain:.3g} per electron and no photon counts, which bit2bit needs; "
-            "give a stream of about one code per electron, or of summed planes"
+            f"{codes.name}: {reason} and no photon counts of one kind, which bit2bit needs; give a stream of summed "
+            "planes, or of about one code per electron with little read noise and no offset"
         )
     dark = sensor.dark_rate * exposure / (sensor.efficiency * sensor.white(exposure))
     return Law(isinstance(sensor, BinarySPAD), float(dark))
+
+
+def _no_counts(codes: Codes) -> str | None:
+    """Return what the codes of a stream are instead of photon counts of one kind; None if they are such."""
+    sensor = codes.sensor
+    if codes.colour is not None:
+        return "its codes are those of colour filters"
+    if codes.shares is not None:
+        return "its codes are those of different exposures"
+    if isinstance(sensor, SpikeCamera):
+        return "its codes are spikes of collected charge"
+    if not isinstance(sensor, QIS):
+        return None
+    if not COUNTING[0] <= sensor.gain <= COUNTING[1]:
+        return f"its codes are {sensor.gain:.3g} per electron"
+    if abs(sensor.offset) > BLACK:
+        return f"its codes are shifted by an offset of {sensor.offset:.3g}"
+    if sensor.read_noise > BLUR:
+        return f"its codes are blurred by a read noise of {sensor.read_noise:.3g} electrons"
+    return None
 
 
 def stream_at(path: Path) -> Codes:
@@ -64,7 +88,7 @@ class StreamWindows(Dataset[dict[str, Any]]):
     """Windows of a stream: a `torch` data set.
 
     An item holds codes float32 [T, 1, h, w] in [0, 1], sample (its number) and key (a text with its place).
-    `ValueError` for a stream that is shorter or smaller than a window.
+    `ValueError` for a stream that is shorter or smaller than a window, or whose codes are no photon counts.
     """
 
     def __init__(self, codes: Codes, settings: WindowSettings) -> None:
@@ -74,7 +98,12 @@ class StreamWindows(Dataset[dict[str, Any]]):
                 f"{codes.name} is {length} x {height} x {width}; a window needs {settings.frames} frames of "
                 f"{settings.crop} x {settings.crop} px; choose a smaller --crop or fewer --frames"
             )
+        law_of(codes)
         self.codes, self.settings = codes, settings
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how a worker makes the same windows: it opens the stored stream again."""
+        return _opened, (self.codes.source, self.settings)
 
     def __len__(self) -> int:
         """Return how many windows hold as many codes as the stream; numbers beyond are windows, too."""
@@ -94,3 +123,8 @@ class StreamWindows(Dataset[dict[str, Any]]):
         part = self.codes.read(start, start + settings.frames)[:, y : y + settings.crop, x : x + settings.crop]
         key = f"{self.codes.name} frame {start}, (y, x) ({y}, {x}), turn {turn}"
         return {"codes": as_input(turned(part, place), self.codes.sensor), "sample": n, "key": key}
+
+
+def _opened(path: str, settings: WindowSettings) -> StreamWindows:
+    """Return the windows of a stored stream."""
+    return StreamWindows(stream_at(Path(path)), settings)

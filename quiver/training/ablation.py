@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 from qsim.tables import markdown_table
+from quiver.data.clips import unfinished
 from quiver.device import pick_device
 from quiver.evaluation.comparison import Comparison, ComparisonRow, evaluate
 from quiver.model.config import Config
@@ -34,12 +35,12 @@ def networks(preset: str) -> dict[str, Config]:
 
 
 def one_noise(settings: Settings) -> tuple[Settings, list[str]]:
-    """Return the settings with the noise of all six networks, and lines about it.
+    """Return the settings with the noise of all six networks, and lines about it and about missing clips.
 
     If the first network has been begun, its noise is kept. ValueError as in `settled`.
     """
     found, lines = settled(replace(settings, out=str(Path(settings.out) / next(iter(ABLATIONS)))))
-    return replace(settings, noise=found.noise), lines
+    return replace(settings, noise=found.noise), lines + unfinished(settings.folders)
 
 
 def run_ablation(

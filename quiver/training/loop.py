@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -25,13 +24,14 @@ from torch.utils.data import DataLoader, Subset, default_collate
 from tqdm import tqdm
 
 from quiver import threads
-from quiver.data.clips import open_clips
+from quiver.data.clips import clips_digest, split_clips, unfinished
 from quiver.data.stream_windows import StreamWindows
 from quiver.data.windows import Batches, Windows, WindowSettings
-from quiver.device import device_of_process, group_backend, is_gpu, moved
+from quiver.device import is_gpu, moved
 from quiver.evaluation import metrics
 from quiver.model.removed import refuse_run
 from quiver.training.optimiser import Optimiser
+from quiver.training.processes import Process, begin_worker, joined, plain_errors
 from quiver.training.run_folder import Run
 from quiver.training.schedule import State, learning_rate, note_plateau, share_used, time_is_up, validation_due
 from quiver.training.self_supervised import make_stream_windows
@@ -47,52 +47,6 @@ VALIDATION_SIDE = 128  # px, of the validation windows at most
 
 class Diverged(RuntimeError):
     """The loss or a gradient is NaN or Inf; the message names the step, the samples and the saved state."""
-
-
-@dataclass(frozen=True)
-class Process:
-    """Rank and device of this process among those of torchrun."""
-
-    rank: int
-    world: int
-    device: torch.device
-
-    @property
-    def leads(self) -> bool:
-        """Return whether this process writes files and shows progress."""
-        return self.rank == 0
-
-    def wait(self) -> None:
-        """Wait for all processes."""
-        if self.world > 1:
-            torch.distributed.barrier()
-
-    def from_leader(self, number: float) -> float:
-        """Return the leader's number in every process."""
-        value = torch.tensor(number, dtype=torch.float64, device=self.device)
-        if self.world > 1:
-            torch.distributed.broadcast(value, 0)
-        return float(value)
-
-    def any(self, condition: bool) -> bool:
-        """Return in every process whether the condition holds in any of them."""
-        flag = torch.tensor(float(condition), device=self.device)
-        if self.world > 1:
-            torch.distributed.all_reduce(flag, torch.distributed.ReduceOp.MAX)
-        return bool(flag)
-
-
-@contextlib.contextmanager
-def joined(device: str) -> Iterator[Process]:
-    """Join the process group if torchrun started this process, and leave it at the end."""
-    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
-    if world > 1:
-        torch.distributed.init_process_group(group_backend(device))
-    try:
-        yield Process(rank, world, device_of_process(device))
-    finally:
-        if world > 1:
-            torch.distributed.destroy_process_group()
 
 
 def make_windows(
@@ -113,10 +67,10 @@ def make_windows(
         still=system.still,
         seed=settings.seed,
     )
-    training, split = open_clips(settings.data, "train"), settings.validation_split
-    windows, validation = Windows(training, window, prepare=system.prepare), open_clips(settings.data, split)
+    training, validation = split_clips(settings.data, settings.validation_split)
+    windows = Windows(training, window, prepare=system.prepare)
     if not validation:
-        names = ", ".join(settings.folders)
+        names, split = ", ".join(settings.folders), settings.validation_split
         warnings.warn(f"{names}: no clip in split '{split}'; validating on training clips", stacklevel=2)
         validation = training
     side = min(VALIDATION_SIDE, *(min(clip.shape[1:]) for clip in validation)) // multiple * multiple
@@ -126,7 +80,7 @@ def make_windows(
 
 
 def batches(windows: AnyWindows, settings: Settings, state: State, process: Process) -> Iterator[dict[str, Any]]:
-    """Return the batches from the current step on; workers draw the same bytes as this process."""
+    """Yield the batches from the current step on; workers draw the same bytes as this process."""
     last = state.step if state.finished else settings.steps or FOREVER
     numbers = Batches(settings.batch, state.step, last, process.rank, process.world)
     loader = DataLoader(
@@ -134,10 +88,27 @@ def batches(windows: AnyWindows, settings: Settings, state: State, process: Proc
         batch_sampler=numbers,
         num_workers=settings.workers,
         multiprocessing_context="spawn" if settings.workers else None,
+        worker_init_fn=begin_worker,
         generator=torch.Generator(),  # separate: the loader must not change the global random state
         pin_memory=is_gpu(process.device),
     )
-    return iter(loader)
+    with plain_errors():
+        yield from loader
+
+
+def precision_of(settings: Settings, device: torch.device) -> str:
+    """Return float32 or bfloat16: what the settings stand for on a device."""
+    automatic = "bfloat16" if is_gpu(device) else "float32"
+    return automatic if settings.precision == "auto" else settings.precision
+
+
+def source_digest(windows: AnyWindows, fixed: Subset[dict[str, Any]] | None) -> str:
+    """Return the SHA-256 of the stream that a run learns from, or of its clips to train and to validate on."""
+    if isinstance(windows, StreamWindows):
+        return windows.codes.digest()
+    assert fixed is not None
+    assert isinstance(fixed.dataset, Windows)
+    return clips_digest(windows.clips, fixed.dataset.clips)
 
 
 def on_device(batch: Batch, device: torch.device) -> Batch:
@@ -207,14 +178,14 @@ class Trainer:
         self.system = system
         self.model, self.run, self.fixed, self.process = model.to(process.device).train(), run, fixed, process
         self.optimiser = Optimiser(model, settings.optimiser, settings.learning_rate, settings.betas)
-        self.state = run.load(model, self.optimiser, process.device)
+        self.state = run.load(model, self.optimiser)
         objective = Objective(model, system.loss, settings)
         self.parallel = (
             nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
             if process.world > 1
             else objective
         )
-        self.low = settings.precision == "bfloat16" or (settings.precision == "auto" and is_gpu(process.device))
+        self.low = precision_of(settings, process.device) == "bfloat16"
         self.board: Board | None = None
         self.started, self.saved = time.monotonic() - self.state.elapsed, time.monotonic()
         self.loss, self.rate = math.nan, math.nan  # of the last step
@@ -298,8 +269,8 @@ def train(
     """Train `model` in place to the end that the settings define, or until `should_stop`; return its state.
 
     A run in `settings.out` is resumed; `force` starts it again from the beginning. `note` receives lines about the
-    noise of the windows. ValueError and OSError for settings and folders that do not fit, `Diverged` for NaN or Inf.
-    The call sets torch's number of threads, and makes denormal numbers zero in this process.
+    noise of the windows and about missing clips. ValueError and OSError for settings and folders that do not fit,
+    `Diverged` for NaN or Inf. The call sets torch's number of threads, and makes denormal numbers zero in this process.
     """
     torch.set_flush_denormal(True)  # gradients in the tails of GELU are denormal and slow down a step
     with joined(device) as process, contextlib.ExitStack() as stack:
@@ -316,7 +287,9 @@ def train(
             settings, lines = settled(settings, force=force)
             settings = replace(settings, threads=threads.use(asked, settings.threads).number)
             windows, fixed = make_windows(settings, system.side(model), system, system.window(model))
-        run = Run(settings)
+            lines += unfinished(settings.folders)
+        conditions = {"processes": process.world, "computes_in": precision_of(settings, process.device)}
+        run = Run(settings, conditions | {"clips": source_digest(windows, fixed)})
         if process.leads:
             stack.enter_context(run.open(force=force))
         process.wait()

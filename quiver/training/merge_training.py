@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from quiver.data.codes import Codes
+from quiver.model.blocks import WINDOW
 from quiver.restoration.merge_inputs import middle_inputs
 from quiver.training.settings import Settings
 from quiver.training.system import Batch
@@ -37,6 +38,12 @@ PROTOCOLS: Mapping[str, Mapping[str, Any]] = {
         "loss": "own",
     }
 }
+
+
+def check(network: nn.Module, settings: Settings) -> None:
+    """Raise `ValueError` unless windows have the frames that a restored frame is merged from."""
+    if settings.frames != WINDOW:
+        raise ValueError(f"--frames {settings.frames}: mergenet restores from {WINDOW} frames; leave --frames out")
 
 
 def prepare(codes: Codes) -> dict[str, Tensor]:

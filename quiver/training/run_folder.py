@@ -35,6 +35,11 @@ OURS = (  # files that a run writes
     r"events\.out\.tfevents\..*"
 )
 LOCK = "lock"  # held by the process that works in the folder
+CONDITIONS = {  # of a run, beside its settings: what a folder holds if one of them differs
+    "processes": "holds a run whose number of processes is {}, now it is {}",
+    "computes_in": "holds a run that computes in {}, now it would compute in {}",
+    "clips": "holds a run on other clips or codes than are there now",
+}
 
 
 def _load_weights(model: nn.Module, stored: Any) -> None:
@@ -75,10 +80,10 @@ def empty(folder: Path) -> None:
 
 
 class Run:
-    """Folder of a run."""
+    """Folder of a run. `conditions` are values by the keys of CONDITIONS, stored beside the settings."""
 
-    def __init__(self, settings: Settings) -> None:
-        self.settings, self.folder = settings, Path(settings.out)
+    def __init__(self, settings: Settings, conditions: Mapping[str, Any] | None = None) -> None:
+        self.settings, self.folder, self.conditions = settings, Path(settings.out), dict(conditions or {})
         self.checkpoint = self.folder / "checkpoint.pt"
 
     @contextlib.contextmanager
@@ -97,7 +102,7 @@ class Run:
                 empty(self.folder)
             path = self.folder / "settings.json"
             if not path.exists():
-                write_json(path, self.settings.to_dict())
+                write_json(path, self.settings.to_dict() | self.conditions)
             self._check_settings()
             found = read_json(path)
             if found.get("threads") != self.settings.threads:
@@ -123,6 +128,13 @@ class Run:
                     f"{self.folder} holds a run with {name} {before}, now it is {short(wanted[name])}; choose "
                     "another -o, or start again with --force"
                 )
+        for name, value in self.conditions.items():
+            before = found.get(name, value)  # earlier versions wrote none
+            if before != value:
+                raise FileExistsError(
+                    f"{self.folder} {CONDITIONS[name].format(short(before), short(value))}; resume it as it began, "
+                    "choose another -o, or start again with --force"
+                )
 
     def save(self, path: Path, model: nn.Module, optimiser: Optimiser, state: State, **extra: Any) -> None:
         """Write the complete state of the run to one file."""
@@ -138,12 +150,12 @@ class Run:
         torch.save(content, buffer)
         write_bytes(path, buffer.getbuffer())
 
-    def load(self, model: nn.Module, optimiser: Optimiser, device: torch.device) -> State:
+    def load(self, model: nn.Module, optimiser: Optimiser) -> State:
         """Load the newest state into model and optimiser; a new state if there is none, ValueError if it is damaged."""
         if not self.checkpoint.exists():
             return State()
         try:
-            content = weights.read_torch(self.checkpoint, device)
+            content = weights.read_torch(self.checkpoint)  # on the CPU, where Adam counts its steps
             if not isinstance(content, dict):
                 raise ValueError(f"it holds a {type(content).__name__}")
             state = State.from_dict(content["state"])

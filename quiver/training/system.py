@@ -65,6 +65,8 @@ class System:
             raise ValueError(
                 f"--loss {settings.loss}: {self.name} is trained with {' or '.join(self.losses)}; leave --loss out"
             )
+        if self.of_stream and settings.schedule == "plateau":
+            raise ValueError(f"--schedule plateau: follows validations, and {self.name} has none; leave it out")
         self.check(network, settings)
 
 

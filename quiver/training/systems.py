@@ -81,7 +81,10 @@ OURS = System("quiver", quiver_loss, quiver_restored, PROTOCOLS, losses=tuple(LO
 
 SYSTEMS: dict[type[nn.Module], System] = {
     MergeNet: System(
-        *("mergenet", merging.loss, merging.restored, merging.PROTOCOLS), multiple=8, prepare=merging.prepare
+        *("mergenet", merging.loss, merging.restored, merging.PROTOCOLS),
+        multiple=8,
+        prepare=merging.prepare,
+        check=merging.check,
     ),
     UNet: replace(OURS, name="unet", loss=unet_loss, restored=rivals.windows_restored),
     EMVD: System(
@@ -111,7 +114,7 @@ SYSTEMS: dict[type[nn.Module], System] = {
     ),
     Bit2Bit: System(
         *("bit2bit", split_loss, rivals.every_frame),
-        {name: _STREAM | sizes for name, sizes in {"quick": {"crop": 64}, "published": {"crop": 256}}.items()},
+        {"quick": _STREAM | {"crop": 64}, "published": _STREAM | {"crop": 256, "precision": "float32"}},
         frames=1,
         of_stream=True,
     ),

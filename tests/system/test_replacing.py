@@ -177,6 +177,7 @@ def test_a_clip_with_a_file_of_yours_is_not_replaced(tmp_path: Path, stranger: s
     assert not Clip.open(clip.path).streams
 
 
+@pytest.mark.filterwarnings("ignore:.*validating on training clips")
 def test_training_and_evaluation_replace_only_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     write_clip(tmp_path / "clip", frames=14, height=36, width=44)
     for command, mark in ((f"train {tmp_path / 'clip'} --steps 1 --crop 32", "settings.json"),

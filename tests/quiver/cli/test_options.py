@@ -532,7 +532,7 @@ def scale() -> Iterator[None]:
         see("workers", num_workers)
         return loader(windows, **named | {"multiprocessing_context": None})
 
-    number = torch.get_num_threads()
+    number, ablations = torch.get_num_threads(), dict(ABLATIONS)
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "quiver-s", TINY)
@@ -549,6 +549,8 @@ def scale() -> Iterator[None]:
         patch.setattr(threads, "cores", lambda: 4)
         patch.setattr(torch, "set_num_threads", lambda number: see("threads", number))  # two on busy cores are slow
         yield
+    ABLATIONS.clear()  # what is deleted comes back at the end, and tables follow the order
+    ABLATIONS.update(ablations)
     threads.measured.cache_clear()
     torch.set_num_threads(number)
 

@@ -118,6 +118,26 @@ def test_a_sensor_file_is_ablated_with_its_bits(tiny_dataset, tmp_path, monkeypa
     assert [noise.bits for noise in asked[0]] == [1]
 
 
+STOPS = {
+    3: "quiver: step 2: loss nan; lower the learning rate",
+    130: "quiver: interrupted; the same command resumes where it stopped",
+}
+
+
+@pytest.mark.parametrize(("command", "code"), [("train", 3), ("ablate", 3), ("ablate", 130)])
+def test_a_run_that_fails_is_told_in_json(capsys, tiny_dataset, tmp_path, monkeypatch, command, code):
+    def ends(*_: object, **__: object) -> None:
+        if code == 3:
+            raise loop.Diverged(STOPS[3].removeprefix("quiver: "))
+
+    monkeypatch.setattr(loop, "train", ends)
+    monkeypatch.setattr(ablation, "run_ablation", ends)
+    assert main([command, str(tiny_dataset), "-o", str(tmp_path / "r"), "--steps", "1", "--json", "-q"]) == code
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {"error": STOPS[code], "exit_code": code}
+    assert err == f"{STOPS[code]}\n"
+
+
 def test_a_sensor_file_is_measured_with_its_bits(capsys, make_clip: ClipMaker, tmp_path, monkeypatch):
     """Its cell is found again, so that the same command measures nothing."""
     words = ["domain", weights(tmp_path), make_clip().path, "--sensor", f"{one_bit_file(tmp_path)},quiver-physical"]

@@ -48,6 +48,13 @@ def test_lights_of_one_label_get_names_that_tell_them_apart():
     assert labels(()) == {}
 
 
+def test_a_sensor_file_with_colour_filters_is_refused(tmp_path):
+    """Training windows have one band, and their sensor is recorded without filters."""
+    file = sensor_file(tmp_path, QIS.removesuffix("[defects]\n") + '[colour]\nmask = "rggb"\n', 3)
+    with pytest.raises(ValueError, match=r"mine\.toml: training windows have one band; leave its table \[colour\] out"):
+        Noise.of(Illumination(file, 3.0, 3))
+
+
 # From streams and options to a mixture
 
 

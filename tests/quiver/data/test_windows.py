@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from clips import ClipMaker, sliding_pattern
+from sensor_files import QIS, sensor_file
 from stats import assert_mean
 from torch.utils.data import DataLoader
 
@@ -151,6 +152,15 @@ def test_light_levels_are_mixed_and_named(make_clip: ClipMaker):
     n = next(n for n in range(40) if data.place(n).light == 2)
     assert set(torch.unique(data[n]["codes"]).tolist()) <= {0.0, 1.0}
     assert "3.25 PPP, 1 bit" in data[n]["key"]
+
+
+def test_a_sensor_file_is_not_needed_after_sensing(make_clip: ClipMaker, tmp_path):
+    """Its stream holds all that windows are drawn from."""
+    clip, file = make_clip(), Path(sensor_file(tmp_path, QIS + "prnu = 0.02\n", 3))
+    clip.sense(file, ppp=3.0)
+    expected = Windows([clip], WindowSettings(crop=16))[0]
+    file.unlink()
+    assert same(Windows([clip], WindowSettings(crop=16))[0], expected)
 
 
 def test_published_windows_have_their_own_exposure(make_clip: ClipMaker):

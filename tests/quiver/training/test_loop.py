@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import math
 import os
+import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
-from clips import write_dataset
+from clips import write_clip, write_dataset
 from golden import TINY
 from runs import same_weights, settings, small_network
 from torch import Tensor, nn
@@ -25,7 +28,8 @@ from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNetConfig
 from quiver.model.weights import load
 from quiver.training import loop as training
-from quiver.training.loop import Diverged, Process, Trainer, make_windows, train
+from quiver.training.loop import Diverged, Trainer, make_windows, train
+from quiver.training.processes import Process, begin_worker
 from quiver.training.run_folder import Run
 from quiver.training.schedule import State, learning_rate
 from quiver.training.settings import settled
@@ -96,6 +100,45 @@ def test_workers_do_not_change_the_run(tiny_dataset, tmp_path):
     train(alone, settings(tiny_dataset, tmp_path / "a", steps=2), progress=False)
     train(helped, settings(tiny_dataset, tmp_path / "b", steps=2, workers=1), progress=False)
     assert same_weights(alone, helped)
+
+
+def test_batches_know_their_workers(tiny_dataset, tmp_path, monkeypatch):
+    """Workers leave Ctrl-C to this process, and the error of one is its own sentence."""
+    asked: list[object] = []
+
+    def loader(windows: object, **named: object) -> object:
+        asked.append(named["worker_init_fn"])
+        yield {}
+        text = "Caught ValueError in DataLoader worker process 0.\nOriginal Traceback (most recent call last):\n  File"
+        raise ValueError(f"{text}\nValueError: clip a: frame 3 is damaged\n")
+
+    monkeypatch.setattr(training, "DataLoader", loader)
+    run, alone = settings(tiny_dataset, tmp_path / "r", workers=1), Process(0, 1, torch.device("cpu"))
+    found = training.batches(None, run, State(), alone)  # type: ignore[arg-type]
+    assert next(found) == {}
+    with pytest.raises(ValueError, match=r"^clip a: frame 3 is damaged$"):
+        next(found)
+    assert asked == [begin_worker]
+
+
+@pytest.mark.slow
+def test_ctrl_c_reaches_all_processes_and_the_state_is_saved(tiny_dataset, tmp_path):
+    """A terminal sends it to the workers too."""
+    words = ["-m", "quiver", "train", str(tiny_dataset), "-o", str(tmp_path / "r"), "--preset", "unet", "--steps"]
+    words += ["100000", "--crop", "16", "--batch", "1", "--validate-every", "3", "--workers", "1", "--threads", "1"]
+    with subprocess.Popen(
+        [sys.executable, *words, "-q"], cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        end = time.monotonic() + 120
+        while not (tmp_path / "r/history.json").exists() and process.poll() is None and time.monotonic() < end:
+            time.sleep(0.2)
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=120)
+    assert (process.returncode, said.splitlines()) == (
+        130,
+        ["quiver: interrupted; the same command resumes where it stopped"],
+    )
+    assert torch.load(tmp_path / "r/checkpoint.pt", weights_only=True)["state"]["step"] >= 3
 
 
 def test_it_learns(tiny_dataset, tmp_path):
@@ -195,6 +238,53 @@ def test_without_validation_clips_the_training_clips_serve(tmp_path):
     data = write_dataset(tmp_path / "d", {"train": 1})
     with pytest.warns(UserWarning, match="no clip in split 'val'; validating on training clips"):
         make_windows(settings(data, tmp_path), 4)
+
+
+def test_clips_that_train_do_not_validate(tiny_dataset, tmp_path):
+    """A clip folder is in every split: alone it serves both, with the warning; beside a data set it only trains."""
+    clip = write_clip(tmp_path / "clip").path
+    with pytest.warns(UserWarning, match="clip: no clip in split 'val'; validating on training clips"):
+        make_windows(settings(clip, tmp_path), 4)
+    windows, fixed = make_windows(settings((tiny_dataset, clip), tmp_path), 4)
+    assert len(windows.clips) == 4
+    assert [one.name for one in fixed.dataset.clips] == ["val_0", "val_1"]
+    _, asked = make_windows(settings((tiny_dataset, clip), tmp_path, validation_split="train"), 4)
+    assert len(asked.dataset.clips) == 4
+
+
+def test_a_run_resumes_only_with_its_clips(tmp_path):
+    """A clip that was made since would change every later sample; a data set without all its clips is named."""
+    data, said = write_dataset(tmp_path / "d", {"train": 2, "val": 1}), list[str]()
+    record = data / "jobs/train_1.json"
+    record.rename(tmp_path / "away.json")
+    once = settings(data, tmp_path / "r", steps=1)
+    train(small_network(), once, progress=False, note=said.append)
+    lacks = f"{data}: the data set lacks 1 of its clips; a run resumes only with the clips that it began with, so"
+    assert said[1:] == [f"{lacks} finish `qsim generate` first"]
+    (tmp_path / "away.json").rename(record)
+    with pytest.raises(FileExistsError, match=r"a run on other clips or codes than .* choose another -o, or start"):
+        train(small_network(), once, progress=False)
+    said.clear()
+    train(small_network(), once, progress=False, force=True, note=said.append)
+    assert len(said) == 1
+    train(small_network(), once, progress=False)
+
+
+def test_a_run_resumes_only_with_its_processes_and_precision(tiny_dataset, tmp_path, monkeypatch):
+    """Of another number of processes or another device its samples or its rounding would change without a word."""
+    once, path = settings(tiny_dataset, tmp_path / "r", steps=1), tmp_path / "r/settings.json"
+    train(small_network(), once, progress=False)
+    found = json.loads(path.read_text())
+    assert (found["processes"], found["computes_in"], len(found["clips"])) == (1, "float32", 64)
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "is_gpu", lambda device: True)
+        with pytest.raises(FileExistsError, match="in 'float32', now it would compute in 'bfloat16'; resume it"):
+            train(small_network(), once, progress=False)
+        patch.setattr(training, "joined", lambda device: contextlib.nullcontext(Process(0, 2, torch.device("cpu"))))
+        with pytest.raises(FileExistsError, match="whose number of processes is 1, now it is 2; resume it"):
+            train(small_network(), once, progress=False)
+    path.write_text(json.dumps({k: v for k, v in found.items() if k not in ("processes", "computes_in", "clips")}))
+    assert train(small_network(), once, progress=False).finished, "a run of an earlier version"
 
 
 def test_bfloat16_trains_with_float32_losses(tiny_dataset, tmp_path):

@@ -62,6 +62,30 @@ def opened(wanted: Settings, *, force: bool = False) -> None:
         pass
 
 
+@pytest.mark.parametrize(
+    ("name", "began", "now", "says"),
+    [
+        ("processes", 2, 1, "holds a run whose number of processes is 2, now it is 1"),
+        ("computes_in", "bfloat16", "float32", "holds a run that computes in 'bfloat16', now it would compute in"),
+        ("clips", "ab", "cd", "holds a run on other clips or codes than are there now"),
+    ],
+)
+def test_other_conditions_are_refused(tmp_path, name, began, now, says):
+    def again(value: object, **force: bool) -> None:
+        with Run(Settings("d", str(tmp_path / "r"), steps=1), {name: value}).open(**force):
+            pass
+
+    again(began)
+    again(began)
+    with pytest.raises(FileExistsError, match=f"{says}.*; resume it as it began, choose another -o, or start again"):
+        again(now)
+    again(now, force=True)
+    again(now)
+    opened(Settings("d", str(tmp_path / "old"), steps=1))  # of an earlier version, which stored none
+    with Run(Settings("d", str(tmp_path / "old"), steps=1), {name: now}).open():
+        pass
+
+
 def test_one_process_at_a_time_trains_in_a_folder(tiny_dataset, tmp_path):
     """A second command is refused in one line, also with --force; the folder does not change."""
     mine = settings(tiny_dataset, tmp_path / "r")
@@ -151,10 +175,23 @@ def trained(folder: Path) -> tuple[Run, dict[str, Any]]:
 def resumed(run: Run) -> State:
     model = UNet(UNetConfig(1))
     optimiser = Optimiser(model, "muon", 1e-3, (0.9, 0.99))
-    state = run.load(model, optimiser, torch.device("cpu"))
+    state = run.load(model, optimiser)
     model(torch.rand(1, 11, 1, 8, 8)).sum().backward()
     optimiser.step(1e-3)  # the loaded state is usable
     return state
+
+
+@pytest.mark.filterwarnings("ignore:.*which is a no-op")
+def test_the_steps_of_adam_stay_on_the_cpu(tmp_path):
+    """Of a network on another device, too, as in a fresh run: from a GPU torch would read back every one."""
+    run, _ = trained(tmp_path / "r")
+    with torch.device("meta"):
+        model = UNet(UNetConfig(1))
+    optimiser = Optimiser(model, "muon", 1e-3, (0.9, 0.99))
+    run.load(model, optimiser)
+    values = list(optimiser.parts[0].state.values())
+    assert {value["step"].device.type for value in values} == {"cpu"}
+    assert {value["exp_avg"].device.type for value in values} == {"meta"}
 
 
 ODD: tuple[Any, ...] = (

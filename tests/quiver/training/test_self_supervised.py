@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +15,10 @@ from clips import write_clip
 from runs import same_weights
 
 from qsim.clip.sensing import Sensing, sense
+from qsim.sensor.colour_filter import ColourFilter
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
+from qsim.sensor.spike import SpikeCamera
 from quiver.baselines import moment
 from quiver.cli.program import main
 from quiver.data.codes import Codes, array_codes
@@ -58,6 +61,40 @@ def test_the_law_is_that_of_the_codes():
         config_for(array_codes(codes, QIS(0.8, 1.6, 0.2, 3, gain=0.135), 5e-4))
 
 
+COUNTS = QIS(0.8, 1.6, 0.2, 3)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "changes", "reason"),
+    [
+        (replace(COUNTS, offset=2.0), {}, "shifted by an offset of 2"),
+        (replace(COUNTS, read_noise=0.6), {}, "blurred by a read noise of 0.6 electrons"),
+        (SpikeCamera(0.5, 0.0, 8), {}, "spikes of collected charge"),
+        (COUNTS, {"colour": ColourFilter(("RG", "GB"))}, "those of colour filters"),
+        (COUNTS, {"shares": (1.0, 0.25)}, "those of different exposures"),
+    ],
+    ids=["offset", "read noise", "spikes", "mosaic", "bracketed"],
+)
+def test_codes_that_are_no_counts_are_refused(sensor, changes, reason):
+    codes = replace(array_codes(np.zeros((4, 16, 16), np.uint8), sensor, 5e-4), **changes)
+    message = f"^codes: its codes are {reason} and no photon counts of one kind, which bit2bit needs; give a stream"
+    with pytest.raises(ValueError, match=message):
+        config_for(codes)
+    with pytest.raises(ValueError, match=message):
+        StreamWindows(codes, WindowSettings(frames=4, crop=16))
+
+
+def test_the_command_refuses_a_black_level_before_it_trains(tmp_path, capsys):
+    clip = write_clip(tmp_path / "clip", frames=8, height=16, width=16)
+    sense(clip, Sensing(replace(COUNTS, offset=2.0), ppp=3.0))
+    words = ["train", str(clip.path), "-o", str(tmp_path / "x"), "--preset", "bit2bit", "--steps", "1"]
+    assert main([*words, "--crop", "16", "--frames", "8"]) == 2
+    said = capsys.readouterr().err
+    assert "its codes are shifted by an offset of 2 and no photon counts" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "x").exists()
+
+
 def test_windows_are_parts_of_the_stream(stream):
     """Unturned ones are found in the stream where the key states; sample n repeats; turned ones hold the same codes."""
     codes = stream_at(stream)
@@ -79,6 +116,26 @@ def test_windows_are_parts_of_the_stream(stream):
     for size in ({"frames": 17}, {"crop": 25}):
         with pytest.raises(ValueError, match="choose a smaller --crop or fewer --frames"):
             StreamWindows(codes, replace(plain, **size))
+
+
+def test_windows_are_sent_to_workers_without_their_codes(stream):
+    """A worker opens the stream again, whose defective pixels it fills alike."""
+    windows = StreamWindows(stream_at(stream), WindowSettings(frames=5, crop=12, seed=3))
+    sent = pickle.dumps(windows)
+    assert len(sent) < 2000
+    again = pickle.loads(sent)
+    assert all(torch.equal(again[n]["codes"], windows[n]["codes"]) for n in range(3))
+    assert again[2]["key"] == windows[2]["key"]
+
+
+@pytest.mark.slow
+def test_workers_do_not_change_the_run(stream, tmp_path):
+    codes, networks = stream_at(stream), []
+    for workers in (0, 1):
+        networks.append(small(codes))
+        torch.manual_seed(5)
+        train(networks[-1], settings_of(stream, tmp_path / str(workers), steps=2, workers=workers), progress=False)
+    assert same_weights(*networks)
 
 
 class Killed(Exception):

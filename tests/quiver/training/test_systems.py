@@ -342,6 +342,8 @@ def test_every_preset_has_a_system_and_a_quick_protocol():
         ("memdeblur", {"crop": 24}, "multiple of 16"),
         ("rvrt", {"loss": "l1"}, "--loss l1: rvrt is trained with own; leave --loss out"),
         ("unet", {"loss": "own"}, "trained with published or paper or l1 or scales-l1"),
+        ("mergenet", {"frames": 12}, "--frames 12: mergenet restores from 11 frames; leave --frames out"),
+        ("bit2bit", {"schedule": "plateau"}, "--schedule plateau: follows validations, and bit2bit has none; leave it"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused_before_anything_is_written(
