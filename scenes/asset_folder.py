@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from qsim import files
 from qsim.scene import Body, Diffuse, EnvironmentImage, Light, Material, Mesh, RoughPlastic, Scene, Texture, Translation
 from qsim.scene.rotation import pose_matrix, vector
 from qsim.scene.shapes import MESH_SUFFIXES, mesh_file, moved
@@ -70,10 +71,12 @@ def _flight(rng: np.random.Generator, speed: float) -> Translation:
 
 
 def _material(rng: np.random.Generator, pictures: list[Path]) -> Material:
-    """Return a matt or slightly glossy material; a picture keeps its values, with white at a reflectance of 0.9."""
+    """Return a matt or slightly glossy material; a picture keeps its colours, with white at a reflectance of 0.9."""
     if not pictures:
         return common.paint(rng, common.surface(rng))
-    texture = Texture(0.9 * Texture(str(pick(rng, pictures))).pixels())
+    picture = pick(rng, pictures)
+    texture = Texture(str(picture), source=files.sha256(picture), scale=0.9)
+    texture.pixels()  # a picture that cannot be read is named here
     return Diffuse(texture) if rng.random() < 0.5 else RoughPlastic(texture, roughness=between(rng, 0.15, 0.4))
 
 

@@ -56,7 +56,7 @@ def _painted(material: Material, rng: np.random.Generator) -> Material:
     grey = texture.pixels()[..., None].astype(np.float64)
     share = grey / max(float(grey.max()), 1e-12)
     image = np.minimum(grey * ((1 - share) * np.array(dark) + share * np.array(bright)), BRIGHTEST)
-    return replace(found, reflectance=replace(texture, image=image.astype(np.float32)))
+    return replace(found, reflectance=replace(texture, image=image.astype(np.float32), scale=1.0))
 
 
 def _lit(light: Light, rng: np.random.Generator) -> Light:

@@ -44,7 +44,8 @@ for name, stream in streams.items():
     )
 
 # %%
-# At low light the difference shows: hot pixels fire without light.
+# At this light photons outnumber dark counts: the mean codes are nearly equal, and the hottest pixels are bright dots
+# in the noisy frame.
 
 figure, axes = plt.subplots(1, 2, figsize=(8, 4.2), layout="constrained")
 for axis, (name, stream) in zip(axes, streams.items(), strict=True):

@@ -15,6 +15,7 @@ import re
 import sys
 import threading
 import time
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
@@ -29,7 +30,7 @@ from qsim.process import peak_memory
 PILOT = "pilot and compilation of kernels"  # before the first frame of a renderer
 RESUMES = "the same command resumes where it stopped"
 STARTS_AGAIN = "no incomplete file is left; run the same command again"
-_MAKE_SPACE = "no incomplete file is left; make space and run the same command again"
+MAKES_AGAIN = "finished files stay; the same command with --force makes all of them again"
 
 # Names of options in other programs -> ours, suggested if the command has ours.
 _ALSO_CALLED = {
@@ -207,7 +208,7 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
     try:
         args = parser.parse_args(given)
     except UsageError as stop:
-        return _failed(stop.text, 2, "--json" in given)
+        return failed(stop.text, 2, "--json" in given)
     except SystemExit as stop:
         return int(stop.code or 0)
     token = quiet.set(args.quiet)
@@ -219,12 +220,13 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> int:
         if isinstance(error, BrokenPipeError):  # the reader of the output has ended, as in `| head`
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
-        unknown_module = isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in _PACKAGES
-        if os.environ.get("QSIM_DEBUG") or args.verbose or unknown_module:
+        if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in _PACKAGES:
             raise
-        return _failed(f"{parser.prog}: {one_line(error)}", 2, args.json)
+        if os.environ.get("QSIM_DEBUG") or args.verbose:
+            traceback.print_exc()
+        return failed(f"{parser.prog}: {one_line(error)}", 2, args.json)
     except KeyboardInterrupt:
-        return _failed(f"\n{parser.prog}: interrupted; {_then(args)}", 130, args.json)
+        return failed(f"\n{parser.prog}: interrupted; {_then(args)}", 130, args.json)
     finally:
         quiet.reset(token)
         if args.verbose:
@@ -238,7 +240,7 @@ def _then(args: argparse.Namespace) -> str:
     return str(args.after_interrupt) if stored else STARTS_AGAIN
 
 
-def _failed(text: str, code: int, as_json: bool) -> int:
+def failed(text: str, code: int, as_json: bool) -> int:
     """Print why a command failed, with --json also as an object on stdout; return its exit code."""
     print(text, file=sys.stderr)
     if as_json:
@@ -271,7 +273,7 @@ def one_line(error: BaseException) -> str:
         for in_the_way in filter(Path.is_file, (path, *path.parents)):
             return f"{in_the_way}: is a file where a folder is needed; name another with -o"
     if isinstance(error, OSError) and error.errno in FULL and error.strerror:
-        return f"{wording(error)}; {_MAKE_SPACE}"
+        return f"{wording(error)}; no incomplete file is left; make space and run the same command again"
     if isinstance(error, ModuleNotFoundError):
         package = (error.name or "").split(".")[0]
         return f"needs the package {package}, which is not installed: pip install {package}"
@@ -297,10 +299,7 @@ def refuse_idle(args: argparse.Namespace, where: str, names: Sequence[str]) -> N
 
 
 def refuse_existing(path: Path, force: bool) -> None:
-    """Raise an `OSError` with the cure if a file cannot be written, or exists and `force` is not set.
-
-    Called before the computation, so that its result can be stored.
-    """
+    """Raise an `OSError` with the cure, before the work, if a file cannot be written or exists without `force`."""
     if path.is_dir():
         raise FileExistsError(f"{path}: is a folder; name a file with -o")
     if path.exists() and not force:

@@ -46,7 +46,7 @@ def _run_generate(args: argparse.Namespace) -> int:
     from qsim.dataset.worker_pool import Limits
 
     wanted = recipe.load(args.recipe)
-    folder = args.output or Path("out") / wanted.name
+    folder = args.output = args.output or Path("out") / wanted.name
     # None: not given, as --cluster needs it (`_cluster`).
     count = generation.Options.workers if args.workers is None else args.workers
     limits = Limits() if args.memory is None else Limits(memory=args.memory)

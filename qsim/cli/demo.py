@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from qsim.cli.console import OPTIONAL, RESUMES, command, output
+from qsim.cli.console import OPTIONAL, RESUMES, command, failed, output
 from qsim.cli.options import check_free
 
 MEASUREMENTS = Path(__file__).parents[1] / "measurements"
@@ -49,14 +49,30 @@ def _run_demo(args: argparse.Namespace) -> int:
     out.mkdir(parents=True, exist_ok=True)
     try:
         steps(out, args.quiet or args.json)
-    except subprocess.CalledProcessError as failed:
-        print(f"qsim demo: stopped at '{shlex.join(failed.cmd[2:])}'; `qsim demo` resumes there", file=sys.stderr)
-        return failed.returncode
+    except subprocess.CalledProcessError as error:
+        step = shlex.join(error.cmd[2:])
+        return failed(f"qsim demo: stopped at '{step}'; `qsim demo` resumes there", error.returncode, args.json)
     minutes, peak = (time.perf_counter() - started) / 60, peak_memory_of_children()
     page = out / "index.html"
     facts = {"page": str(page), "minutes": minutes, "largest_process_bytes": peak}
     output(args, facts, f"\ndemo: {minutes:.1f} minutes, largest process {peak / 2**30:.2f} GB; open {page}")
     return 0
+
+
+def call(words: list[str], capture: bool) -> str:
+    """Run a command and return what it printed if `capture`; `CalledProcessError` if it fails.
+
+    Ctrl-C reaches the command, too, which then saves its state: wait for it.
+    """
+    child = subprocess.Popen(words, text=True, stdout=subprocess.PIPE if capture else None)
+    try:
+        printed, _ = child.communicate()
+    except KeyboardInterrupt:
+        child.wait()
+        raise
+    if child.returncode:
+        raise subprocess.CalledProcessError(child.returncode, words)
+    return printed or ""
 
 
 def steps(out: Path, quiet: bool) -> None:
@@ -67,9 +83,7 @@ def steps(out: Path, quiet: bool) -> None:
         words = [str(word) for word in (*arguments, *(["--quiet"] if quiet else []))]
         if not quiet:
             print(f"\n{what}\n  $ {program} {shlex.join(words)}", flush=True)
-        shown = subprocess.PIPE if capture or quiet else None
-        done = subprocess.run([sys.executable, "-m", program, *words], check=True, text=True, stdout=shown)
-        return done.stdout or ""
+        return call([sys.executable, "-m", program, *words], capture or quiet)
 
     def restore(source: Path, target: Path, method: str) -> None:
         if not target.with_suffix(".json").exists():

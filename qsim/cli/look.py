@@ -65,6 +65,7 @@ def _run_preview(args: argparse.Namespace) -> int:
                 f"or give --fps {FASTEST_GIF} or less"
             )
         refuse_existing(target, args.force)
+        refuse_existing(preview.sidecar(target), args.force)
     if args.fps is not None and not 0.01 <= args.fps <= 1000:
         raise ValueError(f"--fps: expected frames per second between 0.01 and 1000, got {args.fps:g}")
     if args.scale is not None and not 1 <= args.scale <= 64:

@@ -80,6 +80,7 @@ def add_render(sub: Any) -> None:
 def _run_render(args: argparse.Namespace) -> int:
     from qsim import backend, scenes
     from qsim.clip.clamped_error import stated
+    from qsim.clip.exr import HALF_MAX
     from qsim.dataset.scene_rendering import load_scene, render
     from qsim.optics.diffraction import diffraction_line
     from qsim.rendering.budget import Finding, explain
@@ -119,6 +120,9 @@ def _run_render(args: argparse.Namespace) -> int:
         fireflies, pixels = sum(clip.meta["fireflies_per_frame"]), math.prod(clip.shape)
         how = "before denoising" if render_meta["denoise"] else "not removed"
         text += f"\n{fireflies} of {pixels} pixels are fireflies (Monte-Carlo outliers); {how}"
+    if cut := clip.meta["clipped_pixels"]:
+        text += f"\n{cut} of {math.prod(clip.shape)} pixels are brighter than {HALF_MAX:g}, the most a clip holds"
+        text += ": cut off there, and left out of scores" if "saturated_pixels" in clip.meta else ": cut off there"
     findings = [Finding(**finding) for finding in render_meta["findings"]]
     if not args.explain and (args.reuse or render_meta["neighbours"]):
         text += "".join(f"\n{explain([one])}" for one in findings if one.effect == REUSE)

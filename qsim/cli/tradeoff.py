@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from qsim import checks, files
-from qsim.cli.console import bar, command, note, output, refuse_existing, refuse_idle
+from qsim.cli.console import MAKES_AGAIN, RESUMES, bar, command, note, output, refuse_existing, refuse_idle
 from qsim.cli.options import check_free, checked, count, frame_size, positive, steps, whole_numbers
 
 
@@ -20,7 +20,7 @@ def add_tradeoff(sub: Any) -> None:
         "qsim tradeoff out/fast --ppp 0.65 -o out/bits\n"
         "qsim tradeoff fan --px 3 --ppp 2 -o out/fan_3px\n"
         "qsim tradeoff fan --speed 0.5:8 --ppp 0.1:30 -o out/sweep\n"
-        "qsim tradeoff --paper-figure 1 -o out/figure1",
+        "qsim tradeoff --paper-figure 1 -o out/figure1", RESUMES,
         threads="threads of the compiled engine (Dr.Jit)",
     )  # fmt: skip
     parser.add_argument("source", nargs="?", help="a clip of at least 10000 fps, or a scene (rendered into -o)")
@@ -41,9 +41,15 @@ def add_tradeoff(sub: Any) -> None:
     )
     px = "motion of the moving pixels, px per 3-bit frame of 7 planes, listed as in --ppp; sets the speed"
     moving.add_argument("--px", type=steps, help=px)
-    parser.add_argument("--sensor", help="sensor of the multi-bit read (default quiver-physical)")
+    files_of = "a name of `qsim doctor --devices`, or a file of a SPAD or of a QIS with gain 1, whatever its bits"
     parser.add_argument(
-        "--plane-sensor", help="sensor of a binary plane (default: a clocked SPAD of the same efficiency)"
+        "--sensor",
+        help=f"sensor of the multi-bit read (default quiver-physical): {files_of}; another QIS file at its own --bits",
+    )
+    parser.add_argument(
+        "--plane-sensor",
+        help=f"sensor of a binary plane (default: a clocked SPAD of the same efficiency): {files_of}; another QIS file "
+        "if it has 1 bit",
     )
     parser.add_argument("--instants", type=count, help="frames drawn and scored per depth (default 8)")
     parser.add_argument("--frames", type=count, help="frames of a rendered scene (default: enough for the instants)")
@@ -97,6 +103,7 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
     bits, instants = tuple(args.bits or (1, 2, 3, 4, 5)), 8 if args.instants is None else args.instants
     sensor = args.sensor or "quiver-physical"
     settings = StudySettings(bits, sensor, args.plane_sensor, None, 1, instants, args.seed)
+    study_clips.check_sensors(settings, args.streams)  # before anything is rendered
     height, width = args.size or (96, 128)
     widen = args.bits is None
     frames = args.frames or (2**WIDEST - 1 if widen else max(4 * settings.longest, 32))
@@ -134,6 +141,7 @@ def _tradeoff_study(args: argparse.Namespace) -> int:
     if args.px:
         result["px_asked"], result["speeds_found"] = args.px, speeds
     if args.streams:
+        args.after_interrupt = MAKES_AGAIN
         lit = replace(settings, ppp=levels[0])
         made = study_clips.write_streams(first, args.output / "streams", lit, force=args.force)
         result["streams"] = [str(path) for path in made]

@@ -108,7 +108,7 @@ def light_windows(instants: Sequence[float], exposure: float) -> list[tuple[floa
 
     `instants` are those of `instants`. The parts cover the exposure evenly, so the mean light is exact at any count.
     Three instants share a part where the count allows it: every third one then sees the light of all, and `blur_left`
-    compares motion only.
+    compares motion only. A flash shorter than a part is spread over it, which no error counts (`fidelity.flickering`).
     """
     each = 3 if len(instants) % 3 == 0 else 1
     start, count = (instants[0] + instants[-1] - exposure) / 2, len(instants) // each

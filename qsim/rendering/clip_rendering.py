@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
+from qsim import files
 from qsim.clip.clip import Clip
 from qsim.clip.manifest import PHYSICAL
 from qsim.clip.writer import ClipWriter
@@ -30,7 +32,7 @@ def render_clip(
     extra: dict[str, Any] | None = None,
     force: bool = False,
 ) -> Clip:
-    """Render frames 0 .. frames - 1 into a clip folder; an equal call resumes an interrupted one.
+    """Render frames 0 .. frames - 1 into a clip folder; an equal call with an equal scene resumes an interrupted one.
 
     `progress(done, frames)` is called after each frame; `extra` is added to clip.json (the split of a
     data set, for example).
@@ -51,6 +53,7 @@ def render_clip(
         "radiance_unit": PHYSICAL,
         "camera": describe(scene.camera),
         "scene": {"family": scene.name, "seed": scene.seed, "speed": scene.speed},
+        "scene_sha256": files.sha256(json.dumps(scene.to_dict(), sort_keys=True).encode()),
         "seed": seed,
         "render": asdict(renderer.budget) | {"engine": renderer.engine.backend, "variant": renderer.engine.variant},
     }

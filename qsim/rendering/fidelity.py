@@ -82,13 +82,17 @@ def choose_budget(
     frames share samples where that is predicted to cost less and the trial costs little against the clip; True tries
     it at any length, False renders each frame alone. The result depends only on the arguments and the installed
     software: an interrupted clip resumes with the same budget. `ValueError` for a `psnr` outside 10 to 80 dB, for
-    another value of `denoise` or `reuse`, and for a scene without light.
+    other values out of range, and for a scene without light.
     """
     if not 10 <= psnr <= 80:
         raise ValueError(f"psnr: expected 10 to 80 dB, got {psnr!r}")
     for name, wish in (("denoise", denoise), ("reuse", reuse)):
         if not isinstance(wish, bool | None):
             raise ValueError(f"{name}: expected True, False or None, got {wish!r}")
+    if ppp is not None and not 0 < ppp < math.inf:
+        raise ValueError(f"ppp: expected photons per pixel above 0, or None, got {ppp!r}")
+    if not 0 < quantum_efficiency <= 1:
+        raise ValueError(f"quantum_efficiency: expected a number above 0, at most 1, got {quantum_efficiency!r}")
     pilot = Pilot.of(scene, frame_rate, shutter, frames, seed)
     full = pilot.mean(COUNTS[1], DEEPEST)
     if not full.mean() > 0:
@@ -131,8 +135,8 @@ def choose_budget(
         size = f"frames alone: {about_samples.chosen}"
         about_samples = Finding("samples", f"{chosen.samples} per pixel{', denoised' if chosen.denoise else ''}", size)
         about_denoiser = Finding("denoiser", chosen.about_denoiser, "tried on shared samples")
-    effects = (*_flicker(pilot.renderer.strengths(frames)), *_lens(scene.camera))
-    lens = (*effects, *_left_out(scene.camera, pilot.truths()))
+    effects = (*flickering(pilot.renderer.strengths(frames), pilot.extent, instants), *_lens(scene.camera))
+    lens = (*effects, *effects_left_out(scene.camera, pilot.truths()))
     pixels = scene.camera.height * scene.camera.width
     noisy = noise.at(chosen.samples / instants, instants).plain / math.sqrt(pixels) / float(full.mean())
     about_light, about_motion = _light(dimmed, noisy, bool(chosen.denoise)), moving(pilot.extent, shutter)
@@ -306,10 +310,20 @@ def _error(errors: tuple[float, ...], samples: float) -> float:
     return float(errors[i + 1] * (samples / COUNTS[i + 1]) ** -power)
 
 
-def _flicker(strengths: dict[str, Array]) -> tuple[Finding, ...]:
-    """Return a finding for lights that flicker: their strengths [frames] over the exposures of the clip."""
+def flickering(strengths: dict[str, Array], extent: Array, instants: int) -> tuple[Finding, ...]:
+    """Return findings for lights that flicker: their strengths [frames] over the exposures, and what these blur.
+
+    Three instants share their mean light: the motion within them (`extent` as in `Pilot`) is in no stated error.
+    """
+    if not strengths:
+        return ()
     sizes = [f"{name} {found.min():.3g} to {found.max():.3g} of its mean" for name, found in strengths.items()]
-    return (Finding("flicker", "exact mean over each exposure", ", ".join(sizes)),) if sizes else ()
+    exact = Finding("flicker", "exact mean over each exposure", ", ".join(sizes))
+    if instants == 1:
+        return (exact,)
+    within = 3 / instants * max(map(bright_end, extent))
+    size = f"the fastest pixels move {within:.2g} px within them, not counted in the stated error"
+    return exact, Finding("flicker and motion", f"light averaged over 3 of {instants} instants", size)
 
 
 def _lens(camera: Camera) -> tuple[Finding, ...]:
@@ -322,10 +336,11 @@ def _lens(camera: Camera) -> tuple[Finding, ...]:
     return (Finding("lens", "exact rays", f"corner moved by {moved:+.3g} px, with {100 * share:.3g} % of the light"),)
 
 
-def _left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, ...]:
+def effects_left_out(camera: Camera, truths: list[dict[str, Array]]) -> tuple[Finding, ...]:
     """Return findings for effects that the renderer leaves out, with their size where it can be computed."""
     depths = np.concatenate([truth["depth"].ravel() for truth in truths])
-    depths = depths[np.isfinite(depths) & (depths > camera.focal_length)]
+    depths = np.where(np.isinf(depths), 1e9, depths)  # the surroundings
+    depths = depths[depths > camera.focal_length]
     blur = float(np.max(camera.circle_of_confusion(depths), initial=0.0))
     how = "thin lens" if camera.aperture_blur else "left out, pinhole"
     return (

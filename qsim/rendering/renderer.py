@@ -228,7 +228,7 @@ class Renderer:
         cut = reused_mean(own, best, surfaces, white, self.budget.quality).cut(self.crop, self.film.thinned)
         errors_at = frame_errors(lambda white: math.hypot(cut.error_at(white), self.budget.left_out_clamped), white)
         y, x, height, width = self.crop
-        fireflies = int(np.count_nonzero(_fireflies(own, broken)[y : y + height, x : x + width]))
+        fireflies = int(np.count_nonzero(fireflies_in(own, broken)[y : y + height, x : x + width]))
         return cut.picture.astype(np.float32), math.hypot(cut.error, self.budget.left_out), errors_at, fireflies
 
     def _exposed(self, instants: list[float], key: Key) -> Exposed:
@@ -237,7 +237,7 @@ class Renderer:
         halves, broken = means[0], ~np.isfinite(means[0]).all(axis=0)
         means[:, :, broken] = 0  # they would break the denoiser and every mean around them
         error, radiance = rms((halves[0] - halves[1]) / 2), halves.mean(axis=0)
-        fireflies = int(np.count_nonzero(_fireflies(halves, broken)))
+        fireflies = int(np.count_nonzero(fireflies_in(halves, broken)))
         white = self.budget.white or white_in(radiance)
         mixed = None
         if self.budget.denoise:
@@ -337,11 +337,12 @@ class Renderer:
         return extent.reshape(self.shape), hits.number.reshape(self.shape)
 
 
-def _fireflies(halves: Array, broken: Array) -> Array:
-    """Return which pixels [H, W] are broken, or differ between the halves [2, H, W] by more than FIREFLY rms."""
+def fireflies_in(halves: Array, broken: Array) -> Array:
+    """Return which pixels [H, W] are broken, or differ between the halves [2, (3,) H, W] by more than FIREFLY rms."""
     difference = (halves[0] - halves[1]) / 2
     error = rms(difference)
-    return broken | ((np.abs(difference) > FIREFLY * error) & (error > 0))
+    found = broken | ((np.abs(difference) > FIREFLY * error) & (error > 0))
+    return found.reshape(-1, *found.shape[-2:]).any(axis=0)
 
 
 def _checked_crop(scene: Scene, crop: Crop | None) -> Crop:

@@ -131,8 +131,10 @@ def stream_line(stream: Stream) -> str:
     ppp, lux = meta.get("ppp"), meta.get("equivalent_lux_555nm")
     light = "" if ppp is None else f": {ppp:.4g} photons per pixel (the clip's light × {stream.photons_factor:.4g})"
     light += "" if lux is None else f", equal to {lux:.4g} lx at 555 nm"
-    light += "" if ppp is None else f", {ppp * stream.sensor.efficiency:.3g} e⁻ per pixel"
-    filters = "" if stream.colour_filter is None else f"; colour filters {' '.join(stream.colour_filter.mask)}"
+    efficiency, colours = stream.sensor.efficiency, stream.colour_filter
+    efficiency = efficiency if colours is None else colours.mean_efficiency(efficiency)
+    light += "" if ppp is None else f", {ppp * efficiency:.3g} e⁻ per pixel"
+    filters = "" if colours is None else f"; colour filters {' '.join(colours.mask)}"
     words = f"{filters}{timing_words(stream)}{defects_words(stream)}"
     return f"Stream {stream.name}{light}; {stream.bits} bit, {stream.sensor}{words}"
 

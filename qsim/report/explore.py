@@ -100,7 +100,10 @@ def explore_page(clip: Clip) -> str:
 
 
 def named_sensors(exposure: float, ppp: float = 3.25) -> list[dict[str, Any]]:
-    """Return the devices that the sliders can state, at this exposure [s] and light: {name, what, settings}."""
+    """Return the devices that the sliders can state, at this exposure [s] and light: {name, what, settings, follows}.
+
+    `follows` holds light and frames per code of the settings where these follow them, else None.
+    """
     found = []
     for device in devices.DEVICES.values():
         if device.bits > BITS:
@@ -115,7 +118,8 @@ def named_sensors(exposure: float, ppp: float = 3.25) -> list[dict[str, Any]]:
             "gain": own.get("gain", 1.0),
             "dead": own.get("dead_time", 0.0),
         }
-        found.append({"name": device.name, "what": device.what, "settings": settings})
+        follows = {"light": ppp, "frames": 1} if device.follows_light else None
+        found.append({"name": device.name, "what": device.what, "settings": settings, "follows": follows})
     return found
 
 

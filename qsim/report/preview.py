@@ -85,7 +85,7 @@ def write(
 ) -> None:
     """Write PNG (the first of `frames`), GIF or mp4 by the suffix of `path`, and a sidecar with `about` and the scales.
 
-    The sidecar of OUT.mp4 is OUT.mp4.json. Both are written atomically.
+    Both are written atomically.
     """
     declared = {"format": "qsim-preview-1", "curve": CURVE, "views": [declaration(view) for view in page.views]}
     drawn = _drawn(page, frames, progress)
@@ -97,7 +97,12 @@ def write(
         from qsim.formats.video import write_video
 
         write_video(path, drawn, fps, lossless=False)
-    files.write_json(path.with_name(path.name + ".json"), declared | about)
+    files.write_json(sidecar(path), declared | about)
+
+
+def sidecar(path: Path) -> Path:
+    """Return the file beside a preview that states its scales: OUT.mp4.json of OUT.mp4."""
+    return path.with_name(path.name + ".json")
 
 
 def _drawn(page: Sheet, frames: range, progress: Progress | None) -> Iterator[Picture]:

@@ -214,12 +214,11 @@ def study_section(path: Path) -> page.Section:
     table = page.table(page.Table(f"{len(rows)} rows", [_heading(key) for key in keys],
                                   [[row.get(key) for key in keys] for row in rows]))  # fmt: skip
     lines = [f"{_heading(key)}: {page.number_text(value)}" for key, value in words.items()]
-    pictures = [
-        folder_picture for name in (path.stem, "best") if (folder_picture := path.with_name(f"{name}.png")).is_file()
-    ]
-    figures = [page.stored_figure(picture.read_bytes(), f"{path.parent.name}/{picture.name}") for picture in pictures]
+    picture = path.with_name("best.png" if "cells" in found else f"{path.stem}.png")  # of a sweep, or of one study
+    name = f"{path.parent.name}/{picture.name}"
+    figure = page.stored_figure(picture.read_bytes(), name) if picture.is_file() else None
     story = next((str(text) for text in (found.get("answer"), *found.get("answers", [])) if text), "")
-    return page.section(f"Study: {path.parent.name}", page.bullets(lines), *figures, table, story=story)
+    return page.section(f"Study: {path.parent.name}", page.bullets(lines), figure, table, story=story)
 
 
 def bench_section(path: Path) -> page.Section:

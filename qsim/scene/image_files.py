@@ -21,16 +21,26 @@ def read_colour(path: Path) -> np.ndarray:
 
 
 def _linear(path: Path) -> np.ndarray:
+    """Return linear colours [H, W, 3]; grey pictures count with all their 16 bits, colours with the upper 8."""
     from PIL import Image
 
     if not path.is_file():
         raise FileNotFoundError(f"texture {path}: no such file")
     try:
         with Image.open(path) as opened:
-            colour = np.asarray(opened.convert("RGB"), np.float32) / 255
-    except OSError as error:
+            if opened.mode == "F":
+                raise ValueError(
+                    f"texture {path}: holds floating-point numbers, whose white is unknown; store 8 or 16 bits, or "
+                    "give Texture an array of linear values"
+                )
+            if not opened.mode.startswith("I"):
+                return to_linear(np.asarray(opened.convert("RGB")), "srgb", 255)
+            grey = np.asarray(opened)
+    except (OSError, Image.DecompressionBombError) as error:
         raise ValueError(f"texture {path}: not a readable image ({error})") from error
-    return to_linear(colour, "srgb", 1.0)
+    if grey.min() < 0 or grey.max() > 65535:
+        raise ValueError(f"texture {path}: values of 0 to 65535 are read, found {grey.min()} to {grey.max()}")
+    return np.repeat(to_linear(grey, "srgb", 65535)[..., None], 3, axis=2)
 
 
 def read_hdr(path: Path) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from qsim.scene.bands import Colour, numbers
 from qsim.scene.flicker import Flicker, check_flicker
 from qsim.scene.image_files import read_colour, read_grey
 from qsim.scene.lights import check_light
+
+AIR = 1.000277  # Mitsuba's index around bodies; it raises RuntimeError for a rough surface of the same index
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +28,7 @@ class Texture:
     repeat: tuple[float, float] = (1.0, 1.0)  # repetitions of the picture in u, v = 0..1
     nearest: bool = False  # nearest texel instead of bilinear
     source: str | None = None  # name of the photograph that the picture shows; data sets record it
+    scale: float = 1.0  # factor on all values
 
     def pixels(self) -> np.ndarray:
         """Return linear values, float32 [H, W]; `FileNotFoundError` or `ValueError` with the file's name."""
@@ -36,20 +40,23 @@ class Texture:
             pixels = read_grey(Path(self.image))
         if pixels.ndim != 2 or pixels.size == 0:
             raise ValueError(f"{where}: expected a picture [H, W], got shape {pixels.shape}")
-        require_finite(where, pixels)
-        return pixels
+        return self._scaled(where, pixels)
 
     def colours(self) -> np.ndarray:
         """Return linear values of the bands, float32 [H, W, 3], equal in a grey picture; errors as of `pixels`."""
         if isinstance(self.image, str | Path):
-            return read_colour(Path(self.image))
+            return self._scaled(str(self.image), read_colour(Path(self.image)))
         pixels = np.asarray(self.image, np.float32)
         if pixels.ndim != 3:
             return np.repeat(self.pixels()[..., None], 3, axis=2)
         if pixels.shape[2] != 3 or pixels.size == 0:
             raise ValueError(f"Texture.image: expected a picture [H, W] or [H, W, 3], got shape {pixels.shape}")
-        require_finite("Texture.image", pixels)
-        return pixels
+        return self._scaled("Texture.image", pixels)
+
+    def _scaled(self, where: str, pixels: np.ndarray) -> np.ndarray:
+        scaled = np.float32(self.scale) * pixels
+        require_finite(where, scaled)
+        return scaled
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +73,16 @@ class NormalMap:
 
     image: np.ndarray
     repeat: tuple[float, float] = (1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        image = np.asarray(self.image)
+        if image.ndim != 3 or image.shape[2] != 3 or not image.size:
+            raise ValueError(f"NormalMap.image: a picture [H, W, 3] is expected, got shape {image.shape}")
+        if not (image.min() >= 0 and image.max() <= 1):
+            raise ValueError(
+                f"NormalMap.image: values from 0 to 1 are expected, found {image.min()} to {image.max()}; divide 8-bit "
+                "values by 255"
+            )
 
 
 Relief = Bump | NormalMap | None
@@ -93,6 +110,9 @@ class RoughPlastic:
 
     def __post_init__(self) -> None:
         _check_reflectance(self)
+        _check_surface(self)
+        if self.roughness == 0:
+            raise ValueError("RoughPlastic.roughness: a number above 0 is expected, got 0; its coat cannot be a mirror")
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +128,13 @@ class Conductor:
     roughness: float = 0.1  # GGX alpha
     relief: Relief = None
 
+    def __post_init__(self) -> None:
+        for name in ("eta", "k"):
+            found = getattr(self, name)
+            if min(numbers(found), default=-1) < 0:
+                raise ValueError(f"Conductor.{name}: a finite number from 0 up is expected, got {found!r}")
+        _check_surface(self)
+
 
 @dataclass(frozen=True, eq=False)
 class Dielectric:
@@ -116,6 +143,9 @@ class Dielectric:
     ior: float = 1.5
     roughness: float = 0.0
     thin: bool = False
+
+    def __post_init__(self) -> None:
+        _check_surface(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,3 +168,23 @@ def _check_reflectance(material: Diffuse | RoughPlastic) -> None:
     values = list(numbers(found))
     if not isinstance(found, Texture) and not (values and min(values) >= 0 and max(values) <= 1):
         raise ValueError(f"{kind}.reflectance: a number from 0 to 1 or a Texture is expected, got {found!r}")
+
+
+def shows_picture(material: Material) -> bool:
+    """Return whether a material places a picture on its surface: a texture or a relief."""
+    return isinstance(getattr(material, "reflectance", None), Texture) or getattr(material, "relief", None) is not None
+
+
+def _check_surface(material: Any) -> None:
+    """Raise `ValueError` for a roughness outside 0 to 1, and for an index of refraction that Mitsuba does not take."""
+    kind, roughness, ior = type(material).__name__, material.roughness, getattr(material, "ior", 1.5)
+    if not (_is_number(roughness) and 0 <= roughness <= 1):
+        raise ValueError(f"{kind}.roughness: a number from 0 to 1 is expected, got {roughness!r}")
+    if not (_is_number(ior) and ior > 0):
+        raise ValueError(f"{kind}.ior: a finite number above 0 is expected, got {ior!r}")
+    if roughness > 0 and abs(ior - AIR) < 1e-6:
+        raise ValueError(f"{kind}.ior: a rough surface needs an index other than that of air, got {ior!r}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and bool(np.isfinite(value))

@@ -25,7 +25,7 @@ from qsim.optics.camera import Camera, Pose
 from qsim.scene.bands import Bands, check_bands, has_colour, largest
 from qsim.scene.flicker import Flicker
 from qsim.scene.lights import ENVIRONMENTS, Light, strength
-from qsim.scene.materials import Diffuse, Glow, Material
+from qsim.scene.materials import Diffuse, Glow, Material, shows_picture
 
 
 @runtime_checkable
@@ -73,6 +73,13 @@ class Body:
     mesh: Mesh
     material: Material = dataclasses.field(default_factory=Diffuse)
     motion: Pose | None = None  # None: stays where its mesh is
+
+    def __post_init__(self) -> None:
+        if self.mesh.uv is None and shows_picture(self.material):
+            raise ValueError(
+                f"body {self.name}: its material shows a picture, and its mesh has no texture coordinates; give Mesh "
+                "uv=, or build it with qsim.scene.shapes.box_mapped"
+            )
 
     def pose(self, t: float) -> np.ndarray:
         """Return the body-to-world matrix at time t [s], float64 [4, 4]."""

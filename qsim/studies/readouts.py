@@ -53,7 +53,8 @@ class Readouts:
 def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) -> Readouts:
     """Return the comparison of streams (by default all) over `span` [s], by default the longest code of them.
 
-    `ValueError` for a clip of three bands or without streams, and for a span below a clip frame or above the clip.
+    Instants end with the stream that ends first. `ValueError` for a clip of three bands or without streams, and for a
+    span below a clip frame or above what all streams cover.
     """
     clip.require_one_band("a comparison of readouts")
     streams = [clip.stream(name) for name in names or clip.streams]
@@ -64,12 +65,15 @@ def compare(clip: Clip, names: Sequence[str] = (), span: float | None = None) ->
     frame = 1 / clip.frame_rate
     seconds = max(frame * _frames_per_code(stream) for stream in streams) if span is None else span
     window = round(seconds / frame)
-    if not 1 <= window <= len(clip):
+    covered = {stream.name: len(stream) * _frames_per_code(stream) for stream in streams}
+    first = min(covered, key=lambda name: covered[name])
+    end = min(covered[first], len(clip))
+    if not 1 <= window <= end:
+        where = "the clip has" if end == len(clip) else f"stream {first} covers"
         raise ValueError(
-            f"{clip.path}: a span of {seconds:.4g} s; the clip has {len(clip)} frames of {frame:.4g} s: give a span "
-            "between"
+            f"{clip.path}: a span of {seconds:.4g} s; {where} {end} frames of {frame:.4g} s: give a span between"
         )
-    centres = tuple(range(window // 2, len(clip) - window + window // 2 + 1, window))
+    centres = tuple(range(window // 2, end - window + window // 2 + 1, window))
     truth = np.stack([clip_photons(clip, t, sharp=True) for t in centres])
     peak = WHITE_PER_MEAN * float(np.mean([clip_photons(clip, t).mean() for t in range(len(clip))]))
 

@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 import bench_rows
 
 
+@pytest.mark.slow
 def test_rows_are_made_once_and_shown(tmp_path, capfd):
     out = tmp_path / "rows"
     words = ["--tiny", "--out", str(out), "--rows", "moment,emvd"]

@@ -257,6 +257,13 @@ def test_the_page_of_evidence_is_made_from_its_numbers():
     page = _load("evidence").page(numbers)
     assert "| clip folder | 250.0 | 300.0 |" in page
     assert "(100 windows/s, 5 times the mp4) is **not reached** in this run" in page
+    assert "These rows were stored before the chosen numbers of samples were" in page
+    for row in numbers["render"]["report"]["rows"]:
+        row["chosen_samples"] = row["samples"]
+    numbers["render"]["report"]["rows"][0]["chosen_samples"] = 8
+    page = _load("evidence").page(numbers)
+    assert "These rows were stored before" not in page
+    assert page.count(", raised from ") == page.count("| 12, raised from 8 |") == 1
 
 
 def test_tests_named_as_evidence_exist():

@@ -23,6 +23,7 @@ def data(tmp_path_factory):
     return str(write_dataset(folder, {"train": 2, "test": 2}, frames=11))
 
 
+@pytest.mark.slow
 def test_rows_are_made_once_and_told_in_a_table(tmp_path, data, capsys):
     out = tmp_path / "rows"
     words = [data, data, data, "--tiny", "--out", str(out), "--work", str(tmp_path / "w"), "--workers", "0"]
@@ -97,6 +98,7 @@ def test_mistakes_are_one_sentence(tmp_path, monkeypatch, capsys, words, told):
     assert not list(tmp_path.glob("rows/*"))
 
 
+@pytest.mark.slow
 def test_other_data_and_sizes_are_refused(tmp_path, monkeypatch, capsys, data):
     monkeypatch.chdir(tmp_path)
     words = ["--tiny", "--rows", "all", "--workers", "0"]

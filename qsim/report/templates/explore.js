@@ -78,7 +78,13 @@ function showControls() {
 
 function takeDevice(name) {
   const device = data.devices.find(one => one.name === name);
-  if (device) Object.assign(state, { device: name }, device.settings);
+  if (device) Object.assign(state, { device: name }, device.settings, device.follows);
+}
+
+// Some gains follow the light: at other light, or with more frames per code, the settings are those of no named sensor.
+function keepName() {
+  const device = data.devices.find(one => one.name === state.device);
+  if (device && Object.entries(device.follows || {}).some(([name, value]) => state[name] !== value)) state.device = "";
 }
 
 // Settings in the address.
@@ -96,6 +102,7 @@ function readAddress() {
     if (["frames", "bits", "start", "seed"].includes(name)) state[name] = Math.round(state[name]);
   }
   if (wanted.has("model") || NAMES.slice(2, 8).some(name => wanted.has(name))) state.device = "";
+  keepName();
 }
 
 function writeAddress() {
@@ -235,6 +242,7 @@ function later() {
 function change(name, value) {
   state[name] = value;
   if (["model", ...NAMES.slice(2, 8)].includes(name)) state.device = "";
+  keepName();
   showControls();
   later();
 }

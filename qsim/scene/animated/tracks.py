@@ -24,6 +24,8 @@ KINDS = ("step", "linear", "cubic")
 class Clock:
     """The time of an animation: start + speed * t, from 0 to its length, where it starts again or holds its last pose.
 
+    It repeats after t = 0 only. Before, in the first half of the exposure of frame 0, an end that it meets is held: the
+    exposure would else mix in the other end. So a closed cycle that starts at an end rests for half an exposure.
     Without a length it runs without end.
     """
 
@@ -42,8 +44,10 @@ class Clock:
         moment = self.start + self.speed * t
         if self.length is None:
             return moment
-        if self.repeat:
-            return moment % self.length if self.length > 0 else 0.0
+        if self.repeat and self.length > 0:
+            if t > 0:
+                return moment % self.length
+            moment = self.start % self.length + self.speed * t
         return min(max(moment, 0.0), self.length)
 
 

@@ -48,7 +48,7 @@ class StudyRow:
     shot_error: float  # of an ideal photon counter behind the same efficiency and dark rate
     quantisation_error: float  # added by few levels and saturation (in squares), without read noise
     read_error: float  # added by read noise (in squares); negative where it dithers coarse levels
-    snr_db: float  # exposure-referred, at the mean light: photons sqrt(Fisher information), 20 log10
+    snr_db: float | None  # exposure-referred, at the mean light: 20 log10(photons sqrt(Fisher information)); None: none
     psnr_db: float  # of the maximum-likelihood frame against the sharp instant
     psnr_predicted_db: float  # its exact expectation
     psnr_error_db: float  # standard error of the simulated PSNR: draws only
@@ -249,6 +249,7 @@ def _row(
     error = math.sqrt(squares / sums.pixels)
     _, height, width = clip.shape
     fps = clip.frame_rate / form.planes
+    snr = form.snr_db(form.planes * ppp)
     return StudyRow(
         model=form.model,
         bits=form.bits,
@@ -259,7 +260,7 @@ def _row(
         shot_error=math.sqrt(shot),
         quantisation_error=signed_root(quiet - shot),
         read_error=signed_root(noise - quiet),
-        snr_db=form.snr_db(form.planes * ppp),
+        snr_db=snr if math.isfinite(snr) else None,
         psnr_db=psnr(peak, math.sqrt(simulated)),
         psnr_predicted_db=psnr(peak, math.sqrt(predicted)),
         psnr_error_db=10 / math.log(10) * error / simulated,

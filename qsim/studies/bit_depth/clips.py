@@ -15,9 +15,10 @@ from qsim.clip.sensing import Sensing, describe, sense, write_stream
 from qsim.clip.simulation import Draw
 from qsim.clip.writer import ClipWriter, target_of
 from qsim.files import Progress
+from qsim.sensor.defects import defect_table
 from qsim.sensor.spad import BinarySPAD
 from qsim.studies.bit_depth.clip_study import check_clip
-from qsim.studies.bit_depth.readout import StudySettings, plane_sensor
+from qsim.studies.bit_depth.readout import StudySettings, at_depth, plane_sensor, readouts
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,25 +43,34 @@ class ClipShape:
 
 
 def render(name: str, path: Path, shape: ClipShape, *, speed: float = 1.0, progress: Progress | None = None) -> Clip:
-    """Render a scene to a clip, or return the clip at `path` if scene, shape, rate and speed are the same.
+    """Render a scene to a clip, or return the clip at `path` if scene, its files, shape, rate and speed are the same.
 
     Raise `FileExistsError` if the clip there is another one.
     """
-    from qsim import scenes
+    from qsim.dataset import scene_files
     from qsim.rendering import fidelity
     from qsim.rendering.clip_rendering import render_clip
 
-    scene = scenes.load(name, seed=shape.seed, speed=speed).resized(shape.height, shape.width)
+    loaded, read = scene_files.load(name, shape.seed, speed)
+    scene = loaded.resized(shape.height, shape.width)
     if (path / "clip.json").is_file():
         clip = Clip.open(path)
         wanted = {"family": scene.name, "seed": scene.seed, "speed": scene.speed}
         same = clip.shape == (shape.frames, shape.height, shape.width) and clip.frame_rate == shape.frame_rate
-        if same and clip.meta.get("scene") == wanted:
-            return clip
-        raise FileExistsError(f"{path}: exists and is another clip; name another folder with -o")
+        if not same or clip.meta.get("scene") != wanted:
+            raise FileExistsError(f"{path}: exists and is another clip; name another folder with -o")
+        if clip.meta.get("reads", {}) != read:
+            raise FileExistsError(
+                f"{path}: exists and is not known to be of {name} and its files as they are now; name another folder "
+                "with -o"
+            )
+        return clip
     frames, rate = shape.frames, shape.frame_rate
     chosen = fidelity.choose_budget(scene, frame_rate=rate, frames=frames, psnr=shape.psnr, seed=shape.seed)
-    return render_clip(scene, path, frames=frames, frame_rate=rate, seed=shape.seed, budget=chosen, progress=progress)
+    extra = {"reads": read} if read else None
+    return render_clip(
+        scene, path, frames=frames, frame_rate=rate, seed=shape.seed, budget=chosen, progress=progress, extra=extra
+    )
 
 
 def clips_for(
@@ -88,6 +98,24 @@ def clips_for(
         yield MovingClip(v, render(source, path, shape, speed=v, progress=progress))
 
 
+def check_sensors(settings: StudySettings, streams: bool) -> None:
+    """Raise `ValueError` if a sensor cannot be read as the study needs it, or not stored as `streams`.
+
+    Neither depends on light and exposure.
+    """
+    readouts(settings, 1.0, 1e-4)
+    if streams:
+        _summed_plane(settings, 1.0, 1e-4)
+
+
+def _summed_plane(settings: StudySettings, ppp: float, exposure: float) -> BinarySPAD:
+    """Return the sensor of planes whose sums are stored; raise `ValueError` if it is no clocked SPAD."""
+    plane = plane_sensor(settings, ppp, exposure)
+    if not isinstance(plane, BinarySPAD):
+        raise ValueError("streams of summed planes need a clocked SPAD; leave out the plane sensor")
+    return plane
+
+
 def stream_clip(clip: Clip, folder: Path, bits: int, force: bool) -> Path:
     """Return the clip that `write_streams` writes for a depth; `FileExistsError` if it may not be replaced."""
     path = folder / f"{clip.name}_{bits}bit"
@@ -103,15 +131,16 @@ def write_streams(clip: Clip, folder: Path, settings: StudySettings, *, force: b
     """
     check_clip(clip, settings)
     level = light_level(clip, ppp=settings.ppp)
-    plane = plane_sensor(settings, level.ppp, clip.exposure)
-    if not isinstance(plane, BinarySPAD):
-        raise ValueError("streams of summed planes need a clocked SPAD; leave out the plane sensor")
+    plane = _summed_plane(settings, level.ppp, clip.exposure)
     made = []
     for bits in settings.bits:
         m = 2**bits - 1
         path = stream_clip(clip, folder, bits, force)
         grouped = group(clip, path, m, force=force)
         read = Sensing(settings.sensor, bits, ppp=m * level.ppp, seed=settings.seed, name="multibit")
+        if settings.sensor.endswith(".toml"):  # read at every depth, which the file does not state
+            own = at_depth(settings.sensor, bits, m * level.ppp, m * clip.exposure)
+            read = replace(read, sensor=own, defects=defect_table.from_toml(settings.sensor))
         sense(grouped, read)
         key = keys.Key(seed=settings.seed, clip=keys.hash_name(clip.name))
         draw = Draw(replace(plane, bits=bits), plane, level, key, m, False)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy import ndarray as Array
 
 from qsim.sensor import devices
+from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
@@ -110,11 +111,36 @@ class Readout:
         return replace(self, sensor=replace(self.sensor, read_noise=0.0)) if isinstance(self.sensor, QIS) else self
 
 
+def at_depth(name: str, bits: int, ppp: float, exposure: float) -> Sensor:
+    """Return a named sensor, or that of a file, with so many bits at `ppp` photons per pixel and exposure.
+
+    A file of a SPAD, or of a QIS with gain 1 and no offset, is taken at every depth. `ValueError` for another file
+    whose sensor has other bits, because gain and offset belong to them.
+    """
+    if not name.endswith(".toml"):
+        return devices.load(name, ppp=ppp, bits=bits, exposure=exposure)
+    sensor = devices.load(name)
+    if isinstance(sensor, BinarySPAD | CountingSPAD):
+        return replace(sensor, bits=bits)
+    if isinstance(sensor, QIS) and (sensor.gain, sensor.offset) == (1.0, 0.0):
+        return replace(sensor, bits=bits)
+    if isinstance(sensor, QIS) and sensor.bits != bits:
+        raise ValueError(
+            f"{name}: its gain and offset belong to its {sensor.bits} bits, and {bits} are asked for; give a QIS of "
+            f"gain 1 without offset, a SPAD, or for --sensor its own depth alone: --bits {sensor.bits}"
+        )
+    return devices.load(name, bits=bits)
+
+
 def plane_sensor(settings: StudySettings, ppp: float, exposure: float) -> Sensor:
-    """Return the sensor of one binary plane; raise `ValueError` if the named one has more than one bit."""
+    """Return the sensor of one binary plane; raise `ValueError` if the named one has more than one bit.
+
+    Unless one is named, efficiency and dark rate are those of the multi-bit read, whatever the bits of its file.
+    """
     if settings.plane is not None:
-        return devices.load(settings.plane, ppp=ppp, bits=1, exposure=exposure)
-    read = devices.load(settings.sensor, ppp=ppp, bits=1, exposure=exposure)
+        return at_depth(settings.plane, 1, ppp, exposure)
+    bits = None if settings.sensor.endswith(".toml") else 1
+    read = devices.load(settings.sensor, ppp=ppp, bits=bits, exposure=exposure)
     return BinarySPAD(read.efficiency, read.dark_rate, 1)
 
 
@@ -124,6 +150,5 @@ def readouts(settings: StudySettings, ppp: float, exposure: float) -> list[Reado
     result = [Readout("planes", b, plane, exposure) for b in settings.bits]
     for b in settings.bits:
         m = 2**b - 1
-        sensor = devices.load(settings.sensor, ppp=m * ppp, bits=b, exposure=m * exposure)
-        result.append(Readout("multibit", b, sensor, m * exposure))
+        result.append(Readout("multibit", b, at_depth(settings.sensor, b, m * ppp, m * exposure), m * exposure))
     return result

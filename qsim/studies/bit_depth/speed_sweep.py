@@ -193,7 +193,7 @@ def _cells(row: StudyRow) -> list[str]:
         f"{row.blur_error:.3f}",
         f"({row.blur_predicted:.3f})",
         *(f"{error:.3f}" for error in (row.shot_error, row.quantisation_error, row.read_error)),
-        f"{row.snr_db:.2f}",
+        "-" if row.snr_db is None else f"{row.snr_db:.2f}",
         f"{row.psnr_db:.2f}",
         f"({row.psnr_predicted_db:.2f})",
         f"{row.psnr_error_db:.2f}",

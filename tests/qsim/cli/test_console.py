@@ -9,8 +9,11 @@ import time
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 from clips import write_clip
+from PIL import Image
+from waves import wave_clip
 
 import qsim.cli.program
 import quiver.cli.program
@@ -18,6 +21,7 @@ from qsim.cli import console
 from qsim.cli.options import checked
 from qsim.cli.program import main
 from qsim.clip.clip import Clip
+from qsim.clip.writer import ClipWriter
 
 ROOT = Path(__file__).parents[3]
 
@@ -157,6 +161,70 @@ def test_an_interrupted_command_with_json_is_an_object(tmp_path, monkeypatch, ca
     assert json.loads(found.out) == {"error": found.err.strip(), "exit_code": 130}
 
 
+def interrupt_at(patch: pytest.MonkeyPatch, clip: str, frame: int) -> None:
+    """Let Ctrl-C come when a frame of a clip is to be written."""
+    add = ClipWriter.add
+
+    def stop(self: ClipWriter, t: int, *rest: object, **named: object) -> None:
+        if (self.name, t) == (clip, frame):
+            raise KeyboardInterrupt
+        add(self, t, *rest, **named)  # type: ignore[arg-type]
+
+    patch.setattr(ClipWriter, "add", stop)
+
+
+def test_an_interrupted_import_resumes_and_says_so(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    np.save("light.npy", np.random.default_rng(0).random((4, 6, 8)).astype(np.float32))
+    words = ["convert", "light.npy", "c", "--transfer", "linear", "--frame-rate", "9"]
+    for frame, then in ((0, console.STARTS_AGAIN), (2, console.RESUMES)):
+        with monkeypatch.context() as patch:
+            interrupt_at(patch, "c", frame)
+            assert main(words) == 130
+        assert capsys.readouterr().err.endswith(f"\nqsim: interrupted; {then}\n")
+        assert Path("c.part").exists() == (frame > 0)
+    assert main(words) == 0
+
+
+def test_an_interrupted_import_of_several_says_what_stays(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ("many/a", "many/b"):
+        Path(name).mkdir(parents=True)
+        for t in range(2):
+            Image.fromarray(np.full((6, 8), 40 + t, np.uint8)).save(f"{name}/{t}.png")
+    words = ["convert", "many", "clips", "--transfer", "linear", "--frame-rate", "9"]
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, "b", 1)
+        assert main(words) == 130
+    assert capsys.readouterr().err.endswith(f"\nqsim: interrupted; {console.MAKES_AGAIN}\n")
+    assert sorted(path.name for path in Path("clips").iterdir()) == ["a", "b.part"]
+    assert main(words) == 2
+    assert main([*words, "--force"]) == 0
+
+
+def test_an_interrupted_study_of_a_scene_resumes_and_says_so(tmp_path, monkeypatch, capsys):
+    def render(name: str, path: Path, *_: object, **__: object) -> Clip:
+        if path.name == "plain_x2":
+            raise KeyboardInterrupt
+        return Clip.open(path) if path.exists() else wave_clip(path, 4, 1)
+
+    monkeypatch.setattr("qsim.studies.bit_depth.clips.render", render)
+    words = ["tradeoff", "plain", "--speed", "1,2", "--ppp", "1", "--bits", "1", "-o", str(tmp_path / "o")]
+    assert main(words) == 130
+    assert capsys.readouterr().err.endswith(f"\nqsim: interrupted; {console.RESUMES}\n")
+
+
+def test_an_interrupted_data_set_without_a_name_resumes_and_says_so(tmp_path, monkeypatch, capsys):
+    def generate(_: object, folder: Path, *__: object, **___: object) -> None:
+        folder.mkdir(parents=True)
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("qsim.dataset.generation.generate", generate)
+    assert main(["generate", "demo"]) == 130
+    assert capsys.readouterr().err.endswith(f"\nqsim: interrupted; {console.RESUMES}\n")
+
+
 def test_a_bar_names_the_work_before_the_first_frame(capsys, monkeypatch):
     """After two seconds without a frame the bar says what is being done, and the name of the work from then on."""
     started: list[object] = []
@@ -206,8 +274,12 @@ def test_verbose_says_time_and_memory_and_shows_the_traceback(tmp_path, capsys):
     out, err = capsys.readouterr()
     assert json.loads(out)["problems"] == []
     assert " s, at most " in err
-    with pytest.raises(FileNotFoundError):
-        main(["check", "/none", "-v"])
+    assert main(["check", "/none", "-v", "--json"]) == 2
+    out, err = capsys.readouterr()
+    found = json.loads(out)
+    assert found["exit_code"] == 2
+    assert err.startswith("Traceback (most recent call last):\n")
+    assert f"\n{found['error']}\n" in err
 
 
 def test_a_quiet_bar_shows_nothing(capsys):

@@ -1,7 +1,11 @@
 """Tests the demo: every command that it runs is one that the programs take, and a failure names its step."""
 
 import json
+import os
+import signal
 import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +27,7 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, list[str]]]:
     """The commands of the demo, parsed in place of being run."""
     found: list[tuple[str, list[str]]] = []
 
-    def parse(words: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+    def parse(words: list[str], capture: bool) -> str:
         program, arguments = words[2], words[3:]
         args = PARSERS[program].parse_args(arguments)
         found.append((program, arguments))
@@ -31,9 +35,9 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, list[str]]]:
             args.output.mkdir()
             jobs = {"a": {"split": "train"}, "b": {"split": "test"}}
             (args.output / "dataset.json").write_text(json.dumps({"jobs": jobs}))
-        return subprocess.CompletedProcess(words, 0, stdout="{}")
+        return "{}"
 
-    monkeypatch.setattr(subprocess, "run", parse)
+    monkeypatch.setattr(demo, "call", parse)
     return found
 
 
@@ -60,9 +64,48 @@ def test_a_finished_restoration_is_not_repeated(ran, tmp_path: Path):
 
 
 def test_a_failed_step_is_named(tmp_path: Path, monkeypatch, capsys):
-    def fail(words: list[str], **_: object) -> None:
+    def fail(words: list[str], capture: bool) -> None:
         raise subprocess.CalledProcessError(1, words)
 
-    monkeypatch.setattr(subprocess, "run", fail)
+    monkeypatch.setattr(demo, "call", fail)
     assert qsim.cli.program.main(["demo", str(tmp_path / "d"), "-q"]) == 1
     assert "stopped at 'qsim generate demo -o" in capsys.readouterr().err
+    assert qsim.cli.program.main(["demo", str(tmp_path / "d"), "--json"]) == 1
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {"error": err.strip(), "exit_code": 1}
+
+
+def test_a_step_returns_what_it_printed_or_its_failure():
+    assert demo.call([sys.executable, "-c", "print(3)"], True) == "3\n"
+    assert demo.call([sys.executable, "-c", ""], False) == ""
+    with pytest.raises(subprocess.CalledProcessError) as failed:
+        demo.call([sys.executable, "-c", "raise SystemExit(3)"], False)
+    assert failed.value.returncode == 3
+
+
+def test_ctrl_c_waits_for_the_step_which_saves_its_state(tmp_path: Path):
+    """A step that needs a second after SIGINT, as a training does, is not killed before."""
+    (tmp_path / "child.py").write_text(
+        "import pathlib, signal, time\n"
+        "signal.signal(signal.SIGINT, lambda *_: (time.sleep(1), pathlib.Path('saved').touch(), exit(130)))\n"
+        "pathlib.Path('ready').touch()\n"
+        "time.sleep(60)\n"
+    )
+    code = "import sys; from qsim.cli import demo; demo.call([sys.executable, 'child.py'], True)"
+    root = Path(__file__).parents[3]
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(root)},
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells ignore it in what they put behind
+    )
+    end = time.monotonic() + 60
+    while not (tmp_path / "ready").exists():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    os.killpg(parent.pid, signal.SIGINT)  # as a terminal does
+    _, err = parent.communicate(timeout=60)
+    assert (tmp_path / "saved").exists()
+    assert b"KeyboardInterrupt" in err

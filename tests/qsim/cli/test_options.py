@@ -240,7 +240,7 @@ ROWS: dict[tuple[str, str], list[Row]] = {
     ],
     ("compare", "--span"): [Acts("compare clip", "--span 1e-3", stdout), Refused("compare clip", "--span 9", "span")],
     # convert
-    ("convert", "--layout"): [Acts(CODES.replace("--layout codes", ""), "--layout codes", exit_code, codes=(0, 2))],
+    ("convert", "--layout"): [Acts("convert codes.npy c --frame-rate 9", "--layout cube", exit_code, codes=(0, 2))],
     ("convert", "--frame-rate"): [
         Refused("convert clip e.mp4", "--frame-rate 9", "--frame-rate"),
         Acts("convert codes.npy c --layout codes --bits 3", "--frame-rate 9", exit_code, codes=(0, 2)),

@@ -148,3 +148,23 @@ def test_options_that_cannot_act_are_refused(clip, capsys, tmp_path, monkeypatch
     assert message in error
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_no_signal_to_noise_ratio_is_no_number(clip, capsys):
+    """Planes that always fire have no slope: null in JSON, which has no infinity, and - in the table."""
+    words = ["tradeoff", str(clip.path), "--ppp", "1000", "--bits", "1,2", "--instants", "1"]
+    assert main([*words, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out, parse_constant=lambda name: pytest.fail(name))["rows"]
+    assert [row["snr_db"] is None for row in rows] == [True, True, False, False]
+    assert main(words) == 0
+    lines = capsys.readouterr().out.splitlines()
+    cells = [line.split() for line in lines if line.split()[0] == "planes"]
+    assert [len(row) for row in cells] == [15, 15]
+    assert [row[9] for row in cells] == ["-", "-"]
+
+
+def test_a_sensor_file_of_any_bits_compares_depths(clip, tmp_path, capsys):
+    (tmp_path / "spad.toml").write_text('[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 10.0\nbits = 4\n')
+    words = ["tradeoff", str(clip.path), "--ppp", "0.65", "--instants", "1", "--json"]
+    assert main([*words, "--bits", "1,2", "--sensor", str(tmp_path / "spad.toml")]) == 0
+    assert [row["bits"] for row in json.loads(capsys.readouterr().out)["rows"]] == [1, 2, 1, 2]

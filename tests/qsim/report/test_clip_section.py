@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from clips import square_clip, write_clip
+from clips import colour_clip, square_clip, write_clip
 from stats import mixture_p_value
 
 from qsim.cli.program import main
@@ -87,6 +87,14 @@ def test_the_section_states_light_motion_model_and_error(tmp_path):
     assert "Error of a frame (noise, blur, omitted bounces): 0.01 rms in the unit of the radiance, worst 0.01" in page
     for words in ("light of the truth", "drawn, and expected from the light", "error of every frame"):
         assert words in page, words
+
+
+def test_electrons_behind_colour_filters_are_those_of_the_mosaic(tmp_path):
+    """A white pixel of four passes three bands, so 3.25 photons of each make 3.25 x 0.8 x 6 / 4 electrons."""
+    clip = colour_clip(tmp_path / "c", height=8, width=10)
+    stream, line = sense(clip, Sensing("quiver-physical", ppp=3.25, bits=3, colour="rgbw", name="mosaic"))
+    assert ", 3.9 e⁻ per pixel; 3 bit, QIS" in clip_section.stream_line(stream)
+    assert "3.9 e-" in line
 
 
 def test_motion_is_that_of_the_pixels_that_move(folder):

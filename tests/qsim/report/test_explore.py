@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from browser import browser, needs_chromium
 from clips import sliding_pattern, write_clip
+from javascript import TEMPLATES, MiniRacer, Script
 from stats import critical_z, mixture_p_value, per_check
 
 from qsim.cli.program import main
@@ -48,6 +49,28 @@ def written(clip):
     target = clip.path.with_name("page.html")
     assert main(["explore", str(clip.path), "-o", str(target), "--quiet"]) == 0
     return target
+
+
+@pytest.fixture
+def controls(clip):
+    """The script of the page without its pictures: settings, and what changes them."""
+    data = json.dumps(held(explore.explore_page(clip)))
+    around = f"""
+        const atob = () => "", location = {{ hash: "" }};
+        const control = {{ textContent: {json.dumps(data)}, dataset: {{ from: 0, to: 1e6 }} }};
+        const document = {{ getElementById: () => control }};
+        class URLSearchParams {{
+          constructor(text) {{ this.found = new Map(text.split("&").map(word => word.split("="))); }}
+          has(name) {{ return this.found.has(name); }}
+          get(name) {{ return this.found.get(name); }}
+        }}
+    """
+    script = (TEMPLATES / "explore.js").read_text(encoding="utf-8").partition("\nfor (const name of NAMES) at(name)")[0]
+    with MiniRacer() as engine:
+        engine.eval(around)
+        engine.eval(script)
+        engine.eval("showControls = later = () => {}; readAddress()")
+        yield Script(engine)
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +140,23 @@ def test_named_sensors_are_those_that_the_sliders_can_state():
     assert "quiver-physical" in names
     assert "spcm20a" in names
     assert "cmos-5.1e" not in names, "10 bits and an offset"
+
+
+def test_a_named_sensor_keeps_its_name_only_at_the_light_of_its_gain(controls):
+    """Its gain is that of 3.25 photons in one frame: elsewhere the settings are the user's own."""
+
+    def after(steps: str) -> list:
+        return controls.value(f"({steps}, [state.device, state.light, state.frames])")
+
+    assert after("0") == ["quiver-physical", 3.25, 1]
+    assert after("change('start', 2)") == ["quiver-physical", 3.25, 1]
+    assert after("change('light', 10)") == ["", 10, 1]
+    assert after("takeDevice('quiver-published')") == ["quiver-published", 3.25, 1], "it comes with its light"
+    assert after("change('frames', 2)") == ["", 3.25, 2]
+    assert after("takeDevice('quiver-paper'), change('light', 10)") == ["quiver-paper", 10, 2], "its gain is 1"
+    assert after("location.hash = '#device=quiver-published&light=3.25', readAddress()")[0] == "quiver-published"
+    assert after("location.hash = '#device=quiver-published&light=9', readAddress()") == ["", 9, 1]
+    assert controls.value("state.gain") == pytest.approx(0.5 * 7 / 3.25)
 
 
 def test_a_black_clip_is_refused_and_nothing_is_written(tmp_path, capsys):

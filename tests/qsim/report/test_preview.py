@@ -196,3 +196,13 @@ def test_mistakes_are_one_line(clip, tmp_path, monkeypatch, capsys, words, messa
     assert captured.err.count("\n") == 1
     assert captured.out == ""
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_neither_the_picture_nor_its_json_is_replaced_without_force(clip, tmp_path, capsys):
+    target, beside = tmp_path / "a.png", tmp_path / "a.png.json"
+    beside.write_text("mine")
+    assert main(["preview", str(clip.path), "-o", str(target), "--what", "sharp"]) == 2
+    assert "a.png.json: exists; name another with -o, or use --force" in capsys.readouterr().err
+    assert (beside.read_text(), target.exists()) == ("mine", False)
+    assert main(["preview", str(clip.path), "-o", str(target), "--what", "sharp", "--force"]) == 0
+    assert json.loads(beside.read_text())["frames"] == [2, 3]

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from qsim.report import report
-from qsim.report.table_sections import training_section
+from qsim.report.table_sections import study_section, training_section
 from qsim.studies.validation.backends import BackendReport, BackendRow
 from qsim.studies.validation.light import LightReport, LightRow
 from qsim.studies.validation.reading import ReadingReport
@@ -118,3 +118,16 @@ def test_validations_without_a_section_are_left_out(tmp_path):
     for name in ("light", "engines"):
         with pytest.raises(ValueError, match="nothing to report"):
             report.build_page(tmp_path / f"{name}.json")
+
+
+def test_a_study_shows_its_own_picture(tmp_path):
+    """A study beside the picture of an earlier sweep, and a sweep beside that of an earlier study."""
+    study = {"clip": "fan", "ppp": 0.65, "rows": [{"model": "planes", "bits": 3}], "structure_function": [0.0]}
+    sweep = {"cells": [{"speed": 2.0, "best_bits": 3}], "studies": [study]}
+    for name in ("tradeoff.png", "best.png"):
+        (tmp_path / name).write_bytes(b"\x89PNG")
+    for found, own in ((study, "tradeoff.png"), (sweep, "best.png")):
+        (tmp_path / "tradeoff.json").write_text(json.dumps(found))
+        body = study_section(tmp_path / "tradeoff.json").body
+        assert body.count("data:image/png") == 1
+        assert f"{tmp_path.name}/{own}" in body

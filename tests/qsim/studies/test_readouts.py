@@ -67,6 +67,19 @@ def test_spikes_come_near_the_light_they_count(tmp_path):
     assert abs(error / expected - 1) < 6 * np.sqrt(2.5 / 77)
 
 
+def test_instants_end_with_the_stream_that_ends_first(tmp_path):
+    """Codes of four frames leave the last three of eleven unseen: no stream is scored there."""
+    clip = write_clip(tmp_path / "c", frames=11, height=5, width=8)
+    clip.sense(EXACT, ppp=90.0, slices=4, name="four")
+    clip.sense(EXACT, ppp=90.0, name="each")
+    span = 1 / clip.frame_rate
+    assert compare(clip, span=span).instants == tuple(range(8))
+    assert compare(clip, ["each"], span).instants == tuple(range(11))
+    assert compare(clip, span=8 * span).instants == (4,)
+    with pytest.raises(ValueError, match=r"a span of 0\.0045 s; stream four covers 8 frames of 0\.0005 s: give a span"):
+        compare(clip, span=9 * span)
+
+
 def test_the_command_prints_a_table_and_refuses_what_cannot_be(tmp_path, capsys):
     clip = write_clip(tmp_path / "c", frames=6, height=5, width=8)
     assert main(["compare", str(clip.path)]) == 2

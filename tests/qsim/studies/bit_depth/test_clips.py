@@ -5,9 +5,11 @@ import pytest
 from clips import write_clip
 from waves import SIZE, wave_clip
 
+from qsim.cli.program import main
 from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons, light_level
 from qsim.dataset.redraw import redraw
+from qsim.rendering import clip_rendering, fidelity
 from qsim.studies.bit_depth.clips import ClipShape, clips_for, group, render, write_streams
 from qsim.studies.bit_depth.readout import StudySettings
 from qsim.studies.readouts import compare
@@ -60,3 +62,43 @@ def test_another_clip_in_the_place_of_a_rendered_one_is_refused(tmp_path):
     wave_clip(tmp_path / "plain_x1", 4, 1)
     with pytest.raises(FileExistsError, match="exists and is another clip; name another folder with -o"):
         render("plain", tmp_path / "plain_x1", ClipShape(8, 24, 32))
+
+
+def test_a_clip_of_an_edited_scene_file_is_refused(tmp_path, monkeypatch):
+    """The digests of the files that a scene reads are stored with its clip, and compared before it is taken."""
+
+    def rendered(scene, path, *, frames, frame_rate, extra, **_):
+        about = {"family": scene.name, "seed": scene.seed, "speed": scene.speed}
+        return write_clip(path, frames=frames, height=6, width=8, frame_rate=frame_rate, scene=about, **(extra or {}))
+
+    monkeypatch.setattr(clip_rendering, "render_clip", rendered)
+    monkeypatch.setattr(fidelity, "choose_budget", lambda *_, **__: None)
+    file, shape = tmp_path / "own.py", ClipShape(2, 6, 8, frame_rate=10_000.0)
+    file.write_text("from qsim.scenes.plain import scene\n")
+    made = render(str(file), tmp_path / "own_x1", shape)
+    assert list(made.meta["reads"]) == ["own.py"]
+    assert render(str(file), tmp_path / "own_x1", shape).meta == made.meta
+    assert "reads" not in render("plain", tmp_path / "plain_x1", shape).meta
+    assert render("plain", tmp_path / "plain_x1", shape)
+    file.write_text("from qsim.scenes.plain import scene\n\n")
+    with pytest.raises(FileExistsError, match=r"own\.py and its files as they are now; name another folder with -o"):
+        render(str(file), tmp_path / "own_x1", shape)
+
+
+def test_streams_of_a_sensor_file_have_every_depth(clip, tmp_path):
+    """Its bits are those of the depth, and its defects are drawn."""
+    file = tmp_path / "spad.toml"
+    text = '[sensor]\nmodel = "BinarySPAD"\npde = 0.4\ndark_count_rate = 10.0\nbits = 2\n'
+    file.write_text(f"{text}[defects]\nprnu = 0.02\n")
+    made = write_streams(clip, tmp_path, StudySettings(bits=(1, 3), sensor=str(file), ppp=0.65))
+    streams = [Clip.open(path).stream("multibit") for path in made]
+    assert [stream.bits for stream in streams] == [1, 3]
+    assert all(stream.sensor.efficiency == 0.4 and "prnu" in stream.meta["defects"] for stream in streams)
+
+
+def test_planes_that_cannot_be_summed_are_refused_before_the_study(clip, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("qsim.studies.bit_depth.clip_study.study", lambda *_, **__: pytest.fail("was studied first"))
+    words = ["tradeoff", str(clip.path), "--ppp", "0.65", "--bits", "1,2", "--plane-sensor", "quiver-paper"]
+    assert main([*words, "--streams", "-o", str(tmp_path / "out")]) == 2
+    assert "need a clocked SPAD; leave out the plane sensor" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

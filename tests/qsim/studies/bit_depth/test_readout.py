@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from qsim.sensor.spad import BinarySPAD
-from qsim.studies.bit_depth.readout import Readout
+from qsim.studies.bit_depth.readout import Readout, StudySettings, plane_sensor, readouts
+
+SPAD = '[sensor]\nmodel = "BinarySPAD"\npde = 0.3\ndark_count_rate = 25.0\nbits = 4\n'
+COUNTER = '[sensor]\nmodel = "CountingSPAD"\npde = 0.3\ndark_count_rate = 25.0\ndead_time = 5e-8\nbits = 8\n'
+QIS = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.3\ndark_current = 25.0\nread_noise = 0.2\nbits = 3\n'
 
 
 def test_a_readout_of_planes_is_the_spad_that_sums_them():
@@ -17,3 +21,31 @@ def test_a_readout_of_planes_is_the_spad_that_sums_them():
         20 * np.log10(theta * np.sqrt(summed.fisher_information(np.array(theta), 7e-4)))
     )
     assert np.allclose(readout.estimates, summed.maximum_likelihood(np.eye(8), 7e-4).photons, rtol=1e-6)
+
+
+@pytest.mark.parametrize("text", [SPAD, COUNTER, QIS])
+def test_a_sensor_file_is_read_at_every_depth(tmp_path, text):
+    """Its bits do not matter; a plane has its efficiency and dark rate."""
+    file = str(tmp_path / "mine.toml")
+    (tmp_path / "mine.toml").write_text(text)
+    settings = StudySettings(bits=(1, 3, 5), sensor=file)
+    forms = [form for form in readouts(settings, 0.65, 1e-4) if form.model == "multibit"]
+    assert [form.sensor.bits for form in forms] == [1, 3, 5]
+    assert {(form.sensor.efficiency, form.sensor.dark_rate) for form in forms} == {(0.3, 25.0)}
+    assert plane_sensor(settings, 0.65, 1e-4) == BinarySPAD(0.3, 25.0, 1)
+    plane = plane_sensor(StudySettings(plane=file), 0.65, 1e-4)
+    assert (plane.bits, plane.efficiency) == (1, 0.3)
+
+
+@pytest.mark.parametrize("own", ["gain = 1.08\n", "offset = 2.0\n", "full_well = 100.0\niso = 400\n"])
+def test_a_gain_belongs_to_the_bits_of_its_file(tmp_path, own):
+    """The refusal names the depth at which the file is taken."""
+    file = str(tmp_path / "mine.toml")
+    (tmp_path / "mine.toml").write_text(QIS + own)
+    with pytest.raises(ValueError, match=r"belong to its 3 bits, and 1 are asked for; .* alone: --bits 3$"):
+        readouts(StudySettings(sensor=file), 0.65, 1e-4)
+    planes, multibit = readouts(StudySettings(bits=(3,), sensor=file), 0.65, 1e-4)
+    assert planes.sensor == BinarySPAD(0.3, 25.0, 1)
+    assert multibit.sensor.bits == 3
+    with pytest.raises(ValueError, match="belong to its 3 bits, and 1 are asked for"):
+        plane_sensor(StudySettings(plane=file), 0.65, 1e-4)

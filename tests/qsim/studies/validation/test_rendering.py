@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from small_scenes import plate, renderer
 from qsim.rendering.budget import Budget
 from qsim.scene import Spin, SunSky
 from qsim.studies.validation import rendering
-from qsim.studies.validation.rendering import NaiveLoop, RenderReport, RenderRow, Target
+from qsim.studies.validation.rendering import FRAME, NaiveLoop, RenderReport, RenderRow, Target
 
 ROW = RenderRow("a/0", 40.0, 1024, 40.2, 3.0, False, 32, True, 4, 40.6, 40.1, 0.25)
 
@@ -80,6 +81,33 @@ def test_frames_that_share_samples_have_a_row_where_they_are_predicted_to_cost_l
     report = rendering.run([plate(None, light=SunSky())], levels=(30.0, 40.0), reference_samples=4)
     expected = [(30.0, 0), (40.0, 0)] + [(40.0, neighbours)] * (neighbours > 0)
     assert [(row.level, row.neighbours) for row in report.rows] == expected
+
+
+class Timed:
+    """A renderer whose frames reach 38 dB below 12 samples and 41 dB from them on; frames after FRAME state 10 dB."""
+
+    def __init__(self, scene, *, budget):
+        self.budget = budget
+
+    def frame(self, t, with_truth):
+        stated = 10.0 if t > FRAME else 39.0
+        return SimpleNamespace(
+            radiance=38.0 if self.budget.samples < 12 else 41.0, errors_at=[(1.0, 10 ** (-stated / 20))]
+        )
+
+
+@pytest.mark.parametrize(("chosen", "raised"), [(8, True), (16, False)])
+def test_a_row_states_the_error_of_the_scored_frame_and_the_chosen_samples(monkeypatch, chosen, raised):
+    monkeypatch.setattr(rendering, "Renderer", Timed)
+    monkeypatch.setattr(rendering, "NaiveLoop", lambda ours: SimpleNamespace(mean=lambda t, samples: 40.0))
+    target = SimpleNamespace(white=1.0, psnr=lambda image: image)
+    row = rendering._compare(None, "a/0", 40.0, Budget(chosen, 4), target, rounds=1, most_samples=256)
+    assert row.stated_psnr == pytest.approx(39.0)
+    assert row.psnr == 41.0
+    assert (row.chosen_samples, row.raised) == (chosen, raised)
+    assert (row.samples > chosen) == raised
+    text = rendering.table(RenderReport(8, 10, "llvm", (row,), {"a/0": 1.0}))
+    assert ("12 (raised from 8)" in text) == raised
 
 
 @pytest.mark.slow
