@@ -1,8 +1,7 @@
 """Repeats the paper's ablation with a QUIVER of a million parameters: six networks, two seeds, one row each.
 
-    python docs/ablation_rows.py out/starter                       # 20 minutes for each row that is missing
-    python docs/ablation_rows.py out/starter --rows all,none       # these networks alone, with both seeds
-    python docs/ablation_rows.py out/starter --steps 1500          # equal steps, all missing rows at once: on a GPU
+    python docs/ablation_rows.py out/starter --steps 277           # equal steps, all missing rows at once: on a GPU
+    python docs/ablation_rows.py out/starter --out out/rows        # 20 minutes for each row that is missing
     python docs/ablation_rows.py out/tiny --tiny --out out/rows    # seconds for each row: a test of this program
 
 A row is RESULTS/NAME-SEED.json: one of the six networks of the paper's Table 4, with one seed of weights and windows.

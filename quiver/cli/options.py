@@ -110,8 +110,13 @@ def add_strict(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--strict", action="store_true", help="networks: refuse a stream outside their measured domain")
 
 
-def check_domain(args: argparse.Namespace, methods: Sequence[Any], streams: Iterable[Any]) -> list[str]:
-    """Print a line for each network outside of what it was measured for; `ValueError` with --strict."""
+def check_domain(
+    args: argparse.Namespace, methods: Sequence[Any], streams: Iterable[Any], shown: int | None = None
+) -> list[str]:
+    """Print a line for each network outside of what it was measured for; `ValueError` with --strict.
+
+    Of many lines only the first `shown` are printed, and how many follow.
+    """
     from quiver.restoration.domain_remarks import measured_at, refuse_outside, remarks
 
     found: list[str] = []
@@ -122,8 +127,10 @@ def check_domain(args: argparse.Namespace, methods: Sequence[Any], streams: Iter
         if args.verbose:
             for text in filter(None, (measured_at(method, codes) for method in methods)):
                 note(f"quiver: {text}")
-    for text in found:
+    for text in found[:shown]:
         note(f"quiver: warning: {text}")
+    if shown is not None and len(found) > shown:
+        note(f"quiver: warning: {len(found) - shown} more lines of this kind, for other streams")
     return found
 
 

@@ -128,7 +128,7 @@ def _restore_cubes(args: argparse.Namespace) -> int:
     bands = [band_codes(cube, colour, planes) for cube in found for colour in range(len(COLOURS))]
     method, why = chosen_for_all(args.method, bands, running_options(args))
     refuse_idle(vars(args), [method])
-    check_domain(args, [method], bands)
+    check_domain(args, [method], bands, shown=1)
     use_threads(args)
     for text in (why, assumed(bands[0], method)):
         if text is not None:

@@ -113,11 +113,12 @@ def sheet(
 ) -> bool:
     """Draw one row per clip and one column per method as PNG, peak = white, gamma 2.2.
 
-    `crops` names the crop of each clip and method; without a name its place stays empty. Return False if there are no
-    crops.
+    `crops` names the crop of each clip and method; without a name its place stays empty. Return False, and leave
+    `target` as it is, if there are no crops, or named ones are missing: those of an earlier version had other names.
     """
     rows = [clip for clip in clips if crop_file(out, light, clip, "truth").exists()][:SCENES_SHOWN]
-    if not rows:
+    named = [crop_file(out, light, clip, name) for (clip, _), name in crops.items() if clip in rows]
+    if not rows or not all(path.exists() for path in named):
         return False
     columns = ["truth", "codes", *methods]
     drawing = new_figure(1.5 * len(columns), 1.55 * len(rows) + 0.4)

@@ -138,6 +138,19 @@ def test_a_run_that_fails_is_told_in_json(capsys, tiny_dataset, tmp_path, monkey
     assert err == f"{STOPS[code]}\n"
 
 
+@pytest.mark.parametrize("command", ["train", "ablate"])
+def test_exhausted_memory_is_one_sentence(capsys, tiny_dataset, tmp_path, monkeypatch, command):
+    def exhausted(*given: object, **named: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(loop, "train", exhausted)
+    monkeypatch.setattr(ablation, "run_ablation", exhausted)
+    words = [command, str(tiny_dataset), "-o", str(tmp_path / "r"), "--steps", "1", "-q"]
+    assert main([*words, *(["--preset", "unet"] if command == "train" else [])]) == 2
+    told = capsys.readouterr().err
+    assert told.splitlines()[-1].endswith("memory is exhausted (CUDA out of memory); give a smaller --batch")
+
+
 def test_a_sensor_file_is_measured_with_its_bits(capsys, make_clip: ClipMaker, tmp_path, monkeypatch):
     """Its cell is found again, so that the same command measures nothing."""
     words = ["domain", weights(tmp_path), make_clip().path, "--sensor", f"{one_bit_file(tmp_path)},quiver-physical"]

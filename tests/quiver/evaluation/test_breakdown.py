@@ -122,4 +122,7 @@ def test_crops_show_where_most_moves(make_clip: ClipMaker, tmp_path):
     still = make_clip("still", frames=3, height=120, width=40)
     assert breakdown.place(still, 1) == (slice(40, 80), slice(0, 40))
     assert not breakdown.sheet(tmp_path, "3.25 PPP", [clip.name], ["moment"], {}, tmp_path / "none.png")
+    breakdown.save_crop(breakdown.crop_file(tmp_path, "3.25 PPP", clip.name, "truth"), np.zeros((8, 8)))
+    lost = {(clip.name, "moment"): "moment 01234567"}
+    assert not breakdown.sheet(tmp_path, "3.25 PPP", [clip.name], ["moment"], lost, tmp_path / "none.png")
     assert not (tmp_path / "none.png").exists()

@@ -193,7 +193,7 @@ def test_exhausted_memory_keeps_the_finished_blocks(tmp_path, blocks_of_four, mo
     assert main(words) == 2
     told = capsys.readouterr().err
     assert told.count("\n") == 1
-    assert f"memory is exhausted ({said}); give a smaller --memory; the finished frames are kept" in told
+    assert f"memory is exhausted ({said}); give a smaller --memory, which may start again; or free some" in told
     monkeypatch.setattr(restorers, "fill_classical", counted)
     assert main([*words, "--memory", "1GB"]) == 0
     assert starts == [4, 8]

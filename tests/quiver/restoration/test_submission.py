@@ -124,7 +124,7 @@ class Idle:
 
 def test_every_band_of_every_cube_decides(tmp_path, monkeypatch, capsys):
     """`auto`, and --strict with the remark on the last band of the last cube."""
-    source, seen = static_cubes(tmp_path / "cubes", planes=21), []
+    source, seen, unknown = static_cubes(tmp_path / "cubes", planes=21), [], {"night/000007 blue"}
     words = ["restore", str(source), "-o", str(tmp_path / "a.zip"), "--planes", "7"]
 
     def chosen(name: str, streams: Iterable[Codes], options: object) -> tuple[Restorer, None]:
@@ -132,7 +132,7 @@ def test_every_band_of_every_cube_decides(tmp_path, monkeypatch, capsys):
         return restorer("naive"), None
 
     def remark(name: str, scope: object, codes: Codes) -> str | None:
-        return "never measured so" if codes.name == "night/000007 blue" else None
+        return f"never measured so: {codes.name}" if codes.name in unknown else None
 
     with monkeypatch.context() as patched:
         patched.setattr(automatic, "chosen_for_all", chosen)
@@ -140,4 +140,9 @@ def test_every_band_of_every_cube_decides(tmp_path, monkeypatch, capsys):
     assert seen == [f"{scene}/000007 {colour}" for scene in ("day", "night") for colour in ("red", "green", "blue")]
     monkeypatch.setattr(domain_remarks, "remark", remark)
     assert main([*words, "--force", "--method", "mergenet", "--strict"]) == 2
-    assert "never measured so; leave out --strict" in capsys.readouterr().err
+    assert "never measured so: night/000007 blue; leave out --strict" in capsys.readouterr().err
+    unknown |= {"day/000007 red", "night/000007 red"}
+    assert main([*words, "--force", "--method", "mergenet"]) == 0
+    told = capsys.readouterr().err
+    assert told.count("never measured so") == 1
+    assert "warning: 2 more lines of this kind" in told
