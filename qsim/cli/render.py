@@ -122,7 +122,11 @@ def _run_render(args: argparse.Namespace) -> int:
         text += f"\n{fireflies} of {pixels} pixels are fireflies (Monte-Carlo outliers); {how}"
     if cut := clip.meta["clipped_pixels"]:
         text += f"\n{cut} of {math.prod(clip.shape)} pixels are brighter than {HALF_MAX:g}, the most a clip holds"
-        text += ": cut off there, and left out of scores" if "saturated_pixels" in clip.meta else ": cut off there"
+        text += (
+            ": cut off there, and left out of the scores of quiver"
+            if "saturated_pixels" in clip.meta
+            else ": cut off there"
+        )
     findings = [Finding(**finding) for finding in render_meta["findings"]]
     if not args.explain and (args.reuse or render_meta["neighbours"]):
         text += "".join(f"\n{explain([one])}" for one in findings if one.effect == REUSE)

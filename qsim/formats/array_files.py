@@ -227,16 +227,15 @@ def read_visionsim(path: Path, hints: Hints) -> Recording:
         return checked_codes(path, joined, bits, start)
 
     model = "binary_sum" if packed else "binary_sum_static"
-    return Recording(shape, read, "visionsim", bits, model, {"bit_order": "msb"})
+    meta = {"bit_order": "msb"} | ({} if planes in (None, 2**bits - 1) else {"bitplanes": planes})
+    return Recording(shape, read, "visionsim", bits, model, meta)
 
 
 def _bits_of_sums(path: Path, planes: int, bits: int | None) -> int:
-    """Return the bits of sums of bitplanes; `ValueError` unless a clocked SPAD sums as many, and of other `bits`."""
+    """Return the bits of sums of bitplanes; `ValueError` for more than 16, and for other `bits`."""
     found = planes.bit_length()
-    if not 1 <= found <= 16 or planes != 2**found - 1:
-        raise ValueError(
-            f"{path}: sums of {planes!r:.40} bitplanes; read are 2^b - 1 of them, as 3, 7 or 15, up to 65535"
-        )
+    if not 1 <= found <= 16:
+        raise ValueError(f"{path}: sums of {planes!r:.40} bitplanes; read are 1 to 65535")
     if bits is not None and bits != found:
         raise ValueError(f"{path}: sums of {planes} bitplanes have {found} bits, not {bits}; leave --bits out")
     return found

@@ -116,14 +116,14 @@ def _detect_npy(path: Path, hints: Hints) -> str:
         return "codes"
     if hints.transfer is not None or hints.white is not None:
         return "light"
-    if hints.bits is not None and array.dtype.kind == "u":
-        return "codes"
     if array.dtype != np.uint8:
-        return "light"
+        return "codes" if hints.bits is not None and array.dtype.kind == "u" else "light"
     if array.ndim == 4 or hints.width is not None or array_files.written_width(path) is not None:
         return "cube"
     top = max((int(array[t].max()) for t in range(len(array)) if array[t].size), default=0)
     bits = max(top.bit_length(), 1)
+    if hints.bits is not None and bits <= hints.bits:
+        return "codes"
     if bits < 8:  # every eighth column of packed planes would be dark
         raise ValueError(
             f"{path}: uint8 up to {top}: codes of {bits} bits, packed planes or dark pictures; choose with "

@@ -180,6 +180,11 @@ def to_stream(
                 f"{file}: is not a stream, which is all that --force replaces; move it away, or name another"
             )
     frames, height, width = recording.shape
+    if "bitplanes" in recording.meta:
+        raise ValueError(
+            f"{path}: sums of {recording.meta['bitplanes']} bitplanes; codes of a stream are sums of 2^b - 1, as 3, "
+            "7 or 15"
+        )
     capture = _as_stated(path, recording, capture)
     sensor, tables = _tables(capture, _sensor(recording, capture), height, width)
     model = recording.code_model if isinstance(sensor, BinarySPAD) else sensor.code_model

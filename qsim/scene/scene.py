@@ -213,12 +213,14 @@ def describe(value: Any) -> Any:
         }
         return {"kind": type(value).__name__} | {name: describe(each) for name, each in values.items()}
     if isinstance(value, np.ndarray):
-        if value.size <= 16:
-            return value.tolist()
+        if value.size <= 16 or value.dtype.kind == "O":
+            return describe(value.tolist())
         digest = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
         return {"shape": list(value.shape), "dtype": str(value.dtype), "sha256": digest}
     if isinstance(value, np.generic):
-        return value.item()
+        return describe(value.item())
+    if isinstance(value, complex):
+        return [value.real, value.imag]
     if isinstance(value, tuple | list):
         return [describe(item) for item in value]
     if isinstance(value, dict):

@@ -165,5 +165,8 @@ def group(clip: Clip, path: Path, m: int, *, force: bool = False) -> Clip:
     with ClipWriter(path, meta, force=force) as writer:
         for t in range(frames // m):
             mean = np.stack([clip.radiance(t * m + i) for i in range(m)]).mean(axis=0, dtype=np.float64)
-            writer.add(t, np.asarray(mean, np.float32), clip.sharp(t * m + m // 2) if m > 1 else None)
+            cut = None
+            if clip.meta.get("saturated_pixels"):
+                cut = np.any([clip.saturated(t * m + i) for i in range(m)], axis=0)
+            writer.add(t, np.asarray(mean, np.float32), clip.sharp(t * m + m // 2) if m > 1 else None, saturated=cut)
     return Clip.open(path)

@@ -81,15 +81,14 @@ def test_visionsim_folders(tmp_path: Path, width: int, sharded: bool):
 
 
 def test_sums_of_visionsim_are_those_of_a_clocked_sensor(tmp_path: Path):
-    """Sums of 7 planes have 3 bits; of 5 planes no sensor here has the law, and --bits would state another one."""
+    """Sums of 7 planes have 3 bits; sums of 5 are read for a calibration, and are no codes of a stream."""
     sums = np.random.default_rng(0).integers(0, 6, (2, 5, 7, 1)).astype(np.uint8)
     np.save(tmp_path / "frames.npy", sums)
     info = {"w": 7, "h": 5, "c": 1, "bitpack": False}
     for planes, hints, message in [
         (7, {}, None),
         (7, {"bits": 3}, None),
-        (5, {}, r"transforms\.json: sums of 5 bitplanes; read are 2\^b - 1 of them"),
-        (5, {"bits": 3}, "sums of 5 bitplanes"),
+        (5, {}, None),
         (0, {}, "sums of 0 bitplanes"),
         (2**17 - 1, {}, "sums of 131071 bitplanes"),
         (7, {"bits": 4}, "sums of 7 bitplanes have 3 bits, not 4; leave --bits out"),
@@ -102,6 +101,9 @@ def test_sums_of_visionsim_are_those_of_a_clocked_sensor(tmp_path: Path):
         else:
             with pytest.raises(ValueError, match=message):
                 everything(tmp_path, **hints)
+    (tmp_path / "transforms.json").write_text(json.dumps(info | {"bitplanes": 5}))
+    with pytest.raises(ValueError, match=r"sums of 5 bitplanes; codes of a stream are sums of 2\^b - 1"):
+        importing.to_stream(importing.read(tmp_path, Hints(channel=0)), tmp_path / "s", importing.Import(100.0))
 
 
 @pytest.mark.parametrize("version", [2, 3])

@@ -53,6 +53,9 @@ def test_given_hints_decide_what_an_array_holds(tmp_path: Path):
         everything(tmp_path / "a.npy", white=7)
     np.save(tmp_path / "b.npy", array.astype(np.uint16) * 100)
     np.testing.assert_array_equal(everything(tmp_path / "b.npy", bits=10), array.astype(np.uint16) * 100)
+    np.save(tmp_path / "planes.npy", np.random.default_rng(1).integers(0, 256, (3, 5, 7)).astype(np.uint8))
+    with pytest.raises(ValueError, match="--bits changes nothing for photon cube"):
+        everything(tmp_path / "planes.npy", bits=1)
 
 
 def test_pictures_that_look_like_a_cube_are_asked_about(tmp_path: Path):

@@ -105,6 +105,8 @@ def test_a_description_is_json_and_distinguishes_textures():
     texts = [json.dumps(scene(bodies=(body,)).to_dict()) for body in bodies]
     assert texts[0] != texts[1]
     assert describe(np.float32(2)) == 2.0
+    assert describe(np.array([1j])) == describe([np.complex128(1j)]) == [[0.0, 1.0]]
+    assert describe(np.array([None] * 20, object)) == [None] * 20
 
 
 def test_a_black_environment_does_not_count_as_light():

@@ -33,6 +33,14 @@ def test_a_grouped_frame_is_the_mean_and_its_sharp_frame_the_middle_one(clip, tm
     assert np.array_equal(grouped.sharp(1), clip.radiance(10))
 
 
+def test_a_grouped_frame_is_saturated_where_one_of_its_frames_is(tmp_path):
+    light = np.ones((6, *SIZE), np.float32)
+    light[1, 0, 0] = 1e6
+    grouped = group(write_clip(tmp_path / "sun", radiance=light), tmp_path / "sun_3", 3)
+    assert np.argwhere(grouped.saturated(0)).tolist() == [[0, 0]]
+    assert not grouped.saturated(1).any()
+
+
 @pytest.mark.parametrize("relative", [True, False])
 def test_codes_of_summed_planes_belong_to_the_frames_of_their_own_clip(clip, tmp_path, relative):
     """A code of either stream is one frame of the grouped clip: the same truth, and a like score."""
