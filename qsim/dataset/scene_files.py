@@ -47,7 +47,7 @@ def load(family: str | Path, seed: int = 0, speed: float = 1.0) -> tuple[Scene, 
     if str(family) in scenes.FAMILIES or not path.exists():
         return scenes.load(family, seed, speed), {}
     with _tracing() as trace:
-        scene = scenes.load(path, seed, speed)  # however its path was written: the scene's record holds it
+        scene = scenes.load(family, seed, speed)
     if path.suffix == ".xml":
         found = of_xml(path)
     elif path.is_dir():

@@ -58,7 +58,7 @@ def _within_memory(action: Callable[[argparse.Namespace], int]) -> Callable[[arg
             option = next((name for name in ("batch", "memory") if hasattr(args, name)), "size")
             output = getattr(args, "output", None)
             kept = output is not None and Path(f"{Path(output).resolve()}.part.json").exists()
-            more = ", which may start again; or free some, and the same command goes on" if kept else ""
+            more = ", which may start again; or free some, and the same command resumes" if kept else ""
             raise ValueError(
                 f"memory is exhausted ({shorten(str(error), 100)}); give a smaller --{option}{more}"
             ) from error
