@@ -40,6 +40,7 @@ from rows import (
     starred,
 )
 
+from qsim.cli.options import count
 from qsim.files import VERSION, read_json, write_bytes, write_json
 from qsim.tables import markdown_table
 from quiver.device import pick_device
@@ -110,13 +111,6 @@ def main(words: list[str] | None = None) -> int:
         print(f"ablation_rows: stopped at '{shlex.join(failed.cmd[2:])}'; the same command resumes", file=sys.stderr)
         return failed.returncode
     return 0
-
-
-def count(text: str) -> int:
-    """Return a number of steps, for argparse: its message names the option."""
-    if not text.isdigit() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
-    return int(text)
 
 
 def together(todo: list[tuple[str, int]], args: argparse.Namespace, budget: Steps) -> int:
