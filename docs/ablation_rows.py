@@ -16,10 +16,7 @@ import argparse
 import shlex
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -31,17 +28,16 @@ from rows import (
     Budget,
     check_row,
     keep_apart,
-    machine,
     make_row,
     notes_on,
     options,
-    recipe_digest,
     scores,
     starred,
 )
+from step_rows import Steps, together
 
 from qsim.cli.options import count
-from qsim.files import VERSION, read_json, write_bytes, write_json
+from qsim.files import read_json, write_bytes
 from qsim.tables import markdown_table
 from quiver.device import pick_device
 from quiver.model.config import Config
@@ -54,19 +50,8 @@ FORMAT = "quiver-ablation-1"
 MILLION = Config(channels=4, deformable_groups=4, denoiser_growth=8, flow_channels=(20, 40, 20, 10))
 SEEDS = (0, 1)
 RATE = 3e-4  # the lower one of docs/equal_budget.py: the same for all six
-STEPS_BATCH = 8  # windows of a step where steps are given: a GPU takes them in the time of one
 LIMITS = """So short a training shows which parts help at once, not which help after days. The spread of two seeds is
 the only measure of chance here: differences within it mean nothing."""
-
-
-@dataclass(frozen=True)
-class Steps(Budget):
-    """What every row gets where all make the same number of steps."""
-
-    minutes: float = 0.0  # not limited
-    threads: int = 1
-    batch: int = STEPS_BATCH
-    steps: int = 0
 
 
 def main(words: list[str] | None = None) -> int:
@@ -88,7 +73,8 @@ def main(words: list[str] | None = None) -> int:
         for path in sorted(args.out.glob("*.json")):  # they share a table
             check_row(path, budget, args.data)
         if isinstance(budget, Steps):
-            return together(todo, args, budget)
+            makers = {f"{name}-{seed}": partial(network, name, seed, args, budget) for name, seed in todo}
+            return together("ablation_rows", makers, args, budget, partial(write_table, args.out))
         for name, seed in todo:
             make = partial(network, name, seed, args, budget)
             sessions = args.work / f"{name}-{seed}_sessions.json"
@@ -111,33 +97,6 @@ def main(words: list[str] | None = None) -> int:
         print(f"ablation_rows: stopped at '{shlex.join(failed.cmd[2:])}'; the same command resumes", file=sys.stderr)
         return failed.returncode
     return 0
-
-
-def together(todo: list[tuple[str, int]], args: argparse.Namespace, budget: Steps) -> int:
-    """Make the rows that are missing, each in a process and all at the same time; return 1 if one failed."""
-    missing = [(name, seed) for name, seed in todo if not (args.out / f"{name}-{seed}.json").exists()]
-    if missing and not args.data.is_dir():
-        raise FileNotFoundError(f"{args.data}: no such data set")
-    if not missing:
-        write_table(args.out)
-        return 0
-    failed = 0
-    with ProcessPoolExecutor(len(missing), mp_context=get_context("spawn")) as pool:
-        made = {pool.submit(network, name, seed, args, budget): f"{name}-{seed}" for name, seed in missing}
-        for future in as_completed(made):
-            try:
-                own = future.result()
-            except Exception as error:  # whatever it was, the other rows are made
-                print(f"ablation_rows: {made[future]}: {type(error).__name__}: {error}", file=sys.stderr)
-                failed = 1
-                continue
-            head = {"quiver": VERSION, "budget": asdict(budget), "data": args.data.name, "machine": machine()}
-            head |= {"recipe_sha256": recipe_digest(args.data), "quiet": True}  # others change nothing in equal steps
-            args.out.mkdir(parents=True, exist_ok=True)
-            write_json(args.out / f"{made[future]}.json", head | own)
-            print(f"{args.out / made[future]}.json: written", flush=True)
-            write_table(args.out)
-    return failed
 
 
 def network(name: str, seed: int, args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
@@ -180,7 +139,7 @@ def how_long(budget: Budget) -> dict[str, Any]:
     """Return the settings that end a training: its minutes, or its steps with a validation after every fifth."""
     if not isinstance(budget, Steps):
         return {"minutes": budget.minutes}
-    return {"steps": budget.steps, "validate_every": max(1, budget.steps // 5), "workers": 1}
+    return {"steps": budget.steps, "validate_every": budget.interval, "workers": 1}
 
 
 def variant(name: str) -> Config:

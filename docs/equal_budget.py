@@ -124,23 +124,26 @@ def parser() -> argparse.ArgumentParser:
 
 def network(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
     """Return the row of a network: trials, one run, scores and costs."""
-    trials: dict[str, dict[str, Any]] = {}
-    for rate in RATES.get(name.removesuffix("-1m"), RATES_OF_OTHERS):
-        folder = args.work / f"{name}_trial_{rate}"
-        trials[rate] = trial(name, rate, folder, args.data, budget)
-    rate = best_rate(trials)
-    folder = args.work / name
-    train(name, rate, budget.minutes, folder, args.data, budget)
-    found = read_json(folder / "history.json")
-    curve, scored = found["history"], {name: {}}
-    lights = lights_of(name, args, budget, curve[-1]["psnr_matched"])
+    folder, row = learned(name, args, budget)
+    scored: dict[str, Any] = {name: {}}
+    lights = lights_of(name, args, budget, row["curve"][-1]["psnr_matched"])
     if lights:
         scored = scores([str(folder)], args.work / f"{name}_scores", args.data, lights, budget)
-    row = {"format": FORMAT, "name": name, "kind": "network", "rate": float(rate), "trials": trials}
-    row |= {"settings": found["settings"], "curve": curve, "steps": curve[-1]["step"]}
-    design = of_design(folder / "best.safetensors")
     spent = cost(str(folder), args.work / f"{name}_bench", budget)
-    return row | design | {"scores": scored[name], "cost": spent}
+    return {"format": FORMAT} | row | {"scores": scored[name], "cost": spent}
+
+
+def learned(name: str, args: argparse.Namespace, budget: Budget) -> tuple[Path, dict[str, Any]]:
+    """Return the folder of a trained network and its row without scores: two trials choose the rate of the run."""
+    trials: dict[str, dict[str, Any]] = {}
+    for rate in RATES.get(name.removesuffix("-1m"), RATES_OF_OTHERS):
+        trials[rate] = trial(name, rate, args.work / f"{name}_trial_{rate}", args.data, budget)
+    rate, folder = best_rate(trials), args.work / name
+    train(name, rate, folder, args.data, budget)
+    found = read_json(folder / "history.json")
+    row = {"name": name, "kind": "network", "rate": float(rate), "trials": trials, "settings": found["settings"]}
+    row |= {"curve": found["history"], "steps": found["history"][-1]["step"]}
+    return folder, row | of_design(folder / "best.safetensors")
 
 
 def lights_of(name: str, args: argparse.Namespace, budget: Budget, validation: float) -> tuple[str, ...]:
@@ -166,15 +169,15 @@ def apart(name: str, args: argparse.Namespace, budget: Budget) -> dict[str, Any]
 
 def trial(name: str, rate: str, folder: Path, data: Path, budget: Budget) -> dict[str, Any]:
     """Return the PSNR [dB] of the last validation of a short run, None if it diverged, and its curve."""
-    if not converged(partial(train, name, rate, budget.trial_minutes, folder, data, budget)):
+    if not converged(partial(train, name, rate, folder, data, budget, short=True)):
         return {"psnr": None, "curve": []}
     curve = read_json(folder / "history.json")["history"]
     return {"psnr": float(curve[-1]["psnr_matched"]), "curve": curve}
 
 
-def classical(args: argparse.Namespace, budget: Budget) -> dict[str, Any]:
+def classical(args: argparse.Namespace, budget: Budget, lights: tuple[str, ...] = LIGHTS) -> dict[str, Any]:
     """Return the row of the classical methods."""
-    scored = scores(list(CLASSICAL), args.work / "classical_scores", args.data, LIGHTS, budget)
+    scored = scores(list(CLASSICAL), args.work / "classical_scores", args.data, lights, budget)
     return {"format": FORMAT, "name": "classical", "kind": "classical", "scores": scored}
 
 
@@ -195,7 +198,7 @@ def of_design(weights: Path) -> dict[str, Any]:
 # ---- Commands
 
 
-def train(name: str, rate: str, minutes: float, folder: Path, data: Path, budget: Budget) -> None:
+def train(name: str, rate: str, folder: Path, data: Path, budget: Budget, *, short: bool = False) -> None:
     """Train a network, unless it is done; QUIVER with its published loss, by Adam as all others."""
     own = {
         "unet": ["control"],
@@ -204,8 +207,8 @@ def train(name: str, rate: str, minutes: float, folder: Path, data: Path, budget
     }
     quiver(
         *("train", data, "-o", folder, "--preset", name, "--protocol", *own.get(name.removesuffix("-1m"), ["quick"])),
-        *("--device", "cpu", "--minutes", minutes, "--optimiser", "adam", "--learning-rate", rate),
-        *("--crop", budget.crop, "--batch", budget.batch),
+        *budget.length(trial=short),
+        *("--optimiser", "adam", "--learning-rate", rate, "--crop", budget.crop, "--batch", budget.batch),
         *("--sensor", "quiver-physical", "--ppp", LIGHTS[0], "--bits", 3, "-q"),
         budget=budget,
     )  # fmt: skip

@@ -46,6 +46,10 @@ class Budget:
     batch: int = 2  # the published RVRT takes 8 GB a window; more windows leave slow networks too few steps
     size: str = "128x128"  # of the frames whose cost is measured
 
+    def length(self, *, trial: bool = False) -> tuple[object, ...]:
+        """Return the options of `quiver train` for where a run or a trial is made, and how long."""
+        return ("--device", "cpu", "--minutes", self.trial_minutes if trial else self.minutes)
+
 
 TINY = Budget(minutes=0.02, trial_minutes=0.01, threads=1, crop=32, batch=2, size="32x32")
 

@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,8 +20,10 @@ sys.path.insert(0, str(ROOT / "tests" / "support"))
 sys.path.insert(0, str(ROOT / "docs"))
 import ablation_rows  # noqa: E402
 import equal_budget  # noqa: E402
+import equal_steps  # noqa: E402
 import rows  # noqa: E402
 import stream_rows  # noqa: E402
+from step_rows import Steps, together  # noqa: E402
 
 
 def run(*words: object, program: str = "equal_budget") -> subprocess.CompletedProcess[str]:
@@ -30,21 +33,30 @@ def run(*words: object, program: str = "equal_budget") -> subprocess.CompletedPr
 
 @pytest.mark.parametrize(
     ("program", "known"),
-    [(equal_budget, ("classical", "unet")), (ablation_rows, ("none", "denoiser+flow"))],
+    [
+        (equal_budget, ("classical", "unet")),
+        (equal_steps, ("classical", "unet")),
+        (ablation_rows, ("none", "denoiser+flow")),
+    ],
     ids=str,
 )
 def test_an_unknown_row_is_one_sentence(program, known, capsys):
-    assert program.main(["data", "--rows", "emdv", "--tiny"]) == 2
+    length = ["--steps", "2"] if program is equal_steps else []
+    assert program.main(["data", "--rows", "emdv", "--tiny", *length]) == 2
     found = capsys.readouterr()
     assert (found.out, found.err.count("\n")) == ("", 1)
     told = found.err.removeprefix(f"{program.__name__}: no row is called 'emdv'; known are ").strip().split(", ")
     assert {*known} <= {*told}
 
 
-@pytest.mark.parametrize("program", [equal_budget, ablation_rows], ids=str)
-def test_a_missing_data_set_is_one_sentence(program, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("program", "words"),
+    [(equal_budget, ["unet"]), (equal_steps, ["unet", "--steps", "2"]), (ablation_rows, ["all"])],
+    ids=str,
+)
+def test_a_missing_data_set_is_one_sentence(program, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert program.main(["none", "--rows", "all" if program is ablation_rows else "unet", "--tiny", "--out", "r"]) == 2
+    assert program.main(["none", "--tiny", "--out", "r", "--rows", *words]) == 2
     assert capsys.readouterr().err == f"{program.__name__}: none: no such data set\n"
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
@@ -264,6 +276,57 @@ def test_rows_of_the_ablation_are_made_once_and_shown(tmp_path, length):
         other = run(*words[:-1], 3, program="ablation_rows")
         assert (other.returncode, other.stdout) == (2, "")
         assert "was made with budget" in other.stderr
+
+
+# ---- Equal steps
+
+
+def test_networks_of_equal_steps_are_those_that_learn_from_clips_at_published_width():
+    assert {*equal_steps.NAMES} >= {"classical", "unet", "quiver", "rvrt"}
+    assert not [name for name in equal_steps.NAMES if name.startswith("bit2bit") or name.endswith(("-1m", "published"))]
+
+
+def test_a_trial_has_a_sixth_of_the_steps():
+    words = {short: Steps(steps=600).length(trial=short) for short in (True, False)}
+    assert words[True][-4:] == ("--steps", 100, "--validate-every", 100)
+    assert words[False][-4:] == ("--steps", 600, "--validate-every", 120)
+    assert Steps(steps=2).length(trial=True)[-4:] == ("--steps", 1, "--validate-every", 1)
+
+
+@pytest.mark.slow
+def test_rows_of_equal_steps_are_made_once_and_shown(tmp_path):
+    from clips import write_dataset
+
+    data = write_dataset(tmp_path / "data", {"train": 2, "val": 1, "test": 2})
+    out = tmp_path / "rows"
+    words = (data, "--tiny", "--out", out, "--work", tmp_path / "work", "--rows", "classical,unet", "--steps", 6)
+    first = run(*words, program="equal_steps")
+    assert first.returncode == 0, first.stderr
+    row = json.loads((out / "unet.json").read_text())
+    assert (row["steps"], row["budget"]["steps"], row["quiet"]) == (6, 6, True)
+    trials = {float(rate): found for rate, found in row["trials"].items()}
+    assert trials[row["rate"]]["psnr"] == max(found["psnr"] for found in trials.values())
+    assert [found["curve"][-1]["step"] for found in trials.values()] == [1, 1]
+    assert row["settings"]["precision"] == "float32"
+    second = run(*words, program="equal_steps")
+    assert (second.returncode, second.stdout) == (0, ""), second.stderr
+    table = out.with_suffix(".md").read_text()
+    score = row["scores"]["3.25 PPP, 3 bit"]["scores"]["psnr_matched"]
+    assert rows.interval(score, 2) in next(line for line in table.split("\n") if "| unet |" in line)
+    assert "`python docs/equal_steps.py out/starter --steps 6`: steps of 2 windows" in table
+    other = run(*words[:-1], 7, program="equal_steps")
+    assert (other.returncode, other.stdout) == (2, "")
+    assert "was made with budget" in other.stderr
+
+
+def test_a_row_of_equal_steps_that_fails_does_not_stop_the_others(tmp_path, capsys):
+    args = argparse.Namespace(out=tmp_path / "rows", data=tmp_path)
+    makers = {"good": partial(dict, name="good"), "bad": partial(int, "x")}
+    pages = []
+    assert together("equal_steps", makers, args, Steps(steps=2), lambda: pages.append(1)) == 1
+    assert [path.name for path in args.out.iterdir()] == ["good.json"]
+    assert "equal_steps: bad: ValueError: invalid literal" in capsys.readouterr().err
+    assert pages == [1]
 
 
 @pytest.mark.slow

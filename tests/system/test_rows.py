@@ -15,6 +15,7 @@ import ablation_rows  # noqa: E402
 import clip_rows  # noqa: E402
 import cycles_rows  # noqa: E402
 import equal_budget  # noqa: E402
+import equal_steps  # noqa: E402
 import restorer_ablation  # noqa: E402
 import restorer_tuned  # noqa: E402
 import reuse_rows  # noqa: E402
@@ -29,6 +30,7 @@ from quiver.evaluation.cost import checked_cases  # noqa: E402
     [
         (equal_budget, ["data", "--tiny"]),
         (equal_budget, ["data", "--budget-seconds", "5"]),
+        (equal_steps, ["data", "--tiny", "--steps", "2"]),
         (ablation_rows, ["data", "--tiny"]),
         (reuse_rows, ["--tiny"]),
         (clip_rows, ["--tiny"]),
@@ -70,10 +72,12 @@ def test_rows_of_the_page_have_the_options_of_the_program(folder, plan):
     assert all(plan == usual for plan in stored)
 
 
-def test_the_page_of_the_ablation_holds_its_rows(tmp_path):
-    shutil.copytree(ROOT / "docs" / "results" / "ablation_rows", tmp_path / "rows")
-    ablation_rows.write_table(tmp_path / "rows")
-    assert (tmp_path / "rows.md").read_text() == (ROOT / "docs" / "results" / "ablation_rows.md").read_text()
+@pytest.mark.parametrize("program", [ablation_rows, equal_steps], ids=str)
+def test_a_page_of_equal_steps_holds_its_rows(program, tmp_path):
+    page = ROOT / "docs" / "results" / program.__name__
+    shutil.copytree(page, tmp_path / "rows")
+    program.write_table(tmp_path / "rows")
+    assert (tmp_path / "rows.md").read_text() == page.with_suffix(".md").read_text()
 
 
 @pytest.mark.parametrize("method", ["fastdvdnet", "quiver-s", "mergenet-1m"])
