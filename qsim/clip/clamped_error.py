@@ -110,13 +110,16 @@ def measured(
     """Return the fields of clip.json about the errors of a clip's frames.
 
     `means` are the mean radiances of the frames, `high` is the 99.9th percentile of all. `errors` holds the plain error
-    of each frame, `errors_at` its pairs (white, error). Without pairs the plain error is taken, which is never smaller.
-    `shares` states whether the frames share samples.
+    of each frame, `errors_at` its pairs (white, error). Where none reaches the white of the clip, the plain error
+    is taken, which is never smaller. `shares` states whether the frames share samples.
     """
     white = white_of(math.fsum(means) / len(means), high)
     found: dict[str, Any] = {"error_per_frame": list(errors), "white": white}
     if white > 0:
-        own = [error_at(white, pairs) if len(pairs) else plain for plain, pairs in zip(errors, errors_at, strict=True)]
+        own = [
+            error_at(white, pairs) if len(pairs) and white <= pairs[-1][0] else plain
+            for plain, pairs in zip(errors, errors_at, strict=True)
+        ]
         found["error_at_white_per_frame"] = over_neighbours(own, means, shares)
         found["psnr_of_truth"] = _stored(psnr(white, rms(np.array(own))))
         found["psnr_unclamped"] = _stored(psnr(white, rms(np.array(errors))))

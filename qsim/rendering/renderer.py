@@ -52,7 +52,7 @@ class Frame:
     radiance: Array  # float32 [H, W], or [3, H, W] of a colour scene, W m^-2 sr^-1, mean over the exposure
     error: float  # rms error of `radiance`, W m^-2 sr^-1: noise and blur as measured, and the budget's `left_out`
     errors_at: tuple[tuple[float, float], ...]  # (white, the same clamped there), rising; empty without light
-    fireflies: int  # pixels whose halves differ by more than FIREFLY rms, or are not finite (and made 0)
+    fireflies: int  # pixels whose halves differ by more than FIREFLY rms, or are not finite; those of `sharp` are added
     sharp: Array | None = None  # as radiance, the instant at mid-exposure, only for an open shutter
     flow: Array | None = None  # float32 [2, H, W], px, mid-exposure of t to that of t + 1
     flow_back: Array | None = None  # float32 [2, H, W], px, mid-exposure of t to that of t - 1
@@ -142,13 +142,12 @@ class Renderer:
     def frame(self, t: int, *, with_truth: bool = True) -> Frame:
         """Render frame t: arrays of the window's height and width [H, W]."""
         activate(self.engine)
-        if self._whole is not None:
-            radiance, error, errors_at, fireflies = self._shared(t, self._whole)
-        else:
-            radiance, error, errors_at, fireflies = self._exposed(self.instants(t), self.key(t))
+        exposed = self._shared(t, self._whole) if self._whole else self._exposed(self.instants(t), self.key(t))
+        radiance, error, errors_at, fireflies = exposed
         sharp = None
         if self.shutter > 0 and self.budget.sharp:
-            sharp = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))[0]
+            sharp, _, _, more = self._exposed([self.time(t)], self.key(t, SHARP_STAGE))
+            fireflies += more
         # Last: it leaves the scene at t + 1, where the next frame starts.
         found = self.truth(t) if with_truth else {}
         return Frame(radiance, error, errors_at, fireflies, sharp, **found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -62,13 +63,17 @@ def read_hdr(path: Path) -> Array:
 
 
 def _read_radiance(path: Path) -> Array:
-    """Decode Radiance RGBE (Ward, "Real pixels", Graphics Gems II, 1991), flat or with new-style run lengths."""
+    """Decode Radiance RGBE (Ward, "Real pixels", Graphics Gems II, 1991), flat or with new-style run lengths.
+
+    Pixels are divided by the exposures of the header, which programs have multiplied into them.
+    """
     content = path.read_bytes()
     head, _, rest = content.partition(b"\n\n")
     size, _, body = rest.partition(b"\n")
     words = size.split()
     if not head.startswith(b"#?") or len(words) != 4 or (words[0], words[2]) != (b"-Y", b"+X"):
         raise ValueError(f"environment {path}: not a Radiance .hdr file with rows from top to bottom")
+    exposure = _exposure(path, head.decode("latin-1"))
     height, width = int(words[1]), int(words[3])
     rgbe = np.empty((height, width, 4), np.uint8)
     at = 0
@@ -78,7 +83,30 @@ def _read_radiance(path: Path) -> Array:
     except (IndexError, ValueError) as error:
         raise ValueError(f"environment {path}: damaged at byte {len(content) - len(body) + at}") from error
     scale = np.ldexp(1.0, rgbe[..., 3].astype(np.int32) - 136)
-    return (rgbe[..., :3] * np.where(rgbe[..., 3:] > 0, scale[..., None], 0)).astype(np.float32)
+    return (rgbe[..., :3] * np.where(rgbe[..., 3:] > 0, scale[..., None] / exposure, 0)).astype(np.float32)
+
+
+def _exposure(path: Path, head: str) -> float:
+    """Return the product of the exposures in a Radiance header, 1 for none; `ValueError` for pixels other than RGBE."""
+    exposure = 1.0
+    for line in head.split("\n"):
+        name, _, value = line.partition("=")
+        value = value.strip()
+        if name == "FORMAT" and value != "32-bit_rle_rgbe":
+            raise ValueError(f"environment {path}: its pixels are {value}; convert the file to 32-bit_rle_rgbe")
+        if name == "EXPOSURE":
+            exposure *= _positive(path, value)
+    return exposure
+
+
+def _positive(path: Path, value: str) -> float:
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise ValueError(f"environment {path}: EXPOSURE={value} in its header is not a positive number; correct it")
+    return number
 
 
 def _read_row(body: bytes, at: int, row: Array) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,7 +33,7 @@ class SunSky:
     Both irradiances are those in the rendered band. Azimuth 0 is +z, pi/2 is +x.
     """
 
-    elevation: float = 0.8  # rad above the horizon
+    elevation: float = 0.8  # rad above the horizon; below it, only without sun_irradiance
     azimuth: float = 0.6  # rad
     sun_irradiance: float | Colour = 1.0  # W m^-2 on a plane facing the sun
     sky_irradiance: float | Colour = 0.25  # W m^-2 on the ground, sky alone
@@ -41,6 +42,15 @@ class SunSky:
 
     def __post_init__(self) -> None:
         check_light(self, "sun_irradiance", "sky_irradiance")
+        for name, expected, right in (
+            ("ground_reflectance", "a share from 0 to 1", 0 <= self.ground_reflectance <= 1),
+            ("sun_radius", "an angle [rad] between 0 and pi/2", 0 < self.sun_radius < math.pi / 2),
+            ("elevation", "an angle [rad] from -pi/2 to pi/2", abs(self.elevation) <= math.pi / 2),
+        ):
+            if not right:
+                raise ValueError(f"SunSky.{name}: {expected} is needed, got {getattr(self, name)!r}")
+        if self.elevation < 0 < largest(self.sun_irradiance):
+            raise ValueError("SunSky.elevation: the sun is below the horizon; give sun_irradiance=0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +99,7 @@ class EnvironmentImage:
     flicker: Flicker | None = None  # None: steady
 
     def __post_init__(self) -> None:
-        check_light(self)
+        check_light(self, "scale")
         check_flicker(self)
 
 

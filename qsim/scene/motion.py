@@ -51,7 +51,7 @@ class Motion(ABC):
         """Return the velocity of the body's origin [m/s] and its angular velocity [rad/s], float64 [3], world axes."""
 
     def __matmul__(self, inner: Motion) -> Composition:
-        """Return `outer @ inner`: the inner motion in the frame that the outer one moves."""
+        """Return `outer @ inner`: the inner motion in the frame that the outer one moves; see `Composition`."""
         return Composition(self, inner)
 
 
@@ -261,10 +261,20 @@ class Keyframes(Motion):
 
 @dataclass(frozen=True)
 class Composition(Motion):
-    """`inner` in the frame that `outer` moves: pose = outer.pose @ inner.pose."""
+    """`inner` in the frame that `outer` moves: pose = outer.pose @ inner.pose.
+
+    `ValueError` for motions that deform a mesh: a composition has a pose only and would leave the mesh at rest.
+    """
 
     outer: Motion
     inner: Motion
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for part in (self.outer, self.inner):
+            if hasattr(part, "deform"):
+                name = type(part).__name__
+                raise ValueError(f"{name} deforms a mesh, which @ would lose; move it by {name}(..., carrier=...)")
 
     def pose(self, t: float) -> Array:
         return self.outer.pose(t) @ self.inner.pose(t)

@@ -99,6 +99,12 @@ def test_a_clip_states_both_figures_below_its_own_white():
     assert "psnr_of_truth" not in measured([0.0], 0.0, [0.1], [[]])
 
 
+def test_a_white_above_those_of_the_frames_takes_the_plain_error():
+    found = measured([4.0, 4.0], 100.0, [1.0, 1.0], [[[1.0, 0.01], [2.0, 0.02]]] * 2)
+    assert found["white"] == pytest.approx(10.0)
+    assert found["psnr_of_truth"] == found["psnr_unclamped"] == pytest.approx(20.0)
+
+
 def test_a_frame_states_the_mean_of_three_estimates():
     """Under equal light the mean of the squares of a frame and its neighbours; the ends have one neighbour."""
     found = over_neighbours([1.0, 2.0, 3.0, 4.0], [5.0] * 4)

@@ -198,6 +198,21 @@ def test_a_sample_that_is_not_a_number_costs_one_pixel(monkeypatch, denoise):
     assert frame.fireflies >= 1
 
 
+def test_a_sharp_sample_that_is_not_a_number_is_counted(monkeypatch):
+    one = renderer(plate(None), shutter=1.0, budget=Budget(8, 2, 3))
+
+    def means(instants, *_):
+        found = np.ones((3, 2, *one.shape))
+        if len(instants) == 1:  # the sharp one
+            found[0, 0, 3, 4] = np.nan
+        return found
+
+    monkeypatch.setattr(one, "means", means)
+    frame = one.frame(0, with_truth=False)
+    assert np.isfinite(frame.sharp).all()
+    assert frame.fireflies == 1
+
+
 def test_a_crop_shows_its_window_of_the_frame(spinning):
     made, whole = spinning.scene, spinning.frame(1)
     part = renderer(made, crop=(3, 5, 9, 14)).frame(1)

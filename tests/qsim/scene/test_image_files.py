@@ -1,11 +1,14 @@
-"""Textures of image files become linear light."""
+"""Image files become linear light, Radiance files radiance."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from qsim.scene import Texture
+from qsim.scene.image_files import read_hdr
 
 
 def test_texture_files_become_linear_light(tmp_path):
@@ -57,3 +60,34 @@ def test_pictures_without_a_known_white_and_too_large_ones_are_refused(tmp_path,
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 4)
     with pytest.raises(ValueError, match=r"large\.png: not a readable image"):
         Texture(str(tmp_path / "large.png")).pixels()
+
+
+def radiance_file(path: Path, *header: str) -> Path:
+    """Write a flat Radiance file of 2 x 3 px, each 96, 128, 160 times 1/128."""
+    head = "\n".join(["#?RADIANCE", *header]).encode() + b"\n\n-Y 2 +X 3\n"
+    path.write_bytes(head + bytes([96, 128, 160, 129]) * 6)
+    return path
+
+
+def test_the_exposures_of_a_radiance_file_are_divided_out(tmp_path):
+    plain = read_hdr(radiance_file(tmp_path / "a.hdr", "FORMAT=32-bit_rle_rgbe"))
+    np.testing.assert_array_equal(plain, np.broadcast_to([0.75, 1.0, 1.25], (2, 3, 3)))
+    once = radiance_file(tmp_path / "b.hdr", "FORMAT=32-bit_rle_rgbe", "EXPOSURE=2")
+    np.testing.assert_array_equal(read_hdr(once), plain / 2)
+    twice = radiance_file(tmp_path / "c.hdr", "EXPOSURE= 2.0e+00", "FORMAT=32-bit_rle_rgbe", "EXPOSURE=4")
+    np.testing.assert_array_equal(read_hdr(twice), plain / 8)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("FORMAT=32-bit_rle_xyze", r"x.hdr: its pixels are 32-bit_rle_xyze; convert the file to 32-bit_rle_rgbe"),
+        *(
+            (f"EXPOSURE={value}", f"x.hdr: EXPOSURE={value} in its header")
+            for value in ("0", "-2", "nan", "inf", "two")
+        ),
+    ],
+)
+def test_headers_of_other_pixels_and_exposures_are_refused(tmp_path, line, message):
+    with pytest.raises(ValueError, match=message):
+        read_hdr(radiance_file(tmp_path / "x.hdr", line))

@@ -9,12 +9,14 @@ from qsim.scene import (
     Ballistic,
     Composition,
     Flag,
+    Joint,
     Keyframes,
     Motion,
     Oscillation,
     Pendulum,
     Ripple,
     Shake,
+    Skinned,
     Spin,
     Still,
     Translation,
@@ -36,6 +38,7 @@ SHAKING = Shake(
 )
 REST = sheet(0.4, 0.2, 7, 5).vertices + np.array([0.2, 0, 0])
 FLAG = Flag(REST, (Ripple(0.05, 0.3, 4.0, 3.0, 0.5), Ripple(0.02, 0.11, -7.0)), FLYING)
+SKINNED = Skinned(REST, (Joint(TURNING),), np.zeros((len(REST), 1), int), np.ones((len(REST), 1)))
 MOTIONS: dict[str, Motion] = {
     "still": Still((1, 2, 3), (0.1, -0.2, 0.3)),
     "translation": Translation((1.0, -2.0, 0.5), (0.1, 0, 0)),
@@ -114,6 +117,14 @@ def test_composition_multiplies_poses_and_is_associative():
         np.testing.assert_allclose(left, right)
     assert isinstance(a @ b, Composition)
     np.testing.assert_allclose((a @ Still()).pose(t), a.pose(t))
+
+
+@pytest.mark.parametrize("deforming", [FLAG, SKINNED], ids=["flag", "skinned"])
+def test_a_composition_of_a_motion_that_deforms_is_refused(deforming):
+    name = type(deforming).__name__
+    for compose in (lambda: FLYING @ deforming, lambda: deforming @ FLYING):
+        with pytest.raises(ValueError, match=rf"{name} deforms a mesh, .* move it by {name}\(..., carrier=...\)"):
+            compose()
 
 
 def test_keyframes_pass_their_keys_and_rest_outside():

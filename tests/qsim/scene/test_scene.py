@@ -69,11 +69,20 @@ def test_a_scene_without_light_is_refused_and_a_glowing_body_is_light():
         (lambda: AreaLamp((0, 1, 0), (0, 0, 0), np.inf, 1, 1.0), r"AreaLamp.width: expected a finite number"),
         (lambda: SunSky(elevation="0.8"), r"SunSky.elevation: expected numbers, got '0.8'"),
         (lambda: EnvironmentImage("sky.exr", rotation=np.nan), r"EnvironmentImage.rotation: expected a finite number"),
+        (lambda: EnvironmentImage("sky.exr", scale=-1.0), r"EnvironmentImage.scale: a finite number from 0 up"),
+        (lambda: SunSky(ground_reflectance=1.5), r"SunSky.ground_reflectance: a share from 0 to 1 is needed, got 1.5"),
+        (lambda: SunSky(sun_radius=0.0), r"SunSky.sun_radius: an angle .* between 0 and pi/2 is needed, got 0.0"),
+        (lambda: SunSky(elevation=80.0), r"SunSky.elevation: an angle .* from -pi/2 to pi/2 is needed, got 80.0"),
+        (lambda: SunSky(elevation=-0.1), r"SunSky.elevation: the sun is below the horizon; give sun_irradiance=0"),
     ],
 )
 def test_a_light_of_wrong_numbers_is_refused_by_name(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_sky_without_sun_may_have_it_below_the_horizon():
+    assert SunSky(elevation=-0.1, sun_irradiance=0).elevation < 0
 
 
 def test_only_one_light_may_surround_the_scene():
