@@ -7,7 +7,7 @@ QIS:  mean codes; dark level of every pixel from the dark frames of the flat's e
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -24,8 +24,13 @@ class Response:
     """Exact curve of mean code against arrivals of one pixel, with the measured dead time, and its inverse."""
 
     bits: int
-    ratio: float  # dead time in exposures; 0 for 1-bit planes
+    ratio: float  # dead time in exposures of `exposure`; 0 for 1-bit planes
     paralyzable: bool
+    exposure: float  # s
+
+    def at(self, exposure: float) -> Response:
+        """Return the curve of the same pixel at another exposure [s]."""
+        return replace(self, ratio=self.ratio * (self.exposure / exposure), exposure=exposure)
 
     def table(self, largest: float) -> tuple[Array, Array]:
         """Return (arrivals, mean code) [G], rising, up to a mean of `largest` or to the maximum of the mean."""
@@ -54,7 +59,7 @@ class Response:
         mean = stack.total / t
         if self.bits == 1:
             mean = np.minimum(mean, 1 - 0.5 / t)
-        arrivals, codes = self.table(float(mean.max()))
+        arrivals, codes = self.at(stack.exposure).table(float(mean.max()))
         found = np.interp(mean, codes, arrivals)
         at = np.interp(stack.mean, codes, arrivals)
         slope_table = np.gradient(codes, arrivals)

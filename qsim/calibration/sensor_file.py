@@ -110,7 +110,12 @@ def sensor_of(found: Calibration) -> Sensor:
     return CountingSPAD(efficiency, dark, value.get("dead_time", 0.0), found.bits, found.paralyzable)
 
 
-_FIELDS = {"quantum_efficiency": ("quantum_efficiency",), "pde": ("pde_fill",)}
+_UNMEASURED = {
+    "quantum_efficiency": "1, not measured: give light in detected photons",
+    "pde": "1, not measured: give light in detected photons",
+    "dark_count_rate": "0, not measured",
+    "dead_time": "0, not measured",
+}
 
 
 def to_toml(found: Calibration, title: str, dark_map: str | None = None) -> str:
@@ -123,12 +128,11 @@ def to_toml(found: Calibration, title: str, dark_map: str | None = None) -> str:
     lines += [f"{key} = {_toml(value)}" for key, value in described.items() if value is not None]
     lines += ["", "[sources]"]
     for key in described:
-        for name in _FIELDS.get(key, (key,)):
-            if name in found.values:
-                v = found.values[name]
-                lines.append(f'{key} = "{v.value:.6g}, 95 % interval {v.low:.6g} to {v.high:.6g} {v.unit}; {v.method}"')
-            elif key in _FIELDS:
-                lines.append(f'{key} = "1, not measured: give light in detected photons"')
+        v = found.values.get("pde_fill" if key == "pde" else key)
+        if v is not None:
+            lines.append(f'{key} = "{v.value:.6g}, 95 % interval {v.low:.6g} to {v.high:.6g} {v.unit}; {v.method}"')
+        elif key in _UNMEASURED:
+            lines.append(f'{key} = "{_UNMEASURED[key]}"')
     if dark_map is not None:
         lines += ["", "# [defects]  # uncomment to give every pixel its own dark counts", f'# dark_map = "{dark_map}"']
     return "\n".join(lines) + "\n"

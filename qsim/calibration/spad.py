@@ -12,6 +12,7 @@ crosstalk, afterpulses within one frame.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import inf, isfinite, log, nan, sqrt
 
 import numpy as np
@@ -47,9 +48,13 @@ def calibrate_spad(
     warnings = _dispersed([*darks, *flats])
     values: dict[str, Value] = {}
     maps: dict[str, Array] = {}
-    fano = fitted_dead_time(flats, bits, paralyzable) if bits > 1 and flats and dead_time else None
+    usable = [flat for flat in flats if flat.frames > 1 and flat.mean > 0]  # of one exposure, if dead time is fitted
+    fano = fitted_dead_time(usable, bits, paralyzable) if bits > 1 and usable and dead_time else None
+    if bits > 1 and dead_time and fano is None:
+        warnings.append("dead time is not measured (flats of two frames or more are needed): taken as 0")
     ratio = 0.0 if fano is None else fano.value
-    response = Response(bits, ratio, paralyzable)
+    exposure = usable[0].exposure if usable else 1.0  # without dead time it does not matter
+    response = Response(bits, ratio, paralyzable, exposure)
     if darks:
         dcr_map, of_map = dark_rates(darks, response)
         maps["dark_count_rate"] = dcr_map
@@ -77,12 +82,11 @@ def calibrate_spad(
         else:
             warnings.append("PRNU is not measured: the flats have one frame, or no light above the dark counts")
     if fano is not None:
-        exposure = flats[0].exposure
         method = "Fano factor against flux" + (", paralyzable" if paralyzable else "")
         values["dead_time"] = normal_interval(ratio * exposure, fano.variance * exposure**2, "s", method, floor=0.0)
     values |= _afterpulsing([*darks, *flats], bits)
     spread = _spread(flats, darks, response)
-    p_value, residuals = _goodness(flats, bits, ratio, spread, paralyzable, len(flats) + (fano is not None))
+    p_value, residuals = _goodness(flats, response, spread, len(flats) + (fano is not None))
     if p_value < 1e-3:
         warnings.append(
             f"the fitted histograms do not describe the counts (p = {p_value:.1g}): the model is wrong here"
@@ -147,7 +151,7 @@ def _efficiency(
     moved = np.zeros_like(values)
     if ratio_variance > 0:
         step = max(1e-4 * response.ratio, 1e-7)
-        moved = (slopes(Response(response.bits, response.ratio + step, response.paralyzable))[0] - values) / step
+        moved = (slopes(replace(response, ratio=response.ratio + step))[0] - values) / step
     covariance = np.diag(variances) + ratio_variance * np.outer(moved, moved)
     weights = np.linalg.solve(covariance, np.ones(len(known)))
     weights /= weights.sum()
@@ -225,14 +229,16 @@ def _afterpulsing(stacks: Sequence[FrameStatistics], bits: int) -> dict[str, Val
 
 
 def _goodness(
-    flats: Sequence[FrameStatistics], bits: int, ratio: float, s: float, paralyzable: bool, fitted: int
+    flats: Sequence[FrameStatistics], response: Response, s: float, fitted: int
 ) -> tuple[float, tuple[Array, ...]]:
     """Compare the flats' histograms with the model at each flat's own mean and PRNU `s`; NaN for 1-bit planes."""
+    bits, paralyzable = response.bits, response.paralyzable
     if bits == 1 or not flats:
         return nan, ()
-    sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
     shares = []
     for flat in flats:
+        ratio = response.at(flat.exposure).ratio
+        sensor = CountingSPAD(1.0, 0.0, ratio, bits, paralyzable)
         arrivals, _, _ = matched_variance(flat.mean, bits, ratio, paralyzable)
         pmf = np.exp(sensor.log_pmf(np.maximum(arrivals * (1 + s * NODES), 0.0), 1.0))
         shares.append(WEIGHTS @ pmf)

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from synthetic import SPADCase
+from synthetic import SPADCase, statistics_of
 
-from qsim.calibration.sensor_file import read_stack, sensor_of, write
+from qsim.calibration.sensor_file import read_stack, sensor_of, to_toml, write
+from qsim.calibration.spad import calibrate_spad
 from qsim.sensor import devices
 from qsim.sensor.defects import defect_table
 
@@ -32,3 +33,15 @@ def test_frames_are_read_from_npy_and_from_a_photon_cube(tmp_path):
     assert np.array_equal(one.total, two.total)
     with pytest.raises(FileNotFoundError, match=r"nothing\.npy"):
         read_stack(tmp_path / "nothing.npy", bits=1, exposure=1e-5, photons=None)
+
+
+def test_parameters_that_were_not_measured_are_named():
+    """A dead time of 0 was written without a word."""
+    counts = np.random.default_rng(0).poisson(1.0, (6, 8, 9))
+    found = calibrate_spad([statistics_of(counts, 8)], [], bits=8)
+    assert any("dead time is not measured" in words for words in found.warnings)
+    assert 'dead_time = "0, not measured"' in to_toml(found, "a test")
+    ignored = calibrate_spad([statistics_of(counts, 8)], [], bits=8, dead_time=False)
+    assert not any("dead time is not measured" in words for words in ignored.warnings)
+    flat = calibrate_spad([], [statistics_of(counts, 8, None)], bits=8)
+    assert 'dark_count_rate = "0, not measured"' in to_toml(flat, "a test")

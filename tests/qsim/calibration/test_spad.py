@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from synthetic import COUNTER, PLANE, draw_planes, statistics_of
 
-from qsim.calibration.frame_statistics import measure, measure_sums
+from qsim.calibration.frame_statistics import FrameStatistics, measure, measure_sums
 from qsim.calibration.spad import calibrate_spad
+from qsim.sensor.counting import CountingSPAD
 
 DATA = Path(__file__).parents[2] / "data"
 
@@ -100,3 +101,28 @@ def test_another_number_of_planes_is_noticed():
     assert abs(wrong.dispersion - 0.7 / 0.85) < 5 * sigma
     assert not any("scatter" in words for words in calibrate_spad([], [right], bits=1).warnings)
     assert any("scatter 0.8" in words for words in calibrate_spad([], [wrong], bits=1).warnings)
+
+
+def counted(rng: np.random.Generator, arrivals: float, exposure: float, frames: int) -> FrameStatistics:
+    """Return the statistics of counts with a dead time of 50 us."""
+    cdf = CountingSPAD(1.0, 0.0, 5e-5, 6).cdf(np.array(arrivals), exposure)
+    codes = np.searchsorted(cdf[:-1], rng.random((frames, 24, 24)), side="right")
+    return measure([codes], bits=6, exposure=exposure, photons=None)
+
+
+def test_dead_time_is_a_smaller_share_of_long_dark_frames():
+    """It is 5 % of the flats' exposure and 1 % of the long darks'; all were corrected for 5 %, to 430 counts/s."""
+    rng = np.random.default_rng(5)
+    darks = [counted(rng, 400 * exposure, exposure, 160) for exposure in (1e-3, 5e-3)]
+    flats = [counted(rng, arrivals, 1e-3, 40) for arrivals in (2.0, 6.0, 14.0)]
+    rate = calibrate_spad(darks, flats, bits=6).values["dark_count_rate"]
+    assert rate.low <= 400 <= rate.high
+
+
+def test_the_dead_time_is_that_of_the_flats_of_several_frames():
+    """A first flat of one frame and another exposure doubled it."""
+    rng = np.random.default_rng(6)
+    flats = [counted(rng, 4.0, 2e-3, 1), *(counted(rng, arrivals, 1e-3, 40) for arrivals in (2.0, 6.0, 14.0))]
+    found = calibrate_spad([], flats, bits=6)
+    assert found.values["dead_time"].low <= 5e-5 <= found.values["dead_time"].high
+    assert found.p_value > 1e-4
