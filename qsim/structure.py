@@ -178,6 +178,7 @@ COUNT = expected("a whole number from 0", is_count)
 WHOLE = expected("a whole number from 1", is_whole)
 SHAPE = expected("[frames, height, width] of at least 1", list_of(is_whole, 3))
 VECTOR = expected("three numbers", list_of(is_number, 3))
+PLACE = expected("[y, x] in pixels", list_of(is_count, 2))
 SPLIT = expected(f"one of {', '.join(SPLITS)}", lambda value: value in SPLITS)
 OBJECT: Table = {}
 
@@ -225,7 +226,7 @@ CLIP: Table = {
     "split, if any": SPLIT,
     "camera, if any": CAMERA,
     "bands, if any": expected("three wavelengths in m", is_bands),
-    "origin, if any": expected("[y, x] in pixels", list_of(is_count, 2)),
+    "origin, if any": PLACE,
     "mean_photons, if any": LIGHT,
     "shutter, if any": LIGHT,
     "flicker, if any": expected(
@@ -279,6 +280,7 @@ STREAM: Table = {
     "defects, if any": OBJECT,
     "rows, if any": {"delay": POSITIVE, "order": TEXT},
     "colour, if any": OBJECT,
+    "origin, if any": PLACE,
     "exposures, if any": expected(
         "shares from 1e-6 to 1",
         lambda value: list_of(lambda v: is_number(v) and 1e-6 <= v <= 1)(value) and bool(value),

@@ -82,6 +82,8 @@ def _run_sense(args: argparse.Namespace) -> int:
     levels = [{"ppp": ppp} for ppp in args.ppp or []] + [{"lux": lux} for lux in args.lux or []] or [{}]
     if args.name and len(levels) > 1:
         raise ValueError(f"--name {args.name}: one name for {len(levels)} light levels; leave it out")
+    if args.replay and len(levels) > 1:
+        raise ValueError(f"--replay {args.replay}: is of one stream, not of {len(levels)} light levels; give one")
     rows = Rows.of(args.row_delay, args.row_order)
     wanted = [
         Sensing(args.sensor or "quiver-physical", args.bits, seed=args.seed, name=args.name, group=args.group,
@@ -136,6 +138,11 @@ def _replay(args: argparse.Namespace, clips: list[Any], sensing: Any) -> int:
     refuse_idle(args, "--replay draws what is stored", unused)
     if args.slices != 1:
         raise ValueError("--replay draws what is stored: --slices changes nothing here; leave it out")
+    if args.name:
+        where = f"--replay of --name {args.name}"
+        refuse_idle(args, where, ["sensor", "bits", "ppp", "lux", "colour"])
+        if args.seed:
+            raise ValueError(f"{where}: --seed changes nothing here; leave it out")
     name, _, number = args.replay.rpartition(":")
     if not number.isdigit() or (not name and len(clips) != 1):
         raise ValueError(f"--replay {args.replay}: expected CLIP:FRAME, as in fan_0003:7")

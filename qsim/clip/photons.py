@@ -10,12 +10,16 @@ from numpy import ndarray as Array
 from qsim.clip.clip_folder import ClipFolder
 from qsim.optics.diffraction import diffract
 from qsim.optics.radiometry import Crop, LightLevel, band_photons, expected_photons, photons_per_lux, ppp_factor
+from qsim.sensor.colour_filter import ColourFilter
+
+_MOST = 1e12  # photons per pixel and frame: the exact laws are tested up to it
 
 
 def light_level(clip: ClipFolder, *, ppp: float | None = None, lux: float | None = None) -> LightLevel:
     """Return the light level of a clip: `ppp` photons per pixel, `lux` on the faceplate, or factor 1 without either.
 
-    `ValueError` for a black clip, for both targets at once, and for a clip of relative radiance without `ppp`.
+    `ValueError` for a black clip, for both targets at once, for a clip of relative radiance without `ppp`, and above
+    1e12 photons.
     """
     if ppp is not None and lux is not None:
         raise ValueError(f"{clip.name}: give the light level as ppp or as lux, not both")
@@ -27,13 +31,21 @@ def light_level(clip: ClipFolder, *, ppp: float | None = None, lux: float | None
                 f"{clip.name}: its radiance is relative (imported video) and has no {what}; "
                 "give a target in photons per pixel, as in --ppp 3.25"
             )
-        return LightLevel(ppp_factor(clip.mean_radiance, ppp, clip.name), ppp, clip.mean_radiance, None)
+        factor = ppp_factor(clip.mean_radiance, ppp, clip.name)
+        return LightLevel(factor, _checked(clip, ppp), clip.mean_radiance, None)
     per_lux = photons_per_lux(camera, clip.exposure)
     if lux is not None:
         ppp = lux * per_lux
     factor = 1.0 if ppp is None else ppp_factor(clip.mean_photons, ppp, clip.name)
-    level = clip.mean_photons if ppp is None else ppp
+    level = _checked(clip, clip.mean_photons if ppp is None else ppp)
     return LightLevel(factor, level, clip.mean_photons, level / per_lux)
+
+
+def _checked(clip: ClipFolder, ppp: float) -> float:
+    """Return the mean photons per pixel; `ValueError` for more than the sensor models are made for."""
+    if ppp > _MOST:
+        raise ValueError(f"{clip.name}: {ppp:.3g} photons per pixel and frame are too many; give at most {_MOST:g}")
+    return ppp
 
 
 def clip_photons(
@@ -73,11 +85,13 @@ def clip_photons(
     return expected_photons(radiance, camera, clip.exposure, origin=(y, x)) * factor
 
 
-def light_line(level: LightLevel, electrons_per_photon: float) -> str:
-    """Return a one-line summary of the light level.
+def light_line(level: LightLevel, efficiency: float, filters: ColourFilter | None = None) -> str:
+    """Return a one-line summary of the light level of a sensor; behind filters the electrons of equal bands.
 
     `light scaled by 0.1228 to 3.25 photons/pixel (2.6 e-, equivalent to 1.313 lx at 555 nm)`
     """
     lux = "" if level.lux is None else f", equivalent to {level.lux:.4g} lx at 555 nm"
-    electrons = f"{level.ppp * electrons_per_photon:.3g} e-"
+    electrons = f"{level.ppp * efficiency:.3g} e-"
+    if filters is not None:
+        electrons = f"about {level.ppp * filters.mean_efficiency(efficiency):.3g} e- with equal bands"
     return f"light scaled by {level.factor:.4g} to {level.ppp:.4g} photons/pixel ({electrons}{lux})"

@@ -19,7 +19,7 @@ from qsim.clip import gates
 from qsim.clip.clip_folder import ClipFolder
 from qsim.clip.photons import light_level, light_line
 from qsim.clip.rows import Rows
-from qsim.clip.simulation import Draw, plane_of, stored
+from qsim.clip.simulation import Draw, plane_of, same_settings, stored
 from qsim.clip.stream import Stream, orientation, write_packed, writing
 from qsim.files import Progress, check_name
 from qsim.sensor import colour_filter, devices, packing
@@ -28,7 +28,7 @@ from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects import defect_table
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.event_simulation import TOLERANCE, Effects
-from qsim.sensor.defects.pixel_array import PixelArray
+from qsim.sensor.defects.pixel_array import PixelArray, require_effect
 from qsim.sensor.qis import QIS
 from qsim.sensor.sensor import Sensor
 from qsim.sensor.spad import BinarySPAD
@@ -91,11 +91,12 @@ class Sensing:
 
 def prepare(clip: ClipFolder, sensing: Sensing) -> Draw:
     """Return the draw of a clip with these settings; `ValueError` if they do not fit the clip."""
-    own = sensing.sensor_name if sensing.sensor_name.endswith(".toml") else None
-    source = sensing.defects or own
-    if isinstance(source, str):
-        return assemble(clip, sensing, defect_table.from_toml(source, needed=sensing.defects is not None))
-    return assemble(clip, sensing, source)
+    found = sensing.defects or (sensing.sensor_name if sensing.sensor_name.endswith(".toml") else None)
+    if isinstance(found, str):
+        found = defect_table.from_toml(found, needed=sensing.defects is not None)
+    draw = assemble(clip, sensing, found)
+    require_effect(found, draw.sensor)
+    return draw
 
 
 def filters_of(sensing: Sensing) -> ColourFilter | None:
@@ -130,21 +131,22 @@ def assemble(clip: ClipFolder, sensing: Sensing, found: Defects | None, own: Sen
         raise ValueError(f"{clip.name}: {len(clip)} frames are too few for {what}")
     if sensing.rows is not None:
         _check_rows(sensing, clip, 1 if sensing.group else planes)
-    target = None if sensing.ppp is None else sensing.ppp / planes
-    level = light_level(clip, ppp=target, lux=sensing.lux)
+    level = light_level(clip, ppp=None if sensing.ppp is None else sensing.ppp / planes, lux=sensing.lux)
     sensor = own or devices.load(
         sensing.sensor, ppp=level.ppp * planes, bits=sensing.bits, exposure=clip.exposure * planes
     )
     if found is not None and isinstance(sensor, SpikeCamera):
         raise ValueError(f"{sensing.sensor_name}: defects of spike cameras are not modelled; leave [defects] out")
     if found is not None:  # a measured dark map replaces the dark rate of the sensor
-        sensor = PixelArray.of(found, sensor, *clip.shape[1:]).sensor
+        sensor = PixelArray.of(found, sensor, *clip.shape[1:], clip.origin).sensor
     _check_planes(sensor, sensing, clip)
     key = keys.Key(seed=sensing.seed, clip=keys.hash_name(clip.name))
+    if not 0 <= key.seed < 2**64:
+        raise ValueError(f"{clip.name}: the seed must be a whole number from 0 to 2^64 - 1, got {key.seed}")
     plane = plane_of(sensor, planes)
     shares = None if sensing.exposures is None else _checked_exposures(sensing, sensor, found)
     draw = Draw(sensor, plane, level, key, planes, sensing.diffraction, found, rows=sensing.rows, colour=filters)
-    return dataclasses.replace(draw, shares=shares)
+    return dataclasses.replace(draw, shares=shares, origin=clip.origin)
 
 
 def _checked_exposures(sensing: Sensing, sensor: Sensor, found: Defects | None) -> tuple[float, ...]:
@@ -227,6 +229,7 @@ def describe(clip: ClipFolder, sensing: Sensing, draw: Draw) -> dict[str, Any]:
         | ({} if draw.rows is None else {"rows": draw.rows.to_dict()})
         | ({} if draw.colour is None else {"colour": draw.colour.to_dict()})
         | ({} if draw.shares is None else {"exposures": list(draw.shares)})
+        | ({} if draw.origin == (0, 0) else {"origin": list(draw.origin)})
     )
 
 
@@ -247,9 +250,9 @@ def sense(
     meta = describe(clip, sensing, draw)
     efficiency = draw.sensor.efficiency
     whole = dataclasses.replace(draw.level, ppp=draw.level.ppp * draw.planes)  # of a code, not of a clip frame
-    line = light_line(whole, efficiency if draw.colour is None else draw.colour.mean_efficiency(efficiency))
+    line = light_line(whole, efficiency, draw.colour)
     if draw.colour is not None:
-        line += f"; {_colours(draw.colour, efficiency)}"
+        line += f"; {draw.colour.words(efficiency)}"
     if draw.rows is not None:
         line += f"; {draw.rows}"
     if draw.shares is not None:
@@ -278,17 +281,6 @@ def sense(
         return _write(clip, sensing.stream_name, blocks, draw.sensor, meta), line
 
 
-def _colours(filters: ColourFilter, efficiency: float) -> str:
-    """Return mask and efficiencies as text: `mask RG GB, efficiency R 0.45, G 0.6, B 0.5`."""
-    each = []
-    for colour in dict.fromkeys("".join(filters.mask)):
-        values = filters.efficiency_of(colour, efficiency)
-        own = [value for value in values if value]
-        each.append(f"{colour} {own[0]:g}" if len(own) == 1 else f"{colour} {'/'.join(f'{v:g}' for v in values)}")
-    rows = filters.mask if len(filters.mask) <= 8 else (f"of {filters.tile[0]} x {filters.tile[1]} pixels",)
-    return f"mask {' '.join(rows)}, efficiency {', '.join(each)}"
-
-
 def _kept(clip: ClipFolder, sensing: Sensing, draw: Draw, meta: dict[str, Any]) -> Stream | None:
     """Return the stored stream if its settings are these, None if there is none; `FileExistsError` for others."""
     json_path = clip.path / "streams" / f"{sensing.stream_name}.json"
@@ -296,11 +288,7 @@ def _kept(clip: ClipFolder, sensing: Sensing, draw: Draw, meta: dict[str, Any]) 
         old = Stream.open(json_path)
     except FileNotFoundError:
         return None
-    if (
-        all(old.meta.get(key, value if key == "drawn_by" else None) == value for key, value in meta.items())
-        and all(old.meta.get(key) == meta.get(key) for key in ("defects", "rows", "colour", "exposures"))
-        and old.meta["sensor"] == draw.sensor.to_dict()
-    ):
+    if same_settings(old.meta, meta) and old.meta["sensor"] == draw.sensor.to_dict():
         return old
     raise FileExistsError(f"{json_path}: exists with other settings; name this stream with --name, or use --force")
 

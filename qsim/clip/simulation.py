@@ -11,6 +11,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy import ndarray as Array
@@ -55,6 +57,7 @@ class Draw:
     rows: Rows | None = None  # rows or columns at their own time; None: all at once
     colour: ColourFilter | None = None  # from the first pixel of the clip; None: the clip has one band
     shares: tuple[float, ...] | None = None  # exposures of codes in turn, over a full one; None: all are full
+    origin: tuple[int, int] = (0, 0)  # (y, x) of the first pixel in the full frame
 
     @property
     def law(self) -> str:
@@ -129,17 +132,17 @@ class Draw:
         light = (self._exposed(self.light(clip, *place)) for place in places)
         array = self._array(clip)
         if isinstance(self.plane, SpikeCamera):
-            yield from self.plane.spikes(light, clip.exposure, self.key.at(start))
+            yield from self.plane.spikes(light, clip.exposure, self.key.at(start), self.origin)
             return
         if array is not None:
             drawn: Iterator[Array] = array.blocks(
-                light, self._exposure(clip), self.key.at(self._number(start)), engine=self.engine
+                light, self._exposure(clip), self.key.at(self._number(start)), self.origin, self.engine
             )
         else:
             keys = (self.key.at(self._number(t)) for t in range(start, stop, step))
-            exposure, engine = self._exposure(clip), self.engine
+            exposure = self._exposure(clip)
             each = zip(light, keys, strict=True)
-            drawn = (self.plane.sample(p, exposure, key=key, engine=engine) for p, key in each)
+            drawn = (self._sampled(None, p, exposure, key) for p, key in each)
         for block in drawn:
             yield self._summed(block)
 
@@ -154,7 +157,11 @@ class Draw:
         else:
             blocks = (
                 self.plane.sample_packed(
-                    self.light(clip, t, min(t + step, frames)), clip.exposure, key=self.key.at(t), engine=self.engine
+                    self.light(clip, t, min(t + step, frames)),
+                    clip.exposure,
+                    key=self.key.at(t),
+                    origin=self.origin,
+                    engine=self.engine,
                 )
                 for t in range(0, frames, step)
             )
@@ -171,9 +178,13 @@ class Draw:
         share = gates.share_of(self.shares, t)
         part = np.full(self.planes, share) if self.sums else gates.weights(share, self.planes)
         light = self.light(clip, t * self.planes, (t + 1) * self.planes) * part[:, None, None]
-        sample = self.plane.sample if array is None else array.sample
         key, exposure = self.key.at(self._number(t)), share * self._exposure(clip)
-        return self._summed(sample(self._exposed(light), exposure, key=key, engine=self.engine))
+        return self._summed(self._sampled(array, self._exposed(light), exposure, key))
+
+    def _sampled(self, array: PixelArray | None, light: Array, exposure: float, key: Key) -> Array:
+        """Return the codes of exposures of `plane`, or of a pixel array of it, both [t, H, W], at the clip's place."""
+        source = self.plane if array is None else array
+        return source.sample(light, exposure, key=key, origin=self.origin, engine=self.engine)
 
     @property
     def remembers(self) -> bool:
@@ -209,7 +220,7 @@ class Draw:
         counts = self.followed is not None
         if self.defects is None and not counts:
             return None
-        return PixelArray.of(self.defects or Defects(), self.plane, *clip.shape[1:])
+        return PixelArray.of(self.defects or Defects(), self.plane, *clip.shape[1:], self.origin)
 
     def _slices(self, clip: ClipFolder) -> IncidentLight:
         """Return a function that reads the photons [slices, rows, W] of some rows of a stream frame."""
@@ -228,7 +239,7 @@ class Draw:
         memory = event_simulation.memory_of(self.defects)
         if self.planes == 1 and not (memory.carry or memory.afterpulse):
             return None
-        array = PixelArray.of(self.defects or Defects(), self.plane, *clip.shape[1:])
+        array = PixelArray.of(self.defects or Defects(), self.plane, *clip.shape[1:], self.origin)
         shape = (self.count(clip), *clip.shape[1:])
         return event_simulation.clip_effects(
             array, self._slices(clip), shape, self._exposure(clip), self.planes / clip.frame_rate
@@ -240,7 +251,7 @@ class Draw:
         assert array is not None
         shape = (frames, *clip.shape[1:])
         exposure, frame_time = self._exposure(clip), self.planes / clip.frame_rate
-        return event_simulation.follow(array, self._slices(clip), shape, exposure, frame_time, self.key)
+        return event_simulation.follow(array, self._slices(clip), shape, exposure, frame_time, self.key, self.origin)
 
     def trace(self, clip: ClipFolder, frames: int) -> Iterator[tuple[Array, Array]]:
         """Yield the times [n] in s and kinds [n] of the events behind the first codes of each pixel, row by row.
@@ -254,7 +265,7 @@ class Draw:
             )
         shape = (frames, *clip.shape[1:])
         exposure, frame_time = self._exposure(clip), self.planes / clip.frame_rate
-        return event_simulation.trace(array, self._slices(clip), shape, exposure, frame_time, self.key)
+        return event_simulation.trace(array, self._slices(clip), shape, exposure, frame_time, self.key, self.origin)
 
 
 def stored(stream: Stream) -> Draw:
@@ -282,7 +293,25 @@ def stored(stream: Stream) -> Draw:
     diffraction = bool(meta.get("diffraction", False))
     plane = plane_of(sensor, planes)
     draw = Draw(sensor, plane, level, key, planes, diffraction, found, followed, colour=stream.colour_filter)
-    return dataclasses.replace(draw, rows=stream.rows, shares=stream.shares)
+    return dataclasses.replace(draw, rows=stream.rows, shares=stream.shares, origin=stream.origin)
+
+
+def same_settings(old: dict[str, Any], new: dict[str, Any]) -> bool:
+    """Return whether two descriptions of streams have the same settings; folders of files do not count."""
+    old, new = _without_folders(old), _without_folders(new)
+    same = all(old.get(key, value if key == "drawn_by" else None) == value for key, value in new.items())
+    return same and all(old.get(key) == new.get(key) for key in ("defects", "rows", "colour", "exposures", "origin"))
+
+
+def _without_folders(meta: dict[str, Any]) -> dict[str, Any]:
+    """Return a description in which a sensor file has its name alone, and measured maps have their checksums."""
+    name, table = meta.get("sensor_name"), meta.get("defects")
+    if isinstance(name, str) and name.endswith(".toml"):
+        meta = meta | {"sensor_name": Path(name).name}
+    if isinstance(table, dict):
+        maps = {key: value["sha256"] for key, value in table.items() if isinstance(value, dict) and "sha256" in value}
+        meta = meta | {"defects": table | maps}
+    return meta
 
 
 def plane_of(sensor: Sensor, planes: int) -> Sensor:

@@ -188,6 +188,12 @@ class Stream:
         return frames, height, width
 
     @property
+    def origin(self) -> tuple[int, int]:
+        """(y, x) of the first pixel in the full frame; earlier versions drew every crop as one at (0, 0)."""
+        y, x = self.meta.get("origin") or (0, 0)
+        return y, x
+
+    @property
     def exposure(self) -> float:
         """Seconds of light in one code: in all its planes if it sums some, in a full one under a schedule."""
         return float(self.meta["exposure"])
@@ -231,8 +237,7 @@ class Stream:
         described = self.path.with_suffix(".json")
         problem = f"{described}: was replaced since it was opened; open the stream again"
         try:
-            status = described.stat()
-            now = files.read_json(described)
+            status, now = described.stat(), files.read_json(described)
         except FileNotFoundError:
             raise ValueError(problem) from None
         if now.get("sha256", now) != self.meta.get("sha256", self.meta):
@@ -307,9 +312,7 @@ def write_packed(path: Path, blocks: Iterable[Array], sensor: Sensor, meta: dict
     `meta` must hold shape (T, H, W), ppp_factor, exposure and frame_rate. `ValueError` if there are not T frames.
     """
     frames, height, width = meta["shape"]
-    bits = sensor.bits
-    row = packing.packed_width(width, bits)
-    json_path = path.with_suffix(".json")
+    row, json_path = packing.packed_width(width, sensor.bits), path.with_suffix(".json")
     done, digest = 0, hashlib.sha256()
     with files.replacing_described(path, json_path) as (stored, described):
         head = _header(frames, height, row)
@@ -326,7 +329,7 @@ def write_packed(path: Path, blocks: Iterable[Array], sensor: Sensor, meta: dict
             raise ValueError(f"{path}: got {done} frames, expected {frames}")
         full = {
             "format_version": FORMAT_VERSION,
-            "bits": bits,
+            "bits": sensor.bits,
             "width": width,
             "bit_order": "msb",
             "orientation": "upright",
@@ -336,7 +339,6 @@ def write_packed(path: Path, blocks: Iterable[Array], sensor: Sensor, meta: dict
             "sha256": digest.hexdigest(),
             "software": {"qsim": VERSION},
         } | meta
-        full["shape"] = [frames, height, width]
         described.write(files.to_json(files.sealed(full)))
     return Stream.open(json_path)
 

@@ -132,8 +132,10 @@ def stream_line(stream: Stream) -> str:
     light = "" if ppp is None else f": {ppp:.4g} photons per pixel (the clip's light × {stream.photons_factor:.4g})"
     light += "" if lux is None else f", equal to {lux:.4g} lx at 555 nm"
     efficiency, colours = stream.sensor.efficiency, stream.colour_filter
-    efficiency = efficiency if colours is None else colours.mean_efficiency(efficiency)
-    light += "" if ppp is None else f", {ppp * efficiency:.3g} e⁻ per pixel"
+    if ppp is not None:
+        electrons = efficiency if colours is None else colours.mean_efficiency(efficiency)
+        about, bands = ("", "") if colours is None else ("about ", " with equal bands")
+        light += f", {about}{ppp * electrons:.3g} e⁻ per pixel{bands}"
     filters = "" if colours is None else f"; colour filters {' '.join(colours.mask)}"
     words = f"{filters}{timing_words(stream)}{defects_words(stream)}"
     return f"Stream {stream.name}{light}; {stream.bits} bit, {stream.sensor}{words}"
@@ -260,7 +262,7 @@ def expected_codes(clip: Clip, stream: Stream, count: int) -> NDArray[np.float64
     sensor, maps = stream.sensor, fixed_pattern.PERFECT
     if "defects" in stream.meta:
         found = defect_table.from_dict(stream.meta["defects"], f"{stream.name}: defects")
-        device = PixelArray.of(found, sensor, height, width)
+        device = PixelArray.of(found, sensor, height, width, stream.origin)
         thinned = {name: None if m is None else m[::step, ::step] for name, m in vars(device.maps).items()}
         sensor, maps = device.sensor, fixed_pattern.Maps(**thinned)
     probabilities = fixed_pattern.pmf(sensor, np.stack(light), stream.exposure, maps)

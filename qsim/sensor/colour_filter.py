@@ -107,6 +107,16 @@ class ColourFilter:
         height, width = photons.shape[-2:]
         return np.asarray((photons * self.over(efficiency, height, width, origin)).sum(axis=-3))
 
+    def words(self, efficiency: float) -> str:
+        """Return mask and efficiencies as text: `mask RG GB, efficiency R 0.45, G 0.6, B 0.5`."""
+        each = []
+        for colour in dict.fromkeys("".join(self.mask)):
+            values = self.efficiency_of(colour, efficiency)
+            own = [value for value in values if value]
+            each.append(f"{colour} {own[0]:g}" if len(own) == 1 else f"{colour} {'/'.join(f'{v:g}' for v in values)}")
+        rows = self.mask if len(self.mask) <= 8 else (f"of {self.tile[0]} x {self.tile[1]} pixels",)
+        return f"mask {' '.join(rows)}, efficiency {', '.join(each)}"
+
     def to_dict(self) -> dict[str, Any]:
         """Return the table as stored with a stream; `from_dict` reads it."""
         efficiency = None if self.efficiency is None else {key: list(value) for key, value in self.efficiency.items()}

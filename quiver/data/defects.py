@@ -60,16 +60,21 @@ class Filler:
 
 
 def defective(
-    defects: Defects | None, sensor: Sensor, exposure: float, light: float, shape: tuple[int, int]
+    defects: Defects | None,
+    sensor: Sensor,
+    exposure: float,
+    light: float,
+    shape: tuple[int, int],
+    origin: tuple[int, int] = (0, 0),
 ) -> Array | None:
     """Return the dead and the hot pixels, bool [H, W], of a sensor with defects; None without any.
 
     A pixel is hot if its dark detections per exposure [s] exceed HOT times those of the mean light [photons]. Of a
-    clocked sum, `sensor` and `exposure` are those of the sum.
+    clocked sum, `sensor` and `exposure` are those of the sum. `origin` (y, x) places a crop in the full frame.
     """
     if defects is None:
         return None
-    array = PixelArray.of(defects, sensor, *shape)
+    array = PixelArray.of(defects, sensor, *shape, origin)
     bad = np.zeros(shape, bool) if array.maps.dead is None else np.array(array.maps.dead)
     if array.maps.dark is not None:
         bad |= array.maps.dark * array.sensor.dark_rate * exposure > HOT * light * array.sensor.efficiency
@@ -81,14 +86,15 @@ def as_measured(defects: Defects | None, sensor: Sensor, shape: tuple[int, int])
     return sensor if defects is None else PixelArray.of(defects, sensor, *shape).sensor
 
 
-def behind(bad: Array | None, defects: Defects | None, sensor: Sensor) -> Sensor:
+def behind(bad: Array | None, defects: Defects | None, sensor: Sensor, origin: tuple[int, int] = (0, 0)) -> Sensor:
     """Return the sensor of filled codes: its dark rate is the mean of the good pixels, bool [H, W] `bad` being false.
 
     The mean over all pixels belongs mostly to the hot ones. Restored light would be too dark by their share of it.
     """
     if bad is None or defects is None:
         return sensor
-    array = PixelArray.of(defects, sensor, *bad.shape)
+    height, width = bad.shape
+    array = PixelArray.of(defects, sensor, height, width, origin)
     if array.maps.dark is None or bad.all():
         return sensor
     return sensor.with_dark_rate(array.sensor.dark_rate * float(array.maps.dark[~bad].mean()))
@@ -96,7 +102,8 @@ def behind(bad: Array | None, defects: Defects | None, sensor: Sensor) -> Sensor
 
 def of_draw(draw: Draw, exposure: float, shape: tuple[int, int]) -> Array | None:
     """Return the defective pixels of a clip that is sensed now."""
-    return defective(draw.defects, draw.sensor, exposure * draw.planes, draw.level.ppp * draw.planes, shape)
+    light = draw.level.ppp * draw.planes
+    return defective(draw.defects, draw.sensor, exposure * draw.planes, light, shape, draw.origin)
 
 
 def of_stream(stream: Stream) -> Array | None:
@@ -104,10 +111,10 @@ def of_stream(stream: Stream) -> Array | None:
     table, ppp = stream.meta.get("defects"), stream.meta.get("ppp")
     if table is None or ppp is None:
         return None
+    _, height, width = stream.shape
     try:
-        return defective(
-            read_defects(table), stream.sensor, stream.exposure, float(ppp), (stream.shape[1], stream.shape[2])
-        )
+        found = read_defects(table)
+        return defective(found, stream.sensor, stream.exposure, float(ppp), (height, width), stream.origin)
     except (OSError, ValueError) as error:
         warnings.warn(f"{stream.path}: its hot and dead pixels are not filled: {files.wording(error)}", stacklevel=2)
         return None

@@ -44,8 +44,8 @@ class WindowPlace:
 
 
 @lru_cache(maxsize=16)
-def _pixel_array(defects: str, sensor: Sensor, shape: tuple[int, int]) -> PixelArray:
-    return PixelArray.of(stored_defects(defects), sensor, *shape)
+def _pixel_array(defects: str, sensor: Sensor, shape: tuple[int, int], origin: tuple[int, int]) -> PixelArray:
+    return PixelArray.of(stored_defects(defects), sensor, *shape, origin)
 
 
 def check_windows(noise: Noise, clip: Clip) -> None:
@@ -54,7 +54,7 @@ def check_windows(noise: Noise, clip: Clip) -> None:
     if draw.remembers:
         raise ValueError(f"{noise.sensor}: training windows cannot follow the charge of a spike camera; give --sensor")
     if noise.defects is not None:
-        array = _pixel_array(noise.defects, draw.plane, clip.shape[1:])
+        array = _pixel_array(noise.defects, draw.plane, clip.shape[1:], draw.origin)
         if array.follows_photons:
             raise ValueError(
                 f"{noise.sensor}: carry_dead_time and afterpulse of counting pixels reach from exposure to exposure, "
@@ -67,8 +67,9 @@ def behind_defects(noise: Noise, draw: Draw, clip: Clip) -> tuple[Array | None, 
     if noise.defects is None:
         return None, draw.sensor
     table = stored_defects(noise.defects)
-    bad = defective(table, draw.sensor, clip.exposure, draw.level.ppp, (clip.shape[1], clip.shape[2]))
-    return bad, behind(bad, table, draw.sensor)
+    shape = clip.shape[1], clip.shape[2]
+    bad = defective(table, draw.sensor, clip.exposure, draw.level.ppp, shape, draw.origin)
+    return bad, behind(bad, table, draw.sensor, draw.origin)
 
 
 def window_filler(bad: Array | None, place: WindowPlace, side: int) -> Filler | None:
@@ -87,7 +88,7 @@ def window_codes(
     scene moves, the sensor does not.
     """
     assert noise.defects is not None
-    array = _pixel_array(noise.defects, draw.plane, clip.shape[1:])
+    array = _pixel_array(noise.defects, draw.plane, clip.shape[1:], draw.origin)
     length, height, width = clip.shape
     before = length - place.start - frames if place.backwards else place.start
     lead = min(array.lead(NEGLIGIBLE), before)
@@ -104,8 +105,8 @@ def window_codes(
 
     order = range(last + lead, -1, -1) if place.backwards else range(-lead, frames)
     stack = np.stack([light(i) for i in order])
-    origin = (place.y - top, place.x - left)
-    part = array.crop(*origin, rows, columns)
+    part = array.crop(place.y - top, place.x - left, rows, columns)
+    origin = (draw.origin[0] + place.y - top, draw.origin[1] + place.x - left)
     key = place.key.at(place.start - lead if not place.backwards else 0)
     codes = next(part.blocks([stack], clip.exposure, key, origin, draw_codes))
     return codes[lead:, top : top + side, left : left + side]

@@ -132,8 +132,8 @@ def effects(sensor: CountingSPAD, photons: Array, exposure: float, frame_time: f
     """Return the relative size of each effect for photons [T, S, ...]: the largest of all pixels and frames.
 
     At r arrivals per second a dead time tau loses about r^2 tau counts per second. If r varies with the coefficient of
-    variation c, the loss grows by the factor 1 + c^2. A pixel is dead at the start of a frame with probability r tau,
-    for tau / 2 on average, if the gap before it is not longer than tau. An afterpulse adds at most its probability.
+    variation c, the loss grows by the factor 1 + c^2. Counts of a paralyzable pixel, r exp(-r tau) per second, change
+    by the share c^2 r tau (r tau - 2) / 2. An afterpulse adds at most its probability.
     """
     slices = photons.shape[1]
     rates = sensor.efficiency * np.asarray(photons, float) + sensor.dark_rate * exposure / slices
@@ -141,9 +141,28 @@ def effects(sensor: CountingSPAD, photons: Array, exposure: float, frame_time: f
     share = sensor.dead_time / exposure
     spread = slices * (rates**2).sum(axis=1) - arrivals**2  # c^2 lambda^2
     varying = share * np.divide(spread, arrivals, out=np.zeros_like(arrivals), where=arrivals > 0)
-    reach = max(0.0, sensor.dead_time - (frame_time - exposure))
-    carried = arrivals.max() * (reach / exposure) ** 2 / 2 if memory.carry else 0.0
-    return Effects(float(varying.max()), float(carried), memory.afterpulse)
+    if sensor.paralyzable:
+        varying = varying * np.maximum(1.0, arrivals * share / 2)  # no less than that share
+    reach = max(0.0, sensor.dead_time - (frame_time - exposure)) / exposure
+    carried = float(_carried(sensor, arrivals, share, reach).max()) if memory.carry else 0.0
+    return Effects(float(varying.max()), carried, memory.afterpulse)
+
+
+def _carried(sensor: CountingSPAD, arrivals: Array, share: float, reach: float) -> Array:
+    """Return the relative error of the mean count without carried dead time: n = `arrivals` per exposure -> [...].
+
+    A dead time lasts `share` exposures, `reach` of them after the gap between two exposures. A pixel is dead at the
+    start with probability n reach, for reach / 2 on average. A bright paralyzable pixel loses more, as it counts an
+    arrival only if none came in the dead time before. With y = n reach and x = n share, carried dead times take
+    1 - (1 + y) exp(-y) counts and leave (1 + y) exp(-y) - exp(-x) + n (1 - share) exp(-x).
+    """
+    dim = arrivals * reach**2 / 2
+    if not sensor.paralyzable:
+        return dim
+    y, x = arrivals * min(reach, 1.0), arrivals * min(share, 1.0)
+    taken = -np.expm1(-y) - y * np.exp(-y)
+    left = np.exp(-y) * (y - np.expm1(y - x)) + arrivals * max(1 - share, 0.0) * np.exp(-x)
+    return np.maximum(dim, taken / np.maximum(left, np.finfo(float).tiny))
 
 
 def simulate(
@@ -247,25 +266,37 @@ def _lit(array: PixelArray, photons: Array, row: int, exposure: float) -> tuple[
 
 
 def follow(
-    array: PixelArray, light: IncidentLight, shape: tuple[int, int, int], exposure: float, frame_time: float, key: Key
+    array: PixelArray,
+    light: IncidentLight,
+    shape: tuple[int, int, int],
+    exposure: float,
+    frame_time: float,
+    key: Key,
+    origin: tuple[int, int] = (0, 0),
 ) -> Array:
     """Return codes of a clip of `shape` (T, H, W), each pixel followed photon by photon from the first frame.
 
-    Crosstalk is drawn after that, between the pixels of each frame.
+    Crosstalk is drawn after that, between the pixels of each frame. `origin` (y, x) places a crop in the full frame.
     """
     codes = np.empty(shape, array.sensor.dtype)
     memory = memory_of(array.defects)
     for y, sensor, photons in _strips(array, light, shape, exposure):
         rows = slice(y, y + photons.shape[2])
-        codes[:, rows] = _follow_pixels(sensor, photons, exposure, frame_time, memory, key, (y, 0))
+        codes[:, rows] = _follow_pixels(sensor, photons, exposure, frame_time, memory, key, (origin[0] + y, origin[1]))
     if array.maps.dead is not None:
         codes[:, array.maps.dead] = 0
     noise = CorrelatedNoise(crosstalk=array.defects.crosstalk)
-    return noise.disturb(None, codes, array.sensor.levels - 1, key, array.maps.dead, (0, 0))[0]
+    return noise.disturb(None, codes, array.sensor.levels - 1, key, array.maps.dead, origin)[0]
 
 
 def trace(
-    array: PixelArray, light: IncidentLight, shape: tuple[int, int, int], exposure: float, frame_time: float, key: Key
+    array: PixelArray,
+    light: IncidentLight,
+    shape: tuple[int, int, int],
+    exposure: float,
+    frame_time: float,
+    key: Key,
+    origin: tuple[int, int] = (0, 0),
 ) -> Iterator[tuple[Array, Array]]:
     """Yield the events behind the codes of `follow`, pixel by pixel, row by row: times [n] in s, kinds uint8 [n].
 
@@ -278,7 +309,7 @@ def trace(
         for y, x in np.ndindex(photons.shape[2:]):
             log: list[Event] = []
             if array.maps.dead is None or not array.maps.dead[first + y, x]:
-                rng = pixel_stream(key, first + y, x)
+                rng = pixel_stream(key, origin[0] + first + y, origin[1] + x)
                 simulate(sensor, photons[:, :, y, x], exposure, frame_time, memory, rng, log)
             times, kinds = zip(*log, strict=True) if log else ((), ())
             yield np.array(times, np.float64), np.array(kinds, np.uint8)

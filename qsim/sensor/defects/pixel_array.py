@@ -35,21 +35,25 @@ class PixelArray:
     defects: Defects = field(default_factory=Defects)
 
     @classmethod
-    def of(cls, defects: Defects, sensor: Sensor, height: int, width: int) -> PixelArray:
+    def of(
+        cls, defects: Defects, sensor: Sensor, height: int, width: int, origin: tuple[int, int] = (0, 0)
+    ) -> PixelArray:
         """Return the pixel array of a device for frames of `height` x `width` pixels.
 
-        Measured maps may be larger: frames lie in their upper left corner. `ValueError` if the defects do not fit the
-        sensor, or a map the size.
+        `origin` (y, x) places a crop in the full frame, where measured maps begin; maps may be larger than the frames.
+        `ValueError` if the defects do not fit the sensor, or a map does not cover the frames.
         """
         _check_model(defects, sensor)
-        drawn = draw_maps(defects.pattern, (height, width))
+        y, x = origin
+        drawn = draw_maps(defects.pattern, (height, width), origin)
         measured: dict[str, Array] = {}
         for key, path in defects.maps.items():
             full = _read_map(path, key)
-            if full.shape[0] < height or full.shape[1] < width:
+            if full.shape[0] < y + height or full.shape[1] < x + width:
+                place = f" at row {y}, column {x}" if y or x else ""
                 raise ValueError(
-                    f"{path}: the {key} has {full.shape[0]} x {full.shape[1]} pixels, the frames {height} x {width}; "
-                    "a map must cover the frames: measure a larger one, or draw smaller frames"
+                    f"{path}: the {key} has {full.shape[0]} x {full.shape[1]} pixels, the frames {height} x {width}"
+                    f"{place}; a map must cover the frames: measure a larger one, or draw smaller frames"
                 )
             name = key.removesuffix("_map")
             if name == "dark":
@@ -59,7 +63,8 @@ class PixelArray:
                 if not sensor.read_noise:
                     raise ValueError(f"{path}: a map of read noise needs a sensor with read_noise above 0")
                 full = full / sensor.read_noise
-            measured[name] = full[:height, :width] != 0 if name == "dead" else full[:height, :width]
+            part = full[y : y + height, x : x + width]
+            measured[name] = part != 0 if name == "dead" else part
         return cls(sensor, replace(drawn, **measured), defects)
 
     @property
@@ -206,6 +211,14 @@ def _check_model(defects: Defects, sensor: Sensor) -> None:
         raise ValueError(f"defects: carry_dead_time and afterpulse_delay are for a CountingSPAD, this is a {name}")
     if counting and defects.afterpulse and not defects.afterpulse_delay:
         raise ValueError("defects: afterpulse of a counting pixel needs afterpulse_delay in seconds")
+
+
+def require_effect(defects: Defects | None, sensor: Sensor) -> None:
+    """Raise `ValueError` for defects drawn around a dark rate or read noise of 0, which would change nothing."""
+    if defects is not None and defects.pattern.dark is not None and not sensor.dark_rate:
+        raise ValueError("defects: dark spreads the sensor's dark rate, which is 0; state one, or give a dark_map")
+    if defects is not None and defects.pattern.read_noise and isinstance(sensor, QIS) and not sensor.read_noise:
+        raise ValueError("defects: read_noise spreads the sensor's read noise, which is 0; state one, or leave it out")
 
 
 def _read_map(path: str, key: str) -> Array:

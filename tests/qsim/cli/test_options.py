@@ -185,7 +185,8 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         Refused("sense clip", "--follow", "followed"),
     ],
     ("sense", "--replay"): [
-        Acts("sense clip --ppp 3.25 --bits 3 --name s", "--replay clip:1", stdout),
+        Acts("sense clip --ppp 3.25 --bits 3", "--replay clip:1", stdout, before="sense clip --ppp 3.25 --bits 3"),
+        Refused("sense clip --replay clip:1", "--ppp 3.25,26", "2 light levels"),
         Refused("sense clip --replay clip:1", "--row-order up", "row delay"),
         *(
             Refused("sense clip --replay clip:1", option, option.split()[0])
@@ -203,6 +204,10 @@ ROWS: dict[tuple[str, str], list[Row]] = {
         *(
             Refused("sense clip --replay clip:1", option, "no stream")
             for option in ("--ppp 77", "--bits 7", "--sensor spad-320x240", "--seed 5", "--lux 2", "--name x")
+        ),
+        *(
+            Refused("sense clip --name s --replay clip:1", option, option.split()[0])
+            for option in ("--ppp 77", "--bits 7", "--sensor b", "--seed 5", "--lux 2", "--colour rggb")
         ),
     ],
     ("sense", "--force"): [Acts("sense clip --name s --seed 9", "--force", codes=(0, 2))],

@@ -34,6 +34,17 @@ def test_light_levels(tmp_path: Path):
     assert "to 3.25 photons/pixel (2.6 e-" in light_line(light_level(clip, ppp=3.25), 0.8)
 
 
+def test_light_beyond_the_sensor_models_is_refused(tmp_path: Path):
+    """A QIS showed no more light above 1e15 electrons, without a word."""
+    clip, video = write(tmp_path / "a"), write(tmp_path / "r", radiance_unit=RELATIVE, camera=None)
+    for levels in ({"ppp": 1e17}, {"lux": 1e17}):
+        with pytest.raises(ValueError, match=r"a: .* photons per pixel and frame are too many; give at most 1e\+12"):
+            light_level(clip, **levels)
+    with pytest.raises(ValueError, match=r"r: 1e\+17 photons per pixel"):
+        light_level(video, ppp=1e17)
+    assert light_level(clip, ppp=1e12).ppp == 1e12
+
+
 def test_relative_radiance_needs_a_target(tmp_path: Path):
     clip = write(tmp_path / "r", radiance_unit=RELATIVE, camera=None)
     with pytest.raises(ValueError, match=r"r: its radiance is relative .* --ppp 3.25"):

@@ -146,3 +146,12 @@ def test_two_light_levels_share_their_random_numbers_and_another_seed_does_not(t
     low, high, other = noise(3.25), noise(4.0), noise(4.0, seed=1)
     assert np.corrcoef(low, high)[0, 1] == pytest.approx(0.96, abs=0.01)
     assert abs(np.corrcoef(low, other)[0, 1]) < 5 / np.sqrt(light.size)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**64])
+def test_a_seed_that_no_description_can_hold_is_refused(tmp_path: Path, seed: int):
+    clip = write_clip(tmp_path / "c", frames=2)
+    with pytest.raises(ValueError, match=f"c: the seed must be a whole number from 0 to 2\\^64 - 1, got {seed}"):
+        sense(clip, Sensing("quiver-physical", 3, 3.25, seed=seed, name="s"))
+    assert not list(clip.path.glob("streams/*"))
+    assert sense(clip, Sensing("quiver-physical", 3, 3.25, seed=2**64 - 1, name="s"))[0].meta["seed"] == 2**64 - 1

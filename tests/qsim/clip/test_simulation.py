@@ -1,13 +1,25 @@
-"""Tests the draw of a clip: packed codes are the codes of single frames."""
+"""Tests the draw of a clip: packed codes are the codes of single frames, and crops have those of their place."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from clips import write_clip
+from clips import sliding_pattern, write_clip
+from compiled_cases import needs_engine
 
+from qsim.clip.clip import Clip
 from qsim.clip.photons import clip_photons
-from qsim.clip.sensing import Sensing, prepare, replay
+from qsim.clip.sensing import Sensing, describe, prepare, replay, sense, write_stream
+from qsim.clip.simulation import stored
 from qsim.sensor import packing
+from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.defects.defect_table import Defects
+from qsim.sensor.defects.fixed_pattern import DarkSpread, FixedPattern
 from qsim.sensor.qis import QIS
+from qsim.sensor.sensor import Sensor
+from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
 
 
@@ -66,3 +78,89 @@ def test_what_a_spike_camera_does_not_model_is_refused(clip, tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             prepare(clip, Sensing(sensor, ppp=6.0, **settings))
+
+
+# ---- Clips that are a crop of the frame
+
+BITS3, PLANE, COUNTER = QIS(0.8, 1.6, 0.2, 3), BinarySPAD(0.5, 200.0), CountingSPAD(0.5, 10.0, 5e-5, 3)
+PATTERN = FixedPattern(device_seed=4, prnu=0.2, dark=DarkSpread(hot_share=0.1), dead=0.1)
+CROPPED: dict[str, tuple[Sensor, dict[str, Any]]] = {
+    "table": (BITS3, {}),
+    "process": (QIS(0.8, 1.6, 0.2, 10), {}),
+    "slices": (BITS3, {"slices": 2}),
+    "exposures": (BITS3, {"exposures": (1.0, 0.25)}),
+    "maps": (BITS3, {"defects": Defects(PATTERN)}),
+    "maps, exposures": (BITS3, {"defects": Defects(PATTERN), "exposures": (1.0, 0.25)}),
+    "read-out": (BITS3, {"defects": Defects(FixedPattern(offset=0.3, read_noise=0.2))}),
+    "planes": (BinarySPAD(0.5, 200.0, 2), {}),
+    "many planes": (BinarySPAD(0.5, 200.0, 10), {}),
+    "summed planes": (BinarySPAD(0.5, 200.0, 2), {"group": True}),
+    "afterpulses": (PLANE, {"defects": Defects(PATTERN, afterpulse=0.3)}),
+    "closed form": (COUNTER, {}),
+    "events": (COUNTER, {"follow": True, "defects": Defects(PATTERN, carry_dead_time=True)}),
+    "spikes": (SpikeCamera(0.6, 10.0, 8), {}),
+}
+
+
+def whole_and_crop(folder: Path, place: tuple[int, int]) -> tuple[Clip, Clip]:
+    """A clip, and one of the same name that is its crop of 7 x 9 pixels at a place: 3 photons per pixel."""
+    whole = write_clip(folder / "whole" / "c", radiance=0.02 * sliding_pattern(6, 12, 18, 1))
+    y, x = place
+    light = np.stack([whole.radiance(t) for t in range(6)])[:, y : y + 7, x : x + 9]
+    return whole, write_clip(folder / "crop" / "c", radiance=light, camera=whole.meta["camera"], origin=[y, x])
+
+
+@pytest.mark.parametrize("place", [(3, 4), (5, 6)])  # packing begins inside a block of random words, or not
+@pytest.mark.parametrize("kind", CROPPED)
+def test_a_crop_has_the_defects_and_the_noise_of_its_place(tmp_path, kind, place):
+    """Under the same name and light the codes are those of the whole clip: stored, packed, replayed, drawn again."""
+    (whole, crop), (y, x), (sensor, how) = whole_and_crop(tmp_path, place), place, CROPPED[kind]
+    expected = sense(whole, Sensing(sensor, name="s", **how))[0]
+    stream = sense(crop, Sensing(sensor, name="s", **how))[0]
+    assert "origin" not in expected.meta
+    assert stream.meta["origin"] == [y, x]
+    assert 0 < stream.codes().mean() < sensor.levels - 1
+    np.testing.assert_array_equal(stream.codes(), expected.codes()[:, y : y + 7, x : x + 9])
+    np.testing.assert_array_equal(*replay(crop, stream, 1))
+    again = replace(stored(stream), engine="reference").frames(crop, 0, len(stream))
+    np.testing.assert_array_equal(again, stream.codes())
+    assert sense(crop, Sensing(sensor, name="s", **how))[0].meta == stream.meta, "kept, not drawn again"
+
+
+@needs_engine
+@pytest.mark.parametrize("place", [(3, 4), (5, 6)])
+def test_the_compiled_engine_draws_a_crop_at_its_place(tmp_path, monkeypatch, place):
+    monkeypatch.setattr("qsim.sensor.sensor.SMALLEST", 0)
+    (whole, crop), (y, x) = whole_and_crop(tmp_path, place), place
+    for how in ({}, {"defects": Defects(PATTERN)}):
+        wanted = Sensing(BITS3, name="s", **how)
+        reference = replace(prepare(whole, wanted), engine="reference").frames(whole, 0, 6)[:, y : y + 7, x : x + 9]
+        fast = replace(prepare(crop, wanted), engine="fast")
+        np.testing.assert_array_equal(fast.frames(crop, 0, 6), reference)
+        np.testing.assert_array_equal(np.concatenate(list(fast.packed(crop, 6))), packing.pack(reference, 3))
+
+
+def test_the_times_of_photons_of_a_crop_are_those_of_its_place(tmp_path):
+    whole, crop = whole_and_crop(tmp_path, (3, 4))
+    sensor, how = CROPPED["events"]
+    wholes, crops = (
+        list(stored(sense(clip, Sensing(sensor, name="s", **how))[0]).trace(clip, 6)) for clip in (whole, crop)
+    )
+    for n, (times, kinds) in enumerate(crops):
+        y, x = divmod(n, 9)
+        for found, expected in zip((times, kinds), wholes[(3 + y) * 18 + 4 + x], strict=True):
+            np.testing.assert_array_equal(found, expected)
+
+
+def test_a_crop_of_an_earlier_version_is_drawn_again_as_it_was(tmp_path):
+    """Its description holds no origin: its defects and noise are those of the upper left corner."""
+    _, crop = whole_and_crop(tmp_path, (3, 4))
+    wanted = Sensing(BITS3, name="s", defects=Defects(PATTERN))
+    draw = replace(prepare(crop, wanted), origin=(0, 0))
+    meta = describe(crop, wanted, draw)
+    assert "origin" not in meta
+    old = write_stream(crop, "s", draw.blocks(crop, 0, 6, 6), draw.sensor, meta)
+    assert (old.codes() != prepare(crop, wanted).frames(crop, 0, 6)).any()
+    np.testing.assert_array_equal(*replay(crop, old, 2))
+    with pytest.raises(FileExistsError, match="exists with other settings"):
+        sense(crop, wanted)

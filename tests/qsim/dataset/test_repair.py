@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fakes import (
     HERE,
@@ -19,6 +20,16 @@ from qsim.clip.sensing import Sensing, sense
 from qsim.dataset import recipe
 from qsim.dataset.dataset import Dataset
 from qsim.dataset.generation import Options, generate
+
+SENSOR = """[sensor]
+model = "BinarySPAD"
+pde = 0.5
+dark_count_rate = 200.0
+bits = 3
+[defects]
+prnu = 0.1
+dead_map = "bad.npy"
+"""
 
 
 @pytest.mark.parametrize("kind", ["missing", "truncated", "bit-flipped"])
@@ -115,3 +126,25 @@ def test_a_clip_that_was_moved_and_linked(tmp_path: Path):
     link.unlink()  # the advice of the message: the clip is made here
     assert generate(wanted, folder, Options(workers=0, repair=True), make=make).failed == {}
     assert tree(folder) == expected
+
+
+def test_the_folder_of_the_recipe_may_move(tmp_path: Path):
+    """Streams of a sensor's file, with a measured map, are kept beside one that is made again."""
+    place, folder = tmp_path / "a", tmp_path / "d"
+    place.mkdir()
+    np.save(place / "bad.npy", np.eye(8, 10) > 0)
+    (place / "my.toml").write_text(SENSOR)
+    own = RECIPE.replace("quiver-physical", "my.toml").replace("bits = [1, 3]\nppp = 3.25", "ppp = [2, 4]")
+    (place / "r.toml").write_text(own)
+    generate(recipe.load(place / "r.toml"), folder, HERE, make=make)
+    kept, damaged = (folder / "clips" / "fan_0000" / "streams" / f"my_{level}ppp.npy" for level in (2, 4))
+    before = (kept.stat().st_ino, damaged.read_bytes())
+    damage(damaged, "bit-flipped")
+    place.rename(tmp_path / "b")
+    summary = generate(recipe.load(tmp_path / "b" / "r.toml"), folder, Options(workers=0, repair=True), make=make)
+    assert (summary.failed, summary.made) == ({}, 1)
+    assert (kept.stat().st_ino, damaged.read_bytes()) == before
+    np.save(tmp_path / "b" / "bad.npy", np.eye(8, 10) < 1)
+    clip = Dataset.open(folder).clips()[0]
+    with pytest.raises(FileExistsError, match=r"my_2ppp\.json: exists with other settings"):
+        sense(clip, Sensing(str(tmp_path / "b" / "my.toml"), ppp=2))

@@ -90,11 +90,11 @@ def test_the_section_states_light_motion_model_and_error(tmp_path):
 
 
 def test_electrons_behind_colour_filters_are_those_of_the_mosaic(tmp_path):
-    """A white pixel of four passes three bands, so 3.25 photons of each make 3.25 x 0.8 x 6 / 4 electrons."""
+    """A white pixel of four passes three bands, so 3.25 photons of equal bands make 3.25 x 0.8 x 6 / 4 electrons."""
     clip = colour_clip(tmp_path / "c", height=8, width=10)
     stream, line = sense(clip, Sensing("quiver-physical", ppp=3.25, bits=3, colour="rgbw", name="mosaic"))
-    assert ", 3.9 e⁻ per pixel; 3 bit, QIS" in clip_section.stream_line(stream)
-    assert "3.9 e-" in line
+    assert ", about 3.9 e⁻ per pixel with equal bands; 3 bit, QIS" in clip_section.stream_line(stream)
+    assert "(about 3.9 e- with equal bands, equivalent to" in line
 
 
 def test_motion_is_that_of_the_pixels_that_move(folder):

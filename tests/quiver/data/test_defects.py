@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from stats import assert_mean
 
 from qsim.clip.sensing import Sensing, sense
 from qsim.keys import Key
+from qsim.sensor.defects.fixed_pattern import FixedPattern, draw_maps
 from qsim.sensor.spad import BinarySPAD
 from quiver.baselines import METHODS
 from quiver.data.codes import array_codes, filled, light_of, sensed, stream_codes
@@ -97,6 +99,19 @@ def test_a_stream_states_its_dead_and_hot_pixels(make_clip: ClipMaker, tmp_path)
     assert now.read(0, 4)[:, now.defective].mean() == pytest.approx(now.read(0, 4)[:, ~now.defective].mean(), rel=0.25)
     healthy = sensor_file(tmp_path, QIS + "prnu = 0.05\n", bits=3, name="healthy.toml")
     assert sensed(clip, Illumination(healthy, 3.25, 3))[0].defective is None
+
+
+def test_a_crop_has_the_defective_pixels_of_its_place(make_clip: ClipMaker, tmp_path):
+    """Sensed now, stored, and stored by an earlier version, which drew every crop as one at (0, 0)."""
+    clip = make_clip(frames=2, height=20, width=21, origin=[6, 9])
+    path = sensor_file(tmp_path, SPAD + "dead = 0.1\n", bits=3)
+    stream = sense(clip, Sensing(path, 3, ppp=3.25))[0]
+    whole = draw_maps(FixedPattern(dead=0.1), (26, 30)).dead
+    now, _ = sensed(clip, Illumination(path, 3.25, 3))
+    earlier = replace(stream, meta={key: value for key, value in stream.meta.items() if key != "origin"})
+    np.testing.assert_array_equal(now.defective, whole[6:, 9:])
+    np.testing.assert_array_equal(stream_codes(stream).defective, whole[6:, 9:])
+    np.testing.assert_array_equal(stream_codes(earlier).defective, whole[:20, :21])
 
 
 @pytest.mark.parametrize("model", [QIS, COUNTER], ids=["QIS", "COUNTER"])

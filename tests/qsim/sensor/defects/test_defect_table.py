@@ -10,7 +10,7 @@ from clips import write_clip
 
 from qsim.cli import program
 from qsim.clip.photons import clip_photons
-from qsim.clip.sensing import Sensing, prepare, replay, sense
+from qsim.clip.sensing import Sensing, assemble, prepare, replay, sense
 from qsim.keys import Key, hash_name
 from qsim.sensor import devices
 from qsim.sensor.defects import defect_table, event_simulation, fixed_pattern
@@ -169,6 +169,21 @@ def test_effects_below_the_tolerance_take_the_closed_form(tmp_path):
 def test_mistakes_are_named(clip, tmp_path, sensor, table, message):
     with pytest.raises((ValueError, OSError), match=re.escape(message)):
         drawn(clip, device(tmp_path, sensor, table))
+
+
+@pytest.mark.parametrize(
+    ("sensor", "table", "message"),
+    [
+        (QUANTA.replace("1.6", "0.0"), "dark.hot_share = 0.022", "dark spreads the sensor's dark rate, which is 0"),
+        (QUANTA.replace("0.2", "0.0"), "read_noise = 0.1", "read_noise spreads the sensor's read noise, which is 0"),
+    ],
+)
+def test_defects_that_would_change_nothing_are_refused(clip, tmp_path, sensor, table, message):
+    """They were printed and stored as applied; a stream that was stored so is still drawn again."""
+    path = device(tmp_path, sensor, table)
+    with pytest.raises(ValueError, match=message):
+        drawn(clip, path)
+    assert assemble(clip, Sensing(path, ppp=2.0), defect_table.from_toml(path)).defects is not None
 
 
 def test_the_command_takes_defects_for_any_sensor(clip, tmp_path, capsys):

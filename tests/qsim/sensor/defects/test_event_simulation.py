@@ -10,6 +10,7 @@ from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.event_simulation import (
+    TOLERANCE,
     Effects,
     Memory,
     State,
@@ -205,6 +206,34 @@ def test_the_stated_effects_are_those_found(arrivals, share):
     found = 1 - counts(sensor, light).mean() / expected
     error = 5 * np.sqrt(2 * arrivals / frames) / expected
     assert stated.varying_flux == pytest.approx(found, abs=0.3 * found + error)
+
+
+@pytest.mark.parametrize(("arrivals", "share"), [(0.5, 0.05), (8.0, 0.25), (30.0, 0.1), (1.5e3, 0.01)])
+def test_the_stated_loss_of_a_paralyzable_pixel_is_exact(arrivals, share):
+    """Beside the mean count of the closed form; with carried dead times n exp(-x) remain. It was far too small."""
+    sensor = counter(share, bits=8, paralyzable=True)
+    stated = effects(sensor, np.full((1, 1), arrivals), EXPOSURE, EXPOSURE, Memory(carry=True)).carried_dead_time
+    carried = arrivals * np.exp(-arrivals * share)
+    assert stated == pytest.approx(float(sensor.mean(np.array(arrivals), EXPOSURE)) / carried - 1, rel=1e-6)
+
+
+def test_bright_paralyzable_pixels_are_followed():
+    """300 000 photons: all dead times of 1e-4 exposures overlap, and only a new start of each frame counts one."""
+    sensor = CountingSPAD(1.0, 0.0, 1e-4 * EXPOSURE, 8, True)
+    bright = np.full((1, 1), 1.5e5)
+    assert effects(sensor, bright, EXPOSURE, EXPOSURE, Memory(carry=True)).largest > TOLERANCE
+    assert effects(sensor, 1e3 * bright, EXPOSURE, EXPOSURE, Memory(carry=True)).largest < np.inf
+    assert effects(sensor, 0 * bright, EXPOSURE, EXPOSURE, Memory(carry=True)).largest == 0
+
+
+def test_light_that_varies_changes_a_bright_paralyzable_pixel_by_no_more_than_is_stated():
+    """Half an exposure each at n (1 + c) and n (1 - c): r exp(-r tau) gives cosh(c x) - c sinh(c x)."""
+    n, x, c = 1e5, 8.0, 0.05
+    sensor = counter(x / n, bits=8, paralyzable=True)
+    light = np.array([[n / 2 * (1 + c), n / 2 * (1 - c)]])
+    stated = effects(sensor, light, EXPOSURE, EXPOSURE, NO_MEMORY).varying_flux
+    found = np.cosh(c * x) - c * np.sinh(c * x) - 1
+    assert found <= stated < 2 * found
 
 
 def test_no_effect_without_dead_time_gap_or_memory():

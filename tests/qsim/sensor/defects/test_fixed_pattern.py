@@ -8,6 +8,7 @@ from stats import FALSE_ALARM, assert_histogram, assert_mean, assert_share, asse
 
 from qsim.keys import Key
 from qsim.sensor.counting import CountingSPAD
+from qsim.sensor.defects.defect_table import Defects
 from qsim.sensor.defects.fixed_pattern import (
     PERFECT,
     DarkSpread,
@@ -107,6 +108,20 @@ def test_a_map_is_a_function_of_device_and_place():
         for second, values in vars(whole).items():  # no two kinds of map have common random numbers
             if name != second and value.dtype == values.dtype:
                 assert abs(np.corrcoef(value.ravel(), values.ravel())[0, 1]) < 6 / np.sqrt(value.size)
+
+
+def test_a_device_has_one_pattern_for_frames_and_crops(tmp_path):
+    """Drawn and measured maps of a crop are the crop of the maps; a measured map has to cover the place."""
+    rng = np.random.default_rng(0)
+    np.save(tmp_path / "dead.npy", rng.random((12, 15)) < 0.2)
+    np.save(tmp_path / "gain.npy", rng.uniform(0.5, 1.5, (12, 15)))
+    measured = {f"{name}_map": str(tmp_path / f"{name}.npy") for name in ("dead", "gain")}
+    found = Defects(FixedPattern(device_seed=9, dark=DarkSpread()), measured)
+    whole, crop = PixelArray.of(found, SENSORS[0], 12, 15), PixelArray.of(found, SENSORS[0], 5, 6, (4, 7))
+    for name in ("gain", "dark", "dead"):
+        np.testing.assert_array_equal(vars(crop.maps)[name], vars(whole.maps)[name][4:9, 7:13])
+    with pytest.raises(ValueError, match="has 12 x 15 pixels, the frames 5 x 6 at row 8, column 0; a map must cover"):
+        PixelArray.of(found, SENSORS[0], 5, 6, (8, 0))
 
 
 def test_the_pattern_is_fixed_while_the_noise_is_not():
