@@ -11,19 +11,23 @@ nothing more. Saturated codes of long exposures tell `moment` and `likelihood` t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import lru_cache
+from math import log
 
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.sensor.estimation import pieces
 from qsim.sensor.sensor import Sensor
 from quiver.baselines.naive_mean import dark_codes
 from quiver.baselines.sliding_window import check_codes, check_window, in_units, window_frames
 
-GRID = 1024  # levels of light; a parabola through the best three errs by less than 1e-3 of the light
+GRID = 1024  # levels of light from DARKEST on; a parabola through the best three errs by less than 1e-3 of the light
 DARKEST = 1e-5  # of the brightest light: the first level above darkness
+FEW = 1e-3  # Poisson events of a full exposure: the first level has no more, however bright the last one is
 CHUNK = 1 << 22  # likelihoods, and entries of histograms, held at a time
+TABLE_BYTES = 1 << 28  # most of a table of likelihoods: 3 exposures of 12 bits
 
 Estimate = Callable[[Array, Array, Sensor, float], Array]  # codes [window, N], their shares, ... -> photons [N]
 
@@ -82,7 +86,7 @@ def likelihood(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> 
     """Return the most likely photons [N] of codes [window, N]; saturated codes count as what they are."""
     distinct, kinds = np.unique(shares, return_inverse=True)
     light = levels(tuple(distinct), sensor, exposure)
-    table = np.concatenate([_log_pmf(tuple(distinct), share, sensor, exposure) for share in distinct], axis=1)
+    table = _log_pmf(tuple(distinct), sensor, exposure)
     found = np.empty(codes.shape[1])
     step = max(1, CHUNK // table.shape[1])
     for start in range(0, len(found), step):
@@ -96,7 +100,7 @@ def likelihood(codes: Array, shares: Array, sensor: Sensor, exposure: float) -> 
 def _most_likely(codes: Array, kinds: Array, table: Array, light: Array) -> Array:
     """Return the most likely `light` [N] of codes [window, N] of these kinds of exposure; equal outcomes count once.
 
-    `table` [GRID, kinds x levels] holds the logarithms of probabilities.
+    `table` [len(light), kinds x levels] holds the logarithms of probabilities.
     """
     pixels = np.arange(codes.shape[1])
     bins = np.zeros((len(pixels), kinds.max() + 1, table.shape[1] // (kinds.max() + 1)), np.int32)
@@ -115,29 +119,54 @@ METHODS: dict[str, Estimate] = {"naive": naive, "moment": moment, "likelihood": 
 
 @lru_cache(maxsize=8)
 def levels(shares: tuple[float, ...], sensor: Sensor, exposure: float) -> Array:
-    """Return the levels of light [GRID] of full exposures on which estimates are looked for, evenly spaced in log.
+    """Return the levels of light [G] of full exposures on which estimates are looked for, evenly spaced in log.
 
     They end where the response of the shortest exposure ends, or that of the longest where responses fall again.
     """
     ends = [sensor.response(exposure * share).photons[-1] / share for share in shares]
     end = min(ends) if np.isfinite(sensor.brightest(exposure)) else max(ends)
-    return np.geomspace(DARKEST * end, end, GRID)
+    low = min(DARKEST * end, FEW / sensor.efficiency)
+    return np.geomspace(low, end, 1 + round(log(low / end) / log(DARKEST) * (GRID - 1)))
 
 
 @lru_cache(maxsize=32)
 def _mean(shares: tuple[float, ...], share: float, sensor: Sensor, exposure: float) -> Array:
-    """Return the mean code of one of these exposures in the dark and at `levels`, [1 + GRID]."""
-    return sensor.mean(np.append(0.0, levels(shares, sensor, exposure)) * share, exposure * share)
+    """Return the mean code of one of these exposures in the dark and at `levels`, [1 + G]."""
+    light = np.append(0.0, levels(shares, sensor, exposure)) * share
+    return np.concatenate([sensor.mean(part, exposure * share) for part in pieces(light, sensor.levels)])
 
 
-@lru_cache(maxsize=32)
-def _log_pmf(shares: tuple[float, ...], share: float, sensor: Sensor, exposure: float) -> Array:
-    """Return the logarithm of the probability of each code of one of these exposures, [GRID, levels]."""
-    return np.maximum(sensor.log_pmf(levels(shares, sensor, exposure) * share, exposure * share), -1e6)
+def table_bytes(shares: Iterable[float], sensor: Sensor, exposure: float) -> int:
+    """Return the size [bytes] of the table that `likelihood` takes for these shares; TABLE_BYTES is the most."""
+    distinct = tuple(np.unique(list(shares)))
+    return 8 * len(levels(distinct, sensor, exposure)) * len(distinct) * sensor.levels
+
+
+@lru_cache(maxsize=4)
+def _log_pmf(shares: tuple[float, ...], sensor: Sensor, exposure: float) -> Array:
+    """Return the logarithm of the probability of each code of these exposures, [G, shares x levels].
+
+    `ValueError` if it takes more than TABLE_BYTES.
+    """
+    light, codes = levels(shares, sensor, exposure), sensor.levels
+    size = table_bytes(shares, sensor, exposure)
+    if size > TABLE_BYTES:
+        raise ValueError(
+            f"likelihood: {len(shares)} different exposures of {sensor.bits} bit need a table of {size / 1e6:.0f} MB, "
+            f"and at most {TABLE_BYTES / 1e6:.0f} MB are taken; use the method moment"
+        )
+    table = np.empty((len(light), len(shares) * codes))
+    for n, share in enumerate(shares):
+        row = 0
+        for part in pieces(light, codes):
+            own = table[row : row + len(part), n * codes : (n + 1) * codes]
+            np.maximum(sensor.log_pmf(part * share, exposure * share), -1e6, out=own)
+            row += len(part)
+    return table
 
 
 def _peak(table: Array, light: Array) -> Array:
-    """Return the light of the largest value of each row of a table [N, GRID], by a parabola in log light."""
+    """Return the light of the largest value of each row of a table [N, G], by a parabola in log light."""
     best = table.argmax(axis=1)
     inner = np.clip(best, 1, len(light) - 2)
     rows = np.arange(len(table))

@@ -8,6 +8,7 @@ Nothing here needs torch.
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -21,10 +22,10 @@ from qsim.clip.lazy_array import LazyArray
 from qsim.clip.photons import clip_photons
 from qsim.clip.sensing import describe
 from qsim.clip.stream import Stream
-from qsim.files import read_json, sha256, to_json
+from qsim.files import read_json, sha256, to_json, wording
 from qsim.keys import Key, hash_name
 from qsim.sensor.colour_filter import ColourFilter
-from qsim.sensor.demosaicing import demosaic
+from qsim.sensor.demosaicing import demosaic, determines_bands
 from qsim.sensor.sensor import Sensor
 from quiver.data import defects
 from quiver.data.code_table import draw_codes
@@ -37,9 +38,11 @@ __all__ = [
     "Stream",
     "array_codes",
     "array_digest",
+    "codes_of",
     "filled",
     "frame_reader",
     "open_stream",
+    "repaired",
     "sensed",
     "stored",
     "stream_codes",
@@ -82,6 +85,11 @@ class Codes:
     def video_shape(self) -> tuple[int, ...]:
         """Return the shape of the restored video: [T, H, W], or [T, 3, H, W] behind colour filters."""
         return self.shape if self.colour is None else (self.shape[0], 3, *self.shape[1:])
+
+    @property
+    def bands_determined(self) -> bool:
+        """Return whether the colours of the stream's filters determine R, G and B; one filter does not."""
+        return self.colour is None or determines_bands(self.colour, self.sensor.efficiency)
 
     def demosaiced(self, light: Array) -> Array:
         """Return the photons of R, G and B [3, H, W] of the light [H, W] behind the stream's colour filters."""
@@ -219,7 +227,7 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
     codes = Codes(
         name=f"{clip.name}, {light.label}",
         shape=clip.shape,
-        sensor=defects.behind(bad, draw.defects, draw.sensor),
+        sensor=defects.behind(bad, draw.defects, draw.sensor, draw.origin),
         exposure=clip.exposure,
         frame_rate=clip.frame_rate,
         read=read,
@@ -234,11 +242,13 @@ def sensed(clip: Clip, light: Illumination, seed: int = 0) -> tuple[Codes, float
 
 def stream_codes(stream: Stream) -> Codes:
     """Return the codes of a stored stream; its dead and hot pixels, where it states them, are filled."""
-    meta, bad = stream.meta, defects.of_stream(stream)
+    meta, bad, sensor = stream.meta, defects.of_stream(stream), stream.sensor
+    if bad is not None:
+        sensor = defects.behind(bad, defects.read_defects(meta["defects"]), sensor, stream.origin)
     codes = Codes(
         stream.name,
         stream.shape,
-        stream.sensor if bad is None else defects.behind(bad, defects.read_defects(meta["defects"]), stream.sensor),
+        sensor,
         stream.exposure,
         float(meta["frame_rate"]),
         stream.codes,
@@ -250,6 +260,28 @@ def stream_codes(stream: Stream) -> Codes:
         colour=stream.colour_filter,
     )
     return filled(codes, bad)
+
+
+def codes_of(stream: Stream) -> Codes:
+    """Return the codes of a stored stream, dead and hot pixels filled; a warning where a map is missing.
+
+    An imported stream states no light: pixels are hot beside the light that its codes tell.
+    """
+    codes, table = stream_codes(stream), stream.meta.get("defects")
+    if table is None or stream.meta.get("ppp") is not None:
+        return codes
+    try:
+        return repaired(codes, defects.read_defects(table))
+    except (OSError, ValueError) as error:
+        warnings.warn(f"{stream.path}: its hot and dead pixels are not filled: {wording(error)}", stacklevel=2)
+        return codes
+
+
+def repaired(codes: Codes, found: defects.Defects | None) -> Codes:
+    """Return the codes of a sensor with these defects: dead and hot pixels filled, the dark rate that of the others."""
+    codes = replace(codes, sensor=defects.as_measured(found, codes.sensor, codes.shape[1:]))
+    bad = defects.defective(found, codes.sensor, codes.exposure, light_of(codes), codes.shape[1:])
+    return filled(replace(codes, sensor=defects.behind(bad, found, codes.sensor)), bad)
 
 
 def open_stream(path: Path) -> Stream:

@@ -17,7 +17,7 @@ from qsim.keys import Key
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from qsim.sensor.spike import SpikeCamera
-from quiver.data.codes import Codes, open_stream, stream_codes
+from quiver.data.codes import Codes, codes_of, open_stream, stream_codes
 from quiver.data.window_noise import WindowPlace
 from quiver.data.windows import WindowSettings, as_input, turned
 
@@ -81,7 +81,7 @@ def stream_at(path: Path) -> Codes:
         return stream_codes(clip.stream(clip.streams[0]))
     if not path.with_suffix(".json").is_file():
         raise FileNotFoundError(f"{path}: no stored stream, which is a .npy with its .json; see `qsim sense`")
-    return stream_codes(open_stream(path))
+    return codes_of(open_stream(path))
 
 
 class StreamWindows(Dataset[dict[str, Any]]):

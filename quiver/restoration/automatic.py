@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from quiver.baselines import exposures
 from quiver.data.codes import Codes
 from quiver.restoration.domain import place_of
 from quiver.restoration.domain_remarks import light_of
@@ -51,6 +52,11 @@ def chosen_for_all(
 def _best(codes: Codes, known: dict[str, Restorer], options: RestoreOptions | None) -> tuple[str, str]:
     """Return the name of the best method for a stream, and why. The network is loaded once, into `known`."""
     if codes.shares is not None:
+        if exposures.table_bytes(codes.shares, codes.sensor, codes.exposure) > exposures.TABLE_BYTES:
+            return (
+                "moment",
+                f"the codes have different exposures, and {codes.sensor.bits} bit are too many for likelihood",
+            )
         return "likelihood", "the codes have different exposures"
     try:
         network = known.get(NETWORK) or known.setdefault(NETWORK, restorer(NETWORK, options))

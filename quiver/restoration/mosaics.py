@@ -17,12 +17,22 @@ from qsim.files import Progress
 from quiver.data.codes import Codes
 
 
+def check_bands(codes: Codes) -> None:
+    """Raise `ValueError` if the colours of a mask do not determine three bands."""
+    if codes.colour is not None and not codes.bands_determined:
+        raise ValueError(
+            f"{codes.name}: the mask {' '.join(codes.colour.mask)} does not determine three bands; restore the bare "
+            "array of its codes as one band"
+        )
+
+
 def places(codes: Codes) -> Iterator[tuple[tuple[int, int], Codes]]:
     """Yield row and column of each place of the tile, and the codes [T, h, w] of its pixels as a stream of one band.
 
-    `ValueError` for frames smaller than the tile.
+    `ValueError` for frames smaller than the tile, and as of `check_bands`.
     """
     assert codes.colour is not None
+    check_bands(codes)
     length, height, width = codes.shape
     rows, columns = codes.colour.tile
     if height < rows or width < columns:

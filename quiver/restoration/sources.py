@@ -6,20 +6,19 @@ An option is None until it is given. An option that would be ignored for this in
 from __future__ import annotations
 
 import argparse
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from qsim.files import wording
 from quiver.data.clips import Clip, open_clips
-from quiver.data.codes import Codes, Stream, filled, light_of, open_stream, sensed, stream_codes
-from quiver.data.defects import Defects, as_measured, behind, defective, read_defects, read_map
+from quiver.data.codes import Codes, codes_of, filled, light_of, open_stream, repaired, sensed, stream_codes
+from quiver.data.defects import read_map
 from quiver.data.illumination import Illumination, follows_light, read_sensor
 from quiver.data.noise import colour_filter
 from quiver.data.photon_cubes import cube_codes
 from quiver.restoration.interface import AUTO
+from quiver.restoration.mosaics import check_bands
 
 if TYPE_CHECKING:
     from quiver.restoration.interface import Restorer
@@ -60,6 +59,7 @@ def codes_to_restore(args: argparse.Namespace) -> Codes:
     Pixels that the map `--defects` or the sensor's file marks are filled (quiver/data/defects.py).
     """
     codes = _found(args)
+    check_bands(codes)
     return codes if args.defects is None else filled(codes, read_map(args.defects))
 
 
@@ -110,29 +110,7 @@ def _of_array(path: Path, args: argparse.Namespace) -> Codes:
     codes = cube_codes(path, light, args.frame_rate or FRAME_RATE, planes=args.planes, width=args.width)
     if not sensor.endswith(".toml"):
         return codes
-    return _repaired(replace(codes, colour=colour_filter.from_toml(sensor)), read_sensor(sensor)[1])
-
-
-def codes_of(stream: Stream) -> Codes:
-    """Return the codes of a stored stream, with its dead and hot pixels filled; a warning where a map is missing.
-
-    An imported stream states no light: pixels are hot beside the light that its codes tell.
-    """
-    codes, table = stream_codes(stream), stream.meta.get("defects")
-    if table is None or stream.meta.get("ppp") is not None:
-        return codes
-    try:
-        return _repaired(codes, read_defects(table))
-    except (OSError, ValueError) as error:
-        warnings.warn(f"{stream.path}: its hot and dead pixels are not filled: {wording(error)}", stacklevel=2)
-        return codes
-
-
-def _repaired(codes: Codes, found: Defects | None) -> Codes:
-    """Return the codes of a sensor with these defects: dead and hot pixels filled, the dark rate that of the others."""
-    codes = replace(codes, sensor=as_measured(found, codes.sensor, codes.shape[1:]))
-    bad = defective(found, codes.sensor, codes.exposure, light_of(codes), codes.shape[1:])
-    return filled(replace(codes, sensor=behind(bad, found, codes.sensor)), bad)
+    return repaired(replace(codes, colour=colour_filter.from_toml(sensor)), read_sensor(sensor)[1])
 
 
 def _sensor(args: argparse.Namespace) -> str:

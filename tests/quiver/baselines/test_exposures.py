@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,9 @@ from qsim.sensor.counting import CountingSPAD
 from qsim.sensor.qis import QIS
 from qsim.sensor.spad import BinarySPAD
 from quiver.baselines import exposures, likelihood, moment
+from quiver.data.codes import array_codes
+from quiver.restoration.automatic import chosen
+from quiver.restoration.interface import AUTO
 
 EXPOSURE = 5e-4
 SENSORS = {
@@ -134,3 +138,21 @@ def test_the_memory_of_the_likelihood_does_not_grow_with_pixels_times_codes(monk
         assert tracemalloc.get_traced_memory()[1] < 6e6  # 3 MB are the logarithms of all probabilities
     finally:
         tracemalloc.stop()
+
+
+def test_the_likelihood_sees_dim_light_of_many_bits():
+    """The brightest light of 8 bits is so bright that levels from 1e-5 of it on began at 1.3 photons."""
+    sensor, shares = BinarySPAD(1.0, 0.0, bits=8), np.resize(SCHEDULE, 12)
+    codes = drawn(sensor, np.full(4000, 0.6), shares, 9)[:, 0]
+    assert exposures.likelihood(codes, shares, sensor, EXPOSURE).mean() == pytest.approx(0.6, rel=0.05)
+
+
+def test_a_table_of_likelihoods_that_is_too_large_is_refused(monkeypatch):
+    monkeypatch.setattr(exposures, "TABLE_BYTES", 1 << 20)
+    codes = np.zeros((3, 2, 2), np.uint8)
+    with pytest.raises(ValueError, match=r"3 different exposures of 6 bit need a table of .*; use the method moment"):
+        exposures.restore(codes, QIS(0.8, 0.0, 0.2, 6), EXPOSURE, SCHEDULE, window=3)
+    stream = replace(array_codes(codes, QIS(0.8, 0.0, 0.2, 6), EXPOSURE), shares=tuple(SCHEDULE))
+    method, why = chosen(AUTO, stream)
+    assert (method.name, why) == ("moment", "the codes have different exposures, and 6 bit are too many for likelihood")
+    assert method.restore(stream).shape == codes.shape

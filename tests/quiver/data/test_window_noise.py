@@ -79,6 +79,16 @@ def test_a_window_is_the_crop_of_the_sensed_frames(make_clip: ClipMaker, tmp_pat
         np.testing.assert_array_equal(part, whole[place.start : place.start + frames][(slice(None), *crop)])
 
 
+@pytest.mark.parametrize("table", ["prnu = 0.2\ndead = 0.1\n", "dead = 0.1\ncrosstalk = 0.1\n"])
+def test_a_window_of_a_clip_that_is_a_crop_is_that_of_its_place(make_clip: ClipMaker, tmp_path, table):
+    clip = make_clip(frames=5, height=20, width=26, origin=[5, 6])
+    file = sensor_file(tmp_path, (QIS if "prnu" in table else SPAD) + table)
+    noise = Noise.of(Illumination(file, 2.0, 1))
+    draw = noise.draw(clip)
+    part = window_codes(noise, draw, clip, WindowPlace(0, 1, 3, 7, (0, 0), 0, 0, False, draw.key), 3, 8)
+    np.testing.assert_array_equal(part, draw.frames(clip, 1, 4)[:, 3:11, 7:15])
+
+
 def test_sums_of_planes_have_the_distribution_of_their_pixels(make_clip: ClipMaker, tmp_path):
     """Flat light on hot and dull pixels: the mean code of each kind over many windows is that of its cdf."""
     gain = np.tile([1.0, 0.25, 0.0], (20, 9))[:, :26]
@@ -126,6 +136,17 @@ def test_filled_windows_are_prepared_with_the_dark_rate_of_good_pixels(make_clip
     data[0]
     assert seen[0].sensor == sensed(clip, light)[0].sensor
     assert seen[0].sensor.dark_rate < 0.01 * data.noise.noises[0].draw(clip).sensor.dark_rate
+
+
+def test_resting_copies_have_the_dark_rate_of_good_pixels(make_clip: ClipMaker, tmp_path):
+    """As filled codes: the mean over all pixels, 4 % of them hot, would add two electrons to every code."""
+    dark = np.ones((20, 26))
+    dark[::5, ::5] = 1e5
+    np.save(tmp_path / "dark.npy", dark)
+    file = sensor_file(tmp_path, QIS + 'dark_map = "dark.npy"\n', 3)
+    clip = make_clip(radiance=np.full((14, 20, 26), 0.5), relative=True)
+    sample = Windows([clip], WindowSettings(crop=16, lights=(Illumination(file, 3.0, 3),), still=True))[0]
+    assert abs(7 * float(sample["still"].mean() - sample["codes"].mean())) < 0.25
 
 
 def test_a_drifting_window_keeps_its_pixels(make_clip: ClipMaker, tmp_path):

@@ -16,7 +16,7 @@ from qsim.sensor.qis import QIS
 from quiver.baselines import METHODS
 from quiver.cli import main
 from quiver.data.codes import array_codes, filled, stream_codes
-from quiver.restoration.mosaics import places
+from quiver.restoration.mosaics import fill_mosaic, places
 from quiver.restoration.restorers import restorer
 
 SENSOR = QIS(0.8, 5.0, 0.2, 3)
@@ -141,3 +141,18 @@ def test_raw_codes_of_a_sensor_with_filters_are_restored_in_colour(stream, tmp_p
     (tmp_path / "dead.npy").unlink()
     with pytest.warns(UserWarning, match=r"imported\.npy: its hot and dead pixels are not filled"):
         quiver.restore(tmp_path / "imported.npy", "moment")
+
+
+def test_one_filter_is_refused_before_any_work(tmp_path, capsys):
+    """It does not determine three bands, which was noticed after the last frame."""
+    stream = colour_clip(tmp_path / "c", frames=3).sense(SENSOR, ppp=6.0, colour="red", name="red")
+
+    def fill(*given):
+        pytest.fail("a band was restored")
+
+    with pytest.raises(ValueError, match="the mask R does not determine three bands"):
+        fill_mosaic(fill, stream_codes(stream), np.zeros((3, 3, 7, 9), np.float32), 0, None)
+    out = tmp_path / "out" / "video.npy"
+    assert main(["restore", str(stream.path), "-o", str(out), "--method", "naive"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not out.parent.exists()
