@@ -20,7 +20,8 @@ from qsim.clip.sensing import sense
 from quiver.data.clips import Clip, open_clips
 from quiver.data.codes import sensed
 from quiver.data.illumination import Illumination
-from quiver.evaluation.comparison import Comparison, ComparisonRow, json_safe, restore_clip
+from quiver.evaluation.comparison import Comparison, ComparisonRow, restore_clip
+from quiver.evaluation.json_values import json_safe
 from quiver.evaluation.summary import summarise
 from quiver.model.weights import metadata_of
 from quiver.restoration.restorers import restorer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ from qsim import checks
 from qsim.cli.console import bar, note, output
 from qsim.cli.options import check_free, checked, count, frame_size, positive, words
 from qsim.files import write_bytes, write_json
+from qsim.locks import Lock
 from quiver.cli.options import (
     add_light,
     add_running,
@@ -29,8 +30,8 @@ from quiver.device import DEVICES
 if TYPE_CHECKING:
     from quiver.evaluation.comparison import Comparison
 
-# Files of an evaluation, and its clips of a test set
-OURS = r"plan\.json|rows\.jsonl|evaluation\.(json|md|png)|crops_[^/]*\.png|crops/[^/]*\.npy|lock|clips/.*"
+# Files of an evaluation, beside its clips of a test set
+OURS = r"plan\.json|rows\.jsonl|evaluation\.(json|md|png)|crops_[^/]*\.png|crops/[^/]*\.npy|lock"
 
 # evaluate
 
@@ -71,7 +72,7 @@ def add_evaluate(sub: Any) -> None:
     )
     parser.add_argument("--frames", type=count, help="static: frames to restore from (default 11)")
     parser.add_argument("--splits", type=count, help="static: random splits (default 3)")
-    add_running(parser)
+    add_running(parser, resumed=False)
     add_strict(parser)
     parser.add_argument("--force", action="store_true", help="replace an existing evaluation")
 
@@ -90,19 +91,60 @@ def _run_evaluate(args: argparse.Namespace) -> int:
     if args.source is None or args.output is None:
         raise ValueError("give a data set or clip folder and -o, or --static COUNTS")
     from quiver.evaluation import summary
-    from quiver.evaluation.comparison import evaluate, streams
+    from quiver.evaluation.comparison import evaluate
 
-    comparison = _comparison(args)
-    remarks = check_domain(args, methods, streams(comparison))
-    if args.force and args.output.exists() and args.protocol is None:
-        renew(args.output, "plan.json", OURS)
-    with bar("rows", "row") as progress:
-        rows = evaluate(comparison, methods, args.output, lambda what, done, total: progress(done, total))
-    summary.write(args.output, comparison, methods, rows, remarks)
+    with _prepared(args, methods) as (comparison, remarks):
+        with bar("rows", "row") as progress:
+            rows = evaluate(comparison, methods, args.output, lambda what, done, total: progress(done, total))
+        summary.write(args.output, comparison, methods, rows, remarks)
     output(
         args, summary.as_dict(comparison, methods, rows, remarks), summary.markdown(comparison, methods, rows, remarks)
     )
     return 1 if any(row.failure for row in rows) else 0
+
+
+@contextlib.contextmanager
+def _prepared(args: argparse.Namespace, methods: Sequence[Any]) -> Iterator[tuple[Comparison, list[str]]]:
+    """Check what `quiver evaluate` scores, then hold the folder of its results; yield the settings and remarks."""
+    from quiver.evaluation.comparison import check, streams
+
+    comparison = _comparison(args)
+    if comparison.test_set is None:
+        check(comparison)
+        remarks = check_domain(args, methods, streams(comparison))
+        with _folder(args, comparison):
+            yield comparison, remarks
+        return
+    from quiver.data.test_sets import TEST_SETS, counted, describe, import_test_set
+
+    which, source = TEST_SETS[args.protocol], Path(args.source)
+    described = describe(source, which)
+    with _folder(args, comparison):
+        with bar("clips", "clip") as progress:
+            clips = import_test_set(source, which, Path(comparison.source), progress, described)
+        line = counted(clips, which)
+        note(line)
+        yield comparison, [f"{line}; read from {source}", *check_domain(args, methods, streams(comparison))]
+
+
+@contextlib.contextmanager
+def _folder(args: argparse.Namespace, comparison: Comparison) -> Iterator[None]:
+    """Hold the folder of an evaluation, which is made or with --force emptied; `ValueError` if another process does."""
+    from quiver.evaluation.comparison import CLIPS, LOCK, check_folder
+
+    check_folder(args.output, comparison, force=args.force)
+    args.output.mkdir(parents=True, exist_ok=True)
+    lock = Lock(args.output / LOCK)
+    if not lock.acquire():
+        raise ValueError(f"{args.output}: another process evaluates here; wait for it to end, or choose another -o")
+    try:
+        if args.force:
+            from quiver.data import test_sets
+
+            renew(args.output, "plan.json", f"{OURS}|{CLIPS}/{test_sets.OURS}")
+        yield
+    finally:
+        lock.delete()
 
 
 def _comparison(args: argparse.Namespace) -> Comparison:
@@ -112,6 +154,7 @@ def _comparison(args: argparse.Namespace) -> Comparison:
     from quiver.restoration.sources import LIGHT, refuse
 
     refuse(args, ("frames", "splits"), "belongs to --static COUNTS")
+    _check_source(args)
     if args.protocol is not None:
         return _published_test(args)
     if (Path(args.source) / "clip.json").exists() and args.split not in (None, "all"):
@@ -135,22 +178,27 @@ def _comparison(args: argparse.Namespace) -> Comparison:
     return Comparison(args.source, split, lights, args.seed or 0, args.published, args.stream, args.peak)
 
 
+def _check_source(args: argparse.Namespace) -> None:
+    """Raise `ValueError` if --force would remove the source with the imported clips, or a test set would hold them."""
+    from quiver.evaluation.comparison import CLIPS
+
+    source, clips = Path(args.source).resolve(), (args.output / CLIPS).resolve()
+    if clips in (source, *source.parents) or (args.protocol is not None and source in clips.parents):
+        raise ValueError(
+            f"{args.source}: overlaps with {args.output / CLIPS}, which is for imported clips; choose another -o"
+        )
+
+
 def _published_test(args: argparse.Namespace) -> Comparison:
-    """Import the clips of a test set of the paper into OUT/clips, and return what is scored there."""
+    """Return what is scored on a test set of the paper, whose clips are imported into OUT/clips."""
     from quiver.data.illumination import Illumination
-    from quiver.data.test_sets import TEST_SETS, counted, import_test_set
     from quiver.evaluation.comparison import CLIPS, Comparison
 
     refuse_published(args)
     check_free(args.output)
-    which, folder = TEST_SETS[args.protocol], args.output / CLIPS
-    if args.force and args.output.exists():
-        renew(args.output, "plan.json", OURS)
-    with bar("clips", "clip") as progress:
-        clips = import_test_set(Path(args.source), which, folder, progress)
-    note(counted(clips, which))
+    folder = str(args.output / CLIPS)
     lights = tuple(Illumination("quiver-published", ppp, 3) for ppp in args.ppp or (3.25,))
-    return Comparison(str(folder), None, lights, args.seed or 0, published=True, test_set=which.name)
+    return Comparison(folder, None, lights, args.seed or 0, published=True, test_set=args.protocol)
 
 
 def refuse_published(args: argparse.Namespace) -> None:
@@ -222,7 +270,7 @@ def add_bench(sub: Any) -> None:
     parser.add_argument("--size", type=frame_size, default="64x64", help="ROWSxCOLUMNS in px (default 64x64)")
     parser.add_argument("--ppp", type=positive, default=3.25, help="light of the fixed clip (default 3.25)")
     parser.add_argument("--device", choices=DEVICES, help="device of networks (default auto)")
-    add_threads(parser)
+    add_threads(parser, resumed=False)
     parser.add_argument("-o", "--output", type=Path, help="folder for bench.md, bench.json, bench.png")
     parser.add_argument("--force", action="store_true", help="replace an existing result")
 

@@ -77,21 +77,26 @@ def add_noise(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bits", type=whole_numbers, help="bits per code; several: 1,3 (default: the streams')")
 
 
-def add_running(parser: argparse.ArgumentParser) -> None:
-    """Add the options of how methods run."""
-    parser.add_argument("--memory", type=memory_size, default="2GB", help="working memory, as in 500MB (default 2GB)")
+def add_running(parser: argparse.ArgumentParser, *, resumed: bool = True) -> None:
+    """Add the options of how methods run; `resumed` as in `add_threads`."""
+    parser.add_argument(
+        "--memory",
+        type=memory_size,
+        help="working memory, as in 500MB (default 2GB; of a network on a GPU half of the GPU's)",
+    )
     parser.add_argument("--mode", choices=MODES, help="networks: how frames share work (default exact)")
     parser.add_argument("--device", choices=DEVICES, help="networks: where they run (default auto)")
     parser.add_argument("--precision", choices=("float32", "bfloat16"), help="networks: precision (default float32)")
-    add_threads(parser)
+    add_threads(parser, resumed=resumed)
 
 
-def add_threads(parser: argparse.ArgumentParser) -> None:
-    """Add --threads."""
+def add_threads(parser: argparse.ArgumentParser, *, resumed: bool = True) -> None:
+    """Add --threads; `resumed` if the command keeps the number when it resumes its work."""
+    kept = "; resumed work keeps its number" if resumed else ""
     parser.add_argument(
         "--threads",
         type=count,
-        help="torch threads on the CPU (default: measured at start; resumed work keeps its number)",
+        help=f"torch threads on the CPU (default: measured at start{kept})",
     )
 
 
@@ -142,13 +147,16 @@ def running_options(args: argparse.Namespace) -> Any:
 
 
 def renew(folder: Path, mark: str, ours: str) -> None:
-    """Remove a folder that holds the file `mark`, and only files whose names match the pattern `ours`."""
+    """Empty a folder whose lock the caller holds; the lock stays, and the file `mark`, by which it is known, goes last.
 
-    if (folder / mark).is_file():
-        check_ours(folder, ours)
-        shutil.rmtree(folder)
-    elif folder.exists():
-        raise FileExistsError(f"{folder} holds no {mark}; --force removes only what this command made")
+    `FileExistsError` if it holds files whose names do not match the pattern `ours`.
+    """
+    check_ours(folder, ours)
+    for path in sorted(folder.iterdir(), key=lambda path: path.name == mark):
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name != "lock":
+            path.unlink()
 
 
 def command(

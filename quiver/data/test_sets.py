@@ -10,7 +10,7 @@ of size is bicubic (a = -0.75, no antialiasing), rounded to whole numbers.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,16 +18,17 @@ from typing import Any
 import numpy as np
 from numpy import ndarray as Array
 
+from qsim.clip import manifest
 from qsim.clip.clip import Clip
-from qsim.clip.manifest import RELATIVE
 from qsim.clip.writer import ClipWriter
-from qsim.files import Progress
+from qsim.files import Progress, sha256, to_json
 from qsim.formats.detection import recordings
 from qsim.formats.images import read_pictures
 from qsim.formats.video import read_frames
 
 WINDOW = 11  # frames of a published window; one is restored
 WEIGHTS = (0.299, 0.587, 0.114)  # of red, green and blue in OpenCV's grey
+OURS = rf"[^/]+/(?:{manifest.OURS}|begun\.json|journal\.jsonl|lock)"  # files of imported clips, finished or not
 
 
 @dataclass(frozen=True)
@@ -54,11 +55,11 @@ TEST_SETS = {
 }
 
 
-def import_test_set(folder: Path, which: TestSet, out: Path, progress: Progress | None = None) -> list[Clip]:
-    """Write the clips of a test set that OUT does not hold yet, and return all of them in the order of their names.
+def describe(folder: Path, which: TestSet) -> dict[Path, dict[str, Any]]:
+    """Read a test set, and return what the clip of each recording states of itself.
 
-    `FileNotFoundError` without the folder. `ValueError` if it holds no recordings, both kinds of them or one of fewer
-    than eleven frames, or if OUT holds clips of other files.
+    `FileNotFoundError` without the folder. `ValueError` if it holds no recordings, both kinds of them, two that would
+    have one name, or one of fewer than eleven frames.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; name the folder of the test set")
@@ -68,17 +69,33 @@ def import_test_set(folder: Path, which: TestSet, out: Path, progress: Progress 
     if files[0].is_file() and (pictures := recordings(folder, "png")):
         raise ValueError(f"{folder}: holds videos and folders of pictures ({pictures[0]}); name the folder of one kind")
     _check_names(folder, files)
-    described = [_described(file, which) for file in files]  # all are checked before the first is written
-    targets = [out / _name(folder, file) for file in files]
-    for target, meta in zip(targets, described, strict=True):
-        _check_target(target, meta)
+    return {file: _described(file, which) for file in files}
+
+
+def import_test_set(
+    folder: Path,
+    which: TestSet,
+    out: Path,
+    progress: Progress | None = None,
+    described: Mapping[Path, dict[str, Any]] | None = None,
+) -> list[Clip]:
+    """Write the clips of a test set that OUT does not hold yet, and return all of them in the order of their names.
+
+    `described` is the result of `describe`, where that was called before. Errors as there, and `ValueError` if OUT
+    holds clips of other files. All are checked before the first is written.
+    """
+    described = describe(folder, which) if described is None else described
+    targets = {file: out / _name(folder, file) for file in described}
+    _check_others(folder, out, {target.name for target in targets.values()})
+    for file, meta in described.items():
+        _check_target(targets[file], meta)
     clips = []
-    for done, (file, target, meta) in enumerate(zip(files, targets, described, strict=True)):
+    for done, (file, meta) in enumerate(described.items()):
         if progress is not None:
-            progress(done, len(files))
-        clips.append(_imported(file, target, meta))
+            progress(done, len(described))
+        clips.append(_imported(file, targets[file], meta))
     if progress is not None:
-        progress(len(files), len(files))
+        progress(len(described), len(described))
     return clips
 
 
@@ -119,11 +136,31 @@ def _described(file: Path, which: TestSet) -> dict[str, Any]:
         "shape": [count, *size],
         "frame_rate": which.frame_rate,
         "exposure": 1 / which.frame_rate,
-        "radiance_unit": RELATIVE,
+        "radiance_unit": manifest.RELATIVE,
         "camera": None,
-        "source": {"file": str(file.resolve()), "test_set": which.name, "size": list(first.shape[:2])},
+        "source": {
+            "file": str(file.resolve()),
+            "sha256": _digest(file),
+            "test_set": which.name,
+            "size": list(first.shape[:2]),
+        },
         "split": "test",
     }
+
+
+def _digest(file: Path) -> str:
+    """Return the SHA-256 of a video, or of the names and digests of the pictures in a folder."""
+    if file.is_file():
+        return sha256(file)
+    pictures = [item for item in file.iterdir() if item.suffix.lower() == ".png" and not item.name.startswith(".")]
+    return sha256(to_json({picture.name: sha256(picture) for picture in pictures}))
+
+
+def _check_others(folder: Path, out: Path, names: set[str]) -> None:
+    """Raise `ValueError` if OUT holds anything but clips of these names, finished or not: it would be scored along."""
+    for item in sorted(out.iterdir()) if out.is_dir() else []:
+        if not item.name.startswith(".") and not {item.name, item.name.removesuffix(".part")} & names:
+            raise ValueError(f"{item}: is no clip of {folder}; choose another -o")
 
 
 def _check_target(target: Path, meta: dict[str, Any]) -> None:
@@ -131,12 +168,18 @@ def _check_target(target: Path, meta: dict[str, Any]) -> None:
     if not target.exists():
         return
     clip = Clip.open(target)
-    if clip.meta.get("source") != meta["source"] or list(clip.shape) != meta["shape"]:
-        of = (clip.meta.get("source") or {}).get("file")
-        raise ValueError(
-            f"{target}: is a clip of {of} with {len(clip)} frames, not of {meta['source']['file']} with "
-            f"{meta['shape'][0]}; choose another -o"
-        )
+    wanted, found = dict(meta["source"]), clip.meta.get("source") or {}
+    if "sha256" not in found:  # an earlier version did not record it
+        del wanted["sha256"]
+    same = list(clip.shape) == meta["shape"]
+    if found == wanted and same:
+        return
+    if found | {"sha256": wanted.get("sha256")} == wanted and same:
+        raise ValueError(f"{target}: {wanted['file']} was changed since it became this clip; choose another -o")
+    raise ValueError(
+        f"{target}: is a clip of {found.get('file')} with {len(clip)} frames, not of {wanted['file']} with "
+        f"{meta['shape'][0]}; choose another -o"
+    )
 
 
 def _imported(file: Path, target: Path, meta: dict[str, Any]) -> Clip:

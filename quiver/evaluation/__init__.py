@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 from qsim.files import lazy_names
 
 if TYPE_CHECKING:
-    from quiver.evaluation.comparison import Comparison, ComparisonRow, evaluate
+    from quiver.evaluation.comparison import Comparison, evaluate
+    from quiver.evaluation.comparison_rows import ComparisonRow
     from quiver.evaluation.metrics import Score, score
 
 __all__ = ["Comparison", "ComparisonRow", "Score", "evaluate", "score"]
@@ -14,7 +15,7 @@ __getattr__ = lazy_names(
     __name__,
     {
         "Comparison": "comparison",
-        "ComparisonRow": "comparison",
+        "ComparisonRow": "comparison_rows",
         "Score": "metrics",
         "evaluate": "comparison",
         "score": "metrics",

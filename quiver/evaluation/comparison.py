@@ -12,7 +12,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -29,13 +28,14 @@ from quiver.data.illumination import Illumination, read_sensor
 from quiver.data.noise import file_digests, labels
 from quiver.device import PeakMemory
 from quiver.evaluation import breakdown, metrics
-from quiver.evaluation.json_values import json_safe, number
-from quiver.restoration.interface import RestoreOptions, Restorer
+from quiver.evaluation.comparison_rows import ComparisonRow, append, stored_rows
+from quiver.restoration.interface import Restorer
 from quiver.restoration.networks import settings_of
 
 FORMAT = "quiver-evaluation-2"  # 1: peak = the sensor's white, factor of the least unclamped error
 PLAN_FORMAT = "quiver-plan-2"
 CLIPS = "clips"  # folder in an evaluation that holds the imported clips of a test set
+LOCK = "lock"  # file in an evaluation that `quiver evaluate` holds while it works there
 PUBLISHED_EDGE = 5  # frames at each end that the published evaluation leaves out
 
 ComparisonProgress = Callable[[str, int, int], None]  # (text for people, rows done, rows in all)
@@ -65,53 +65,6 @@ class Comparison:
         """Return plain values, for JSON."""
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return plain if self.test_set else {name: v for name, v in plain.items() if name != "test_set"}
-
-
-@dataclass(frozen=True)
-class ComparisonRow:
-    """One clip restored by one method at one light level: a score, or the reason why there is none."""
-
-    method: str
-    description: str  # of the method, with a digest of its weights
-    light: str
-    clip: str
-    scene: str
-    score: metrics.Score | None = None
-    seconds_per_frame: float = math.nan
-    peak_bytes: int | None = None  # of memory while restoring: on a GPU all that was allocated, else what was added
-    peak: float = math.nan  # photons per pixel that the scores refer to
-    truth_psnr: float | None = None  # dB; lower bound of the score of a perfect restorer
-    motion_pixels: tuple[int, ...] = ()  # per bin of breakdown.EDGES; empty where the clip has no flow
-    motion_squares: tuple[float, ...] = ()  # squared error summed over them, matched, in units of the peak
-    failure: str | None = None
-    precision: str = RestoreOptions.precision
-    cut: str | None = None  # tiles of a frame where they change the answer, else empty; None: not recorded earlier
-
-    @property
-    def key(self) -> tuple[str, str, str, str, str, str | None]:
-        """Return what must agree for an old result to count."""
-        return self.method, self.description, self.light, self.clip, self.precision, self.cut
-
-    @property
-    def crop(self) -> str:
-        """Return the name of the crops of this method with these settings."""
-        settings = json.dumps([self.description, self.precision, self.cut])
-        return f"{self.method} {hashlib.sha256(settings.encode()).hexdigest()[:8]}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON: null for NaN, and the texts inf and -inf."""
-        return json_safe(asdict(self), infinite=True)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> ComparisonRow:
-        """Return the inverse of `to_dict`."""
-        score = values.pop("score")
-        if score is not None:
-            score = metrics.Score(**{name: number(v) for name, v in score.items()})
-        values |= {name: number(values[name]) for name in ("seconds_per_frame", "peak")}
-        values |= {name: tuple(map(number, values[name])) for name in ("motion_pixels", "motion_squares")}
-        truth = values.get("truth_psnr")
-        return cls(score=score, **values | {"truth_psnr": None if truth is None else number(truth)})
 
 
 def scored_frames(length: int, published: bool) -> range:
@@ -215,7 +168,8 @@ def restore_clip(
         speed = np.where(valid, speed, math.nan)
     pixels, squares = ((), ()) if speed is None else breakdown.by_motion(matched, target, speed)
     if out is not None:
-        breakdown.keep_crops(out, row.light, clip, codes, frames, {row.crop: matched, "truth": target})
+        shown = replace(codes, read=_middles(windows, frames)) if windows else codes
+        breakdown.keep_crops(out, row.light, clip, shown, frames, {row.crop: matched, "truth": target})
     return replace(
         row,
         score=score,
@@ -228,6 +182,36 @@ def restore_clip(
     )
 
 
+def _middles(windows: Sequence[Codes], frames: range) -> Callable[[int, int], Array]:
+    """Return the reader of the middle codes of windows, each of which restores one of the frames."""
+
+    def read(start: int, stop: int) -> Array:
+        chosen = windows[start - frames.start : stop - frames.start]
+        return np.concatenate([window.read(PUBLISHED_EDGE, PUBLISHED_EDGE + 1) for window in chosen])
+
+    return read
+
+
+def check(comparison: Comparison) -> list[Clip]:
+    """Return the scored clips; `ValueError` if there are none, or if they or the lights do not fit the settings."""
+    if comparison.stream is not None and (comparison.published or len(comparison.lights) > 1):
+        raise ValueError("a stored stream has one light level and one exposure; leave out --ppp and --published")
+    clips = clips_of(comparison)
+    if not clips:
+        raise ValueError(f"{comparison.source}: no finished clip in split {comparison.split!r}")
+    for clip in clips:
+        if comparison.published:
+            clip.require_one_band("the published protocol")
+        if not scored_frames(len(clip), comparison.published):
+            raise ValueError(f"clip {clip.name}: {len(clip)} frames are too few; published windows have 11")
+    for light in comparison.lights:
+        if comparison.published and light.sensor.endswith(".toml") and read_sensor(light.sensor, light.bits)[1]:
+            raise ValueError(
+                f"--published: draws windows without defects, and {light.sensor} has a table [defects]; leave it out"
+            )
+    return clips
+
+
 def evaluate(
     comparison: Comparison,
     methods: Sequence[Restorer],
@@ -238,19 +222,7 @@ def evaluate(
 
     `ValueError` if there is nothing to score, `FileExistsError` if OUT holds another evaluation.
     """
-    if comparison.stream is not None and (comparison.published or len(comparison.lights) > 1):
-        raise ValueError("a stored stream has one light level and one exposure; leave out --ppp and --published")
-    clips = clips_of(comparison)
-    if not clips:
-        raise ValueError(f"{comparison.source}: no finished clip in split {comparison.split!r}")
-    for clip in clips:
-        if not scored_frames(len(clip), comparison.published):
-            raise ValueError(f"clip {clip.name}: {len(clip)} frames are too few; published windows have 11")
-    for light in comparison.lights:
-        if comparison.published and light.sensor.endswith(".toml") and read_sensor(light.sensor, light.bits)[1]:
-            raise ValueError(
-                f"--published: draws windows without defects, and {light.sensor} has a table [defects]; leave it out"
-            )
+    clips = check(comparison)
     known = {row.key: row for row in begin(comparison, out, clips)} if out is not None else {}
     rows: list[ComparisonRow] = []
     total = len(comparison.lights) * len(clips) * len(methods)
@@ -302,14 +274,28 @@ def content_of(comparison: Comparison, clips: Sequence[Clip]) -> dict[str, Any]:
     return found | ({"sensors_sha256": files} if files else {})
 
 
+def check_folder(out: Path, comparison: Comparison, *, force: bool = False) -> None:
+    """Raise `FileExistsError` if OUT is neither an evaluation nor empty but for its lock and imported clips.
+
+    With `force` the error says that --force does not remove such a folder.
+    """
+    if (out / "plan.json").is_file() or not out.exists():
+        return
+    allowed = {LOCK, CLIPS} if comparison.test_set else {LOCK}
+    if out.is_dir() and all(path.name in allowed for path in out.iterdir()):
+        return
+    if force:
+        raise FileExistsError(f"{out} holds no plan.json; --force removes only what this command made")
+    raise FileExistsError(f"{out} exists and is not an evaluation; choose another -o")
+
+
 def begin(comparison: Comparison, out: Path, clips: Sequence[Clip]) -> list[ComparisonRow]:
     """Create the folder of an evaluation, or return the finished rows of an interrupted one of the same content."""
     path = out / "plan.json"
     content = content_of(comparison, clips)
     wanted = {"format": PLAN_FORMAT} | comparison.to_dict() | content
     if not path.exists():
-        if out.exists() and (not out.is_dir() or any(path.name != CLIPS for path in out.iterdir())):
-            raise FileExistsError(f"{out} exists and is not an evaluation; choose another -o")
+        check_folder(out, comparison)
         out.mkdir(parents=True, exist_ok=True)
         write_json(path, wanted)
     elif (found := read_json(path)) != wanted:
@@ -318,30 +304,4 @@ def begin(comparison: Comparison, out: Path, clips: Sequence[Clip]) -> list[Comp
             what = "rows of clips, streams or sensors that were changed since" if changed else "another evaluation"
             raise FileExistsError(f"{out} holds {what}; choose another -o, or start again with --force")
         write_json(path, wanted)  # an earlier version did not record the sensor files
-    rows = out / "rows.jsonl"
-    if not rows.exists():
-        return []
-    text = rows.read_text()
-    if not text.endswith("\n"):  # a killed writer's last line is incomplete: end it
-        with open(rows, "a", encoding="utf-8") as file:
-            file.write("\n")
-    return list(finished(text.splitlines()))
-
-
-def finished(lines: Sequence[str]) -> Iterator[ComparisonRow]:
-    """Yield the rows of a file whose last line may be incomplete. Failures are left out: they are tried again."""
-    for line in lines:
-        try:
-            row = ComparisonRow.from_dict(json.loads(line))
-        except (ValueError, KeyError, TypeError):
-            continue
-        if row.failure is None:
-            yield row
-
-
-def append(path: Path, row: ComparisonRow) -> None:
-    """Append a row to a file and sync it."""
-    with open(path, "a", encoding="utf-8") as file:
-        file.write(json.dumps(row.to_dict(), sort_keys=True, allow_nan=False) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
+    return stored_rows(out / "rows.jsonl")

@@ -120,11 +120,11 @@ def markdown(
 ) -> str:
     """Return the complete evaluation as Markdown: means, caveats, failures and scores per scene.
 
-    `remarks` are lines about networks outside of what they were measured for.
+    `remarks` are lines about what was scored, and about networks outside of what they were measured for.
     """
-    by_name = {method.name: method for method in methods}
+    by_name, count = {method.name: method for method in methods}, len({row.clip for row in rows})
     text = [
-        f"# Evaluation of {comparison.source}, split {comparison.split or 'all'}",
+        f"# Evaluation of {comparison.source}, split {comparison.split or 'all'}, {count} clip{'s' * (count != 1)}",
         "",
         f"{_seen_by(comparison)}, noise seed {comparison.seed}; "
         + (
@@ -256,7 +256,7 @@ def as_dict(
                 }
                 for m in methods
             ],
-            "table": [asdict(line) for line in summarise(rows)],
+            "table": [json_safe(asdict(line), infinite=True) for line in summarise(rows)],
             "rows": [asdict(row) for row in rows],
         }
     )

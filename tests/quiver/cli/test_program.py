@@ -14,6 +14,7 @@ from golden import published_state
 from safetensors.torch import save_file
 
 from qsim.cli.options import memory_size
+from qsim.locks import Lock
 from quiver.cli.program import main
 from quiver.data.clips import open_clips
 
@@ -236,6 +237,47 @@ def test_force_starts_a_run_and_a_table_again(capsys, tmp_path, tiny_dataset):
     other = ["evaluate", tiny_dataset, "-o", tmp_path / "t", "--methods", "moment", "--seed", 1]
     assert "holds another evaluation" in mistake(capsys, *other)
     assert run(capsys, *other, "--force")[0] == 0
+
+
+def test_force_removes_no_evaluation_before_the_new_one_is_checked(capsys, tmp_path, make_clip):
+    folder, out = make_clip(frames=9, split="test").path.parent, tmp_path / "t"
+    words = ["evaluate", folder, "-o", out, "--methods", "naive"]
+    assert run(capsys, *words)[0] == 0
+    before = (out / "rows.jsonl").read_bytes()
+    for more, message in (("--split=val", "no finished clip in split 'val'"), ("--published", "frames are too few")):
+        assert message in mistake(capsys, *words, more, "--force")
+        assert (out / "rows.jsonl").read_bytes() == before
+
+
+def test_one_evaluation_at_a_time(capsys, tmp_path, clip):
+    out = tmp_path / "t"
+    words = ["evaluate", clip, "-o", out, "--methods", "naive"]
+    assert run(capsys, *words)[0] == 0
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with Lock(out / "lock") as lock:
+        assert lock.acquire()
+        for more in ([], ["--force"], ["--seed", 1, "--force"]):
+            assert f"{out}: another process evaluates here; wait" in mistake(capsys, *words, *more)
+    assert {path: path.read_bytes() for path in before} == before
+    assert run(capsys, *words, "--force")[0] == 0  # a killed process leaves the file
+    assert not (out / "lock").exists()
+
+
+def test_a_clip_is_not_evaluated_into_the_folder_of_its_clips(capsys, clip, make_clip):
+    """With --force the second evaluation removed them as clips of a test set."""
+    own = make_clip()
+    words = ["evaluate", own.path, "-o", own.path.parents[1], "--methods", "naive", "--split", "all"]
+    for more in ([], ["--force"]):
+        assert "overlaps with" in mistake(capsys, *words, *more)
+    assert own.verify() == []
+    assert "is not an evaluation" in mistake(capsys, "evaluate", clip, *words[2:])
+
+
+def test_the_help_says_whose_threads_are_kept(capsys):
+    for command in (name for name in COMMANDS if name != "domain"):
+        text = " ".join(run(capsys, command, "--help")[1].split())
+        kept = "resumed work keeps its number" in text
+        assert kept == (command in ("train", "restore", "ablate")), command
 
 
 def test_a_checkpoint_that_is_none_is_refused(capsys, tmp_path):

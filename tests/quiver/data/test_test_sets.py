@@ -11,8 +11,10 @@ import pytest
 from numpy import ndarray as Array
 from PIL import Image
 
+from qsim import files
 from qsim.formats.video import write_video
 from quiver.cli.program import main
+from quiver.data import test_sets
 from quiver.data.test_sets import TEST_SETS, counted, grey, import_test_set, resized
 
 I2, X4K = TEST_SETS["quiver-published"], TEST_SETS["x4k1000fps"]
@@ -44,6 +46,11 @@ def x4k(folder: Path, clips: int, frames: int = 33, size: tuple[int, int] = (36,
             colour = np.stack([frame, frame // 2, 255 - frame], axis=-1)
             Image.fromarray(colour).save(place / f"{t:04d}.png")
     return folder
+
+
+def evaluation(folder: Path, out: Path) -> list[str]:
+    """The command that scores a small test set by the quickest method."""
+    return ["evaluate", str(folder), "-o", str(out), "--protocol", "quiver-published", "--methods", "naive", "-q"]
 
 
 def test_grey_has_the_weights_of_the_published_reader():
@@ -213,6 +220,60 @@ def test_a_recording_that_grew_is_not_taken_for_its_clip(tmp_path):
         import_test_set(folder, I2, tmp_path / "out")
 
 
+@pytest.mark.parametrize("ending", ["", ".part"])
+def test_clips_of_another_folder_are_not_scored_along(tmp_path, ending):
+    """An interrupted import of the wrong folder leaves them."""
+    out = tmp_path / "out"
+    import_test_set(i2(tmp_path / "one", (11,)), I2, out)
+    (out / "test_00000").rename(out / f"test_00000{ending}")
+    other = tmp_path / "other"
+    other.mkdir()
+    write_video(other / "x.mp4", iter(moving(11, 32, 48, 5)), 30, lossless=True)
+    with pytest.raises(ValueError, match=rf"test_00000{ending}: is no clip of .*other; choose another -o"):
+        import_test_set(other, I2, out)
+    assert not (out / "x").exists()
+
+
+def test_a_recording_that_was_replaced_is_not_taken_for_its_clip(tmp_path):
+    """Neither a video nor one picture of a folder; a clip of an earlier version, without a digest, is taken."""
+    small = replace(X4K, size=lambda height, width: (16, 32))
+    videos, pictures, out = i2(tmp_path / "videos", (11,)), x4k(tmp_path / "pictures", 1, frames=11), tmp_path / "out"
+    import_test_set(videos, I2, out / "i2")
+    import_test_set(pictures, small, out / "x4k")
+    write_video(videos / "test_00000.mp4", iter(moving(11, 32, 48, 7)), 30, lossless=True)
+    Image.fromarray(np.zeros((36, 68, 3), np.uint8)).save(pictures / "Type1/TEST01_000_f0433/0004.png")
+    with pytest.raises(ValueError, match=r"test_00000\.mp4 was changed since it became this clip; choose another -o"):
+        import_test_set(videos, I2, out / "i2")
+    with pytest.raises(ValueError, match=r"TEST01_000_f0433 was changed since it became this clip"):
+        import_test_set(pictures, small, out / "x4k")
+    about = out / "i2/test_00000/clip.json"
+    earlier = files.read_json(about)
+    del earlier["source"]["sha256"]
+    files.write_description(about, earlier)
+    assert len(import_test_set(videos, I2, out / "i2")) == 1
+
+
+def test_an_interrupted_import_is_not_finished_with_another_recording(tmp_path, monkeypatch):
+    folder, out, done = i2(tmp_path / "test", (11,)), tmp_path / "out", []
+
+    def interrupted(frame: Array, size: tuple[int, int]) -> Array:
+        done.append(frame)
+        if len(done) == 5:
+            raise KeyboardInterrupt
+        return frame
+
+    with monkeypatch.context() as patch:
+        patch.setattr(test_sets, "resized", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            import_test_set(folder, I2, out)
+    before = (folder / "test_00000.mp4").read_bytes()
+    write_video(folder / "test_00000.mp4", iter(moving(11, 32, 48, 7)), 30, lossless=True)
+    with pytest.raises(ValueError, match="4 frames exist, begun with other settings"):
+        import_test_set(folder, I2, out)
+    (folder / "test_00000.mp4").write_bytes(before)
+    assert len(import_test_set(folder, I2, out)[0]) == 11
+
+
 @pytest.mark.parametrize("name", ["none", "file"])
 def test_a_folder_that_is_none_is_told(tmp_path, name, capsys):
     (tmp_path / "file").write_text("x")
@@ -241,6 +302,48 @@ def test_the_command_scores_windows_as_published(tmp_path, capsys):
         assert "--protocol quiver-published" in capsys.readouterr().err
     assert main([*words, "--force"]) == 0
     assert len((out / "rows.jsonl").read_text().splitlines()) == 2
+
+
+def test_the_table_says_what_was_scored(tmp_path):
+    folder, out = i2(tmp_path / "test", (13, 11), (16, 16)), tmp_path / "table"
+    assert main(evaluation(folder, out)) == 0
+    scored = f"2 clips, 4 windows; the published set has 31 clips and 6017 windows; read from {folder}"
+    text = (out / "evaluation.md").read_text()
+    assert scored in text
+    assert text.splitlines()[0].endswith("split all, 2 clips")
+    assert json.loads((out / "evaluation.json").read_text())["remarks"] == [f"quiver-published: {scored}"]
+
+
+def test_force_keeps_what_was_not_imported(tmp_path, capsys):
+    """Nothing goes before the test set was read; a file among the clips stays, and so does a set in their place."""
+    folder, out = i2(tmp_path / "test", (11,), (16, 16)), tmp_path / "table"
+    words = evaluation(folder, out)
+    assert main(words) == 0
+    before = (out / "rows.jsonl").read_bytes()
+    assert main([*evaluation(tmp_path / "tset", out), "--force"]) == 2
+    assert "tset: no such folder" in capsys.readouterr().err
+    mine = out / "clips/test_00000/holiday.mp4"
+    mine.write_text("mine")
+    assert main([*words, "--force"]) == 2
+    assert "holiday.mp4: was not made by this program" in capsys.readouterr().err
+    assert mine.read_text() == "mine"
+    assert (out / "rows.jsonl").read_bytes() == before
+    mine.unlink()
+    assert main([*words, "--force"]) == 0
+
+    folder.rename(tmp_path / "clips")
+    for more in ([], ["--force"]):
+        assert main([*evaluation(tmp_path / "clips", tmp_path), *more]) == 2
+        assert "overlaps with" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "clips").iterdir()] == ["test_00000.mp4"]
+
+
+def test_force_begins_an_interrupted_import_again(tmp_path):
+    folder, out = i2(tmp_path / "test", (11,), (16, 16)), tmp_path / "table"
+    import_test_set(i2(tmp_path / "wrong", (12, 12), (16, 16)), I2, out / "clips")
+    assert main(evaluation(folder, out)) == 2
+    assert main([*evaluation(folder, out), "--force"]) == 0
+    assert [path.name for path in (out / "clips").iterdir()] == ["test_00000"]
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clips import ClipMaker
+from clips import ClipMaker, colour_clip
 from methods import broken, method
 from numpy import ndarray as Array
 from sensor_files import QIS, sensor_file
@@ -22,19 +22,18 @@ from qsim.clip.writer import ClipWriter
 from quiver.data.clips import open_clips, truth
 from quiver.data.codes import Codes, sensed, stream_codes
 from quiver.data.illumination import Illumination
+from quiver.evaluation import breakdown, metrics, summary
 from quiver.evaluation import comparison as comparison_module
-from quiver.evaluation import metrics, summary
 from quiver.evaluation.comparison import (
     Comparison,
     ComparisonRow,
-    append,
     begin,
     evaluate,
-    finished,
     score_video,
     scored_frames,
     truth_psnr,
 )
+from quiver.evaluation.comparison_rows import append, finished
 from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer
 
@@ -331,6 +330,23 @@ def test_published_protocol_forces_every_window(tiny_dataset):
         )
 
 
+def test_published_crops_show_the_codes_that_methods_saw(make_clip: ClipMaker, tmp_path):
+    """Of the middle window, not of the clip at one exposure."""
+    seen: list[Array] = []
+
+    def look(codes: Codes) -> Array:
+        seen.append(codes.read(5, 6)[0])
+        return codes.read(0, codes.shape[0]).astype(np.float32)
+
+    clip, out = make_clip(), tmp_path / "table"
+    row = evaluate(Comparison(str(clip.path), None, published=True), [method("look", look)], out)[0]
+    assert row.failure is None
+    frames = scored_frames(len(clip), True)
+    wanted = seen[len(frames) // 2][breakdown.place(clip, frames[len(frames) // 2])] / 7
+    stored = files.load_array(breakdown.crop_file(out, row.light, clip.name, "codes"))
+    np.testing.assert_array_equal(stored, wanted.astype(np.float16))
+
+
 def test_published_windows_of_a_sensor_with_defects_are_refused(tiny_dataset, tmp_path):
     """They are drawn without defects; nothing is written."""
     text = '[sensor]\nmodel = "QIS"\nquantum_efficiency = 0.8\ndark_current = 1.6\nread_noise = 0.2\nbits = 3\n'
@@ -395,6 +411,13 @@ def test_nothing_to_score_is_an_error(tmp_path, tiny_dataset):
         evaluate(Comparison(str(tmp_path / "none")), [restorer("moment")])
     with pytest.raises(ValueError, match="unknown split 'tset'"):
         evaluate(Comparison(str(tiny_dataset), "tset"), [restorer("moment")])
+
+
+def test_a_colour_clip_is_refused_as_published_before_anything_is_written(tmp_path):
+    clip = colour_clip(tmp_path / "colour", frames=12)
+    with pytest.raises(ValueError, match="holds three bands"):
+        evaluate(Comparison(str(clip.path), None, published=True), [restorer("naive")], tmp_path / "table")
+    assert not (tmp_path / "table").exists()
 
 
 def test_rows_survive_json(tmp_path):

@@ -18,8 +18,10 @@ from quiver.data.illumination import Illumination
 from quiver.evaluation import summary
 from quiver.evaluation.comparison import (
     Comparison,
+    ComparisonRow,
     evaluate,
 )
+from quiver.evaluation.metrics import Score
 from quiver.restoration.interface import Restorer
 from quiver.restoration.restorers import restorer
 
@@ -122,3 +124,10 @@ def test_frames_of_a_method_lie_in_the_published_window(window, future, seamless
     method = Restorer("x", window, future, True, "", lambda *given: None, seamless)
     assert summary.frames_of(method, published=False) == stated
     assert summary.frames_of(method, published=True) == published
+
+
+def test_an_infinite_score_is_stored_as_one():
+    score = Score(math.inf, math.inf, 1.0, 1.0, scale=1.0, scale_spread=0.0, frames=3)
+    rows = [ComparisonRow("exact", "", "3.25 PPP, 3 bit", "fan", "fan", score)]
+    (line,) = summary.as_dict(Comparison("data"), [], rows)["table"]
+    assert line["scores"]["psnr_matched"] == {"mean": "inf", "half_width": None, "scenes": 1}
