@@ -86,7 +86,7 @@ def _drop_after(best: float, last: float) -> str:
 
 
 def evaluation_section(path: Path) -> page.Section:
-    """Return the scores of methods on held-out clips: means and 95 % intervals over scenes, best matched PSNR bold."""
+    """Return the scores of methods: means and 95 % intervals over scenes, the best matched PSNR of each light bold."""
     found = files.read_json(path)
     rows = [
         [
@@ -101,9 +101,10 @@ def evaluation_section(path: Path) -> page.Section:
         ]
         for line in found["table"]
     ]
-    scores = [line["scores"]["psnr_matched"]["mean"] for line in found["table"]]
     lights = [line["light"] for line in found["table"]]
-    best = {max((i for i, own in enumerate(lights) if own == light), key=lambda i: scores[i] or -1) for light in lights}
+    means = [line["scores"]["psnr_matched"]["mean"] for line in found["table"]]
+    scores = {i: float(mean) for i, mean in enumerate(means) if mean is not None}  # "inf" too
+    best = {max((i for i in scores if lights[i] == lights[one]), key=scores.__getitem__) for one in scores}
     headers = [
         "method",
         "light",
@@ -130,13 +131,19 @@ def evaluation_section(path: Path) -> page.Section:
         for line in winners
     ]
     parts = [table, *remarks, _speed_against_error(found)]
-    return page.section(f"Methods compared: {path.parent.name}", *parts, story=_winner(winners), facts=facts)
+    story = _winner(winners, found.get("plan", {}))
+    return page.section(f"Methods compared: {path.parent.name}", *parts, story=story, facts=facts)
 
 
-def _winner(lines: list[dict[str, Any]]) -> str:
-    """Return a sentence with the best method of each light level."""
+def _winner(lines: list[dict[str, Any]], plan: dict[str, Any]) -> str:
+    """Return a sentence with the best method of each light level, given their lines; empty without any."""
+    if not lines:
+        return ""
     best = [f"{_pm(line['scores']['psnr_matched'], 1)} dB by {line['method']} at {line['light']}" for line in lines]
-    return f"On held-out clips the best matched PSNR is {', '.join(best)}."
+    split = "test" if plan.get("test_set") else plan.get("split")
+    kind = "training" if split == "train" else "held-out" if split in ("val", "test") else None
+    start = "The" if kind is None else f"On {kind} clips the"
+    return f"{start} best matched PSNR is {', '.join(best)}."
 
 
 def _definition(found: dict[str, Any]) -> str:
@@ -146,7 +153,10 @@ def _definition(found: dict[str, Any]) -> str:
             "scores of the earlier definition (peak = the sensor's white, matched = after the factor of least "
             "squares without the clamp); they cannot be compared with later ones"
         )
-    return f"peak = {found['peak']}; matched = after the one factor that is best behind the clamp at the peak"
+    unit = "window" if found.get("plan", {}).get("published") else "clip"
+    return (
+        f"peak = {found['peak']}; matched = after the one factor per {unit} that is best behind the clamp at the peak"
+    )
 
 
 def _near(line: dict[str, Any], name: str) -> str:
@@ -158,11 +168,11 @@ def _percent(share: object) -> str | None:
 
 
 def _pm(interval: dict[str, Any], digits: int) -> str:
-    """Return "23.45 ± 0.67", without the half-width if there is one scene."""
+    """Return "23.45 ± 0.67", without the half-width if there is one scene; "inf" for the text that stands for it."""
     mean, half = interval["mean"], interval["half_width"]
-    if not isinstance(mean, int | float):
+    if mean is None:
         return "n/a" if interval.get("scenes") else "failed"
-    return f"{mean:.{digits}f}" + (f" ± {half:.{digits}f}" if isinstance(half, int | float) else "")
+    return f"{float(mean):.{digits}f}" + (f" ± {half:.{digits}f}" if isinstance(half, int | float) else "")
 
 
 def static_section(path: Path) -> page.Section:

@@ -257,24 +257,51 @@ def _run_ablate(args: argparse.Namespace) -> int:
     from quiver.training.loop import Diverged
 
     check_free(Path(args.output))
+    _check_scored(args.data, args.split)
     args.precision, precision = None, args.precision  # for restoring; training has another default
     settings = _settings(args)
     args.precision = precision
     first = Path(args.output) / next(iter(ABLATIONS)) / "settings.json"
     settings = replace(settings, threads=use_threads(args, threads.recorded(first)))
-    settings, lines = one_noise(settings)
-    for line in lines:
-        note(line)
-    comparison = Comparison(args.data, args.split, tuple(noise.simple for noise in settings.noise or ()), settings.seed)
     try:
+        settings, lines = one_noise(settings)
+        for line in lines:
+            note(line)
+        lights = tuple(noise.simple for noise in settings.noise or ())
+        comparison = Comparison(args.data, args.split, lights, settings.seed)
         with _signals() as interrupted:
             options, show = running_options(args), not (args.json or args.quiet)
             found = run_ablation(settings, comparison, options, should_stop=lambda: bool(interrupted), progress=show)
     except Diverged as error:
-        return failed(f"quiver: {error}", DIVERGED, args.json)
+        text = _without_force(error, "choose another --protocol or --seed, and another -o")
+        return failed(f"quiver: {text}", DIVERGED, args.json)
+    except (FileExistsError, ValueError) as error:
+        if "--force" not in str(error):
+            raise
+        raise FileExistsError(_without_force(error, "choose another -o")) from error
     if found is None:
         return failed("quiver: interrupted; the same command resumes where it stopped", 130, args.json)
     methods, rows = found
     summary.write(Path(args.output) / "table", comparison, methods, rows)
     output(args, summary.as_dict(comparison, methods, rows), markdown(args.preset, rows))
     return 1 if any(row.failure for row in rows) else 0
+
+
+def _check_scored(data: str, split: str) -> None:
+    """Raise `ValueError` if there is nothing to score: no clip of the split, or only one that also trains."""
+    from quiver.data.clips import split_clips
+
+    if split_clips(data, split)[1]:
+        return
+    if (Path(data) / "clip.json").exists():
+        raise ValueError(f"{data}: is one clip, which trains; give a data set with clips in split {split}")
+    raise ValueError(f"--split {split}: {data} has no finished clip in that split; choose another one")
+
+
+def _without_force(error: Exception, advice: str) -> str:
+    """Return the text of an error; where its last clause advises --force, which `quiver ablate` lacks, with this advice
+    instead.
+    """
+    text = str(error)
+    kept, _, last = text.rpartition("; ")
+    return f"{kept}; {advice}" if kept and "--force" in last else text

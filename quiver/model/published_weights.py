@@ -87,7 +87,7 @@ def published_name(name: str) -> str:
 
 
 def from_published(state: Mapping[str, Tensor]) -> QUIVER:
-    """Return the network with the 335 entries of a published state dict, whose shapes determine the width.
+    """Return the float32 network with the 335 entries of a published state dict, whose shapes determine the width.
 
     Aliases may be missing, but must equal the block that they repeat. ValueError for anything else: entries that are
     missing, unknown or of another shape, values that are not finite, flow constants that are not the published ones.
@@ -111,9 +111,9 @@ def from_published(state: Mapping[str, Tensor]) -> QUIVER:
                 f"published checkpoint: {theirs} must be {tuple(expected[name].shape)} at width {first.shape[0]}, "
                 f"got {tuple(value.shape)}"
             )
-        if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
+        if not value.is_floating_point() or not bool(torch.isfinite(value.float()).all()):
             raise ValueError(f"published checkpoint: {theirs} holds values that are not finite numbers")
-        ours[name] = value.clone()
+        ours[name] = value.to(torch.float32, copy=True)
     for name in ("flow.mean", "flow.deviation"):
         _check_constant(name, ours[name])
     network.load_state_dict(ours, assign=True)

@@ -15,6 +15,7 @@ from qsim.tables import markdown_table
 from quiver.data.clips import unfinished
 from quiver.device import pick_device
 from quiver.evaluation.comparison import Comparison, ComparisonRow, evaluate
+from quiver.evaluation.summary import summarise
 from quiver.model.config import Config
 from quiver.model.presets import ABLATIONS, PRESETS, ablated, parameter_count
 from quiver.model.quiver import QUIVER
@@ -77,16 +78,21 @@ def _run_ablation(
 
 
 def markdown(preset: str, rows: Sequence[ComparisonRow]) -> str:
-    """Return the paper's table: parts, parameters, PSNR after the best factor, and SSIM."""
-    lines = []
-    for name, config in networks(preset).items():
-        scores = [row.score for row in rows if row.method == name and row.score is not None]
-        cells = ["yes" if part else "no" for part in ABLATIONS[name]]
-        cells.append(f"{parameter_count(config):,}")
-        if scores:
-            cells += [f"{sum(s.psnr_matched for s in scores) / len(scores):.2f} dB"]
-            cells += [f"{sum(s.ssim for s in scores) / len(scores):.3f}"]
+    """Return the paper's table, one line per network and light level: parts, parameters, and means over scenes of the
+    PSNR after the best factor and of SSIM.
+    """
+    configs, lines = networks(preset), summarise(rows)
+    several = len({line.light for line in lines}) > 1
+    header = (*HEADER[:4], "light", *HEADER[4:]) if several else HEADER
+    table = []
+    for line in lines:
+        psnr, ssim = line.scores["psnr_matched"], line.scores["ssim"]
+        cells = ["yes" if part else "no" for part in ABLATIONS[line.method]]
+        cells += [f"{parameter_count(configs[line.method]):,}"]
+        cells += [line.light] if several else []
+        if psnr.scenes:
+            cells += [f"{psnr.mean:.2f} dB", f"{ssim.mean:.3f}"]
         else:
-            cells += ["failed", ""]
-        lines.append(cells)
-    return "\n".join(markdown_table(lines, HEADER)) + "\n"
+            cells += ["failed" if line.failures else "n/a", ""]
+        table.append(cells)
+    return "\n".join(markdown_table(table, header)) + "\n"

@@ -1,11 +1,12 @@
 """Tests the tables of a page: evaluations, studies, costs and validations from their files."""
 
 import json
+from pathlib import Path
 
 import pytest
 
-from qsim.report import report
-from qsim.report.table_sections import study_section, training_section
+from qsim.report import html, report
+from qsim.report.table_sections import evaluation_section, study_section, training_section
 from qsim.studies.validation.backends import BackendReport, BackendRow
 from qsim.studies.validation.light import LightReport, LightRow
 from qsim.studies.validation.reading import ReadingReport
@@ -31,15 +32,28 @@ def test_an_evaluation_defines_its_scores(folder):
     assert "of the earlier definition" not in page
 
 
+def scored(method: str, light: str, psnr: float | str | None, scenes: int = 3) -> dict:
+    """A line of a stored table; `psnr` is None without a score, and the text inf for an infinite one."""
+    interval = {"mean": psnr, "half_width": 0.5 if isinstance(psnr, float) else None, "scenes": scenes}
+    scores = dict.fromkeys(("psnr", "psnr_matched", "ssim_matched"), interval)
+    return {"method": method, "light": light, "seconds_per_frame": 6.5e-5, "truth_psnr": 38.0, "scores": scores}
+
+
+def evaluated(folder: Path, *lines: dict, **plan: object) -> html.Section:
+    """The section of an evaluation with these lines and this plan."""
+    found = {"format": "quiver-evaluation-2", "peak": "white", "plan": plan, "table": lines}
+    (folder / "evaluation.json").write_text(json.dumps(found))
+    return evaluation_section(folder / "evaluation.json")
+
+
 def test_the_top_of_a_page_tells_the_best_method_and_the_kept_weights(tmp_path):
     """The best of each light level, and the best validation, not the last."""
-
-    def line(method: str, light: str, psnr: float) -> dict:
-        interval = {"mean": psnr, "half_width": 0.5, "scenes": 3}
-        scores = dict.fromkeys(("psnr", "psnr_matched", "ssim_matched"), interval)
-        return {"method": method, "light": light, "seconds_per_frame": 6.5e-5, "truth_psnr": 38.0, "scores": scores}
-
-    lines = [line("a", "3 PPP", 20.0), line("b", "3 PPP", 22.0), line("a", "9 PPP", 25.0), line("b", "9 PPP", 24.0)]
+    lines = [
+        scored("a", "3 PPP", 20.0),
+        scored("b", "3 PPP", 22.0),
+        scored("a", "9 PPP", 25.0),
+        scored("b", "9 PPP", 24.0),
+    ]
     evaluation = {"format": "quiver-evaluation-2", "peak": "white", "table": lines}
     (tmp_path / "evaluation.json").write_text(json.dumps(evaluation))
     entries = [
@@ -56,6 +70,42 @@ def test_the_top_of_a_page_tells_the_best_method_and_the_kept_weights(tmp_path):
     assert '<td class="number">65 µs</td>' in page
     assert page.count("class=best") == 2
     assert "RVRT" not in page
+
+
+def test_a_light_at_which_all_methods_failed_has_no_best_one(tmp_path):
+    dark = [scored("naive", "3 PPP", None, scenes=0), scored("moment", "3 PPP", None, scenes=0)]
+    section = evaluated(tmp_path, *dark)
+    assert (section.story, section.facts) == ("", ())
+    assert "class=best" not in section.body
+    section = evaluated(tmp_path, *dark, scored("naive", "9 PPP", None, scenes=0), scored("moment", "9 PPP", -2.0))
+    assert section.story == "The best matched PSNR is -2.0 ± 0.5 dB by moment at 9 PPP."
+
+
+@pytest.mark.parametrize(
+    ("plan", "words"),
+    [
+        ({"split": "test"}, "On held-out clips the best"),
+        ({"split": "val"}, "On held-out clips the best"),
+        ({"split": "train"}, "On training clips the best"),
+        ({"split": None}, "The best"),
+        ({"split": None, "published": True, "test_set": "x4k1000fps"}, "On held-out clips the best"),
+    ],
+)
+def test_only_clips_that_do_not_train_are_called_held_out(tmp_path, plan, words):
+    assert evaluated(tmp_path, scored("a", "3 PPP", 20.0), **plan).story.startswith(words)
+
+
+@pytest.mark.parametrize(("published", "unit"), [(False, "clip"), (True, "window")])
+def test_a_page_says_what_has_its_own_factor(tmp_path, published, unit):
+    body = evaluated(tmp_path, scored("a", "3 PPP", 20.0), split="test", published=published).body
+    assert f"matched = after the one factor per {unit} that is best" in body
+
+
+def test_an_infinite_score_is_the_best(tmp_path):
+    section = evaluated(tmp_path, scored("finite", "3 PPP", 40.0), scored("exact", "3 PPP", "inf"), split="test")
+    assert section.story == "On held-out clips the best matched PSNR is inf dB by exact at 3 PPP."
+    assert section.body.count("class=best") == 1
+    assert "n/a" not in section.body
 
 
 @pytest.mark.parametrize(("last", "told"), [(22.0, False), (21.996, False), (21.99, True)])

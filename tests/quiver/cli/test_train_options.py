@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from clips import ClipMaker
+from clips import ClipMaker, write_dataset
 from domains import weights
 from safetensors.torch import load_file
 from sensor_files import FILES, sensor_file
@@ -116,6 +116,53 @@ def test_a_sensor_file_is_ablated_with_its_bits(tiny_dataset, tmp_path, monkeypa
     words = ("--protocol", "spad-sum", "--sensor", one_bit_file(tmp_path), "--steps", "1", "-q")
     assert main(["ablate", str(tiny_dataset), "-o", str(tmp_path / "six"), *words]) == 130  # as after Ctrl-C
     assert [noise.bits for noise in asked[0]] == [1]
+
+
+def test_an_ablation_has_clips_to_score_before_it_trains(capsys, make_clip: ClipMaker, tmp_path, monkeypatch):
+    """A clip folder is in every split, so only `--split train` names what is scored there."""
+    clip, data, out = make_clip().path, write_dataset(tmp_path / "data", {"train": 1, "val": 1}), tmp_path / "x"
+    monkeypatch.setattr(ablation, "run_ablation", lambda *_, **__: None)
+    capsys.readouterr()
+    for source, message in (
+        (clip, f"{clip}: is one clip, which trains; give a data set with clips in split test"),
+        (data, f"--split test: {data} has no finished clip in that split"),
+    ):
+        assert message in told(capsys, "ablate", source, "-o", out, "--steps", 1, "-q")
+    assert not out.exists()
+    assert main(["ablate", str(clip), "-o", str(out), "--steps", "1", "--split", "train", "-q"]) == 130
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (
+            FileExistsError("x holds another evaluation; choose another -o, or start again with --force"),
+            "x holds another evaluation; choose another -o",
+        ),
+        (
+            ValueError("x: not a state of this run (y); start again with --force"),
+            "x: not a state of this run (y); choose another -o",
+        ),
+        (
+            loop.Diverged("loss nan; lower the learning rate and start again with --force"),
+            "loss nan; choose another --protocol or --seed, and another -o",
+        ),
+    ],
+)
+def test_no_error_of_an_ablation_advises_force(capsys, tiny_dataset, tmp_path, monkeypatch, error, message):
+    def fails(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(ablation, "run_ablation", fails)
+    assert main(["ablate", str(tiny_dataset), "-o", str(tmp_path / "x"), "--steps", "1", "-q"]) in (2, 3)
+    assert capsys.readouterr().err == f"quiver: {message}\n"
+
+
+def test_a_damaged_ablation_is_refused_without_force(capsys, tiny_dataset, tmp_path):
+    (tmp_path / "x/none").mkdir(parents=True)
+    (tmp_path / "x/none/settings.json").write_text(json.dumps({"noise": []}))
+    said = told(capsys, "ablate", tiny_dataset, "-o", tmp_path / "x", "--steps", 1, "-q")
+    assert said.endswith("settings.json: noise is []; choose another -o\n")
 
 
 STOPS = {

@@ -65,6 +65,10 @@ def without(state: dict, name: str) -> dict:
         (lambda s: s | {"epoch": 3}, "epoch is a int, not a tensor"),
         (lambda s: s | {"pa_deform.bias": torch.ones(17)}, r"pa_deform.bias must be \(16,\) at width 16, got \(17,\)"),
         (lambda s: s | {"pa_deform.bias": torch.full((16,), torch.nan)}, "pa_deform.bias holds values that are not"),
+        (
+            lambda s: s | {"pa_deform.bias": torch.full((16,), 1e300, dtype=torch.float64)},  # infinite as float32
+            "pa_deform.bias holds values that are not",
+        ),
         (lambda s: s | {"spynet.std": torch.ones(1, 1, 1, 1)}, "spynet.std must be 0.226, got 1.0"),
     ],
 )
@@ -85,6 +89,15 @@ def test_a_checkpoint_is_converted(tmp_path: Path, state, wrap, prefix):
     assert notes(target)["converted_from"] == "their.pth"
     with pytest.raises(FileExistsError, match=r"ours\.safetensors exists"):
         convert_weights(source, target)
+
+
+def test_a_checkpoint_in_float64_becomes_float32(tmp_path: Path, state):
+    source, target = tmp_path / "their.pth", tmp_path / "ours.safetensors"
+    torch.save({name: value.double() for name, value in state.items()}, source)
+    convert_weights(source, target)
+    ours = load(target).state_dict()
+    for name, value in from_published(state).state_dict().items():
+        assert torch.equal(ours[name], value), name
 
 
 class Bomb:

@@ -1,0 +1,32 @@
+"""Tests the table of the paper's ablation: light levels stay apart, and clips of one scene count once."""
+
+from __future__ import annotations
+
+from quiver.evaluation.comparison import ComparisonRow
+from quiver.evaluation.metrics import Score
+from quiver.training.ablation import markdown
+
+
+def row(light: str, psnr: float, clip: str, scene: str) -> ComparisonRow:
+    """A score of the network with all parts."""
+    score = Score(psnr, psnr, 0.5, 0.5, scale=1.0, scale_spread=0.0, frames=3)
+    return ComparisonRow("all", "", light, clip, scene, score)
+
+
+def test_light_levels_have_lines_of_their_own():
+    dim, bright = row("A", 20.0, "fan", "fan"), row("B", 30.0, "fan", "fan")
+    header, _, first, second = markdown("quiver-s", [dim, bright]).splitlines()
+    assert header.split("|")[5].strip() == "light"
+    assert first.endswith("| A | 20.00 dB | 0.500 |")
+    assert second.endswith("| B | 30.00 dB | 0.500 |")
+    assert "light" not in markdown("quiver-s", [dim])
+
+
+def test_clips_of_one_scene_count_once():
+    clips = [row("A", 20.0, "fan_0", "fan"), row("A", 22.0, "fan_1", "fan"), row("A", 31.0, "gears", "gears")]
+    assert "| 26.00 dB |" in markdown("quiver-s", clips)
+
+
+def test_a_network_without_a_score_failed():
+    lost = ComparisonRow("all", "", "A", "fan", "fan", failure="ValueError: no")
+    assert markdown("quiver-s", [lost]).endswith("| failed |  |\n")
