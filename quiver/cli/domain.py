@@ -8,10 +8,9 @@ from typing import Any
 
 from qsim import checks
 from qsim.cli.console import bar, output
-from qsim.cli.options import checked, memory_size, numbers, whole_numbers, words
+from qsim.cli.options import checked, numbers, whole_numbers, words
 from quiver.cli.options import add_running, command, running_options, use_threads
 
-MEMORY = "2GB"  # as in other commands
 MEASURING = ("split", "sensor", "bits", "ppp", "methods", "seed", "memory", "mode", "device", "precision", "threads")
 
 
@@ -38,7 +37,6 @@ def add_domain(sub: Any) -> None:
     )
     parser.add_argument("--seed", type=checked(checks.seed), help="seed of the noise (default 0)")
     add_running(parser)
-    parser.set_defaults(memory=None)  # None: not given
     parser.add_argument("--force", action="store_true", help="measure existing cells again")
 
 
@@ -54,7 +52,6 @@ def _run_domain(args: argparse.Namespace) -> int:
     if args.clips:
         from quiver.evaluation.domain_measurement import measure
 
-        args.memory = args.memory or memory_size(MEMORY)
         threads.check(args.threads)
         options, settings = running_options(args), _settings(args)
         refuse_idle(vars(args), [network_restorer(path, options)])

@@ -16,6 +16,7 @@ from quiver.data.illumination import Illumination
 from quiver.restoration.automatic import chosen
 from quiver.restoration.domain_remarks import refuse_outside, remarks
 from quiver.restoration.interface import AUTO, DEFAULT_METHOD, RestoreOptions
+from quiver.restoration.restored_file import check_finite
 from quiver.restoration.sources import codes_of, refuse_idle
 
 Source = Stream | Clip | str | os.PathLike[str] | Array
@@ -60,7 +61,9 @@ def restore(
         refuse_outside([runner], found, "strict=", named=method != AUTO)
     for text in found:
         warnings.warn(text, stacklevel=2)
-    return runner.restore(codes)
+    restored = runner.restore(codes)
+    check_finite(restored, runner.name)
+    return restored
 
 
 def _codes(source: Source, sensor: Sensor | None, exposure: float | None, ppp: float | None) -> Codes:

@@ -11,7 +11,7 @@ from numpy import ndarray as Array
 from quiver.data.codes import DARKEST, Codes, light_of
 from quiver.data.illumination import Illumination
 from quiver.restoration.domain import NEAR, OperatingPoint, Scope, place_of
-from quiver.restoration.interface import Restorer
+from quiver.restoration.interface import RestoreOptions, Restorer
 
 DARK = 0.1  # dark counts over the events of the mean light, above which a stream is unlike all cells
 CHANGE = 0.08  # of the light within eleven frames, above which a stream is unlike all cells: they reach 0.05
@@ -81,8 +81,22 @@ def _dark_text(share: float) -> str:
 
 def remarks(methods: Iterable[Restorer], codes: Codes) -> list[str]:
     """Return the remarks on all networks among the methods."""
-    found = (None if m.scope is None else remark(m.name, m.scope, codes) for m in methods)
+    found = (None if m.scope is None else remark(m.name, m.scope, codes) or _run_unlike(m) for m in methods)
     return [text for text in found if text is not None]
+
+
+def _run_unlike(method: Restorer) -> str | None:
+    """Return the remark on a network that runs otherwise than when it was measured: in mode or precision."""
+    if method.scope is None or method.scope.domain is None:
+        return None
+    usual = {"mode": RestoreOptions.mode, "precision": RestoreOptions.precision}
+    now = [str(method.identity.get(key) or value) for key, value in usual.items()]
+    then = [str(method.scope.domain.measured.get(key) or value) for key, value in usual.items()]
+    if now == then:
+        return None
+    return (
+        f"{method.name} was measured in {' and '.join(then)}, and runs in {' and '.join(now)}: nothing tells how well"
+    )
 
 
 def measured_at(method: Restorer, codes: Codes) -> str | None:

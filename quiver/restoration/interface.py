@@ -10,12 +10,12 @@ from numpy import ndarray as Array
 
 from qsim.files import Progress
 from quiver.data.codes import Codes
+from quiver.device import HOST_MEMORY, default_memory, pick_device
 from quiver.restoration.domain import Scope
 from quiver.restoration.mosaics import fill_mosaic
 
 AUTO = "auto"  # chooses the method of a stream: see automatic.py
 DEFAULT_METHOD = AUTO  # of `quiver restore` and `quiver.restore`
-DEFAULT_MEMORY = 2_000_000_000  # bytes; of working memory
 # Presets: see quiver/model/presets.py. Those of equal cost: quiver/model/equal_cost.py.
 QUIVERS = ("quiver-s", "quiver")
 COMPARED = ("unet", "fastdvdnet", "student-teacher", "bit2bit", "emvd", "flornn", "memdeblur", "rvrt", "spk2imgnet")
@@ -36,11 +36,11 @@ RestoreInto = Callable[[Codes, Array, int, Progress | None], None]
 class RestoreOptions:
     """Options of a run. Apart from `mode` and `precision` they change results by rounding only.
 
-    There is one exception: a QUIVER network whose complete frame exceeds the memory. A warning then states the
-    difference.
+    There is one exception: a network whose complete frame exceeds the memory, which by default depends on the device.
+    A warning then states the difference.
     """
 
-    memory: int = DEFAULT_MEMORY  # bytes
+    memory: int | None = None  # bytes of working memory; None = 2 GB, on a GPU half of its memory (`bound`)
     mode: str = "exact"  # exact = the published windows; streaming = state kept, faster; windows = recomputed
     device: str = "auto"  # one of quiver.device.DEVICES
     precision: str = "float32"  # or bfloat16
@@ -50,8 +50,14 @@ class RestoreOptions:
             raise ValueError(f"mode {self.mode!r}; known are {', '.join(MODES)}")
         if self.precision not in ("float32", "bfloat16"):
             raise ValueError(f"precision {self.precision!r}; known are float32 and bfloat16")
-        if self.memory < 1:
+        if self.memory is not None and self.memory < 1:
             raise ValueError(f"memory is in bytes and above 0, got {self.memory}")
+
+    def bound(self, *, host: bool = False) -> int:
+        """Return the working memory [bytes] on the device, or of what runs on the `host` alone."""
+        if self.memory is not None:
+            return self.memory
+        return HOST_MEMORY if host else default_memory(pick_device(self.device))
 
 
 @dataclass(frozen=True)

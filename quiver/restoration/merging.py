@@ -32,7 +32,7 @@ def fill_merged(
 
     length, height, width = codes.shape
     domain = information_domain(codes.sensor, codes.exposure)
-    pieces = cut_pieces(network, height, width, options.memory)
+    pieces = cut_pieces(network, height, width, options.bound(host=True))  # merging runs on the CPU
     apart, done, read = Disagreement.nothing(height, width), 0, frame_reader(codes)
     for tile in pieces.tiles:
         rows, columns = tile.weight.shape
@@ -49,7 +49,7 @@ def fill_merged(
             done += 1
             if progress is not None:
                 progress(done, len(out) * len(pieces.tiles))
-    warn_of_cut(codes, options, pieces, apart)
+    warn_of_cut(codes, pieces, apart)
 
 
 def corrected(network: Any, merged: Any, domain: Any, options: RestoreOptions) -> Array:

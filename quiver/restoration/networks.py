@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,8 @@ from numpy import ndarray as Array
 
 from qsim.files import Progress
 from quiver.baselines.sliding_window import reflect
-from quiver.data.codes import Codes, frame_reader
+from quiver.data.clips import peak_of
+from quiver.data.codes import Codes, frame_reader, light_of
 from quiver.data.noise import noise_table
 from quiver.device import moved, pick_device
 from quiver.restoration.interface import RestoreOptions, Restorer
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
 # Restores into zeros; called with (network, codes, zeros, first, options, progress)
 RestoreNetwork = Callable[[Any, Codes, Array, int, RestoreOptions, Progress | None], None]
+EXCESS = 10.0  # times white, or the peak of scores where that is brighter: restored light lies near 0 ... 1
 CONTEXT = 5  # frames that a network needs before and after the one it restores
 
 
@@ -78,16 +81,41 @@ def wrap_network(
         run, window, look_ahead, together = fill_parts, part.past + 1 + part.future, part.future, part.kept
         description = f"{description}; look-ahead {look_ahead} frames"
 
+    told: set[str] = set()  # streams whose light was too bright: blocks and places of a mask are told once
+
     def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
         run(model, codes, out, first, options, progress)
+        stream = codes.name.partition(" window ")[0].partition(", ")[0]  # not its window or its place of a mask
+        if run is not fill_merged and stream not in told and (text := excess(codes, out, first)):
+            told.add(stream)
+            warnings.warn(text, stacklevel=2)
 
     identity = {"weights_sha256": weights_sha256, "mode": mode, "precision": options.precision}
 
     def cut(height: int, width: int) -> str:
-        return cut_pieces(model, height, width, options.memory).text
+        return cut_pieces(model, height, width, options.bound(host=isinstance(model, MergeNet))).text
 
     return Restorer(
         name, window, look_ahead, True, description, fill, mode != "streaming", identity, cut, together, device=device
+    )
+
+
+def excess(codes: Codes, out: Array, first: int) -> str | None:
+    """Return a line on restored light [t, H, W] far above all light of its stream: a recurrent state grew, or the
+    weights are bad. None otherwise. Frames that are not finite are an error elsewhere.
+    """
+    most = np.array([max(float(frame.max()), -float(frame.min())) for frame in out])  # a copy of `out` may not fit
+    most[~np.isfinite(most)] = 0
+    if not most.size or most.max() <= EXCESS * codes.white:
+        return None
+    unit = max(codes.white, peak_of(light_of(codes)))  # of a binary SPAD the mean may exceed white
+    beyond = np.flatnonzero(most > EXCESS * unit)
+    if not beyond.size:
+        return None
+    return (
+        f"{codes.name}: the restored light reaches {most.max() / unit:.2g} times the brightest of such a stream, above "
+        f"{EXCESS:g} times first in frame {first + beyond[0]}: this network is not stable here; train it longer, or on "
+        "longer windows"
     )
 
 
@@ -113,7 +141,7 @@ def fill_network(
     device = next(model.parameters()).device
     dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
     height, width = codes.shape[1:]
-    pieces = cut_pieces(model, height, width, options.memory)
+    pieces = cut_pieces(model, height, width, options.bound())
     multiple = int(model.multiple)  # type: ignore[arg-type]
     apart, done = Disagreement.nothing(height, width), 0
     for tile in pieces.tiles:
@@ -129,7 +157,7 @@ def fill_network(
                 done += 1
                 if progress is not None:
                     progress(done, len(out) * len(pieces.tiles))
-    warn_of_cut(codes, options, pieces, apart)
+    warn_of_cut(codes, pieces, apart)
 
 
 def fill_parts(
@@ -145,7 +173,7 @@ def fill_parts(
     dtype = torch.bfloat16 if options.precision == "bfloat16" else torch.float32
     length, height, width = codes.shape
     part, last, done, top = part_of(network), first + len(out), 0, np.float32(codes.sensor.levels - 1)
-    pieces = cut_pieces(network, height, width, options.memory)
+    pieces = cut_pieces(network, height, width, options.bound())
     apart, known = Disagreement.nothing(height, width), known_of(network, codes)
     for start in range(first - first % part.kept, last, part.kept):
         end = min(length, start + part.kept + part.after)
@@ -168,7 +196,7 @@ def fill_parts(
             done += len(restored)
             if progress is not None:
                 progress(done, len(out) * len(pieces.tiles))
-    warn_of_cut(codes, options, pieces, apart)
+    warn_of_cut(codes, pieces, apart)
 
 
 def restored_frames(network: Any, frames: Tensor, first: int, last: int, **known: Tensor) -> Tensor:

@@ -16,7 +16,6 @@ import numpy as np
 from numpy import ndarray as Array
 
 from quiver.data.codes import Codes
-from quiver.restoration.interface import RestoreOptions
 from quiver.restoration.parts import part_of, takes_clips
 from quiver.tiles import Tile, cut_tiles
 
@@ -37,6 +36,7 @@ class Pieces:
     tiles: list[Tile]
     exact: bool = True  # whether the result is that of the complete frame
     needed: int = 0  # bytes, about, for an exact cut; 0 for an exact one
+    memory: int = 0  # bytes, the bound that led to a cut that is not exact
 
     @property
     def text(self) -> str:
@@ -51,7 +51,7 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int) -> Pieces
     """Return the cut of a frame for a network and `memory` bytes. `ValueError` if they do not hold a small tile."""
     from quiver.model.quiver import QUIVER
 
-    memory = max(memory - weight_bytes(model), 0)
+    stated, memory = memory, max(memory - weight_bytes(model), 0)
     pixels = memory // bytes_per_pixel(model)
     if height * width <= pixels:
         return Pieces(cut_tiles(height, width, height * width, 0))
@@ -60,12 +60,12 @@ def cut_pieces(model: nn.Module, height: int, width: int, memory: int) -> Pieces
         return Pieces(cut_tiles(height, width, pixels, reach, int(model.multiple)))  # type: ignore[arg-type]
     if takes_clips(model):  # recurrent, or aligned along any motion: no overlap makes tiles exact
         needed = bytes_needed(model, height, width)
-        return Pieces(cut_tiles(height, width, pixels, BLENDED, STEP, blend=True), False, needed)
+        return Pieces(cut_tiles(height, width, pixels, BLENDED, STEP, blend=True), False, needed, stated)
     multiple, needed = int(model.multiple), bytes_needed(model, height, width)  # type: ignore[arg-type]
     if not isinstance(model, QUIVER):
-        return Pieces(cut_tiles(height, width, pixels, BLENDED, multiple, blend=True), False, needed)
+        return Pieces(cut_tiles(height, width, pixels, BLENDED, multiple, blend=True), False, needed, stated)
     step, pixels = max(multiple, model.stride), max(memory - TILING, 0) // bytes_per_pixel(model)
-    return Pieces(cut_tiles(height, width, pixels, BLENDED, step, blend=True), False, needed)
+    return Pieces(cut_tiles(height, width, pixels, BLENDED, step, blend=True), False, needed, stated)
 
 
 def bytes_needed(model: nn.Module, height: int, width: int) -> int:
@@ -143,7 +143,7 @@ class Disagreement:
         return (float(np.sqrt(np.mean(apart**2))), float(apart.max())) if apart.size else (0.0, 0.0)
 
 
-def warn_of_cut(codes: Codes, options: RestoreOptions, pieces: Pieces, apart: Disagreement) -> None:
+def warn_of_cut(codes: Codes, pieces: Pieces, apart: Disagreement) -> None:
     """Warn where a cut changes the answer: by how much tiles differ, and which memory avoids the cut.
 
     Tiles that agree may still differ from the uncut frame.
@@ -153,7 +153,7 @@ def warn_of_cut(codes: Codes, options: RestoreOptions, pieces: Pieces, apart: Di
     rms, most = apart.measured()
     more = f"; --memory {-(-pieces.needed // 10**6)}MB avoids the cut" if pieces.needed else ""
     warnings.warn(
-        f"{codes.name}: {options.memory / 1e6:.0f} MB hold no frame of {codes.shape[1]} x {codes.shape[2]} px; it is "
+        f"{codes.name}: {pieces.memory / 1e6:.0f} MB hold no frame of {codes.shape[1]} x {codes.shape[2]} px; it is "
         f"cut into {pieces.text}, which differ where they overlap by {100 * rms:.2g} % of white rms, "
         f"{100 * most:.2g} % at most{more}",
         stacklevel=3,

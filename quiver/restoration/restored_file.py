@@ -237,6 +237,10 @@ def _done(part: Path, journal: Path, meta: dict[str, Any]) -> tuple[int, float, 
     if not changed and found.keys() == meta.keys():
         return done, seconds, ""
     told = dict.fromkeys(WHAT_CHANGED[key] for key in WHAT_CHANGED if key in changed)
+    before, now = found.get("identity"), meta["identity"]
+    if changed == ["identity"] and isinstance(before, dict) and before | {"cut": now["cut"]} == now:
+        cuts = [tiles or "none" for tiles in (before.get("cut"), now["cut"])]
+        return 0, 0.0, f"the tiles of a frame, by --memory and the device, were {cuts[0]} and are {cuts[1]} now"
     return 0, 0.0, f"{' and '.join(told) or 'its description'} changed since"
 
 

@@ -51,12 +51,13 @@ def restorer(name: str, options: RestoreOptions | None = None) -> Restorer:
 
     def fill(codes: Codes, out: Array, first: int, progress: Progress | None) -> None:
         taken = method.bytes_per_pixel * codes.shape[1] * codes.shape[2]
-        if taken > options.memory:
+        memory = options.bound(host=True)
+        if taken > memory:
             size = f"{codes.shape[1]} x {codes.shape[2]} px"
             warnings.warn(
                 f"{name} takes about {taken / 1e6:.0f} MB for a frame of {size}, above --memory", stacklevel=2
             )
-        free = options.memory - taken
+        free = memory - taken
         if codes.shares is None:
             fill_classical(run, frames, codes, out, first, free, progress)
             return

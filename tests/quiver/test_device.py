@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from quiver import device
+from quiver.restoration.interface import RestoreOptions
 
 CPU = torch.device("cpu")
 
@@ -70,3 +71,17 @@ def test_errors_that_tell_of_exhausted_memory_are_known():
     )
     assert all(map(device.out_of_memory, told))
     assert not any(map(device.out_of_memory, (RuntimeError("no road"), ValueError("out of memory"), OSError())))
+
+
+def test_working_memory_is_half_of_a_gpu_for_what_runs_there(monkeypatch):
+    """What is stated holds everywhere; classical methods and merging never run on a GPU."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (3 * 10**9, 80 * 10**9))
+    assert RestoreOptions().bound() == RestoreOptions(device="cuda").bound() == 40 * 10**9
+    assert RestoreOptions().bound(host=True) == 2 * 10**9
+    assert RestoreOptions(device="cpu").bound() == 2 * 10**9
+    for stated in (1, 3 * 10**9):
+        options = RestoreOptions(memory=stated)
+        assert options.bound() == options.bound(host=True) == stated
+    with pytest.raises(ValueError, match="memory is in bytes and above 0, got 0"):
+        RestoreOptions(memory=0)

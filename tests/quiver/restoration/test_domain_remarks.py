@@ -17,12 +17,13 @@ from qsim.sensor import devices
 from qsim.sensor.qis import QIS
 from quiver.baselines import METHODS
 from quiver.data.clips import open_clips
-from quiver.data.codes import array_codes, light_of
+from quiver.data.codes import Codes, array_codes, light_of
 from quiver.data.illumination import Illumination
 from quiver.data.noise import Noise
 from quiver.model.weights import metadata_of
 from quiver.restoration import domain, domain_remarks
 from quiver.restoration.domain import Domain, Scope
+from quiver.restoration.interface import Restorer
 
 
 def test_inside_nothing_is_said_and_outside_the_better_method():
@@ -155,6 +156,28 @@ def test_evaluate_warns_in_its_table_and_refuses_with_strict(capsys, tiny_datase
     assert code == 2
     assert "small was never measured near ideal counter, 3 bit, 0.9" in err or "3 bit, 1" in err
     assert run(capsys, *static)[0] == 0
+
+
+def test_another_mode_or_precision_than_that_of_the_cells_is_told():
+    """Cells name what was not usual; classical methods and networks without cells have nothing to compare."""
+    inside = stream()
+    usual = {"mode": "exact", "precision": "float32"}
+    assert said_of(MEASURED, usual, inside) == said_of(MEASURED, {"mode": None, "precision": "float32"}, inside) == []
+    streamed = replace(MEASURED, measured={**MEASURED.measured, "mode": "streaming"})
+    assert said_of(streamed, usual | {"mode": "streaming"}, inside) == []
+    told = "mine was measured in exact and float32, and runs in streaming and float32: nothing tells how well"
+    assert said_of(MEASURED, usual | {"mode": "streaming"}, inside) == [told]
+    assert said_of(streamed, usual, inside) != []
+    assert said_of(MEASURED, usual | {"precision": "bfloat16"}, inside) != []
+
+
+def said_of(found: Domain, identity: dict[str, object], codes: Codes) -> list[str]:
+    return domain_remarks.remarks(
+        [Restorer("mine", 11, 5, True, "", nothing, identity=identity, scope=Scope(found))], codes
+    )
+
+
+def nothing(codes: Codes, out: np.ndarray, first: int, progress: object) -> None: ...
 
 
 def test_the_call_in_python_warns_and_refuses_with_strict(tmp_path, make_clip: ClipMaker):

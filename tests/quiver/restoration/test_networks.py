@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,8 @@ from numpy import ndarray as Array
 from random_codes import random_codes
 from torch import Tensor, nn
 
-from quiver.data.codes import Codes
+from qsim.sensor.spad import BinarySPAD
+from quiver.data.codes import Codes, array_codes
 from quiver.model.blocks import Output
 from quiver.model.config import Config
 from quiver.model.presets import build
@@ -24,7 +27,7 @@ from quiver.model.quiver import QUIVER
 from quiver.model.unet import UNet, UNetConfig
 from quiver.model.weights import save
 from quiver.restoration.interface import RestoreOptions
-from quiver.restoration.networks import fill_network, network_title, pictures, wrap_network
+from quiver.restoration.networks import excess, fill_network, network_title, pictures, wrap_network
 from quiver.restoration.pieces import bytes_needed, cut_pieces
 from quiver.restoration.restorers import restorer
 
@@ -200,3 +203,41 @@ def test_a_network_has_a_title():
     assert titles == {"mergenet": "MergeNet (mergenet)", "quiver-s": "QUIVER (quiver-s)", "unet": "U-Net",
                       "emvd": "EMVD (emvd)"}  # fmt: skip
     assert network_title(QUIVER(config)) == "QUIVER"
+
+
+def test_light_that_no_codes_can_mean_is_told():
+    """A state that grows from frame to frame; light of nine times white is let pass, and on a binary SPAD more."""
+
+    class Growing(CentreFrame):
+        def __init__(self, first: float) -> None:
+            super().__init__()
+            self.light = first
+
+        def forward(self, x: Tensor) -> Output:
+            self.light *= 2
+            picture = torch.full_like(x[:, 5:6], self.light)
+            return Output(x, picture, picture, picture)
+
+    codes, cpu = replace(random_codes(6, 8, 8), ppp=0.5), RestoreOptions(device="cpu")
+    grown = wrap_network(Growing(1.0), "grown", "", cpu)
+    for first in range(3):  # block by block, as a file is restored
+        grown.restore(codes, first, first + 1)
+    with pytest.warns(UserWarning, match="reaches 16 times .* above 10 times first in frame 3"):
+        grown.restore(codes, 3, 4)
+    grown.restore(codes, 4, 6)  # it was told
+    with pytest.warns(UserWarning, match="above 10 times first in frame 0"):  # another stream is told again
+        grown.restore(replace(codes, name="other"))
+    assert wrap_network(Growing(9 / 64), "q", "", cpu).restore(codes).max() == pytest.approx(9 * codes.white)
+    bright = replace(array_codes(np.ones((6, 8, 8), np.uint8), BinarySPAD(1.0, 0.0, 1), 1e-3), ppp=10.0)
+    assert wrap_network(Growing(200 / 64), "q", "", cpu).restore(bright).max() == pytest.approx(200)  # its peak is 25
+    with pytest.warns(UserWarning, match="reaches 12 times"):
+        wrap_network(Growing(300 / 64), "q", "", cpu).restore(bright)
+
+
+def test_frames_are_looked_at_one_by_one():
+    """A film that fits no memory is a memory map: no copy of it may be made."""
+    film = np.zeros((200, 256, 256), np.float32)
+    tracemalloc.start()
+    assert excess(random_codes(1, 4, 4), film, 0) is None
+    assert tracemalloc.get_traced_memory()[1] < film.nbytes / 20
+    tracemalloc.stop()

@@ -48,7 +48,7 @@ class Means(nn.Module):
 
 
 class Sums(Means):
-    """Restores a frame as the sum of all frames up to it: sees the complete past."""
+    """Restores a frame as an eighth of the sum of all frames up to it: sees the complete past."""
 
     frames_in = property()  # type: ignore[assignment]
     look_ahead = 0
@@ -56,7 +56,7 @@ class Sums(Means):
     def forward(self, frames: Tensor) -> Tensor:
         self.longest = max(self.longest, frames.shape[1])
         self.computed += frames.shape[1]
-        return frames.cumsum(dim=1)
+        return frames.cumsum(dim=1) / 8
 
 
 def restored(network: nn.Module, codes: Codes, options: RestoreOptions | None = None, *span: int) -> Array:

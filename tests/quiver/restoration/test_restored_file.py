@@ -89,7 +89,9 @@ def weights(folder: Path, seed: int) -> Path:
     return path
 
 
-@pytest.mark.parametrize("what", ["stream", "array", "sensed clip", "weights", "window", "precision", "sensor"])
+@pytest.mark.parametrize(
+    "what", ["stream", "array", "sensed clip", "weights", "window", "precision", "tiles", "sensor"]
+)
 def test_a_restoration_of_something_else_starts_again(tmp_path, make_clip, blocks_of_four, what):
     """Each change of the answer: all blocks are restored again, and one line gives the reason."""
     before, after = random_codes(), random_codes()
@@ -125,6 +127,9 @@ def test_a_restoration_of_something_else_starts_again(tmp_path, make_clip, block
             path = str(weights(tmp_path, 0))
             old, new = (restorer(path, RestoreOptions(precision=p)) for p in ("float32", "bfloat16"))
             why = "settings"
+        case "tiles":
+            old = replace(old, cut=lambda height, width: "10 tiles")
+            why = "but the tiles of a frame, by --memory and the device, were 10 tiles and are none now"
         case "sensor":
             after = array_codes(after.read(0, 10), replace(SENSOR, gain=1.0), EXPOSURE)
             why = "the sensor"
