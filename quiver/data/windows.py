@@ -199,7 +199,7 @@ class Windows(Dataset[dict[str, Any]]):
         if self.settings.still:
             resting = np.broadcast_to(photons[len(photons) // 2] * scale, photons.shape)
             key = replace(place.key, stage=STILL + place.key.stage)
-            sample["still"] = as_input(draw_codes(draw.sensor, resting, clip.exposure, key), draw.sensor)
+            sample["still"] = as_input(draw_codes(behind, resting, clip.exposure, key), draw.sensor)
         if self.prepare is None:
             return sample
         seen = array_codes(codes, behind, clip.exposure, name=clip.name)
@@ -289,9 +289,10 @@ def check_clips(clips: Sequence[Clip], settings: WindowSettings) -> None:
         clip.require_one_band("training")
         length, height, width = clip.shape
         if length < settings.frames or min(height, width) < settings.crop:
+            less = "fewer --frames" if length < settings.frames else "a smaller --crop"
             raise ValueError(
                 f"clip {clip.name} is {length} x {height} x {width}; a window needs {settings.frames} frames of "
-                f"{settings.crop} x {settings.crop} px; choose a smaller --crop or longer clips"
+                f"{settings.crop} x {settings.crop} px; choose {less}, or other clips"
             )
 
 

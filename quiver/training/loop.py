@@ -286,10 +286,11 @@ def train(
         else:
             settings, lines = settled(settings, force=force)
             settings = replace(settings, threads=threads.use(asked, settings.threads).number)
-            windows, fixed = make_windows(settings, system.side(model), system, system.window(model))
+            windows, fixed = make_windows(settings, system.side(model), system, system.validated(model, settings))
             lines += unfinished(settings.folders)
         conditions = {"processes": process.world, "computes_in": precision_of(settings, process.device)}
-        run = Run(settings, conditions | {"clips": source_digest(windows, fixed)})
+        conditions |= {"clips": source_digest(windows, fixed), "validated_frames": system.validated(model, settings)}
+        run = Run(settings, conditions, earlier={"validated_frames": system.window(model)})
         if process.leads:
             stack.enter_context(run.open(force=force))
         process.wait()

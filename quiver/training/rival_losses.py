@@ -24,7 +24,7 @@ from quiver.training.system import Batch
 
 EPSILON = 1e-3  # of the Charbonnier loss, in units of white
 ESTIMATES = 0.02  # weight of Spk2ImgNet's light estimates
-PHOTOMETRIC = 0.1  # ours: weight of FloRNN's flow loss, beside squared errors
+PHOTOMETRIC = 0.05  # ours: weight of FloRNN's flow loss, beside squared errors of one frame
 HALF = 0.5  # sums of squares are divided by twice their number
 
 
@@ -39,8 +39,9 @@ def every_frame(network: nn.Module, batch: Batch) -> tuple[Tensor, int]:
 
 
 def centre_frame(network: nn.Module, batch: Batch) -> tuple[Tensor, int]:
-    """Return frame 5 of a window [B, 1, 1, h, w], and 5."""
-    return network(batch["codes"])[:, BEFORE : BEFORE + 1], BEFORE
+    """Return the middle frame of a window [B, 1, 1, h, w], and its place: 5 of the published eleven or twelve."""
+    middle = (batch["codes"].shape[1] - 1) // 2
+    return network(batch["codes"])[:, middle : middle + 1], middle
 
 
 def windows_restored(network: Any, batch: Batch) -> tuple[Tensor, int]:
@@ -109,7 +110,7 @@ def flornn_loss(network: Any, batch: Batch, settings: Settings, share: float) ->
     moved = warp(later, flows.forward.flatten(0, 1).float(), "border")
     back = warp(earlier, flows.backward.flatten(0, 1).float(), "border")
     photometric = (moved - earlier).abs().mean() + (back - later).abs().mean()
-    return squares + PHOTOMETRIC * photometric * codes.shape[-2] * codes.shape[-1]
+    return squares + PHOTOMETRIC * restored.shape[1] * photometric * codes.shape[-2] * codes.shape[-1]
 
 
 def flornn_restored(network: Any, batch: Batch) -> tuple[Tensor, int]:

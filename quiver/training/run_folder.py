@@ -39,6 +39,7 @@ CONDITIONS = {  # of a run, beside its settings: what a folder holds if one of t
     "processes": "holds a run whose number of processes is {}, now it is {}",
     "computes_in": "holds a run that computes in {}, now it would compute in {}",
     "clips": "holds a run on other clips or codes than are there now",
+    "validated_frames": "holds a run that was validated on windows of {} frames, now it is {}",
 }
 
 
@@ -80,10 +81,15 @@ def empty(folder: Path) -> None:
 
 
 class Run:
-    """Folder of a run. `conditions` are values by the keys of CONDITIONS, stored beside the settings."""
+    """Folder of a run. `conditions` are values by the keys of CONDITIONS, stored beside the settings; `earlier` those
+    of runs of versions that wrote none.
+    """
 
-    def __init__(self, settings: Settings, conditions: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, settings: Settings, conditions: Mapping[str, Any] | None = None, earlier: Mapping[str, Any] | None = None
+    ) -> None:
         self.settings, self.folder, self.conditions = settings, Path(settings.out), dict(conditions or {})
+        self.earlier = dict(earlier or {})
         self.checkpoint = self.folder / "checkpoint.pt"
 
     @contextlib.contextmanager
@@ -129,7 +135,7 @@ class Run:
                     "another -o, or start again with --force"
                 )
         for name, value in self.conditions.items():
-            before = found.get(name, value)  # earlier versions wrote none
+            before = found.get(name, self.earlier.get(name, value))
             if before != value:
                 raise FileExistsError(
                     f"{self.folder} {CONDITIONS[name].format(short(before), short(value))}; resume it as it began, "

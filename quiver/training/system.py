@@ -39,6 +39,7 @@ class System:
     protocols: Mapping[str, Mapping[str, Any]]  # name -> settings that options override
     losses: tuple[str, ...] = ("own",)  # values of Settings.loss that `loss` accepts
     frames: int = 11  # of the windows of a validation, and least of those of training
+    as_long: bool = False  # validations see as many frames as training: a state that grows over them is told
     multiple: int | None = None  # px that divides the side of a crop; None: the network's own `multiple`, else 1
     prepare: Prepare | None = None  # computes more inputs where samples are drawn
     still: bool = False  # samples also hold noisy copies of the centre frame
@@ -49,6 +50,10 @@ class System:
     def window(self, network: nn.Module) -> int:
         """Return the least number of frames of a window: the network's own `frames_in`, if it has one."""
         return int(getattr(network, "frames_in", self.frames))
+
+    def validated(self, network: nn.Module, settings: Settings) -> int:
+        """Return the frames of the windows of a validation."""
+        return settings.frames if self.as_long else self.window(network)
 
     def side(self, network: nn.Module) -> int:
         """Return the number of px that must divide the side of a crop."""

@@ -89,15 +89,20 @@ SYSTEMS: dict[type[nn.Module], System] = {
     UNet: replace(OURS, name="unet", loss=unet_loss, restored=rivals.windows_restored),
     EMVD: System(
         *("emvd", rivals.emvd_loss, rivals.emvd_restored, _protocols({"clip_norm": 5.0}, clip_norm=5.0)),
+        as_long=True,
         prepare=rivals.noise_inputs,
     ),
     FloRNN: System(
-        *("flornn", rivals.flornn_loss, rivals.flornn_restored, _protocols({}, learning_rate=3e-4)),
+        *("flornn", rivals.flornn_loss, rivals.flornn_restored),
+        # The published eleven frames train the forward state over one step: on whole clips it can grow without end.
+        _protocols({}, learning_rate=3e-4, frames=20),
+        as_long=True,
         prepare=rivals.noise_inputs,
         check=rivals.check_flornn,
     ),
     MemDeblur: System(
-        *("memdeblur", rivals.memdeblur_loss, rivals.centre_frame, _protocols({})),
+        *("memdeblur", rivals.memdeblur_loss, rivals.centre_frame, _protocols({}, crop=128)),  # less has keys of 1 px
+        as_long=True,
         multiple=16,
         check=rivals.check_memdeblur,
     ),
@@ -120,8 +125,10 @@ SYSTEMS: dict[type[nn.Module], System] = {
     ),
     RVRT: System(
         *("rvrt", rivals.charbonnier_loss, rivals.centre_frame),
-        _protocols({"crop": 240, "batch": 2, "steps": 125_000, "frames": 12}, learning_rate=3e-4),
+        # 64 px would be padded to 132, and three quarters of the pixels would repeat the border.
+        _protocols({"crop": 240, "batch": 2, "steps": 125_000, "frames": 12}, learning_rate=3e-4, crop=128),
         frames=12,
+        as_long=True,
     ),
     Spk2ImgNet: System(
         *("spk2imgnet", rivals.spk2imgnet_loss, rivals.spk2imgnet_restored),

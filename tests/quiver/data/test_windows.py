@@ -207,8 +207,11 @@ def test_of_more_clips_than_windows_each_gives_one_at_most(make_clip: ClipMaker)
 
 
 def test_clips_that_hold_no_window_are_named(make_clip: ClipMaker):
-    with pytest.raises(ValueError, match="clip short is 5 x 36 x 44; a window needs 11 frames of 16 x 16 px"):
+    needs = "clip short is 5 x 36 x 44; a window needs 11 frames of 16 x 16 px; choose fewer --frames, or other clips"
+    with pytest.raises(ValueError, match=needs):
         Windows([make_clip("short", frames=5)], WindowSettings(crop=16))
+    with pytest.raises(ValueError, match="choose a smaller --crop, or other clips"):
+        Windows([make_clip("small", frames=11)], WindowSettings(crop=40))
     with pytest.raises(ValueError, match="no complete clip"):
         Windows([], WindowSettings())
 

@@ -68,6 +68,7 @@ def opened(wanted: Settings, *, force: bool = False) -> None:
         ("processes", 2, 1, "holds a run whose number of processes is 2, now it is 1"),
         ("computes_in", "bfloat16", "float32", "holds a run that computes in 'bfloat16', now it would compute in"),
         ("clips", "ab", "cd", "holds a run on other clips or codes than are there now"),
+        ("validated_frames", 11, 24, "holds a run that was validated on windows of 11 frames, now it is 24"),
     ],
 )
 def test_other_conditions_are_refused(tmp_path, name, began, now, says):
@@ -83,6 +84,11 @@ def test_other_conditions_are_refused(tmp_path, name, began, now, says):
     again(now)
     opened(Settings("d", str(tmp_path / "old"), steps=1))  # of an earlier version, which stored none
     with Run(Settings("d", str(tmp_path / "old"), steps=1), {name: now}).open():
+        pass
+    with (
+        pytest.raises(FileExistsError, match=says),  # where it is known what earlier versions did
+        Run(Settings("d", str(tmp_path / "old"), steps=1), {name: now}, earlier={name: began}).open(),
+    ):
         pass
 
 

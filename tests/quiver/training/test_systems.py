@@ -21,7 +21,7 @@ from quiver.data.noise import noise_table
 from quiver.data.windows import Windows, WindowSettings
 from quiver.model.presets import NETWORKS as KINDS
 from quiver.model.presets import OTHERS, PRESETS, build
-from quiver.model.rivals.flornn import FloRNN, FloRNNConfig
+from quiver.model.rivals.flornn import FloRNN, FloRNNConfig, Flows
 from quiver.model.rivals.memdeblur import MemDeblur, MemDeblurConfig
 from quiver.model.rivals.rvrt import RVRT, RVRTConfig
 from quiver.model.rivals.student_teacher import StudentTeacher, StudentTeacherConfig
@@ -30,6 +30,7 @@ from quiver.restoration.interface import NETWORKS, QUIVERS, RestoreOptions
 from quiver.restoration.networks import wrap_network
 from quiver.training import loop as training
 from quiver.training.loop import train
+from quiver.training.rival_losses import centre_frame
 from quiver.training.settings import Settings, settled
 from quiver.training.system import System, protocol
 from quiver.training.systems import OURS, SYSTEMS, system_named, system_of
@@ -364,6 +365,57 @@ def test_batch_normalisation_of_memdeblur_needs_two_small_crops(tiny_dataset, tm
     network = MemDeblur(replace(config, group_norm=True))
     once = {"steps": 1, "validate_every": 1, "validation_windows": 1, "crop": 32, "batch": 1}
     assert train(network, tiny_settings(network, tiny_dataset, tmp_path / "r", **once), progress=False).step == 1
+
+
+def test_flornn_learns_over_more_frames_than_published():
+    """With the published eleven, and a look-ahead of nine, its forward state is trained over one step."""
+    network = FloRNN(FloRNNConfig(width=4, blocks=1, flow_channels=(4, 4)))
+    system = system_of(network)
+    quick, published = (Settings("d", "o", **{"steps": 1} | protocol(system, n)) for n in ("quick", "published"))
+    assert (quick.frames, published.frames) == (20, 11)
+    restored, first = system.restored(network, {"codes": torch.rand(1, quick.frames, 1, 16, 16)})
+    assert (restored.shape, first) == ((1, 1, 1, 16, 16), quick.frames - 1 - network.look_ahead)
+
+
+@pytest.mark.parametrize("name", ["emvd", "flornn", "memdeblur", "rvrt", "unet", "spk2imgnet"])
+def test_validations_of_networks_with_a_state_are_as_long_as_training(name):
+    network = tiny(name)
+    system, run = system_of(network), Settings("d", "o", frames=40, steps=1)
+    assert system.validated(network, run) == (40 if name not in ("unet", "spk2imgnet") else system.window(network))
+
+
+def test_the_middle_frame_is_scored_of_any_window():
+    """Of the published eleven or twelve frames that is frame 5."""
+    for frames, middle in ((11, 5), (12, 5), (21, 10)):
+        codes = torch.arange(frames, dtype=torch.float32).view(1, frames, 1, 1, 1)
+        restored, first = centre_frame(torch.nn.Identity(), {"codes": codes})
+        assert (first, restored.flatten().tolist()) == (middle, [middle])
+
+
+def test_the_flow_of_flornn_weighs_the_same_for_any_number_of_frames():
+    """A network that is off by the same in every frame, on a scene that moves: shares of the loss are equal."""
+    network = FloRNN(FloRNNConfig(width=4, blocks=1, look_ahead=3, flow_channels=(4, 4)))
+    shares = []
+    for frames in (5, 10):
+        target = torch.rand(1, 1, 1, 16, 16, generator=torch.Generator().manual_seed(0)).expand(1, frames, 1, 16, 16)
+        target = torch.where(torch.arange(frames).view(1, -1, 1, 1, 1) % 2 == 0, target, 1 - target)
+        still = torch.zeros(1, frames - 1, 2, 16, 16)
+        network.flows = lambda codes, still=still: Flows(still, still)  # type: ignore[method-assign]
+        losses = []
+        for off in (0.0, 0.5):
+            found = target[:, : frames - 3].expand(-1, -1, 3, -1, -1) + off
+            network.restore = lambda images, noise, flows, found=found: found  # type: ignore[method-assign]
+            batch = {"codes": target, "target": target}
+            losses.append(float(system_of(network).loss(network, batch, Settings("d", "o", steps=1), 1.0)))
+        shares.append(losses[0] / losses[1])
+    assert 0 < shares[0] < 1
+    assert shares[1] == pytest.approx(shares[0], rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["rvrt", "memdeblur"])
+def test_quick_crops_are_not_mostly_filled(name):
+    """RVRT fills crops to 132 px, and MemDeblur has keys at a sixteenth of a quarter."""
+    assert Settings("d", "o", steps=1, **protocol(system_named(name), "quick")).crop == 128
 
 
 def test_flornn_needs_its_look_ahead_and_a_flow(tiny_dataset, tmp_path):
